@@ -1,0 +1,39 @@
+# `make demo` draws a first landscape, `make test` runs every test; both set up .venv by themselves.
+# Needs CPython 3.11 or 3.12; name another interpreter with PYTHON=...
+PYTHON ?= $(firstword $(foreach p,python3.11 python3.12 python3,$(if $(shell $(p) -c 'import sys; print(sys.version_info[:2] in ((3, 11), (3, 12)) or "")' 2>/dev/null | grep True),$(p))))
+BIN := .venv/bin
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+
+.PHONY: demo test setup setup-test check clean
+
+demo: setup
+	$(BIN)/landscape slice fluid --dims 6 8
+
+test: setup-test
+	$(BIN)/python -m pytest -n 2
+
+check: setup-test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+setup: .venv/.installed
+setup-test: .venv/.installed-test
+
+.venv/bin/python:
+	@test -n "$(PYTHON)" || { echo "gradscape needs CPython 3.11 or 3.12; none was found. Install one, or name it: make PYTHON=/path/to/python3.11" >&2; exit 1; }
+	$(PYTHON) -m venv .venv
+
+# torch comes first and by itself: named exactly, it is the build the constraints ask for.
+.venv/.installed: pyproject.toml constraints.txt | .venv/bin/python
+	$(INSTALL) torch==$(shell sed -n 's/^torch==//p' constraints.txt)
+	$(INSTALL) --editable .
+	@touch $@
+
+.venv/.installed-test: .venv/.installed
+	$(INSTALL) --editable '.[test,dev]'
+	@touch $@
+
+clean:
+	rm -rf .venv build dist

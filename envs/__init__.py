@@ -1,0 +1,1 @@
+"""The environments: differentiable simulations whose parameters span a landscape."""

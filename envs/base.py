@@ -1,0 +1,202 @@
+"""What every environment is: a scene with parameters, three fidelities, losses and true gradients."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..landscapes.objective import Evaluation
+from ..landscapes.space import ParameterSpace
+from .options import NoOptions, read_options
+
+
+@dataclass(frozen=True)
+class Fidelity:
+    """Say how accurately a scene is simulated.
+
+    `dt` is the time step [s], `resolution` the number of grid cells (or mesh edges) across the scene, 0 where it has
+    none, `sampling` the particles per cell along each axis, `precision` that of the engine: float32 or float64.
+    """
+
+    name: str
+    dt: float
+    precision: str = "float32"
+    resolution: int = 0
+    sampling: float = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """Hold the frames of one episode to draw.
+
+    `time` [s], shape (frame,); `points` [m], body name -> shape (frame, point, axis); `tools` [m], tool name -> shape
+    (frame, axis).
+    """
+
+    time: Float[Tensor, " frame"]
+    points: Mapping[str, Float[Tensor, "frame point 3"]]
+    tools: Mapping[str, Float[Tensor, "frame 3"]] = field(default_factory=dict)
+
+
+class Environment(abc.ABC):
+    """A differentiable scene: a batch of parameter vectors in, losses and gradients out.
+
+    A scene is written by deriving from this class: the class attributes say what it is, `_evaluate` simulates. An
+    environment is an `Objective`, and a torch function: `env(x)` returns losses, shape (batch,), that can be
+    differentiated. `fidelity` is a name from `fidelities`, the first unless said otherwise, or a record of one's own;
+    `device` is auto, cpu or cuda; options are those of the class's `Options`.
+    """
+
+    name: ClassVar[str]
+    fidelities: ClassVar[Mapping[str, Fidelity]]
+    examples: ClassVar[Mapping[str, tuple[float, ...]]] = {}
+    Options: ClassVar[type[Any]] = NoOptions
+    devices: ClassVar[tuple[str, ...]] = ("cpu",)
+
+    space: ParameterSpace
+
+    def __init__(self, *, fidelity: str | Fidelity | None = None, device: str = "auto", **options: Any) -> None:
+        self.fidelity = self._named_fidelity(fidelity)
+        self.device = self._available_device(device)
+        self.options = read_options(self.name, self.Options, options)
+        self._setup()
+
+    @final
+    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
+        """Return losses, and gradients if asked, at points `x`, shape (batch, dim), in the parameters' units.
+
+        Rows do not depend on each other. A row whose simulation fails says so in its status. Raises ValueError where x
+        has another shape, another type or values that are not finite.
+        """
+        x = self._checked(x)
+        if len(x) == 0:
+            return _empty(x, grad)
+        parts = torch.split(x, self._share(len(x), grad=grad))
+        with self._pool(len(parts)) as each:
+            results = list(each(lambda part: self._evaluate(part, grad=grad), parts))
+        loss = torch.cat([r.loss.to(x) for r in results])
+        slope = torch.cat([r.grad.to(x) for r in results if r.grad is not None]) if grad else None
+        return Evaluation.judged(loss, slope, torch.cat([r.status.cpu() for r in results]))
+
+    @final
+    def __call__(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"]:
+        """Return losses that torch can differentiate."""
+        losses: Tensor = _Bridge.apply(x, self)  # type: ignore[no-untyped-call]
+        return losses
+
+    @final
+    def example(self, name: str) -> Float[Tensor, " dim"]:
+        """Return a parameter vector this scene is known for."""
+        if name not in self.examples:
+            raise ValueError(f"{self.name} has no example {name!r}; it has {', '.join(self.examples) or 'none'}")
+        return torch.tensor(self.examples[name], dtype=torch.float64)
+
+    def episode(self, x: Float[Tensor, " dim"]) -> Episode:
+        """Return the frames of the episode at one point."""
+        raise ValueError(f"{self.name} has no episode to draw")
+
+    def memory(self, *, grad: bool = True) -> int:
+        """Estimate the bytes one episode takes while it runs."""
+        return 0
+
+    @property
+    def threads(self) -> int:
+        """Number of Python threads a batch is spread over."""
+        return 1
+
+    @property
+    def preferred_batch(self) -> int:
+        """Number of points worth evaluating at once."""
+        return 16
+
+    @abc.abstractmethod
+    def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+        """Simulate at least one point; called from several threads at once where `threads` is above one."""
+
+    def _setup(self) -> None:  # noqa: B027 -- a scene that shares nothing needs none
+        """Prepare what all evaluations share; sets `space` unless the class does."""
+
+    def _largest_part(self, *, grad: bool) -> int:
+        """Return how many rows `_evaluate` takes at the most."""
+        return 1 << 20
+
+    def _share(self, rows: int, *, grad: bool) -> int:
+        return max(1, min(-(-rows // self.threads), self._largest_part(grad=grad)))
+
+    @contextmanager
+    def _pool(self, parts: int) -> Iterator[Any]:
+        if self.threads == 1 or parts == 1:
+            yield map
+            return
+        with ThreadPoolExecutor(self.threads) as executor:
+            yield executor.map
+
+    def _checked(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch dim"]:
+        if not isinstance(x, Tensor) or not x.is_floating_point():
+            raise ValueError(f"{self.name} takes a floating-point tensor; got {_kind(x)}")
+        if x.ndim != 2 or x.shape[1] != self.space.dim:
+            raise ValueError(
+                f"{self.name} takes {self.space.dim} parameters, x of shape (batch, {self.space.dim}); "
+                f"got x of shape {tuple(x.shape)}"
+            )
+        if not bool(x.isfinite().all()):
+            row = int((~x.isfinite().all(dim=1)).nonzero()[0])
+            raise ValueError(f"{self.name} takes finite parameters; row {row} of x holds {x[row].tolist()}")
+        return x.detach().to("cpu", torch.float64)
+
+    def _named_fidelity(self, fidelity: str | Fidelity | None) -> Fidelity:
+        if isinstance(fidelity, Fidelity):
+            return fidelity
+        if fidelity is None:
+            return next(iter(self.fidelities.values()))
+        if fidelity not in self.fidelities:
+            raise ValueError(f"{self.name} has fidelities {', '.join(self.fidelities)}; got {fidelity!r}")
+        return self.fidelities[fidelity]
+
+    def _available_device(self, device: str) -> str:
+        if device == "auto":
+            return "cuda" if "cuda" in self.devices and _cuda() else "cpu"
+        if device not in self.devices:
+            raise ValueError(f"{self.name} runs on {' and '.join(self.devices)}; got device {device!r}")
+        if device == "cuda" and not _cuda():
+            raise ValueError(f"{self.name} was asked to run on cuda; no CUDA device was found here, use --device cpu")
+        return device
+
+
+class _Bridge(torch.autograd.Function):
+    """Make an environment one node of torch's graph: the gradient is computed with the loss, rows being independent."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, environment: Environment) -> Tensor:
+        result = environment.evaluate(x, grad=ctx.needs_input_grad[0])
+        if result.grad is not None:
+            ctx.save_for_backward(result.grad.to(x))
+        return result.loss.to(x)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor, None]:
+        (grad,) = ctx.saved_tensors
+        return grad_loss[:, None] * grad, None
+
+
+def _empty(x: Tensor, grad: bool) -> Evaluation:
+    return Evaluation.judged(x.new_zeros(0), x.new_zeros(x.shape) if grad else None)
+
+
+def _kind(x: object) -> str:
+    return f"a tensor of {x.dtype}" if isinstance(x, Tensor) else type(x).__name__
+
+
+def _cuda() -> bool:
+    from .engines.runtime import cuda_available
+
+    return cuda_available()

@@ -1,0 +1,135 @@
+"""The Bounce scene: a ball is thrown so that it meets a target after bouncing off the ground."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..landscapes.objective import Evaluation, Status
+from ..landscapes.space import ParameterSpace
+from .base import Environment, Episode, Fidelity
+from .engines.rigid import Ball, Solver
+from .engines.runtime import Pool, cores
+
+START = (-0.5, 1.0, 0.0)  # [m]
+DURATION = 2.0  # [s]
+
+
+@dataclass(frozen=True)
+class BounceOptions:
+    """Contact: stiffness `ke` [N/m], damping `kd` and viscous friction `kf` [N s/m], Coulomb's `mu`; target [m]."""
+
+    ke: float = 1e4
+    kd: float = 10.0
+    kf: float = 1e3
+    mu: float = 0.25
+    target_x: float = 2.0
+    target_y: float = 1.0
+    target_z: float = 0.0
+
+
+class Bounce(Environment):
+    """Throw a ball so that it is at the target after 2 s, having bounced off the ground.
+
+    Model: a ball of radius 0.1 m and mass 1 kg flies from (-0.5, 1, 0) m under gravity; the ground y = 0 pushes back by
+    Warp's relaxed contact (penalty stiffness 1e4 N/m, damping 10 N s/m while approaching, friction); semi-implicit
+    Euler, dt 1/480 s at standard.
+    Parameters: initial velocity x, y, z [m/s].
+    Loss: squared distance of the ball's centre to the target (2, 1, 0) m at 2 s [m^2]. One bounce reaches it (example
+    `aim`).
+    Simplifications: the ball does not spin, since friction on a point keeps the discontinuity the scene is about; there
+    is no wall, since the policy has to use the ground. Viscous friction is capped so that a step cannot reverse
+    sliding.
+    Source: task Bounce of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
+    2022), appendix B.1; contact constants of NVIDIA Warp's bounce example.
+    The paper says: gradients over horizontal velocity are smooth; over vertical velocity bounces come and go, and the
+    discontinuities remain in spite of relaxed contact.
+    """
+
+    name: ClassVar[str] = "bounce"
+    devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
+    fidelities: ClassVar[dict[str, Fidelity]] = {
+        "draft": Fidelity("draft", dt=1 / 240),
+        "standard": Fidelity("standard", dt=1 / 480),
+        "reference": Fidelity("reference", dt=1 / 3840, precision="float64"),
+    }
+    Options: ClassVar[type[Any]] = BounceOptions
+    examples: ClassVar[dict[str, tuple[float, ...]]] = {"aim": (6.12, -9.68, 0.0)}
+    space = ParameterSpace(
+        ("velocity x", "velocity y", "velocity z"),
+        torch.full((3,), -10.0, dtype=torch.float64),
+        torch.full((3,), 10.0, dtype=torch.float64),
+        ("m/s",) * 3,
+    )
+
+    @property
+    def threads(self) -> int:
+        """Number of Python threads a batch is spread over."""
+        return cores() if self.device == "cpu" else 1
+
+    @property
+    def preferred_batch(self) -> int:
+        """Number of points worth evaluating at once."""
+        return 512 if self.device == "cpu" else 1 << 16
+
+    @property
+    def steps(self) -> int:
+        """Number of time steps of an episode."""
+        return round(DURATION / self.fidelity.dt)
+
+    def memory(self, *, grad: bool = True) -> int:
+        """Estimate the bytes one episode takes while it runs."""
+        return (self.steps + 1) * 4 * 3 * (8 if self.fidelity.precision == "float64" else 4)
+
+    def bounces(self, x: Float[Tensor, "batch 3"]) -> Int[Tensor, " batch"]:
+        """Count how often each ball leaves the ground."""
+        counts = []
+        for part in torch.split(self._checked(x), self._capacity):
+            with self._solvers.lend() as solver:
+                height = solver.run(torch.tensor(START), part)[:, :, 1].cpu()
+            inside = height < self.ball.radius
+            counts.append((inside[:-1] & ~inside[1:]).sum(dim=0))
+        return torch.cat(counts) if counts else torch.zeros(0, dtype=torch.int64)
+
+    def episode(self, x: Float[Tensor, " dim"]) -> Episode:
+        """Return the ball's flight."""
+        (row,) = self._checked(x[None])
+        with self._solvers.lend() as solver:
+            flight = solver.run(torch.tensor(START), row[None]).double().cpu()
+        time = self.fidelity.dt * torch.arange(self.steps + 1, dtype=torch.float64)
+        return Episode(time, {"ball": flight}, {"target": self.target.expand(len(time), 3)})
+
+    @property
+    def target(self) -> Float[Tensor, " 3"]:
+        """Where the ball is wanted [m]."""
+        o = self.options
+        return torch.tensor([o.target_x, o.target_y, o.target_z], dtype=torch.float64)
+
+    def _setup(self) -> None:
+        o = self.options
+        self.ball = Ball(radius=0.1, mass=1.0, gravity=9.8, ke=o.ke, kd=o.kd, kf=o.kf, mu=o.mu)
+        self._capacity = 256 if self.device == "cpu" else self.preferred_batch
+        self._solvers = Pool(self._solver)
+
+    def _solver(self) -> Solver:
+        return Solver(
+            self.ball,
+            dt=self.fidelity.dt,
+            steps=self.steps,
+            name=self.fidelity.precision,
+            capacity=self._capacity,
+            device=self.device,
+        )
+
+    def _largest_part(self, *, grad: bool) -> int:
+        return self._capacity
+
+    def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+        with self._solvers.lend() as solver:
+            miss = solver.run(torch.tensor(START), x)[-1].cpu().double() - self.target
+            slope = solver.gradient(2 * miss) if grad else None
+        return Evaluation(miss.square().sum(dim=1), slope, torch.full((len(x),), Status.OK, dtype=torch.int8))

@@ -1,0 +1,1 @@
+"""Simulation engines: the only place that knows Warp or Taichi."""

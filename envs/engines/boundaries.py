@@ -1,0 +1,111 @@
+"""What grid velocities meet: moving tools and walls.
+
+A boundary is a Warp function (node position, velocity, environment, tools, control step, fraction of it, 1/its span) ->
+velocity. `tools` [environment, control step, tool] holds positions [m] at the ends of control steps; in between a tool
+moves at constant velocity.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, no_type_check
+
+import warp as wp
+
+from .runtime import precision
+from .sdf import bowl, rod
+
+
+@dataclass(frozen=True)
+class Open:
+    """No boundary at all."""
+
+    def function(self, name: str) -> Any:
+        """Return the boundary's Warp function."""
+        return _open(name)
+
+
+@dataclass(frozen=True)
+class LadleInTank:
+    """A square tank with slippery walls, centred on x = z = 0, floor at y = 0, and a ladle that moves in it.
+
+    Lengths in m: half the tank's `width`, the bowl's mid-surface `radius`, `half_thickness` of its shell, the handle's
+    `height` and the `band` over which the ladle's grip fades to nothing outside its surface. `friction` is Coulomb's.
+    """
+
+    half_width: float
+    radius: float
+    half_thickness: float
+    height: float
+    band: float
+    friction: float
+
+    def function(self, name: str) -> Any:
+        """Return the boundary's Warp function."""
+        return _ladle_in_tank(name, self)
+
+
+@cache
+@no_type_check
+def _open(name: str) -> Any:
+    types = precision(name)
+    real, vec3 = types.real, types.vec3
+
+    @wp.func(module=f"gradscape.boundaries.{name}", name=f"open_{name}")
+    def boundary(p: vec3, v: vec3, e: int, tools: wp.array3d[vec3], step: int, fraction: real, rate: real) -> vec3:
+        return v
+
+    return boundary
+
+
+@cache
+@no_type_check
+def _ladle_in_tank(name: str, scene: LadleInTank) -> Any:
+    types = precision(name)
+    real, vec3, vec4 = types.real, types.vec3, types.vec4
+    module = f"gradscape.boundaries.{name}"
+    bowl_distance, rod_distance = bowl(name), rod(name)
+    radius, thickness = real(scene.radius), real(scene.half_thickness)
+    height, band, friction = real(scene.height), real(scene.band), real(scene.friction)
+    half_width = real(scene.half_width)
+
+    @wp.func(module=module)
+    def slide(v: vec3, body: vec3, hit: vec4) -> vec3:
+        """Take from the velocity what goes into the body, less with distance; rub the rest (Coulomb)."""
+        n = vec3(hit[0], hit[1], hit[2])
+        u = v - body
+        normal = wp.dot(u, n)
+        if normal >= real(0.0) or hit[3] >= band:
+            return v
+        s = wp.clamp(real(1.0) - hit[3] / band, real(0.0), real(1.0))
+        grip = s * s * (real(3.0) - real(2.0) * s)
+        tangent = u - normal * n
+        speed = wp.sqrt(wp.dot(tangent, tangent) + real(1e-10))
+        tangent = tangent * wp.max(real(0.0), real(1.0) + friction * normal / speed)
+        return body + (real(1.0) - grip) * u + grip * tangent
+
+    @wp.func(module=module)
+    def boundary(p: vec3, v: vec3, e: int, tools: wp.array3d[vec3], step: int, fraction: real, rate: real) -> vec3:
+        start = tools[e, step, 0]
+        travel = tools[e, step + 1, 0] - start
+        local = p - (start + fraction * travel)
+        body = rate * travel
+        v = slide(v, body, bowl_distance(local, radius, thickness))
+        v = slide(v, body, rod_distance(local + vec3(radius, real(0.0), real(0.0)), height, thickness))
+        edge = half_width - real(1e-6)
+        vx, vy, vz = v[0], v[1], v[2]
+        if p[0] < -edge:
+            vx = wp.max(vx, real(0.0))
+        if p[0] > edge:
+            vx = wp.min(vx, real(0.0))
+        if p[1] < real(1e-6):
+            vy = wp.max(vy, real(0.0))
+        if p[2] < -edge:
+            vz = wp.max(vz, real(0.0))
+        if p[2] > edge:
+            vz = wp.min(vz, real(0.0))
+        return vec3(vx, vy, vz)
+
+    return boundary
+
+
+Boundary = Open | LadleInTank

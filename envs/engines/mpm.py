@@ -1,0 +1,320 @@
+"""MLS-MPM (Hu et al. 2018) for a batch of environments, with gradients recomputed from control-step checkpoints.
+
+One substep, state (x, v, C, S) of frame s to frame s + 1, S being each material's own state:
+
+    stress  A    = -dt V 4/dx^2 tau(S, C) + m C
+    p2g     m_i  = sum w m,   q_i = sum w (m v + A (x_i - x))
+    grid    v_i  = boundary(q_i / m_i + dt g)
+    g2p     v'   = sum w v_i, C' = 4/dx^2 sum w v_i (x_i - x)^T, x' = x + dt v'
+    deform  S'   = deform(S, C')
+
+State is kept at the ends of control steps only; the gradient recomputes one control step at a time.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from itertools import chain
+from typing import Any, no_type_check
+
+import numpy as np
+import torch
+import warp as wp
+
+from .boundaries import Boundary
+from .materials import Fluid, Material
+from .runtime import load, precision, to_torch
+from .transfers import transfers
+
+EMPTY = 1e-8  # nodes lighter than this part of a particle carry no velocity
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """One body of equal particles: positions `x` [m], shape (particle, 3), `volume` [m^3] of each, initial J."""
+
+    material: Material
+    x: np.ndarray
+    volume: float
+    ratio: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Everything a batch of episodes shares. Lengths [m], times [s]; `nodes` of the grid along x, y, z."""
+
+    precision: str
+    bodies: tuple[Body, ...]
+    boundary: Boundary
+    origin: tuple[float, float, float]
+    dx: float
+    nodes: tuple[int, int, int]
+    dt: float
+    substeps: int
+    steps: int
+    gravity: float = 9.81
+
+    @property
+    def particles(self) -> int:
+        """Number of particles of all bodies."""
+        return sum(len(body.x) for body in self.bodies)
+
+    def bytes_per_environment(self) -> int:
+        """Return what one environment of a solver takes, adjoints included."""
+        state = sum(len(body.x) * (1 if isinstance(body.material, Fluid) else 9) for body in self.bodies)
+        frame = 15 * self.particles + state  # x, v, C and each material's own
+        grids, affine = 4 * 4 * int(np.prod(self.nodes)), 2 * 9 * self.particles
+        return (8 if self.precision == "float64" else 4) * ((self.steps + self.substeps + 2) * frame + grids + affine)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """The state of a batch at one instant, or its adjoint: arrays [environment, particle]."""
+
+    x: wp.array
+    v: wp.array
+    C: wp.array
+    S: tuple[wp.array, ...]
+
+    def arrays(self) -> tuple[wp.array, ...]:
+        """Return every array of the frame."""
+        return (self.x, self.v, self.C, *self.S)
+
+
+class Solver:
+    """Run up to `capacity` environments of one model at once, and differentiate their last frame."""
+
+    def __init__(self, model: Model, *, capacity: int, device: str) -> None:
+        self.model, self.capacity, self.device = model, capacity, device
+        self.types = precision(model.precision)
+        self.kernels = transfers(model.precision)
+        self.velocity = velocity_kernel(model.precision, model.boundary)
+        self.materials = [body.material.kernels(model.precision) for body in model.bodies]
+        transferring = [self.kernels.p2g, self.kernels.g2p, self.kernels.adjoint_p2g, self.kernels.adjoint_g2p]
+        load([*transferring, self.velocity, *chain.from_iterable(self.materials)], device)
+        self.first = np.concatenate([[0], np.cumsum([len(body.x) for body in model.bodies])]).tolist()
+        self.mass = self._constant([body.material.density * body.volume for body in model.bodies])
+        self.volume = self._constant([body.volume for body in model.bodies])
+        self.lattice = self._lattice()
+        self.checkpoints = [self._frame() for _ in range(model.steps + 1)]
+        self.window = [self._frame() for _ in range(model.substeps - 1)]
+        self.A = self._array(self.types.mat33, model.particles)
+        cells = int(np.prod(model.nodes))
+        self.grid_m, self.grid_v = (self._array(self.types.vec4, cells) for _ in range(2))
+        self.tools = self._tools()
+        self.escaped = wp.zeros(capacity, dtype=wp.int32, device=device)
+        self.adjoint: _Adjoint | None = None
+        self._start()
+
+    def run(self, tools: torch.Tensor) -> torch.Tensor:
+        """Simulate; `tools` [m], shape (batch, step + 1, tool, 3); return last x, shape (batch, particle, 3)."""
+        batch = len(tools)
+        self.escaped.zero_()
+        to_torch(self.tools)[:batch] = tools.to(self.types.torch)
+        for step in range(self.model.steps):
+            self._advance(step, batch)
+        return to_torch(self.checkpoints[-1].x)[:batch]
+
+    def positions(self, environment: int) -> torch.Tensor:
+        """Return x [m] of one environment of the last run at the ends of control steps, (step + 1, particle, 3)."""
+        return torch.stack([to_torch(frame.x)[environment] for frame in self.checkpoints]).double().cpu()
+
+    def left_grid(self, batch: int) -> torch.Tensor:
+        """Say for each environment whether a particle has left the grid, shape (batch,)."""
+        return to_torch(self.escaped)[:batch] > 0
+
+    def gradient(self, adj_x: torch.Tensor) -> torch.Tensor:
+        """Return the adjoint of the tools of the last run from that of its last positions, same shapes."""
+        if self.adjoint is None:
+            self.adjoint = _Adjoint(self)
+        return self.adjoint.run(adj_x)
+
+    def frames(self, step: int) -> list[Frame]:
+        """Return the frames of one control step, both ends included."""
+        return [self.checkpoints[step], *self.window, self.checkpoints[step + 1]]
+
+    def _advance(self, step: int, batch: int) -> None:
+        frames = self.frames(step)
+        for s in range(self.model.substeps):
+            self.fill_grid(frames[s], step, s, batch)
+            self._gather(frames[s], frames[s + 1], batch)
+
+    def fill_grid(self, frame: Frame, step: int, substep: int, batch: int) -> None:
+        """Compute stress, scatter particles, and turn momentum into velocity."""
+        for b, (stress, _) in enumerate(self.materials):
+            self.launch(stress, self.size(b), batch, self.stress_inputs(b, frame))
+        self.grid_m.zero_()
+        inputs = [self.lattice, self.mass, frame.x, frame.v, self.A, self.grid_m]
+        self.launch(self.kernels.p2g, self.model.particles, batch, inputs)
+        self.launch(self.velocity, self.grid_m.shape[1], batch, self.velocity_inputs(step, substep))
+
+    def _gather(self, frame: Frame, new: Frame, batch: int) -> None:
+        inputs = [self.lattice, self.model.dt, frame.x, self.grid_v, new.x, new.v, new.C, self.escaped]
+        self.launch(self.kernels.g2p, self.model.particles, batch, inputs)
+        for b, (_, deform) in enumerate(self.materials):
+            self.launch(deform, self.size(b), batch, self.deform_inputs(b, frame, new))
+
+    def stress_inputs(self, b: int, frame: Frame) -> list[Any]:
+        """Return the arguments of a material's stress kernel."""
+        scale = -self.model.dt * 4.0 / self.model.dx**2
+        constants = self.model.bodies[b].material.constants()
+        return [self.first[b], scale, *constants, self.mass, self.volume, frame.S[b], frame.C, self.A]
+
+    def deform_inputs(self, b: int, frame: Frame, new: Frame) -> list[Any]:
+        """Return the arguments of a material's deform kernel."""
+        return [self.first[b], self.model.dt, frame.S[b], new.C, new.S[b]]
+
+    def velocity_inputs(self, step: int, substep: int) -> list[Any]:
+        """Return the arguments of the grid's velocity kernel."""
+        model = self.model
+        empty = EMPTY * min(body.material.density * body.volume for body in model.bodies)
+        time = [step, substep / model.substeps, 1.0 / (model.substeps * model.dt)]
+        return [self.lattice, model.dt, model.gravity, empty, *time, self.tools, self.grid_m, self.grid_v]
+
+    def size(self, b: int) -> int:
+        """Return the number of particles of body b."""
+        return len(self.model.bodies[b].x)
+
+    def launch(self, kernel: Any, size: int, batch: int, inputs: list[Any]) -> None:
+        """Launch a kernel over [environment, element]."""
+        wp.launch(kernel, (batch, size), inputs, device=self.device, record_tape=False)
+
+    def _array(self, dtype: Any, size: int) -> wp.array:
+        return wp.zeros((self.capacity, size), dtype=dtype, device=self.device)
+
+    def _frame(self) -> Frame:
+        types, count = self.types, self.model.particles
+        x, v, C = (self._array(kind, count) for kind in (types.vec3, types.vec3, types.mat33))
+        states = (self._array(b.material.state(self.model.precision), len(b.x)) for b in self.model.bodies)
+        return Frame(x, v, C, tuple(states))
+
+    def _tools(self) -> wp.array:
+        return wp.zeros((self.capacity, self.model.steps + 1, 1), dtype=self.types.vec3, device=self.device)
+
+    def _constant(self, values: list[float]) -> wp.array:
+        each = np.concatenate([np.full(len(b.x), value) for b, value in zip(self.model.bodies, values, strict=True)])
+        return wp.array(each, dtype=self.types.real, device=self.device)
+
+    def _lattice(self) -> Any:
+        lattice = self.kernels.Lattice()
+        lattice.origin = self.types.vec3(*self.model.origin)
+        lattice.inv_dx = 1.0 / self.model.dx
+        lattice.nx, lattice.ny, lattice.nz = self.model.nodes
+        return lattice
+
+    def _start(self) -> None:
+        first = self.checkpoints[0]
+        to_torch(first.x)[:] = torch.from_numpy(np.concatenate([body.x for body in self.model.bodies]))
+        for body, state in zip(self.model.bodies, first.S, strict=True):
+            to_torch(state)[:] = torch.from_numpy(body.material.initial(body.ratio))
+
+
+class _Adjoint:
+    """Hold the adjoint arrays of a solver and run its backward pass."""
+
+    def __init__(self, solver: Solver) -> None:
+        self.solver = solver
+        self.new, self.old = solver._frame(), solver._frame()
+        self.A = wp.zeros_like(solver.A)
+        self.grid_m, self.grid_v = wp.zeros_like(solver.grid_m), wp.zeros_like(solver.grid_v)
+        self.tools = solver._tools()
+
+    def run(self, adj_x: torch.Tensor) -> torch.Tensor:
+        """Return the adjoint of the tools, shape (batch, step + 1, tool, 3)."""
+        solver, batch = self.solver, len(adj_x)
+        for array in (*self.new.arrays(), self.tools):
+            array.zero_()
+        to_torch(self.new.x)[:batch] = adj_x.to(solver.types.torch)
+        for step in reversed(range(solver.model.steps)):
+            if step < solver.model.steps - 1:  # the run has left the last step's frames in the window
+                solver._advance(step, batch)
+            self._retreat(step, batch)
+        return to_torch(self.tools)[:batch].clone()
+
+    def _retreat(self, step: int, batch: int) -> None:
+        solver = self.solver
+        frames = solver.frames(step)
+        for s in reversed(range(solver.model.substeps)):
+            solver.fill_grid(frames[s], step, s, batch)
+            self._gather(frames[s], frames[s + 1], batch)
+            self._grid(step, s, batch)
+            self._scatter(frames[s], batch)
+            self.new, self.old = self.old, self.new
+
+    def _gather(self, frame: Frame, new: Frame, batch: int) -> None:
+        solver = self.solver
+        for b, (_, deform) in enumerate(solver.materials):
+            self.old.S[b].zero_()
+            adjoints = [None, None, self.old.S[b], self.new.C, self.new.S[b]]
+            self._launch(deform, solver.size(b), batch, solver.deform_inputs(b, frame, new), adjoints)
+        self.grid_v.zero_()
+        inputs = [solver.lattice, solver.model.dt, frame.x, solver.grid_v]
+        inputs += [self.new.x, self.new.v, self.new.C, self.grid_v, self.old.x]
+        solver.launch(solver.kernels.adjoint_g2p, solver.model.particles, batch, inputs)
+
+    def _grid(self, step: int, substep: int, batch: int) -> None:
+        solver = self.solver
+        self.grid_m.zero_()
+        inputs = solver.velocity_inputs(step, substep)
+        adjoints = [solver.kernels.Lattice(), *[None] * (len(inputs) - 4), self.tools, self.grid_m, self.grid_v]
+        self._launch(solver.velocity, solver.grid_m.shape[1], batch, inputs, adjoints)
+
+    def _scatter(self, frame: Frame, batch: int) -> None:
+        solver = self.solver
+        inputs = [solver.lattice, solver.mass, frame.x, frame.v, solver.A, self.grid_m]
+        inputs += [self.old.x, self.old.v, self.A]
+        solver.launch(solver.kernels.adjoint_p2g, solver.model.particles, batch, inputs)
+        self.old.C.zero_()
+        for b, (stress, _) in enumerate(solver.materials):
+            inputs = solver.stress_inputs(b, frame)
+            adjoints = [None] * (len(inputs) - 3) + [self.old.S[b], self.old.C, self.A]
+            self._launch(stress, solver.size(b), batch, inputs, adjoints)
+
+    def _launch(self, kernel: Any, size: int, batch: int, inputs: list[Any], adjoints: list[Any]) -> None:
+        wp.launch(
+            kernel,
+            (batch, size),
+            inputs,
+            adj_inputs=adjoints,
+            adj_outputs=[],
+            device=self.solver.device,
+            adjoint=True,
+            record_tape=False,
+        )
+
+
+@cache
+@no_type_check
+def velocity_kernel(name: str, boundary: Boundary) -> Any:
+    """Return the kernel that turns a node's momentum into its velocity after gravity and boundary."""
+    types = precision(name)
+    real, vec3, vec4 = types.real, types.vec3, types.vec4
+    Lattice = transfers(name).Lattice
+    meet = boundary.function(name)
+
+    @wp.kernel(module="unique")
+    def velocity(
+        lattice: Lattice,
+        dt: real,
+        gravity: real,
+        empty: real,
+        step: int,
+        fraction: real,
+        rate: real,
+        tools: wp.array3d[vec3],
+        grid_m: wp.array2d[vec4],
+        grid_v: wp.array2d[vec4],
+    ):
+        e, i = wp.tid()
+        g = grid_m[e, i]
+        if g[3] > empty:
+            k = i % lattice.nz
+            j = (i / lattice.nz) % lattice.ny
+            node = vec3(real(i / (lattice.nz * lattice.ny)), real(j), real(k))
+            p = lattice.origin + node * (real(1.0) / lattice.inv_dx)
+            v = vec3(g[0], g[1], g[2]) / g[3] - vec3(real(0.0), dt * gravity, real(0.0))
+            v = meet(p, v, e, tools, step, fraction, rate)
+            grid_v[e, i] = vec4(v[0], v[1], v[2], real(0.0))
+        else:
+            grid_v[e, i] = vec4()
+
+    return velocity

@@ -1,0 +1,91 @@
+"""Start Warp: device, precision, threads, kernel cache."""
+
+from __future__ import annotations
+
+import os
+import queue
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Generic, TypeVar
+
+import torch
+import warp as wp
+
+wp.config.log_level = wp.LOG_ERROR  # no banner, and no complaint where there is no GPU
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Precision:
+    """Tie one floating-point precision to its Warp and torch types."""
+
+    name: str
+    real: Any
+    vec3: Any
+    vec4: Any
+    mat33: Any
+    torch: torch.dtype
+
+
+@cache
+def precision(name: str) -> Precision:
+    """Return the types of `float32` or `float64`."""
+    reals = {"float32": (wp.float32, torch.float32), "float64": (wp.float64, torch.float64)}
+    if name not in reals:
+        raise ValueError(f"precision must be float32 or float64; got {name!r}")
+    real, dtype = reals[name]
+    vector, matrix = wp.types.vector, wp.types.matrix
+    return Precision(name, real, vector(3, real), vector(4, real), matrix((3, 3), real), dtype)
+
+
+def cuda_available() -> bool:
+    """Say whether Warp can drive a CUDA device here."""
+    return bool(wp.is_cuda_available())
+
+
+def free_memory() -> int:
+    """Return the free bytes of the CUDA device."""
+    return int(wp.get_device("cuda").free_memory)
+
+
+def cores() -> int:
+    """Count the cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def to_torch(array: wp.array) -> torch.Tensor:
+    """View a Warp array as a tensor of the same memory."""
+    tensor: torch.Tensor = wp.to_torch(array, requires_grad=False)
+    return tensor
+
+
+def load(kernels: Iterable[Any], device: str) -> None:
+    """Compile kernels, or fetch them from the cache, before threads launch them."""
+    for module in {kernel.module for kernel in kernels}:
+        module.load(wp.get_device(device))
+
+
+class Pool(Generic[T]):
+    """Lend objects that serve one thread at a time, making a new one where none is idle."""
+
+    def __init__(self, make: Callable[[], T]) -> None:
+        self._make = make
+        self._idle: queue.LifoQueue[T] = queue.LifoQueue()
+        self._making = threading.Lock()
+
+    @contextmanager
+    def lend(self) -> Iterator[T]:
+        """Give an idle object, or a new one, for the length of a with block."""
+        try:
+            item = self._idle.get_nowait()
+        except queue.Empty:
+            with self._making:
+                item = self._make()
+        try:
+            yield item
+        finally:
+            self._idle.put(item)

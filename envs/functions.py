@@ -1,0 +1,77 @@
+"""BoTorch's synthetic test functions as environments: known minima and exact gradients, to hold tools against."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from botorch.test_functions import synthetic
+from jaxtyping import Float
+from torch import Tensor
+
+from ..landscapes.objective import Evaluation, Status
+from ..landscapes.space import ParameterSpace
+from .base import Environment, Fidelity
+from .options import NoOptions
+
+
+@dataclass(frozen=True)
+class AnyDimension:
+    """`dim`: how many variables the function takes."""
+
+    dim: int = 2
+
+
+class Function(Environment):
+    """Evaluate one of BoTorch's synthetic functions and its exact gradient (float64 throughout).
+
+    Parameters: x0, x1, ..., without units, in the function's customary box. Loss: the function's value, no unit.
+    """
+
+    fidelities: ClassVar[dict[str, Fidelity]] = {"exact": Fidelity("exact", dt=0.0, precision="float64")}
+    synthetic: ClassVar[Any]  # a class of botorch.test_functions.synthetic
+
+    def _setup(self) -> None:
+        dim = getattr(self.options, "dim", None)
+        try:
+            self.function = self.synthetic() if dim is None else self.synthetic(dim=dim)
+        except (ValueError, RuntimeError) as error:
+            raise ValueError(f"{self.name} cannot be made with dim={dim}: {error}") from None
+        lower, upper = self.function.bounds.double()
+        names = tuple(f"x{i}" for i in range(len(lower)))
+        self.space = ParameterSpace(names, lower, upper, ("",) * len(names))
+
+    @property
+    def minimum(self) -> float:
+        """The function's least value."""
+        return float(self.function.optimal_value)
+
+    @property
+    def minimizers(self) -> Float[Tensor, "count dim"]:
+        """Where it is attained."""
+        return torch.as_tensor(self.function.optimizers, dtype=torch.float64)
+
+    def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+        x = x.clone().requires_grad_(grad)
+        with torch.set_grad_enabled(grad):
+            loss = torch.stack([self.function(row[None])[0] for row in x.unbind()])
+        slope = torch.autograd.grad(loss.sum(), x)[0] if grad else None
+        return Evaluation(loss.detach(), slope, torch.full((len(x),), Status.OK, dtype=torch.int8))
+
+
+def _named(name: str, function: type[synthetic.SyntheticTestFunction], options: type[Any]) -> type[Function]:
+    """Return the environment of one function."""
+    body = {"name": name, "synthetic": function, "Options": options, "__doc__": Function.__doc__}
+    return type(function.__name__, (Function,), body)
+
+
+Branin = _named("branin", synthetic.Branin, NoOptions)
+Beale = _named("beale", synthetic.Beale, NoOptions)
+SixHumpCamel = _named("six-hump-camel", synthetic.SixHumpCamel, NoOptions)
+Ackley = _named("ackley", synthetic.Ackley, AnyDimension)
+Griewank = _named("griewank", synthetic.Griewank, AnyDimension)
+Levy = _named("levy", synthetic.Levy, AnyDimension)
+Rastrigin = _named("rastrigin", synthetic.Rastrigin, AnyDimension)
+Rosenbrock = _named("rosenbrock", synthetic.Rosenbrock, AnyDimension)
+StyblinskiTang = _named("styblinski-tang", synthetic.StyblinskiTang, AnyDimension)

@@ -1,0 +1,163 @@
+"""A slice as the loss map over its gradient arrows (matplotlib)."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+import torch
+import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
+from numpy.typing import NDArray
+
+from ..plane import Plane
+from ..store import plane_of
+from . import page, style
+
+Grid = NDArray[np.float64]
+
+
+def landscape_figure(dataset: xr.Dataset) -> Figure:
+    """Draw a slice of rank 2: the loss as colours above, its negated gradients as arrows below.
+
+    Each cell is one sample, or for a coarse slice the part of the box nearest to it; nothing is interpolated. All
+    arrows are equally long and point down the steepest slope of the picture as it is seen, its axes scaled to the same
+    length; their colour is the magnitude of the gradient along the plane. Failures are hatched and counted.
+    """
+    plane = plane_of(dataset)
+    if plane.rank != 2:
+        raise ValueError(f"landscape_figure draws planes; got a slice of rank {plane.rank}, so use profile_figure")
+    panels = 2 if "grad" in dataset else 1
+    figure = page.blank_page(style.PANEL + 2.0, panels * style.PANEL + 1.4)
+    axes: list[Axes] = list(figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0])
+    entries = _draw_loss(axes[0], dataset)
+    entries += _draw_arrows(axes[1], dataset, plane) if panels == 2 else []
+    for ax in axes:
+        _frame(ax, dataset, plane)
+    axes[-1].set_xlabel(plane.labels[0], size=style.LABEL, parse_math=False)
+    page.head(figure, axes[0], dataset)
+    page.key(figure, [*entries, *page.failure_key(dataset)])
+    return figure
+
+
+def _frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
+    style.dress(ax)
+    ax.set_box_aspect(1)
+    ax.set_xlim(*_limits(plane, 0))
+    ax.set_ylim(*_limits(plane, 1))
+    ax.set_ylabel(plane.labels[1], size=style.LABEL, parse_math=False)
+    status = dataset["status"].to_numpy()
+    edges = _edges(dataset["u"].to_numpy(), plane, 0), _edges(dataset["v"].to_numpy(), plane, 1)
+    for kind, look in style.LOOKS.items():
+        if (where := status == kind).any():
+            patch = PathPatch(_cells(*edges, where), **look, zorder=1.5, antialiased=False, gid=kind.name)
+            ax.add_patch(patch)
+
+
+def _cells(u: Grid, v: Grid, where: NDArray[np.bool_]) -> Path:
+    """Return the outlines of the chosen cells as one path: hatching it costs as much as hatching one cell."""
+    corners = [
+        [(u[column], v[row]), (u[column + 1], v[row]), (u[column + 1], v[row + 1]), (u[column], v[row + 1])]
+        for row, column in np.argwhere(where)
+    ]
+    return Path.make_compound_path(*(Path([*corner, corner[0]], closed=True) for corner in corners))
+
+
+def _draw_loss(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
+    plane, loss = plane_of(dataset), dataset["loss"].to_numpy()
+    u, v = dataset["u"].to_numpy(), dataset["v"].to_numpy()
+    scale = style.Scale.of_loss(loss)
+    edges = _edges(u, plane, 0), _edges(v, plane, 1)
+    mesh = ax.pcolormesh(*edges, np.ma.masked_invalid(loss), cmap=style.LOSS_MAP, norm=scale.norm, rasterized=True)
+    unit = dataset["loss"].attrs.get("units", "")
+    bar = ax.figure.colorbar(mesh, ax=ax, extend=scale.extend, fraction=0.05, pad=0.02)
+    style.dress_bar(bar, f"loss [{unit}]" if unit else "loss")
+    if not np.isfinite(loss).any():
+        return []
+    row, column = np.unravel_index(np.nanargmin(loss), loss.shape)
+    (lowest,) = ax.plot(u[column], v[row], **style.LOWEST, label=f"lowest sample: {style.number(loss[row, column])}")
+    return [lowest]
+
+
+def _draw_arrows(ax: Axes, dataset: xr.Dataset, plane: Plane) -> list[Artist]:
+    rows, columns = (_thinned(dataset.sizes[name]) for name in ("v", "u"))
+    slope = plane.slope(torch.from_numpy(dataset["grad"].to_numpy())).numpy()
+    size, label = magnitude(slope, plane, dataset["loss"].attrs.get("units", ""))
+    flat = size == 0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logarithm = np.where(flat, np.nan, np.log10(size))
+    scale = style.Scale.of_magnitude(logarithm)
+    at = np.ix_(rows, columns)
+    u, v = np.meshgrid(dataset["u"].to_numpy()[columns], dataset["v"].to_numpy()[rows])
+    sides = _sides(plane)
+    length = _length(u[0] / sides[0], v[:, 0] / sides[1])
+    steps = length * sides * descent(slope[at], plane)
+    seen = np.isfinite(logarithm[at])
+    quiver = ax.quiver(
+        u[seen], v[seen], steps[seen, 0], steps[seen, 1], logarithm[at][seen],
+        cmap=style.SLOPE_MAP, norm=scale.norm, pivot="mid", angles="xy", scale_units="xy", scale=1.0, **style.ARROW,
+    )  # fmt: skip
+    bar = ax.figure.colorbar(quiver, ax=ax, extend=scale.extend, fraction=0.05, pad=0.02)
+    style.dress_bar(bar, label)
+    if not flat.any():
+        return []
+    ax.plot(u[flat[at]], v[flat[at]], **style.FLAT, zorder=2.5)
+    return [Line2D([], [], **style.FLAT, label=f"gradient exactly zero: {int(flat.sum())} of {flat.size}")]
+
+
+def descent(slope: Grid, plane: Plane) -> Grid:
+    """Return the direction of steepest descent as unit vectors in fractions of the picture's sides; NaN where flat."""
+    scaled = slope * _sides(plane)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scaled = scaled / np.abs(scaled).max(axis=-1, keepdims=True)  # no overflow, no underflow
+        direction: Grid = -scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)
+    return direction
+
+
+def magnitude(slope: Grid, plane: Plane, loss_unit: str) -> tuple[Grid, str]:
+    """Return the length of the gradient along the plane, and its label.
+
+    Where both axes have the same unit it is the gradient's projection on the plane. Otherwise lengths along them cannot
+    be added, and it is taken per width of the box instead.
+    """
+    if len(set(plane.units)) == 1:
+        along: Grid = slope @ torch.linalg.pinv(plane.basis).T.numpy()
+        unit = plane.units[0]
+        unit = f"{loss_unit or '1'}/({unit})" if "/" in unit else f"{loss_unit or '1'}/{unit}" if unit else loss_unit
+    else:
+        along = slope * (plane.upper - plane.lower).numpy()
+        unit = f"{loss_unit or 'loss'} per width of the box"
+    return np.linalg.norm(along, axis=-1), f"log₁₀ |gradient| [{unit}]" if unit else "log₁₀ |gradient|"
+
+
+def _limits(plane: Plane, axis: int) -> tuple[float, float]:
+    """Return the box with half a sample's width around it."""
+    low, high = float(plane.lower[axis]), float(plane.upper[axis])
+    half = (high - low) / (plane.resolution[axis] - 1) / 2
+    return low - half, high + half
+
+
+def _sides(plane: Plane) -> Grid:
+    return np.diff([_limits(plane, axis) for axis in range(plane.rank)])[:, 0]
+
+
+def _length(*positions: Grid) -> float:
+    """Return the length of arrows at these places along each side, in fractions of it, so that few of them touch."""
+    closest = min(float(np.diff(places).min()) for places in positions)
+    densest = max(len(places) for places in positions)
+    return min(style.LONGEST_ARROW, max(0.86 * closest, 0.45 / densest))
+
+
+def _edges(centers: Grid, plane: Plane, axis: int) -> Grid:
+    low, high = _limits(plane, axis)
+    return np.concatenate([[low], (centers[1:] + centers[:-1]) / 2, [high]])
+
+
+def _thinned(points: int) -> NDArray[np.intp]:
+    step = -(-points // style.ARROWS)
+    return cast("NDArray[np.intp]", np.arange((points - 1) % step // 2, points, step))

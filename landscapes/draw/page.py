@@ -1,0 +1,96 @@
+"""The page a matplotlib picture stands on: size, title, provenance, legend and file."""
+
+from __future__ import annotations
+
+import os
+import textwrap
+import uuid
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from ..objective import Status
+from . import style
+
+
+def blank_page(width: float, height: float) -> Figure:
+    """Return an empty figure of a size [inch] that draws without a window or any global state."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def head(figure: Figure, ax: Axes, dataset: xr.Dataset) -> None:
+    """Write the title over the figure and where it comes from, small, over its uppermost panel."""
+    figure.suptitle(_wrapped(title(dataset), 56), size=style.TITLE, color=style.INK, parse_math=False)
+    if line := provenance(dataset):
+        ax.set_title(_wrapped(line, 92), size=style.SMALL, color=style.QUIET, parse_math=False)
+
+
+def title(dataset: xr.Dataset) -> str:
+    """Return objective, fidelity and resolution, and how much of it is sampled if not all."""
+    identity = dataset.attrs["identity"]
+    points = " \N{MULTIPLICATION SIGN} ".join(str(dataset.sizes[name]) for name in dataset["loss"].dims[::-1])
+    said = [str(identity[key]) for key in ("objective", "fidelity") if identity.get(key)]
+    whole = int(np.prod(identity["plane"]["resolution"]))
+    done = int((dataset["status"] != Status.MISSING).sum())
+    said.append(f"{points} points" if done == whole else f"{done} of {whole} points so far")
+    return " · ".join(said)
+
+
+def provenance(dataset: xr.Dataset) -> str:
+    """Return version, device, date and command, as far as they are known."""
+    known = {**dataset.attrs["provenance"], **dataset.attrs["identity"]}
+    said = [f"gradscape {known['gradscape']}"]
+    said += [str(known[key]) for key in ("device", "created", "command") if known.get(key)]
+    return " · ".join(said)
+
+
+def failure_key(dataset: xr.Dataset) -> list[Patch]:
+    """Return one legend entry for each way of failing that occurs, with how often."""
+    status = dataset["status"].to_numpy()
+    names = style.FAILURES | {Status.MISSING: "not sampled yet"}
+    return [
+        Patch(**style.LOOKS[kind], label=f"{name}: {count} of {status.size}")
+        for kind, name in names.items()
+        if (count := int((status == kind).sum()))
+    ]
+
+
+def key(figure: Figure, entries: Sequence[Artist]) -> None:
+    """Put a legend under the panels."""
+    if entries:
+        legend = figure.legend(
+            handles=list(entries),
+            loc="outside lower center",
+            ncols=2,
+            fontsize=style.TICK,
+            frameon=False,
+            handlelength=1.8,
+            columnspacing=1.6,
+        )
+        for text in legend.get_texts():
+            text.set_parse_math(False)
+
+
+def save(figure: Figure, path: str | Path) -> None:
+    """Write a figure as PNG, whole or not at all."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
+    try:
+        figure.savefig(partial, format="png", dpi=style.DPI)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _wrapped(text: str, width: int) -> str:
+    return "\n".join(textwrap.wrap(text, width, max_lines=2, placeholder=" …"))

@@ -1,0 +1,73 @@
+"""What makes two slices the same, and the refusal to mix two that differ."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from .. import __version__
+from .plane import Plane
+from .space import ParameterSpace
+
+SHOWN = 6
+
+
+class StoreError(ValueError):
+    """Say that a path does not hold the slice store that was asked for."""
+
+
+class StoreExistsError(StoreError):
+    """Say that a store is not made because its path is taken."""
+
+
+class StoreMismatchError(StoreError):
+    """Say that a store was made by other settings."""
+
+
+def full_identity(identity: Mapping[str, Any], plane: Plane, space: ParameterSpace, *, grad: bool) -> dict[str, Any]:
+    """Add to a caller's settings what the slice itself decides, as plain JSON."""
+    own = {"plane": plane.record(), "parameters": space.names, "gradients": grad, "gradscape": __version__}
+    if clash := own.keys() & identity.keys():
+        raise ValueError(f"a slice's identity gets {', '.join(sorted(clash))} from the slice; leave them out")
+    return plain_json({**identity, **own}, "identity")
+
+
+def plain_json(settings: Mapping[str, Any], kind: str) -> dict[str, Any]:
+    """Return settings as they come back from JSON: tuples are lists, keys are strings."""
+    try:
+        plain: dict[str, Any] = json.loads(json.dumps(settings, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"a slice's {kind} must be plain JSON (numbers, strings, lists, dicts): {error}") from None
+    return plain
+
+
+def check_identity(path: Path | None, *, wanted: Mapping[str, Any], found: Mapping[str, Any]) -> None:
+    """Raise `StoreMismatchError`, naming each setting that differs, unless the two are equal."""
+    if wanted == found:
+        return
+    ours, theirs = dict(_leaves(wanted)), dict(_leaves(found))
+    names = [name for name in ours | theirs if ours.get(name) != theirs.get(name)]
+    said = [f"{name}: wanted {_shown(ours, name)}, found {_shown(theirs, name)}" for name in names[:SHOWN]]
+    if len(names) > SHOWN:
+        said.append(f"and {len(names) - SHOWN} more")
+    raise StoreMismatchError(
+        f"{path or 'the store'} holds a slice made by other settings ({'; '.join(said)}); "
+        "write elsewhere with --out, or replace it with --force"
+    )
+
+
+def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from _leaves(inner, f"{name}.{key}" if name else str(key))
+    elif isinstance(value, list):
+        for number, inner in enumerate(value):
+            yield from _leaves(inner, f"{name}[{number}]")
+    else:
+        yield name, value
+
+
+def _shown(settings: Mapping[str, Any], name: str) -> str:
+    return repr(settings[name]) if name in settings else "none"

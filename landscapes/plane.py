@@ -1,0 +1,226 @@
+"""The line or plane through parameter space that a landscape is sampled on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .space import ParameterSpace
+
+Bound = float | Sequence[float]
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """Span a line (rank 1) or a plane (rank 2) through parameter space.
+
+    A point with plane coordinates `u` has parameters `origin + u @ basis`. `origin` [parameters' own units] is float64
+    of shape (dim,); `basis` [parameter unit / plane unit] is float64 of shape (rank, dim), with independent rows of any
+    length and angle; `lower` and `upper` [plane units], shape (rank,), bound what is sampled, at `resolution` points
+    per axis with both ends included. `labels` name the axes with their units: "speed, segment 3 [m/s]".
+    """
+
+    origin: Float[Tensor, " dim"]
+    basis: Float[Tensor, "rank dim"]
+    lower: Float[Tensor, " rank"]
+    upper: Float[Tensor, " rank"]
+    resolution: tuple[int, ...]
+    labels: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if self.basis.ndim != 2 or self.basis.shape[0] not in (1, 2):
+            raise ValueError(f"Plane needs one or two directions; got a basis of shape {tuple(self.basis.shape)}")
+        if self.origin.shape != self.basis.shape[1:]:
+            raise ValueError(f"Plane needs an origin of shape ({self.dim},); got {tuple(self.origin.shape)}")
+        sizes = {"lower": self.lower.numel(), "upper": self.upper.numel()}
+        sizes |= {"resolution": len(self.resolution), "labels": len(self.labels)}
+        for field, size in sizes.items():
+            if size != self.rank:
+                raise ValueError(f"Plane of rank {self.rank} needs {self.rank} values of {field}; got {size}")
+        if min(self.resolution) < 2:
+            raise ValueError(f"Plane needs a resolution of at least 2 points per axis; got {self.resolution}")
+        if not bool((self.lower < self.upper).all()) or not bool((self.upper - self.lower).isfinite().all()):
+            raise ValueError(
+                f"Plane needs finite lower < upper on every axis; got {self.lower.tolist()} to {self.upper.tolist()}"
+            )
+        if not bool(self.origin.isfinite().all()) or not bool(self.basis.isfinite().all()):
+            raise ValueError("Plane needs a finite origin and finite directions; got NaN or infinity")
+        unit = self.basis / self.basis.norm(dim=1, keepdim=True)
+        if int(torch.linalg.matrix_rank(unit)) < self.rank:
+            raise ValueError("Plane needs directions that are not zero and not parallel; give two that differ")
+
+    @classmethod
+    def through(
+        cls,
+        space: ParameterSpace,
+        origin: Float[Tensor, " dim"],
+        dims: Sequence[str | int],
+        *,
+        resolution: int | Sequence[int],
+        extent: float | tuple[Bound, Bound] | None = None,
+    ) -> Plane:
+        """Vary one or two parameters, named or numbered, and hold the others as they are at `origin`.
+
+        The plane coordinate is the parameter's own value. `extent` is None for the parameters' bounds, a fraction of
+        them for a window of that size around `origin` (moved to stay inside the bounds if it fits), or a pair (lower,
+        upper) in the parameters' units, each one number or one per axis.
+        """
+        numbers = [space.index(dim) for dim in dims]
+        if len(numbers) not in (1, 2) or len(set(numbers)) != len(numbers):
+            raise ValueError(
+                f"a slice varies one or two different parameters; got {', '.join(map(str, dims)) or 'none'}"
+            )
+        origin = origin.detach().to("cpu", torch.float64)
+        if origin.shape != (space.dim,):
+            raise ValueError(f"a slice goes through a point of shape ({space.dim},); got shape {tuple(origin.shape)}")
+        lower, upper = _window(space.lower[numbers], space.upper[numbers], origin[numbers], extent)
+        start = origin.clone()
+        start[numbers] = 0
+        basis = torch.eye(space.dim, dtype=torch.float64)[numbers]
+        labels = tuple(space.labels[number] for number in numbers)
+        return cls(start, basis, lower, upper, _per_axis(resolution, len(numbers)), labels)
+
+    @classmethod
+    def spanned(
+        cls,
+        origin: Float[Tensor, " dim"],
+        directions: Float[Tensor, "rank dim"],
+        *,
+        resolution: int | Sequence[int],
+        extent: tuple[Bound, Bound] = (-1.0, 1.0),
+        labels: Sequence[str] | None = None,
+    ) -> Plane:
+        """Span a plane by any directions, kept as given: coordinate 1 is one whole `directions[i]` from `origin`."""
+        origin, directions = (t.detach().to("cpu", torch.float64) for t in (origin, directions))
+        rank = len(directions)
+        lower, upper = (_bound(bound, rank) for bound in extent)
+        named = labels or [f"along direction {axis + 1}" for axis in range(rank)]
+        return cls(origin, directions, lower, upper, _per_axis(resolution, rank), tuple(named))
+
+    @classmethod
+    def principal(
+        cls,
+        points: Float[Tensor, "count dim"],
+        *,
+        rank: int = 2,
+        resolution: int | Sequence[int],
+        margin: float = 0.1,
+    ) -> Plane:
+        """Lay a plane through the principal directions of a run's points.
+
+        The origin is their mean and the directions have unit length, the largest component positive. The axes cover
+        the projected points and a `margin`, as a fraction of their range. Parameters count in their own units: where
+        these differ wildly, run it on a space of comparable ones.
+        """
+        points = points.detach().to("cpu", torch.float64)
+        if points.ndim != 2 or len(points) <= rank:
+            raise ValueError(
+                f"{rank} principal directions need more than {rank} points; got shape {tuple(points.shape)}"
+            )
+        mean = points.mean(dim=0)
+        _, scale, directions = torch.linalg.svd(points - mean, full_matrices=False)
+        if len(scale) < rank or not bool(scale[rank - 1] > 1e-12 * scale[0]):
+            raise ValueError(f"{rank} principal directions need points that spread in as many; these do not")
+        basis = directions[:rank]
+        basis = basis * basis.gather(1, basis.abs().argmax(dim=1, keepdim=True)).sign()
+        u = (points - mean) @ basis.T
+        pad = margin * (u.amax(dim=0) - u.amin(dim=0))
+        share = 100 * scale**2 / (scale**2).sum()
+        labels = tuple(f"principal direction {axis + 1} ({share[axis]:.0f} % of variance)" for axis in range(rank))
+        return cls(mean, basis, u.amin(dim=0) - pad, u.amax(dim=0) + pad, _per_axis(resolution, rank), labels)
+
+    @property
+    def rank(self) -> int:
+        """1 for a line, 2 for a plane."""
+        return len(self.basis)
+
+    @property
+    def dim(self) -> int:
+        """Number of parameters."""
+        return self.basis.shape[1]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Axis labels without their units."""
+        return tuple(_split(label)[0] for label in self.labels)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the axes, empty where they have none."""
+        return tuple(_split(label)[1] for label in self.labels)
+
+    def lift(self, u: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch dim"]:
+        """Return the parameters at plane coordinates `u`; each row's bits are independent of the batch it is in."""
+        return self.origin + (u[..., :, None] * self.basis).sum(dim=-2)
+
+    def project(self, x: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch rank"]:
+        """Return the plane coordinates nearest to `x` (least squares in the parameters' own units)."""
+        u: Float[Tensor, "*batch rank"] = (x - self.origin) @ torch.linalg.pinv(self.basis)
+        return u
+
+    def distance(self, x: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch"]:
+        """Return how far `x` is from the plane (Euclidean, in the parameters' own units)."""
+        off: Float[Tensor, "*batch dim"] = x - self.lift(self.project(x))
+        return off.square().sum(dim=-1).sqrt()
+
+    def slope(self, grad: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch rank"]:
+        """Return the derivatives along the plane's axes [loss unit / plane unit] (chain rule, so any basis)."""
+        return (grad[..., None, :] * self.basis).sum(dim=-1)
+
+    def axes(self) -> tuple[Float[Tensor, " points"], ...]:
+        """Return the sampled coordinates of each axis, ascending, both ends included."""
+        return tuple(
+            torch.linspace(float(low), float(high), count, dtype=torch.float64)
+            for low, high, count in zip(self.lower, self.upper, self.resolution, strict=True)
+        )
+
+    def record(self) -> dict[str, Any]:
+        """Return the plane as plain numbers and strings, exactly."""
+        tensors = {name: getattr(self, name).tolist() for name in ("origin", "basis", "lower", "upper")}
+        return tensors | {"resolution": list(self.resolution), "labels": list(self.labels)}
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> Plane:
+        """Rebuild a plane from its `record`, bit for bit."""
+        origin, basis, lower, upper = (
+            torch.tensor(record[name], dtype=torch.float64) for name in ("origin", "basis", "lower", "upper")
+        )
+        return cls(origin, basis, lower, upper, tuple(record["resolution"]), tuple(record["labels"]))
+
+
+def _per_axis(resolution: int | Sequence[int], rank: int) -> tuple[int, ...]:
+    return (resolution,) * rank if isinstance(resolution, int) else tuple(resolution)
+
+
+def _split(label: str) -> tuple[str, str]:
+    name, bracket, unit = label.removesuffix("]").partition(" [")  # a unit may hold brackets, a name does not
+    return (name, unit) if bracket and label.endswith("]") else (label, "")
+
+
+def _bound(bound: Bound, rank: int) -> Float[Tensor, " rank"]:
+    values = torch.as_tensor(bound, dtype=torch.float64)
+    if values.ndim > 1 or (values.ndim == 1 and len(values) != rank):
+        raise ValueError(f"extent needs one number per axis, {rank} in all; got {bound}")
+    return values.expand(rank).clone()
+
+
+def _window(
+    lower: Float[Tensor, " rank"],
+    upper: Float[Tensor, " rank"],
+    center: Float[Tensor, " rank"],
+    extent: float | tuple[Bound, Bound] | None,
+) -> tuple[Float[Tensor, " rank"], Float[Tensor, " rank"]]:
+    if extent is None:
+        return lower.clone(), upper.clone()
+    if not isinstance(extent, int | float):
+        return _bound(extent[0], len(lower)), _bound(extent[1], len(lower))
+    if not extent > 0:
+        raise ValueError(f"extent as a fraction of the bounds must be positive; got {extent}")
+    width = extent * (upper - lower)
+    start = (center - width / 2).clamp(torch.minimum(lower, upper - width), torch.maximum(lower, upper - width))
+    return start, start + width

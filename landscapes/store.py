@@ -1,0 +1,358 @@
+"""The zarr layout of a slice; nothing else knows it.
+
+A slice is a group of arrays: `loss(v, u)`, `grad(v, u, dim)` unless sampled without gradients, `status(v, u)` and the
+coordinates `u`, `v`, `dim`; a line has no `v`. Axes are stored coarse to fine (`tiling.coarse_to_fine`) and one chunk
+is one tile, so the first tile is a coarse picture of the whole box and every square of tiles from it a finer one.
+
+A tile is finished when its chunks decode, its status has no MISSING, and loss and gradient are finite exactly where the
+status is OK. Everything else, a torn file included, is as if it had never been written.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import shutil
+import time
+import uuid
+import warnings
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import xarray as xr
+import zarr
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+from zarr.codecs import ZstdCodec
+from zarr.storage import MemoryStore
+
+from .identity import StoreError, StoreExistsError, check_identity, full_identity, plain_json
+from .objective import Evaluation, Status
+from .plane import Plane
+from .space import ParameterSpace
+from .tiling import Tile, coarse_to_fine, tile_side
+
+FORMAT = 1
+AXES = ("u", "v")
+STALE = 60.0  # seconds after which a hidden folder of a creation that was killed is cleared away
+
+
+class SliceStore:
+    """Keep a slice on disk tile by tile, so that a run stopped at any instant can go on.
+
+    Make one with `create`, `open`, `open_or_create` or `in_memory`. Two processes may fill the same store: a tile is
+    the same whoever writes it, and each file appears whole or not at all.
+    """
+
+    def __init__(self, group: zarr.Group, path: Path | None) -> None:
+        arrays = dict(group.arrays())
+        self.path = path
+        self._inode = path.stat().st_ino if path else None
+        self.identity: dict[str, Any] = dict(group.attrs["identity"])  # type: ignore[arg-type]
+        self.provenance: dict[str, Any] = dict(group.attrs["provenance"])  # type: ignore[arg-type]
+        self.plane = Plane.from_record(self.identity["plane"])
+        self.dims = AXES[: self.plane.rank][::-1]
+        self._values: dict[str, zarr.Array[Any]] = {
+            name: arrays[name] for name in ("loss", "grad", "status") if name in arrays
+        }
+        self._coordinates = {name: np.asarray(arrays[name][:]) for name in self.dims}
+        self._parameters = [str(name) for name in np.asarray(arrays["dim"][:])]
+        self._attributes = {name: dict(array.attrs) for name, array in arrays.items()}
+        self.side = self._values["status"].chunks
+
+    @classmethod
+    def create(
+        cls,
+        path: str | Path,
+        plane: Plane,
+        space: ParameterSpace,
+        *,
+        identity: Mapping[str, Any],
+        provenance: Mapping[str, Any] | None = None,
+        grad: bool = True,
+        overwrite: bool = False,
+    ) -> SliceStore:
+        """Make an empty store at a path where there is none, all at once.
+
+        `identity` holds what decides the numbers (objective, options, fidelity, device); plane, parameters, gradients
+        and version are added here. `provenance` is anything else worth keeping. Both must be plain JSON. `overwrite`
+        replaces a slice store, and refuses to replace anything else.
+        """
+        path = Path(path).resolve()
+        whole = full_identity(identity, plane, space, grad=grad)
+        if path.exists() and not overwrite:
+            raise StoreExistsError(f"{path} exists already; write elsewhere with --out, or replace it with --force")
+        if path.exists() and not is_slice(path):
+            raise StoreError(f"{path} is no slice store, so it is not replaced; move it away or write elsewhere")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _clear_stale(path)
+        new = _hidden(path)
+        group = zarr.create_group(new, zarr_format=3)
+        _lay_out(group, plane, space, whole, plain_json(provenance or {}, "provenance"), grad=grad)
+        with warnings.catch_warnings():  # readable by plain xarray.open_zarr; the layout never changes again
+            warnings.simplefilter("ignore")
+            zarr.consolidate_metadata(str(new))
+        _put_in_place(new, path, overwrite=overwrite)
+        return cls.open(path)
+
+    @classmethod
+    def open(cls, path: str | Path) -> SliceStore:
+        """Open a store that exists."""
+        path = Path(path).resolve()
+        if not path.exists():
+            raise StoreError(f"there is no slice store at {path}; make one with `landscape slice`")
+        if not is_slice(path):
+            raise StoreError(f"{path} is no slice store of format {FORMAT}; move it away or write elsewhere")
+        return cls(zarr.open_group(path, mode="r+", use_consolidated=False), path)
+
+    @classmethod
+    def open_or_create(
+        cls,
+        path: str | Path,
+        plane: Plane,
+        space: ParameterSpace,
+        *,
+        identity: Mapping[str, Any],
+        provenance: Mapping[str, Any] | None = None,
+        grad: bool = True,
+    ) -> SliceStore:
+        """Go on with the store at `path`, or make it; a store made by other settings raises `StoreMismatchError`."""
+        with contextlib.suppress(StoreExistsError):
+            cls.create(path, plane, space, identity=identity, provenance=provenance, grad=grad)
+        store = cls.open(path)
+        check_identity(store.path, wanted=full_identity(identity, plane, space, grad=grad), found=store.identity)
+        return store
+
+    @classmethod
+    def in_memory(
+        cls, plane: Plane, space: ParameterSpace, *, identity: Mapping[str, Any] | None = None, grad: bool = True
+    ) -> SliceStore:
+        """Make a store that lives as long as the object."""
+        group = zarr.create_group(MemoryStore(), zarr_format=3)
+        _lay_out(group, plane, space, full_identity(identity or {}, plane, space, grad=grad), {}, grad=grad)
+        return cls(group, None)
+
+    @property
+    def grad(self) -> bool:
+        """Whether the slice holds gradients."""
+        return "grad" in self._values
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Points per axis, in array order."""
+        return tuple(len(self._coordinates[name]) for name in self.dims)
+
+    def tiles(self) -> list[Tile]:
+        """Return every tile, coarse to fine."""
+        counts = [math.ceil(points / side) for points, side in zip(self.shape, self.side, strict=True)]
+        return sorted(map(Tile, np.ndindex(*counts)), key=lambda tile: (tile.level, sum(tile.index), tile.index))
+
+    def pending(self, status: NDArray[np.int8] | None = None) -> list[Tile]:
+        """Return the tiles that are not finished, coarse to fine; `status` spares reading it again."""
+        status = self.status() if status is None else status
+        return [tile for tile in self.tiles() if (status[self._place(tile)] == Status.MISSING).any()]
+
+    def count(self, tile: Tile) -> int:
+        """Return how many points a tile has."""
+        return math.prod(at.stop - at.start for at in self._place(tile))
+
+    def points(self, tile: Tile) -> Float[Tensor, "points dim"]:
+        """Return the parameters at the points of a tile."""
+        parts = [self._coordinates[name][place] for name, place in zip(self.dims, self._place(tile), strict=True)]
+        grid = np.meshgrid(*parts, indexing="ij")[::-1]
+        return self.plane.lift(torch.from_numpy(np.stack([axis.ravel() for axis in grid], axis=1)))
+
+    def write(self, tile: Tile, evaluation: Evaluation) -> None:
+        """Write a whole tile, status last; `evaluation` has its points in the order of `points`, failures blanked."""
+        place = self._place(tile)
+        shape = tuple(at.stop - at.start for at in place)
+        if self.grad and evaluation.grad is None:
+            raise ValueError("this slice holds gradients; got an evaluation without, so evaluate with grad=True")
+        if bool((evaluation.status == Status.MISSING).any()):
+            raise ValueError("a tile is written whole; got an evaluation with status MISSING")
+        self._check_in_place()
+        for name, values in self._values.items():  # loss, grad, status
+            tensor: Tensor = getattr(evaluation, name)
+            values[place] = tensor.detach().cpu().numpy().reshape(shape + tensor.shape[1:]).astype(values.dtype)
+
+    def status(self) -> NDArray[np.int8]:
+        """Return the status of every point in stored order, MISSING wherever a tile is not finished."""
+        return self._read(tuple(slice(points) for points in self.shape))["status"]
+
+    def dataset(self) -> xr.Dataset:
+        """Return everything sampled so far, axes ascending; MISSING and NaN where nothing is."""
+        return self._dataset(tuple(slice(points) for points in self.shape))
+
+    def coarse(self) -> xr.Dataset | None:
+        """Return the largest coarse picture of the whole that is complete, axes ascending; None before the first."""
+        pending = self.pending()
+        if not pending:
+            return self.dataset()
+        level = pending[0].level
+        return self._dataset(tuple(slice(level * side) for side in self.side)) if level else None
+
+    def _check_in_place(self) -> None:
+        """Refuse to write into a store that was replaced or removed since it was opened."""
+        with contextlib.suppress(FileNotFoundError):
+            if self.path is None or self.path.stat().st_ino == self._inode:
+                return
+        raise StoreError(f"{self.path} was replaced or removed while it was being filled; run the command again")
+
+    def _place(self, tile: Tile) -> tuple[slice, ...]:
+        sizes = zip(tile.index, self.side, self.shape, strict=True)
+        return tuple(slice(at * side, min((at + 1) * side, points)) for at, side, points in sizes)
+
+    def _read(self, box: tuple[slice, ...]) -> dict[str, NDArray[Any]]:
+        """Read a box of whole tiles, each array at once; where that fails, tile by tile, leaving out what is torn."""
+        try:
+            values = {name: np.asarray(array[box]) for name, array in self._values.items()}
+        except Exception:  # a damaged chunk raises whatever its codec does
+            values = self._salvage(box)
+        intact = np.isfinite(values["loss"])
+        if self.grad:
+            intact &= np.isfinite(values["grad"]).all(axis=-1)
+        status = values["status"]
+        status[(status == Status.OK) != intact] = Status.MISSING
+        for tile in self.tiles() if (status == Status.MISSING).any() else ():  # finished whole or not at all
+            if (status[self._place(tile)] == Status.MISSING).any():
+                status[self._place(tile)] = Status.MISSING
+        values["loss"][status == Status.MISSING] = np.nan
+        if self.grad:
+            values["grad"][status == Status.MISSING] = np.nan
+        return values
+
+    def _salvage(self, box: tuple[slice, ...]) -> dict[str, NDArray[Any]]:
+        shape = tuple(len(range(points)[at]) for at, points in zip(box, self.shape, strict=True))
+        values = {
+            name: np.full(shape + array.shape[len(shape) :], array.fill_value, array.dtype)
+            for name, array in self._values.items()
+        }
+        for tile in self.tiles():
+            place = self._place(tile)
+            if all(at.stop <= size for at, size in zip(place, shape, strict=True)):
+                with contextlib.suppress(Exception):  # as above; status comes last, so it stays MISSING
+                    for name, array in self._values.items():
+                        values[name][place] = array[place]
+        return values
+
+    def _dataset(self, box: tuple[slice, ...]) -> xr.Dataset:
+        values = self._read(box)
+        shaped = {"loss": self.dims, "grad": (*self.dims, "dim"), "status": self.dims}
+        coordinates = {name: self._coordinates[name][at] for name, at in zip(self.dims, box, strict=True)}
+        dataset = xr.Dataset(
+            {name: (shaped[name], values[name], self._attributes[name]) for name in values},
+            {name: (name, values, self._attributes[name]) for name, values in coordinates.items()},
+            {"identity": self.identity, "provenance": self.provenance},
+        )
+        return dataset.assign_coords(dim=self._parameters).sortby(list(self.dims))
+
+
+def open_slice(path: str | Path) -> xr.Dataset:
+    """Read a slice from disk: loss and gradient in float64, axes ascending, MISSING where it is not sampled yet."""
+    return SliceStore.open(path).dataset()
+
+
+def plane_of(dataset: xr.Dataset) -> Plane:
+    """Return the plane that a slice was sampled on."""
+    return Plane.from_record(dataset.attrs["identity"]["plane"])
+
+
+def is_slice(path: Path) -> bool:
+    """Say whether a slice store of this format is at `path`."""
+    try:
+        return zarr.open_group(path, mode="r", use_consolidated=False).attrs.get("gradscape_slice") == FORMAT
+    except Exception:  # whatever else is there is none
+        return False
+
+
+def _lay_out(
+    group: zarr.Group,
+    plane: Plane,
+    space: ParameterSpace,
+    identity: dict[str, Any],
+    provenance: dict[str, Any],
+    *,
+    grad: bool,
+) -> None:
+    names = AXES[: plane.rank][::-1]
+    coordinates = dict(_coordinates(plane))
+    shape = tuple(len(coordinates[name]) for name in names)
+    side = tuple(tile_side(points) for points in shape)
+    group.attrs.update({"gradscape_slice": FORMAT, "identity": identity, "provenance": provenance})
+    loss_unit = str(provenance.get("loss_unit", ""))
+    _array(group, "loss", shape, side, names, "float64", long_name="loss", units=loss_unit)
+    if grad:
+        deep = (*shape, space.dim), (*side, space.dim), (*names, "dim")
+        _array(group, "grad", *deep, "float64", long_name="gradient of the loss by each parameter in its own unit")
+    _array(group, "status", shape, side, names, "int8", long_name="how the evaluation ended", **_flags())
+    for name, axis in coordinates.items():
+        number = AXES.index(name)
+        label = {"label": plane.labels[number], "long_name": plane.names[number], "units": plane.units[number]}
+        _array(group, name, axis.shape, axis.shape, (name,), "float64", **label)[:] = axis
+    parameters = np.array(space.names, dtype=object)
+    about = {"long_name": "parameter", "units": list(space.units)}
+    _array(group, "dim", (space.dim,), (space.dim,), ("dim",), "string", **about)[:] = parameters
+
+
+def _coordinates(plane: Plane) -> Iterator[tuple[str, NDArray[np.float64]]]:
+    for name, axis in zip(AXES, plane.axes(), strict=False):
+        values = axis.numpy()
+        yield name, values[coarse_to_fine(len(values), tile_side(len(values)))]
+
+
+def _flags() -> dict[str, Any]:
+    return {"flag_values": [int(s) for s in Status], "flag_meanings": " ".join(s.name.lower() for s in Status)}
+
+
+def _array(
+    group: zarr.Group,
+    name: str,
+    shape: tuple[int, ...],
+    chunks: tuple[int, ...],
+    dims: tuple[str, ...],
+    dtype: str,
+    **attributes: Any,
+) -> zarr.Array[Any]:
+    fill = {"float64": float("nan"), "int8": int(Status.MISSING), "string": ""}[dtype]
+    return group.create_array(
+        name,
+        shape=shape,
+        chunks=chunks,
+        dtype=dtype,
+        fill_value=fill,
+        dimension_names=dims,
+        compressors=[ZstdCodec(level=3, checksum=True)],  # a torn or altered chunk does not decode
+        config={"write_empty_chunks": True},  # a tile of NaN is a result too
+        attributes=attributes,
+    )
+
+
+def _hidden(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex}.making")
+
+
+def _put_in_place(new: Path, path: Path, *, overwrite: bool) -> None:
+    """Rename a finished store to where it belongs, so that it is there whole or not at all."""
+    old = _hidden(path)
+    if overwrite and path.exists():
+        os.rename(path, old)
+    try:
+        os.rename(new, path)
+    except OSError:
+        shutil.rmtree(new, ignore_errors=True)
+        if is_slice(path):
+            raise StoreExistsError(f"{path} was made by another process meanwhile; run the command again") from None
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _clear_stale(path: Path) -> None:
+    for folder in path.parent.glob(f".{path.name}.*.making"):
+        with contextlib.suppress(OSError):
+            if time.time() - folder.stat().st_mtime > STALE:
+                shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,1 @@
+"""Ask/tell optimisers and the race that compares them."""
