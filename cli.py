@@ -1,0 +1,153 @@
+"""The command `landscape`: one function per verb, nothing heavy imported before it is used."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated, Any
+
+import typer
+
+from . import __version__
+
+app = typer.Typer(
+    name="landscape",
+    help="See, measure and search the loss landscapes of differentiable simulators.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+Fidelity = Annotated[str | None, typer.Option(help="How accurately to simulate: draft, standard or reference.")]
+Device = Annotated[str, typer.Option(help="auto, cpu or cuda; auto takes CUDA where it is.")]
+Set = Annotated[list[str] | None, typer.Option("--set", help="A scene option, name=value; may be repeated.")]
+Out = Annotated[
+    str | None, typer.Option(help="Folder for the results; by default one under out/ named after the slice.")
+]
+Json = Annotated[bool, typer.Option("--json", help="Print the summary as one JSON object on standard output.")]
+Force = Annotated[bool, typer.Option("--force", help="Begin anew where a slice exists already.")]
+Extent = Annotated[
+    str | None,
+    typer.Option(help="What to cover: a fraction of the box around the point, or LOW:HIGH; the whole box by default."),
+]
+Through = Annotated[
+    str, typer.Option(help="The point it goes through: center, random:SEED, example:NAME or a file of parameters.")
+]
+NoGradients = Annotated[bool, typer.Option("--no-gradients", help="Sample losses only.")]
+
+
+@app.callback(invoke_without_command=True)
+def _root(version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False) -> None:
+    if version:
+        typer.echo(f"gradscape {__version__}")
+        raise typer.Exit()
+
+
+@app.command()
+def envs(name: Annotated[str | None, typer.Argument(help="One environment, to see all of it.")] = None) -> None:
+    """List the environments: name, dimension, parameters, model, fidelities."""
+    from .console import describe_environment, list_environments
+
+    describe_environment(name) if name else list_environments()
+
+
+@app.command()
+def info() -> None:
+    """Show versions and devices."""
+    from .console import show_info
+
+    show_info()
+
+
+@app.command("slice")
+def slice_(
+    env: Annotated[str, typer.Argument(help="The environment; `landscape envs` lists them.")],
+    dims: Annotated[tuple[str, str], typer.Option(help="The two parameters to vary, by number or by name.")],
+    resolution: Annotated[int, typer.Option(min=2, help="Points along each axis.")] = 24,
+    fidelity: Fidelity = None,
+    device: Device = "auto",
+    through: Through = "center",
+    extent: Extent = None,
+    set_: Set = None,
+    no_gradients: NoGradients = False,
+    out: Out = None,
+    json_: Json = False,
+    force: Force = False,
+) -> None:
+    """Sample losses and gradients over a plane through parameter space, and draw them.
+
+    Stop it at any moment: the same command goes on where it stopped.
+    """
+    from .console import cut
+
+    cut(
+        env,
+        dims,
+        resolution=resolution,
+        fidelity=fidelity,
+        device=device,
+        through=through,
+        extent=extent,
+        settings=set_ or [],
+        grad=not no_gradients,
+        out=out,
+        as_json=json_,
+        force=force,
+    )
+
+
+@app.command()
+def bounce(
+    axis: Annotated[str, typer.Option(help="The initial velocity to vary: x, y or z.")],
+    resolution: Annotated[int, typer.Option(min=2, help="Number of velocities.")] = 512,
+    fidelity: Fidelity = None,
+    device: Device = "auto",
+    through: Through = "example:aim",
+    extent: Extent = None,
+    set_: Set = None,
+    out: Out = None,
+    json_: Json = False,
+    force: Force = False,
+) -> None:
+    """Draw loss and gradient of the bouncing ball over one velocity, and mark where the number of bounces changes."""
+    from .console import cut
+
+    if axis not in ("x", "y", "z"):
+        raise ValueError(f"bounce varies the velocity along axis x, y or z; got {axis!r}")
+    cut(
+        "bounce",
+        (f"velocity {axis}",),
+        resolution=resolution,
+        fidelity=fidelity,
+        device=device,
+        through=through,
+        extent=extent,
+        settings=set_ or [],
+        grad=True,
+        out=out,
+        as_json=json_,
+        force=force,
+    )
+
+
+def main(arguments: list[str] | None = None) -> Any:
+    """Run the command; bad input ends with one line on standard error and exit code 2."""
+    from typer.exceptions import TyperException
+
+    try:
+        code = app(args=arguments, standalone_mode=False)
+    except TyperException as error:
+        code = _fail(error.format_message(), 2)
+    except ValueError as error:
+        code = _fail(str(error), 2)
+    except OSError as error:
+        code = _fail(str(error), 1)
+    except (KeyboardInterrupt, typer.Abort):
+        code = 130
+    sys.exit(code)
+
+
+def _fail(message: str, code: int) -> int:
+    typer.echo(f"landscape: {' '.join(message.split())}", err=True)
+    return code

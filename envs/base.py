@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, final
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..landscapes.objective import Evaluation
@@ -60,6 +60,7 @@ class Environment(abc.ABC):
     examples: ClassVar[Mapping[str, tuple[float, ...]]] = {}
     Options: ClassVar[type[Any]] = NoOptions
     devices: ClassVar[tuple[str, ...]] = ("cpu",)
+    loss_unit: ClassVar[str] = ""
 
     space: ParameterSpace
 
@@ -81,7 +82,7 @@ class Environment(abc.ABC):
             return _empty(x, grad)
         parts = torch.split(x, self._share(len(x), grad=grad))
         with self._pool(len(parts)) as each:
-            results = list(each(lambda part: self._evaluate(part, grad=grad), parts))
+            results = list(each(lambda part: self._simulate(part, grad=grad), parts))
         loss = torch.cat([r.loss.to(x) for r in results])
         slope = torch.cat([r.grad.to(x) for r in results if r.grad is not None]) if grad else None
         return Evaluation.judged(loss, slope, torch.cat([r.status.cpu() for r in results]))
@@ -103,6 +104,10 @@ class Environment(abc.ABC):
         """Return the frames of the episode at one point."""
         raise ValueError(f"{self.name} has no episode to draw")
 
+    def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Int[Tensor, " batch"]]:
+        """Count what happens in each episode, name -> shape (batch,); where a count changes, losses may jump."""
+        return {}
+
     def memory(self, *, grad: bool = True) -> int:
         """Estimate the bytes one episode takes while it runs."""
         return 0
@@ -120,6 +125,10 @@ class Environment(abc.ABC):
     @abc.abstractmethod
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         """Simulate at least one point; called from several threads at once where `threads` is above one."""
+
+    def _simulate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+        with torch.set_grad_enabled(grad):  # torch switches it off around `_Bridge.forward`; threads have their own
+            return self._evaluate(x, grad=grad)
 
     def _setup(self) -> None:  # noqa: B027 -- a scene that shares nothing needs none
         """Prepare what all evaluations share; sets `space` unless the class does."""

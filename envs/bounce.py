@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -57,6 +58,7 @@ class Bounce(Environment):
         "standard": Fidelity("standard", dt=1 / 480),
         "reference": Fidelity("reference", dt=1 / 3840, precision="float64"),
     }
+    loss_unit: ClassVar[str] = "m²"
     Options: ClassVar[type[Any]] = BounceOptions
     examples: ClassVar[dict[str, tuple[float, ...]]] = {"aim": (6.12, -9.68, 0.0)}
     space = ParameterSpace(
@@ -94,6 +96,10 @@ class Bounce(Environment):
             inside = height < self.ball.radius
             counts.append((inside[:-1] & ~inside[1:]).sum(dim=0))
         return torch.cat(counts) if counts else torch.zeros(0, dtype=torch.int64)
+
+    def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Int[Tensor, " batch"]]:
+        """Count the bounces of each flight."""
+        return {"bounces": self.bounces(x)}
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return the ball's flight."""

@@ -71,7 +71,10 @@ class Fluid(Environment):
         "standard": Fidelity("standard", dt=SPAN / 20, resolution=22),
         "reference": Fidelity("reference", dt=SPAN / 40, resolution=22, precision="float64"),
     }
-    examples: ClassVar[dict[str, tuple[float, ...]]] = {}
+    examples: ClassVar[dict[str, tuple[float, ...]]] = {
+        "scoop": (0.62, 0.17, 1.6, -0.33, 0.96, 1.44, 1.32, -1.56, -0.16, 1.56)
+    }
+    loss_unit: ClassVar[str] = "m"
     Options: ClassVar[type[Any]] = FluidOptions
     space = ParameterSpace.box(
         [f"ladle {axis} speed, segment {segment}" for segment in range(1, SEGMENTS + 1) for axis in "xy"],

@@ -47,7 +47,9 @@ class Evaluation:
 
         `failed` holds a Status per row, OK where nothing is known to have gone wrong.
         """
-        status = torch.full(loss.shape, Status.OK, dtype=torch.int8) if failed is None else failed.to(torch.int8).clone()
+        status = (
+            torch.full(loss.shape, Status.OK, dtype=torch.int8) if failed is None else failed.to(torch.int8).clone()
+        )
         finite = loss.isfinite() if grad is None else loss.isfinite() & grad.isfinite().all(dim=1)
         status[(status == Status.OK) & ~finite] = Status.NONFINITE
         blank = status != Status.OK

@@ -47,6 +47,11 @@ def cuda_available() -> bool:
     return bool(wp.is_cuda_available())
 
 
+def device_names() -> list[str]:
+    """Return the names of the CUDA devices."""
+    return [f"{device.alias}: {device.name}" for device in wp.get_cuda_devices()]
+
+
 def free_memory() -> int:
     """Return the free bytes of the CUDA device."""
     return int(wp.get_device("cuda").free_memory)

@@ -1,0 +1,48 @@
+"""Name a point of an environment's parameter space in a few words."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .base import Environment
+
+FORMS = "center, random:SEED, example:NAME or a file with its parameters (.json, .npy or text)"
+
+
+def point(environment: Environment, text: str) -> Float[Tensor, " dim"]:
+    """Return the point that `text` means: center, random:SEED, example:NAME or a file of numbers."""
+    kind, _, value = text.partition(":")
+    if text == "center":
+        return environment.space.center
+    if kind == "random" and value.isdecimal():
+        return environment.space.uniform(1, seed=int(value))[0]
+    if kind == "example":
+        return environment.example(value)
+    path = Path(text)
+    if not path.is_file():
+        raise ValueError(f"{environment.name} can be cut through {FORMS}; got {text!r}, which is no file")
+    return _read(environment, path)
+
+
+def _read(environment: Environment, path: Path) -> Float[Tensor, " dim"]:
+    try:
+        if path.suffix == ".npy":
+            values = np.load(path, allow_pickle=False)
+        elif path.suffix == ".json":
+            values = np.asarray(json.loads(path.read_text()), dtype=float)
+        else:
+            values = np.loadtxt(path, delimiter="," if "," in path.read_text() else None, ndmin=1)
+        flat = torch.from_numpy(np.asarray(values, dtype=np.float64).ravel())
+    except (ValueError, TypeError, OSError) as error:
+        raise ValueError(f"{path} holds no list of numbers: {' '.join(str(error).split())}") from None
+    if len(flat) != environment.space.dim or not bool(flat.isfinite().all()):
+        raise ValueError(
+            f"{environment.name} takes {environment.space.dim} finite parameters; {path} holds {len(flat)} numbers"
+        )
+    return flat

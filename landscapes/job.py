@@ -1,0 +1,151 @@
+"""One slice from start to files: its folder, its cost, its pictures on the way and its summary."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from .objective import Objective, Status
+from .plane import Plane
+from .sampling import Progress, sample
+from .store import SliceStore, is_slice
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+STORE, PICTURE, SUMMARY = "slice.zarr", "landscape.png", "summary.json"
+PAUSE = 10.0  # least seconds between two pictures of an unfinished slice
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Say what is left of a slice to compute: episodes, seconds they should take, bytes of memory."""
+
+    episodes: int
+    seconds: float
+    memory: int
+
+
+@dataclass(frozen=True)
+class Job:
+    """A slice to sample into `folder`, and how to draw it."""
+
+    objective: Objective
+    plane: Plane
+    folder: Path
+    store: SliceStore
+    draw: Callable[[xr.Dataset], Figure]
+
+    @classmethod
+    def open(
+        cls,
+        objective: Objective,
+        plane: Plane,
+        folder: Path,
+        draw: Callable[[xr.Dataset], Figure],
+        *,
+        identity: Mapping[str, Any],
+        provenance: Mapping[str, Any],
+        grad: bool = True,
+        force: bool = False,
+    ) -> Job:
+        """Go on with the slice in `folder`, or begin it there; `force` begins anew where another slice is."""
+        path = folder / STORE
+        if folder.exists() and not path.exists() and any(folder.iterdir()):
+            raise ValueError(f"{folder} holds other files and no slice; give --out a new or an empty folder")
+        settings: dict[str, Any] = {"identity": identity, "provenance": provenance, "grad": grad}
+        if force and is_slice(path):
+            store = SliceStore.create(path, plane, objective.space, overwrite=True, **settings)
+            (folder / PICTURE).unlink(missing_ok=True)
+            (folder / SUMMARY).unlink(missing_ok=True)
+        else:
+            store = SliceStore.open_or_create(path, plane, objective.space, **settings)
+        return cls(objective, plane, folder, store, draw)
+
+    def cost(self) -> Cost:
+        """Estimate what is left from one batch of its own points, evaluated twice: to warm up and to time."""
+        pending = self.store.pending()
+        left = sum(self.store.count(tile) for tile in pending)
+        if not left:
+            return Cost(0, 0.0, _peak_memory())
+        points = self.store.points(pending[0])
+        trial = points[: min(len(points), getattr(self.objective, "preferred_batch", 1))]
+        self.objective.evaluate(trial[:1], grad=self.store.grad)
+        start = time.perf_counter()
+        self.objective.evaluate(trial, grad=self.store.grad)
+        seconds = (time.perf_counter() - start) / len(trial) * left
+        arrays = 8 * int(np.prod(self.plane.resolution)) * (2 + self.plane.dim * self.store.grad)
+        return Cost(left, seconds, _peak_memory() + arrays)
+
+    def run(self, progress: Callable[[Progress], None], *, command: str) -> dict[str, Any]:
+        """Sample what is missing, draw each finer picture as it completes, write and return the summary."""
+        start, drawn = time.monotonic(), -PAUSE
+        last: Progress | None = None
+
+        def follow(now: Progress) -> None:
+            nonlocal drawn, last
+            last = now
+            progress(now)
+            if now.level_complete and now.done < now.total and time.monotonic() - drawn > PAUSE:
+                self.picture()
+                drawn = time.monotonic()
+
+        dataset = sample(self.objective, self.plane, self.store, grad=self.store.grad, progress=follow)
+        self._save(dataset)
+        computed = last.done - last.resumed if last else 0
+        summary = self._summary(dataset, computed, time.monotonic() - start, command)
+        _write(self.folder / SUMMARY, json.dumps(summary, indent=2) + "\n")
+        return summary
+
+    def picture(self) -> None:
+        """Draw the finest complete picture of the whole so far, if there is one."""
+        if (coarse := self.store.coarse()) is not None:
+            self._save(coarse)
+
+    def _save(self, dataset: xr.Dataset) -> None:
+        from .draw.page import save
+
+        save(self.draw(dataset), self.folder / PICTURE)
+
+    def _summary(self, dataset: xr.Dataset, computed: int, seconds: float, command: str) -> dict[str, Any]:
+        identity, status = self.store.identity, dataset["status"].to_numpy()
+        loss = dataset["loss"].to_numpy()
+        ends = [float(np.nanmin(loss)), float(np.nanmax(loss))] if np.isfinite(loss).any() else [None, None]
+        return {
+            "env": identity.get("objective"),
+            "dims": list(self.plane.names),
+            "fidelity": identity.get("fidelity"),
+            "device": identity.get("device"),
+            "options": identity.get("options"),
+            "resolution": list(self.plane.resolution),
+            "gradients": self.store.grad,
+            "episodes": computed,
+            "resumed": int(status.size) - computed,
+            "seconds": round(seconds, 3),
+            "status": {kind.name.lower(): int((status == kind).sum()) for kind in Status},
+            "loss": {"lowest": ends[0], "highest": ends[1]},
+            "command": command,
+            "files": [STORE, PICTURE, SUMMARY],
+        }
+
+
+def _peak_memory() -> int:
+    """Return the most memory this process has held [bytes]."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak
+
+
+def _write(path: Path, text: str) -> None:
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text(text)
+    os.replace(partial, path)

@@ -1,0 +1,258 @@
+"""What the verbs of `landscape` do and print: tables, costs, progress, summaries."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from .envs.registry import entries, environment_class, make
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.figure import Figure
+
+    from .envs.base import Environment
+    from .landscapes import sampling
+    from .landscapes.job import Job
+    from .landscapes.plane import Plane
+
+PACKAGES = (
+    *("numpy", "torch", "warp-lang", "taichi", "xarray", "zarr", "matplotlib"),
+    *("pyvista", "rerun-sdk", "botorch", "gpytorch", "cma", "typer", "rich"),
+)
+
+
+def list_environments() -> None:
+    """Print every registered environment as a table, without importing any."""
+    table = Table(title="environments", title_justify="left")
+    for heading in ("name", "dim", "parameters", "model", "fidelities"):
+        table.add_column(heading, overflow="fold")
+    for entry in entries().values():
+        table.add_row(entry.name, entry.dim, entry.parameters, entry.model, ", ".join(entry.fidelities) or "?")
+    console = Console()
+    console.print(table)
+    console.print("`landscape envs NAME` shows one in full: bounds, options, examples, fidelities, what it models.")
+
+
+def describe_environment(name: str) -> None:
+    """Print all there is to know about one environment."""
+    from inspect import getdoc
+
+    from .envs.options import describe
+
+    env, console = make(name, device="cpu"), Console(soft_wrap=True, highlight=False)
+    console.print(
+        f"[bold]{name}[/bold]  {env.space.dim} parameters\n\n{getdoc(environment_class(name))}\n", markup=True
+    )
+    table = Table("no.", "parameter", "lower", "upper", "unit")
+    bounds = zip(env.space.lower.tolist(), env.space.upper.tolist(), strict=True)
+    for number, (label, unit, (lower, upper)) in enumerate(zip(env.space.names, env.space.units, bounds, strict=True)):
+        table.add_row(str(number), label, f"{lower:g}", f"{upper:g}", unit)
+    console.print(table)
+    for fidelity in env.fidelities.values():
+        console.print(f"fidelity {asdict(fidelity)}", markup=False)
+    console.print(f"options: {describe(env.Options) or 'none'}", markup=False)
+    console.print(f"examples: {', '.join(env.examples) or 'none'}", markup=False)
+
+
+def show_info() -> None:
+    """Print versions and devices."""
+    from .envs.engines.runtime import cores, device_names
+
+    table = Table("what", "version or name", title="gradscape " + version("gradscape"), title_justify="left")
+    table.add_row("python", sys.version.split()[0])
+    for package in PACKAGES:
+        table.add_row(package, _installed(package))
+    table.add_row("cpu", f"{cores()} cores for this process")
+    for name in device_names() or ["none found"]:
+        table.add_row("cuda", name)
+    Console().print(table)
+
+
+def cut(
+    name: str,
+    dims: Sequence[str],
+    *,
+    resolution: int,
+    fidelity: str | None,
+    device: str,
+    through: str,
+    extent: str | None,
+    settings: Sequence[str],
+    grad: bool,
+    out: str | None,
+    as_json: bool,
+    force: bool,
+) -> None:
+    """Sample a slice into its folder and say what it costs, how far it is and what came out."""
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    env = make(name, fidelity=fidelity, device=device, **_options(settings))
+    from .envs.points import point
+    from .landscapes.plane import Plane
+
+    window = _extent(extent)
+    plane = Plane.through(env.space, point(env, through), dims, resolution=resolution, extent=window)
+    command = shlex.join(["landscape", *sys.argv[1:]])
+    job = _open(env, plane, out=out, grad=grad, force=force, command=command)
+    try:
+        _announce(console, job, env)
+        summary = _run(console, job, command)
+    except KeyboardInterrupt:
+        _farewell(console, job, command)
+        raise
+    if as_json:
+        print(json.dumps({**summary, "folder": str(job.folder)}))
+    console.print(_outcome(summary) + f"\n{job.folder}: {', '.join(summary['files'])}", markup=False)
+
+
+def _open(env: Environment, plane: Plane, *, out: str | None, grad: bool, force: bool, command: str) -> Job:
+    from .landscapes.job import Job
+
+    identity = {
+        "objective": env.name,
+        "options": asdict(env.options),
+        "fidelity": env.fidelity.name,
+        "settings": asdict(env.fidelity),
+        "device": env.device,
+    }
+    provenance = {
+        "command": command,
+        "created": datetime.now(UTC).strftime("%Y-%m-%d"),
+        "versions": {package: _installed(package) for package in PACKAGES},
+        "loss_unit": env.loss_unit,
+    }
+    folder = Path(out) if out else _folder(identity, plane, grad)
+    return Job.open(
+        env, plane, folder, _picture(env, plane), identity=identity, provenance=provenance, grad=grad, force=force
+    )
+
+
+def _folder(identity: dict[str, Any], plane: Plane, grad: bool) -> Path:
+    """Return a folder of its own for every different slice, the same for the same one."""
+    settings = json.dumps([identity, plane.record(), grad], sort_keys=True)
+    numbers = [int(row.nonzero()[0]) for row in plane.basis]
+    points = "x".join(map(str, plane.resolution))
+    parts = [identity["objective"], *map(str, numbers), identity["fidelity"], points]
+    return Path("out") / "-".join([*parts, hashlib.sha256(settings.encode()).hexdigest()[:6]])
+
+
+def _picture(env: Environment, plane: Plane) -> Any:
+    def surface(dataset: xr.Dataset) -> Figure:
+        from .landscapes.draw.contour import landscape_figure
+
+        return landscape_figure(dataset)
+
+    def profile(dataset: xr.Dataset) -> Figure:
+        import torch
+
+        from .landscapes.draw.profile import profile_figure
+
+        u = torch.tensor(dataset["u"].to_numpy())
+        return profile_figure(dataset, events=env.events(plane.lift(u[:, None])))
+
+    return surface if plane.rank == 2 else profile
+
+
+def _announce(console: Console, job: Job, env: Environment) -> None:
+    with console.status(f"{env.name}: preparing (kernels are compiled once, then kept)"):
+        cost = job.cost()
+    total = job.plane.resolution[0] if job.plane.rank == 1 else job.plane.resolution[0] * job.plane.resolution[1]
+    kind = "episodes with gradients" if job.store.grad else "episodes"
+    console.print(f"{env.name} · {env.fidelity.name} · {env.device} · {job.folder}", markup=False)
+    if not cost.episodes:
+        console.print(f"all {total} {kind} are there already")
+        return
+    kept = f", {total - cost.episodes} are there already" if cost.episodes < total else ""
+    device = f", {_bytes(env.memory(grad=job.store.grad) * env.preferred_batch)} of it on the GPU at a time"
+    console.print(
+        f"{cost.episodes} {kind} to compute{kept}: about {_duration(cost.seconds)}, "
+        f"{_bytes(cost.memory)} of memory{device if env.device == 'cuda' else ''}"
+    )
+
+
+def _run(console: Console, job: Job, command: str) -> dict[str, Any]:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=console) as bar:
+        task: TaskID | None = None
+
+        def follow(now: sampling.Progress) -> None:
+            nonlocal task
+            if task is None:
+                task = bar.add_task("episodes", total=now.total, completed=now.done)
+            failed = sum(count for status, count in now.statuses.items() if status.name != "OK")
+            bar.update(task, completed=now.done, description=f"episodes, {failed} failed" if failed else "episodes")
+
+        return job.run(follow, command=command)
+
+
+def _farewell(console: Console, job: Job, command: str) -> None:
+    status = job.store.status()
+    job.picture()
+    console.print(
+        f"stopped: {int((status > 0).sum())} of {status.size} points are kept in {job.folder}; "
+        f"the same command goes on from there: {command}",
+        markup=False,
+    )
+
+
+def _outcome(summary: dict[str, Any]) -> str:
+    counts = {kind: count for kind, count in summary["status"].items() if count}
+    said = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+    low, high = summary["loss"]["lowest"], summary["loss"]["highest"]
+    losses = "no finite loss" if low is None else f"losses from {low:.4g} to {high:.4g}"
+    return f"{summary['episodes']} episodes in {_duration(summary['seconds'])}; {said}; {losses}"
+
+
+def _options(settings: Sequence[str]) -> dict[str, str]:
+    pairs = [setting.partition("=") for setting in settings]
+    for setting, (name, equals, _) in zip(settings, pairs, strict=True):
+        if not equals or not name:
+            raise ValueError(f"--set takes name=value; got {setting!r}")
+    return {name: value for name, _, value in pairs}
+
+
+def _extent(text: str | None) -> float | tuple[float, float] | None:
+    if text is None:
+        return None
+    low, colon, high = text.partition(":")
+    try:
+        return (float(low), float(high)) if colon else float(low)
+    except ValueError:
+        raise ValueError(f"--extent takes a fraction or LOW:HIGH in the parameters' unit; got {text!r}") from None
+
+
+def _installed(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def _bytes(count: float) -> str:
+    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
