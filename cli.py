@@ -64,7 +64,7 @@ def info() -> None:
 def slice_(
     env: Annotated[str, typer.Argument(help="The environment; `landscape envs` lists them.")],
     dims: Annotated[tuple[str, str], typer.Option(help="The two parameters to vary, by number or by name.")],
-    resolution: Annotated[int, typer.Option(min=2, help="Points along each axis.")] = 24,
+    resolution: Annotated[int, typer.Option(min=2, help="Points along each axis.")] = 16,
     fidelity: Fidelity = None,
     device: Device = "auto",
     through: Through = "center",
@@ -101,7 +101,7 @@ def slice_(
 def bounce(
     axis: Annotated[str, typer.Option(help="The initial velocity to vary: x, y or z.")],
     resolution: Annotated[int, typer.Option(min=2, help="Number of velocities.")] = 512,
-    fidelity: Fidelity = None,
+    fidelity: Fidelity = "standard",
     device: Device = "auto",
     through: Through = "example:aim",
     extent: Extent = None,

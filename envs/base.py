@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import threading
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -68,6 +69,7 @@ class Environment(abc.ABC):
         self.fidelity = self._named_fidelity(fidelity)
         self.device = self._available_device(device)
         self.options = read_options(self.name, self.Options, options)
+        self._stop = threading.Event()
         self._setup()
 
     @final
@@ -146,7 +148,13 @@ class Environment(abc.ABC):
             yield map
             return
         with ThreadPoolExecutor(self.threads) as executor:
-            yield executor.map
+            try:
+                yield executor.map
+            except BaseException:  # an interrupt too: let no thread simulate on
+                self._stop.set()
+                executor.shutdown(cancel_futures=True)
+                self._stop.clear()
+                raise
 
     def _checked(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch dim"]:
         if not isinstance(x, Tensor) or not x.is_floating_point():

@@ -22,9 +22,9 @@ from .engines.runtime import Pool, cores, free_memory
 
 TANK_WIDTH, TANK_HEIGHT, FILL = 0.4, 0.2, 0.15  # the tank, and the depth of the syrup [m]
 HEADROOM = 0.6  # what the grid covers above the floor [m]
-CUBE_EDGE, CUBE_CENTER = 0.05, (0.07, 0.122, 0.0)  # [m]
+CUBE_EDGE, CUBE_CENTER = 0.05, (0.11, 0.122, 0.0)  # [m]
 BOWL, SHELL, HANDLE = 0.07, 0.01, 0.25  # the ladle: radius, half its thickness, its handle's height [m]
-RIM = (-0.115, 0.09, 0.0)  # centre of the bowl's rim at the start [m]
+RIM = (0.0, 0.09, 0.0)  # centre of the bowl's rim at the start [m]
 LOWEST, HIGHEST = 0.085, 0.3  # how far the rim can go [m]
 SYRUP_DENSITY, SPEED_OF_SOUND = 1330.0, 6.0  # [kg/m^3], [m/s]
 GRAVITY = 9.81  # [m/s^2]
@@ -56,7 +56,7 @@ class Fluid(Environment):
     Loss at 0.5 s [m], cube's centre (x, y, z): max(0, 0.2 - y) + 3 |(x, z) - ladle| + |(x, z) - tank's axis|. The paper
     prints max(0, y - 0.2), which rewards a low cube although the goal is "as high as possible"; that is goal=printed.
     Simplifications: sound travels at 6 m/s, so that the syrup compresses by a few percent and a step may be long; walls
-    are slippery and reach to the top of the grid, so that no syrup is lost; the ladle has no mass and stops where it
+    are slippery and reach up to a lid at 0.6 m, so that no syrup is lost; the ladle has no mass and stops where it
     would leave the tank; the cube is as soft as that speed of sound makes it (38 kPa), which is stiff beside the loads
     on it; the shell is felt over a fraction of a grid cell.
     Source: task Fluid of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
@@ -67,7 +67,7 @@ class Fluid(Environment):
     name: ClassVar[str] = "fluid"
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
     fidelities: ClassVar[dict[str, Fidelity]] = {
-        "draft": Fidelity("draft", dt=SPAN / 3, resolution=12, sampling=1.5),
+        "draft": Fidelity("draft", dt=SPAN / 3, resolution=12, sampling=1.4),
         "standard": Fidelity("standard", dt=SPAN / 20, resolution=22),
         "reference": Fidelity("reference", dt=SPAN / 40, resolution=22, precision="float64"),
     }
@@ -129,7 +129,7 @@ class Fluid(Environment):
             self._capacity = max(1, min(1024, free_memory() * 3 // 4 // self.memory()))
 
     def _solver(self) -> Solver:
-        return Solver(self.model, capacity=self._capacity, device=self.device)
+        return Solver(self.model, capacity=self._capacity, device=self.device, stop=self._stop)
 
     def _largest_part(self, *, grad: bool) -> int:
         return self._capacity
@@ -173,7 +173,7 @@ def _model(fidelity: Fidelity, options: FluidOptions) -> Model:
     return Model(
         precision=fidelity.precision,
         bodies=_bodies(dx / fidelity.sampling, options),
-        boundary=LadleInTank(TANK_WIDTH / 2, BOWL, SHELL, HANDLE, band=0.75 * dx, friction=options.friction),
+        boundary=LadleInTank(TANK_WIDTH / 2, HEADROOM, BOWL, SHELL, HANDLE, band=0.75 * dx, friction=options.friction),
         origin=(corner, -MARGIN * dx, corner),
         dx=dx,
         nodes=(across, int(np.ceil(HEADROOM / dx)) + 1 + MARGIN, across),

@@ -62,7 +62,13 @@ class Function(Environment):
 
 def _named(name: str, function: type[synthetic.SyntheticTestFunction], options: type[Any]) -> type[Function]:
     """Return the environment of one function."""
-    body = {"name": name, "synthetic": function, "Options": options, "__doc__": Function.__doc__}
+    body = {
+        "name": name,
+        "synthetic": function,
+        "Options": options,
+        "__doc__": Function.__doc__,
+        "__module__": __name__,
+    }
     return type(function.__name__, (Function,), body)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -38,10 +39,19 @@ def _read(owner: str, name: str, kind: Any, value: Any) -> Any:
             return by_text[str(value).lower()]
     else:
         try:
-            return kind(value)
-        except (TypeError, ValueError):
+            return _number(kind, value)
+        except (TypeError, ValueError, OverflowError):
             pass
     raise ValueError(f"{owner} option {name} takes {_wanted(kind)}; got {value!r}")
+
+
+def _number(kind: Any, value: Any) -> Any:
+    number = kind(value)
+    if kind is float and not math.isfinite(number):
+        raise ValueError("not finite")
+    if kind is int and not isinstance(value, str) and number != value:
+        raise ValueError("not whole")
+    return number
 
 
 def _wanted(kind: Any) -> str:

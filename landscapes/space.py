@@ -14,7 +14,7 @@ from torch import Tensor
 class ParameterSpace:
     """Name the parameters of an objective, their units and their bounds.
 
-    `lower` and `upper` are float64, shape (dim,), in the parameters' own units. The bounds say where a landscape is
+    `lower` and `upper` become float64, shape (dim,), in the parameters' own units. The bounds say where a landscape is
     looked at by default; an objective may be evaluated outside them.
     """
 
@@ -25,6 +25,8 @@ class ParameterSpace:
 
     def __post_init__(self) -> None:
         dim = len(self.names)
+        object.__setattr__(self, "lower", self.lower.detach().to("cpu", torch.float64))
+        object.__setattr__(self, "upper", self.upper.detach().to("cpu", torch.float64))
         for field, size in (("units", len(self.units)), ("lower", self.lower.numel()), ("upper", self.upper.numel())):
             if size != dim:
                 raise ValueError(f"ParameterSpace has {dim} names; {field} must have as many, got {size}")

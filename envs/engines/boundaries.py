@@ -28,11 +28,13 @@ class Open:
 class LadleInTank:
     """A square tank with slippery walls, centred on x = z = 0, floor at y = 0, and a ladle that moves in it.
 
-    Lengths in m: half the tank's `width`, the bowl's mid-surface `radius`, `half_thickness` of its shell, the handle's
-    `height` and the `band` over which the ladle's grip fades to nothing outside its surface. `friction` is Coulomb's.
+    Lengths in m: half the tank's width, the height of a `lid` that stops what flies highest, the bowl's mid-surface
+    `radius`, `half_thickness` of its shell, the handle's `height`, and the `band` over which the ladle's grip fades to
+    nothing outside its surface. `friction` is Coulomb's.
     """
 
     half_width: float
+    lid: float
     radius: float
     half_thickness: float
     height: float
@@ -66,7 +68,8 @@ def _ladle_in_tank(name: str, scene: LadleInTank) -> Any:
     bowl_distance, rod_distance = bowl(name), rod(name)
     radius, thickness = real(scene.radius), real(scene.half_thickness)
     height, band, friction = real(scene.height), real(scene.band), real(scene.friction)
-    half_width = real(scene.half_width)
+    half_width, lid = real(scene.half_width), real(scene.lid)
+    near, beside = real(scene.radius + scene.half_thickness + scene.band), real(scene.half_thickness + scene.band)
 
     @wp.func(module=module)
     def slide(v: vec3, body: vec3, hit: vec4) -> vec3:
@@ -89,9 +92,12 @@ def _ladle_in_tank(name: str, scene: LadleInTank) -> Any:
         travel = tools[e, step + 1, 0] - start
         local = p - (start + fraction * travel)
         body = rate * travel
-        v = slide(v, body, bowl_distance(local, radius, thickness))
-        v = slide(v, body, rod_distance(local + vec3(radius, real(0.0), real(0.0)), height, thickness))
-        edge = half_width - real(1e-6)
+        if wp.abs(local[2]) < near and wp.abs(local[0]) < near and wp.abs(local[1]) < near:
+            v = slide(v, body, bowl_distance(local, radius, thickness))
+        foot = local + vec3(radius, real(0.0), real(0.0))
+        if wp.abs(foot[2]) < beside and wp.abs(foot[0]) < beside:
+            v = slide(v, body, rod_distance(foot, height, thickness))
+        edge = half_width - real(1e-6)  # a wall's own nodes belong to it
         vx, vy, vz = v[0], v[1], v[2]
         if p[0] < -edge:
             vx = wp.max(vx, real(0.0))
@@ -99,6 +105,8 @@ def _ladle_in_tank(name: str, scene: LadleInTank) -> Any:
             vx = wp.min(vx, real(0.0))
         if p[1] < real(1e-6):
             vy = wp.max(vy, real(0.0))
+        if p[1] > lid:
+            vy = wp.min(vy, real(0.0))
         if p[2] < -edge:
             vz = wp.max(vz, real(0.0))
         if p[2] > edge:

@@ -8,9 +8,11 @@ One substep, state (x, v, C, S) of frame s to frame s + 1, S being each material
     g2p     v'   = sum w v_i, C' = 4/dx^2 sum w v_i (x_i - x)^T, x' = x + dt v'
     deform  S'   = deform(S, C')
 
-State is kept at the ends of control steps only; the gradient recomputes one control step at a time.
+Particles are kept at the ends of control steps only. The gradient recomputes one control step at a time, and keeps that
+one whole, grids included.
 """
 
+import threading
 from dataclasses import dataclass
 from functools import cache
 from itertools import chain
@@ -22,7 +24,7 @@ import warp as wp
 
 from .boundaries import Boundary
 from .materials import Fluid, Material
-from .runtime import load, precision, to_torch
+from .runtime import flushed, load, precision, to_torch
 from .transfers import transfers
 
 EMPTY = 1e-8  # nodes lighter than this part of a particle carry no velocity
@@ -62,7 +64,7 @@ class Model:
         """Return what one environment of a solver takes, adjoints included."""
         state = sum(len(body.x) * (1 if isinstance(body.material, Fluid) else 9) for body in self.bodies)
         frame = 15 * self.particles + state  # x, v, C and each material's own
-        grids, affine = 4 * 4 * int(np.prod(self.nodes)), 2 * 9 * self.particles
+        grids, affine = (self.substeps + 1) * 2 * 4 * int(np.prod(self.nodes)), 2 * 9 * self.particles
         return (8 if self.precision == "float64" else 4) * ((self.steps + self.substeps + 2) * frame + grids + affine)
 
 
@@ -80,11 +82,23 @@ class Frame:
         return (self.x, self.v, self.C, *self.S)
 
 
-class Solver:
-    """Run up to `capacity` environments of one model at once, and differentiate their last frame."""
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """What nodes hold in one substep, [environment, node]: momentum and mass, then velocity; or the adjoints."""
 
-    def __init__(self, model: Model, *, capacity: int, device: str) -> None:
+    m: wp.array
+    v: wp.array
+
+
+class Solver:
+    """Run up to `capacity` environments of one model at once, and differentiate their last frame.
+
+    Setting `stop` ends a run within a control step, with InterruptedError.
+    """
+
+    def __init__(self, model: Model, *, capacity: int, device: str, stop: threading.Event | None = None) -> None:
         self.model, self.capacity, self.device = model, capacity, device
+        self.stop = stop or threading.Event()
         self.types = precision(model.precision)
         self.kernels = transfers(model.precision)
         self.velocity = velocity_kernel(model.precision, model.boundary)
@@ -99,7 +113,7 @@ class Solver:
         self.window = [self._frame() for _ in range(model.substeps - 1)]
         self.A = self._array(self.types.mat33, model.particles)
         cells = int(np.prod(model.nodes))
-        self.grid_m, self.grid_v = (self._array(self.types.vec4, cells) for _ in range(2))
+        self.grids = [Grid(*(self._array(self.types.vec4, cells) for _ in range(2))) for _ in range(model.substeps)]
         self.tools = self._tools()
         self.escaped = wp.zeros(capacity, dtype=wp.int32, device=device)
         self.adjoint: _Adjoint | None = None
@@ -110,8 +124,9 @@ class Solver:
         batch = len(tools)
         self.escaped.zero_()
         to_torch(self.tools)[:batch] = tools.to(self.types.torch)
-        for step in range(self.model.steps):
-            self._advance(step, batch)
+        with flushed():
+            for step in range(self.model.steps):
+                self._advance(step, batch)
         return to_torch(self.checkpoints[-1].x)[:batch]
 
     def positions(self, environment: int) -> torch.Tensor:
@@ -126,29 +141,36 @@ class Solver:
         """Return the adjoint of the tools of the last run from that of its last positions, same shapes."""
         if self.adjoint is None:
             self.adjoint = _Adjoint(self)
-        return self.adjoint.run(adj_x)
+        with flushed():
+            return self.adjoint.run(adj_x)
 
     def frames(self, step: int) -> list[Frame]:
         """Return the frames of one control step, both ends included."""
         return [self.checkpoints[step], *self.window, self.checkpoints[step + 1]]
 
     def _advance(self, step: int, batch: int) -> None:
+        if self.stop.is_set():
+            raise InterruptedError("the simulation was stopped")
         frames = self.frames(step)
         for s in range(self.model.substeps):
-            self.fill_grid(frames[s], step, s, batch)
-            self._gather(frames[s], frames[s + 1], batch)
+            self.stress(frames[s], batch)
+            self._scatter(frames[s], step, s, batch)
+            self._gather(frames[s], frames[s + 1], self.grids[s], batch)
 
-    def fill_grid(self, frame: Frame, step: int, substep: int, batch: int) -> None:
-        """Compute stress, scatter particles, and turn momentum into velocity."""
+    def stress(self, frame: Frame, batch: int) -> None:
+        """Fill A from the frame's state and motion."""
         for b, (stress, _) in enumerate(self.materials):
             self.launch(stress, self.size(b), batch, self.stress_inputs(b, frame))
-        self.grid_m.zero_()
-        inputs = [self.lattice, self.mass, frame.x, frame.v, self.A, self.grid_m]
-        self.launch(self.kernels.p2g, self.model.particles, batch, inputs)
-        self.launch(self.velocity, self.grid_m.shape[1], batch, self.velocity_inputs(step, substep))
 
-    def _gather(self, frame: Frame, new: Frame, batch: int) -> None:
-        inputs = [self.lattice, self.model.dt, frame.x, self.grid_v, new.x, new.v, new.C, self.escaped]
+    def _scatter(self, frame: Frame, step: int, substep: int, batch: int) -> None:
+        grid = self.grids[substep]
+        grid.m.zero_()
+        inputs = [self.lattice, self.mass, frame.x, frame.v, self.A, grid.m]
+        self.launch(self.kernels.p2g, self.model.particles, batch, inputs)
+        self.launch(self.velocity, grid.m.shape[1], batch, self.velocity_inputs(step, substep))
+
+    def _gather(self, frame: Frame, new: Frame, grid: "Grid", batch: int) -> None:
+        inputs = [self.lattice, self.model.dt, frame.x, grid.v, new.x, new.v, new.C, self.escaped]
         self.launch(self.kernels.g2p, self.model.particles, batch, inputs)
         for b, (_, deform) in enumerate(self.materials):
             self.launch(deform, self.size(b), batch, self.deform_inputs(b, frame, new))
@@ -168,7 +190,8 @@ class Solver:
         model = self.model
         empty = EMPTY * min(body.material.density * body.volume for body in model.bodies)
         time = [step, substep / model.substeps, 1.0 / (model.substeps * model.dt)]
-        return [self.lattice, model.dt, model.gravity, empty, *time, self.tools, self.grid_m, self.grid_v]
+        grid = self.grids[substep]
+        return [self.lattice, model.dt, model.gravity, empty, *time, self.tools, grid.m, grid.v]
 
     def size(self, b: int) -> int:
         """Return the number of particles of body b."""
@@ -215,7 +238,7 @@ class _Adjoint:
         self.solver = solver
         self.new, self.old = solver._frame(), solver._frame()
         self.A = wp.zeros_like(solver.A)
-        self.grid_m, self.grid_v = wp.zeros_like(solver.grid_m), wp.zeros_like(solver.grid_v)
+        self.grid = Grid(wp.zeros_like(solver.grids[0].m), wp.zeros_like(solver.grids[0].v))
         self.tools = solver._tools()
 
     def run(self, adj_x: torch.Tensor) -> torch.Tensor:
@@ -234,33 +257,33 @@ class _Adjoint:
         solver = self.solver
         frames = solver.frames(step)
         for s in reversed(range(solver.model.substeps)):
-            solver.fill_grid(frames[s], step, s, batch)
-            self._gather(frames[s], frames[s + 1], batch)
-            self._grid(step, s, batch)
+            self._gather(frames[s], frames[s + 1], solver.grids[s], batch)
+            self._velocity(step, s, batch)
+            solver.stress(frames[s], batch)
             self._scatter(frames[s], batch)
             self.new, self.old = self.old, self.new
 
-    def _gather(self, frame: Frame, new: Frame, batch: int) -> None:
+    def _gather(self, frame: Frame, new: Frame, grid: Grid, batch: int) -> None:
         solver = self.solver
         for b, (_, deform) in enumerate(solver.materials):
             self.old.S[b].zero_()
             adjoints = [None, None, self.old.S[b], self.new.C, self.new.S[b]]
             self._launch(deform, solver.size(b), batch, solver.deform_inputs(b, frame, new), adjoints)
-        self.grid_v.zero_()
-        inputs = [solver.lattice, solver.model.dt, frame.x, solver.grid_v]
-        inputs += [self.new.x, self.new.v, self.new.C, self.grid_v, self.old.x]
+        self.grid.v.zero_()
+        inputs = [solver.lattice, solver.model.dt, frame.x, grid.v]
+        inputs += [self.new.x, self.new.v, self.new.C, self.grid.v, self.old.x]
         solver.launch(solver.kernels.adjoint_g2p, solver.model.particles, batch, inputs)
 
-    def _grid(self, step: int, substep: int, batch: int) -> None:
+    def _velocity(self, step: int, substep: int, batch: int) -> None:
         solver = self.solver
-        self.grid_m.zero_()
+        self.grid.m.zero_()
         inputs = solver.velocity_inputs(step, substep)
-        adjoints = [solver.kernels.Lattice(), *[None] * (len(inputs) - 4), self.tools, self.grid_m, self.grid_v]
-        self._launch(solver.velocity, solver.grid_m.shape[1], batch, inputs, adjoints)
+        adjoints = [solver.kernels.Lattice(), *[None] * (len(inputs) - 4), self.tools, self.grid.m, self.grid.v]
+        self._launch(solver.velocity, self.grid.m.shape[1], batch, inputs, adjoints)
 
     def _scatter(self, frame: Frame, batch: int) -> None:
         solver = self.solver
-        inputs = [solver.lattice, solver.mass, frame.x, frame.v, solver.A, self.grid_m]
+        inputs = [solver.lattice, solver.mass, frame.x, frame.v, solver.A, self.grid.m]
         inputs += [self.old.x, self.old.v, self.A]
         solver.launch(solver.kernels.adjoint_p2g, solver.model.particles, batch, inputs)
         self.old.C.zero_()

@@ -11,12 +11,28 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, Generic, TypeVar
 
+import numpy as np
 import torch
 import warp as wp
 
-wp.config.log_level = wp.LOG_ERROR  # no banner, and no complaint where there is no GPU
+wp.config.log_level = wp.LOG_ERROR  # no banner
 
 T = TypeVar("T")
+
+
+def _start() -> None:
+    """Start Warp without its native complaint, on standard error, where there is no GPU."""
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        wp.init()
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+_start()
 
 
 @dataclass(frozen=True)
@@ -66,6 +82,17 @@ def to_torch(array: wp.array) -> torch.Tensor:
     """View a Warp array as a tensor of the same memory."""
     tensor: torch.Tensor = wp.to_torch(array, requires_grad=False)
     return tensor
+
+
+@contextmanager
+def flushed() -> Iterator[None]:
+    """Round subnormal numbers to zero in this thread: adjoints are full of them, and they slow a CPU down."""
+    before = bool(np.float64(5e-324) * np.float64(1.0) == 0.0)
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(before)
 
 
 def load(kernels: Iterable[Any], device: str) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -48,7 +49,8 @@ def list_environments() -> None:
     for heading in ("name", "dim", "parameters", "model", "fidelities"):
         table.add_column(heading, overflow="fold")
     for entry in entries().values():
-        table.add_row(entry.name, entry.dim, entry.parameters, entry.model, ", ".join(entry.fidelities) or "?")
+        row = (entry.name, entry.dim, entry.parameters, entry.model, ", ".join(entry.fidelities) or "?")
+        table.add_row(*map(escape, row))
     console = Console()
     console.print(table)
     console.print("`landscape envs NAME` shows one in full: bounds, options, examples, fidelities, what it models.")
@@ -61,13 +63,12 @@ def describe_environment(name: str) -> None:
     from .envs.options import describe
 
     env, console = make(name, device="cpu"), Console(soft_wrap=True, highlight=False)
-    console.print(
-        f"[bold]{name}[/bold]  {env.space.dim} parameters\n\n{getdoc(environment_class(name))}\n", markup=True
-    )
+    said = f"{name}: {env.space.dim} parameters\n\n{getdoc(environment_class(name))}\n"
+    console.print(said, markup=False)
     table = Table("no.", "parameter", "lower", "upper", "unit")
     bounds = zip(env.space.lower.tolist(), env.space.upper.tolist(), strict=True)
     for number, (label, unit, (lower, upper)) in enumerate(zip(env.space.names, env.space.units, bounds, strict=True)):
-        table.add_row(str(number), label, f"{lower:g}", f"{upper:g}", unit)
+        table.add_row(str(number), escape(label), f"{lower:g}", f"{upper:g}", escape(unit))
     console.print(table)
     for fidelity in env.fidelities.values():
         console.print(f"fidelity {asdict(fidelity)}", markup=False)

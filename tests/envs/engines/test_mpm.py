@@ -1,0 +1,264 @@
+"""MLS-MPM against conservation laws and closed forms: free fall, a resting tank, sound in a column, true gradients."""
+
+from dataclasses import fields, is_dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from gradscape.envs.engines.boundaries import LadleInTank, Open
+from gradscape.envs.engines.materials import Elastic, Fluid
+from gradscape.envs.engines.mpm import Body, Model, Solver
+from gradscape.envs.engines.runtime import to_torch
+
+DENSITY, SPEED, GRAVITY = 1330.0, 6.0, 9.81  # [kg/m^3], of sound [m/s], [m/s^2]
+SYRUP = Fluid(DENSITY, DENSITY * SPEED**2, viscosity=4.0)
+SPONGE = Elastic.with_wave_speed(DENSITY, SPEED, poisson=0.3)
+MATERIALS = {"fluid": SYRUP, "elastic": SPONGE}
+WIDTH, DEPTH = 0.2, 0.15  # of the tank and of what fills it [m]
+SPAN = 0.01  # length of a control step [s]
+
+
+def lattice(counts, sides):
+    """Return the centres of equal cells of a box that stands on the middle of the plane y = 0."""
+    axes = [(np.arange(n) + 0.5) / n * side for n, side in zip(counts, sides, strict=True)]
+    x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return x - np.array([sides[0] / 2, 0, sides[2] / 2])
+
+
+def block(material, corner, side=0.1, count=4):
+    x = lattice((count,) * 3, (side,) * 3) + np.array(corner)
+    return Body(material, x, (side / count) ** 3, np.ones(count**3))
+
+
+def free_model(**changes):
+    """Return a fluid and an elastic block in empty space."""
+    model = Model(
+        precision="float64",
+        bodies=(block(SYRUP, (-0.1, 0.4, 0.0)), block(SPONGE, (0.07, 0.45, 0.0))),
+        boundary=Open(),
+        origin=(-0.3, 0.0, -0.3),
+        dx=0.05,
+        nodes=(13, 16, 13),
+        dt=SPAN / 5,
+        substeps=5,
+        steps=12,
+        gravity=0.0,
+    )
+    return replace(model, **changes)
+
+
+def tank(material, dx, *, at_rest, steps):
+    """Return a tank full of one material, compressed as its own weight does, or not at all."""
+    counts = [round(2 * side / dx) for side in (WIDTH, DEPTH, WIDTH)]
+    x = lattice(counts, (WIDTH, DEPTH, WIDTH))
+    pressure = DENSITY * GRAVITY * (DEPTH - x[:, 1]) * at_rest
+    margin = 2
+    across = round(WIDTH / dx) + 1 + 2 * margin
+    ladle = {"radius": 0.07, "half_thickness": 0.01, "height": 0.25, "friction": 0.1}
+    return Model(
+        precision="float64",
+        bodies=(Body(material, x, WIDTH * DEPTH * WIDTH / len(x), material.volume_ratio(pressure)),),
+        boundary=LadleInTank(half_width=WIDTH / 2, lid=0.25, band=0.75 * dx, **ladle),
+        origin=(-WIDTH / 2 - margin * dx, -margin * dx, -WIDTH / 2 - margin * dx),
+        dx=dx,
+        nodes=(across, round(0.25 / dx) + 1 + 2 * margin, across),
+        dt=SPAN / 10,
+        substeps=10,
+        steps=steps,
+        gravity=GRAVITY,
+    )
+
+
+def parked(model, batch=1):
+    """Return tools that stay 10 m above everything."""
+    return torch.tensor([0.0, 10.0, 0.0], dtype=torch.float64).expand(batch, model.steps + 1, 1, 3)
+
+
+def solved(model, batch=1, velocity=None):
+    """Run a model; `velocity` [m/s], shape (batch, particle, 3), is that of the first frame."""
+    solver = Solver(model, capacity=batch, device="cpu")
+    if velocity is not None:
+        to_torch(solver.checkpoints[0].v)[:] = velocity
+    solver.run(parked(model, batch))
+    return solver
+
+
+def over_time(solver, name):
+    """Return x or v at the ends of control steps, shape (step + 1, batch, particle, 3)."""
+    return torch.stack([to_torch(getattr(frame, name)) for frame in solver.checkpoints])
+
+
+def masses(model):
+    return torch.cat(
+        [torch.full((len(b.x),), b.material.density * b.volume, dtype=torch.float64) for b in model.bodies]
+    )
+
+
+def random_velocities(model, batch, size):
+    generator = torch.Generator().manual_seed(0)
+    return size * (torch.rand((batch, model.particles, 3), generator=generator, dtype=torch.float64) - 0.5)
+
+
+def test_mass_and_momentum_are_conserved_away_from_walls():
+    model = free_model()
+    velocity = random_velocities(model, 2, size=1.0) + torch.tensor([0.3, -0.2, 0.1])
+    solver = solved(model, 2, velocity)
+    m = masses(model)
+    momentum = (m[:, None] * over_time(solver, "v")).sum(dim=2)
+    torch.testing.assert_close(momentum, momentum[:1].expand_as(momentum), rtol=0, atol=1e-7 * float(m.sum()))
+    on_grid = to_torch(solver.grids[-1].m)[:, :, 3].sum(dim=1)
+    torch.testing.assert_close(on_grid, m.sum().expand(2), rtol=1e-12, atol=0)
+    deformed = to_torch(solver.checkpoints[-1].S[0])
+    assert (deformed - 1).abs().max() > 1e-3  # and this was no rigid motion
+
+
+def test_angular_momentum_is_conserved_away_from_walls():
+    """That of the particles, m cross(x, v), and that of their affine fields, m dx^2/4 times the axial vector of C."""
+    model = free_model()
+    solver = solved(model, 1, random_velocities(model, 1, size=1.0))
+    x, v, C = (over_time(solver, name)[:, 0] for name in ("x", "v", "C"))
+    axial = torch.stack([C[..., k, j] - C[..., j, k] for j, k in ((1, 2), (2, 0), (0, 1))], dim=-1)
+    turning = torch.linalg.cross(x, v) + model.dx**2 / 4 * axial
+    total = (masses(model)[:, None] * turning).sum(dim=1)
+    assert total.diff(dim=0).abs().max() < 1e-7 * float(masses(model).sum())
+
+
+def test_blocks_fall_as_far_as_the_integrator_says_exactly():
+    model = free_model(gravity=GRAVITY)
+    fall = over_time(solved(model), "x")[-1, 0] - torch.from_numpy(np.concatenate([b.x for b in model.bodies]))
+    t = model.steps * SPAN
+    exact = -GRAVITY * t**2 / 2 - GRAVITY * t * model.dt / 2
+    wanted = torch.tensor([0.0, exact, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(fall, wanted.expand_as(fall), rtol=0, atol=1e-8)
+
+
+def test_a_particle_out_of_the_grid_is_reported_and_harms_no_neighbour():
+    model = free_model()
+    calm = random_velocities(model, 3, size=0.2)
+    wild = calm.clone()
+    wild[1, -1, 1] += 200.0
+    wild[1, : len(model.bodies[0].x), 1] += 8.0
+    lone, together = solved(model, 3, calm), solved(model, 3, wild)
+    assert lone.left_grid(3).tolist() == [False, False, False]
+    assert together.left_grid(3).tolist() == [False, True, False]
+    ends = [over_time(solver, "x")[-1] for solver in (lone, together)]
+    assert torch.equal(ends[0][[0, 2]], ends[1][[0, 2]])
+    assert not torch.equal(ends[0][1], ends[1][1])
+
+
+def test_a_run_forgets_the_one_before():
+    model = free_model()
+    solver = Solver(model, capacity=2, device="cpu")
+    start = to_torch(solver.checkpoints[0].v)
+    ends = []
+    for velocity in (
+        random_velocities(model, 2, size=0.5),
+        30 * torch.ones_like(start),
+        random_velocities(model, 2, 0.5),
+    ):
+        start[:] = velocity
+        ends.append((solver.run(parked(model, 2)).clone(), solver.left_grid(2).tolist()))
+    assert torch.equal(ends[0][0], ends[2][0])
+    assert [left for _, left in ends] == [[False, False], [True, True], [False, False]]
+
+
+@pytest.fixture(scope="module")
+def resting():
+    """Return what half a second does to a tank at rest: (centre's drift [m], fastest and last mean speed [m/s])."""
+    found = {}
+    for name, material in MATERIALS.items():
+        for dx in (0.05, 0.025):
+            solver = solved(tank(material, dx, at_rest=True, steps=50))
+            height = over_time(solver, "x")[:, 0, :, 1].mean(dim=1)
+            speed = over_time(solver, "v")[:, 0].norm(dim=2)
+            found[name, dx] = float((height - height[0]).abs().max()), float(speed.max()), float(speed[-1].mean())
+    return found
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+def test_a_resting_tank_stays_at_rest(resting, material):
+    for dx in (0.05, 0.025):
+        drift, fastest, last = resting[material, dx]
+        assert drift < 1e-3
+        assert fastest < 0.06
+        assert last < 0.01
+    assert resting[material, 0.025][0] < resting[material, 0.05][0]
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+def test_a_column_that_starts_to_bear_its_weight_swings_at_the_speed_of_sound(material):
+    """Without weight so far, all of it sinks until 2 H / c, its centre 2 g H^2 / (3 c^2) deep, and turns back."""
+    turn, depth = 2 * DEPTH / SPEED, 2 * GRAVITY * DEPTH**2 / (3 * SPEED**2)
+    late = []
+    for dx in (0.05, 0.025):
+        solver = solved(tank(MATERIALS[material], dx, at_rest=False, steps=8))
+        height, v = (over_time(solver, name)[:, 0, :, 1].mean(dim=1) for name in "xv")
+        step = int((v[1:] > 0).nonzero()[0])
+        crossing = SPAN * (step - float(v[step] / (v[step + 1] - v[step])))
+        late.append(abs(crossing / turn - 1))
+        assert float(height[0] - height.min()) == pytest.approx(depth, rel=0.08)
+    assert late[1] < 0.05
+    assert late[1] < 0.6 * late[0]
+
+
+@pytest.fixture(scope="module")
+def stirred():
+    """Return a solver of a coarse tank, and the path of a ladle that stirs it.
+
+    Nodes lie nowhere on the bowl's mid-surface nor in the plane of its rim: there the normal jumps, or bends.
+    """
+    model = tank(SYRUP, 0.05, at_rest=True, steps=6)
+    time = torch.linspace(0, 1, model.steps + 1, dtype=torch.float64)
+    path = torch.stack([0.003 + 0.02 * time, 0.113 - 0.05 * time, 0.007 + 0.01 * time], dim=-1)[None, :, None]
+    return Solver(model, capacity=2, device="cpu"), path.expand(2, -1, -1, -1).contiguous()
+
+
+def test_the_gradient_by_the_tools_is_the_slope_on_a_ladder_of_steps(stirred):
+    solver, path = stirred
+    generator = torch.Generator().manual_seed(1)
+    adj_x = torch.rand((2, solver.model.particles, 3), generator=generator, dtype=torch.float64) - 0.5
+    direction = torch.rand(path.shape, generator=generator, dtype=torch.float64) - 0.5
+    solver.run(path)
+    slope = (solver.gradient(adj_x) * direction).sum(dim=(1, 2, 3))
+    errors = []
+    for step in (1e-3, 1e-4, 1e-5, 1e-6, 1e-7):
+        ends = [(solver.run(path + sign * step * direction) * adj_x).sum(dim=(1, 2)) for sign in (1, -1)]
+        errors.append(float((((ends[0] - ends[1]) / (2 * step) - slope) / slope).abs().max()))
+    assert min(errors) < 1e-7
+    assert errors[0] > 100 * min(errors)  # the slope over a millimetre is another one
+
+
+def test_a_second_gradient_of_the_same_run_has_the_same_bits(stirred):
+    solver, path = stirred
+    adj_x = torch.ones((2, solver.model.particles, 3), dtype=torch.float64)
+    solver.run(path)
+    first = solver.gradient(adj_x)
+    solver.run(path)
+    assert torch.equal(solver.gradient(adj_x), first)
+    assert first.abs().max() > 0
+
+
+def arrays(thing, seen):
+    """Yield every array a solver holds that grows with its capacity."""
+    if isinstance(thing, wp.array):
+        if thing.ndim > 1 and thing.ptr not in seen:
+            seen.add(thing.ptr)
+            yield thing
+    elif is_dataclass(thing):
+        for field in fields(thing):
+            yield from arrays(getattr(thing, field.name), seen)
+    elif isinstance(thing, list | tuple):
+        for item in thing:
+            yield from arrays(item, seen)
+
+
+def test_the_memory_estimate_is_what_a_solver_takes(stirred):
+    solver, path = stirred
+    solver.run(path)
+    solver.gradient(torch.ones((2, solver.model.particles, 3), dtype=torch.float64))
+    seen = set()
+    held = [*vars(solver).values(), *vars(solver.adjoint).values()]
+    taken = sum(array.capacity for thing in held for array in arrays(thing, seen))
+    assert taken / solver.capacity == pytest.approx(solver.model.bytes_per_environment(), rel=0.05)

@@ -1,0 +1,209 @@
+"""What every registered environment promises. A newly registered one is held to it without another line here."""
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+
+from gradscape.envs.base import Fidelity
+from gradscape.envs.bounce import Bounce
+from gradscape.envs.fluid import SPAN
+from gradscape.envs.registry import entries, environment_class, make
+from gradscape.landscapes.objective import Objective, Status
+
+# Float64, since gradients are held against differences, and cheap, since that takes many episodes.
+SETTINGS = {
+    "bounce": {"fidelity": replace(Bounce.fidelities["draft"], precision="float64")},
+    "fluid": {"fidelity": Fidelity("tiny", dt=SPAN / 2, precision="float64", resolution=6, sampling=1.5)},
+}
+ROWS = 7
+
+
+def made(name):
+    return make(name, device="cpu", **SETTINGS.get(name, {}))
+
+
+@pytest.fixture(scope="module", params=sorted(entries()))
+def env(request):
+    return made(request.param)
+
+
+@pytest.fixture(scope="module")
+def points(env):
+    return env.space.uniform(ROWS, seed=1)
+
+
+@pytest.fixture(scope="module")
+def result(env, points):
+    return env.evaluate(points)
+
+
+def assert_same_bits(got, wanted):
+    assert torch.equal(got.status, wanted.status)
+    for ours, theirs in ((got.loss, wanted.loss), (got.grad, wanted.grad)):
+        assert torch.equal(ours.view(torch.int64), theirs.view(torch.int64))
+
+
+def test_it_is_an_objective(env, points, result):
+    dim = env.space.dim
+    assert isinstance(env, Objective)
+    assert (result.loss.shape, result.loss.dtype) == ((ROWS,), torch.float64)
+    assert (result.grad.shape, result.grad.dtype) == ((ROWS, dim), torch.float64)
+    assert (result.status.shape, result.status.dtype) == ((ROWS,), torch.int8)
+    assert (result.status == Status.OK).all()
+    assert result.loss.isfinite().all()
+    assert result.grad.isfinite().all()
+    assert not result.loss.requires_grad
+
+
+def test_the_loss_is_the_same_bits_without_its_gradient(env, points, result):
+    alone = env.evaluate(points, grad=False)
+    assert alone.grad is None
+    assert torch.equal(alone.loss, result.loss)
+    assert torch.equal(alone.status, result.status)
+
+
+def test_gradcheck(env):
+    """Against central differences in float64, backward twice included; one full Jacobian, then random directions."""
+    full = env.space.uniform(1, seed=2)
+    assert torch.autograd.gradcheck(env, (full.requires_grad_(),), fast_mode=env.space.dim > 5)
+    x = env.space.uniform(3, seed=3).requires_grad_()
+    assert torch.autograd.gradcheck(env, (x,), fast_mode=True)
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_rows_do_not_depend_on_their_batch(env, points, result, size):
+    parts = [env.evaluate(part) for part in points.split(size)]
+    together = replace(
+        result,
+        loss=torch.cat([part.loss for part in parts]),
+        grad=torch.cat([part.grad for part in parts]),
+        status=torch.cat([part.status for part in parts]),
+    )
+    assert_same_bits(together, result)
+
+
+def test_rows_do_not_depend_on_their_order(env, points, result):
+    order = torch.tensor([4, 2, 6, 0, 5, 1, 3])
+    shuffled = env.evaluate(points[order])
+    assert_same_bits(shuffled, replace(result, **{f: getattr(result, f)[order] for f in ("loss", "grad", "status")}))
+
+
+def test_an_empty_batch_gives_an_empty_evaluation(env, points):
+    result = env.evaluate(points[:0])
+    assert result.loss.shape == result.status.shape == (0,)
+    assert result.grad.shape == (0, env.space.dim)
+    assert env.evaluate(points[:0], grad=False).grad is None
+    x = points[:0].clone().requires_grad_()
+    env(x).sum().backward()
+    assert x.grad.shape == (0, env.space.dim)
+
+
+def test_the_same_point_gives_the_same_bits(env, points, result):
+    assert_same_bits(env.evaluate(points), result)
+    assert_same_bits(made(env.name).evaluate(points), result)
+
+
+def test_a_second_backward_adds_the_same_gradient(env, points, result):
+    x = points[:2].clone().requires_grad_()
+    total = env(x).sum()
+    for _ in range(2):
+        x.grad = None
+        total.backward(retain_graph=True)
+        assert torch.equal(x.grad, result.grad[:2])
+
+
+def test_losses_are_weighed_row_by_row(env, points, result):
+    x = points[:2].clone().requires_grad_()
+    weight = torch.tensor([3.0, -0.5], dtype=torch.float64)
+    (weight * env(x)).sum().backward()
+    assert torch.equal(x.grad, weight[:, None] * result.grad[:2])
+
+
+def test_parameters_of_any_precision_get_gradients_of_their_own(env, points):
+    x = points[:2].float().requires_grad_()
+    losses = env(x)
+    losses.sum().backward()
+    exact = env.evaluate(x.detach().double())
+    assert losses.dtype == x.grad.dtype == torch.float32
+    torch.testing.assert_close(losses.detach(), exact.loss.float())
+    torch.testing.assert_close(x.grad, exact.grad.float())
+
+
+def refusal(call):
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 -- each caller looks into the message
+        call()
+    return str(caught.value)
+
+
+def test_points_of_another_shape_or_type_are_refused(env, points):
+    dim = env.space.dim
+    shapes = {(3, dim + 2): points.new_zeros(3, dim + 2), (dim,): points[0], (1, 1, dim): points[None, :1]}
+    for shape, x in shapes.items():
+        for call in (env.evaluate, env):
+            message = refusal(lambda call=call, x=x: call(x))
+            assert message.startswith(f"{env.name} takes {dim} parameters")
+            assert message.endswith(f"got x of shape {shape}")
+    whole = refusal(lambda: env.evaluate(points.long()))
+    assert whole == f"{env.name} takes a floating-point tensor; got a tensor of torch.int64"
+    assert refusal(lambda: env.evaluate(points.numpy())).endswith("got ndarray")
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_points_that_are_not_finite_are_refused(env, points, bad):
+    x = points.clone()
+    x[3, -1] = bad
+    message = refusal(lambda: env.evaluate(x))
+    assert message.startswith(f"{env.name} takes finite parameters; row 3 of x holds [")
+    assert str(bad) in message
+
+
+def test_unknown_settings_are_refused(env):
+    cls = type(env)
+    unknown = refusal(lambda: cls(wind=3.0))
+    assert f"{env.name} has no option 'wind'; it has " in unknown
+    for option in fields(cls.Options):
+        assert option.name in unknown
+        wrong = refusal(lambda option=option: cls(**{option.name: "a wrong value"}))
+        assert f"{env.name} option {option.name} takes " in wrong
+        assert "got 'a wrong value'" in wrong
+    fidelity = refusal(lambda: cls(fidelity="perfect"))
+    assert fidelity == f"{env.name} has fidelities {', '.join(cls.fidelities)}; got 'perfect'"
+    device = refusal(lambda: cls(device="tpu"))
+    assert device == f"{env.name} runs on {' and '.join(cls.devices)}; got device 'tpu'"
+
+
+def test_every_named_example_is_a_point_it_can_simulate(env):
+    for name in env.examples:
+        x = env.example(name)
+        assert (x.shape, x.dtype) == ((env.space.dim,), torch.float64)
+        assert env.evaluate(x[None]).status.tolist() == [Status.OK], name
+    assert refusal(lambda: env.example("nothing")).startswith(f"{env.name} has no example 'nothing'; it has ")
+
+
+def test_its_row_in_the_registry_is_true(env):
+    entry = entries()[env.name]
+    if entry.dim == "any":
+        assert type(env)(dim=3).space.dim == 3
+    elif entry.dim != "?":
+        assert env.space.dim == int(entry.dim)
+    if entry.fidelities:
+        assert entry.fidelities == tuple(env.fidelities)
+    if entry.parameters != "?":
+        for unit in set(env.space.units):
+            assert (f"[{unit}]" if unit else "no unit") in entry.parameters
+
+
+def test_every_fidelity_can_be_made(env):
+    cls = environment_class(env.name)
+    for name, fidelity in cls.fidelities.items():
+        assert fidelity.name == name
+        assert make(env.name, fidelity=name, device="cpu").fidelity is fidelity
+    assert make(env.name, device="cpu").fidelity is next(iter(cls.fidelities.values()))
+
+
+def test_an_unknown_environment_is_refused_with_the_closest_name():
+    assert "no environment is called 'flood'; did you mean fluid?" in refusal(lambda: make("flood"))
+    far = refusal(lambda: make("zzz"))
+    assert "did you mean" not in far
+    assert f"`landscape envs` lists all {len(entries())}" in far

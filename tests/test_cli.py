@@ -1,0 +1,224 @@
+"""The command line: what it prints, leaves, refuses and survives."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gradscape
+from gradscape.cli import main
+
+COMMAND = [sys.executable, "-m", "gradscape"]
+
+
+@dataclass(frozen=True)
+class Said:
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Said]:
+    """Run the command in this process, in a folder of its own."""
+
+    def command(*arguments: str, cwd: Path) -> Said:
+        monkeypatch.chdir(cwd)
+        monkeypatch.setattr(sys, "argv", ["landscape", *arguments])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as left:
+            main(list(arguments))
+        return Said(int(left.value.code or 0), *capsys.readouterr())
+
+    return command
+
+
+def loaded(arguments: list[str]) -> set[str]:
+    code = (
+        "import sys\nfrom gradscape.cli import main\n"
+        f"try: main({arguments})\nexcept SystemExit: pass\nprint('MODULES', *sys.modules, file=sys.stderr)"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    return set(said.stderr.split("MODULES")[1].split())
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["slice", "--help"], ["envs"]])
+def test_help_and_table_import_nothing_heavy(arguments: list[str]) -> None:
+    heavy = {"torch", "warp", "taichi", "numpy", "matplotlib", "xarray", "zarr", "botorch", "pyvista", "rerun"}
+    assert not heavy & loaded(arguments)
+
+
+def test_envs_lists_every_environment_with_units(
+    run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    said = run("envs", cwd=tmp_path).stdout
+    for shown in ("bounce", "initial velocity x, y, z [m/s]", "fluid", "draft, standard, reference", "branin"):
+        assert shown in said
+
+
+def test_envs_shows_one_in_full(run: Callable[..., Said], tmp_path: Path) -> None:
+    said = run("envs", "fluid", cwd=tmp_path).stdout
+    for shown in ("ladle x speed, segment 1", "goal=high|printed", "scoop", "reference", "m/s", "y - 0.2"):
+        assert shown in said
+
+
+def test_slice_leaves_store_picture_and_summary(run: Callable[..., Said], tmp_path: Path) -> None:
+    done = run("slice", "branin", "--dims", "x0", "1", "--resolution", "9", "--json", "--out", "cut", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout)
+    assert summary == {**json.loads((tmp_path / "cut/summary.json").read_text()), "folder": "cut"}
+    assert summary["env"] == "branin"
+    assert summary["dims"] == ["x0", "x1"]
+    assert summary["episodes"] == summary["status"]["ok"] == 81
+    dataset = gradscape.open_slice(tmp_path / "cut/slice.zarr")
+    assert dataset["grad"].shape == (9, 9, 2)
+    assert summary["loss"]["lowest"] == float(dataset["loss"].min())
+    assert (tmp_path / "cut/landscape.png").read_bytes().startswith(b"\x89PNG")
+    assert "81 episodes with gradients to compute: about" in done.stderr
+
+
+def test_same_command_computes_nothing_twice_and_force_begins_anew(run: Callable[..., Said], tmp_path: Path) -> None:
+    command = ["slice", "branin", "--dims", "0", "1", "--resolution", "5", "--json"]
+    assert json.loads(run(*command, cwd=tmp_path).stdout)["episodes"] == 25
+    again = run(*command, cwd=tmp_path)
+    assert json.loads(again.stdout)["episodes"] == 0
+    assert "there already" in again.stderr
+    assert json.loads(run(*command, "--force", cwd=tmp_path).stdout)["episodes"] == 25
+
+
+def test_another_slice_is_not_overwritten(run: Callable[..., Said], tmp_path: Path) -> None:
+    first = ["slice", "branin", "--dims", "0", "1", "--resolution", "5", "--out", "cut"]
+    run(*first, cwd=tmp_path)
+    before = (tmp_path / "cut/summary.json").read_bytes()
+    other = run("slice", "beale", "--dims", "0", "1", "--resolution", "5", "--out", "cut", cwd=tmp_path)
+    assert other.returncode == 2
+    assert "wanted 'beale', found 'branin'" in other.stderr
+    assert (tmp_path / "cut/summary.json").read_bytes() == before
+
+
+def test_a_folder_of_other_files_is_left_alone(run: Callable[..., Said], tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/landscape.png").write_text("precious")
+    for extra in ([], ["--force"]):
+        done = run("slice", "branin", "--dims", "0", "1", "--out", "mine", *extra, cwd=tmp_path)
+        assert done.returncode == 2
+        assert (tmp_path / "mine/landscape.png").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["slice", "flud", "--dims", "0", "1"], "did you mean fluid?"),
+        (["slice", "branin"], "--dims"),
+        (["slice", "branin", "--dims", "0", "2"], "numbered 0 to 1; got 2"),
+        (["slice", "branin", "--dims", "0", "0"], "two different parameters; got 0, 0"),
+        (["slice", "branin", "--dims", "0", "1", "--resolution", "1"], "--resolution"),
+        (["slice", "branin", "--dims", "0", "1", "--fidelity", "best"], "has fidelities exact; got 'best'"),
+        (["slice", "branin", "--dims", "0", "1", "--device", "tpu"], "got device 'tpu'"),
+        (
+            ["slice", "branin", "--dims", "0", "1", "--through", "nowhere"],
+            "center, random:SEED, example:NAME or a file",
+        ),
+        (["slice", "branin", "--dims", "0", "1", "--through", "example:x"], "branin has no example 'x'"),
+        (["slice", "branin", "--dims", "0", "1", "--extent", "wide"], "got 'wide'"),
+        (["slice", "branin", "--dims", "0", "1", "--set", "dim=3"], "branin has no option 'dim'"),
+        (["slice", "ackley", "--dims", "0", "1", "--set", "dim=two"], "dim takes a whole number; got 'two'"),
+        (["slice", "ackley", "--dims", "0", "1", "--set", "dim"], "--set takes name=value; got 'dim'"),
+        (["bounce", "--axis", "w"], "axis x, y or z; got 'w'"),
+        (["envs", "nothing"], "no environment is called 'nothing'"),
+        (["plot"], "plot"),
+    ],
+)
+def test_bad_input_gets_one_line_and_exit_code_2(
+    run: Callable[..., Said], tmp_path: Path, arguments: list[str], said: str
+) -> None:
+    done = run(*arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("landscape: ")
+    assert len(done.stderr.splitlines()) == 1
+    assert said in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("name", "text"), [("p.json", "[1.5, 2.5]"), ("p.txt", "1.5 2.5\n"), ("p.csv", "1.5,2.5\n")])
+def test_a_slice_goes_through_the_point_in_a_file(
+    run: Callable[..., Said], tmp_path: Path, name: str, text: str
+) -> None:
+    (tmp_path / name).write_text(text)
+    arguments = ["--through", name, "--extent", "0.1", "--resolution", "3", "--out", "cut", "--no-gradients"]
+    assert run("slice", "branin", "--dims", "0", "1", *arguments, cwd=tmp_path).returncode == 0
+    dataset = gradscape.open_slice(tmp_path / "cut/slice.zarr")
+    assert "grad" not in dataset
+    assert (float(dataset["u"][1]), float(dataset["v"][1])) == (1.5, 2.5)
+
+
+def test_bounce_counts_the_bounces_it_marks(run: Callable[..., Said], tmp_path: Path) -> None:
+    done = run("bounce", "--axis", "y", "--resolution", "64", "--json", "--out", "b", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout)
+    assert summary["dims"] == ["velocity y"]
+    assert summary["status"]["ok"] == 64
+    assert (tmp_path / "b/landscape.png").exists()
+
+
+# 48 x 48 flights of a ball take seconds, in many tiles: time enough to be killed in the middle.
+LONG = [
+    "slice",
+    "bounce",
+    "--dims",
+    "0",
+    "1",
+    "--resolution",
+    "48",
+    "--fidelity",
+    "reference",
+    "--json",
+    "--out",
+    "cut",
+]
+
+
+def begun(folder: Path) -> subprocess.Popen[str]:
+    """Start the long slice and return once it has written a tile."""
+    process = subprocess.Popen([*COMMAND, *LONG], cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    while not list(folder.glob("cut/slice.zarr/status/c/**/[0-9]*")) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert process.poll() is None, "the slice ended before it could be stopped"
+    return process
+
+
+def test_sigkill_costs_nothing_but_the_tiles_under_way(run: Callable[..., Said], tmp_path: Path) -> None:
+    (tmp_path / "whole").mkdir()
+    (tmp_path / "killed").mkdir()
+    whole = run(*LONG, cwd=tmp_path / "whole")
+    assert whole.returncode == 0, whole.stderr
+    process = begun(tmp_path / "killed")
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    resumed = json.loads(run(*LONG, cwd=tmp_path / "killed").stdout)
+    assert 0 < resumed["resumed"] < 48 * 48
+    assert resumed["episodes"] + resumed["resumed"] == 48 * 48
+    one, two = (gradscape.open_slice(tmp_path / name / "cut/slice.zarr") for name in ("whole", "killed"))
+    for name in ("loss", "grad", "status"):
+        np.testing.assert_array_equal(one[name], two[name])
+
+
+def test_interrupt_ends_cleanly_and_says_how_to_go_on(run: Callable[..., Said], tmp_path: Path) -> None:
+    process = begun(tmp_path)
+    process.send_signal(signal.SIGINT)
+    out, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert out == ""
+    assert "Traceback" not in said
+    assert "the same command goes on from there: landscape slice bounce" in said
+    assert json.loads(run(*LONG, cwd=tmp_path).stdout)["resumed"] > 0

@@ -1,0 +1,36 @@
+"""The package holds every folder, and the constraints every dependency."""
+
+import re
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+def test_packages_are_the_folders_that_hold_code() -> None:
+    tops = ("landscapes", "envs", "optim", "gallery")
+    found = {file.parent.relative_to(ROOT) for top in tops for file in (ROOT / top).rglob("*.py")}
+    names = {"gradscape", *("gradscape." + ".".join(folder.parts) for folder in found)}
+    assert set(PROJECT["tool"]["setuptools"]["packages"]) == names
+
+
+def test_every_linked_folder_is_the_one_at_the_root() -> None:
+    links = {link.name: link.resolve() for link in (ROOT / "src/gradscape").iterdir() if link.is_symlink()}
+    assert links == {name: ROOT / name for name in ("landscapes", "envs", "optim", "gallery", "cli.py")}
+
+
+def test_constraints_are_plain_and_cover_every_dependency() -> None:
+    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
+    assert all(re.fullmatch(r"[A-Za-z0-9_.-]+==[A-Za-z0-9_.]+", line) for line in lines)
+    tested = {line.split("==")[0].lower().replace("_", "-") for line in lines}
+    extras = PROJECT["project"]["optional-dependencies"].values()
+    wanted = [*PROJECT["project"]["dependencies"], *(name for extra in extras for name in extra)]
+    assert {re.split(r"[<>=;\[ ]", name)[0].lower() for name in wanted} <= tested
+
+
+def test_every_dependency_states_its_reason() -> None:
+    text = (ROOT / "pyproject.toml").read_text()
+    lines = [line for line in text.splitlines() if re.match(r'\s+"[a-z-]+>=', line)]
+    assert len(lines) >= 15
+    assert all("#" in line for line in lines)
