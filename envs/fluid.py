@@ -72,7 +72,7 @@ class Fluid(Environment):
         "reference": Fidelity("reference", dt=SPAN / 40, resolution=22, precision="float64"),
     }
     examples: ClassVar[dict[str, tuple[float, ...]]] = {
-        "scoop": (0.62, 0.17, 1.6, -0.33, 0.96, 1.44, 1.32, -1.56, -0.16, 1.56)
+        "scoop": (1.41, -0.77, 0.15, 0.74, 0.08, 1.13, -1.3, 1.41, 0.17, 0.27)
     }
     loss_unit: ClassVar[str] = "m"
     Options: ClassVar[type[Any]] = FluidOptions
