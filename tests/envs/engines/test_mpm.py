@@ -230,14 +230,23 @@ def test_the_gradient_by_the_tools_is_the_slope_on_a_ladder_of_steps(stirred):
     assert errors[0] > 100 * min(errors)  # the slope over a millimetre is another one
 
 
-def test_a_second_gradient_of_the_same_run_has_the_same_bits(stirred):
+def test_gradients_have_the_same_bits_every_time(stirred):
+    solver, path = stirred
+    adj_x = torch.ones((2, solver.model.particles, 3), dtype=torch.float64)
+    gradients = []
+    for _ in range(2):
+        solver.run(path)
+        gradients.append(solver.gradient(adj_x))
+    assert torch.equal(*gradients)
+    assert gradients[0].abs().max() > 0
+
+
+@pytest.mark.xfail(reason="the window holds the first control step by then, and the last is not recomputed")
+def test_a_second_gradient_of_one_run_has_the_same_bits(stirred):
     solver, path = stirred
     adj_x = torch.ones((2, solver.model.particles, 3), dtype=torch.float64)
     solver.run(path)
-    first = solver.gradient(adj_x)
-    solver.run(path)
-    assert torch.equal(solver.gradient(adj_x), first)
-    assert first.abs().max() > 0
+    assert torch.equal(solver.gradient(adj_x), solver.gradient(adj_x))
 
 
 def arrays(thing, seen):
