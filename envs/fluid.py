@@ -189,19 +189,34 @@ def _bodies(pitch: float, options: FluidOptions) -> tuple[Body, Body]:
     counts = round(TANK_WIDTH / pitch), round(FILL / pitch), round(TANK_WIDTH / pitch)
     sides = (TANK_WIDTH, FILL, TANK_WIDTH)
     grid = _lattice(counts, sides) + np.array([0.0, FILL / 2, 0.0])
-    taken = (np.abs(grid - CUBE_CENTER).max(axis=1) < CUBE_EDGE / 2) | (_to_bowl(grid - RIM) < SHELL)
+    volume = _outside_cube(grid, np.divide(sides, counts))
+    free = (np.abs(grid - CUBE_CENTER).max(axis=1) >= CUBE_EDGE / 2) & (_to_bowl(grid - RIM) >= SHELL)
     edge = max(3, round(CUBE_EDGE / pitch))
     syrup = Liquid(SYRUP_DENSITY, SYRUP_DENSITY * SPEED_OF_SOUND**2, options.viscosity)
     sugar = Elastic.with_wave_speed(options.cube_density, SPEED_OF_SOUND, poisson=0.3)
     return (
-        _body(syrup, grid[~taken], float(np.prod(sides) / np.prod(counts))),
-        _body(sugar, _lattice((edge,) * 3, (CUBE_EDGE,) * 3) + CUBE_CENTER, (CUBE_EDGE / edge) ** 3),
+        _body(syrup, grid[free], volume[free]),
+        _body(sugar, _lattice((edge,) * 3, (CUBE_EDGE,) * 3) + CUBE_CENTER, np.full(edge**3, (CUBE_EDGE / edge) ** 3)),
     )
 
 
-def _body(material: Liquid | Elastic, x: np.ndarray, volume: float) -> Body:
+def _body(material: Liquid | Elastic, x: np.ndarray, volume: np.ndarray) -> Body:
     pressure = SYRUP_DENSITY * GRAVITY * np.maximum(FILL - x[:, 1], 0.0)
     return Body(material, x, volume, material.volume_ratio(pressure))
+
+
+def _outside_cube(grid: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    """Return what each particle's cell has outside the cube [m^3], so that the cube displaces just its own volume.
+
+    What cells with their centre in the cube (they get no particle) have outside goes to those its surface cuts.
+    """
+    reach = np.clip((CUBE_EDGE + cell) / 2 - np.abs(grid - CUBE_CENTER), 0.0, np.minimum(cell, CUBE_EDGE))
+    volume = np.asarray(np.prod(cell) - np.prod(reach, axis=1))
+    inside = np.abs(grid - CUBE_CENTER).max(axis=1) < CUBE_EDGE / 2
+    cut = ~inside & (volume < np.prod(cell) * (1 - 1e-9))
+    if cut.any():
+        volume[cut] *= 1.0 + volume[inside].sum() / volume[cut].sum()
+    return volume
 
 
 def _lattice(counts: tuple[int, ...], sides: tuple[float, ...]) -> np.ndarray:

@@ -170,21 +170,8 @@ def test_bounce_counts_the_bounces_it_marks(run: Callable[..., Said], tmp_path: 
     assert (tmp_path / "b/landscape.png").exists()
 
 
-# 48 x 48 flights of a ball take seconds, in many tiles: time enough to be killed in the middle.
-LONG = [
-    "slice",
-    "bounce",
-    "--dims",
-    "0",
-    "1",
-    "--resolution",
-    "48",
-    "--fidelity",
-    "reference",
-    "--json",
-    "--out",
-    "cut",
-]
+# 64 x 64 flights of a ball take seconds, in many tiles: time enough to be stopped in the middle.
+LONG = "slice bounce --dims 0 1 --resolution 64 --fidelity standard --json --out cut".split()
 
 
 def begun(folder: Path) -> subprocess.Popen[str]:
@@ -206,8 +193,8 @@ def test_sigkill_costs_nothing_but_the_tiles_under_way(run: Callable[..., Said],
     process.send_signal(signal.SIGKILL)
     process.communicate()
     resumed = json.loads(run(*LONG, cwd=tmp_path / "killed").stdout)
-    assert 0 < resumed["resumed"] < 48 * 48
-    assert resumed["episodes"] + resumed["resumed"] == 48 * 48
+    assert 0 < resumed["resumed"] < 64 * 64
+    assert resumed["episodes"] + resumed["resumed"] == 64 * 64
     one, two = (gradscape.open_slice(tmp_path / name / "cut/slice.zarr") for name in ("whole", "killed"))
     for name in ("loss", "grad", "status"):
         np.testing.assert_array_equal(one[name], two[name])

@@ -14,10 +14,16 @@ import warp as wp
 
 from .runtime import precision
 
+TORN = 1.1  # volume ratio at which a fluid tears
+
 
 @dataclass(frozen=True)
 class Fluid:
-    """A viscous, weakly compressible fluid: density [kg/m^3], bulk modulus [Pa], dynamic viscosity [Pa s]."""
+    """A viscous, weakly compressible fluid: density [kg/m^3], bulk modulus [Pa], dynamic viscosity [Pa s].
+
+    It bears tension up to a tenth more than its volume, then tears: J grows no further, so that a droplet in the air
+    neither pulls itself together nor, its stiffness rising with J, outgrows the time step.
+    """
 
     density: float
     bulk: float
@@ -124,9 +130,9 @@ def _fluid_kernels(name: str) -> tuple[Any, Any]:
 
     @wp.kernel(module=module, name=f"fluid_deform_{name}")
     def deform(first: int, dt: real, J: wp.array2d[real], C_new: wp.array2d[mat33], J_new: wp.array2d[real]):
-        """Advance J' = (1 + dt tr C') J."""
+        """Advance J' = min((1 + dt tr C') J, TORN)."""
         e, p = wp.tid()
-        J_new[e, p] = (real(1.0) + dt * wp.trace(C_new[e, first + p])) * J[e, p]
+        J_new[e, p] = wp.min((real(1.0) + dt * wp.trace(C_new[e, first + p])) * J[e, p], real(TORN))
 
     return stress, deform
 

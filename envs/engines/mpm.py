@@ -32,12 +32,17 @@ EMPTY = 1e-8  # nodes lighter than this part of a particle carry no velocity
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """One body of equal particles: positions `x` [m], shape (particle, 3), `volume` [m^3] of each, initial J."""
+    """One body: positions `x` [m], shape (particle, 3), `volume` [m^3] and initial `ratio` J, shape (particle,)."""
 
     material: Material
     x: np.ndarray
-    volume: float
+    volume: np.ndarray
     ratio: np.ndarray
+
+    @property
+    def mass(self) -> np.ndarray:
+        """Mass of each particle [kg]."""
+        return self.material.density * self.volume
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +64,11 @@ class Model:
     def particles(self) -> int:
         """Number of particles of all bodies."""
         return sum(len(body.x) for body in self.bodies)
+
+    @property
+    def lightest(self) -> float:
+        """Mass of the lightest particle [kg]."""
+        return min(float(body.mass.min()) for body in self.bodies)
 
     def bytes_per_environment(self) -> int:
         """Return what one environment of a solver takes, adjoints included."""
@@ -106,7 +116,7 @@ class Solver:
         transferring = [self.kernels.p2g, self.kernels.g2p, self.kernels.adjoint_p2g, self.kernels.adjoint_g2p]
         load([*transferring, self.velocity, *chain.from_iterable(self.materials)], device)
         self.first = np.concatenate([[0], np.cumsum([len(body.x) for body in model.bodies])]).tolist()
-        self.mass = self._constant([body.material.density * body.volume for body in model.bodies])
+        self.mass = self._constant([body.mass for body in model.bodies])
         self.volume = self._constant([body.volume for body in model.bodies])
         self.lattice = self._lattice()
         self.checkpoints = [self._frame() for _ in range(model.steps + 1)]
@@ -116,6 +126,7 @@ class Solver:
         self.grids = [Grid(*(self._array(self.types.vec4, cells) for _ in range(2))) for _ in range(model.substeps)]
         self.tools = self._tools()
         self.escaped = wp.zeros(capacity, dtype=wp.int32, device=device)
+        self.held = -1  # the control step whose frames and grids are in the window
         self.adjoint: _Adjoint | None = None
         self._start()
 
@@ -151,6 +162,7 @@ class Solver:
     def _advance(self, step: int, batch: int) -> None:
         if self.stop.is_set():
             raise InterruptedError("the simulation was stopped")
+        self.held = step
         frames = self.frames(step)
         for s in range(self.model.substeps):
             self.stress(frames[s], batch)
@@ -188,7 +200,7 @@ class Solver:
     def velocity_inputs(self, step: int, substep: int) -> list[Any]:
         """Return the arguments of the grid's velocity kernel."""
         model = self.model
-        empty = EMPTY * min(body.material.density * body.volume for body in model.bodies)
+        empty = EMPTY * model.lightest
         time = [step, substep / model.substeps, 1.0 / (model.substeps * model.dt)]
         grid = self.grids[substep]
         return [self.lattice, model.dt, model.gravity, empty, *time, self.tools, grid.m, grid.v]
@@ -213,9 +225,8 @@ class Solver:
     def _tools(self) -> wp.array:
         return wp.zeros((self.capacity, self.model.steps + 1, 1), dtype=self.types.vec3, device=self.device)
 
-    def _constant(self, values: list[float]) -> wp.array:
-        each = np.concatenate([np.full(len(b.x), value) for b, value in zip(self.model.bodies, values, strict=True)])
-        return wp.array(each, dtype=self.types.real, device=self.device)
+    def _constant(self, values: list[np.ndarray]) -> wp.array:
+        return wp.array(np.concatenate(values), dtype=self.types.real, device=self.device)
 
     def _lattice(self) -> Any:
         lattice = self.kernels.Lattice()
@@ -248,7 +259,7 @@ class _Adjoint:
             array.zero_()
         to_torch(self.new.x)[:batch] = adj_x.to(solver.types.torch)
         for step in reversed(range(solver.model.steps)):
-            if step < solver.model.steps - 1:  # the run has left the last step's frames in the window
+            if solver.held != step:
                 solver._advance(step, batch)
             self._retreat(step, batch)
         return to_torch(self.tools)[:batch].clone()

@@ -7,7 +7,7 @@ import pytest
 import torch
 import warp as wp
 
-from gradscape.envs.engines.materials import Elastic, Fluid
+from gradscape.envs.engines.materials import TORN, Elastic, Fluid
 from gradscape.envs.engines.runtime import precision, to_torch
 
 SYRUP = Fluid(density=1300.0, bulk=4e4, viscosity=4.0)
@@ -161,16 +161,25 @@ def test_particles_carry_their_affine_momentum():
     torch.testing.assert_close(Bench(RUBBER).affine(at_rest, C), MASS * C, rtol=0, atol=1e-12)
 
 
+def test_a_fluid_tears_instead_of_stretching_on():
+    J = torch.ones(1, dtype=torch.float64)
+    expanding, contracting = (rate * IDENTITY[None] for rate in (10.0, -10.0))
+    for _ in range(100):
+        J = Bench(SYRUP).deform(J, expanding, 0.01)
+    assert float(J) == TORN
+    assert float(Bench(SYRUP).deform(J, contracting, 0.01)) < TORN
+
+
 def test_states_follow_a_constant_motion_at_first_order():
     """F' = C F is solved by exp(t C), J' = tr(C) J by exp(t tr C)."""
     C = 2 * draw(6, 3, 3, seed=6)
     trace = C.diagonal(dim1=-2, dim2=-1).sum(-1)
     errors = []
     for steps in (100, 200, 400):
-        F, J = IDENTITY.expand(6, 3, 3), torch.ones(6, dtype=torch.float64)
+        F, J = IDENTITY.expand(6, 3, 3), torch.full((6,), 0.5, dtype=torch.float64)
         for _ in range(steps):
             F, J = Bench(RUBBER).deform(F, C, 0.1 / steps), Bench(SYRUP).deform(J, C, 0.1 / steps)
-        far_F, far_J = F - torch.linalg.matrix_exp(0.1 * C), J - torch.exp(0.1 * trace)
+        far_F, far_J = F - torch.linalg.matrix_exp(0.1 * C), J - 0.5 * torch.exp(0.1 * trace)
         errors.append(float(far_F.abs().max() + far_J.abs().max()))
     assert all(math.isclose(ratio, 2, abs_tol=0.1) for ratio in np.array(errors[:-1]) / errors[1:])
 
