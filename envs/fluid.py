@@ -26,7 +26,7 @@ CUBE_EDGE, CUBE_CENTER = 0.05, (0.11, 0.122, 0.0)  # [m]
 BOWL, SHELL, HANDLE = 0.07, 0.01, 0.25  # the ladle: radius, half its thickness, its handle's height [m]
 RIM = (0.0, 0.09, 0.0)  # centre of the bowl's rim at the start [m]
 LOWEST, HIGHEST = 0.085, 0.3  # how far the rim can go [m]
-SYRUP_DENSITY, SPEED_OF_SOUND = 1330.0, 6.0  # [kg/m^3], [m/s]
+SYRUP_DENSITY, SPEED_OF_SOUND = 1330.0, 5.0  # [kg/m^3], [m/s]
 GRAVITY = 9.81  # [m/s^2]
 SEGMENTS, STEPS, SPAN = 5, 50, 0.01  # control segments, control steps, length of a step [s]
 MARGIN = 2  # nodes outside the walls
@@ -55,9 +55,9 @@ class Fluid(Environment):
     Parameters: ladle speed x, y [m/s] in each of 5 segments of 0.1 s; even numbers are horizontal, odd ones vertical.
     Loss at 0.5 s [m], cube's centre (x, y, z): max(0, 0.2 - y) + 3 |(x, z) - ladle| + |(x, z) - tank's axis|. The paper
     prints max(0, y - 0.2), which rewards a low cube although the goal is "as high as possible"; that is goal=printed.
-    Simplifications: sound travels at 6 m/s, so that the syrup compresses by a few percent and a step may be long; walls
+    Simplifications: sound travels at 5 m/s, so that the syrup compresses by some percent and a step may be long; walls
     are slippery and reach up to a lid at 0.6 m, so that no syrup is lost; the ladle has no mass and stops where it
-    would leave the tank; the cube is as soft as that speed of sound makes it (38 kPa), which is stiff beside the loads
+    would leave the tank; the cube is as soft as that speed of sound makes it (26 kPa), which is stiff beside the loads
     on it; the shell is felt over a fraction of a grid cell.
     Source: task Fluid of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
     2022), appendix A.2.1; material and geometry where it is silent are ours.
@@ -176,7 +176,7 @@ def _model(fidelity: Fidelity, options: FluidOptions) -> Model:
         boundary=LadleInTank(TANK_WIDTH / 2, HEADROOM, BOWL, SHELL, HANDLE, band=0.75 * dx, friction=options.friction),
         origin=(corner, -MARGIN * dx, corner),
         dx=dx,
-        nodes=(across, int(np.ceil(HEADROOM / dx)) + 1 + MARGIN, across),
+        nodes=(across, int(np.ceil(HEADROOM / dx)) + 1 + 2 * MARGIN, across),
         dt=fidelity.dt,
         substeps=round(SPAN / fidelity.dt),
         steps=STEPS,

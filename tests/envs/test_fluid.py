@@ -108,7 +108,7 @@ def test_threads_share_a_batch_without_changing_a_bit(tiny, monkeypatch):
 
 
 def test_syrup_thrown_out_of_the_grid_is_an_escape_and_spoils_no_other_row(monkeypatch):
-    monkeypatch.setattr(fluid, "HEADROOM", 0.2)
+    monkeypatch.setattr(fluid, "HEADROOM", 0.1)
     monkeypatch.setattr(fluid, "LadleInTank", lambda *args, **kw: replace(LadleInTank(*args, **kw), lid=9.0))
     low = Fluid(fidelity=TINY, device="cpu")
     x = STILL.repeat(3, 1)

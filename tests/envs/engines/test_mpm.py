@@ -209,7 +209,7 @@ def stirred():
     """
     model = tank(SYRUP, 0.05, at_rest=True, steps=6)
     time = torch.linspace(0, 1, model.steps + 1, dtype=torch.float64)
-    path = torch.stack([0.003 + 0.02 * time, 0.113 - 0.05 * time, 0.007 + 0.01 * time], dim=-1)[None, :, None]
+    path = torch.stack([0.003 + 0.02 * time, 0.1141 - 0.05 * time, 0.007 + 0.01 * time], dim=-1)[None, :, None]
     return Solver(model, capacity=2, device="cpu"), path.expand(2, -1, -1, -1).contiguous()
 
 

@@ -1,0 +1,35 @@
+"""On a GPU the same kernels give the same losses and gradients; skipped where there is none."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gradscape.envs.engines.runtime import cuda_available
+from gradscape.envs.registry import entries, environment_class, make
+
+SCENES = [name for name in entries() if "cuda" in environment_class(name).devices]
+
+pytestmark = pytest.mark.skipif(not cuda_available(), reason="no CUDA device")
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(("precision", "loss", "grad"), [("float64", 1e-12, 1e-10), ("float32", 1e-4, 1e-3)])
+def test_cuda_agrees_with_the_cpu(name: str, precision: str, loss: float, grad: float) -> None:
+    fidelity = replace(environment_class(name).fidelities["draft"], precision=precision)
+    one, other = (make(name, fidelity=fidelity, device=device) for device in ("cpu", "cuda"))
+    x = one.space.uniform(5, seed=1)
+    cpu, cuda = one.evaluate(x), other.evaluate(x)
+    assert cpu.grad is not None
+    assert cuda.grad is not None
+    assert torch.equal(cpu.status, cuda.status)
+    assert float((cpu.loss - cuda.loss).abs().max()) <= loss * float(cpu.loss.abs().max())
+    assert float((cpu.grad - cuda.grad).norm()) <= grad * float(cpu.grad.norm())
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_gradients_on_cuda_are_slopes(name: str) -> None:
+    fidelity = replace(environment_class(name).fidelities["draft"], precision="float64")
+    env = make(name, fidelity=fidelity, device="cuda")
+    x = env.space.uniform(1, seed=2).requires_grad_()
+    assert torch.autograd.gradcheck(env, (x,), nondet_tol=1e-7, rtol=1e-3)
