@@ -171,7 +171,7 @@ def test_bounce_counts_the_bounces_it_marks(run: Callable[..., Said], tmp_path: 
 
 
 # 64 x 64 flights of a ball take seconds, in many tiles: time enough to be stopped in the middle.
-LONG = "slice bounce --dims 0 1 --resolution 64 --fidelity standard --json --out cut".split()
+LONG = ["slice", "bounce", "--dims", "0", "1", "--resolution", "64", "--fidelity", "standard", "--json", "--out", "cut"]
 
 
 def begun(folder: Path) -> subprocess.Popen[str]:

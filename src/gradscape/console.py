@@ -26,7 +26,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from .envs.registry import entries, environment_class, make
+from .envs.registry import code_digest, entries, environment_class, make
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -135,6 +135,7 @@ def _open(env: Environment, plane: Plane, *, out: str | None, grad: bool, force:
         "fidelity": env.fidelity.name,
         "settings": asdict(env.fidelity),
         "device": env.device,
+        "code": code_digest(env.name),
     }
     provenance = {
         "command": command,
