@@ -110,6 +110,9 @@ class Environment(abc.ABC):
         """Count what happens in each episode, name -> shape (batch,); where a count changes, losses may jump."""
         return {}
 
+    def prepare(self) -> None:  # noqa: B027 -- most have nothing to prepare
+        """Compile what evaluations need, so that the first is as quick as the next."""
+
     def memory(self, *, grad: bool = True) -> int:
         """Estimate the bytes one episode takes while it runs."""
         return 0

@@ -83,6 +83,11 @@ class Bounce(Environment):
         """Number of time steps of an episode."""
         return round(DURATION / self.fidelity.dt)
 
+    def prepare(self) -> None:
+        """Compile the kernels, or fetch them from the cache."""
+        with self._solvers.lend():
+            pass
+
     def memory(self, *, grad: bool = True) -> int:
         """Estimate the bytes one episode takes while it runs."""
         return (self.steps + 1) * 4 * 3 * (8 if self.fidelity.precision == "float64" else 4)

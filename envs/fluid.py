@@ -30,6 +30,7 @@ SYRUP_DENSITY, SPEED_OF_SOUND = 1330.0, 5.0  # [kg/m^3], [m/s]
 GRAVITY = 9.81  # [m/s^2]
 SEGMENTS, STEPS, SPAN = 5, 50, 0.01  # control segments, control steps, length of a step [s]
 MARGIN = 2  # nodes outside the walls
+FULL_CARD = 2_000_000  # particles that keep a GPU busy
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,11 @@ class Fluid(Environment):
         """Number of points worth evaluating at once."""
         return 4 * self.threads if self.device == "cpu" else self._capacity
 
+    def prepare(self) -> None:
+        """Compile the kernels, or fetch them from the cache."""
+        with self._solvers.lend():
+            pass
+
     def memory(self, *, grad: bool = True) -> int:
         """Estimate the bytes one episode takes while it runs."""
         return self.model.bytes_per_environment()
@@ -124,9 +130,10 @@ class Fluid(Environment):
     def _setup(self) -> None:
         self.model = _model(self.fidelity, self.options)
         self._solvers = Pool(self._solver)
-        self._capacity = 4
+        self._capacity = 4  # enough to hide what a launch costs, few enough for the cache
         if self.device == "cuda":
-            self._capacity = max(1, min(1024, free_memory() * 3 // 4 // self.memory()))
+            fitting = free_memory() * 3 // 4 // self.memory()
+            self._capacity = max(1, min(1024, FULL_CARD // self.model.particles, fitting))
 
     def _solver(self) -> Solver:
         return Solver(self.model, capacity=self._capacity, device=self.device, stop=self._stop)

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
+from jaxtyping import Float
+from torch import Tensor
 
 from .objective import Objective, Status
 from .plane import Plane
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 
 STORE, PICTURE, SUMMARY = "slice.zarr", "landscape.png", "summary.json"
 PAUSE = 10.0  # least seconds between two pictures of an unfinished slice
+PATIENCE = 1.0  # seconds per episode from which a single one must do for an estimate
 
 
 @dataclass(frozen=True)
@@ -73,19 +76,24 @@ class Job:
         return cls(objective, plane, folder, store, draw)
 
     def cost(self) -> Cost:
-        """Estimate what is left from one batch of its own points, evaluated twice: to warm up and to time."""
+        """Estimate what is left from its own first points: a batch, or one episode where that is long already."""
         pending = self.store.pending()
         left = sum(self.store.count(tile) for tile in pending)
         if not left:
             return Cost(0, 0.0, _peak_memory())
         points = self.store.points(pending[0])
         trial = points[: min(len(points), getattr(self.objective, "preferred_batch", 1))]
-        self.objective.evaluate(trial[:1], grad=self.store.grad)
-        start = time.perf_counter()
-        self.objective.evaluate(trial, grad=self.store.grad)
-        seconds = (time.perf_counter() - start) / len(trial) * left
+        getattr(self.objective, "prepare", lambda: None)()
+        seconds = left * self._seconds(trial[:1]) / getattr(self.objective, "threads", 1)
+        if seconds < left * PATIENCE:
+            seconds = left * self._seconds(trial) / len(trial)
         arrays = 8 * int(np.prod(self.plane.resolution)) * (2 + self.plane.dim * self.store.grad)
         return Cost(left, seconds, _peak_memory() + arrays)
+
+    def _seconds(self, points: Float[Tensor, "batch dim"]) -> float:
+        start = time.perf_counter()
+        self.objective.evaluate(points, grad=self.store.grad)
+        return time.perf_counter() - start
 
     def run(self, progress: Callable[[Progress], None], *, command: str) -> dict[str, Any]:
         """Sample what is missing, draw each finer picture as it completes, write and return the summary."""

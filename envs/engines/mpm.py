@@ -27,7 +27,7 @@ from .materials import Fluid, Material
 from .runtime import flushed, load, precision, to_torch
 from .transfers import transfers
 
-EMPTY = 1e-8  # nodes lighter than this part of a particle carry no velocity
+EMPTY = 1e-8  # nodes lighter than this part of the lightest particle carry no velocity
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +64,6 @@ class Model:
     def particles(self) -> int:
         """Number of particles of all bodies."""
         return sum(len(body.x) for body in self.bodies)
-
-    @property
-    def lightest(self) -> float:
-        """Mass of the lightest particle [kg]."""
-        return min(float(body.mass.min()) for body in self.bodies)
 
     def bytes_per_environment(self) -> int:
         """Return what one environment of a solver takes, adjoints included."""
@@ -118,6 +113,7 @@ class Solver:
         self.first = np.concatenate([[0], np.cumsum([len(body.x) for body in model.bodies])]).tolist()
         self.mass = self._constant([body.mass for body in model.bodies])
         self.volume = self._constant([body.volume for body in model.bodies])
+        self.empty = EMPTY * min(float(body.mass.min()) for body in model.bodies)
         self.lattice = self._lattice()
         self.checkpoints = [self._frame() for _ in range(model.steps + 1)]
         self.window = [self._frame() for _ in range(model.substeps - 1)]
@@ -200,10 +196,9 @@ class Solver:
     def velocity_inputs(self, step: int, substep: int) -> list[Any]:
         """Return the arguments of the grid's velocity kernel."""
         model = self.model
-        empty = EMPTY * model.lightest
         time = [step, substep / model.substeps, 1.0 / (model.substeps * model.dt)]
         grid = self.grids[substep]
-        return [self.lattice, model.dt, model.gravity, empty, *time, self.tools, grid.m, grid.v]
+        return [self.lattice, model.dt, model.gravity, self.empty, *time, self.tools, grid.m, grid.v]
 
     def size(self, b: int) -> int:
         """Return the number of particles of body b."""
