@@ -144,7 +144,7 @@ def main(arguments: list[str] | None = None) -> Any:
     except OSError as error:
         code = _fail(str(error), 1)
     except (KeyboardInterrupt, typer.Abort):
-        code = 130
+        code = _fail("stopped before anything was computed; the same command begins again", 130)
     sys.exit(code)
 
 

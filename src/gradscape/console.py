@@ -120,7 +120,7 @@ def cut(
         summary = _run(console, job, command)
     except KeyboardInterrupt:
         _farewell(console, job, command)
-        raise
+        sys.exit(130)
     if as_json:
         print(json.dumps({**summary, "folder": str(job.folder)}))
     console.print(_outcome(summary) + f"\n{job.folder}: {', '.join(summary['files'])}", markup=False)
