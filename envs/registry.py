@@ -93,7 +93,10 @@ def environment_class(name: str) -> type[Environment]:
         hint = f"; did you mean {close[0]}?" if close else ""
         raise ValueError(f"no environment is called {name!r}{hint} `landscape envs` lists all {len(known)}")
     module, _, attribute = known[name].target.partition(":")
-    found: type[Environment] = getattr(import_module(module), attribute)
+    try:
+        found: type[Environment] = getattr(import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"{name} is registered as {known[name].target}, which cannot be imported: {error}") from error
     return found
 
 

@@ -108,7 +108,7 @@ def cut(
     """Sample a slice into its folder and say what it costs, how far it is and what came out."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     env = make(name, fidelity=fidelity, device=device, **_options(settings))
-    from .envs.points import point
+    from .envs.points import point  # after make: a name that does not exist is refused before torch is loaded
     from .landscapes.plane import Plane
 
     window = _extent(extent)

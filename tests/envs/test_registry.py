@@ -6,7 +6,7 @@ import sys
 import pytest
 import torch
 
-from gradscape.envs.registry import BUILTIN, GROUP, entries, environment_class, make
+from gradscape.envs.registry import BUILTIN, GROUP, code_digest, entries, environment_class, make
 
 ENVIRONMENT = """
 import torch
@@ -57,6 +57,22 @@ def test_another_packages_environment_is_listed_then_made(package):
     torch.testing.assert_close(arm.evaluate(x).loss, x.square().sum(dim=1))
     assert torch.autograd.gradcheck(arm, (x.requires_grad_(),))
     assert environment_class("my-arm") is type(arm)
+
+
+def test_a_digest_follows_the_code_the_numbers_come_from(package, tmp_path):
+    package({"my-arm": "gradscape_test_arm:Arm"})
+    before = code_digest("my-arm")
+    assert code_digest("my-arm") == before
+    (tmp_path / "gradscape_test_arm.py").write_text(ENVIRONMENT.replace("2 * x", "3 * x"))
+    assert code_digest("my-arm") != before
+    assert code_digest("bounce") == code_digest("fluid") != before
+
+
+@pytest.mark.parametrize("target", ["gradscape_no_such_module:Arm", "gradscape_test_arm:Leg"])
+def test_an_entry_point_that_leads_nowhere_is_refused_with_its_target(package, target):
+    package({"my-arm": target})
+    with pytest.raises(ValueError, match=f"my-arm is registered as {target}, which cannot be imported"):
+        make("my-arm")
 
 
 def test_a_name_that_is_taken_is_refused_with_both_owners(package):
