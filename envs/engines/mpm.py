@@ -24,7 +24,7 @@ import warp as wp
 
 from .boundaries import Boundary
 from .materials import Fluid, Material
-from .runtime import flushed, load, precision, to_torch
+from .runtime import load, precision, to_torch
 from .transfers import transfers
 
 EMPTY = 1e-8  # nodes lighter than this part of the lightest particle carry no velocity
@@ -131,9 +131,8 @@ class Solver:
         batch = len(tools)
         self.escaped.zero_()
         to_torch(self.tools)[:batch] = tools.to(self.types.torch)
-        with flushed():
-            for step in range(self.model.steps):
-                self._advance(step, batch)
+        for step in range(self.model.steps):
+            self._advance(step, batch)
         return to_torch(self.checkpoints[-1].x)[:batch]
 
     def positions(self, environment: int) -> torch.Tensor:
@@ -148,8 +147,7 @@ class Solver:
         """Return the adjoint of the tools of the last run from that of its last positions, same shapes."""
         if self.adjoint is None:
             self.adjoint = _Adjoint(self)
-        with flushed():
-            return self.adjoint.run(adj_x)
+        return self.adjoint.run(adj_x)
 
     def frames(self, step: int) -> list[Frame]:
         """Return the frames of one control step, both ends included."""

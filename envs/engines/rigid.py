@@ -7,7 +7,7 @@ from typing import Any, no_type_check
 import torch
 import warp as wp
 
-from .runtime import flushed, load, precision, to_torch
+from .runtime import load, precision, to_torch
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,8 @@ class Solver:
         batch = len(velocity)
         to_torch(self.x)[0, :batch] = start.to(self.types.torch)
         to_torch(self.v)[0, :batch] = velocity.to(self.types.torch)
-        with flushed():
-            for step in range(self.steps):
-                wp.launch(self.kernel, batch, self._inputs(step), device=self.device, record_tape=False)
+        for step in range(self.steps):
+            wp.launch(self.kernel, batch, self._inputs(step), device=self.device, record_tape=False)
         return to_torch(self.x)[:, :batch]
 
     def gradient(self, adj_x: torch.Tensor) -> torch.Tensor:

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, Generic, TypeVar
 
-import numpy as np
 import torch
 import warp as wp
 
@@ -82,17 +81,6 @@ def to_torch(array: wp.array) -> torch.Tensor:
     """View a Warp array as a tensor of the same memory."""
     tensor: torch.Tensor = wp.to_torch(array, requires_grad=False)
     return tensor
-
-
-@contextmanager
-def flushed() -> Iterator[None]:
-    """Round subnormal numbers to zero in this thread: adjoints are full of them, and they slow a CPU down."""
-    before = bool(np.float64(5e-324) * np.float64(1.0) == 0.0)
-    torch.set_flush_denormal(True)
-    try:
-        yield
-    finally:
-        torch.set_flush_denormal(before)
 
 
 def load(kernels: Iterable[Any], device: str) -> None:
