@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, final
+from typing import TYPE_CHECKING, Any, ClassVar, final
 
 import torch
 from jaxtyping import Float, Int
@@ -17,6 +17,9 @@ from torch import Tensor
 from ..landscapes.objective import Evaluation
 from ..landscapes.space import ParameterSpace
 from .options import NoOptions, read_options
+
+if TYPE_CHECKING:
+    from .engines.runtime import Pool
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,8 @@ class Environment(abc.ABC):
     loss_unit: ClassVar[str] = ""
 
     space: ParameterSpace
+    _solvers: Pool[Any] | None = None  # a scene on an engine sets both in `_setup`: what simulates,
+    _capacity = 1 << 20  # and how many rows it takes at once
 
     def __init__(self, *, fidelity: str | Fidelity | None = None, device: str = "auto", **options: Any) -> None:
         self.fidelity = self._named_fidelity(fidelity)
@@ -81,8 +86,8 @@ class Environment(abc.ABC):
         """
         x = self._checked(x)
         if len(x) == 0:
-            return _empty(x, grad)
-        parts = torch.split(x, self._share(len(x), grad=grad))
+            return Evaluation.empty(self.space.dim, grad=grad)
+        parts = torch.split(x, self._share(len(x)))
         with self._pool(len(parts)) as each:
             results = list(each(lambda part: self._simulate(part, grad=grad), parts))
         loss = torch.cat([r.loss.to(x) for r in results])
@@ -110,17 +115,21 @@ class Environment(abc.ABC):
         """Count what happens in each episode, name -> shape (batch,); where a count changes, losses may jump."""
         return {}
 
-    def prepare(self) -> None:  # noqa: B027 -- most have nothing to prepare
-        """Compile what evaluations need, so that the first is as quick as the next."""
+    @final
+    def prepare(self) -> None:
+        """Compile the kernels, or fetch them from the cache, so that the first evaluation is as quick as the next."""
+        if self._solvers is not None:
+            with self._solvers.lend():
+                pass
 
-    def memory(self, *, grad: bool = True) -> int:
+    def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
         return 0
 
     @property
     def threads(self) -> int:
-        """Number of Python threads a batch is spread over."""
-        return 1
+        """Number of Python threads a batch is spread over: an engine's CPU kernels leave each other alone."""
+        return _cores() if self._solvers is not None and self.device == "cpu" else 1
 
     @property
     def preferred_batch(self) -> int:
@@ -138,12 +147,8 @@ class Environment(abc.ABC):
     def _setup(self) -> None:  # noqa: B027 -- a scene that shares nothing needs none
         """Prepare what all evaluations share; sets `space` unless the class does."""
 
-    def _largest_part(self, *, grad: bool) -> int:
-        """Return how many rows `_evaluate` takes at the most."""
-        return 1 << 20
-
-    def _share(self, rows: int, *, grad: bool) -> int:
-        return max(1, min(-(-rows // self.threads), self._largest_part(grad=grad)))
+    def _share(self, rows: int) -> int:
+        return max(1, min(-(-rows // self.threads), self._capacity))
 
     @contextmanager
     def _pool(self, parts: int) -> Iterator[Any]:
@@ -208,10 +213,6 @@ class _Bridge(torch.autograd.Function):
         return grad_loss[:, None] * grad, None
 
 
-def _empty(x: Tensor, grad: bool) -> Evaluation:
-    return Evaluation.judged(x.new_zeros(0), x.new_zeros(x.shape) if grad else None)
-
-
 def _kind(x: object) -> str:
     return f"a tensor of {x.dtype}" if isinstance(x, Tensor) else type(x).__name__
 
@@ -220,3 +221,9 @@ def _cuda() -> bool:
     from .engines.runtime import cuda_available
 
     return cuda_available()
+
+
+def _cores() -> int:
+    from .engines.runtime import cores
+
+    return cores()

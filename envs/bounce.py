@@ -14,7 +14,7 @@ from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
 from .base import Environment, Episode, Fidelity
 from .engines.rigid import Ball, Solver
-from .engines.runtime import Pool, cores
+from .engines.runtime import Pool
 
 START = (-0.5, 1.0, 0.0)  # [m]
 DURATION = 2.0  # [s]
@@ -61,17 +61,13 @@ class Bounce(Environment):
     loss_unit: ClassVar[str] = "m²"
     Options: ClassVar[type[Any]] = BounceOptions
     examples: ClassVar[dict[str, tuple[float, ...]]] = {"aim": (6.12, -9.68, 0.0)}
+    _solvers: Pool[Solver]
     space = ParameterSpace(
         ("velocity x", "velocity y", "velocity z"),
         torch.full((3,), -10.0, dtype=torch.float64),
         torch.full((3,), 10.0, dtype=torch.float64),
         ("m/s",) * 3,
     )
-
-    @property
-    def threads(self) -> int:
-        """Number of Python threads a batch is spread over."""
-        return cores() if self.device == "cpu" else 1
 
     @property
     def preferred_batch(self) -> int:
@@ -83,12 +79,7 @@ class Bounce(Environment):
         """Number of time steps of an episode."""
         return round(DURATION / self.fidelity.dt)
 
-    def prepare(self) -> None:
-        """Compile the kernels, or fetch them from the cache."""
-        with self._solvers.lend():
-            pass
-
-    def memory(self, *, grad: bool = True) -> int:
+    def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
         return (self.steps + 1) * 4 * 3 * (8 if self.fidelity.precision == "float64" else 4)
 
@@ -135,9 +126,6 @@ class Bounce(Environment):
             capacity=self._capacity,
             device=self.device,
         )
-
-    def _largest_part(self, *, grad: bool) -> int:
-        return self._capacity
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         with self._solvers.lend() as solver:

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from ..landscapes.objective import Evaluation, Status
@@ -18,7 +18,7 @@ from .engines.boundaries import LadleInTank
 from .engines.materials import Elastic
 from .engines.materials import Fluid as Liquid
 from .engines.mpm import Body, Model, Solver
-from .engines.runtime import Pool, cores, free_memory
+from .engines.runtime import Pool, free_memory
 
 TANK_WIDTH, TANK_HEIGHT, FILL = 0.4, 0.2, 0.15  # the tank, and the depth of the syrup [m]
 HEADROOM = 0.6  # what the grid covers above the floor [m]
@@ -77,6 +77,7 @@ class Fluid(Environment):
     }
     loss_unit: ClassVar[str] = "m"
     Options: ClassVar[type[Any]] = FluidOptions
+    _solvers: Pool[Solver]
     space = ParameterSpace.box(
         [f"ladle {axis} speed, segment {segment}" for segment in range(1, SEGMENTS + 1) for axis in "xy"],
         -2.0,
@@ -85,21 +86,11 @@ class Fluid(Environment):
     )
 
     @property
-    def threads(self) -> int:
-        """Number of Python threads a batch is spread over."""
-        return cores() if self.device == "cpu" else 1
-
-    @property
     def preferred_batch(self) -> int:
         """Number of points worth evaluating at once."""
-        return 4 * self.threads if self.device == "cpu" else self._capacity
+        return self._capacity * self.threads
 
-    def prepare(self) -> None:
-        """Compile the kernels, or fetch them from the cache."""
-        with self._solvers.lend():
-            pass
-
-    def memory(self, *, grad: bool = True) -> int:
+    def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
         return self.model.bytes_per_environment()
 
@@ -114,8 +105,9 @@ class Fluid(Environment):
 
     def cube(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch 3"]:
         """Return where the cube's centre is at the end of the episode [m]."""
-        parts = torch.split(self._checked(x), self._capacity)
-        return torch.cat([self._center(self._fly(self.ladle(part))[0]) for part in parts])
+        with self._solvers.lend() as solver:
+            parts = torch.split(self._checked(x), self._capacity)
+            return torch.cat([self._center(solver.run(self.ladle(part)).double().cpu()) for part in parts])
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return syrup, cube and ladle at the ends of control steps."""
@@ -138,9 +130,6 @@ class Fluid(Environment):
     def _solver(self) -> Solver:
         return Solver(self.model, capacity=self._capacity, device=self.device, stop=self._stop)
 
-    def _largest_part(self, *, grad: bool) -> int:
-        return self._capacity
-
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         x = x.clone().requires_grad_(grad)
         tools = self.ladle(x)
@@ -150,10 +139,6 @@ class Fluid(Environment):
             loss = self._loss(self._center(end), tools[:, -1, 0])
             slope = _pull_back(solver, loss, end, tools, x) if grad else None
         return Evaluation(loss.detach(), slope, torch.where(escaped, int(Status.ESCAPED), int(Status.OK)))
-
-    def _fly(self, tools: Tensor) -> tuple[Float[Tensor, "batch particle 3"], Bool[Tensor, " batch"]]:
-        with self._solvers.lend() as solver:
-            return solver.run(tools).double().cpu(), solver.left_grid(len(tools)).cpu()
 
     def _center(self, end: Float[Tensor, "batch particle 3"]) -> Float[Tensor, "batch 3"]:
         return end[:, len(self.model.bodies[0].x) :].mean(dim=1)

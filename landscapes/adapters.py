@@ -50,7 +50,7 @@ class _TorchObjective:
         """Return losses, and gradients if asked, at points `x` in the parameters' own units."""
         x = _points(x, self.space, self.name).clone().requires_grad_(grad)
         if len(x) == 0:
-            return _empty(self.space.dim, grad=grad)
+            return Evaluation.empty(self.space.dim, grad=grad)
         with torch.set_grad_enabled(grad):
             loss = self.fn(x)
         if not isinstance(loss, Tensor):
@@ -78,7 +78,7 @@ class _NumpyObjective:
         """Return losses, and gradients if asked, at points `x` in the parameters' own units."""
         points = _points(x, self.space, self.name)
         if len(points) == 0:
-            return _empty(self.space.dim, grad=grad)
+            return Evaluation.empty(self.space.dim, grad=grad)
         loss, gradient = self._call(points)
         if not grad:
             return Evaluation.judged(loss, None)
@@ -124,8 +124,3 @@ def _points(x: Tensor, space: ParameterSpace, name: str) -> Float[Tensor, "batch
 def _check_shape(got: tuple[int, ...], wanted: tuple[int, ...], what: str, name: str) -> None:
     if got != wanted:
         raise ValueError(f"{name} must return {what} of shape {wanted}; got shape {got}")
-
-
-def _empty(dim: int, *, grad: bool) -> Evaluation:
-    loss = torch.zeros(0, dtype=torch.float64)
-    return Evaluation.judged(loss, torch.zeros(0, dim, dtype=torch.float64) if grad else None)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import resource
 import sys
 import time
@@ -17,6 +16,7 @@ import xarray as xr
 from jaxtyping import Float
 from torch import Tensor
 
+from .files import replacing
 from .objective import Objective, Status
 from .plane import Plane
 from .sampling import Progress, sample
@@ -112,7 +112,8 @@ class Job:
         self._save(dataset)
         computed = last.done - last.resumed if last else 0
         summary = self._summary(dataset, computed, time.monotonic() - start, command)
-        _write(self.folder / SUMMARY, json.dumps(summary, indent=2) + "\n")
+        with replacing(self.folder / SUMMARY) as partial:
+            partial.write_text(json.dumps(summary, indent=2) + "\n")
         return summary
 
     def picture(self) -> None:
@@ -151,9 +152,3 @@ def _peak_memory() -> int:
     """Return the most memory this process has held [bytes]."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak
-
-
-def _write(path: Path, text: str) -> None:
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(text)
-    os.replace(partial, path)

@@ -57,6 +57,12 @@ class Evaluation:
         grad = None if grad is None else grad.masked_fill(blank[:, None], torch.nan)
         return cls(loss, grad, status)
 
+    @classmethod
+    def empty(cls, dim: int, *, grad: bool) -> Evaluation:
+        """Return the evaluation of no points at all."""
+        loss = torch.zeros(0, dtype=torch.float64)
+        return cls.judged(loss, loss.new_zeros(0, dim) if grad else None)
+
 
 @runtime_checkable
 class Objective(Protocol):

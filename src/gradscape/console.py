@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import shlex
 import sys
 from collections.abc import Sequence
@@ -178,14 +179,14 @@ def _picture(env: Environment, plane: Plane) -> Any:
 def _announce(console: Console, job: Job, env: Environment) -> None:
     with console.status(f"{env.name}: preparing (kernels are compiled once, then kept)"):
         cost = job.cost()
-    total = job.plane.resolution[0] if job.plane.rank == 1 else job.plane.resolution[0] * job.plane.resolution[1]
+    total = math.prod(job.plane.resolution)
     kind = "episodes with gradients" if job.store.grad else "episodes"
     console.print(f"{env.name} · {env.fidelity.name} · {env.device} · {job.folder}", markup=False)
     if not cost.episodes:
         console.print(f"all {total} {kind} are there already")
         return
     kept = f", {total - cost.episodes} are there already" if cost.episodes < total else ""
-    device = f", {_bytes(env.memory(grad=job.store.grad) * env.preferred_batch)} of it on the GPU at a time"
+    device = f", {_bytes(env.memory() * env.preferred_batch)} of it on the GPU at a time"
     console.print(
         f"{cost.episodes} {kind} to compute{kept}: about {_duration(cost.seconds)}, "
         f"{_bytes(cost.memory)} of memory{device if env.device == 'cuda' else ''}"
