@@ -153,7 +153,7 @@ class Fluid(Environment):
 def _pull_back(solver: Solver, loss: Tensor, end: Tensor, tools: Tensor, x: Tensor) -> Tensor:
     """Return the gradient by x of a loss that depends on where particles end and on the ladle's path."""
     adj_end, adj_tools = torch.autograd.grad(loss.sum(), (end, tools), retain_graph=True)
-    adj_tools = adj_tools + solver.gradient(adj_end).to(adj_tools)
+    adj_tools = adj_tools + solver.gradient({STEPS: adj_end}).to(adj_tools)
     (slope,) = torch.autograd.grad(tools, x, adj_tools)
     return slope
 

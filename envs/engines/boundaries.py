@@ -1,13 +1,14 @@
 """What grid velocities meet: moving tools and walls.
 
-A boundary is a Warp function (node position, velocity, environment, tools, control step, fraction of it, 1/its span) ->
-velocity. `tools` [environment, control step, tool] holds positions [m] at the ends of control steps; in between a tool
-moves at constant velocity.
+A boundary is a Warp function (its data, node position, velocity, environment, tools, control step, fraction of it, 1/its
+span) -> velocity. `tools` [environment, control step, slot] holds positions [m] at the ends of control steps; in between
+a tool moves at constant velocity. Sizes and frictions are data, so that scenes with the same kind of boundary share its
+compiled kernel.
 """
 
-from dataclasses import dataclass
-from functools import cache
-from typing import Any, no_type_check
+from dataclasses import dataclass, fields
+from functools import cache, partial
+from typing import Any, ClassVar, Protocol, no_type_check
 
 import warp as wp
 
@@ -15,13 +16,33 @@ from .runtime import precision
 from .sdf import bowl, rod
 
 
+class Boundary(Protocol):
+    """What a solver asks of a boundary."""
+
+    @property
+    def slots(self) -> int:
+        """Number of vectors per environment and control step in `tools`."""
+
+    def function(self, name: str) -> tuple[Any, Any]:
+        """Return the Warp function of one precision, and the struct its data is in."""
+
+    def data(self, name: str, device: str) -> Any:
+        """Return the function's data."""
+
+
 @dataclass(frozen=True)
 class Open:
     """No boundary at all."""
 
-    def function(self, name: str) -> Any:
-        """Return the boundary's Warp function."""
+    slots: ClassVar[int] = 1
+
+    def function(self, name: str) -> tuple[Any, Any]:
+        """Return the boundary's Warp function and its struct."""
         return _open(name)
+
+    def data(self, name: str, device: str) -> Any:
+        """Return the function's data."""
+        return self.function(name)[1]()
 
 
 @dataclass(frozen=True)
@@ -40,39 +61,62 @@ class LadleInTank:
     height: float
     band: float
     friction: float
+    slots: ClassVar[int] = 1
 
-    def function(self, name: str) -> Any:
-        """Return the boundary's Warp function."""
-        return _ladle_in_tank(name, self)
+    def function(self, name: str) -> tuple[Any, Any]:
+        """Return the boundary's Warp function and its struct."""
+        return _ladle_in_tank(name)
+
+    def data(self, name: str, device: str) -> Any:
+        """Return the function's data."""
+        data = self.function(name)[1]()
+        for field in fields(self):
+            setattr(data, field.name, getattr(self, field.name))
+        return data
 
 
 @cache
 @no_type_check
-def _open(name: str) -> Any:
+def _open(name: str) -> tuple[Any, Any]:
     types = precision(name)
     real, vec3 = types.real, types.vec3
+    module = f"gradscape.boundaries.{name}"
 
-    @wp.func(module=f"gradscape.boundaries.{name}", name=f"open_{name}")
-    def boundary(p: vec3, v: vec3, e: int, tools: wp.array3d[vec3], step: int, fraction: real, rate: real) -> vec3:
+    @partial(wp.struct, module=module)
+    class Nothing:
+        unused: int
+
+    @wp.func(module=module, name=f"open_{name}")
+    def boundary(
+        data: Nothing, p: vec3, v: vec3, e: int, tools: wp.array3d[vec3], step: int, fraction: real, rate: real
+    ) -> vec3:
         return v
 
-    return boundary
+    return boundary, Nothing
 
 
 @cache
 @no_type_check
-def _ladle_in_tank(name: str, scene: LadleInTank) -> Any:
+def _ladle_in_tank(name: str) -> tuple[Any, Any]:
     types = precision(name)
     real, vec3, vec4 = types.real, types.vec3, types.vec4
     module = f"gradscape.boundaries.{name}"
     bowl_distance, rod_distance = bowl(name), rod(name)
-    radius, thickness = real(scene.radius), real(scene.half_thickness)
-    height, band, friction = real(scene.height), real(scene.band), real(scene.friction)
-    half_width, lid = real(scene.half_width), real(scene.lid)
-    near, beside = real(scene.radius + scene.half_thickness + scene.band), real(scene.half_thickness + scene.band)
+
+    @partial(wp.struct, module=module)
+    class Scene:
+        """The fields of LadleInTank."""
+
+        half_width: real
+        lid: real
+        radius: real
+        half_thickness: real
+        height: real
+        band: real
+        friction: real
 
     @wp.func(module=module)
-    def slide(v: vec3, body: vec3, hit: vec4) -> vec3:
+    def slide(v: vec3, body: vec3, hit: vec4, band: real, friction: real) -> vec3:
         """Take from the velocity what goes into the body, less with distance; rub the rest (Coulomb)."""
         n = vec3(hit[0], hit[1], hit[2])
         u = v - body
@@ -87,17 +131,23 @@ def _ladle_in_tank(name: str, scene: LadleInTank) -> Any:
         return body + (real(1.0) - grip) * u + grip * tangent
 
     @wp.func(module=module)
-    def boundary(p: vec3, v: vec3, e: int, tools: wp.array3d[vec3], step: int, fraction: real, rate: real) -> vec3:
+    def boundary(
+        scene: Scene, p: vec3, v: vec3, e: int, tools: wp.array3d[vec3], step: int, fraction: real, rate: real
+    ) -> vec3:
+        beside = scene.half_thickness + scene.band
+        near = scene.radius + beside
         start = tools[e, step, 0]
         travel = tools[e, step + 1, 0] - start
         local = p - (start + fraction * travel)
         body = rate * travel
         if wp.abs(local[2]) < near and wp.abs(local[0]) < near and wp.abs(local[1]) < near:
-            v = slide(v, body, bowl_distance(local, radius, thickness))
-        foot = local + vec3(radius, real(0.0), real(0.0))
+            hit = bowl_distance(local, scene.radius, scene.half_thickness)
+            v = slide(v, body, hit, scene.band, scene.friction)
+        foot = local + vec3(scene.radius, real(0.0), real(0.0))
         if wp.abs(foot[2]) < beside and wp.abs(foot[0]) < beside:
-            v = slide(v, body, rod_distance(foot, height, thickness))
-        edge = half_width - real(1e-6)  # a wall's own nodes belong to it
+            hit = rod_distance(foot, scene.height, scene.half_thickness)
+            v = slide(v, body, hit, scene.band, scene.friction)
+        edge = scene.half_width - real(1e-6)  # a wall's own nodes belong to it
         vx, vy, vz = v[0], v[1], v[2]
         if p[0] < -edge:
             vx = wp.max(vx, real(0.0))
@@ -105,7 +155,7 @@ def _ladle_in_tank(name: str, scene: LadleInTank) -> Any:
             vx = wp.min(vx, real(0.0))
         if p[1] < real(1e-6):
             vy = wp.max(vy, real(0.0))
-        if p[1] > lid:
+        if p[1] > scene.lid:
             vy = wp.min(vy, real(0.0))
         if p[2] < -edge:
             vz = wp.max(vz, real(0.0))
@@ -113,7 +163,4 @@ def _ladle_in_tank(name: str, scene: LadleInTank) -> Any:
             vz = wp.min(vz, real(0.0))
         return vec3(vx, vy, vz)
 
-    return boundary
-
-
-Boundary = Open | LadleInTank
+    return boundary, Scene

@@ -2,17 +2,17 @@
 
 One substep, state (x, v, C, S) of frame s to frame s + 1, S being each material's own state:
 
-    stress  A    = -dt V 4/dx^2 tau(S, C) + m C
+    update  S'   = deform(S, C), A = -dt V 4/dx^2 tau(S', C) + m C
     p2g     m_i  = sum w m,   q_i = sum w (m v + A (x_i - x))
     grid    v_i  = boundary(q_i / m_i + dt g)
     g2p     v'   = sum w v_i, C' = 4/dx^2 sum w v_i (x_i - x)^T, x' = x + dt v'
-    deform  S'   = deform(S, C')
 
 Particles are kept at the ends of control steps only. The gradient recomputes one control step at a time, and keeps that
-one whole, grids included.
+one whole: particles, A, and the grids too unless they are large.
 """
 
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from itertools import chain
@@ -27,6 +27,7 @@ from .materials import Fluid, Material
 from .runtime import load, precision, to_torch
 from .transfers import transfers
 
+KEPT = 32e6  # bytes of grids per environment that a control step may keep for its gradient
 EMPTY = 1e-8  # nodes lighter than this part of the lightest particle carry no velocity
 
 
@@ -65,12 +66,27 @@ class Model:
         """Number of particles of all bodies."""
         return sum(len(body.x) for body in self.bodies)
 
+    @property
+    def cells(self) -> int:
+        """Number of nodes of the grid."""
+        return int(np.prod(self.nodes))
+
+    @property
+    def keeps_grids(self) -> bool:
+        """Whether the gradient's window keeps its grids; else it scatters once more."""
+        return self.substeps * 8 * self.cells * self._real_bytes <= KEPT
+
     def bytes_per_environment(self) -> int:
         """Return what one environment of a solver takes, adjoints included."""
         state = sum(len(body.x) * (1 if isinstance(body.material, Fluid) else 9) for body in self.bodies)
         frame = 15 * self.particles + state  # x, v, C and each material's own
-        grids, affine = (self.substeps + 1) * 2 * 4 * int(np.prod(self.nodes)), 2 * 9 * self.particles
-        return (8 if self.precision == "float64" else 4) * ((self.steps + self.substeps + 2) * frame + grids + affine)
+        affine = (self.substeps + 1) * 9 * self.particles
+        grids = ((self.substeps if self.keeps_grids else 1) + 1) * 8 * self.cells
+        return self._real_bytes * ((self.steps + self.substeps + 2) * frame + affine + grids)
+
+    @property
+    def _real_bytes(self) -> int:
+        return 8 if self.precision == "float64" else 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +112,7 @@ class Grid:
 
 
 class Solver:
-    """Run up to `capacity` environments of one model at once, and differentiate their last frame.
+    """Run up to `capacity` environments of one model at once, and differentiate where their control steps end.
 
     Setting `stop` ends a run within a control step, with InterruptedError.
     """
@@ -106,7 +122,8 @@ class Solver:
         self.stop = stop or threading.Event()
         self.types = precision(model.precision)
         self.kernels = transfers(model.precision)
-        self.velocity = velocity_kernel(model.precision, model.boundary)
+        self.velocity = velocity_kernel(model.precision, *model.boundary.function(model.precision))
+        self.boundary = model.boundary.data(model.precision, device)
         self.materials = [body.material.kernels(model.precision) for body in model.bodies]
         transferring = [self.kernels.p2g, self.kernels.g2p, self.kernels.adjoint_p2g, self.kernels.adjoint_g2p]
         load([*transferring, self.velocity, *chain.from_iterable(self.materials)], device)
@@ -114,12 +131,11 @@ class Solver:
         self.mass = self._constant([body.mass for body in model.bodies])
         self.volume = self._constant([body.volume for body in model.bodies])
         self.empty = EMPTY * min(float(body.mass.min()) for body in model.bodies)
-        self.lattice = self._lattice()
+        self.lattice = lattice(model)
         self.checkpoints = [self._frame() for _ in range(model.steps + 1)]
         self.window = [self._frame() for _ in range(model.substeps - 1)]
-        self.A = self._array(self.types.mat33, model.particles)
-        cells = int(np.prod(model.nodes))
-        self.grids = [Grid(*(self._array(self.types.vec4, cells) for _ in range(2))) for _ in range(model.substeps)]
+        self.A = [self._array(self.types.mat33, model.particles) for _ in range(model.substeps)]
+        self.grids = [self._grid() for _ in range(model.substeps if model.keeps_grids else 1)]
         self.tools = self._tools()
         self.escaped = wp.zeros(capacity, dtype=wp.int32, device=device)
         self.held = -1  # the control step whose frames and grids are in the window
@@ -127,13 +143,17 @@ class Solver:
         self._start()
 
     def run(self, tools: torch.Tensor) -> torch.Tensor:
-        """Simulate; `tools` [m], shape (batch, step + 1, tool, 3); return last x, shape (batch, particle, 3)."""
+        """Simulate; `tools`, shape (batch, step + 1, slot, 3), is the boundary's; return last x, (batch, particle, 3)."""
         batch = len(tools)
         self.escaped.zero_()
         to_torch(self.tools)[:batch] = tools.to(self.types.torch)
         for step in range(self.model.steps):
             self._advance(step, batch)
-        return to_torch(self.checkpoints[-1].x)[:batch]
+        return self.reached(self.model.steps, batch)
+
+    def reached(self, step: int, batch: int) -> torch.Tensor:
+        """Return x [m] before control step `step` of the last run, shape (batch, particle, 3)."""
+        return to_torch(self.checkpoints[step].x)[:batch]
 
     def positions(self, environment: int) -> torch.Tensor:
         """Return x [m] of one environment of the last run at the ends of control steps, (step + 1, particle, 3)."""
@@ -143,8 +163,8 @@ class Solver:
         """Say for each environment whether a particle has left the grid, shape (batch,)."""
         return to_torch(self.escaped)[:batch] > 0
 
-    def gradient(self, adj_x: torch.Tensor) -> torch.Tensor:
-        """Return the adjoint of the tools of the last run from that of its last positions, same shapes."""
+    def gradient(self, adj_x: Mapping[int, torch.Tensor]) -> torch.Tensor:
+        """Return the adjoint of the tools of the last run from those of x before some control steps, same shapes."""
         if self.adjoint is None:
             self.adjoint = _Adjoint(self)
         return self.adjoint.run(adj_x)
@@ -159,44 +179,42 @@ class Solver:
         self.held = step
         frames = self.frames(step)
         for s in range(self.model.substeps):
-            self.stress(frames[s], batch)
-            self._scatter(frames[s], step, s, batch)
-            self._gather(frames[s], frames[s + 1], self.grids[s], batch)
+            self._update(frames[s], frames[s + 1], self.A[s], batch)
+            self.scatter(frames[s], step, s, batch)
+            self._gather(frames[s], frames[s + 1], self.grid(s), batch)
 
-    def stress(self, frame: Frame, batch: int) -> None:
-        """Fill A from the frame's state and motion."""
-        for b, (stress, _) in enumerate(self.materials):
-            self.launch(stress, self.size(b), batch, self.stress_inputs(b, frame))
+    def grid(self, substep: int) -> Grid:
+        """Return the grid of a substep of the control step in the window, or the one that all share."""
+        return self.grids[substep % len(self.grids)]
 
-    def _scatter(self, frame: Frame, step: int, substep: int, batch: int) -> None:
-        grid = self.grids[substep]
+    def _update(self, frame: Frame, new: Frame, A: wp.array, batch: int) -> None:
+        for b, (update, _) in enumerate(self.materials):
+            self.launch(update, self.size(b), batch, [*self.material_inputs(b, frame), new.S[b], A])
+
+    def scatter(self, frame: Frame, step: int, substep: int, batch: int) -> None:
+        """Fill the substep's grid: momentum and mass from particles, then velocity."""
+        grid = self.grid(substep)
         grid.m.zero_()
-        inputs = [self.lattice, self.mass, frame.x, frame.v, self.A, grid.m]
+        inputs = [self.lattice, self.mass, frame.x, frame.v, self.A[substep], grid.m]
         self.launch(self.kernels.p2g, self.model.particles, batch, inputs)
-        self.launch(self.velocity, grid.m.shape[1], batch, self.velocity_inputs(step, substep))
+        self.launch(self.velocity, self.model.cells, batch, self.velocity_inputs(step, substep))
 
-    def _gather(self, frame: Frame, new: Frame, grid: "Grid", batch: int) -> None:
+    def _gather(self, frame: Frame, new: Frame, grid: Grid, batch: int) -> None:
         inputs = [self.lattice, self.model.dt, frame.x, grid.v, new.x, new.v, new.C, self.escaped]
         self.launch(self.kernels.g2p, self.model.particles, batch, inputs)
-        for b, (_, deform) in enumerate(self.materials):
-            self.launch(deform, self.size(b), batch, self.deform_inputs(b, frame, new))
 
-    def stress_inputs(self, b: int, frame: Frame) -> list[Any]:
-        """Return the arguments of a material's stress kernel."""
-        scale = -self.model.dt * 4.0 / self.model.dx**2
+    def material_inputs(self, b: int, frame: Frame) -> list[Any]:
+        """Return what both kernels of a material take."""
+        dt, scale = self.model.dt, -self.model.dt * 4.0 / self.model.dx**2
         constants = self.model.bodies[b].material.constants()
-        return [self.first[b], scale, *constants, self.mass, self.volume, frame.S[b], frame.C, self.A]
-
-    def deform_inputs(self, b: int, frame: Frame, new: Frame) -> list[Any]:
-        """Return the arguments of a material's deform kernel."""
-        return [self.first[b], self.model.dt, frame.S[b], new.C, new.S[b]]
+        return [self.first[b], dt, scale, *constants, self.mass, self.volume, frame.S[b], frame.C]
 
     def velocity_inputs(self, step: int, substep: int) -> list[Any]:
         """Return the arguments of the grid's velocity kernel."""
         model = self.model
         time = [step, substep / model.substeps, 1.0 / (model.substeps * model.dt)]
-        grid = self.grids[substep]
-        return [self.lattice, model.dt, model.gravity, self.empty, *time, self.tools, grid.m, grid.v]
+        grid = self.grid(substep)
+        return [self.lattice, self.boundary, model.dt, model.gravity, self.empty, *time, self.tools, grid.m, grid.v]
 
     def size(self, b: int) -> int:
         """Return the number of particles of body b."""
@@ -215,18 +233,15 @@ class Solver:
         states = (self._array(b.material.state(self.model.precision), len(b.x)) for b in self.model.bodies)
         return Frame(x, v, C, tuple(states))
 
+    def _grid(self) -> Grid:
+        return Grid(*(self._array(self.types.vec4, self.model.cells) for _ in range(2)))
+
     def _tools(self) -> wp.array:
-        return wp.zeros((self.capacity, self.model.steps + 1, 1), dtype=self.types.vec3, device=self.device)
+        shape = self.capacity, self.model.steps + 1, self.model.boundary.slots
+        return wp.zeros(shape, dtype=self.types.vec3, device=self.device)
 
     def _constant(self, values: list[np.ndarray]) -> wp.array:
         return wp.array(np.concatenate(values), dtype=self.types.real, device=self.device)
-
-    def _lattice(self) -> Any:
-        lattice = self.kernels.Lattice()
-        lattice.origin = self.types.vec3(*self.model.origin)
-        lattice.inv_dx = 1.0 / self.model.dx
-        lattice.nx, lattice.ny, lattice.nz = self.model.nodes
-        return lattice
 
     def _start(self) -> None:
         first = self.checkpoints[0]
@@ -241,17 +256,19 @@ class _Adjoint:
     def __init__(self, solver: Solver) -> None:
         self.solver = solver
         self.new, self.old = solver._frame(), solver._frame()
-        self.A = wp.zeros_like(solver.A)
-        self.grid = Grid(wp.zeros_like(solver.grids[0].m), wp.zeros_like(solver.grids[0].v))
+        self.A = wp.zeros_like(solver.A[0])
+        self.grid = solver._grid()
         self.tools = solver._tools()
+        self.structs = solver.kernels.Lattice(), type(solver.boundary)()  # no adjoint is wanted, but Warp wants its place
 
-    def run(self, adj_x: torch.Tensor) -> torch.Tensor:
-        """Return the adjoint of the tools, shape (batch, step + 1, tool, 3)."""
-        solver, batch = self.solver, len(adj_x)
+    def run(self, adj_x: Mapping[int, torch.Tensor]) -> torch.Tensor:
+        """Return the adjoint of the tools, shape (batch, step + 1, slot, 3)."""
+        solver, batch = self.solver, len(next(iter(adj_x.values())))
         for array in (*self.new.arrays(), self.tools):
             array.zero_()
-        to_torch(self.new.x)[:batch] = adj_x.to(solver.types.torch)
-        for step in reversed(range(solver.model.steps)):
+        for step in reversed(range(max(adj_x))):
+            if step + 1 in adj_x:
+                to_torch(self.new.x)[:batch] += adj_x[step + 1].to(to_torch(self.new.x))
             if solver.held != step:
                 solver._advance(step, batch)
             self._retreat(step, batch)
@@ -261,18 +278,16 @@ class _Adjoint:
         solver = self.solver
         frames = solver.frames(step)
         for s in reversed(range(solver.model.substeps)):
-            self._gather(frames[s], frames[s + 1], solver.grids[s], batch)
+            if not solver.model.keeps_grids:
+                solver.scatter(frames[s], step, s, batch)
+            self._gather(frames[s], solver.grid(s), batch)
             self._velocity(step, s, batch)
-            solver.stress(frames[s], batch)
-            self._scatter(frames[s], batch)
+            self._scatter(frames[s], solver.A[s], batch)
+            self._update(frames[s], batch)
             self.new, self.old = self.old, self.new
 
-    def _gather(self, frame: Frame, new: Frame, grid: Grid, batch: int) -> None:
+    def _gather(self, frame: Frame, grid: Grid, batch: int) -> None:
         solver = self.solver
-        for b, (_, deform) in enumerate(solver.materials):
-            self.old.S[b].zero_()
-            adjoints = [None, None, self.old.S[b], self.new.C, self.new.S[b]]
-            self._launch(deform, solver.size(b), batch, solver.deform_inputs(b, frame, new), adjoints)
         self.grid.v.zero_()
         inputs = [solver.lattice, solver.model.dt, frame.x, grid.v]
         inputs += [self.new.x, self.new.v, self.new.C, self.grid.v, self.old.x]
@@ -282,19 +297,20 @@ class _Adjoint:
         solver = self.solver
         self.grid.m.zero_()
         inputs = solver.velocity_inputs(step, substep)
-        adjoints = [solver.kernels.Lattice(), *[None] * (len(inputs) - 4), self.tools, self.grid.m, self.grid.v]
-        self._launch(solver.velocity, self.grid.m.shape[1], batch, inputs, adjoints)
+        adjoints = [*self.structs, *[None] * (len(inputs) - 5), self.tools, self.grid.m, self.grid.v]
+        self._launch(solver.velocity, solver.model.cells, batch, inputs, adjoints)
 
-    def _scatter(self, frame: Frame, batch: int) -> None:
+    def _scatter(self, frame: Frame, A: wp.array, batch: int) -> None:
         solver = self.solver
-        inputs = [solver.lattice, solver.mass, frame.x, frame.v, solver.A, self.grid.m]
+        inputs = [solver.lattice, solver.mass, frame.x, frame.v, A, self.grid.m]
         inputs += [self.old.x, self.old.v, self.A]
         solver.launch(solver.kernels.adjoint_p2g, solver.model.particles, batch, inputs)
-        self.old.C.zero_()
-        for b, (stress, _) in enumerate(solver.materials):
-            inputs = solver.stress_inputs(b, frame)
-            adjoints = [None] * (len(inputs) - 3) + [self.old.S[b], self.old.C, self.A]
-            self._launch(stress, solver.size(b), batch, inputs, adjoints)
+
+    def _update(self, frame: Frame, batch: int) -> None:
+        solver = self.solver
+        for b, (_, adjoint) in enumerate(solver.materials):
+            inputs = [*solver.material_inputs(b, frame), self.new.S[b], self.A, self.old.S[b], self.old.C]
+            solver.launch(adjoint, solver.size(b), batch, inputs)
 
     def _launch(self, kernel: Any, size: int, batch: int, inputs: list[Any], adjoints: list[Any]) -> None:
         wp.launch(
@@ -309,18 +325,27 @@ class _Adjoint:
         )
 
 
+def lattice(model: Model) -> Any:
+    """Return where a model's grid lies, for the transfer kernels."""
+    placed = transfers(model.precision).Lattice()
+    placed.origin = precision(model.precision).vec3(*model.origin)
+    placed.inv_dx = 1.0 / model.dx
+    placed.nx, placed.ny, placed.nz = model.nodes
+    return placed
+
+
 @cache
 @no_type_check
-def velocity_kernel(name: str, boundary: Boundary) -> Any:
+def velocity_kernel(name: str, meet: Any, Data: Any) -> Any:
     """Return the kernel that turns a node's momentum into its velocity after gravity and boundary."""
     types = precision(name)
     real, vec3, vec4 = types.real, types.vec3, types.vec4
     Lattice = transfers(name).Lattice
-    meet = boundary.function(name)
 
     @wp.kernel(module="unique")
     def velocity(
         lattice: Lattice,
+        boundary: Data,
         dt: real,
         gravity: real,
         empty: real,
@@ -339,7 +364,7 @@ def velocity_kernel(name: str, boundary: Boundary) -> Any:
             node = vec3(real(i / (lattice.nz * lattice.ny)), real(j), real(k))
             p = lattice.origin + node * (real(1.0) / lattice.inv_dx)
             v = vec3(g[0], g[1], g[2]) / g[3] - vec3(real(0.0), dt * gravity, real(0.0))
-            v = meet(p, v, e, tools, step, fraction, rate)
+            v = meet(boundary, p, v, e, tools, step, fraction, rate)
             grid_v[e, i] = vec4(v[0], v[1], v[2], real(0.0))
         else:
             grid_v[e, i] = vec4()
