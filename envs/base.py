@@ -28,6 +28,7 @@ class Fidelity:
 
     `dt` is the time step [s], `resolution` the number of grid cells (or mesh edges) across the scene, 0 where it has
     none, `sampling` the particles per cell along each axis, `precision` that of the engine: float32 or float64.
+    `particles` is how many there are, in scenes that count them instead.
     """
 
     name: str
@@ -35,6 +36,7 @@ class Fidelity:
     precision: str = "float32"
     resolution: int = 0
     sampling: float = 2.0
+    particles: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +136,7 @@ class Environment(abc.ABC):
     @property
     def preferred_batch(self) -> int:
         """Number of points worth evaluating at once."""
-        return 16
+        return 16 if self._solvers is None else self._capacity * self.threads
 
     @abc.abstractmethod
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:

@@ -28,3 +28,25 @@ def travel(
     for step in range(velocity.shape[1]):
         positions.append(torch.clamp(positions[-1] + span * velocity[:, step], lower, upper))
     return torch.stack(positions, dim=1)
+
+
+def roll(
+    start: Float[Tensor, " axis"],
+    steps: Float[Tensor, "batch step 3"],
+    radius: float,
+    *,
+    lower: Float[Tensor, " axis"],
+    upper: Float[Tensor, " axis"],
+) -> tuple[Float[Tensor, "batch step_plus_1 3"], Float[Tensor, "batch step_plus_1 3"]]:
+    """Roll a level cylinder without slip: return its positions [m] and its angles (spin, yaw, 0) [rad].
+
+    `steps` are (spin [rad], turn [rad], height [m]) of each control step. The axis starts along z and turns clockwise
+    seen from above; spinning about it moves the cylinder to the left at first.
+    """
+    spin, turn, lift = steps.unbind(dim=2)
+    yaw = -turn.cumsum(dim=1)
+    heading = yaw + turn / 2  # half-way through each step
+    motion = torch.stack([-radius * spin * heading.cos(), lift, radius * spin * heading.sin()], dim=2)
+    angles = torch.stack([spin.cumsum(dim=1), yaw, torch.zeros_like(yaw)], dim=2)
+    angles = torch.cat([torch.zeros_like(angles[:, :1]), angles], dim=1)
+    return travel(start, motion, 1.0, lower=lower, upper=upper), angles

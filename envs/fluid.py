@@ -17,8 +17,8 @@ from .controls import hold, travel
 from .engines.boundaries import LadleInTank
 from .engines.materials import Elastic
 from .engines.materials import Fluid as Liquid
-from .engines.mpm import Body, Model, Solver
-from .engines.runtime import Pool, free_memory
+from .engines.mpm import Body, Model, Solver, capacity
+from .engines.runtime import Pool
 
 TANK_WIDTH, TANK_HEIGHT, FILL = 0.4, 0.2, 0.15  # the tank, and the depth of the syrup [m]
 HEADROOM = 0.6  # what the grid covers above the floor [m]
@@ -30,7 +30,6 @@ SYRUP_DENSITY, SPEED_OF_SOUND = 1330.0, 5.0  # [kg/m^3], [m/s]
 GRAVITY = 9.81  # [m/s^2]
 SEGMENTS, STEPS, SPAN = 5, 50, 0.01  # control segments, control steps, length of a step [s]
 MARGIN = 2  # nodes outside the walls
-FULL_CARD = 2_000_000  # particles that keep a GPU busy
 
 
 @dataclass(frozen=True)
@@ -85,11 +84,6 @@ class Fluid(Environment):
         "m/s",
     )
 
-    @property
-    def preferred_batch(self) -> int:
-        """Number of points worth evaluating at once."""
-        return self._capacity * self.threads
-
     def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
         return self.model.bytes_per_environment()
@@ -122,10 +116,7 @@ class Fluid(Environment):
     def _setup(self) -> None:
         self.model = _model(self.fidelity, self.options)
         self._solvers = Pool(self._solver)
-        self._capacity = 4  # enough to hide what a launch costs, few enough for the cache
-        if self.device == "cuda":
-            fitting = free_memory() * 3 // 4 // self.memory()
-            self._capacity = max(1, min(1024, FULL_CARD // self.model.particles, fitting))
+        self._capacity = capacity(self.model, self.device)
 
     def _solver(self) -> Solver:
         return Solver(self.model, capacity=self._capacity, device=self.device, stop=self._stop)

@@ -24,7 +24,7 @@ import warp as wp
 
 from .boundaries import Boundary
 from .materials import Fluid, Material
-from .runtime import load, precision, to_torch
+from .runtime import free_memory, load, precision, to_torch
 from .transfers import transfers
 
 KEPT = 32e6  # bytes of grids per environment that a control step may keep for its gradient
@@ -65,6 +65,11 @@ class Model:
     def particles(self) -> int:
         """Number of particles of all bodies."""
         return sum(len(body.x) for body in self.bodies)
+
+    @property
+    def mass(self) -> np.ndarray:
+        """Mass of each particle of all bodies [kg], shape (particle,)."""
+        return np.concatenate([body.mass for body in self.bodies])
 
     @property
     def cells(self) -> int:
@@ -111,6 +116,17 @@ class Grid:
     v: wp.array
 
 
+CROWD, FULL_CARD = 8_000, 2_000_000  # particles that hide what a launch costs on one core, that keep a GPU busy
+
+
+def capacity(model: Model, device: str) -> int:
+    """Return how many environments of a model a solver should take at once."""
+    if device == "cpu":
+        return max(1, min(4, CROWD // model.particles))  # few enough for the cache
+    fitting = free_memory() * 3 // 4 // model.bytes_per_environment()
+    return max(1, min(1024, FULL_CARD // model.particles, fitting))
+
+
 class Solver:
     """Run up to `capacity` environments of one model at once, and differentiate where their control steps end.
 
@@ -128,10 +144,10 @@ class Solver:
         transferring = [self.kernels.p2g, self.kernels.g2p, self.kernels.adjoint_p2g, self.kernels.adjoint_g2p]
         load([*transferring, self.velocity, *chain.from_iterable(self.materials)], device)
         self.first = np.concatenate([[0], np.cumsum([len(body.x) for body in model.bodies])]).tolist()
-        self.mass = self._constant([body.mass for body in model.bodies])
-        self.volume = self._constant([body.volume for body in model.bodies])
-        self.empty = EMPTY * min(float(body.mass.min()) for body in model.bodies)
-        self.lattice = lattice(model)
+        self.mass = self._constant(model.mass)
+        self.volume = self._constant(np.concatenate([body.volume for body in model.bodies]))
+        self.empty = EMPTY * float(model.mass.min())
+        self.lattice = place(model)
         self.checkpoints = [self._frame() for _ in range(model.steps + 1)]
         self.window = [self._frame() for _ in range(model.substeps - 1)]
         self.A = [self._array(self.types.mat33, model.particles) for _ in range(model.substeps)]
@@ -240,8 +256,8 @@ class Solver:
         shape = self.capacity, self.model.steps + 1, self.model.boundary.slots
         return wp.zeros(shape, dtype=self.types.vec3, device=self.device)
 
-    def _constant(self, values: list[np.ndarray]) -> wp.array:
-        return wp.array(np.concatenate(values), dtype=self.types.real, device=self.device)
+    def _constant(self, values: np.ndarray) -> wp.array:
+        return wp.array(values, dtype=self.types.real, device=self.device)
 
     def _start(self) -> None:
         first = self.checkpoints[0]
@@ -325,7 +341,7 @@ class _Adjoint:
         )
 
 
-def lattice(model: Model) -> Any:
+def place(model: Model) -> Any:
     """Return where a model's grid lies, for the transfer kernels."""
     placed = transfers(model.precision).Lattice()
     placed.origin = precision(model.precision).vec3(*model.origin)

@@ -5,7 +5,7 @@ from typing import Any, no_type_check
 
 import warp as wp
 
-from .runtime import precision
+from ..runtime import precision
 
 SWEEPS = 8  # at most; three or four reach round-off
 ROUND_OFF = {"float32": 1e-7, "float64": 1e-16}

@@ -17,7 +17,7 @@ from typing import Any, no_type_check
 import warp as wp
 
 from .decomposition import svd
-from .runtime import precision
+from ..runtime import precision
 
 SMALLEST = 0.05  # singular values below count as this; what is pressed flatter has lost its shape
 ROUNDED = 1e-8  # added to |d|^2, so that an undeformed body has a gradient

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from . import elastic, fluid, plasticine
-from .runtime import precision
+from ..runtime import precision
 
 
 @dataclass(frozen=True)

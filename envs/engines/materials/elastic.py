@@ -5,7 +5,7 @@ from typing import Any, no_type_check
 
 import warp as wp
 
-from .runtime import precision
+from ..runtime import precision
 
 
 @cache

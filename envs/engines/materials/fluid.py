@@ -5,7 +5,7 @@ from typing import Any, no_type_check
 
 import warp as wp
 
-from .runtime import precision
+from ..runtime import precision
 
 TORN = 1.1  # volume ratio at which a fluid tears
 
