@@ -38,6 +38,11 @@ class Tool:
     friction: float
 
     @property
+    def radius(self) -> float:
+        """Radius of a ball around the tool's middle that holds it [m]."""
+        return float(np.hypot(*self.size)) if self.kind is Kind.CYLINDER else sum(self.size)
+
+    @property
     def slots(self) -> int:
         """Number of vectors that say where the tool is."""
         return 2 if self.kind is Kind.ROLLER else 1
@@ -76,6 +81,8 @@ class Manipulators:
         sizes = [(*tool.size, 0.0)[:2] for tool in self.tools]
         rows = np.array([[*size, tool.friction] for size, tool in zip(sizes, self.tools, strict=True)])
         data.shape = wp.array(rows, dtype=types.vec3, device=device)
+        shell = float(-np.log(FAINTEST)) / self.softness
+        data.reach = wp.array([tool.radius + shell for tool in self.tools], dtype=types.real, device=device)
         data.kind = wp.array([int(tool.kind) for tool in self.tools], dtype=wp.int32, device=device)
         slots = np.cumsum([0] + [tool.slots for tool in self.tools[:-1]])
         data.slot = wp.array(slots, dtype=wp.int32, device=device)
@@ -103,6 +110,7 @@ def _manipulators(name: str, count: int) -> tuple[Any, Any]:
         shape: wp.array[vec3]
         kind: wp.array[wp.int32]
         slot: wp.array[wp.int32]
+        reach: wp.array[real]
 
     @wp.func(module=module)
     def distance(kind: int, p: vec3, axis: vec3, shape: vec3) -> vec4:
@@ -150,6 +158,8 @@ def _manipulators(name: str, count: int) -> tuple[Any, Any]:
         start = tools[e, step, slot]
         travel = tools[e, step + 1, slot] - start
         local = p - (start + fraction * travel)
+        if wp.dot(local, local) > scene.reach[j] * scene.reach[j]:
+            return v
         body = rate * travel
         axis = up
         if kind == Kind.ROLLER:

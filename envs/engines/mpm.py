@@ -28,6 +28,7 @@ from .runtime import free_memory, load, precision, to_torch
 from .transfers import transfers
 
 KEPT = 32e6  # bytes of grids per environment that a control step may keep for its gradient
+MARGIN = 2  # cells around the particles that a control step begins with
 EMPTY = 1e-8  # nodes lighter than this part of the lightest particle carry no velocity
 
 
@@ -108,6 +109,19 @@ class Frame:
         return (self.x, self.v, self.C, *self.S)
 
 
+@dataclass(frozen=True)
+class Box:
+    """A box of nodes: the `first` of them, and how many there are along x, y, z."""
+
+    first: tuple[int, int, int]
+    nodes: tuple[int, int, int]
+
+    @property
+    def cells(self) -> int:
+        """Number of nodes."""
+        return int(np.prod(self.nodes))
+
+
 @dataclass(frozen=True, eq=False)
 class Grid:
     """What nodes hold in one substep, [environment, node]: momentum and mass, then velocity; or the adjoints."""
@@ -147,13 +161,13 @@ class Solver:
         self.mass = self._constant(model.mass)
         self.volume = self._constant(np.concatenate([body.volume for body in model.bodies]))
         self.empty = EMPTY * float(model.mass.min())
-        self.lattice = place(model)
+        self.boxes = [Box((0, 0, 0), model.nodes)] * model.steps
         self.checkpoints = [self._frame() for _ in range(model.steps + 1)]
         self.window = [self._frame() for _ in range(model.substeps - 1)]
         self.A = [self._array(self.types.mat33, model.particles) for _ in range(model.substeps)]
         self.grids = [self._grid() for _ in range(model.substeps if model.keeps_grids else 1)]
         self.tools = self._tools()
-        self.escaped = wp.zeros(capacity, dtype=wp.int32, device=device)
+        self.strayed, self.escaped = (wp.zeros(capacity, dtype=wp.int32, device=device) for _ in range(2))
         self.held = -1  # the control step whose frames and grids are in the window
         self.adjoint: _Adjoint | None = None
         self._start()
@@ -164,7 +178,7 @@ class Solver:
         self.escaped.zero_()
         to_torch(self.tools)[:batch] = tools.to(self.types.torch)
         for step in range(self.model.steps):
-            self._advance(step, batch)
+            self._explore(step, batch)
         return self.reached(self.model.steps, batch)
 
     def reached(self, step: int, batch: int) -> torch.Tensor:
@@ -189,10 +203,22 @@ class Solver:
         """Return the frames of one control step, both ends included."""
         return [self.checkpoints[step], *self.window, self.checkpoints[step + 1]]
 
+    def _explore(self, step: int, batch: int) -> None:
+        """Simulate a control step on the nodes around the particles, or on more where one leaves them."""
+        margin, whole = MARGIN, Box((0, 0, 0), self.model.nodes)
+        while True:
+            self.boxes[step] = around(self.model, self.reached(step, batch), margin)
+            self.strayed.zero_()
+            self._advance(step, batch)
+            margin *= 2
+            if self.boxes[step] == whole or not bool(to_torch(self.strayed)[:batch].any()):
+                break
+        to_torch(self.escaped)[:batch] += to_torch(self.strayed)[:batch]
+
     def _advance(self, step: int, batch: int) -> None:
         if self.stop.is_set():
             raise InterruptedError("the simulation was stopped")
-        self.held = step
+        self.held, self.lattice = step, place(self.model, self.boxes[step])
         frames = self.frames(step)
         for s in range(self.model.substeps):
             self._update(frames[s], frames[s + 1], self.A[s], batch)
@@ -210,13 +236,17 @@ class Solver:
     def scatter(self, frame: Frame, step: int, substep: int, batch: int) -> None:
         """Fill the substep's grid: momentum and mass from particles, then velocity."""
         grid = self.grid(substep)
-        grid.m.zero_()
+        self.clear(grid.m, step, batch)
         inputs = [self.lattice, self.mass, frame.x, frame.v, self.A[substep], grid.m]
         self.launch(self.kernels.p2g, self.model.particles, batch, inputs)
-        self.launch(self.velocity, self.model.cells, batch, self.velocity_inputs(step, substep))
+        self.launch(self.velocity, self.boxes[step].cells, batch, self.velocity_inputs(step, substep))
+
+    def clear(self, grid: wp.array, step: int, batch: int) -> None:
+        """Zero what a control step uses of a grid."""
+        to_torch(grid)[:batch, : self.boxes[step].cells].zero_()
 
     def _gather(self, frame: Frame, new: Frame, grid: Grid, batch: int) -> None:
-        inputs = [self.lattice, self.model.dt, frame.x, grid.v, new.x, new.v, new.C, self.escaped]
+        inputs = [self.lattice, self.model.dt, frame.x, grid.v, new.x, new.v, new.C, self.strayed]
         self.launch(self.kernels.g2p, self.model.particles, batch, inputs)
 
     def material_inputs(self, b: int, frame: Frame) -> list[Any]:
@@ -296,7 +326,9 @@ class _Adjoint:
         for s in reversed(range(solver.model.substeps)):
             if not solver.model.keeps_grids:
                 solver.scatter(frames[s], step, s, batch)
+            solver.clear(self.grid.v, step, batch)
             self._gather(frames[s], solver.grid(s), batch)
+            solver.clear(self.grid.m, step, batch)
             self._velocity(step, s, batch)
             self._scatter(frames[s], solver.A[s], batch)
             self._update(frames[s], batch)
@@ -304,17 +336,15 @@ class _Adjoint:
 
     def _gather(self, frame: Frame, grid: Grid, batch: int) -> None:
         solver = self.solver
-        self.grid.v.zero_()
         inputs = [solver.lattice, solver.model.dt, frame.x, grid.v]
         inputs += [self.new.x, self.new.v, self.new.C, self.grid.v, self.old.x]
         solver.launch(solver.kernels.adjoint_g2p, solver.model.particles, batch, inputs)
 
     def _velocity(self, step: int, substep: int, batch: int) -> None:
         solver = self.solver
-        self.grid.m.zero_()
         inputs = solver.velocity_inputs(step, substep)
         adjoints = [*self.structs, *[None] * (len(inputs) - 5), self.tools, self.grid.m, self.grid.v]
-        self._launch(solver.velocity, solver.model.cells, batch, inputs, adjoints)
+        self._launch(solver.velocity, solver.boxes[step].cells, batch, inputs, adjoints)
 
     def _scatter(self, frame: Frame, A: wp.array, batch: int) -> None:
         solver = self.solver
@@ -341,13 +371,28 @@ class _Adjoint:
         )
 
 
-def place(model: Model) -> Any:
-    """Return where a model's grid lies, for the transfer kernels."""
+def place(model: Model, box: Box | None = None) -> Any:
+    """Return where a model's grid lies, for the transfer kernels: the nodes in `box`, or all."""
+    first, nodes = (box.first, box.nodes) if box else ((0, 0, 0), model.nodes)
     placed = transfers(model.precision).Lattice()
     placed.origin = precision(model.precision).vec3(*model.origin)
     placed.inv_dx = 1.0 / model.dx
-    placed.nx, placed.ny, placed.nz = model.nodes
+    placed.first = wp.vec3i(*first)
+    placed.nx, placed.ny, placed.nz = nodes
     return placed
+
+
+def around(model: Model, x: torch.Tensor, margin: int) -> Box:
+    """Return the nodes that particles at x [m], shape (batch, particle, 3), meet while none moves `margin` cells."""
+    low, high = x.amin(dim=(0, 1)).double().cpu(), x.amax(dim=(0, 1)).double().cpu()
+    if not bool((low + high).isfinite().all()):
+        return Box((0, 0, 0), model.nodes)
+    origin = torch.tensor(model.origin, dtype=torch.float64)
+    last = torch.tensor(model.nodes) - 1
+    first = ((low - origin) / model.dx - 0.5).floor().int() - margin
+    end = ((high - origin) / model.dx + 1.5).floor().int() + margin
+    first, end = first.clamp_min(0).minimum(last - 2), end.minimum(last)
+    return Box(tuple(first.tolist()), tuple((end - first).clamp_min(2).add(1).tolist()))
 
 
 @cache
@@ -375,9 +420,10 @@ def velocity_kernel(name: str, meet: Any, Data: Any) -> Any:
         e, i = wp.tid()
         g = grid_m[e, i]
         if g[3] > empty:
+            first = lattice.first
             k = i % lattice.nz
             j = (i / lattice.nz) % lattice.ny
-            node = vec3(real(i / (lattice.nz * lattice.ny)), real(j), real(k))
+            node = vec3(real(i / (lattice.nz * lattice.ny) + first[0]), real(j + first[1]), real(k + first[2]))
             p = lattice.origin + node * (real(1.0) / lattice.inv_dx)
             v = vec3(g[0], g[1], g[2]) / g[3] - vec3(real(0.0), dt * gravity, real(0.0))
             v = meet(boundary, p, v, e, tools, step, fraction, rate)

@@ -28,21 +28,26 @@ def transfers(name: str) -> SimpleNamespace:
 
     @partial(wp.struct, module=module)
     class Lattice:
-        """Place the grid: node (0, 0, 0) at `origin` [m], spacing 1/`inv_dx` [m], `nx, ny, nz` nodes."""
+        """Place the grid: node (0, 0, 0) at `origin` [m], spacing 1/`inv_dx` [m].
+
+        Arrays hold `nx, ny, nz` nodes from node `first` on. What a particle reads and writes does not depend on them, to
+        the last bit, as long as they cover it.
+        """
 
         origin: vec3
         inv_dx: real
+        first: wp.vec3i
         nx: int
         ny: int
         nz: int
 
     @wp.func(module=module)
     def base_node(s: vec3, lattice: Lattice):
-        # Clamped, so that a particle out of the grid (its episode is reported as escaped) touches no foreign memory.
+        # Clamped, so that a particle out of the grid (its episode is reported as strayed) touches no foreign memory.
         return wp.vec3i(
-            wp.clamp(int(wp.floor(s[0] - real(0.5))), 0, lattice.nx - 3),
-            wp.clamp(int(wp.floor(s[1] - real(0.5))), 0, lattice.ny - 3),
-            wp.clamp(int(wp.floor(s[2] - real(0.5))), 0, lattice.nz - 3),
+            wp.clamp(int(wp.floor(s[0] - real(0.5))), lattice.first[0], lattice.first[0] + lattice.nx - 3),
+            wp.clamp(int(wp.floor(s[1] - real(0.5))), lattice.first[1], lattice.first[1] + lattice.ny - 3),
+            wp.clamp(int(wp.floor(s[2] - real(0.5))), lattice.first[2], lattice.first[2] + lattice.nz - 3),
         )
 
     @wp.func(module=module)
@@ -79,6 +84,7 @@ def transfers(name: str) -> SimpleNamespace:
         s = (x[e, p] - lattice.origin) * lattice.inv_dx
         base = base_node(s, lattice)
         f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
+        corner = base - lattice.first
         wx, wy, wz = weights(f[0]), weights(f[1]), weights(f[2])
         m = mass[p]
         a = A[e, p] * (real(1.0) / lattice.inv_dx)
@@ -86,7 +92,7 @@ def transfers(name: str) -> SimpleNamespace:
         q0 = m * v[e, p] - a * f
         for i in range(3):
             for j in range(3):
-                row = ((base[0] + i) * lattice.ny + base[1] + j) * lattice.nz + base[2]
+                row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
                 wij = wx[i] * wy[j]
                 qij = q0 + offset[i] * ax + offset[j] * ay
                 for k in range(3):
@@ -111,6 +117,7 @@ def transfers(name: str) -> SimpleNamespace:
         s = (x[e, p] - lattice.origin) * lattice.inv_dx
         base = base_node(s, lattice)
         f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
+        corner = base - lattice.first
         wx, wy, wz = weights(f[0]), weights(f[1]), weights(f[2])
         dx_, dy_, dz_ = weight_slopes(f[0]), weight_slopes(f[1]), weight_slopes(f[2])
         m = mass[p]
@@ -125,7 +132,7 @@ def transfers(name: str) -> SimpleNamespace:
         slope = vec3()
         for i in range(3):
             for j in range(3):
-                row = ((base[0] + i) * lattice.ny + base[1] + j) * lattice.nz + base[2]
+                row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
                 wij = wx[i] * wy[j]
                 gx = dx_[i] * wy[j]
                 gy = wx[i] * dy_[j]
@@ -155,13 +162,14 @@ def transfers(name: str) -> SimpleNamespace:
         x_new: wp.array2d[vec3],
         v_new: wp.array2d[vec3],
         C_new: wp.array2d[mat33],
-        escaped: wp.array[wp.int32],
+        strayed: wp.array[wp.int32],
     ):
         """Gather v' = sum w v_i and C' = 4/dx^2 sum w v_i (x_i - x)^T; move x' = x + dt v'."""
         e, p = wp.tid()
         s = (x[e, p] - lattice.origin) * lattice.inv_dx
         base = base_node(s, lattice)
         f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
+        corner = base - lattice.first
         wx, wy, wz = weights(f[0]), weights(f[1]), weights(f[2])
         s0 = vec3()
         sx = vec3()
@@ -169,7 +177,7 @@ def transfers(name: str) -> SimpleNamespace:
         sz = vec3()
         for i in range(3):
             for j in range(3):
-                row = ((base[0] + i) * lattice.ny + base[1] + j) * lattice.nz + base[2]
+                row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
                 g0, g1, g2 = head(grid_v[e, row]), head(grid_v[e, row + 1]), head(grid_v[e, row + 2])
                 wij = wx[i] * wy[j]
                 r1 = (wij * wz[1]) * g1
@@ -183,7 +191,7 @@ def transfers(name: str) -> SimpleNamespace:
         C_new[e, p] = (real(4.0) * lattice.inv_dx) * wp.matrix_from_cols(sx - f[0] * s0, sy - f[1] * s0, sz - f[2] * s0)
         x_new[e, p] = x[e, p] + dt * s0
         if wp.min(wp.min(f[0], f[1]), f[2]) < real(0.49) or wp.max(wp.max(f[0], f[1]), f[2]) > real(1.51):
-            escaped[e] = 1
+            strayed[e] = 1
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint_g2p(
@@ -202,6 +210,7 @@ def transfers(name: str) -> SimpleNamespace:
         s = (x[e, p] - lattice.origin) * lattice.inv_dx
         base = base_node(s, lattice)
         f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
+        corner = base - lattice.first
         wx, wy, wz = weights(f[0]), weights(f[1]), weights(f[2])
         dx_, dy_, dz_ = weight_slopes(f[0]), weight_slopes(f[1]), weight_slopes(f[2])
         c = (real(4.0) * lattice.inv_dx) * adj_C_new[e, p]
@@ -211,7 +220,7 @@ def transfers(name: str) -> SimpleNamespace:
         s0 = vec3()
         for i in range(3):
             for j in range(3):
-                row = ((base[0] + i) * lattice.ny + base[1] + j) * lattice.nz + base[2]
+                row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
                 wij = wx[i] * wy[j]
                 gx = dx_[i] * wy[j]
                 gy = wx[i] * dy_[j]

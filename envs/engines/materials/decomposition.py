@@ -29,12 +29,9 @@ def svd(name: str) -> Any:
     @wp.func(module=module)
     def rotation(app: real, aqq: real, apq: real):
         """Return (c, s, t): cosine, sine and tangent of the rotation that annihilates a_pq."""
-        t = real(0.0)
-        if apq != real(0.0):
-            theta = (aqq - app) / (real(2.0) * apq)
-            t = wp.where(theta < real(0.0), real(-1.0), real(1.0)) / (
-                wp.abs(theta) + wp.sqrt(theta * theta + real(1.0))
-            )
+        twice, gap = real(2.0) * apq, aqq - app
+        span = wp.abs(gap) + wp.sqrt(gap * gap + twice * twice)
+        t = wp.where(gap < real(0.0), -twice, twice) / wp.max(span, real(TINY))
         c = real(1.0) / wp.sqrt(t * t + real(1.0))
         return c, t * c, t
 
