@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import inspect
 import threading
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -102,6 +103,12 @@ class Environment(abc.ABC):
         losses: Tensor = _Bridge.apply(x, self)  # type: ignore[no-untyped-call]
         return losses
 
+    @classmethod
+    def about(cls) -> str:
+        """Return what a scene says of itself, and after it what its family says."""
+        family = cls.__mro__[: cls.__mro__.index(Environment)]
+        return "\n\n".join(inspect.cleandoc(kind.__doc__) for kind in family if kind.__doc__)
+
     @final
     def example(self, name: str) -> Float[Tensor, " dim"]:
         """Return a parameter vector this scene is known for."""
@@ -123,6 +130,7 @@ class Environment(abc.ABC):
         if self._solvers is not None:
             with self._solvers.lend():
                 pass
+        self._prepare()
 
     def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
@@ -148,6 +156,9 @@ class Environment(abc.ABC):
 
     def _setup(self) -> None:  # noqa: B027 -- a scene that shares nothing needs none
         """Prepare what all evaluations share; sets `space` unless the class does."""
+
+    def _prepare(self) -> None:  # noqa: B027 -- nothing, for most scenes
+        """Make what else a first evaluation would make."""
 
     def _share(self, rows: int) -> int:
         return max(1, min(-(-rows // self.threads), self._capacity))

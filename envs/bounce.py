@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -115,17 +116,8 @@ class Bounce(Environment):
         o = self.options
         self.ball = Ball(radius=0.1, mass=1.0, gravity=9.8, ke=o.ke, kd=o.kd, kf=o.kf, mu=o.mu)
         self._capacity = 256 if self.device == "cpu" else self.preferred_batch
-        self._solvers = Pool(self._solver)
-
-    def _solver(self) -> Solver:
-        return Solver(
-            self.ball,
-            dt=self.fidelity.dt,
-            steps=self.steps,
-            name=self.fidelity.precision,
-            capacity=self._capacity,
-            device=self.device,
-        )
+        settings: dict[str, Any] = {"dt": self.fidelity.dt, "steps": self.steps, "name": self.fidelity.precision}
+        self._solvers = Pool(partial(Solver, self.ball, capacity=self._capacity, device=self.device, **settings))
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         with self._solvers.lend() as solver:

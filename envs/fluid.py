@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -115,11 +116,8 @@ class Fluid(Environment):
 
     def _setup(self) -> None:
         self.model = _model(self.fidelity, self.options)
-        self._solvers = Pool(self._solver)
         self._capacity = capacity(self.model, self.device)
-
-    def _solver(self) -> Solver:
-        return Solver(self.model, capacity=self._capacity, device=self.device, stop=self._stop)
+        self._solvers = Pool(partial(Solver, self.model, capacity=self._capacity, device=self.device, stop=self._stop))
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         x = x.clone().requires_grad_(grad)

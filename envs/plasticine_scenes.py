@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import ClassVar
 
 from .engines.manipulators import STICKY, Kind, Tool
-from .plasticine import Anchor, Lump, Plasticine, Scene
+from .plasticine import DEMONSTRATION, Plasticine
+from .plasticine_model import Anchor, Lump, Scene
 from .shapes import Ball, Box, Point, Ring
 
 SLAB = Lump(Box((0.5, 0.05, 0.5), (0.3, 0.1, 0.3)), 10_000)
@@ -15,10 +16,24 @@ def _finger(x: float, y: float, z: float, radius: float, step: Point) -> Anchor:
     return Anchor(Tool(Kind.SPHERE, (radius,), 0.9), (x, y, z), step)
 
 
+def _demonstration(text: str) -> dict[str, tuple[float, ...]]:
+    """Read the parameters that solve a scene."""
+    return {DEMONSTRATION: tuple(map(float, text.split()))}
+
+
 class Assembly(Plasticine):
     """Lift a ball with two spheres and set it on a box."""
 
     name: ClassVar[str] = "assembly"
+    examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
+        """
+        0.093 0.837 -0.028 0.277 0.833 -0.099
+        0.424 1 -0.034 0.465 0.972 -0.07
+        0.929 0.724 -0.022 0.995 0.663 -0.064
+        0.901 -0.251 0.104 1 0.047 -0.022
+        0.875 -0.564 0.137 1 -0.421 0.075
+        """
+    )
     scene: ClassVar[Scene] = Scene(
         lumps=(Lump(Box((0.6, 0.08, 0.5), (0.16, 0.16, 0.16)), 6000), Lump(Ball((0.3, 0.06, 0.5), 0.06), 4000)),
         anchors=tuple(_finger(x, 0.06, 0.5, 0.04, (0.009, 0.009, 0.009)) for x in (0.38, 0.22)),
@@ -32,6 +47,15 @@ class Pinch(Plasticine):
     """Press a dent into the front of a cube with a sphere."""
 
     name: ClassVar[str] = "pinch"
+    examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
+        """
+        0 0 1
+        0 -1 0
+        0 -0.1 -0.6
+        0 0 0
+        0 0 0
+        """
+    )
     scene: ClassVar[Scene] = Scene(
         lumps=(Lump(Box((0.5, 0.1, 0.5), (0.2, 0.2, 0.2)), 10_000),),
         anchors=(
@@ -52,6 +76,15 @@ class RollingPin(Plasticine):
     """Roll a slab flat with a rolling pin."""
 
     name: ClassVar[str] = "rolling-pin"
+    examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
+        """
+        0.6 0 -1
+        -1 0 -1
+        1 0 -0.7
+        -1 0 -0.3
+        0.4 0 0
+        """
+    )
     scene: ClassVar[Scene] = Scene(
         lumps=(SLAB,),
         anchors=(Anchor(Tool(Kind.ROLLER, (0.15, 0.03), 0.9), (0.5, 0.123, 0.5), (2 / 3, 1 / 15, 0.001)),),
@@ -64,6 +97,15 @@ class Rope(Plasticine):
     """Bend a rope around a post by its two ends."""
 
     name: ClassVar[str] = "rope"
+    examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
+        """
+        0.514 0.292 -0.463 -0.277 0.257 -0.624
+        -0.386 -0.065 -1 -0.291 -0.006 -1
+        -0.153 0.003 -1 -0.704 -0.003 -0.999
+        -0.025 -0.003 -1 -0.727 0.003 -0.866
+        0.787 -0.028 -1 -0.785 -0.056 -0.974
+        """
+    )
     scene: ClassVar[Scene] = Scene(
         lumps=(Lump(Box((0.5, 0.03, 0.73), (0.6, 0.06, 0.06)), 10_000),),
         anchors=tuple(_finger(x, 0.015, 0.82, 0.03, (0.01, 0.01, 0.01)) for x in (0.22, 0.78)),
@@ -78,6 +120,15 @@ class Table(Plasticine):
     """Bend one leg of a table outwards with a sphere."""
 
     name: ClassVar[str] = "table"
+    examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
+        """
+        0.07 0 -0.07
+        0.06 0 -0.06
+        0.06 0 -0.06
+        0.04 0 -0.04
+        0 0 0
+        """
+    )
     scene: ClassVar[Scene] = Scene(
         lumps=(
             *(Lump(Box((x, 0.1, z), (0.04, 0.1, 0.04)), 2000) for x in (0.425, 0.575) for z in (0.425, 0.575)),
@@ -94,12 +145,19 @@ class Torus(Plasticine):
     """Press a ring into a slab."""
 
     name: ClassVar[str] = "torus"
+    examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
+        """
+        -1 -1 -0.6
+        -0.925 -1 -0.475
+        0 -1 0
+        0 0 0
+        0 0 0
+        """
+    )
     scene: ClassVar[Scene] = Scene(
         lumps=(SLAB,),
         anchors=(
-            Anchor(
-                Tool(Kind.TORUS, (0.05, 0.03), 0.9), (0.5, 0.2, 0.5), (0.004, 0.004, 0.004), lower=(0.0, 0.05, 0.0)
-            ),
+            Anchor(Tool(Kind.TORUS, (0.05, 0.03), 0.9), (0.5, 0.2, 0.5), (0.004, 0.004, 0.004), lower=(0.0, 0.05, 0.0)),
         ),
         yield_stress=50.0,
         floor_friction=STICKY,
@@ -110,14 +168,27 @@ class TripleMove(Plasticine):
     """Carry three blocks through the air with three pairs of spheres."""
 
     name: ClassVar[str] = "triple-move"
+    examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
+        """
+        0.123 0.083 0.002 -0.071 0.103 0.018 0.221 0.078 -0.161
+        -0.152 0.124 -0.06 0.218 0.534 0.011 -0.161 0.4 0.008
+        -0.085 0.414 -0.002 -0.064 0.452 0.007 0.115 0.094 -0.895
+        0.06 0.213 -0.953 -0.109 0.89 -0.759 -0.096 0.894 -0.722
+        -0.299 0.428 -0.008 -0.349 0.423 0.006 1 0.246 -0.945
+        0.982 0.228 -0.997 -0.265 0.871 -0.885 -0.324 0.948 -0.856
+        -0.308 0.456 0.008 -0.349 0.422 -0.001 1 0.569 -0.525
+        1 0.55 -0.635 -0.342 0.638 -0.839 -0.346 0.579 -0.791
+        -0.277 0.199 0.023 -0.35 0.152 0.03 1 0.565 -0.519
+        1 0.53 -0.62 -0.018 0.02 -0.718 -0.072 0.099 -0.738
+        """
+    )
     scene: ClassVar[Scene] = Scene(
         lumps=tuple(Lump(Box((x, 0.05, 0.5), (0.1, 0.1, 0.1)), 3333) for x in (0.3, 0.5, 0.7)),
         anchors=tuple(_finger(x, 0.05, 0.5, 0.03, (0.01, 0.01, 0.01)) for x in (0.23, 0.37, 0.43, 0.57, 0.63, 0.77)),
         yield_stress=200.0,
         floor_friction=1.5,
         target=tuple(
-            Box(center, (0.1, 0.1, 0.1))
-            for center in ((0.2, 0.2, 0.5029), (0.8, 0.2, 0.2), (0.6254, 0.3436, 0.2002))
+            Box(center, (0.1, 0.1, 0.1)) for center in ((0.2, 0.2, 0.5029), (0.8, 0.2, 0.2), (0.6254, 0.3436, 0.2002))
         ),
     )
 
@@ -126,12 +197,19 @@ class Writer(Plasticine):
     """Write a stroke into a slab with a pen."""
 
     name: ClassVar[str] = "writer"
+    examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
+        """
+        -0.9 -0.2 0
+        0.3 -0.2 0.8
+        0.8 0 0.2
+        0.6 0 -0.5
+        0 0 0
+        """
+    )
     scene: ClassVar[Scene] = Scene(
         lumps=(SLAB,),
         anchors=(
-            Anchor(
-                Tool(Kind.CAPSULE, (0.03, 0.03), 0.0), (0.5, 0.13, 0.5), (0.01, 0.01, 0.01), lower=(0.0, 0.05, 0.0)
-            ),
+            Anchor(Tool(Kind.CAPSULE, (0.03, 0.03), 0.0), (0.5, 0.13, 0.5), (0.01, 0.01, 0.01), lower=(0.0, 0.05, 0.0)),
         ),
         yield_stress=50.0,
         floor_friction=STICKY,

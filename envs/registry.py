@@ -41,6 +41,12 @@ def _function(name: str, target: str, model: str, dim: str = "2") -> Entry:
     return Entry(name, f"gradscape.envs.functions:{target}", dim, "x0, x1, ... (no unit)", model, ("exact",))
 
 
+def _plasticine(name: str, target: str, dim: str, tools: str, task: str) -> Entry:
+    parameters = f"5 x ({tools})" if ":" in tools else f"5 x ({tools}: x, y, z)"
+    model = f"MLS-MPM: von Mises plasticine, tools; {task}"
+    return Entry(name, f"gradscape.envs.plasticine_scenes:{target}", dim, parameters, model, SCENE)
+
+
 BUILTIN = (
     Entry(
         "bounce",
@@ -58,6 +64,14 @@ BUILTIN = (
         "MLS-MPM: viscous fluid, elastic cube, moving ladle",
         SCENE,
     ),
+    _plasticine("assembly", "Assembly", "30", "2 spheres", "lift a ball onto a box"),
+    _plasticine("pinch", "Pinch", "15", "sphere", "dent a cube"),
+    _plasticine("rolling-pin", "RollingPin", "15", "pin: roll, turn, height", "roll a slab flat"),
+    _plasticine("rope", "Rope", "30", "2 spheres", "bend a rope around a post"),
+    _plasticine("table", "Table", "15", "sphere", "bend a table's leg"),
+    _plasticine("torus", "Torus", "15", "ring", "press a ring into a slab"),
+    _plasticine("triple-move", "TripleMove", "90", "6 spheres", "carry three blocks"),
+    _plasticine("writer", "Writer", "15", "pen", "write into a slab"),
     _function("ackley", "Ackley", "many shallow minima around a funnel", "any"),
     _function("beale", "Beale", "flat plain with sharp corner peaks"),
     _function("branin", "Branin", "three equal minima in a smooth valley"),
@@ -100,9 +114,9 @@ def environment_class(name: str) -> type[Environment]:
     return found
 
 
-def code_digest(name: str) -> str:
+def code_digest(kind: type[Environment]) -> str:
     """Return a digest of the code an environment's numbers come from: all of ours, or the other package's module."""
-    file = Path(inspect.getfile(environment_class(name))).resolve()
+    file = Path(inspect.getfile(kind)).resolve()
     ours = Path(__file__).resolve().parent
     files = sorted(ours.rglob("*.py")) if file.is_relative_to(ours) else [file]
     return hashlib.sha256(b"".join(source.read_bytes() for source in files)).hexdigest()[:12]

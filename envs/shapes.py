@@ -77,8 +77,9 @@ class Ring:
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner [m]."""
-        side = np.array([self.outer, 0.0, self.outer])
-        return np.subtract(self.center, side), np.add(self.center, side) + [0.0, self.height, 0.0]
+        return np.subtract(self.center, [self.outer, 0.0, self.outer]), np.add(
+            self.center, [self.outer, self.height, self.outer]
+        )
 
     def place(self, u: Float[Tensor, "particle 3"]) -> Float[Tensor, "particle 3"]:
         """Map the unit cube onto the shape so that even stays even."""

@@ -1,4 +1,4 @@
-"""What a plasticine loss compares with: the target's mass and distance field, the distance of tools to the plasticine."""
+"""What a plasticine loss is made of: the target's mass and distance field, and how far tools are from the plasticine."""
 
 from __future__ import annotations
 
@@ -82,7 +82,8 @@ def outside(tool: Tool, x: Float[Tensor, "*batch 3"], pose: Float[Tensor, "*batc
             gap = (p - along * axis).norm(dim=-1) - size[1]
         case Kind.CYLINDER:
             raise ValueError("a post does not move: it has no part in the contact term")
-    return gap.clamp_min(0)
+    outer: Tensor = gap.clamp_min(0)
+    return outer
 
 
 def cached(name: str, content: str, make: Callable[[], np.ndarray]) -> np.ndarray:

@@ -1,9 +1,9 @@
 """What grid velocities meet: moving tools and walls.
 
-A boundary is a Warp function (its data, node position, velocity, environment, tools, control step, fraction of it, 1/its
-span) -> velocity. `tools` [environment, control step, slot] holds positions [m] at the ends of control steps; in between
-a tool moves at constant velocity. Sizes and frictions are data, so that scenes with the same kind of boundary share its
-compiled kernel.
+A boundary is a Warp function (its data, node position, velocity, environment, tools, control step, fraction of it, 1
+over its span) -> velocity. `tools` [environment, control step, slot] holds positions [m] at the ends of control steps;
+in between a tool moves at constant velocity. Sizes and frictions are data, so that scenes with the same kind of
+boundary share its compiled kernel.
 """
 
 from dataclasses import dataclass, fields
@@ -38,7 +38,8 @@ class Open:
 
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the boundary's Warp function and its struct."""
-        return _open(name)
+        boundary, Data = _open(name)
+        return boundary, Data
 
     def data(self, name: str, device: str) -> Any:
         """Return the function's data."""
@@ -65,7 +66,8 @@ class LadleInTank:
 
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the boundary's Warp function and its struct."""
-        return _ladle_in_tank(name)
+        boundary, Data = _ladle_in_tank(name)
+        return boundary, Data
 
     def data(self, name: str, device: str) -> Any:
         """Return the function's data."""

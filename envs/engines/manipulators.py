@@ -4,6 +4,7 @@ Every tool is a signed distance. Grid velocities in its shell lose what goes int
 the farther off they are: the influence exp(-softness d) ends at a tenth. Tools are moved, never pushed back.
 """
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache, partial
@@ -40,7 +41,7 @@ class Tool:
     @property
     def radius(self) -> float:
         """Radius of a ball around the tool's middle that holds it [m]."""
-        return float(np.hypot(*self.size)) if self.kind is Kind.CYLINDER else sum(self.size)
+        return math.hypot(*self.size) if self.kind is Kind.CYLINDER else sum(self.size)
 
     @property
     def slots(self) -> int:
@@ -70,7 +71,8 @@ class Manipulators:
 
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the boundary's Warp function and its struct."""
-        return _manipulators(name, len(self.tools))
+        boundary, Data = _manipulators(name, len(self.tools))
+        return boundary, Data
 
     def data(self, name: str, device: str) -> Any:
         """Return the function's data."""
@@ -81,10 +83,10 @@ class Manipulators:
         sizes = [(*tool.size, 0.0)[:2] for tool in self.tools]
         rows = np.array([[*size, tool.friction] for size, tool in zip(sizes, self.tools, strict=True)])
         data.shape = wp.array(rows, dtype=types.vec3, device=device)
-        shell = float(-np.log(FAINTEST)) / self.softness
+        shell = -math.log(FAINTEST) / self.softness
         data.reach = wp.array([tool.radius + shell for tool in self.tools], dtype=types.real, device=device)
         data.kind = wp.array([int(tool.kind) for tool in self.tools], dtype=wp.int32, device=device)
-        slots = np.cumsum([0] + [tool.slots for tool in self.tools[:-1]])
+        slots = np.cumsum([0, *(tool.slots for tool in self.tools[:-1])])
         data.slot = wp.array(slots, dtype=wp.int32, device=device)
         return data
 

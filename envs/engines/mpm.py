@@ -12,6 +12,7 @@ one whole: particles, A, and the grids too unless they are large.
 """
 
 import threading
+import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -80,7 +81,7 @@ class Model:
     @property
     def keeps_grids(self) -> bool:
         """Whether the gradient's window keeps its grids; else it scatters once more."""
-        return self.substeps * 8 * self.cells * self._real_bytes <= KEPT
+        return self.substeps * 8 * self.cells * self.real_bytes <= KEPT
 
     def bytes_per_environment(self) -> int:
         """Return what one environment of a solver takes, adjoints included."""
@@ -88,10 +89,11 @@ class Model:
         frame = 15 * self.particles + state  # x, v, C and each material's own
         affine = (self.substeps + 1) * 9 * self.particles
         grids = ((self.substeps if self.keeps_grids else 1) + 1) * 8 * self.cells
-        return self._real_bytes * ((self.steps + self.substeps + 2) * frame + affine + grids)
+        return self.real_bytes * ((self.steps + self.substeps + 2) * frame + affine + grids)
 
     @property
-    def _real_bytes(self) -> int:
+    def real_bytes(self) -> int:
+        """Bytes of one number."""
         return 8 if self.precision == "float64" else 4
 
 
@@ -173,7 +175,7 @@ class Solver:
         self._start()
 
     def run(self, tools: torch.Tensor) -> torch.Tensor:
-        """Simulate; `tools`, shape (batch, step + 1, slot, 3), is the boundary's; return last x, (batch, particle, 3)."""
+        """Simulate with the boundary's `tools`, shape (batch, step + 1, slot, 3); return x at the end [m]."""
         batch = len(tools)
         self.escaped.zero_()
         to_torch(self.tools)[:batch] = tools.to(self.types.torch)
@@ -300,12 +302,15 @@ class _Adjoint:
     """Hold the adjoint arrays of a solver and run its backward pass."""
 
     def __init__(self, solver: Solver) -> None:
-        self.solver = solver
+        self.solver = weakref.proxy(solver)  # which holds this: a cycle would keep a GPU's memory until it is collected
         self.new, self.old = solver._frame(), solver._frame()
         self.A = wp.zeros_like(solver.A[0])
         self.grid = solver._grid()
         self.tools = solver._tools()
-        self.structs = solver.kernels.Lattice(), type(solver.boundary)()  # no adjoint is wanted, but Warp wants its place
+        self.structs = (
+            solver.kernels.Lattice(),
+            type(solver.boundary)(),
+        )  # no adjoint is wanted, but Warp wants its place
 
     def run(self, adj_x: Mapping[int, torch.Tensor]) -> torch.Tensor:
         """Return the adjoint of the tools, shape (batch, step + 1, slot, 3)."""

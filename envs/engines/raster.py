@@ -18,16 +18,20 @@ class Raster:
         types = precision(model.precision)
         self.kernels, self.lattice, self.device = transfers(model.precision), place(model), device
         load([self.kernels.p2g, self.kernels.adjoint_p2g], device)
-        self.mass = wp.array(mass, dtype=types.real, device=device)
+        self.mass: wp.array = wp.array(mass, dtype=types.real, device=device)
         kinds = types.vec3, types.vec3, types.mat33, types.vec3, types.vec3, types.mat33
         particles = [wp.zeros((capacity, len(mass)), dtype=kind, device=device) for kind in kinds]
         self.particles, self.adjoints = particles[:3], particles[3:]  # x, v, A: a mass does not depend on v and A
         self.grid = wp.zeros((capacity, model.cells), dtype=types.vec4, device=device)
 
+    @staticmethod
+    def bytes_per_row(model: Model) -> int:
+        """Return what a row takes."""
+        return model.real_bytes * (30 * model.particles + 4 * model.cells)
+
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
         """Return the mass at each node, shape (batch, node), of particles at x [m], shape (batch, particle, 3)."""
-        mass: torch.Tensor = _Spread.apply(x, self)  # type: ignore[no-untyped-call]
-        return mass
+        return _Spread.apply(x, self)
 
     def spread(self, x: torch.Tensor) -> torch.Tensor:
         """Return masses without a graph."""

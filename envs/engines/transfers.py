@@ -30,8 +30,8 @@ def transfers(name: str) -> SimpleNamespace:
     class Lattice:
         """Place the grid: node (0, 0, 0) at `origin` [m], spacing 1/`inv_dx` [m].
 
-        Arrays hold `nx, ny, nz` nodes from node `first` on. What a particle reads and writes does not depend on them, to
-        the last bit, as long as they cover it.
+        Arrays hold `nx, ny, nz` nodes from node `first` on. As long as they cover what a particle reads and writes, it
+        does not depend on them, to the last bit.
         """
 
         origin: vec3

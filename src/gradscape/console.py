@@ -27,7 +27,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from .envs.registry import code_digest, entries, environment_class, make
+from .envs.registry import code_digest, entries, make
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -59,12 +59,10 @@ def list_environments() -> None:
 
 def describe_environment(name: str) -> None:
     """Print all there is to know about one environment."""
-    from inspect import getdoc
-
     from .envs.options import describe
 
     env, console = make(name, device="cpu"), Console(soft_wrap=True, highlight=False)
-    said = f"{name}: {env.space.dim} parameters\n\n{getdoc(environment_class(name))}\n"
+    said = f"{name}: {env.space.dim} parameters\n\n{env.about()}\n"
     console.print(said, markup=False)
     table = Table("no.", "parameter", "lower", "upper", "unit")
     bounds = zip(env.space.lower.tolist(), env.space.upper.tolist(), strict=True)
@@ -136,7 +134,7 @@ def _open(env: Environment, plane: Plane, *, out: str | None, grad: bool, force:
         "fidelity": env.fidelity.name,
         "settings": asdict(env.fidelity),
         "device": env.device,
-        "code": code_digest(env.name),
+        "code": code_digest(type(env)),
     }
     provenance = {
         "command": command,

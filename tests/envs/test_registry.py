@@ -61,11 +61,11 @@ def test_another_packages_environment_is_listed_then_made(package):
 
 def test_a_digest_follows_the_code_the_numbers_come_from(package, tmp_path):
     package({"my-arm": "gradscape_test_arm:Arm"})
-    before = code_digest("my-arm")
-    assert code_digest("my-arm") == before
+    before = code_digest(environment_class("my-arm"))
+    assert code_digest(environment_class("my-arm")) == before
     (tmp_path / "gradscape_test_arm.py").write_text(ENVIRONMENT.replace("2 * x", "3 * x"))
-    assert code_digest("my-arm") != before
-    assert code_digest("bounce") == code_digest("fluid") != before
+    assert code_digest(environment_class("my-arm")) != before
+    assert code_digest(environment_class("bounce")) == code_digest(environment_class("fluid")) != before
 
 
 @pytest.mark.parametrize("target", ["gradscape_no_such_module:Arm", "gradscape_test_arm:Leg"])

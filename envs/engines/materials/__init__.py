@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from . import elastic, fluid, plasticine
 from ..runtime import precision
+from . import elastic, fluid, plasticine
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ def svd(name: str) -> Any:
         v1 = vec3(real(0.0), real(1.0), real(0.0))
         v2 = vec3(real(0.0), real(0.0), real(1.0))
         bound = real(small) * (a00 + a11 + a22) * (a00 + a11 + a22)
-        sweep = int(0)
+        sweep = int(0)  # noqa: UP018, RUF046 -- what a loop changes must be a variable to Warp
         while sweep < SWEEPS and a01 * a01 + a02 * a02 + a12 * a12 > bound:
             sweep += 1
             c, s, t = rotation(a00, a11, a01)

@@ -5,10 +5,10 @@ The trial deformation (I + dt C) F = U diag(s) V^T returns to the yield surface 
     d = e - mean(e),  |d| = sqrt(d.d + 1e-8),  e' = e where |d| <= kappa, else mean(e) + kappa d / |d|,
     f = exp(e'),  F' = U diag(f) V^T,  tau = U diag(2 mu f (f - 1) + lam J (J - 1)) U^T,  J = f_0 f_1 f_2.
 
-F' and the rotation R = U V^T are isotropic functions of the trial: with P = U^T dF V, the entries i, j and j, i of their
-differentials depend on those of P only, by the divided differences of f and 1 over s. None of them is singular where
-singular values are equal, as they are in every undeformed body. (The differential of the SVD itself is, which is why
-simulators that clamp its 1/(s_i^2 - s_j^2) get the gradient of undeformed and of symmetrically yielding bodies wrong.)
+F' and tau are isotropic functions of the trial: with P = U^T dF V, the entries i, j and j, i of their differentials
+depend on those of P only, through the divided differences of f over s. None of these is singular where singular values
+are equal, as they are in every undeformed body. (The differential of the SVD itself is, which is why simulators that
+clamp its 1/(s_i^2 - s_j^2) get the gradient of undeformed and of symmetrically yielding bodies wrong.)
 """
 
 from functools import cache
@@ -16,8 +16,8 @@ from typing import Any, no_type_check
 
 import warp as wp
 
-from .decomposition import svd
 from ..runtime import precision
+from .decomposition import svd
 
 SMALLEST = 0.05  # singular values below count as this; what is pressed flatter has lost its shape
 ROUNDED = 1e-8  # added to |d|^2, so that an undeformed body has a gradient
