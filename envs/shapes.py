@@ -96,7 +96,7 @@ def shares(shapes: Sequence[Shape], total: int) -> list[int]:
     """Return how many of `total` particles each shape gets, by volume."""
     ends = np.cumsum([shape.volume for shape in shapes])
     bounds = np.rint(np.concatenate([[0.0], ends / ends[-1]]) * total).astype(int)
-    return np.diff(bounds).tolist()
+    return [int(count) for count in np.diff(bounds)]
 
 
 def fill(shape: Shape, count: int) -> np.ndarray:

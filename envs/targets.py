@@ -1,4 +1,4 @@
-"""What a plasticine loss is made of: the target's mass and distance field, and how far tools are from the plasticine."""
+"""What a plasticine loss is made of: the target's mass and distance field, how far tools are from plasticine."""
 
 from __future__ import annotations
 

@@ -31,7 +31,8 @@ class Raster:
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
         """Return the mass at each node, shape (batch, node), of particles at x [m], shape (batch, particle, 3)."""
-        return _Spread.apply(x, self)
+        mass: torch.Tensor = _Spread.apply(x, self)
+        return mass
 
     def spread(self, x: torch.Tensor) -> torch.Tensor:
         """Return masses without a graph."""

@@ -2,13 +2,12 @@
 
 import pytest
 import torch
-import warp as wp
 
 from gradscape.envs.engines.boundaries import LadleInTank, Open
-from gradscape.envs.engines.runtime import precision, to_torch
+
+from .bench import BoundaryBench, vectors
 
 TANK = LadleInTank(half_width=0.2, lid=0.6, radius=0.07, half_thickness=0.01, height=0.25, band=0.02, friction=0.25)
-TYPES = precision("float64")
 RIM = torch.tensor([0.0, 0.15, 0.0], dtype=torch.float64)
 AWAY = torch.tensor([0.0, 10.0, 0.0], dtype=torch.float64)
 BELOW = RIM - torch.tensor([0.0, TANK.radius, 0.0])  # the bowl's lowest point, on its mid-surface
@@ -16,22 +15,11 @@ RATE = 100.0  # 1 / length of a control step [1/s]
 
 
 def built(boundary):
-    meet, real, vec3 = boundary.function("float64"), TYPES.real, TYPES.vec3
-
-    @wp.kernel(module="unique")
-    def apply(
-        p: wp.array[vec3], tools: wp.array3d[vec3], fraction: real, rate: real, v: wp.array[vec3], out: wp.array[vec3]
-    ):
-        i = wp.tid()
-        out[i] = meet(p[i], v[i], 0, tools, 0, fraction, rate)
+    bench = BoundaryBench(boundary, rate=RATE)
 
     def met(p, v, *, start=AWAY, end=None, fraction=0.0):
-        path = torch.stack([start, start if end is None else end])
-        arrays = [wp.array(t.reshape(-1, 3).numpy(), dtype=vec3, copy=True) for t in (p, v)]
-        tools = wp.array(path[None, :, None].contiguous().numpy(), dtype=vec3, copy=True)
-        out = wp.zeros_like(arrays[1])
-        wp.launch(apply, len(out), [arrays[0], tools, fraction, RATE, arrays[1], out], record_tape=False)
-        return to_torch(out).clone()
+        tools = torch.stack([start, start if end is None else end])[:, None]
+        return bench(p, v.reshape(-1, 3), tools, fraction)
 
     return met
 
@@ -39,10 +27,6 @@ def built(boundary):
 @pytest.fixture(scope="module")
 def tank():
     return built(TANK)
-
-
-def vectors(*rows):
-    return torch.tensor(rows, dtype=torch.float64)
 
 
 def random(count, size, seed):

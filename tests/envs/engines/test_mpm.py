@@ -219,7 +219,7 @@ def test_the_gradient_by_the_tools_is_the_slope_on_a_ladder_of_steps(stirred):
     adj_x = torch.rand((2, solver.model.particles, 3), generator=generator, dtype=torch.float64) - 0.5
     direction = torch.rand(path.shape, generator=generator, dtype=torch.float64) - 0.5
     solver.run(path)
-    slope = (solver.gradient(adj_x) * direction).sum(dim=(1, 2, 3))
+    slope = (solver.gradient({solver.model.steps: adj_x}) * direction).sum(dim=(1, 2, 3))
     errors = []
     for step in (1e-3, 1e-4, 1e-5, 1e-6, 1e-7):
         ends = [(solver.run(path + sign * step * direction) * adj_x).sum(dim=(1, 2)) for sign in (1, -1)]
@@ -234,7 +234,7 @@ def test_gradients_have_the_same_bits_every_time(stirred):
     gradients = []
     for _ in range(2):
         solver.run(path)
-        gradients.append(solver.gradient(adj_x))
+        gradients.append(solver.gradient({solver.model.steps: adj_x}))
     assert torch.equal(*gradients)
     assert gradients[0].abs().max() > 0
 
@@ -243,7 +243,7 @@ def test_a_second_gradient_of_one_run_has_the_same_bits(stirred):
     solver, path = stirred
     adj_x = torch.ones((2, solver.model.particles, 3), dtype=torch.float64)
     solver.run(path)
-    assert torch.equal(solver.gradient(adj_x), solver.gradient(adj_x))
+    assert torch.equal(solver.gradient({solver.model.steps: adj_x}), solver.gradient({solver.model.steps: adj_x}))
 
 
 def arrays(thing, seen):
@@ -263,7 +263,7 @@ def arrays(thing, seen):
 def test_the_memory_estimate_is_what_a_solver_takes(stirred):
     solver, path = stirred
     solver.run(path)
-    solver.gradient(torch.ones((2, solver.model.particles, 3), dtype=torch.float64))
+    solver.gradient({solver.model.steps: torch.ones((2, solver.model.particles, 3), dtype=torch.float64)})
     seen = set()
     held = [*vars(solver).values(), *vars(solver.adjoint).values()]
     taken = sum(array.capacity for thing in held for array in arrays(thing, seen))

@@ -40,6 +40,7 @@ class Bench:
         self.types, self.kernels = precision(name), transfers(name)
         self.lattice = self.kernels.Lattice()
         self.lattice.origin, self.lattice.inv_dx = self.types.vec3(*ORIGIN), 1 / DX
+        self.lattice.first = wp.vec3i(0, 0, 0)
         self.lattice.nx, self.lattice.ny, self.lattice.nz = NODES
         self.kinds = {(): self.types.real, (3,): self.types.vec3, (4,): self.types.vec4, (3, 3): self.types.mat33}
 
