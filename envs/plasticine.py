@@ -58,7 +58,8 @@ class Plasticine(Environment):
     density = sum |m - m*| over the masses of grid nodes [kg]; sdf = sum m D* [kg m], D* the distance to the target's
     nearest node; contact = sum over tools of the squared distance to the closest particle [m^2]. The weight of contact
     is ours: the paper raised it and does not say to what.
-    Targets are shapes, or what the scene's demonstration (an example) leaves at standard fidelity.
+    Targets are shapes, or what the scene's demonstration (an example) leaves at the same fidelity: at each of them a
+    solution is known.
     Simplifications: a tool that only translates carries no rotation; a slippery room ends where tools push nothing, or
     0.5 m beyond the bodies; particles are spread evenly whatever a body weighs (upstream, weight follows the number
     drawn). Departures from upstream: 20 substeps for 19, an exact distance field, softness 666 everywhere; only the
@@ -157,9 +158,10 @@ class Plasticine(Environment):
             escaped = stage.solver.left_grid(len(x)).cpu()
             for step in self._judged:
                 end, terms = self._judge(stage, step, paths)
-                loss += terms.detach() @ weights
+                losses = (terms * weights).sum(dim=1)
+                loss += losses.detach()
                 if grad:
-                    adj_x[step], part = torch.autograd.grad((terms @ weights).sum(), (end, paths))
+                    adj_x[step], part = torch.autograd.grad(losses.sum(), (end, paths))
                     adj_paths += part
             if grad:
                 adj_paths += stage.solver.gradient(adj_x)
@@ -171,29 +173,28 @@ class Plasticine(Environment):
     ) -> tuple[Tensor, Tensor]:
         """Return where particles are before a control step, and the loss's terms there, shape (batch, term)."""
         end = stage.solver.reached(step, len(paths)).detach().requires_grad_(paths.requires_grad)
-        at_nodes = stage.raster(end).double()
-        density = (at_nodes - self._target.mass).abs().sum(dim=1)
-        distance = at_nodes @ self._target.distance
+        rows = stage.raster(end).double().unbind(0)  # one by one: a batched sum rounds as its batch is large
+        density = torch.stack([(row - self._target.mass).abs().sum() for row in rows])
+        distance = torch.stack([(row * self._target.distance).sum() for row in rows])
         touch = contact(end.double(), paths[:, step], [anchor.tool for anchor in self.scene.anchors])
         return end, torch.stack([density, distance, touch], dim=1)
 
     @cached_property
     def _target(self) -> Target:
         """What a shape is compared with, on this model's grid."""
-        standard = model(self.scene, self.fidelities["standard"])
         with self._making:
-            return Target.of(self.model, self._wanted(standard), standard.mass, self.device)
+            return Target.of(self.model, self._wanted(), self.device)
 
-    def _wanted(self, standard: Model) -> np.ndarray:
-        """Return the target's particles [m]."""
+    def _wanted(self) -> np.ndarray:
+        """Return where the target's particles are [m]."""
         if self.scene.target:
-            return target(self.scene, standard.particles)
-        content = f"{self.scene} {self.fidelities['standard']} {self.examples[DEMONSTRATION]} {code_digest(type(self))}"
-        return cached(self.name, content, self._demonstrated)
+            return target(self.scene, self.model.particles)
+        content = f"{self.scene} {self.fidelity} {self.examples[DEMONSTRATION]} {code_digest(type(self))}"
+        return cached(f"{self.name}-{self.fidelity.name}", content, self._demonstrated)
 
     def _demonstrated(self) -> np.ndarray:
-        demonstration = type(self)(fidelity="standard", device="cpu").end(self.example(DEMONSTRATION))
-        return np.asarray(demonstration.numpy(), dtype=np.float32)
+        demonstration = type(self)(fidelity=self.fidelity, device="cpu").end(self.example(DEMONSTRATION))
+        return np.asarray(demonstration)
 
 
 def _stage(model: Model, capacity: int, device: str, stop: threading.Event) -> Stage:

@@ -42,7 +42,7 @@ def _function(name: str, target: str, model: str, dim: str = "2") -> Entry:
 
 
 def _plasticine(name: str, target: str, dim: str, tools: str, task: str) -> Entry:
-    parameters = f"5 x ({tools})" if ":" in tools else f"5 x ({tools}: x, y, z)"
+    parameters = f"5 x ({tools}{'' if ':' in tools else ': x, y, z'}), shares (no unit)"
     model = f"MLS-MPM: von Mises plasticine, tools; {task}"
     return Entry(name, f"gradscape.envs.plasticine_scenes:{target}", dim, parameters, model, SCENE)
 

@@ -32,12 +32,12 @@ class Target:
     distance: Float[Tensor, " node"]
 
     @classmethod
-    def of(cls, model: Model, x: np.ndarray, mass: np.ndarray, device: str) -> Target:
-        """Return the target that particles at `x` [m], shape (particle, 3), of `mass` [kg] are, on a model's grid.
+    def of(cls, model: Model, x: np.ndarray, device: str) -> Target:
+        """Return the target that a model's particles are at `x` [m], shape (particle, 3), on its grid.
 
         Distances are from nodes with more than SOLID; what lies around them and holds any of the target costs nothing.
         """
-        raster = Raster(model, mass, capacity=1, device="cpu")
+        raster = Raster(model, model.mass, capacity=1, device="cpu")
         at_nodes = raster(torch.from_numpy(x)[None])[0]
         solid = min(SOLID * (64 * model.dx) ** 3, float(at_nodes.max()) / 2)
         empty = (at_nodes <= solid).numpy().reshape(model.nodes)
@@ -92,7 +92,7 @@ def cached(name: str, content: str, make: Callable[[], np.ndarray]) -> np.ndarra
     path = user_cache_path("gradscape") / "targets" / f"{name}-{digest}.npy"
     found = _read(path)
     if found is None:
-        log.warning("%s: making its target once, by its demonstration at standard fidelity", name)
+        log.info("%s: making the target by its demonstration", name)
         found = make()
         with replacing(path) as partial, partial.open("wb") as file:
             np.save(file, found)

@@ -8,6 +8,7 @@ import torch
 from gradscape.envs.base import Fidelity
 from gradscape.envs.bounce import Bounce
 from gradscape.envs.fluid import SPAN
+from gradscape.envs.plasticine_model import SPAN as SOFT_SPAN
 from gradscape.envs.registry import entries, environment_class, make
 from gradscape.landscapes.objective import Objective, Status
 
@@ -16,6 +17,9 @@ SETTINGS = {
     "bounce": {"fidelity": replace(Bounce.fidelities["draft"], precision="float64")},
     "fluid": {"fidelity": Fidelity("tiny", dt=SPAN / 2, precision="float64", resolution=6, sampling=1.5)},
 }
+SOFT = ("assembly", "pinch", "rolling-pin", "rope", "table", "torus", "triple-move", "writer")
+SOFT_TINY = Fidelity("tiny", dt=SOFT_SPAN / 5, precision="float64", resolution=16, particles=100)
+SETTINGS |= {name: {"fidelity": SOFT_TINY} for name in SOFT}
 ROWS = 7
 
 

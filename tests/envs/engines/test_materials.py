@@ -133,7 +133,7 @@ def test_adjoints_are_slopes(material, through):
     )
     weights = [draw(*state.shape, seed=10), draw(count, 3, 3, seed=8)]
     weights[through == "state"].zero_()
-    for got, wanted in MaterialBench(material).slack(state, C, *weights, dt, step=1e-5):
+    for got, wanted in MaterialBench(material).slopes(state, C, *weights, dt, step=1e-5):
         assert wanted.abs().max() > 0
         torch.testing.assert_close(got, wanted, rtol=0, atol=1e-8 * float(wanted.abs().max()))
 

@@ -7,15 +7,19 @@ import pytest
 import torch
 import warp as wp
 
+from gradscape.envs.engines import mpm
 from gradscape.envs.engines.boundaries import LadleInTank, Open
-from gradscape.envs.engines.materials import Elastic, Fluid
-from gradscape.envs.engines.mpm import Body, Model, Solver
+from gradscape.envs.engines.manipulators import Kind, Manipulators, Tool
+from gradscape.envs.engines.materials import Elastic, Fluid, Plasticine
+from gradscape.envs.engines.mpm import Body, Box, Model, Solver
 from gradscape.envs.engines.runtime import to_torch
 
 DENSITY, SPEED, GRAVITY = 1330.0, 6.0, 9.81  # [kg/m^3], of sound [m/s], [m/s^2]
 SYRUP = Fluid(DENSITY, DENSITY * SPEED**2, viscosity=4.0)
 SPONGE = Elastic.with_wave_speed(DENSITY, SPEED, poisson=0.3)
-MATERIALS = {"fluid": SYRUP, "elastic": SPONGE}
+CLAY = Plasticine(DENSITY, SPONGE.young, SPONGE.poisson, yield_stress=300.0)
+FIRM = replace(CLAY, yield_stress=1e5)  # never yields
+MATERIALS = {"fluid": SYRUP, "elastic": SPONGE, "plasticine": FIRM}
 WIDTH, DEPTH = 0.2, 0.15  # of the tank and of what fills it [m]
 SPAN = 0.01  # length of a control step [s]
 
@@ -33,10 +37,10 @@ def block(material, corner, side=0.1, count=4):
 
 
 def free_model(**changes):
-    """Return a fluid and an elastic block in empty space."""
+    """Return a block of fluid, of clay and of sponge in empty space."""
     model = Model(
         precision="float64",
-        bodies=(block(SYRUP, (-0.1, 0.4, 0.0)), block(SPONGE, (0.07, 0.45, 0.0))),
+        bodies=(block(SYRUP, (-0.1, 0.4, 0.0)), block(CLAY, (0, 0.27, 0.0)), block(SPONGE, (0.07, 0.45, 0.0))),
         boundary=Open(),
         origin=(-0.3, 0.0, -0.3),
         dx=0.05,
@@ -108,8 +112,10 @@ def test_mass_and_momentum_are_conserved_away_from_walls():
     torch.testing.assert_close(momentum, momentum[:1].expand_as(momentum), rtol=0, atol=1e-7 * float(m.sum()))
     on_grid = to_torch(solver.grids[-1].m)[:, :, 3].sum(dim=1)
     torch.testing.assert_close(on_grid, m.sum().expand(2), rtol=1e-12, atol=0)
-    deformed = to_torch(solver.checkpoints[-1].S[0])
-    assert (deformed - 1).abs().max() > 1e-3  # and this was no rigid motion
+    J, F = (to_torch(state) for state in solver.checkpoints[-1].S[:2])
+    assert (J - 1).abs().max() > 1e-3  # and this was no rigid motion
+    e = torch.linalg.svdvals(F).log()
+    assert (e - e.mean(dim=2, keepdim=True)).norm(dim=2).max() == pytest.approx(CLAY.yield_stress / (2 * CLAY.mu))
 
 
 def test_angular_momentum_is_conserved_away_from_walls():
@@ -121,6 +127,23 @@ def test_angular_momentum_is_conserved_away_from_walls():
     turning = torch.linalg.cross(x, v) + model.dx**2 / 4 * axial
     total = (masses(model)[:, None] * turning).sum(dim=1)
     assert total.diff(dim=0).abs().max() < 1e-7 * float(masses(model).sum())
+
+
+@pytest.mark.parametrize("material", ["elastic", "plasticine"])
+def test_a_spinning_block_turns_as_a_rigid_body(material):
+    """It keeps its angular momentum and its shape, but for what the centrifugal force stretches."""
+    model = free_model(bodies=(block(MATERIALS[material], (0, 0.4, 0)),))
+    x = torch.from_numpy(model.bodies[0].x)
+    middle, omega = x.mean(dim=0), torch.tensor([1.0, 2.0, -2.0], dtype=torch.float64)
+    spin = torch.linalg.cross(omega.expand(3, 3), torch.eye(3, dtype=torch.float64)).T
+    solver = Solver(model, capacity=1, device="cpu")
+    to_torch(solver.checkpoints[0].v)[:] = (x - middle) @ spin.T
+    to_torch(solver.checkpoints[0].C)[:] = spin
+    end = solver.run(parked(model))[0]
+    turned = middle + (x - middle) @ torch.linalg.matrix_exp(model.steps * SPAN * spin).T
+    assert (turned - x).norm(dim=1).max() > 0.02
+    stretch = DENSITY * omega.norm() ** 2 * 0.07**2 / MATERIALS[material].young
+    assert (end - turned).norm(dim=1).max() < 0.07 * (stretch + model.dt * omega.norm())
 
 
 def test_blocks_fall_as_far_as_the_integrator_says_exactly():
@@ -199,6 +222,117 @@ def test_a_column_that_starts_to_bear_its_weight_swings_at_the_speed_of_sound(ma
         assert float(height[0] - height.min()) == pytest.approx(depth, rel=0.08)
     assert late[1] < 0.05
     assert late[1] < 0.6 * late[0]
+
+
+def kneading(**changes):
+    """Return a model of two lumps of clay on a floor, with a ball and a roller, and paths that press and drag them."""
+    room = Manipulators(
+        (Tool(Kind.SPHERE, (0.06,), 0.3), Tool(Kind.ROLLER, (0.05, 0.04), 0.9)),
+        lower=(-0.6, 0.0, -0.3),
+        upper=(0.6, 0.7, 0.3),
+        floor=0.1,
+        friction=0.5,
+        softness=60.0,
+    )
+    lumps = tuple(block(replace(CLAY, yield_stress=50.0), (x, 0.1, 0.0), count=3) for x in (-0.12, 0.09))
+    model = free_model(
+        bodies=lumps, boundary=room, origin=(-0.7, 0.0, -0.4), nodes=(29, 16, 17), gravity=GRAVITY, steps=4
+    )
+    model = replace(model, **changes)
+    generator = torch.Generator().manual_seed(5)
+    start = torch.tensor([[-0.117, 0.251, 0.003], [0.083, 0.232, 0.007], [0.0, 0.3, 0.0]], dtype=torch.float64)
+    travel = torch.tensor([[0.004, -0.01, 0.003], [-0.006, -0.008, 0.002], [0.1, 0.05, 0.0]], dtype=torch.float64)
+    time = torch.arange(model.steps + 1, dtype=torch.float64)[:, None, None]
+    paces = 0.5 + torch.rand((3, 1, 3, 3), generator=generator, dtype=torch.float64)
+    return model, start + time * travel * paces
+
+
+def weights(model, batch, seed):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand((batch, model.particles, 3), generator=generator, dtype=torch.float64) - 0.5
+
+
+def kneaded(model, paths, adj_x):
+    """Return (solver, last x, gradient)."""
+    solver = Solver(model, capacity=len(paths), device="cpu")
+    return solver, solver.run(paths).clone(), solver.gradient(adj_x)
+
+
+def test_the_gradient_by_tools_on_plasticine_is_the_slope():
+    model, paths = kneading()
+    adj_x = {model.steps: weights(model, 3, 1)}
+    solver, _, gradient = kneaded(model, paths, adj_x)
+    direction = torch.rand(paths.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64) - 0.5
+    slope, errors = (gradient * direction).sum(dim=(1, 2, 3)), []
+    for step in (1e-4, 1e-5, 1e-6, 1e-7):
+        ends = [(solver.run(paths + s * step * direction) * adj_x[model.steps]).sum(dim=(1, 2)) for s in (1, -1)]
+        errors.append(float((((ends[0] - ends[1]) / (2 * step) - slope) / slope).abs().max()))
+    assert min(errors) < 1e-6
+
+
+def test_results_do_not_depend_on_what_else_is_in_the_batch():
+    """The others lie elsewhere and stray farther, so that another part of the grid is worked on."""
+    model, paths = kneading()
+    adj_x = weights(model, 3, 3)
+    lone = kneaded(model, paths[:1], {model.steps: adj_x[:1]})
+    solver = Solver(model, capacity=3, device="cpu")
+    to_torch(solver.checkpoints[0].x)[1:] += torch.tensor([[[0.25, 0.1, 0.05]], [[-0.2, 0.2, -0.1]]])
+    end, gradient = solver.run(paths), solver.gradient({model.steps: adj_x})
+    assert all(box.cells < more.cells for box, more in zip(lone[0].boxes, solver.boxes, strict=True))
+    assert torch.equal(end[:1], lone[1])
+    assert torch.equal(gradient[:1], lone[2])
+    assert gradient[0].abs().max() > 0
+
+
+@pytest.mark.parametrize("kept", [mpm.KEPT, 0])
+def test_the_whole_grid_and_kept_or_repeated_ones_give_the_same_bits(monkeypatch, kept):
+    model, paths = kneading()
+    adj_x = {model.steps: weights(model, 3, 4)}
+    cropped = kneaded(model, paths, adj_x)
+    assert all(box.cells < model.cells / 2 for box in cropped[0].boxes)
+    monkeypatch.setattr(mpm, "MARGIN", 1000)
+    monkeypatch.setattr(mpm, "KEPT", kept)
+    whole = kneaded(model, paths, adj_x)
+    assert model.keeps_grids == (kept > 0)
+    assert whole[0].boxes == [Box((0, 0, 0), model.nodes)] * model.steps
+    assert torch.equal(whole[1], cropped[1])
+    assert torch.equal(whole[2], cropped[2])
+
+
+def test_grids_kept_or_repeated_give_the_same_bits(monkeypatch):
+    model, paths = kneading()
+    adj_x = {2: weights(model, 3, 5), model.steps: weights(model, 3, 6)}
+    kept = kneaded(model, paths, adj_x)
+    monkeypatch.setattr(mpm, "KEPT", 0)
+    repeated = kneaded(model, paths, adj_x)
+    assert len(kept[0].grids) > len(repeated[0].grids) == 1
+    assert torch.equal(kept[2], repeated[2])
+
+
+@pytest.mark.parametrize("speed", [8.0, 18.0])  # [m/s], so 1.6 or 3.6 cells in a control step
+def test_the_grid_grows_where_a_particle_leaves_its_part(monkeypatch, speed):
+    """Two cells of margin are enough for the slow; the quick make it repeat the step on more, with the same bits."""
+    model, velocity = free_model(steps=1), torch.zeros(1, 192, 3, dtype=torch.float64)
+    velocity[:, :64, 1], velocity[:, 64:128, 1] = speed, -speed
+    x = torch.from_numpy(np.concatenate([body.x for body in model.bodies]))[None]
+    cropped = solved(model, 1, velocity)
+    assert (cropped.boxes[0] == mpm.around(model, x, mpm.MARGIN)) == (speed < 10)
+    monkeypatch.setattr(mpm, "MARGIN", 1000)
+    whole = solved(model, 1, velocity)
+    for solver in (cropped, whole):
+        assert not solver.left_grid(1).any()
+    for name in "xvC":
+        assert torch.equal(over_time(cropped, name), over_time(whole, name))
+
+
+def test_adjoints_at_several_control_steps_add_up():
+    model, paths = kneading()
+    at = {step: weights(model, 3, step) for step in (1, 2, model.steps)}
+    solver, _, together = kneaded(model, paths, at)
+    separate = [solver.gradient({step: adj_x}) for step, adj_x in at.items()]
+    torch.testing.assert_close(together, sum(separate), rtol=0, atol=1e-12 * float(together.abs().max()))
+    assert not separate[0][:, 2:].any()  # what comes later has no say
+    assert separate[0].abs().max() > 0
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,126 @@
+"""Launch materials' kernels and boundaries' functions on tensors."""
+
+import numpy as np
+import torch
+import warp as wp
+
+from gradscape.envs.engines.runtime import precision, to_torch
+
+SCALE, MASS, VOLUME, DT = -0.7, 0.2, 0.3, 1e-3
+NAMES = ["float32", "float64"]
+IDENTITY = torch.eye(3, dtype=torch.float64)
+
+
+def draw(*shape, seed):
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 0.5
+
+
+def rotations(count, seed):
+    q = torch.linalg.qr(draw(count, 3, 3, seed=seed)).Q
+    return q * torch.linalg.det(q)[:, None, None]
+
+
+def vectors(*rows):
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+class MaterialBench:
+    """Launch one material's kernels on tensors of particles, shape (particle, ...)."""
+
+    def __init__(self, material, name="float64"):
+        self.material, self.types = material, precision(name)
+        self.kernels = material.kernels(name)
+        self.kinds = {(): self.types.real, (3, 3): self.types.mat33}
+
+    def update(self, state, C, dt=DT):
+        """Return the new state and the affine momentum A."""
+        return self._launch(0, dt, [state, C], [state, C])
+
+    def adjoint(self, state, C, adj_new, adj_A, dt=DT):
+        """Return the adjoints of state and C."""
+        return self._launch(1, dt, [state, C, adj_new, adj_A], [state, C])
+
+    def deform(self, state, C, dt=DT):
+        return self.update(state, C, dt)[0]
+
+    def tau(self, state, C=None):
+        """Return the Kirchhoff stress [Pa] of a state that no time passes by."""
+        C = torch.zeros(len(state), 3, 3, dtype=torch.float64) if C is None else C
+        return (self.update(state, C, 0.0)[1] - MASS * C) / (SCALE * VOLUME)
+
+    def slopes(self, state, C, adj_new, adj_A, dt, step):
+        """Return (adjoint, fourth-order difference) along a random direction of state and one of C, by particle."""
+        pairs = []
+        for i, adjoint in enumerate(self.adjoint(state, C, adj_new, adj_A, dt)):
+            direction = draw(*adjoint.shape, seed=20 + i)
+            at = {}
+            for k in (-2, -1, 1, 2):
+                moved = [state, C]
+                moved[i] = moved[i] + k * step * direction
+                new, A = self.update(*moved, dt)
+                at[k] = each_sum(new * adj_new) + each_sum(A * adj_A)
+            slope = (8 * (at[1] - at[-1]) - (at[2] - at[-2])) / (12 * step)
+            pairs.append((each_sum(adjoint * direction), slope))
+        return pairs
+
+    def _launch(self, which, dt, given, wanted):
+        count = len(given[0])
+        each = [wp.array(np.full(count, value), dtype=self.types.real) for value in (MASS, VOLUME)]
+        results = [self._array(torch.zeros_like(like)) for like in wanted]
+        inputs = [0, dt, SCALE, *self.material.constants(), *each, *map(self._array, given), *results]
+        wp.launch(self.kernels[which], (1, count), inputs, record_tape=False)
+        return tuple(to_torch(array)[0].double().clone() for array in results)
+
+    def _array(self, values):
+        kind = self.kinds[tuple(values.shape[1:])]
+        return wp.array(values.to(self.types.torch)[None].contiguous().numpy(), dtype=kind, copy=True)
+
+
+def each_sum(values):
+    return values.flatten(1).sum(dim=1) if values.ndim > 1 else values
+
+
+class BoundaryBench:
+    """Launch a boundary's function, and its adjoint, on tensors of nodes, shape (node, 3)."""
+
+    def __init__(self, boundary, *, rate):
+        self.boundary, self.rate, self.types = boundary, rate, precision("float64")
+        meet, Data = boundary.function("float64")
+        self.data = boundary.data("float64", "cpu")
+        real, vec3 = self.types.real, self.types.vec3
+
+        @wp.kernel(module="unique")
+        def apply(
+            data: Data,
+            p: wp.array[vec3],
+            tools: wp.array3d[vec3],
+            fraction: real,
+            rate: real,
+            v: wp.array[vec3],
+            out: wp.array[vec3],
+        ):
+            i = wp.tid()
+            out[i] = meet(data, p[i], v[i], 0, tools, 0, fraction, rate)
+
+        self.kernel = apply
+
+    def __call__(self, p, v, tools, fraction=0.0):
+        """Return the velocities of nodes at p [m]; `tools`, shape (2, slot, 3), are those of one control step."""
+        inputs = self._inputs(p, v, tools, fraction)
+        wp.launch(self.kernel, len(v), inputs, record_tape=False)
+        return to_torch(inputs[-1]).clone()
+
+    def adjoint(self, p, v, tools, adj_out, fraction=0.0):
+        """Return the adjoints of v and tools."""
+        inputs = self._inputs(p, v, tools, fraction)
+        adj_tools, adj_v = wp.zeros_like(inputs[2]), wp.zeros_like(inputs[5])
+        adjoints = [type(self.data)(), None, adj_tools, None, None, adj_v, self._array(adj_out)]
+        wp.launch(self.kernel, len(v), inputs, adj_inputs=adjoints, adj_outputs=[], adjoint=True, record_tape=False)
+        return to_torch(adj_v).clone(), to_torch(adj_tools)[0].clone()
+
+    def _inputs(self, p, v, tools, fraction):
+        arrays = [self._array(t) for t in (p.expand_as(v), tools[None], v, torch.zeros_like(v))]
+        return [self.data, *arrays[:2], fraction, self.rate, *arrays[2:]]
+
+    def _array(self, values):
+        return wp.array(values.contiguous().numpy(), dtype=self.types.vec3, copy=True)
