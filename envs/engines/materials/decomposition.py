@@ -18,13 +18,13 @@ def svd(name: str) -> Any:
     """Return the function F -> (U, s, V), F = U diag(s) V^T with rotations U and V; the last of s has det F's sign.
 
     Jacobi rotations (Golub and Van Loan 2013, section 8.5) diagonalise F^T F, fewer the more diagonal it is: an
-    undeformed body costs none. The last column of U is the cross product of the others, so that U is a rotation however
-    flat F is. (Warp's svd3 costs more, and in float32 reconstructs a strain of 0.1 with an error of up to 1e-3.)
+    undeformed body costs none. Gram and Schmidt make U a rotation however flat or thin F is. (Warp's svd3 costs more,
+    and in float32 reconstructs a strain of 0.1 with an error of up to 1e-3.)
     """
     types = precision(name)
     real, vec3, mat33 = types.real, types.vec3, types.mat33
     module = f"gradscape.decomposition.{name}"
-    small = ROUND_OFF[name] ** 2
+    round_off = wp.constant(real(ROUND_OFF[name]))
 
     @wp.func(module=module)
     def rotation(app: real, aqq: real, apq: real):
@@ -40,11 +40,25 @@ def svd(name: str) -> Any:
         return vec3(a[0, k], a[1, k], a[2, k])
 
     @wp.func(module=module)
+    def unit(v: vec3, least: real, instead: vec3) -> vec3:
+        length = wp.length(v)
+        if length <= least:
+            return instead
+        return v / length
+
+    @wp.func(module=module)
+    def beside(u: vec3) -> vec3:
+        """Return a unit vector at a right angle to u."""
+        if wp.abs(u[0]) < real(0.6):
+            return wp.normalize(wp.cross(u, vec3(real(1.0), real(0.0), real(0.0))))
+        return wp.normalize(wp.cross(u, vec3(real(0.0), real(1.0), real(0.0))))
+
+    @wp.func(module=module)
     def eigenvectors(a00: real, a11: real, a22: real, a01: real, a02: real, a12: real) -> mat33:
         v0 = vec3(real(1.0), real(0.0), real(0.0))
         v1 = vec3(real(0.0), real(1.0), real(0.0))
         v2 = vec3(real(0.0), real(0.0), real(1.0))
-        bound = real(small) * (a00 + a11 + a22) * (a00 + a11 + a22)
+        bound = round_off * round_off * (a00 + a11 + a22) * (a00 + a11 + a22)
         sweep = int(0)  # noqa: UP018, RUF046 -- what a loop changes must be a variable to Warp
         while sweep < SWEEPS and a01 * a01 + a02 * a02 + a12 * a12 > bound:
             sweep += 1
@@ -92,12 +106,15 @@ def svd(name: str) -> Any:
             v1 = v0
             v0 = v2
             v2 = v
-        u0, u1 = F * v0, F * v1
-        s0, s1 = wp.length(u0), wp.length(u1)
-        u0 = u0 / wp.max(s0, real(TINY))
-        u1 = u1 / wp.max(s1, real(TINY))
+        if wp.length(F * v0) < wp.length(F * v1):
+            v = v0
+            v0 = v1
+            v1 = -v
+        u0 = unit(F * v0, real(TINY), vec3(real(1.0), real(0.0), real(0.0)))
+        u1 = F * v1
+        u1 = unit(u1 - wp.dot(u0, u1) * u0, round_off * wp.dot(u0, F * v0), beside(u0))
         u2 = wp.cross(u0, u1)
-        s = vec3(s0, s1, wp.dot(u2, F * v2))
+        s = vec3(wp.dot(u0, F * v0), wp.dot(u1, F * v1), wp.dot(u2, F * v2))
         return wp.matrix_from_cols(u0, u1, u2), s, wp.matrix_from_cols(v0, v1, v2)
 
     return decompose

@@ -17,7 +17,7 @@ from gradscape.envs.engines.runtime import to_torch
 DENSITY, SPEED, GRAVITY = 1330.0, 6.0, 9.81  # [kg/m^3], of sound [m/s], [m/s^2]
 SYRUP = Fluid(DENSITY, DENSITY * SPEED**2, viscosity=4.0)
 SPONGE = Elastic.with_wave_speed(DENSITY, SPEED, poisson=0.3)
-CLAY = Plasticine(DENSITY, SPONGE.young, SPONGE.poisson, yield_stress=300.0)
+CLAY = Plasticine(DENSITY, SPONGE.young, SPONGE.poisson, yield_stress=150.0)
 FIRM = replace(CLAY, yield_stress=1e5)  # never yields
 MATERIALS = {"fluid": SYRUP, "elastic": SPONGE, "plasticine": FIRM}
 WIDTH, DEPTH = 0.2, 0.15  # of the tank and of what fills it [m]
@@ -115,7 +115,9 @@ def test_mass_and_momentum_are_conserved_away_from_walls():
     J, F = (to_torch(state) for state in solver.checkpoints[-1].S[:2])
     assert (J - 1).abs().max() > 1e-3  # and this was no rigid motion
     e = torch.linalg.svdvals(F).log()
-    assert (e - e.mean(dim=2, keepdim=True)).norm(dim=2).max() == pytest.approx(CLAY.yield_stress / (2 * CLAY.mu))
+    assert (e - e.mean(dim=2, keepdim=True)).norm(dim=2).max() == pytest.approx(
+        CLAY.yield_stress / (2 * CLAY.mu), rel=1e-3
+    )
 
 
 def test_angular_momentum_is_conserved_away_from_walls():
