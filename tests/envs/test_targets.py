@@ -45,9 +45,8 @@ def test_a_tools_distance_is_that_of_its_shape(tool, angles, point, gap):
 
 def test_the_contacts_gradient_is_the_closest_particles_only():
     """The released PlasticineLab gives it to every particle; upstream's atomic minimum is differentiated as a sum."""
-    x = (
-        0.5 + 0.4 * torch.rand((2, 40, 3), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    ).requires_grad_()
+    x = 0.5 + 0.4 * torch.rand((2, 40, 3), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    x.requires_grad_()
     tools = rows([[0.1, 0.2, 0.3], [0.9, 0.2, 0.4]]).repeat(2, 1, 1).requires_grad_()
     movable = [BALL, PEN]
     contact(x, tools, movable).sum().backward()
@@ -58,8 +57,8 @@ def test_the_contacts_gradient_is_the_closest_particles_only():
 
 
 def test_what_touches_costs_no_contact():
-    x = rows([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])[None]
-    assert float(contact(x, rows([[0.0, 0.04, 0.0]])[None], [BALL])) == 0
+    x = rows([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+    assert float(contact(x, rows([[0.0, 0.04, 0.0]]), [BALL])) == 0
 
 
 def test_distances_are_to_the_nearest_solid_node_and_nothing_of_the_target_costs():
