@@ -135,11 +135,12 @@ def test_a_body_that_is_its_own_target_costs_nothing():
 
 def test_triple_moves_targets_are_at_the_listed_centres():
     env = TripleMove(fidelity="standard", device="cpu")
-    x = np.array_split(env._wanted(), 3)
+    ends = np.cumsum([len(body.x) for body in env.model.bodies])
+    x = np.split(env._wanted(), ends[:-1])
     centers = [(0.2, 0.2, 0.5029), (0.8, 0.2, 0.2), (0.6254, 0.3436, 0.2002)]
     for block, center in zip(x, centers, strict=True):
-        assert np.allclose(block.mean(axis=0), center, atol=1e-3)
-        assert np.allclose(np.ptp(block, axis=0), 0.1, atol=1e-3)
+        assert np.allclose(block.mean(axis=0), center, atol=2e-3)
+        assert np.allclose(np.ptp(block, axis=0), 0.1, atol=2e-3)
 
 
 @pytest.mark.parametrize("kind", SCENES, ids=scene_id)
