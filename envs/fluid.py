@@ -18,7 +18,8 @@ from .controls import hold, travel
 from .engines.boundaries import LadleInTank
 from .engines.materials import Elastic
 from .engines.materials import Fluid as Liquid
-from .engines.mpm import Body, Model, Solver, capacity
+from .engines.model import Body, Model
+from .engines.mpm import Solver, capacity
 from .engines.runtime import Pool
 
 TANK_WIDTH, TANK_HEIGHT, FILL = 0.4, 0.2, 0.15  # the tank, and the depth of the syrup [m]

@@ -17,7 +17,8 @@ from ..landscapes.space import ParameterSpace
 from .base import Environment, Episode, Fidelity
 from .controls import hold, roll, travel
 from .engines.manipulators import Kind
-from .engines.mpm import Model, Solver, capacity
+from .engines.model import Model
+from .engines.mpm import Solver, capacity
 from .engines.raster import Raster
 from .engines.runtime import Pool
 from .plasticine_model import SPAN, STEPS, Scene, model, target

@@ -9,7 +9,7 @@ import numpy as np
 from .base import Fidelity
 from .engines.manipulators import Kind, Manipulators, Tool
 from .engines.materials import Plasticine
-from .engines.mpm import Body, Model
+from .engines.model import Body, Model
 from .shapes import Point, Shape, fill, shares
 
 STEPS, SPAN = 50, 2e-3  # control steps, length of one [s]

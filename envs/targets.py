@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..landscapes.files import replacing
 from .engines.manipulators import Kind, Tool
-from .engines.mpm import Model
+from .engines.model import Model
 from .engines.raster import Raster
 
 SOLID = 1e-4  # mass at a node of a grid 1/64 m wide from which it is the target's [kg]; PlasticineLab's

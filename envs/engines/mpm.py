@@ -23,78 +23,12 @@ import numpy as np
 import torch
 import warp as wp
 
-from .boundaries import Boundary
-from .materials import Fluid, Material
+from .model import Box, Model, around, place
 from .runtime import free_memory, load, precision, to_torch
 from .transfers import transfers
 
-KEPT = 32e6  # bytes of grids per environment that a control step may keep for its gradient
 MARGIN = 2  # cells around the particles that a control step begins with
 EMPTY = 1e-8  # nodes lighter than this part of the lightest particle carry no velocity
-
-
-@dataclass(frozen=True, eq=False)
-class Body:
-    """One body: positions `x` [m], shape (particle, 3), `volume` [m^3] and initial `ratio` J, shape (particle,)."""
-
-    material: Material
-    x: np.ndarray
-    volume: np.ndarray
-    ratio: np.ndarray
-
-    @property
-    def mass(self) -> np.ndarray:
-        """Mass of each particle [kg]."""
-        return self.material.density * self.volume
-
-
-@dataclass(frozen=True, eq=False)
-class Model:
-    """Everything a batch of episodes shares. Lengths [m], times [s]; `nodes` of the grid along x, y, z."""
-
-    precision: str
-    bodies: tuple[Body, ...]
-    boundary: Boundary
-    origin: tuple[float, float, float]
-    dx: float
-    nodes: tuple[int, int, int]
-    dt: float
-    substeps: int
-    steps: int
-    gravity: float = 9.81
-
-    @property
-    def particles(self) -> int:
-        """Number of particles of all bodies."""
-        return sum(len(body.x) for body in self.bodies)
-
-    @property
-    def mass(self) -> np.ndarray:
-        """Mass of each particle of all bodies [kg], shape (particle,)."""
-        return np.concatenate([body.mass for body in self.bodies])
-
-    @property
-    def cells(self) -> int:
-        """Number of nodes of the grid."""
-        return int(np.prod(self.nodes))
-
-    @property
-    def keeps_grids(self) -> bool:
-        """Whether the gradient's window keeps its grids; else it scatters once more."""
-        return self.substeps * 8 * self.cells * self.real_bytes <= KEPT
-
-    def bytes_per_environment(self) -> int:
-        """Return what one environment of a solver takes, adjoints included."""
-        state = sum(len(body.x) * (1 if isinstance(body.material, Fluid) else 9) for body in self.bodies)
-        frame = 15 * self.particles + state  # x, v, C and each material's own
-        affine = (self.substeps + 1) * 9 * self.particles
-        grids = ((self.substeps if self.keeps_grids else 1) + 1) * 8 * self.cells
-        return self.real_bytes * ((self.steps + self.substeps + 2) * frame + affine + grids)
-
-    @property
-    def real_bytes(self) -> int:
-        """Bytes of one number."""
-        return 8 if self.precision == "float64" else 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,19 +43,6 @@ class Frame:
     def arrays(self) -> tuple[wp.array, ...]:
         """Return every array of the frame."""
         return (self.x, self.v, self.C, *self.S)
-
-
-@dataclass(frozen=True)
-class Box:
-    """A box of nodes: the `first` of them, and how many there are along x, y, z."""
-
-    first: tuple[int, int, int]
-    nodes: tuple[int, int, int]
-
-    @property
-    def cells(self) -> int:
-        """Number of nodes."""
-        return int(np.prod(self.nodes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -374,30 +295,6 @@ class _Adjoint:
             adjoint=True,
             record_tape=False,
         )
-
-
-def place(model: Model, box: Box | None = None) -> Any:
-    """Return where a model's grid lies, for the transfer kernels: the nodes in `box`, or all."""
-    first, nodes = (box.first, box.nodes) if box else ((0, 0, 0), model.nodes)
-    placed = transfers(model.precision).Lattice()
-    placed.origin = precision(model.precision).vec3(*model.origin)
-    placed.inv_dx = 1.0 / model.dx
-    placed.first = wp.vec3i(*first)
-    placed.nx, placed.ny, placed.nz = nodes
-    return placed
-
-
-def around(model: Model, x: torch.Tensor, margin: int) -> Box:
-    """Return the nodes that particles at x [m], shape (batch, particle, 3), meet while none moves `margin` cells."""
-    low, high = x.amin(dim=(0, 1)).double().cpu(), x.amax(dim=(0, 1)).double().cpu()
-    if not bool((low + high).isfinite().all()):
-        return Box((0, 0, 0), model.nodes)
-    origin = torch.tensor(model.origin, dtype=torch.float64)
-    last = torch.tensor(model.nodes) - 1
-    first = ((low - origin) / model.dx - 0.5).floor().int() - margin
-    end = ((high - origin) / model.dx + 1.5).floor().int() + margin
-    first, end = first.clamp_min(0).minimum(last - 2), end.minimum(last)
-    return Box(tuple(first.tolist()), tuple((end - first).clamp_min(2).add(1).tolist()))
 
 
 @cache

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from .mpm import Model, place
+from .model import Model, place
 from .runtime import load, precision, to_torch
 from .transfers import transfers
 

@@ -71,11 +71,6 @@ class _Solid:
         """First Lame parameter [Pa]."""
         return self.young * self.poisson / ((1.0 + self.poisson) * (1.0 - 2.0 * self.poisson))
 
-    @property
-    def wave_speed(self) -> float:
-        """Speed of pressure waves [m/s]."""
-        return float(np.sqrt((self.lam + 2.0 * self.mu) / self.density))
-
     def volume_ratio(self, pressure: np.ndarray) -> np.ndarray:
         """Return J at which the solid bears `pressure` [Pa], to first order."""
         return 1.0 - pressure / (self.lam + 2.0 * self.mu / 3.0)

@@ -7,11 +7,13 @@ import pytest
 import torch
 import warp as wp
 
+from gradscape.envs.engines import model as model_file
 from gradscape.envs.engines import mpm
 from gradscape.envs.engines.boundaries import LadleInTank, Open
 from gradscape.envs.engines.manipulators import Kind, Manipulators, Tool
 from gradscape.envs.engines.materials import Elastic, Fluid, Plasticine
-from gradscape.envs.engines.mpm import Body, Box, Model, Solver
+from gradscape.envs.engines.model import KEPT, Body, Box, Model, around
+from gradscape.envs.engines.mpm import Solver
 from gradscape.envs.engines.runtime import to_torch
 
 DENSITY, SPEED, GRAVITY = 1330.0, 6.0, 9.81  # [kg/m^3], of sound [m/s], [m/s^2]
@@ -286,14 +288,14 @@ def test_results_do_not_depend_on_what_else_is_in_the_batch():
     assert gradient[0].abs().max() > 0
 
 
-@pytest.mark.parametrize("kept", [mpm.KEPT, 0])
+@pytest.mark.parametrize("kept", [KEPT, 0])
 def test_the_whole_grid_and_kept_or_repeated_ones_give_the_same_bits(monkeypatch, kept):
     model, paths = kneading()
     adj_x = {model.steps: weights(model, 3, 4)}
     cropped = kneaded(model, paths, adj_x)
     assert all(box.cells < model.cells / 2 for box in cropped[0].boxes)
     monkeypatch.setattr(mpm, "MARGIN", 1000)
-    monkeypatch.setattr(mpm, "KEPT", kept)
+    monkeypatch.setattr(model_file, "KEPT", kept)
     whole = kneaded(model, paths, adj_x)
     assert model.keeps_grids == (kept > 0)
     assert whole[0].boxes == [Box((0, 0, 0), model.nodes)] * model.steps
@@ -305,7 +307,7 @@ def test_grids_kept_or_repeated_give_the_same_bits(monkeypatch):
     model, paths = kneading()
     adj_x = {2: weights(model, 3, 5), model.steps: weights(model, 3, 6)}
     kept = kneaded(model, paths, adj_x)
-    monkeypatch.setattr(mpm, "KEPT", 0)
+    monkeypatch.setattr(model_file, "KEPT", 0)
     repeated = kneaded(model, paths, adj_x)
     assert len(kept[0].grids) > len(repeated[0].grids) == 1
     assert torch.equal(kept[2], repeated[2])
@@ -318,7 +320,7 @@ def test_the_grid_grows_where_a_particle_leaves_its_part(monkeypatch, speed):
     velocity[:, :64, 1], velocity[:, 64:128, 1] = speed, -speed
     x = torch.from_numpy(np.concatenate([body.x for body in model.bodies]))[None]
     cropped = solved(model, 1, velocity)
-    assert (cropped.boxes[0] == mpm.around(model, x, mpm.MARGIN)) == (speed < 10)
+    assert (cropped.boxes[0] == around(model, x, mpm.MARGIN)) == (speed < 10)
     monkeypatch.setattr(mpm, "MARGIN", 1000)
     whole = solved(model, 1, velocity)
     for solver in (cropped, whole):

@@ -6,7 +6,7 @@ import torch
 
 from gradscape.envs.engines.boundaries import Open
 from gradscape.envs.engines.materials import Elastic
-from gradscape.envs.engines.mpm import Body, Model
+from gradscape.envs.engines.model import Body, Model
 from gradscape.envs.engines.raster import Raster
 
 from .bench import draw
