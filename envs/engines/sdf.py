@@ -20,6 +20,7 @@ def bowl(name: str) -> Any:
     """Return the distance to an open half-sphere shell, its rim in the plane y = 0, its opening upwards."""
     types = precision(name)
     real, vec3, vec4 = types.real, types.vec3, types.vec4
+    ring = torus(name)
 
     @wp.func(module=f"gradscape.sdf.{name}", name=f"bowl_{name}")
     def distance(p: vec3, radius: real, half_thickness: real) -> vec4:
@@ -28,11 +29,7 @@ def bowl(name: str) -> Any:
             gap = length - radius
             side = wp.where(gap < real(0.0), real(-1.0), real(1.0)) / length
             return vec4(side * p[0], side * p[1], side * p[2], wp.abs(gap) - half_thickness)
-        axial = wp.sqrt(p[0] * p[0] + p[2] * p[2] + real(TINY))
-        gap = axial - radius
-        length = wp.sqrt(gap * gap + p[1] * p[1] + real(TINY))
-        outward = gap / (length * axial)
-        return vec4(outward * p[0], p[1] / length, outward * p[2], length - half_thickness)
+        return ring(p, radius, half_thickness)
 
     return distance
 
