@@ -4,9 +4,9 @@ Every tool is a signed distance. Grid velocities in its shell lose what goes int
 the farther off they are. Tools are moved, never pushed back.
 
 Nothing here jumps as a node moves or a velocity changes sign, where PlasticineLab does twice: its influence
-exp(-softness d) ends at a tenth, ours falls to nothing there; its sticky floor lets go sideways, too, of what moves up
-from it, ours does not. Each such jump is small and none is in a gradient, but there are thousands in an episode: at a
-step of 1e-3 of the box they left gradients 3e-2 off the slopes, which are now 5e-3 (rolling-pin) and 4e-5 (assembly).
+exp(-softness d) ends at a tenth, ours falls to nothing there; its sticky floor lets what rises from it slide, ours lets
+it rise only. Each such jump is small and in no gradient, but an episode has thousands: over steps of 1e-3 of a parameter
+they put slopes 2e-2 (assembly) and 3e-2 (rolling-pin) away from gradients, which is now 4e-5 and 5e-3.
 """
 
 import math
