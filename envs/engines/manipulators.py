@@ -5,8 +5,8 @@ the farther off they are. Tools are moved, never pushed back.
 
 Nothing here jumps as a node moves or a velocity changes sign, where PlasticineLab does twice: its influence
 exp(-softness d) ends at a tenth, ours falls to nothing there; its sticky floor lets what rises from it slide, ours lets
-it rise only. Each such jump is small and in no gradient, but an episode has thousands: over steps of 1e-3 of a parameter
-they put slopes 2e-2 (assembly) and 3e-2 (rolling-pin) away from gradients, which is now 4e-5 and 5e-3.
+it rise only. Each such jump is small and in no gradient, but an episode has thousands: over steps of 1e-3 they put
+slopes 2e-2 (assembly) and 3e-2 (rolling-pin) away from gradients, which is now 4e-5 and 5e-3.
 """
 
 import math
