@@ -98,9 +98,9 @@ import os, signal, sys, time
 from pathlib import Path
 from test_sampling import PLANE, Wave, sample, store_at
 path = Path(sys.argv[1])
-for delay in (0.2, 0.3, 0.25):
+for delay in (0.4, 0.6, 0.5):  # together too short for 20 tiles, however fast the machine
     if not (child := os.fork()):
-        sample(Wave(pause=0.02), PLANE, store_at(path))
+        sample(Wave(pause=0.1), PLANE, store_at(path))
         os._exit(0)
     time.sleep(delay)
     os.kill(child, signal.SIGKILL)
