@@ -22,7 +22,11 @@ def _demonstration(text: str) -> dict[str, tuple[float, ...]]:
 
 
 class Assembly(Plasticine):
-    """Lift a ball with two spheres and set it on a box."""
+    """Lift a ball with two spheres and set it on a box.
+
+    A box 0.16 m wide on a sticky floor, a ball of 0.06 m radius 0.3 m to its left; yield stress 100 Pa. The target is the
+    ball on the box, where this project puts it by the figures known of upstream's. The paper's losses: 23 to 44.
+    """
 
     name: ClassVar[str] = "assembly"
     examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
@@ -44,7 +48,11 @@ class Assembly(Plasticine):
 
 
 class Pinch(Plasticine):
-    """Press a dent into the front of a cube with a sphere."""
+    """Press a dent into the front of a cube with a sphere.
+
+    A cube 0.2 m wide on a sticky floor, a sphere of 0.04 m radius above it; yield stress 50 Pa. Weighs as much as
+    PlasticineLab's target, not as its cube, which weighs 0.6 of it.
+    """
 
     name: ClassVar[str] = "pinch"
     examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
@@ -73,7 +81,11 @@ class Pinch(Plasticine):
 
 
 class RollingPin(Plasticine):
-    """Roll a slab flat with a rolling pin."""
+    """Roll a slab flat with a rolling pin.
+
+    A slab 0.3 m wide and 0.1 m high on a rubbing floor; the pin (0.3 m, radius 0.03 m) rolls without slip, turns about
+    the vertical and rises or sinks; yield stress 50 Pa. The paper says: smooth, with plateaus and flat gradients.
+    """
 
     name: ClassVar[str] = "rolling-pin"
     examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
@@ -94,7 +106,11 @@ class RollingPin(Plasticine):
 
 
 class Rope(Plasticine):
-    """Bend a rope around a post by its two ends."""
+    """Bend a rope around a post by its two ends.
+
+    A rope 0.6 m long on a rubbing floor, two spheres behind it, a post of 0.1 m radius in front; yield stress 50 Pa. The
+    target is a full ring around the post, which the rope is too short for: its loss cannot vanish.
+    """
 
     name: ClassVar[str] = "rope"
     examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
@@ -117,7 +133,11 @@ class Rope(Plasticine):
 
 
 class Table(Plasticine):
-    """Bend one leg of a table outwards with a sphere."""
+    """Bend one leg of a table outwards with a sphere.
+
+    Four legs that weigh as much as the top each, on a rubbing floor, a sphere of 0.04 m radius between them; its vertical
+    parameters do nothing; yield stress 50 Pa, Poisson's ratio 0.05. The paper's losses: 14 to 86.
+    """
 
     name: ClassVar[str] = "table"
     examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
@@ -142,7 +162,10 @@ class Table(Plasticine):
 
 
 class Torus(Plasticine):
-    """Press a ring into a slab."""
+    """Press a ring into a slab.
+
+    A slab 0.3 m wide and 0.1 m high on a sticky floor, a torus (0.05 m, tube 0.03 m) above it; yield stress 50 Pa.
+    """
 
     name: ClassVar[str] = "torus"
     examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
@@ -165,7 +188,11 @@ class Torus(Plasticine):
 
 
 class TripleMove(Plasticine):
-    """Carry three blocks through the air with three pairs of spheres."""
+    """Carry three blocks through the air with three pairs of spheres.
+
+    Blocks 0.1 m wide on a rubbing floor, each between two spheres of 0.03 m radius; yield stress 200 Pa. The targets hang
+    in the air, so that blocks must be lifted and held. The paper's losses: 49 to 85.
+    """
 
     name: ClassVar[str] = "triple-move"
     examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
@@ -194,7 +221,11 @@ class TripleMove(Plasticine):
 
 
 class Writer(Plasticine):
-    """Write a stroke into a slab with a pen."""
+    """Write a stroke into a slab with a pen.
+
+    A slab 0.3 m wide and 0.1 m high on a sticky floor, a frictionless upright capsule that starts 0.03 m deep in it;
+    yield stress 50 Pa. The paper's losses: 4 to 15.
+    """
 
     name: ClassVar[str] = "writer"
     examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
