@@ -52,8 +52,9 @@ class Plasticine(Environment):
     """Model: MLS-MPM, fixed-corotated elasticity, von Mises plasticity in log strain; x right, y up, z to the front.
 
     Young's modulus 5000 Pa at a density of 1 kg/m^3; gravity 30 m/s^2; 0.1 s. Tools are signed distances that move as
-    the parameters say and are felt by grid nodes, with Coulomb friction, through a shell (3.5 mm) in which their influence
-    falls to nothing. The floor is thick: its nodes reach up to y = 1/32 m, and what lies lower rests among them.
+    the parameters say and are felt by grid nodes, with Coulomb friction, through a shell (3.5 mm) in which their
+    influence falls to nothing. The floor is thick: its nodes reach up to y = 1/32 m, and what lies lower rests among
+    them.
     Parameters: 5 segments x tools x 3, each a share of the farthest a tool can go, held for 10 control steps.
     Loss at the end, or summed over control steps: 10 density + 10 sdf + 500 contact (options; `terms` has each alone).
     density = sum |m - m*| over the masses of grid nodes [kg]; sdf = sum m D* [kg m], D* the distance to the target's
@@ -64,8 +65,8 @@ class Plasticine(Environment):
     Simplifications: a tool that only translates carries no rotation; a slippery room ends where tools push nothing, or
     0.5 m beyond the bodies; particles are spread evenly whatever a body weighs (upstream, weight follows the number
     drawn). Departures from upstream: 20 substeps for 19, an exact distance field, softness 666 everywhere, no jump at
-    a shell's end nor on a sticky floor; only the closest particle has the contact's gradient, and undeformed bodies have
-    theirs.
+    a shell's end nor on a sticky floor; only the closest particle has the contact's gradient, and undeformed bodies
+    have theirs.
     Source: PlasticineLab (Huang et al., ICLR 2021), as used in "Rethinking Optimization with Differentiable Simulation
     from a Global Perspective" (CoRL 2022).
     """

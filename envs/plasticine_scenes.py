@@ -24,8 +24,8 @@ def _demonstration(text: str) -> dict[str, tuple[float, ...]]:
 class Assembly(Plasticine):
     """Lift a ball with two spheres and set it on a box.
 
-    A box 0.16 m wide on a sticky floor, a ball of 0.06 m radius 0.3 m to its left; yield stress 100 Pa. The target is the
-    ball on the box, where this project puts it by the figures known of upstream's. The paper's losses: 23 to 44.
+    A box 0.16 m wide on a sticky floor, a ball of 0.06 m radius 0.3 m to its left; yield stress 100 Pa. The target is
+    the ball on the box, where upstream has it. The paper's losses: 23 to 44.
     """
 
     name: ClassVar[str] = "assembly"
@@ -108,8 +108,8 @@ class RollingPin(Plasticine):
 class Rope(Plasticine):
     """Bend a rope around a post by its two ends.
 
-    A rope 0.6 m long on a rubbing floor, two spheres behind it, a post of 0.1 m radius in front; yield stress 50 Pa. The
-    target is a full ring around the post, which the rope is too short for: its loss cannot vanish.
+    A rope 0.6 m long on a rubbing floor, two spheres in front of it, a post of 0.1 m radius behind; yield stress 50 Pa.
+    The target is a full ring around the post, which the rope is too short for: its loss cannot vanish.
     """
 
     name: ClassVar[str] = "rope"
@@ -135,8 +135,8 @@ class Rope(Plasticine):
 class Table(Plasticine):
     """Bend one leg of a table outwards with a sphere.
 
-    Four legs that weigh as much as the top each, on a rubbing floor, a sphere of 0.04 m radius between them; its vertical
-    parameters do nothing; yield stress 50 Pa, Poisson's ratio 0.05. The paper's losses: 14 to 86.
+    Four legs that weigh as much as the top each, on a rubbing floor, a sphere of 0.04 m radius between them; its
+    vertical parameters do nothing; yield stress 50 Pa, Poisson's ratio 0.05. The paper's losses: 14 to 86.
     """
 
     name: ClassVar[str] = "table"
@@ -190,8 +190,8 @@ class Torus(Plasticine):
 class TripleMove(Plasticine):
     """Carry three blocks through the air with three pairs of spheres.
 
-    Blocks 0.1 m wide on a rubbing floor, each between two spheres of 0.03 m radius; yield stress 200 Pa. The targets hang
-    in the air, so that blocks must be lifted and held. The paper's losses: 49 to 85.
+    Blocks 0.1 m wide on a rubbing floor, each between two spheres of 0.03 m radius; yield stress 200 Pa. The targets
+    hang in the air, so that blocks must be lifted and held. The paper's losses: 49 to 85.
     """
 
     name: ClassVar[str] = "triple-move"
