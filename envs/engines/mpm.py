@@ -228,10 +228,7 @@ class _Adjoint:
         self.A = wp.zeros_like(solver.A[0])
         self.grid = solver._grid()
         self.tools = solver._tools()
-        self.structs = (
-            solver.kernels.Lattice(),
-            type(solver.boundary)(),
-        )  # no adjoint is wanted, but Warp wants its place
+        self.structs = solver.kernels.Lattice(), type(solver.boundary)()  # unwanted adjoints, whose place Warp wants
 
     def run(self, adj_x: Mapping[int, torch.Tensor]) -> torch.Tensor:
         """Return the adjoint of the tools, shape (batch, step + 1, slot, 3)."""

@@ -40,12 +40,11 @@ def rod(name: str) -> Any:
     """Return the distance to an upright capsule that stands on the origin."""
     types = precision(name)
     real, vec3, vec4 = types.real, types.vec3, types.vec4
+    ball = sphere(name)
 
     @wp.func(module=f"gradscape.sdf.{name}", name=f"rod_{name}")
     def distance(p: vec3, height: real, radius: real) -> vec4:
-        y = p[1] - wp.clamp(p[1], real(0.0), height)
-        length = wp.sqrt(p[0] * p[0] + y * y + p[2] * p[2] + real(TINY))
-        return vec4(p[0] / length, y / length, p[2] / length, length - radius)
+        return ball(vec3(p[0], p[1] - wp.clamp(p[1], real(0.0), height), p[2]), radius)
 
     return distance
 

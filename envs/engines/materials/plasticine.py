@@ -141,7 +141,7 @@ def kernels(name: str) -> tuple[Any, Any]:
         d = e - mean(e)
         length = size(d)
         f = s
-        a = vec3(real(1.0), real(1.0), real(1.0))  # divided differences of f over s: 01, 02, 12
+        a = one  # divided differences of f over s: 01, 02, 12
         c = real(1.0)
         if length > kappa:
             c = kappa / length
