@@ -15,6 +15,18 @@ def hold(segments: Float[Tensor, "batch segment axis"], steps: int) -> Float[Ten
     return segments.repeat_interleave(steps // count, dim=1)
 
 
+def ramp(
+    start: Float[Tensor, " axis"], waypoints: Float[Tensor, "batch segment axis"], steps: int
+) -> Float[Tensor, "batch step_plus_1 axis"]:
+    """Move from `start` to the waypoints at the ends of equally long segments, linearly in between."""
+    count = waypoints.shape[1]
+    corners = torch.cat([start.expand(len(waypoints), 1, -1), waypoints], dim=1)
+    time = torch.arange(steps + 1, dtype=waypoints.dtype) * count / steps
+    segment = time.floor().long().clamp_max(count - 1)
+    share = (time - segment)[:, None]
+    return (1 - share) * corners[:, segment] + share * corners[:, segment + 1]
+
+
 def travel(
     start: Float[Tensor, " axis"],
     velocity: Float[Tensor, "batch step axis"],

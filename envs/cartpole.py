@@ -1,0 +1,149 @@
+"""The Cartpole scene: a cart swings up the tip of a chain of three links."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..landscapes.objective import Evaluation, Status
+from ..landscapes.space import ParameterSpace
+from .base import Environment, Episode, Fidelity
+from .controls import hold
+from .engines.chain import Chain, Solver
+from .engines.runtime import Pool
+
+CHAIN = Chain(masses=(1.0, 0.5, 0.25), lengths=(1.0, 1.0, 1.0), gravity=9.81)
+CONTROLS, SPAN = 100, 0.02  # how many controls, and how long each is held [s]
+CONTROL = ("cart velocity", "torque 1", "torque 2", "torque 3")
+BOUND, UNITS = (2.0, 10.0, 4.0, 1.0), ("m/s", "N m", "N m", "N m")
+
+KNOTS = range(0, CONTROLS, 11)  # the controls that `upright` gives; it is linear in between
+UPRIGHT = (
+    (-0.09, 0.01, 0.21, 1.23, 1.09, 1.23, -0.22, -1.88, -1.63, -0.71),
+    (-3.51, -2.99, -0.16, -0.7, -1.32, 2.47, 9.85, 10.0, 10.0, 9.97),
+    (0.72, -0.56, -0.94, -0.24, 0.55, 0.97, -3.48, -4.0, -2.64, -0.44),
+    (-0.31, 0.07, 0.19, 0.05, -0.21, -0.19, -0.24, -0.15, 0.13, 0.49),
+)
+
+
+@dataclass(frozen=True)
+class CartpoleOptions:
+    """Where the tip is wanted [m]; the cart starts at (0, 0), its chain hanging down to (0, -3)."""
+
+    target_x: float = 0.0
+    target_y: float = 3.0
+
+
+class Cartpole(Environment):
+    """Swing up a chain of three links, so that its tip is at the target after 2 s.
+
+    Model: a cart moves along a rail at a prescribed velocity; from it hang three uniform rods of 1 m with masses 1, 0.5
+    and 0.25 kg, at rest at first, under gravity (9.81 m/s^2) and the torques of three motors: between cart and first
+    link, first and second, second and third. Angles and their momenta, classical Runge-Kutta, dt 0.01 s at standard.
+    Parameters: cart velocity [m/s] and torques 1, 2, 3 [N m], control by control; each of 100 controls is held for 0.02
+    s. The box, ours, is ±2 m/s and ±10, ±4, ±1 N m: less than holds the links out level (12.3, 4.9, 1.2 N m), so that
+    the tip has to be swung up, and random controls leave it hanging (3.3 to 6.1 m from the target).
+    Loss: distance of the tip to the target (0, 3) m at 2 s [m]; at the target itself its gradient is 0. Example
+    `upright` comes within 2 mm; it was found by gradient descent (Adam at standard on ten knots of each control, with
+    a small penalty on their second differences) from the best looking of 32 random starts.
+    Simplifications: links do not collide, as in the paper; there is no friction, and no limit to joints and rail, which
+    would bring contacts into a scene without any; the cart changes its velocity at once, which kicks the links, since
+    it is the velocity that the paper prescribes.
+    Source: task 3-link Cartpole of "Rethinking Optimization with Differentiable Simulation from a Global Perspective"
+    (CoRL 2022), appendix A.1.1. The paper has 200 timesteps, four controls and 400 parameters: held for two timesteps,
+    controls satisfy all three. Masses, torques, times and target are ours.
+    The paper says: the landscape is very smooth, gradients are of good quality.
+    """
+
+    name: ClassVar[str] = "cartpole"
+    devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
+    fidelities: ClassVar[dict[str, Fidelity]] = {
+        "draft": Fidelity("draft", dt=SPAN),
+        "standard": Fidelity("standard", dt=SPAN / 2),
+        "reference": Fidelity("reference", dt=SPAN / 8, precision="float64"),
+    }
+    loss_unit: ClassVar[str] = "m"
+    Options: ClassVar[type[Any]] = CartpoleOptions
+    examples: ClassVar[dict[str, tuple[float, ...]]] = {
+        "upright": tuple(float(np.interp(k, KNOTS, values)) for k in range(CONTROLS) for values in UPRIGHT)
+    }
+    _solvers: Pool[Solver]
+    space = ParameterSpace(
+        tuple(f"t{k} {name}" for k in range(CONTROLS) for name in CONTROL),
+        torch.tensor(BOUND * CONTROLS, dtype=torch.float64).neg(),
+        torch.tensor(BOUND * CONTROLS, dtype=torch.float64),
+        UNITS * CONTROLS,
+    )
+
+    @property
+    def steps(self) -> int:
+        """Number of time steps of an episode."""
+        return round(CONTROLS * SPAN / self.fidelity.dt)
+
+    def memory(self) -> int:
+        """Estimate the bytes one episode takes while it runs."""
+        numbers = (self.steps + 1) * 4 * 3 + CONTROLS * 2 * 4
+        return numbers * (8 if self.fidelity.precision == "float64" else 4)
+
+    def episode(self, x: Float[Tensor, " dim"]) -> Episode:
+        """Return the cart, and the joints of the chain with its tip."""
+        controls = self._checked(x[None]).view(1, CONTROLS, 4)
+        with self._solvers.lend() as solver:
+            phi = _swing(solver, controls)[:, 0].cpu().double()
+        joints = _joints(self._cart(controls)[0], phi)
+        joints = torch.cat([joints, torch.zeros_like(joints[..., :1])], dim=2)
+        time = self.fidelity.dt * torch.arange(self.steps + 1, dtype=torch.float64)
+        target = torch.cat([self.target, self.target.new_zeros(1)]).expand(len(time), 3)
+        return Episode(time, {"cart": joints[:, :1], "links": joints}, {"target": target})
+
+    @property
+    def target(self) -> Float[Tensor, " 2"]:
+        """Where the tip is wanted [m]."""
+        return torch.tensor([self.options.target_x, self.options.target_y], dtype=torch.float64)
+
+    def _setup(self) -> None:
+        dt = self.fidelity.dt
+        if round(SPAN / dt) < 1 or abs(round(SPAN / dt) * dt - SPAN) > 1e-9:
+            raise ValueError(f"{self.name} holds a control for {SPAN} s, which must be whole steps; got dt {dt} s")
+        self._capacity = 256 if self.device == "cpu" else 1 << 14
+        settings: dict[str, Any] = {"capacity": self._capacity, "device": self.device, "name": self.fidelity.precision}
+        self._solvers = Pool(partial(Solver, CHAIN, dt=dt, hold=round(SPAN / dt), controls=CONTROLS, **settings))
+
+    def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+        controls = x.view(len(x), CONTROLS, 4).requires_grad_(grad)
+        with self._solvers.lend() as solver:
+            phi = _swing(solver, controls.detach())[-1].cpu().double().requires_grad_(grad)
+            tip = _joints(self._cart(controls)[:, -1], phi)[:, -1]
+            loss = (tip - self.target).norm(dim=1)
+            slope = _pull_back(solver, loss, phi, controls) if grad else None
+        return Evaluation(loss.detach(), slope, torch.full((len(x),), Status.OK, dtype=torch.int8))
+
+    def _cart(self, controls: Float[Tensor, "batch control 4"]) -> Float[Tensor, "batch step_plus_1"]:
+        """Return where the cart is at the ends of steps [m]."""
+        path = (self.fidelity.dt * hold(controls[:, :, :1], self.steps)).cumsum(dim=1)[:, :, 0]
+        return torch.cat([torch.zeros_like(path[:, :1]), path], dim=1)
+
+
+def _swing(solver: Solver, controls: Float[Tensor, "batch control 4"]) -> Float[Tensor, "step_plus_1 batch 3"]:
+    """Return the angles at the ends of steps [rad], from hanging at rest."""
+    rest = torch.zeros(3, dtype=torch.float64)
+    return solver.run(rest, rest, controls)
+
+
+def _joints(cart: Float[Tensor, "*batch"], phi: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 2"]:
+    """Return where the joints are, from the cart to the tip [m]."""
+    links = torch.stack([phi.sin(), -phi.cos()], dim=-1) * phi.new_tensor(CHAIN.lengths)[:, None]
+    hinge = torch.stack([cart, torch.zeros_like(cart)], dim=-1)[..., None, :]
+    return torch.cat([hinge, hinge + links.cumsum(dim=-2)], dim=-2)
+
+
+def _pull_back(solver: Solver, loss: Tensor, phi: Tensor, controls: Tensor) -> Tensor:
+    """Return the gradient by the parameters of a loss that depends on the last angles and on the cart's path."""
+    adj_phi, adj_controls = torch.autograd.grad(loss.sum(), (phi, controls))
+    return (adj_controls + solver.gradient(adj_phi).cpu().double()).flatten(start_dim=1)

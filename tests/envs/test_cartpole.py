@@ -1,0 +1,144 @@
+"""Cartpole: its geometry, gradients that are slopes near and far, converged losses, and the swing-up."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gradscape.envs.base import Fidelity
+from gradscape.envs.cartpole import Cartpole
+from gradscape.landscapes.objective import Status
+
+SPACE = Cartpole.space
+ALL = tuple(Cartpole.fidelities)
+
+
+def made(fidelity, **options):
+    return Cartpole(fidelity=fidelity, device="cpu", **options)
+
+
+def exact(dt):
+    return made(Fidelity(f"dt {dt}", dt=dt, precision="float64"))
+
+
+@pytest.fixture(scope="module")
+def cartpole():
+    return made(replace(Cartpole.fidelities["standard"], precision="float64"))
+
+
+def slopes(env, x, step):
+    """Return central differences of the loss along `step`."""
+    ahead, back = (env.evaluate(x + sign * step, grad=False).loss for sign in (1, -1))
+    return (ahead - back) / 2
+
+
+def test_an_episode_starts_hanging_and_ends_where_the_loss_is_measured(cartpole):
+    x = SPACE.uniform(1, seed=0)[0]
+    episode = cartpole.episode(x)
+    cart, links, target = episode.points["cart"], episode.points["links"], episode.tools["target"]
+    assert cart.shape == (201, 1, 3)
+    assert links.shape == (201, 4, 3)
+    assert episode.time.tolist() == pytest.approx([0.01 * step for step in range(201)])
+    hanging = torch.tensor([[0.0, -y, 0.0] for y in range(4)], dtype=torch.float64)
+    torch.testing.assert_close(links[0], hanging)
+    assert torch.equal(links[:, :1], cart)
+    torch.testing.assert_close(links.diff(dim=1).norm(dim=2), torch.ones(201, 3, dtype=torch.float64))
+    speed = (cart[1:, 0, 0] - cart[:-1, 0, 0]) / 0.01
+    torch.testing.assert_close(speed, x[::4].repeat_interleave(2))
+    assert (cart[:, 0, 1:] == 0).all()
+    torch.testing.assert_close((links[-1, -1] - target[-1]).norm(), cartpole.evaluate(x[None], grad=False).loss[0])
+
+
+def test_without_control_the_chain_hangs_where_it_is(cartpole):
+    assert float(cartpole.evaluate(SPACE.center[None]).loss) == 6
+    assert (cartpole.episode(SPACE.center).points["links"][-1, :, 0] == 0).all()
+
+
+def test_a_tip_that_meets_the_target_has_a_gradient_of_zero():
+    below = made("standard", target_y=-3.0).evaluate(SPACE.center[None])
+    assert below.status.tolist() == [Status.OK]
+    assert float(below.loss) == 0
+    assert (below.grad == 0).all()
+
+
+def test_the_mirror_image_of_the_controls_has_the_mirrored_gradient(cartpole):
+    x = SPACE.uniform(8, seed=1)
+    one, other = cartpole.evaluate(x), cartpole.evaluate(-x)
+    torch.testing.assert_close(one.loss, other.loss, rtol=0, atol=1e-12)
+    torch.testing.assert_close(one.grad, -other.grad, rtol=0, atol=1e-10)
+
+
+def test_gradient_is_the_slope_of_the_loss_along_directions(cartpole):
+    x, along = SPACE.uniform(16, seed=2), SPACE.uniform(16, seed=3)
+    got = (cartpole.evaluate(x).grad * along).sum(dim=1)
+    assert got.abs().median() > 0.1
+    torch.testing.assert_close(got, slopes(cartpole, x, 1e-6 * along) / 1e-6, rtol=1e-7, atol=1e-8)
+
+
+def test_gradient_is_the_slope_of_the_loss_by_single_parameters(cartpole):
+    (x,) = SPACE.uniform(1, seed=4)
+    grad = cartpole.evaluate(x[None]).grad[0]
+    some = [4 * control + component for control in (0, 1, 50, 98, 99) for component in range(4)]
+    step = 1e-5 * torch.eye(SPACE.dim, dtype=torch.float64)[some] * SPACE.upper
+    wanted = slopes(cartpole, x, step) / step.sum(dim=1)
+    assert (wanted.abs() > 1e-6).all()
+    torch.testing.assert_close(grad[some], wanted, rtol=1e-7, atol=1e-9)
+
+
+def test_gradients_still_hold_where_every_parameter_moves_by_up_to_a_hundredth_of_the_box(cartpole):
+    """The paper's finding: the landscape is very smooth."""
+    x, along = SPACE.uniform(64, seed=5), SPACE.uniform(64, seed=6)
+    got = (cartpole.evaluate(x).grad * along).sum(dim=1)
+    assert (slopes(cartpole, x, 2e-2 * along) / 2e-2 - got).norm() < 0.03 * got.norm()
+
+
+def test_across_the_box_the_loss_turns_once_at_most_along_one_parameter(cartpole):
+    """The paper's finding: gradients are of good quality."""
+    for seed, parameter in enumerate(range(0, SPACE.dim, 27)):
+        x = SPACE.uniform(1, seed=seed).repeat(33, 1)
+        x[:, parameter] = torch.linspace(-1, 1, 33, dtype=torch.float64) * SPACE.upper[parameter]
+        slope = cartpole.evaluate(x).grad[:, parameter]
+        assert int((slope[1:] * slope[:-1] < 0).sum()) <= 1
+
+
+def test_losses_converge_at_fourth_order():
+    x = SPACE.uniform(32, seed=7)
+    losses = [exact(0.02 / n).evaluate(x, grad=False).loss for n in (4, 8, 16, 64)]
+    errors = [float((loss - losses[-1]).abs().mean()) for loss in losses[:-1]]
+    np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), 4, atol=0.2)
+
+
+@pytest.mark.parametrize(("fidelity", "loss", "grad"), [("draft", 1e-2, 3e-2), ("standard", 5e-4, 2e-3)])
+def test_cheaper_fidelities_agree_with_the_reference(fidelity, loss, grad):
+    x = SPACE.uniform(128, seed=0)
+    one, best = (made(name).evaluate(x) for name in (fidelity, "reference"))
+    assert (one.loss - best.loss).abs().max() < loss
+    assert ((one.grad - best.grad).norm(dim=1) < grad * best.grad.norm(dim=1)).all()
+
+
+@pytest.mark.parametrize("fidelity", ALL)
+def test_the_corners_of_the_box_can_be_simulated(fidelity):
+    sign = torch.randint(0, 2, (64, SPACE.dim), generator=torch.Generator().manual_seed(8)) * 2 - 1
+    sign[0], sign[1] = 1, -1
+    assert (made(fidelity).evaluate(sign * SPACE.upper).status == Status.OK).all()
+
+
+@pytest.mark.parametrize("fidelity", ALL)
+def test_the_example_swings_the_tip_up_to_the_target(fidelity):
+    env = made(fidelity)
+    upright = env.example("upright")
+    assert (upright.abs() <= SPACE.upper).all()
+    assert float(env.evaluate(upright[None], grad=False).loss) < 0.05
+    links = env.episode(upright).points["links"]
+    assert (links[-1, :, 1].diff() > 0.95).all()
+
+
+def test_random_controls_leave_the_tip_far_from_the_target():
+    assert made("draft").evaluate(SPACE.uniform(256, seed=9), grad=False).loss.min() > 2
+
+
+def test_a_step_that_does_not_divide_the_time_of_a_control_is_refused():
+    for dt in (0.03, 0.015, 0.04):
+        with pytest.raises(ValueError, match=f"cartpole holds a control for 0.02 s.*got dt {dt} s"):
+            exact(dt)
