@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 import xarray as xr
 from jaxtyping import Float
 from torch import Tensor
@@ -20,7 +21,7 @@ from .files import replacing
 from .objective import Objective, Status
 from .plane import Plane
 from .sampling import Progress, sample
-from .store import SliceStore, is_slice
+from .store import SliceStore, is_slice, plane_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -143,9 +144,18 @@ class Job:
             "seconds": round(seconds, 3),
             "status": {kind.name.lower(): int((status == kind).sum()) for kind in Status},
             "loss": {"lowest": ends[0], "highest": ends[1]},
+            "flat": flat_points(dataset),
             "command": command,
             "files": [STORE, PICTURE, SUMMARY],
         }
+
+
+def flat_points(dataset: xr.Dataset) -> int | None:
+    """Count the points whose gradient along the plane is exactly zero, none if gradients are not there."""
+    if "grad" not in dataset:
+        return None
+    slope = plane_of(dataset).slope(torch.from_numpy(dataset["grad"].to_numpy()))
+    return int((slope == 0).all(dim=-1).sum())
 
 
 def _peak_memory() -> int:

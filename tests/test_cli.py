@@ -85,6 +85,16 @@ def test_slice_leaves_store_picture_and_summary(run: Callable[..., Said], tmp_pa
     assert "81 episodes with gradients to compute: about" in done.stderr
 
 
+def test_slice_says_where_the_gradient_is_exactly_zero(run: Callable[..., Said], tmp_path: Path) -> None:
+    done = run("slice", "pinball-2", "--dims", "0", "1", "--resolution", "9", "--json", "--out", "cut", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    dataset = gradscape.open_slice(tmp_path / "cut/slice.zarr")
+    flat = int((dataset["grad"] == 0).all("dim").sum())
+    assert json.loads(done.stdout)["flat"] == flat
+    assert 0 < flat < 81
+    assert f"gradient exactly zero at {flat / 81:.1%} of points" in done.stderr
+
+
 def test_same_command_computes_nothing_twice_and_force_begins_anew(run: Callable[..., Said], tmp_path: Path) -> None:
     command = ["slice", "branin", "--dims", "0", "1", "--resolution", "5", "--json"]
     assert json.loads(run(*command, cwd=tmp_path).stdout)["episodes"] == 25

@@ -79,6 +79,8 @@ def _draw_loss(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
     style.dress_bar(bar, f"loss [{unit}]" if unit else "loss")
     if not np.isfinite(loss).any():
         return []
+    if np.nanmin(loss) == np.nanmax(loss):
+        return [Line2D([], [], linestyle="none", label=f"every sample: {style.number(np.nanmin(loss))}")]
     row, column = np.unravel_index(np.nanargmin(loss), loss.shape)
     (lowest,) = ax.plot(u[column], v[row], **style.LOWEST, label=f"lowest sample: {style.number(loss[row, column])}")
     return [lowest]
@@ -104,6 +106,7 @@ def _draw_arrows(ax: Axes, dataset: xr.Dataset, plane: Plane) -> list[Artist]:
     )  # fmt: skip
     bar = ax.figure.colorbar(quiver, ax=ax, extend=scale.extend, fraction=0.05, pad=0.02)
     style.dress_bar(bar, label)
+    bar.ax.set_visible(bool(seen.any()))  # hidden rather than left out, so that both panels keep their width
     if not flat.any():
         return []
     ax.plot(u[flat[at]], v[flat[at]], **style.FLAT, zorder=2.5)

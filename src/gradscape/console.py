@@ -221,7 +221,9 @@ def _outcome(summary: dict[str, Any]) -> str:
     said = ", ".join(f"{count} {kind}" for kind, count in counts.items())
     low, high = summary["loss"]["lowest"], summary["loss"]["highest"]
     losses = "no finite loss" if low is None else f"losses from {low:.4g} to {high:.4g}"
-    return f"{summary['episodes']} episodes in {_duration(summary['seconds'])}; {said}; {losses}"
+    share = (summary["flat"] or 0) / sum(counts.values())
+    flat = f"; gradient exactly zero at {share:.1%} of points" if share else ""
+    return f"{summary['episodes']} episodes in {_duration(summary['seconds'])}; {said}; {losses}{flat}"
 
 
 def _options(settings: Sequence[str]) -> dict[str, str]:

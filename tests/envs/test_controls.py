@@ -1,9 +1,10 @@
-"""Tool motion: segments held, speeds integrated, positions kept within reach, and how gradients pass."""
+"""Tool motion: segments held, waypoints met, speeds integrated, positions kept within reach, and how gradients pass."""
 
+import numpy as np
 import pytest
 import torch
 
-from gradscape.envs.controls import hold, travel
+from gradscape.envs.controls import hold, ramp, travel
 
 START = torch.tensor([0.1, 0.2], dtype=torch.float64)
 LOWER, UPPER = torch.tensor([-0.5, 0.0], dtype=torch.float64), torch.tensor([0.5, 1.0], dtype=torch.float64)
@@ -29,6 +30,28 @@ def test_segments_are_held_over_equal_shares_of_the_steps():
 def test_steps_that_segments_cannot_share_are_refused():
     with pytest.raises(ValueError, match="21 control steps cannot be shared equally by 5 segments"):
         hold(velocities(3, 5, 2), 21)
+
+
+@pytest.mark.parametrize("steps", [20, 21, 4, 3, 100])
+def test_a_ramp_is_linear_between_waypoints_whatever_the_number_of_steps(steps):
+    waypoints = velocities(3, 5, 2)
+    path = ramp(START, waypoints, steps)
+    corners = torch.cat([START.expand(3, 1, 2), waypoints], dim=1)
+    assert path.shape == (3, steps + 1, 2)
+    for row in range(3):
+        for axis in range(2):
+            expected = np.interp(np.linspace(0, 5, steps + 1), np.arange(6), corners[row, :, axis])
+            torch.testing.assert_close(path[row, :, axis], torch.from_numpy(expected), rtol=0, atol=1e-14)
+    if steps % 5 == 0:
+        assert torch.equal(path[:, :: steps // 5], corners)
+
+
+def test_every_waypoint_moves_its_own_two_segments_of_a_ramp():
+    """The shares of a waypoint are a hat function: over 2 x 6 steps they add up to 6; the last has only half a hat."""
+    waypoints = velocities(2, 5, 2).requires_grad_()
+    (grad,) = torch.autograd.grad(ramp(START, waypoints, 30).sum(), waypoints)
+    hats = torch.tensor([6.0, 6.0, 6.0, 6.0, 3.5], dtype=torch.float64)
+    torch.testing.assert_close(grad, hats[:, None].expand(2, 5, 2))
 
 
 def test_a_tool_travels_speed_times_time_within_its_reach():

@@ -157,6 +157,22 @@ def test_the_star_is_on_the_lowest_sample():
     assert (star.get_xdata()[0], star.get_ydata()[0]) == (DATASET["u"].values[column], DATASET["v"].values[row])
 
 
+class Plain(Bowl):
+    """One loss everywhere."""
+
+    name = "plain"
+
+    def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
+        return Evaluation.judged(torch.full((len(x),), 4.5).double(), torch.zeros_like(x), torch.full((len(x),), 1))
+
+
+def test_a_plain_has_neither_a_lowest_sample_nor_a_scale_of_gradients():
+    figure = landscape_figure(sample(Plain(), plane(5, 5)))
+    assert not [line for line in figure.axes[0].lines if line.get_marker() == "*"]
+    assert legend_of(figure) == ["every sample: 4.5", "gradient exactly zero: 25 of 25"]
+    assert [ax.get_visible() for ax in figure.axes] == [True, True, True, False]
+
+
 def test_axes_bars_and_title_say_what_is_shown_and_in_which_units():
     assert BOTTOM.get_xlabel() == "speed [m/s]"
     assert TOP.get_ylabel() == BOTTOM.get_ylabel() == "lift [m]"
