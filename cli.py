@@ -21,6 +21,7 @@ app = typer.Typer(
 
 Fidelity = Annotated[str | None, typer.Option(help="How accurately to simulate: draft, standard or reference.")]
 Device = Annotated[str, typer.Option(help="auto, cpu or cuda; auto takes CUDA where it is.")]
+Engine = Annotated[str, typer.Option(help="warp, or taichi where a scene has it: the reference, to hold Warp against.")]
 Set = Annotated[list[str] | None, typer.Option("--set", help="A scene option, name=value; may be repeated.")]
 Out = Annotated[
     str | None, typer.Option(help="Folder for the results; by default one under out/ named after the slice.")
@@ -67,6 +68,7 @@ def slice_(
     resolution: Annotated[int, typer.Option(min=2, help="Points along each axis.")] = 16,
     fidelity: Fidelity = None,
     device: Device = "auto",
+    engine: Engine = "warp",
     through: Through = "center",
     extent: Extent = None,
     set_: Set = None,
@@ -87,6 +89,7 @@ def slice_(
         resolution=resolution,
         fidelity=fidelity,
         device=device,
+        engine=engine,
         through=through,
         extent=extent,
         settings=set_ or [],
@@ -121,6 +124,7 @@ def bounce(
         resolution=resolution,
         fidelity=fidelity,
         device=device,
+        engine="warp",
         through=through,
         extent=extent,
         settings=set_ or [],
@@ -128,6 +132,40 @@ def bounce(
         out=out,
         as_json=json_,
         force=force,
+    )
+
+
+@app.command()
+def bench(
+    env: Annotated[str, typer.Argument(help="The environment; `landscape envs` lists them.")],
+    fidelity: Fidelity = None,
+    device: Device = "auto",
+    engine: Engine = "warp",
+    against: Annotated[str | None, typer.Option(help="Another engine, to run in turn with the first.")] = None,
+    batch: Annotated[
+        list[int] | None,
+        typer.Option(min=1, help="Episodes at once; may be repeated. By default 1 and what the environment prefers."),
+    ] = None,
+    seconds: Annotated[float, typer.Option(min=0.0, help="How long to time each batch size, about.")] = 10.0,
+    set_: Set = None,
+    json_: Json = False,
+) -> None:
+    """Measure episodes per second, forward and with gradient, and what they are spent on.
+
+    Rates are the best of repetitions that alternate; with --against, engines alternate too, and ratios are of one run.
+    """
+    from .bench_report import bench as report
+
+    report(
+        env,
+        fidelity=fidelity,
+        device=device,
+        engine=engine,
+        against=against,
+        batches=batch or [],
+        seconds=seconds,
+        settings=set_ or [],
+        as_json=json_,
     )
 
 

@@ -9,6 +9,8 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar, final
 
 import torch
@@ -53,13 +55,21 @@ class Episode:
     tools: Mapping[str, Float[Tensor, "frame 3"]] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class Work:
+    """Say how much an episode computes: `count` of a `unit`, such as one particle in one substep."""
+
+    count: int
+    unit: str
+
+
 class Environment(abc.ABC):
     """A differentiable scene: a batch of parameter vectors in, losses and gradients out.
 
     A scene is written by deriving from this class: the class attributes say what it is, `_evaluate` simulates. An
     environment is an `Objective`, and a torch function: `env(x)` returns losses, shape (batch,), that can be
     differentiated. `fidelity` is a name from `fidelities`, the first unless said otherwise, or a record of one's own;
-    `device` is auto, cpu or cuda; options are those of the class's `Options`.
+    `device` is auto, cpu or cuda; `engine` is one of `engines`; options are those of the class's `Options`.
     """
 
     name: ClassVar[str]
@@ -67,15 +77,24 @@ class Environment(abc.ABC):
     examples: ClassVar[Mapping[str, tuple[float, ...]]] = {}
     Options: ClassVar[type[Any]] = NoOptions
     devices: ClassVar[tuple[str, ...]] = ("cpu",)
+    engines: ClassVar[tuple[str, ...]] = ("warp",)
     loss_unit: ClassVar[str] = ""
 
     space: ParameterSpace
     _solvers: Pool[Any] | None = None  # a scene on an engine sets both in `_setup`: what simulates,
     _capacity = 1 << 20  # and how many rows it takes at once
 
-    def __init__(self, *, fidelity: str | Fidelity | None = None, device: str = "auto", **options: Any) -> None:
+    def __init__(
+        self,
+        *,
+        fidelity: str | Fidelity | None = None,
+        device: str = "auto",
+        engine: str = "warp",
+        **options: Any,
+    ) -> None:
         self.fidelity = self._named_fidelity(fidelity)
         self.device = self._available_device(device)
+        self.engine = self.known_engine(engine)
         self.options = read_options(self.name, self.Options, options)
         self._stop = threading.Event()
         self._setup()
@@ -110,6 +129,14 @@ class Environment(abc.ABC):
         return "\n\n".join(inspect.cleandoc(kind.__doc__) for kind in family if kind.__doc__)
 
     @final
+    @classmethod
+    def known_engine(cls, engine: str) -> str:
+        """Return the name of one of the scene's engines, and refuse any other."""
+        if engine not in cls.engines:
+            raise ValueError(f"{cls.name} has engine {' and '.join(cls.engines)}; got engine {engine!r}")
+        return engine
+
+    @final
     def example(self, name: str) -> Float[Tensor, " dim"]:
         """Return a parameter vector this scene is known for."""
         if name not in self.examples:
@@ -136,10 +163,14 @@ class Environment(abc.ABC):
         """Estimate the bytes one episode takes while it runs."""
         return 0
 
+    def work(self) -> Work:
+        """Return what one episode computes, so that engines can be compared by it."""
+        return Work(1, "evaluation")
+
     @property
     def threads(self) -> int:
-        """Number of Python threads a batch is spread over: an engine's CPU kernels leave each other alone."""
-        return _cores() if self._solvers is not None and self.device == "cpu" else 1
+        """Number of Python threads a batch is spread over: Warp's CPU kernels leave each other alone."""
+        return _cores() if self._solvers is not None and self.device == "cpu" and self.engine == "warp" else 1
 
     @property
     def preferred_batch(self) -> int:
@@ -159,6 +190,20 @@ class Environment(abc.ABC):
 
     def _prepare(self) -> None:  # noqa: B027 -- nothing, for most scenes
         """Make what else a first evaluation would make."""
+
+    @final
+    def _engine(self, kind: str) -> ModuleType:
+        """Return the engine's module for `kind` (mpm, springs), imported only when asked for."""
+        module = kind if self.engine == "warp" else f"{self.engine}_{kind}"
+        try:
+            return import_module(f".engines.{module}", __package__)
+        except ImportError as error:
+            raise ValueError(f"{self.name} cannot run on engine {self.engine} here: {error}") from error
+
+    @final
+    def _rows_at_once(self, capacity: int) -> int:
+        """Return the rows a solver takes where one on Warp takes `capacity`: Taichi's has every core to itself."""
+        return capacity * (_cores() if self.engine == "taichi" and self.device == "cpu" else 1)
 
     def _share(self, rows: int) -> int:
         return max(1, min(-(-rows // self.threads), self._capacity))

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
-from .base import Environment, Episode, Fidelity
+from .base import Environment, Episode, Fidelity, Work
 from .engines.rigid import Ball, Solver
 from .engines.runtime import Pool
 
@@ -83,6 +83,10 @@ class Bounce(Environment):
     def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
         return (self.steps + 1) * 4 * 3 * (8 if self.fidelity.precision == "float64" else 4)
+
+    def work(self) -> Work:
+        """Count steps of the ball."""
+        return Work(self.steps, "body-step")
 
     def bounces(self, x: Float[Tensor, "batch 3"]) -> Int[Tensor, " batch"]:
         """Count how often each ball leaves the ground."""

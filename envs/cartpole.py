@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
-from .base import Environment, Episode, Fidelity
+from .base import Environment, Episode, Fidelity, Work
 from .controls import hold
 from .engines.chain import Chain, Solver
 from .engines.runtime import Pool
@@ -90,6 +90,10 @@ class Cartpole(Environment):
         """Estimate the bytes one episode takes while it runs."""
         numbers = (self.steps + 1) * 4 * 3 + CONTROLS * 2 * 4
         return numbers * (8 if self.fidelity.precision == "float64" else 4)
+
+    def work(self) -> Work:
+        """Count steps of links."""
+        return Work(len(CHAIN.masses) * self.steps, "body-step")
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return the cart, and the joints of the chain with its tip."""

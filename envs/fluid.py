@@ -13,13 +13,13 @@ from torch import Tensor
 
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
-from .base import Environment, Episode, Fidelity
+from .base import Environment, Episode, Fidelity, Work
 from .controls import hold, travel
 from .engines.boundaries import LadleInTank
 from .engines.materials import Elastic
 from .engines.materials import Fluid as Liquid
 from .engines.model import Body, Model
-from .engines.mpm import Solver, capacity
+from .engines.mpm import Solver, capacity, memory
 from .engines.runtime import Pool
 
 TANK_WIDTH, TANK_HEIGHT, FILL = 0.4, 0.2, 0.15  # the tank, and the depth of the syrup [m]
@@ -68,6 +68,7 @@ class Fluid(Environment):
 
     name: ClassVar[str] = "fluid"
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
+    engines: ClassVar[tuple[str, ...]] = ("warp", "taichi")
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=SPAN / 3, resolution=12, sampling=1.4),
         "standard": Fidelity("standard", dt=SPAN / 20, resolution=22),
@@ -88,7 +89,11 @@ class Fluid(Environment):
 
     def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
-        return self.model.bytes_per_environment()
+        return memory(self.model, self.device)
+
+    def work(self) -> Work:
+        """Count substeps of particles."""
+        return Work(self.model.particles * self.model.substeps * self.model.steps, "particle-substep")
 
     def ladle(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 1 3"]:
         """Return where the centre of the ladle's rim is at the ends of control steps [m]."""
@@ -117,8 +122,9 @@ class Fluid(Environment):
 
     def _setup(self) -> None:
         self.model = _model(self.fidelity, self.options)
-        self._capacity = capacity(self.model, self.device)
-        self._solvers = Pool(partial(Solver, self.model, capacity=self._capacity, device=self.device, stop=self._stop))
+        self._capacity = self._rows_at_once(capacity(self.model, self.device))
+        settings: dict[str, Any] = {"capacity": self._capacity, "device": self.device, "stop": self._stop}
+        self._solvers = Pool(partial(self._engine("mpm").Solver, self.model, **settings))
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         x = x.clone().requires_grad_(grad)

@@ -14,7 +14,7 @@ from torch.nn.functional import normalize, pad
 
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
-from .base import Environment, Episode, Fidelity
+from .base import Environment, Episode, Fidelity, Work
 from .engines.board import Board
 from .engines.impacts import Solver
 from .engines.runtime import Pool
@@ -88,6 +88,10 @@ class Pinball(Environment):
     def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
         return 2 * self.steps * (2 * 6 * (8 if self.fidelity.precision == "float64" else 4) + 5 * 4)
+
+    def work(self) -> Work:
+        """Count steps of the ball."""
+        return Work(self.steps, "body-step")
 
     def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Int[Tensor, " batch"]]:
         """Count the impacts of each episode that are faster than crawling."""

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
-from .base import Environment, Episode, Fidelity
+from .base import Environment, Episode, Fidelity, Work
 from .controls import hold, roll, travel
 from .engines.manipulators import Kind
 from .engines.model import Model
-from .engines.mpm import Solver, capacity
+from .engines.mpm import Solver, capacity, memory
 from .engines.raster import Raster
 from .engines.runtime import Pool
 from .plasticine_model import SPAN, STEPS, Scene, model, target
@@ -72,6 +72,7 @@ class Plasticine(Environment):
     """
 
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
+    engines: ClassVar[tuple[str, ...]] = ("warp", "taichi")
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=SPAN / 9, resolution=32, particles=800),
         "standard": Fidelity("standard", dt=SPAN / 20, resolution=64, particles=10_000),
@@ -83,7 +84,11 @@ class Plasticine(Environment):
 
     def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
-        return self.model.bytes_per_environment() + Raster.bytes_per_row(self.model)
+        return memory(self.model, self.device) + Raster.bytes_per_row(self.model)
+
+    def work(self) -> Work:
+        """Count substeps of particles."""
+        return Work(self.model.particles * self.model.substeps * self.model.steps, "particle-substep")
 
     def tools(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 slot 3"]:
         """Return where tools are at the ends of control steps [m]; a roller's second slot is (spin, yaw, 0) [rad]."""
@@ -142,8 +147,9 @@ class Plasticine(Environment):
         )
         self.model = model(self.scene, self.fidelity)
         self._judged = (STEPS,) if self.options.loss == "final" else tuple(range(1, STEPS + 1))
-        self._capacity = capacity(self.model, self.device)
-        self._solvers = Pool(partial(_stage, self.model, self._capacity, self.device, self._stop))
+        self._capacity = self._rows_at_once(capacity(self.model, self.device))
+        solver = self._engine("mpm").Solver
+        self._solvers = Pool(partial(_stage, solver, self.model, self._capacity, self.device, self._stop))
         self._making = threading.Lock()
 
     def _prepare(self) -> None:
@@ -200,6 +206,6 @@ class Plasticine(Environment):
         return np.asarray(demonstration)
 
 
-def _stage(model: Model, capacity: int, device: str, stop: threading.Event) -> Stage:
-    solver = Solver(model, capacity=capacity, device=device, stop=stop)
+def _stage(kind: type[Solver], model: Model, capacity: int, device: str, stop: threading.Event) -> Stage:
+    solver = kind(model, capacity=capacity, device=device, stop=stop)
     return Stage(solver, Raster(model, model.mass, capacity=capacity, device=device))

@@ -84,7 +84,7 @@ def model(scene: Scene, fidelity: Fidelity) -> Model:
     last = np.ceil(upper / dx).astype(int) + MARGIN
     return Model(
         precision=fidelity.precision,
-        bodies=_bodies(scene, fidelity.particles),
+        bodies=_bodies(scene, fidelity.particles, dx),
         boundary=Manipulators(
             scene.tools, tuple(lower.tolist()), tuple(upper.tolist()), FLOOR, scene.floor_friction, SOFTNESS
         ),
@@ -104,11 +104,16 @@ def target(scene: Scene, particles: int) -> np.ndarray:
     return np.concatenate([fill(shape, count) for shape, count in zip(scene.target, counts, strict=True)])
 
 
-def _bodies(scene: Scene, particles: int) -> tuple[Body, ...]:
+def _bodies(scene: Scene, particles: int, dx: float) -> tuple[Body, ...]:
     material = Plasticine(1.0, YOUNG, scene.poisson, scene.yield_stress)
     counts = shares([lump.shape for lump in scene.lumps], particles)
     masses = [np.full(n, lump.particles * PARTICLE / n) for lump, n in zip(scene.lumps, counts, strict=True)]
     return tuple(
-        Body(material, fill(lump.shape, len(mass)), mass, np.ones(len(mass)))  # density 1: volume is mass
+        Body(material, _by_cell(fill(lump.shape, len(mass)), dx), mass, np.ones(len(mass)))  # density 1: volume is mass
         for lump, mass in zip(scene.lumps, masses, strict=True)
     )
+
+
+def _by_cell(x: np.ndarray, dx: float) -> np.ndarray:
+    """Return particles cell by cell, so that those that meet the same nodes are neighbours in memory."""
+    return np.asarray(x[np.lexsort(np.floor(x / dx).T[::-1])])

@@ -170,6 +170,13 @@ def code_digest(kind: type[Environment]) -> str:
     return hashlib.sha256(b"".join(source.read_bytes() for source in files)).hexdigest()[:12]
 
 
-def make(name: str, *, fidelity: str | Fidelity | None = None, device: str = "auto", **options: Any) -> Environment:
+def make(
+    name: str,
+    *,
+    fidelity: str | Fidelity | None = None,
+    device: str = "auto",
+    engine: str = "warp",
+    **options: Any,
+) -> Environment:
     """Make a registered environment; `fidelity` defaults to its cheapest, `device` is auto, cpu or cuda."""
-    return environment_class(name)(fidelity=fidelity, device=device, **options)
+    return environment_class(name)(fidelity=fidelity, device=device, engine=engine, **options)

@@ -13,10 +13,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..landscapes.objective import Evaluation, Status
-from .base import Environment, Episode
+from .base import Environment, Episode, Work
 from .engines.contact import Surface
 from .engines.runtime import Pool
-from .engines.springs import Sheet, Solver, bytes_per_row, capacity
+from .engines.springs import Sheet, Solver, capacity
 
 FRAME = 0.01  # between the frames of an episode [s]
 
@@ -43,6 +43,7 @@ class SheetScene(Environment):
     """
 
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
+    engines: ClassVar[tuple[str, ...]] = ("warp", "taichi")
     loss_unit: ClassVar[str] = "m"
     duration: ClassVar[float]  # of an episode [s]
     surface: ClassVar[Surface]
@@ -56,7 +57,12 @@ class SheetScene(Environment):
 
     def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
-        return bytes_per_row(self.sheet, self.steps, self.fidelity.precision)
+        size: int = self._engine("springs").bytes_per_row(self.sheet, self.steps, self.fidelity.precision)
+        return size
+
+    def work(self) -> Work:
+        """Count steps of vertices."""
+        return Work(len(self.sheet.x) * self.steps, "vertex-step")
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return the sheet and its surroundings every hundredth of a second."""
@@ -90,10 +96,10 @@ class SheetScene(Environment):
 
     def _setup(self) -> None:
         self.sheet = self._sheet()
-        self._capacity = capacity(self.memory(), self.device)
+        self._capacity = self._rows_at_once(capacity(self.memory(), self.device))
         self._solvers = Pool(
             partial(
-                Solver,
+                self._engine("springs").Solver,
                 self.sheet,
                 self.surface,
                 dt=self.fidelity.dt,

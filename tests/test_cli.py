@@ -142,6 +142,13 @@ def test_a_folder_of_other_files_is_left_alone(run: Callable[..., Said], tmp_pat
         (["slice", "branin", "--dims", "0", "1", "--set", "dim=3"], "branin has no option 'dim'"),
         (["slice", "ackley", "--dims", "0", "1", "--set", "dim=two"], "dim takes a whole number; got 'two'"),
         (["slice", "ackley", "--dims", "0", "1", "--set", "dim"], "--set takes name=value; got 'dim'"),
+        (["slice", "bounce", "--dims", "0", "1", "--engine", "taichi"], "bounce has engine warp; got engine 'taichi'"),
+        (["bench", "bonce"], "did you mean bounce?"),
+        (["bench", "bounce", "--engine", "taichi"], "bounce has engine warp; got engine 'taichi'"),
+        (["bench", "bounce", "--against", "taichi"], "bounce has engine warp; got engine 'taichi'"),
+        (["bench", "fluid", "--against", "warp"], "two engines are compared; got warp against warp"),
+        (["bench", "bounce", "--batch", "0"], "--batch"),
+        (["bench", "bounce", "--set", "wind=1"], "bounce has no option 'wind'"),
         (["bounce", "--axis", "w"], "axis x, y or z; got 'w'"),
         (["envs", "nothing"], "no environment is called 'nothing'"),
         (["plot"], "plot"),
@@ -178,6 +185,46 @@ def test_bounce_counts_the_bounces_it_marks(run: Callable[..., Said], tmp_path: 
     assert summary["dims"] == ["velocity y"]
     assert summary["status"]["ok"] == 64
     assert (tmp_path / "b/landscape.png").exists()
+
+
+def test_bench_prints_rates_ratios_and_memory_as_json(run: Callable[..., Said], tmp_path: Path) -> None:
+    command = ["bench", "swing-velocity", "--against", "taichi", "--batch", "2", "--seconds", "0"]
+    done = run(*command, "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert (report["env"], report["fidelity"], report["engine"]) == ("swing-velocity", "draft", "warp")
+    assert report["work"] == {"count": 64 * 400, "unit": "vertex-step"}
+    assert report["memory"]["estimated"] == gradscape.make("swing-velocity", device="cpu").memory()
+    assert report["command"] == f"landscape {' '.join(command)} --json"
+    assert set(report["start"]) == {"warp", "taichi"}
+    ours, theirs = report["rates"]
+    for way in ("forward", "with_gradient"):
+        ratio = ours[way]["episodes_per_second"] / theirs[way]["episodes_per_second"]
+        assert ours[f"ratio_{way}"] == pytest.approx(ratio)
+        assert {row["name"] for row in report["kernels"][way]["kernels"]} >= {"spring_kernels.pull"}
+    assert 0 < report["sampler"]["share"] < 1
+
+
+def test_bench_prints_tables(run: Callable[..., Said], tmp_path: Path) -> None:
+    done = run("bench", "bounce", "--batch", "4", "--batch", "2", "--seconds", "0", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    batches = [line.split()[1] for line in done.stdout.splitlines() if " warp " in line and line[2].isdigit()]
+    assert batches == ["2", "4"]
+    for shown in ("480 body-steps", "episodes/s", "advance backward", "outside kernels", "the sampler's own"):
+        assert shown in done.stdout
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_slice_of_one_engine_is_not_continued_by_another(run: Callable[..., Said], tmp_path: Path) -> None:
+    command = ["slice", "swing-velocity", "--dims", "0", "1", "--resolution", "2"]
+    first, second = (
+        json.loads(run(*command, "--engine", engine, "--json", cwd=tmp_path).stdout) for engine in ("warp", "taichi")
+    )
+    assert first["folder"] != second["folder"]
+    assert second["episodes"] == 4
+    refused = run(*command, "--engine", "taichi", "--out", first["folder"], cwd=tmp_path)
+    assert refused.returncode == 2
+    assert "engine: wanted 'taichi', found 'warp'" in refused.stderr
 
 
 # 64 x 64 flights of a ball take seconds, in many tiles: time enough to be stopped in the middle.

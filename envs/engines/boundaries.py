@@ -1,8 +1,10 @@
 """What grid velocities meet: moving tools and walls.
 
-A boundary is a Warp function (its data, node position, velocity, environment, tools, control step, fraction of it, 1
-over its span) -> velocity. `tools` [environment, control step, slot] holds positions [m] at the ends of control steps;
-in between a tool moves at constant velocity. Sizes and frictions are data, so that scenes with the same kind of
+A boundary is a Warp function (its data, node position, velocity, environment, tools, the same tools once more, control
+step, fraction of it, 1 over its span) -> velocity. `tools` [environment, control step, slot] holds positions [m] at the
+ends of control steps; in between a tool moves at constant velocity. `still` are the same places without an adjoint:
+with them a node finds out whether a tool is near. If all nodes asked `tools`, all would add their zeros to its adjoint,
+one after the other. Sizes and frictions are data, so that scenes with the same kind of
 boundary share its compiled kernel.
 """
 
@@ -90,7 +92,15 @@ def _open(name: str) -> tuple[Any, Any]:
 
     @wp.func(module=module, name=f"open_{name}")
     def boundary(
-        data: Nothing, p: vec3, v: vec3, e: int, tools: wp.array3d[vec3], step: int, fraction: real, rate: real
+        data: Nothing,
+        p: vec3,
+        v: vec3,
+        e: int,
+        tools: wp.array3d[vec3],
+        still: wp.array3d[vec3],
+        step: int,
+        fraction: real,
+        rate: real,
     ) -> vec3:
         return v
 
@@ -118,6 +128,12 @@ def _ladle_in_tank(name: str) -> tuple[Any, Any]:
         friction: real
 
     @wp.func(module=module)
+    def between(tools: wp.array3d[vec3], e: int, step: int, fraction: real) -> vec3:
+        """Return where the ladle is."""
+        start = tools[e, step, 0]
+        return start + fraction * (tools[e, step + 1, 0] - start)
+
+    @wp.func(module=module)
     def slide(v: vec3, body: vec3, hit: vec4, band: real, friction: real) -> vec3:
         """Take from the velocity what goes into the body, less with distance; rub the rest (Coulomb)."""
         n = vec3(hit[0], hit[1], hit[2])
@@ -134,21 +150,26 @@ def _ladle_in_tank(name: str) -> tuple[Any, Any]:
 
     @wp.func(module=module)
     def boundary(
-        scene: Scene, p: vec3, v: vec3, e: int, tools: wp.array3d[vec3], step: int, fraction: real, rate: real
+        scene: Scene,
+        p: vec3,
+        v: vec3,
+        e: int,
+        tools: wp.array3d[vec3],
+        still: wp.array3d[vec3],
+        step: int,
+        fraction: real,
+        rate: real,
     ) -> vec3:
         beside = scene.half_thickness + scene.band
         near = scene.radius + beside
-        start = tools[e, step, 0]
-        travel = tools[e, step + 1, 0] - start
-        local = p - (start + fraction * travel)
-        body = rate * travel
+        local = p - between(still, e, step, fraction)
         if wp.abs(local[2]) < near and wp.abs(local[0]) < near and wp.abs(local[1]) < near:
-            hit = bowl_distance(local, scene.radius, scene.half_thickness)
-            v = slide(v, body, hit, scene.band, scene.friction)
-        foot = local + vec3(scene.radius, real(0.0), real(0.0))
-        if wp.abs(foot[2]) < beside and wp.abs(foot[0]) < beside:
+            hit = bowl_distance(p - between(tools, e, step, fraction), scene.radius, scene.half_thickness)
+            v = slide(v, rate * (tools[e, step + 1, 0] - tools[e, step, 0]), hit, scene.band, scene.friction)
+        if wp.abs(local[2]) < beside and wp.abs(local[0] + scene.radius) < beside:
+            foot = p - between(tools, e, step, fraction) + vec3(scene.radius, real(0.0), real(0.0))
             hit = rod_distance(foot, scene.height, scene.half_thickness)
-            v = slide(v, body, hit, scene.band, scene.friction)
+            v = slide(v, rate * (tools[e, step + 1, 0] - tools[e, step, 0]), hit, scene.band, scene.friction)
         edge = scene.half_width - real(1e-6)  # a wall's own nodes belong to it
         vx, vy, vz = v[0], v[1], v[2]
         if p[0] < -edge:

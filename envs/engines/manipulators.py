@@ -156,18 +156,21 @@ def _manipulators(name: str, count: int) -> tuple[Any, Any]:
         v: vec3,
         e: int,
         tools: wp.array3d[vec3],
+        still: wp.array3d[vec3],
         step: int,
         fraction: real,
         rate: real,
     ) -> vec3:
+        slot = scene.slot[j]
+        place = still[e, step, slot]
+        gap = p - (place + fraction * (still[e, step + 1, slot] - place))
+        if wp.dot(gap, gap) > scene.reach[j] * scene.reach[j]:
+            return v
         kind = scene.kind[j]
         shape = scene.shape[j]
-        slot = scene.slot[j]
         start = tools[e, step, slot]
         travel = tools[e, step + 1, slot] - start
         local = p - (start + fraction * travel)
-        if wp.dot(local, local) > scene.reach[j] * scene.reach[j]:
-            return v
         body = rate * travel
         axis = up
         if kind == Kind.ROLLER:
@@ -188,10 +191,18 @@ def _manipulators(name: str, count: int) -> tuple[Any, Any]:
 
     @wp.func(module=module)
     def boundary(
-        scene: Scene, p: vec3, v: vec3, e: int, tools: wp.array3d[vec3], step: int, fraction: real, rate: real
+        scene: Scene,
+        p: vec3,
+        v: vec3,
+        e: int,
+        tools: wp.array3d[vec3],
+        still: wp.array3d[vec3],
+        step: int,
+        fraction: real,
+        rate: real,
     ) -> vec3:
         for j in range(wp.static(count)):  # unrolled: a loop that AD replays would lose v
-            v = meet(scene, j, p, v, e, tools, step, fraction, rate)
+            v = meet(scene, j, p, v, e, tools, still, step, fraction, rate)
         if p[1] <= scene.floor:
             v = floored(v, scene.floor_friction)
         vx, vy, vz = v[0], v[1], v[2]

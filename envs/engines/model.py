@@ -12,7 +12,7 @@ from .materials import Fluid, Material
 from .runtime import precision
 from .transfers import transfers
 
-KEPT = 32e6  # bytes of grids per environment that a control step may keep for its gradient
+MARGIN = 2  # cells around the particles that a control step begins with
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,18 +60,17 @@ class Model:
         """Number of nodes of the grid."""
         return int(np.prod(self.nodes))
 
-    @property
-    def keeps_grids(self) -> bool:
-        """Whether the gradient's window keeps its grids; else it scatters once more."""
-        return self.substeps * 8 * self.cells * self.real_bytes <= KEPT
+    def bytes_per_environment(self, windows: int) -> int:
+        """Return about what one environment of a solver that keeps so many control steps takes, adjoints included.
 
-    def bytes_per_environment(self) -> int:
-        """Return what one environment of a solver takes, adjoints included."""
+        Grids are counted as large as they are around the bodies at rest, and half as large again.
+        """
         state = sum(len(body.x) * (1 if isinstance(body.material, Fluid) else 9) for body in self.bodies)
         frame = 15 * self.particles + state  # x, v, C and each material's own
-        affine = (self.substeps + 1) * 9 * self.particles
-        grids = ((self.substeps if self.keeps_grids else 1) + 1) * 8 * self.cells
-        return self.real_bytes * ((self.steps + self.substeps + 2) * frame + affine + grids)
+        at_rest = torch.from_numpy(np.concatenate([body.x for body in self.bodies]))
+        grid = 8 * min(self.cells, around(self, at_rest[None], MARGIN).cells * 3 // 2)
+        substep = frame + 9 * self.particles + grid
+        return self.real_bytes * ((self.steps + 3) * frame + (windows * self.substeps + 1) * substep)
 
     @property
     def real_bytes(self) -> int:
@@ -103,8 +102,11 @@ def place(model: Model, box: Box | None = None) -> Any:
     return placed
 
 
-def around(model: Model, x: torch.Tensor, margin: int) -> Box:
-    """Return the nodes that particles at x [m], shape (batch, particle, 3), meet while none moves `margin` cells."""
+def around(model: Model, x: torch.Tensor, margin: int, grain: int = 1) -> Box:
+    """Return the nodes that particles at x [m], shape (batch, particle, 3), meet while none moves `margin` cells.
+
+    It begins and ends at multiples of `grain`, or with the grid.
+    """
     low, high = x.amin(dim=(0, 1)).double().cpu(), x.amax(dim=(0, 1)).double().cpu()
     if not bool((low + high).isfinite().all()):
         return Box((0, 0, 0), model.nodes)
@@ -112,5 +114,6 @@ def around(model: Model, x: torch.Tensor, margin: int) -> Box:
     last = torch.tensor(model.nodes) - 1
     first = ((low - origin) / model.dx - 0.5).floor().int() - margin
     end = ((high - origin) / model.dx + 1.5).floor().int() + margin
+    first, end = first // grain * grain, -(-end // grain) * grain
     first, end = first.clamp_min(0).minimum(last - 2), end.minimum(last)
     return Box(tuple(first.tolist()), tuple((end - first).clamp_min(2).add(1).tolist()))

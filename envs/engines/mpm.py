@@ -7,27 +7,27 @@ One substep, state (x, v, C, S) of frame s to frame s + 1, S being each material
     grid    v_i  = boundary(q_i / m_i + dt g)
     g2p     v'   = sum w v_i, C' = 4/dx^2 sum w v_i (x_i - x)^T, x' = x + dt v'
 
-Particles are kept at the ends of control steps only. The gradient recomputes one control step at a time, and keeps that
-one whole: particles, A, and the grids too unless they are large.
+Particles are kept at the ends of control steps; as many of the last control steps as fit are kept whole, with A and
+grids of every substep (on a CPU all or one). The gradient recomputes the others, one at a time.
 """
 
 import threading
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
 from itertools import chain
-from typing import Any, no_type_check
+from typing import Any
 
 import numpy as np
 import torch
 import warp as wp
 
-from .model import Box, Model, around, place
+from .graphs import Replay
+from .grid import velocity_kernel
+from .model import MARGIN, Box, Model, around, place
 from .runtime import free_memory, load, precision, to_torch
 from .transfers import transfers
 
-MARGIN = 2  # cells around the particles that a control step begins with
 EMPTY = 1e-8  # nodes lighter than this part of the lightest particle carry no velocity
 
 
@@ -53,15 +53,25 @@ class Grid:
     v: wp.array
 
 
-CROWD, FULL_CARD = 8_000, 2_000_000  # particles that hide what a launch costs on one core, that keep a GPU busy
+CROWD, FULL_CARD = 8_000, 1_000_000  # particles that hide what a launch costs on one core, that keep a GPU busy
+KEPT = 192e6  # bytes up to which a CPU keeps an episode whole
+LAUNCHES = 200_000  # particles up to which launches cost a GPU more than what they launch
+GRAIN = 4  # nodes to which a GPU's boxes are rounded, so that the same ones come again
+LANES = 32  # copies of the tools on a GPU, so that fewer nodes wait for each other to add to the same adjoint
 
 
 def capacity(model: Model, device: str) -> int:
     """Return how many environments of a model a solver should take at once."""
     if device == "cpu":
         return max(1, min(4, CROWD // model.particles))  # few enough for the cache
-    fitting = free_memory() * 3 // 4 // model.bytes_per_environment()
+    fitting = free_memory() * 3 // 4 // memory(model, device)
     return max(1, min(1024, FULL_CARD // model.particles, fitting))
+
+
+def memory(model: Model, device: str) -> int:
+    """Return about how many bytes an environment takes; a GPU's spare memory is used beyond that."""
+    whole = model.bytes_per_environment(model.steps)
+    return whole if device == "cpu" and whole <= KEPT else model.bytes_per_environment(1)
 
 
 class Solver:
@@ -85,13 +95,14 @@ class Solver:
         self.volume = self._constant(np.concatenate([body.volume for body in model.bodies]))
         self.empty = EMPTY * float(model.mass.min())
         self.boxes = [Box((0, 0, 0), model.nodes)] * model.steps
-        self.checkpoints = [self._frame() for _ in range(model.steps + 1)]
-        self.window = [self._frame() for _ in range(model.substeps - 1)]
-        self.A = [self._array(self.types.mat33, model.particles) for _ in range(model.substeps)]
-        self.grids = [self._grid() for _ in range(model.substeps if model.keeps_grids else 1)]
-        self.tools = self._tools()
+        self.checkpoints = [self.frame() for _ in range(model.steps + 1)]
+        self.replay = Replay(device)
+        whole = device == "cpu" and memory(model, device) > model.bytes_per_environment(1)
+        self.windows = [_Window(self) for _ in range(model.steps if whole else 1)]
+        self.spacious = device == "cpu"  # whether spare memory has been put to use
+        self.lanes = 1 if device == "cpu" else LANES
+        self.tools = self.paths()
         self.strayed, self.escaped = (wp.zeros(capacity, dtype=wp.int32, device=device) for _ in range(2))
-        self.held = -1  # the control step whose frames and grids are in the window
         self.adjoint: _Adjoint | None = None
         self._start()
 
@@ -99,10 +110,23 @@ class Solver:
         """Simulate with the boundary's `tools`, shape (batch, step + 1, slot, 3); return x at the end [m]."""
         batch = len(tools)
         self.escaped.zero_()
-        to_torch(self.tools)[:batch] = tools.to(self.types.torch)
+        to_torch(self.tools).view(self.capacity, self.lanes, *tools.shape[1:])[:batch] = tools[:, None].to(
+            self.types.torch
+        )
         for step in range(self.model.steps):
             self._explore(step, batch)
+        if not self.spacious:
+            self._keep_more()
         return self.reached(self.model.steps, batch)
+
+    def _keep_more(self) -> None:
+        """Keep more control steps whole from the next run on, in half of a GPU's memory that is free after a first."""
+        self.spacious = True
+        more = min(self.model.steps - 1, free_memory() // 2 // self.windows[0].bytes)
+        cells = self.windows[0].grids[0].m.shape[1]
+        self.windows += [_Window(self, cells) for _ in range(more)]
+        self.windows[0].step = -1  # it keeps other steps now
+        self.replay.forget()
 
     def reached(self, step: int, batch: int) -> torch.Tensor:
         """Return x [m] before control step `step` of the last run, shape (batch, particle, 3)."""
@@ -124,13 +148,18 @@ class Solver:
 
     def frames(self, step: int) -> list[Frame]:
         """Return the frames of one control step, both ends included."""
-        return [self.checkpoints[step], *self.window, self.checkpoints[step + 1]]
+        return [self.checkpoints[step], *self.window(step).frames, self.checkpoints[step + 1]]
+
+    def window(self, step: int) -> "_Window":
+        """Return where a control step is kept whole, or another one at the moment."""
+        return self.windows[step % len(self.windows)]
 
     def _explore(self, step: int, batch: int) -> None:
         """Simulate a control step on the nodes around the particles, or on more where one leaves them."""
         margin, whole = MARGIN, Box((0, 0, 0), self.model.nodes)
         while True:
-            self.boxes[step] = around(self.model, self.reached(step, batch), margin)
+            grain = 1 if self.device == "cpu" else GRAIN
+            self.boxes[step] = around(self.model, self.reached(step, batch), margin, grain)
             self.strayed.zero_()
             self._advance(step, batch)
             margin *= 2
@@ -141,35 +170,46 @@ class Solver:
     def _advance(self, step: int, batch: int) -> None:
         if self.stop.is_set():
             raise InterruptedError("the simulation was stopped")
-        self.held, self.lattice = step, place(self.model, self.boxes[step])
-        frames = self.frames(step)
-        for s in range(self.model.substeps):
-            self._update(frames[s], frames[s + 1], self.A[s], batch)
-            self.scatter(frames[s], step, s, batch)
-            self._gather(frames[s], frames[s + 1], self.grid(s), batch)
+        self.window(step).hold(step, self)
+        self.launches(("forward", step, batch), batch, lambda: self._substeps(step, batch))
 
-    def grid(self, substep: int) -> Grid:
-        """Return the grid of a substep of the control step in the window, or the one that all share."""
-        return self.grids[substep % len(self.grids)]
+    def launches(self, key: tuple[Any, ...], batch: int, work: Callable[[], None]) -> None:
+        """Launch a control step's work, where launching is what it costs as one graph."""
+        if batch * self.model.particles > LAUNCHES:
+            work()
+        else:
+            self.replay((*key, self.boxes[key[1]]), work)
+
+    def _substeps(self, step: int, batch: int) -> None:
+        window, frames = self.window(step), self.frames(step)
+        for s in range(self.model.substeps):
+            self._update(frames[s], frames[s + 1], window.A[s], batch)
+            self._scatter(frames[s], step, s, batch)
+            self._gather(frames[s], frames[s + 1], step, s, batch)
 
     def _update(self, frame: Frame, new: Frame, A: wp.array, batch: int) -> None:
         for b, (update, _) in enumerate(self.materials):
             self.launch(update, self.size(b), batch, [*self.material_inputs(b, frame), new.S[b], A])
 
-    def scatter(self, frame: Frame, step: int, substep: int, batch: int) -> None:
+    def _scatter(self, frame: Frame, step: int, substep: int, batch: int) -> None:
         """Fill the substep's grid: momentum and mass from particles, then velocity."""
-        grid = self.grid(substep)
-        self.clear(grid.m, step, batch)
-        inputs = [self.lattice, self.mass, frame.x, frame.v, self.A[substep], grid.m]
+        window = self.window(step)
+        self.clear(window.grids[substep].m, step, batch)
+        inputs = [window.lattice, self.mass, frame.x, frame.v, window.A[substep], window.grids[substep].m]
         self.launch(self.kernels.p2g, self.model.particles, batch, inputs)
         self.launch(self.velocity, self.boxes[step].cells, batch, self.velocity_inputs(step, substep))
 
     def clear(self, grid: wp.array, step: int, batch: int) -> None:
         """Zero what a control step uses of a grid."""
-        to_torch(grid)[:batch, : self.boxes[step].cells].zero_()
+        if self.device == "cpu":  # where numpy is quicker, and torch would spread it over threads that others want
+            grid.numpy()[:batch, : self.boxes[step].cells] = 0.0
+        else:
+            self.launch(self.kernels.wipe, self.boxes[step].cells, batch, [grid])
 
-    def _gather(self, frame: Frame, new: Frame, grid: Grid, batch: int) -> None:
-        inputs = [self.lattice, self.model.dt, frame.x, grid.v, new.x, new.v, new.C, self.strayed]
+    def _gather(self, frame: Frame, new: Frame, step: int, substep: int, batch: int) -> None:
+        window = self.window(step)
+        grid_v = window.grids[substep].v
+        inputs = [window.lattice, self.model.dt, frame.x, grid_v, new.x, new.v, new.C, self.strayed]
         self.launch(self.kernels.g2p, self.model.particles, batch, inputs)
 
     def material_inputs(self, b: int, frame: Frame) -> list[Any]:
@@ -180,10 +220,21 @@ class Solver:
 
     def velocity_inputs(self, step: int, substep: int) -> list[Any]:
         """Return the arguments of the grid's velocity kernel."""
-        model = self.model
-        time = [step, substep / model.substeps, 1.0 / (model.substeps * model.dt)]
-        grid = self.grid(substep)
-        return [self.lattice, self.boundary, model.dt, model.gravity, self.empty, *time, self.tools, grid.m, grid.v]
+        model, window = self.model, self.window(step)
+        time = [self.lanes, step, substep / model.substeps, 1.0 / (model.substeps * model.dt)]
+        grid = window.grids[substep]
+        return [
+            window.lattice,
+            self.boundary,
+            model.dt,
+            model.gravity,
+            self.empty,
+            *time,
+            self.tools,
+            self.tools,
+            grid.m,
+            grid.v,
+        ]
 
     def size(self, b: int) -> int:
         """Return the number of particles of body b."""
@@ -193,21 +244,30 @@ class Solver:
         """Launch a kernel over [environment, element]."""
         wp.launch(kernel, (batch, size), inputs, device=self.device, record_tape=False)
 
-    def _array(self, dtype: Any, size: int) -> wp.array:
+    def array(self, dtype: Any, size: int) -> wp.array:
+        """Return zeros [environment, element]."""
         return wp.zeros((self.capacity, size), dtype=dtype, device=self.device)
 
-    def _frame(self) -> Frame:
+    def frame(self) -> Frame:
+        """Return a frame of zeros."""
         types, count = self.types, self.model.particles
-        x, v, C = (self._array(kind, count) for kind in (types.vec3, types.vec3, types.mat33))
-        states = (self._array(b.material.state(self.model.precision), len(b.x)) for b in self.model.bodies)
+        x, v, C = (self.array(kind, count) for kind in (types.vec3, types.vec3, types.mat33))
+        states = (self.array(b.material.state(self.model.precision), len(b.x)) for b in self.model.bodies)
         return Frame(x, v, C, tuple(states))
 
-    def _grid(self) -> Grid:
-        return Grid(*(self._array(self.types.vec4, self.model.cells) for _ in range(2)))
+    def grid(self, cells: int) -> Grid:
+        """Return a grid of zeros."""
+        return Grid(*(self.array(self.types.vec4, cells) for _ in range(2)))
 
-    def _tools(self) -> wp.array:
-        shape = self.capacity, self.model.steps + 1, self.model.boundary.slots
+    def paths(self) -> wp.array:
+        """Return zeros [environment and lane, step, slot]."""
+        shape = self.capacity * self.lanes, self.model.steps + 1, self.model.boundary.slots
         return wp.zeros(shape, dtype=self.types.vec3, device=self.device)
+
+    def by_lane(self, paths: wp.array) -> torch.Tensor:
+        """View paths as [environment, lane, step, slot, axis]."""
+        view = to_torch(paths)
+        return view.view(self.capacity, self.lanes, *view.shape[1:])
 
     def _constant(self, values: np.ndarray) -> wp.array:
         return wp.array(values, dtype=self.types.real, device=self.device)
@@ -219,15 +279,42 @@ class Solver:
             to_torch(state)[:] = torch.from_numpy(body.material.initial(body.ratio))
 
 
+class _Window:
+    """Hold one control step whole: frames between its ends, A and grids of its substeps, and where the grids lie."""
+
+    def __init__(self, solver: Solver, cells: int = 1) -> None:
+        model = solver.model
+        self.step = -1
+        self.frames = [solver.frame() for _ in range(model.substeps - 1)]
+        self.A = [solver.array(solver.types.mat33, model.particles) for _ in range(model.substeps)]
+        self.grids = [solver.grid(cells) for _ in range(model.substeps)]
+        self.lattice = place(model)
+
+    @property
+    def bytes(self) -> int:
+        """What its arrays take."""
+        grids = [array for grid in self.grids for array in (grid.m, grid.v)]
+        frames = [array for frame in self.frames for array in frame.arrays()]
+        return sum(array.capacity for array in (*frames, *self.A, *grids))
+
+    def hold(self, step: int, solver: Solver) -> None:
+        """Make room for a control step."""
+        self.step, self.lattice = step, place(solver.model, solver.boxes[step])
+        cells = solver.boxes[step].cells
+        if self.grids[0].m.shape[1] < cells:
+            self.grids = [solver.grid(min(cells * 5 // 4, solver.model.cells)) for _ in self.grids]
+            solver.replay.forget()
+
+
 class _Adjoint:
     """Hold the adjoint arrays of a solver and run its backward pass."""
 
     def __init__(self, solver: Solver) -> None:
         self.solver = weakref.proxy(solver)  # which holds this: a cycle would keep a GPU's memory until it is collected
-        self.new, self.old = solver._frame(), solver._frame()
-        self.A = wp.zeros_like(solver.A[0])
-        self.grid = solver._grid()
-        self.tools = solver._tools()
+        self.new, self.old = solver.frame(), solver.frame()
+        self.A = solver.array(solver.types.mat33, solver.model.particles)
+        self.grid = solver.grid(max(box.cells for box in solver.boxes))
+        self.tools = solver.paths()
         self.structs = solver.kernels.Lattice(), type(solver.boundary)()  # unwanted adjoints, whose place Warp wants
 
     def run(self, adj_x: Mapping[int, torch.Tensor]) -> torch.Tensor:
@@ -238,40 +325,47 @@ class _Adjoint:
         for step in reversed(range(max(adj_x))):
             if step + 1 in adj_x:
                 to_torch(self.new.x)[:batch] += adj_x[step + 1].to(to_torch(self.new.x))
-            if solver.held != step:
+            if solver.window(step).step != step:
                 solver._advance(step, batch)
             self._retreat(step, batch)
-        return to_torch(self.tools)[:batch].clone()
+        by_lane: torch.Tensor = solver.by_lane(self.tools)[:batch]
+        return by_lane.sum(dim=1)
 
     def _retreat(self, step: int, batch: int) -> None:
         solver = self.solver
-        frames = solver.frames(step)
+        if self.grid.m.shape[1] < solver.boxes[step].cells:
+            self.grid = solver.grid(solver.boxes[step].cells)
+            solver.replay.forget()
+        key = "backward", step, batch, solver.model.substeps % 2 and id(self.new)
+        solver.launches(key, batch, lambda: self._substeps(step, batch))
+
+    def _substeps(self, step: int, batch: int) -> None:
+        solver = self.solver
+        window, frames = solver.window(step), solver.frames(step)
         for s in reversed(range(solver.model.substeps)):
-            if not solver.model.keeps_grids:
-                solver.scatter(frames[s], step, s, batch)
             solver.clear(self.grid.v, step, batch)
-            self._gather(frames[s], solver.grid(s), batch)
+            self._gather(frames[s], window, s, batch)
             solver.clear(self.grid.m, step, batch)
             self._velocity(step, s, batch)
-            self._scatter(frames[s], solver.A[s], batch)
+            self._scatter(frames[s], window, s, batch)
             self._update(frames[s], batch)
             self.new, self.old = self.old, self.new
 
-    def _gather(self, frame: Frame, grid: Grid, batch: int) -> None:
+    def _gather(self, frame: Frame, window: _Window, substep: int, batch: int) -> None:
         solver = self.solver
-        inputs = [solver.lattice, solver.model.dt, frame.x, grid.v]
+        inputs = [window.lattice, solver.model.dt, frame.x, window.grids[substep].v]
         inputs += [self.new.x, self.new.v, self.new.C, self.grid.v, self.old.x]
         solver.launch(solver.kernels.adjoint_g2p, solver.model.particles, batch, inputs)
 
     def _velocity(self, step: int, substep: int, batch: int) -> None:
         solver = self.solver
         inputs = solver.velocity_inputs(step, substep)
-        adjoints = [*self.structs, *[None] * (len(inputs) - 5), self.tools, self.grid.m, self.grid.v]
+        adjoints = [*self.structs, *[None] * (len(inputs) - 6), self.tools, None, self.grid.m, self.grid.v]
         self._launch(solver.velocity, solver.boxes[step].cells, batch, inputs, adjoints)
 
-    def _scatter(self, frame: Frame, A: wp.array, batch: int) -> None:
+    def _scatter(self, frame: Frame, window: _Window, substep: int, batch: int) -> None:
         solver = self.solver
-        inputs = [solver.lattice, solver.mass, frame.x, frame.v, A, self.grid.m]
+        inputs = [window.lattice, solver.mass, frame.x, frame.v, window.A[substep], self.grid.m]
         inputs += [self.old.x, self.old.v, self.A]
         solver.launch(solver.kernels.adjoint_p2g, solver.model.particles, batch, inputs)
 
@@ -292,42 +386,3 @@ class _Adjoint:
             adjoint=True,
             record_tape=False,
         )
-
-
-@cache
-@no_type_check
-def velocity_kernel(name: str, meet: Any, Data: Any) -> Any:
-    """Return the kernel that turns a node's momentum into its velocity after gravity and boundary."""
-    types = precision(name)
-    real, vec3, vec4 = types.real, types.vec3, types.vec4
-    Lattice = transfers(name).Lattice
-
-    @wp.kernel(module="unique")
-    def velocity(
-        lattice: Lattice,
-        boundary: Data,
-        dt: real,
-        gravity: real,
-        empty: real,
-        step: int,
-        fraction: real,
-        rate: real,
-        tools: wp.array3d[vec3],
-        grid_m: wp.array2d[vec4],
-        grid_v: wp.array2d[vec4],
-    ):
-        e, i = wp.tid()
-        g = grid_m[e, i]
-        if g[3] > empty:
-            first = lattice.first
-            k = i % lattice.nz
-            j = (i / lattice.nz) % lattice.ny
-            node = vec3(real(i / (lattice.nz * lattice.ny) + first[0]), real(j + first[1]), real(k + first[2]))
-            p = lattice.origin + node * (real(1.0) / lattice.inv_dx)
-            v = vec3(g[0], g[1], g[2]) / g[3] - vec3(real(0.0), dt * gravity, real(0.0))
-            v = meet(boundary, p, v, e, tools, step, fraction, rate)
-            grid_v[e, i] = vec4(v[0], v[1], v[2], real(0.0))
-        else:
-            grid_v[e, i] = vec4()
-
-    return velocity

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import os
 import queue
+import re
 import threading
+import time
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -85,8 +89,77 @@ def to_torch(array: wp.array) -> torch.Tensor:
 
 def load(kernels: Iterable[Any], device: str) -> None:
     """Compile kernels, or fetch them from the cache, before threads launch them."""
-    for module in {kernel.module for kernel in kernels}:
-        module.load(wp.get_device(device))
+    modules = list({kernel.module: None for kernel in kernels})
+    wp.force_load(device, modules, max_workers=cores())
+
+
+def compiled_modules() -> int:
+    """Count the modules of kernels in Warp's cache, so that two counts tell what was compiled in between."""
+    return sum(file.suffix in (".o", ".cubin", ".ptx") for file in Path(str(wp.config.kernel_cache_dir)).rglob("*"))
+
+
+@dataclass
+class KernelTime:
+    """How often a kernel was launched, and the seconds it took altogether."""
+
+    calls: int = 0
+    seconds: float = 0.0
+
+    def add(self, seconds: float) -> None:
+        """Count one launch."""
+        self.calls += 1
+        self.seconds += seconds
+
+
+@contextmanager
+def kernel_times(device: str) -> Iterator[dict[str, KernelTime]]:
+    """Time every Warp kernel launched within a with block, by name; complete where the block ends.
+
+    On a CPU, where launches return when their kernel has run, the time includes that of launching. On CUDA kernels are
+    launched one by one, not as graphs.
+    """
+    times: dict[str, KernelTime] = defaultdict(KernelTime)
+    with _cuda_kernels(times) if device == "cuda" else _cpu_launches(times):
+        yield times
+
+
+@contextmanager
+def _cpu_launches(times: dict[str, KernelTime]) -> Iterator[None]:
+    launch = wp.launch
+
+    def timed(kernel: Any, *arguments: Any, **named: Any) -> Any:
+        start = time.perf_counter()
+        launched = launch(kernel, *arguments, **named)
+        times[_kernel_name(kernel.key, backward=named.get("adjoint", False))].add(time.perf_counter() - start)
+        return launched
+
+    wp.launch = timed
+    try:
+        yield
+    finally:
+        wp.launch = launch
+
+
+@contextmanager
+def _cuda_kernels(times: dict[str, KernelTime]) -> Iterator[None]:
+    from .graphs import Replay
+
+    replay = Replay.__call__
+    Replay.__call__ = lambda self, key, launches: launches()  # type: ignore[method-assign]  # a graph hides its kernels
+    wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
+    try:
+        yield
+    finally:
+        Replay.__call__ = replay  # type: ignore[method-assign]
+        for run in wp.timing_end():
+            way, _, name = run.name.partition(" kernel ")
+            key = re.sub(r"_[0-9a-f]{8}$", "", name)  # without the hash of its code
+            times[_kernel_name(key, backward=way == "backward")].add(run.elapsed / 1e3)
+
+
+def _kernel_name(key: str, *, backward: bool) -> str:
+    """Return a kernel's name after that of the function that makes it."""
+    return key.replace("__locals__", ".") + (" backward" if backward else "")
 
 
 class Pool(Generic[T]):

@@ -71,6 +71,7 @@ def describe_environment(name: str) -> None:
     console.print(table)
     for fidelity in env.fidelities.values():
         console.print(f"fidelity {asdict(fidelity)}", markup=False)
+    console.print(f"engines: {', '.join(env.engines)}", markup=False)
     console.print(f"options: {describe(env.Options) or 'none'}", markup=False)
     console.print(f"examples: {', '.join(env.examples) or 'none'}", markup=False)
 
@@ -96,6 +97,7 @@ def cut(
     resolution: int,
     fidelity: str | None,
     device: str,
+    engine: str,
     through: str,
     extent: str | None,
     settings: Sequence[str],
@@ -106,7 +108,7 @@ def cut(
 ) -> None:
     """Sample a slice into its folder and say what it costs, how far it is and what came out."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
-    env = make(name, fidelity=fidelity, device=device, **_options(settings))
+    env = make(name, fidelity=fidelity, device=device, engine=engine, **read_settings(settings))
     from .envs.points import point  # after make: a name that does not exist is refused before torch is loaded
     from .landscapes.plane import Plane
 
@@ -134,6 +136,7 @@ def _open(env: Environment, plane: Plane, *, out: str | None, grad: bool, force:
         "fidelity": env.fidelity.name,
         "settings": asdict(env.fidelity),
         "device": env.device,
+        "engine": env.engine,
         "code": code_digest(type(env)),
     }
     provenance = {
@@ -184,10 +187,10 @@ def _announce(console: Console, job: Job, env: Environment) -> None:
         console.print(f"all {total} {kind} are there already")
         return
     kept = f", {total - cost.episodes} are there already" if cost.episodes < total else ""
-    device = f", {_bytes(env.memory() * env.preferred_batch)} of it on the GPU at a time"
+    device = f", {size(env.memory() * env.preferred_batch)} of it on the GPU at a time"
     console.print(
-        f"{cost.episodes} {kind} to compute{kept}: about {_duration(cost.seconds)}, "
-        f"{_bytes(cost.memory)} of memory{device if env.device == 'cuda' else ''}"
+        f"{cost.episodes} {kind} to compute{kept}: about {duration(cost.seconds)}, "
+        f"{size(cost.memory)} of memory{device if env.device == 'cuda' else ''}"
     )
 
 
@@ -223,10 +226,11 @@ def _outcome(summary: dict[str, Any]) -> str:
     losses = "no finite loss" if low is None else f"losses from {low:.4g} to {high:.4g}"
     share = (summary["flat"] or 0) / sum(counts.values())
     flat = f"; gradient exactly zero at {share:.1%} of points" if share else ""
-    return f"{summary['episodes']} episodes in {_duration(summary['seconds'])}; {said}; {losses}{flat}"
+    return f"{summary['episodes']} episodes in {duration(summary['seconds'])}; {said}; {losses}{flat}"
 
 
-def _options(settings: Sequence[str]) -> dict[str, str]:
+def read_settings(settings: Sequence[str]) -> dict[str, str]:
+    """Return scene options given as name=value."""
     pairs = [setting.partition("=") for setting in settings]
     for setting, (name, equals, _) in zip(settings, pairs, strict=True):
         if not equals or not name:
@@ -251,11 +255,15 @@ def _installed(package: str) -> str:
         return "not installed"
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """Return a time in words, to about two digits."""
     if seconds < 90:
         return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def _bytes(count: float) -> str:
+def size(count: float) -> str:
+    """Return a number of bytes in words."""
+    if count < 1e6:
+        return f"{count / 1e3:.0f} kB"
     return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"

@@ -23,7 +23,7 @@ SETTINGS = {
     "fluid": {"fidelity": Fidelity("tiny", dt=SPAN / 2, precision="float64", resolution=6, sampling=1.5)},
 }
 SETTINGS |= {
-    name: {"fidelity": Fidelity("tiny", dt=1 / 200, precision="float64", resolution=4)}
+    name: {"fidelity": Fidelity("tiny", dt=1 / 500, precision="float64", resolution=4)}
     for name in ("swing-velocity", "swing-stiffness", "flip")
 }
 SOFT = ("assembly", "pinch", "rolling-pin", "rope", "table", "torus", "triple-move", "writer")

@@ -130,7 +130,8 @@ def test_a_body_that_is_its_own_target_costs_nothing():
         with still._solvers.lend() as stage:
             stage.solver.run(paths)
             terms = dict(zip(TERMS, still._judge(stage, 0, paths)[1][0].tolist(), strict=True))
-        assert terms["density"] == terms["sdf"] == 0
+        assert terms["density"] == pytest.approx(0, abs=1e-12)  # its particles are in another order
+        assert terms["sdf"] == 0
 
 
 def test_triple_moves_targets_are_at_the_listed_centres():

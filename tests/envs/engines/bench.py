@@ -94,13 +94,14 @@ class BoundaryBench:
             data: Data,
             p: wp.array[vec3],
             tools: wp.array3d[vec3],
+            still: wp.array3d[vec3],
             fraction: real,
             rate: real,
             v: wp.array[vec3],
             out: wp.array[vec3],
         ):
             i = wp.tid()
-            out[i] = meet(data, p[i], v[i], 0, tools, 0, fraction, rate)
+            out[i] = meet(data, p[i], v[i], 0, tools, still, 0, fraction, rate)
 
         self.kernel = apply
 
@@ -113,14 +114,14 @@ class BoundaryBench:
     def adjoint(self, p, v, tools, adj_out, fraction=0.0):
         """Return the adjoints of v and tools."""
         inputs = self._inputs(p, v, tools, fraction)
-        adj_tools, adj_v = wp.zeros_like(inputs[2]), wp.zeros_like(inputs[5])
-        adjoints = [type(self.data)(), None, adj_tools, None, None, adj_v, self._array(adj_out)]
+        adj_tools, adj_v = wp.zeros_like(inputs[2]), wp.zeros_like(inputs[6])
+        adjoints = [type(self.data)(), None, adj_tools, None, None, None, adj_v, self._array(adj_out)]
         wp.launch(self.kernel, len(v), inputs, adj_inputs=adjoints, adj_outputs=[], adjoint=True, record_tape=False)
         return to_torch(adj_v).clone(), to_torch(adj_tools)[0].clone()
 
     def _inputs(self, p, v, tools, fraction):
-        arrays = [self._array(t) for t in (p.expand_as(v), tools[None], v, torch.zeros_like(v))]
-        return [self.data, *arrays[:2], fraction, self.rate, *arrays[2:]]
+        at, places, before, after = (self._array(t) for t in (p.expand_as(v), tools[None], v, torch.zeros_like(v)))
+        return [self.data, at, places, places, fraction, self.rate, before, after]
 
     def _array(self, values):
         return wp.array(values.contiguous().numpy(), dtype=self.types.vec3, copy=True)

@@ -163,7 +163,7 @@ def test_adjoints_equal_warps_own(bench, transfer, parts):
     if transfer == "g2p":
         given = [draw(BATCH, COUNT, *tail, seed=7 + i) for i, tail in enumerate([(3,), (3,), (3, 3)])]
     ours = getattr(bench, f"adjoint_{transfer}")(*given)
-    warps = getattr(bench, f"warp_adjoint_{transfer}")(*given)
+    warps = getattr(Bench("float64"), f"warp_adjoint_{transfer}")(*given)  # the sum of four floats has none of its own
     assert len(ours) == len(warps) == parts
     for got, wanted in zip(ours, warps, strict=True):
         assert wanted.abs().max() > 0

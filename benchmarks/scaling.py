@@ -1,0 +1,87 @@
+"""How the cost of the fluid scene grows with particles, substeps and grid points.
+
+    python benchmarks/scaling.py [--device cuda] [--batch 8] [--out docs/scaling.png]
+
+Prints the fitted exponents, 1 being linear, and draws what they were fitted to. Particles and grid points are varied
+alone, and timed by the kernels that run over them; substeps by everything.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from gradscape.envs.base import Environment, Fidelity
+from gradscape.envs.engines.runtime import kernel_times
+from gradscape.envs.fluid import SPAN
+from gradscape.envs.registry import make
+
+ON_GRID = "velocity_kernel"
+SERIES: dict[str, list[Fidelity]] = {
+    "particles": [Fidelity("", SPAN / 8, resolution=16, sampling=1.25 * 2 ** (k / 3)) for k in range(5)],
+    "substeps": [Fidelity("", SPAN / n, resolution=12, sampling=1.4) for n in (4, 8, 16, 32)],
+    "grid points": [Fidelity("", SPAN / 8, resolution=n, sampling=24 / n) for n in (12, 16, 20, 24)],
+}
+
+
+def size(what: str, env: Environment) -> float:
+    """Return how much of `what` an episode has."""
+    model = env.model  # type: ignore[attr-defined]
+    return {"particles": model.particles, "substeps": model.steps * model.substeps, "grid points": model.cells}[what]
+
+
+def cost(what: str, env: Environment, batch: int) -> float:
+    """Return the seconds an episode with its gradient takes in what depends on it: the best of three."""
+    x = env.space.uniform(batch, seed=0)
+    env.evaluate(x)
+    return min(once(what, env, lambda: env.evaluate(x)) for _ in range(3)) / batch
+
+
+def once(what: str, env: Environment, work: Callable[[], object]) -> float:
+    """Return the seconds of one repetition."""
+    start = time.perf_counter()
+    if what == "substeps":
+        work()
+        return time.perf_counter() - start
+    with kernel_times(env.device) as times:
+        work()
+    return sum(t.seconds for name, t in times.items() if name.startswith(ON_GRID) == (what == "grid points"))
+
+
+def draw(found: dict[str, tuple[list[float], list[float], float]], path: Path) -> None:
+    """Draw cost over size, one panel each."""
+    figure = Figure(figsize=(10, 3.4), layout="constrained")
+    for ax, (what, (sizes, costs, exponent)) in zip(figure.subplots(1, len(found)), found.items(), strict=True):
+        ax.loglog(sizes, costs, "o", color="#3b528b")
+        line = costs[0] * np.divide(sizes, sizes[0])
+        ax.loglog(sizes, line, "-", color="0.6", zorder=0, label="linear")
+        ax.set(xlabel=what, ylabel="seconds per episode", title=f"exponent {exponent:.2f}")
+        ax.legend(frameon=False)
+    figure.savefig(path, dpi=150)
+
+
+def main() -> None:
+    """Measure, print and draw."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--batch", type=int, default=8)
+    parser.add_argument("--out", type=Path)
+    given = parser.parse_args()
+    found = {}
+    for what, fidelities in SERIES.items():
+        envs = [make("fluid", fidelity=fidelity, device=given.device) for fidelity in fidelities]
+        sizes, costs = [size(what, env) for env in envs], [cost(what, env, given.batch) for env in envs]
+        exponent = float(np.polyfit(np.log(sizes), np.log(costs), 1)[0])
+        found[what] = sizes, costs, exponent
+        print(f"{what}: {', '.join(f'{s:.0f}: {c:.3g} s' for s, c in zip(sizes, costs, strict=True))}; {exponent:.2f}")
+    if given.out:
+        draw(found, given.out)
+
+
+if __name__ == "__main__":
+    main()
