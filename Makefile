@@ -7,7 +7,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 .PHONY: demo test setup setup-test check clean
 
 demo: setup
-	$(BIN)/landscape slice fluid --dims 6 8
+	$(BIN)/landscape slice fluid --dims 6 8 --resolution 24
 
 test: setup-test
 	$(BIN)/python -m pytest -n 2
