@@ -3,7 +3,7 @@
     python benchmarks/scaling.py [--device cuda] [--batch 8] [--out docs/scaling.png]
 
 Prints the fitted exponents, 1 being linear, and draws what they were fitted to. Particles and grid points are varied
-alone, and timed by the kernels that run over them; substeps by everything.
+alone, and timed by one launch of every kernel that runs over them, forward and backward; substeps by whole episodes.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from gradscape.envs.base import Environment, Fidelity
 from gradscape.envs.engines.runtime import kernel_times
@@ -22,6 +23,7 @@ from gradscape.envs.fluid import SPAN
 from gradscape.envs.registry import make
 
 ON_GRID = "velocity_kernel"
+UNIT = {"substeps": "episode"}
 SERIES: dict[str, list[Fidelity]] = {
     "particles": [Fidelity("", SPAN / 8, resolution=16, sampling=1.25 * 2 ** (k / 3)) for k in range(5)],
     "substeps": [Fidelity("", SPAN / n, resolution=12, sampling=1.4) for n in (4, 8, 16, 32)],
@@ -36,10 +38,11 @@ def size(what: str, env: Environment) -> float:
 
 
 def cost(what: str, env: Environment, batch: int) -> float:
-    """Return the seconds an episode with its gradient takes in what depends on it: the best of three."""
-    x = env.space.uniform(batch, seed=0)
+    """Return the seconds of an episode, or of one launch of each kernel, that depend on it: the best of three."""
+    rows = min(batch, env.preferred_batch)
+    x = env.space.uniform(rows, seed=0)
     env.evaluate(x)
-    return min(once(what, env, lambda: env.evaluate(x)) for _ in range(3)) / batch
+    return min(once(what, env, lambda: env.evaluate(x)) for _ in range(3)) / rows
 
 
 def once(what: str, env: Environment, work: Callable[[], object]) -> float:
@@ -50,7 +53,7 @@ def once(what: str, env: Environment, work: Callable[[], object]) -> float:
         return time.perf_counter() - start
     with kernel_times(env.device) as times:
         work()
-    return sum(t.seconds for name, t in times.items() if name.startswith(ON_GRID) == (what == "grid points"))
+    return sum(t.seconds / t.calls for name, t in times.items() if name.startswith(ON_GRID) == (what == "grid points"))
 
 
 def draw(found: dict[str, tuple[list[float], list[float], float]], path: Path) -> None:
@@ -60,8 +63,11 @@ def draw(found: dict[str, tuple[list[float], list[float], float]], path: Path) -
         ax.loglog(sizes, costs, "o", color="#3b528b")
         line = costs[0] * np.divide(sizes, sizes[0])
         ax.loglog(sizes, line, "-", color="0.6", zorder=0, label="linear")
-        ax.set(xlabel=what, ylabel="seconds per episode", title=f"exponent {exponent:.2f}")
+        ax.set(xlabel=what, ylabel=f"seconds per {UNIT.get(what, 'substep')}", title=f"exponent {exponent:.2f}")
         ax.legend(frameon=False)
+        ax.set_xticks(sizes, [f"{one:,.0f}" for one in sizes], rotation=30)
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set_minor_formatter(NullFormatter())
     figure.savefig(path, dpi=150)
 
 
