@@ -110,9 +110,7 @@ class Solver:
         """Simulate with the boundary's `tools`, shape (batch, step + 1, slot, 3); return x at the end [m]."""
         batch = len(tools)
         self.escaped.zero_()
-        to_torch(self.tools).view(self.capacity, self.lanes, *tools.shape[1:])[:batch] = tools[:, None].to(
-            self.types.torch
-        )
+        self.by_lane(self.tools)[:batch] = tools[:, None].to(self.types.torch)
         for step in range(self.model.steps):
             self._explore(step, batch)
         if not self.spacious:
@@ -336,8 +334,10 @@ class _Adjoint:
         if self.grid.m.shape[1] < solver.boxes[step].cells:
             self.grid = solver.grid(solver.boxes[step].cells)
             solver.replay.forget()
-        key = "backward", step, batch, solver.model.substeps % 2 and id(self.new)
+        ends = (self.old, self.new) if solver.model.substeps % 2 else (self.new, self.old)
+        key = "backward", step, batch, id(self.new)
         solver.launches(key, batch, lambda: self._substeps(step, batch))
+        self.new, self.old = ends  # a replayed graph exchanges nothing here
 
     def _substeps(self, step: int, batch: int) -> None:
         solver = self.solver

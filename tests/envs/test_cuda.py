@@ -39,19 +39,21 @@ def test_gradients_on_cuda_are_slopes(name: str) -> None:
     assert torch.autograd.gradcheck(env, (x,), eps=SMALL_STEPS.get(name, 1e-7), nondet_tol=1e-7, atol=1e-4, rtol=1e-3)
 
 
-def test_launches_replayed_as_graphs_do_what_they_did_at_first() -> None:
-    """One row is few enough for graphs: recorded by the second evaluation, replayed from then on."""
-    fidelity = replace(environment_class("pinch").fidelities["draft"], precision="float64")
-    env = make("pinch", fidelity=fidelity, device="cuda")
-    one, other = env.space.uniform(2, seed=3).split(1)
+@pytest.mark.parametrize(("name", "known"), [("fluid", "scoop"), ("assembly", "demonstration")])  # odd substeps
+def test_launches_replayed_as_graphs_do_what_they_did_at_first(name: str, known: str) -> None:
+    """One row is few enough for graphs: recorded when it comes again, replayed from then on."""
+    fidelity = replace(environment_class(name).fidelities["draft"], precision="float64")
+    env = make(name, fidelity=fidelity, device="cuda")
+    one, other = env.example(known)[None], env.space.uniform(1, seed=3)
     first = env.evaluate(one)
-    for x in (other, one, other):
+    for x in (other, one, other, one):
         env.evaluate(x)
     again = env.evaluate(one)
     assert env._solvers is not None
-    with env._solvers.lend() as stage:
-        assert stage.solver.replay.graphs
+    with env._solvers.lend() as lent:
+        replay = getattr(lent, "solver", lent).replay
+        assert {key[0] for key in replay.graphs} == {"forward", "backward"}
     assert first.grad is not None
     assert again.grad is not None
     torch.testing.assert_close(again.loss, first.loss, rtol=1e-12, atol=0)
-    assert float((again.grad - first.grad).norm()) <= 1e-10 * float(first.grad.norm())
+    assert float((again.grad - first.grad).norm()) <= 1e-9 * float(first.grad.norm())
