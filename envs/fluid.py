@@ -93,7 +93,7 @@ class Fluid(Environment):
 
     def work(self) -> Work:
         """Count substeps of particles."""
-        return Work(self.model.particles * self.model.substeps * self.model.steps, "particle-substep")
+        return Work(self.model.particle_substeps, "particle-substep")
 
     def ladle(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 1 3"]:
         """Return where the centre of the ladle's rim is at the ends of control steps [m]."""

@@ -88,7 +88,7 @@ class Plasticine(Environment):
 
     def work(self) -> Work:
         """Count substeps of particles."""
-        return Work(self.model.particles * self.model.substeps * self.model.steps, "particle-substep")
+        return Work(self.model.particle_substeps, "particle-substep")
 
     def tools(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 slot 3"]:
         """Return where tools are at the ends of control steps [m]; a roller's second slot is (spin, yaw, 0) [rad]."""

@@ -8,13 +8,13 @@ one after the other. Sizes and frictions are data, so that scenes with the same 
 boundary share its compiled kernel.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any, ClassVar, Protocol, no_type_check
 
 import warp as wp
 
-from .runtime import precision
+from .runtime import filled, precision
 from .sdf import bowl, rod
 
 
@@ -73,10 +73,7 @@ class LadleInTank:
 
     def data(self, name: str, device: str) -> Any:
         """Return the function's data."""
-        data = self.function(name)[1]()
-        for field in fields(self):
-            setattr(data, field.name, getattr(self, field.name))
-        return data
+        return filled(self.function(name)[1](), self)
 
 
 @cache

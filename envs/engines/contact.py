@@ -5,13 +5,13 @@ pose is (x [m], y [m], tilt about z [rad]).
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any, Protocol, no_type_check
 
 import warp as wp
 
-from .runtime import precision
+from .runtime import filled, precision
 
 
 class Surface(Protocol):
@@ -37,7 +37,7 @@ class Floor:
 
     def data(self, name: str) -> Any:
         """Return the function's data."""
-        return _filled(self, name)
+        return filled(self.function(name)[1](), self)
 
 
 @dataclass(frozen=True)
@@ -65,14 +65,7 @@ class Pan:
 
     def data(self, name: str) -> Any:
         """Return the function's data."""
-        return _filled(self, name)
-
-
-def _filled(surface: Any, name: str) -> Any:
-    data = surface.function(name)[1]()
-    for field in fields(surface):
-        setattr(data, field.name, getattr(surface, field.name))
-    return data
+        return filled(self.function(name)[1](), self)
 
 
 @cache

@@ -51,6 +51,11 @@ class Model:
         return sum(len(body.x) for body in self.bodies)
 
     @property
+    def particle_substeps(self) -> int:
+        """Number of particles times that of an episode's substeps."""
+        return self.particles * self.steps * self.substeps
+
+    @property
     def mass(self) -> np.ndarray:
         """Mass of each particle of all bodies [kg], shape (particle,)."""
         return np.concatenate([body.mass for body in self.bodies])

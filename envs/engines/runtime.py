@@ -10,7 +10,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -91,6 +91,13 @@ def load(kernels: Iterable[Any], device: str) -> None:
     """Compile kernels, or fetch them from the cache, before threads launch them."""
     modules = list({kernel.module: None for kernel in kernels})
     wp.force_load(device, modules, max_workers=cores())
+
+
+def filled(data: Any, record: Any) -> Any:
+    """Return a Warp struct with the fields of a dataclass in it."""
+    for field in fields(record):
+        setattr(data, field.name, getattr(record, field.name))
+    return data
 
 
 def compiled_modules() -> int:
