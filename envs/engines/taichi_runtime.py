@@ -33,6 +33,7 @@ def start(device: str) -> Any:
         raise ValueError(f"Taichi runs on {_started[0]} in this process and on nothing else; use another for {device}")
     if not _started:
         _init(device)
+        torch.set_flush_denormal(False)  # Taichi sets it for the whole thread, and so for what others compute there
         _started.append(device)
     return ti
 

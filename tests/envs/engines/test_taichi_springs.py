@@ -184,3 +184,9 @@ def test_a_row_is_the_same_bit_for_bit_alone_and_among_others():
         assert torch.equal(solver.run(*(part[one] for part in inputs)), x[:, one])
         for alone, among in zip(solver.gradient(adj_x[one]), gradient, strict=True):
             assert torch.equal(alone, among[one])
+
+
+def test_starting_taichi_leaves_subnormal_numbers_to_others():
+    start("cpu")
+    least = torch.tensor([5e-324], dtype=torch.float64)
+    assert torch.equal(least + 0, least)
