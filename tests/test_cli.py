@@ -227,8 +227,10 @@ def test_a_slice_of_one_engine_is_not_continued_by_another(run: Callable[..., Sa
     assert "engine: wanted 'taichi', found 'warp'" in refused.stderr
 
 
-# 64 x 64 flights of a ball take seconds, in many tiles: time enough to be stopped in the middle.
-LONG = ["slice", "bounce", "--dims", "0", "1", "--resolution", "64", "--fidelity", "standard", "--json", "--out", "cut"]
+# So many flights of a ball take seconds, in many tiles: time enough to be stopped in the middle.
+SIDE = 112
+LONG = ["slice", "bounce", "--dims", "0", "1", "--resolution", str(SIDE), "--fidelity", "standard"]
+LONG += ["--json", "--out", "cut"]
 
 
 def begun(folder: Path) -> subprocess.Popen[str]:
@@ -250,8 +252,8 @@ def test_sigkill_costs_nothing_but_the_tiles_under_way(run: Callable[..., Said],
     process.send_signal(signal.SIGKILL)
     process.communicate()
     resumed = json.loads(run(*LONG, cwd=tmp_path / "killed").stdout)
-    assert 0 < resumed["resumed"] < 64 * 64
-    assert resumed["episodes"] + resumed["resumed"] == 64 * 64
+    assert 0 < resumed["resumed"] < SIDE**2
+    assert resumed["episodes"] + resumed["resumed"] == SIDE**2
     one, two = (gradscape.open_slice(tmp_path / name / "cut/slice.zarr") for name in ("whole", "killed"))
     for name in ("loss", "grad", "status"):
         np.testing.assert_array_equal(one[name], two[name])
