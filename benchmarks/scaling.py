@@ -22,19 +22,29 @@ from gradscape.envs.engines.runtime import kernel_times
 from gradscape.envs.fluid import SPAN
 from gradscape.envs.registry import make
 
-ON_GRID = "velocity_kernel"
+ON_GRID = ("velocity_kernel", "transfers.wipe")
 UNIT = {"substeps": "episode"}
 SERIES: dict[str, list[Fidelity]] = {
     "particles": [Fidelity("", SPAN / 8, resolution=16, sampling=1.25 * 2 ** (k / 3)) for k in range(5)],
     "substeps": [Fidelity("", SPAN / n, resolution=12, sampling=1.4) for n in (4, 8, 16, 32)],
-    "grid points": [Fidelity("", SPAN / 8, resolution=n, sampling=24 / n) for n in (12, 16, 20, 24)],
+    "grid points": [Fidelity("", SPAN / 20, resolution=n, sampling=16 / n) for n in (25, 32, 40, 50, 63)],
 }
 
 
+def measured(what: str, fidelity: Fidelity, device: str, batch: int) -> tuple[float, float]:
+    """Return size and cost of an environment, which is gone afterwards: on a GPU it takes what memory there is."""
+    env = make("fluid", fidelity=fidelity, device=device)
+    spent = cost(what, env, batch)
+    return size(what, env), spent
+
+
 def size(what: str, env: Environment) -> float:
-    """Return how much of `what` an episode has."""
+    """Return how much of `what` an episode has: grid points are those it runs over, near its particles."""
     model = env.model  # type: ignore[attr-defined]
-    return {"particles": model.particles, "substeps": model.steps * model.substeps, "grid points": model.cells}[what]
+    if what == "grid points":
+        with env._solvers.lend() as solver:  # type: ignore[union-attr]
+            return float(np.mean([box.cells for box in solver.boxes]))
+    return {"particles": model.particles, "substeps": model.steps * model.substeps}[what]
 
 
 def cost(what: str, env: Environment, batch: int) -> float:
@@ -80,8 +90,8 @@ def main() -> None:
     given = parser.parse_args()
     found = {}
     for what, fidelities in SERIES.items():
-        envs = [make("fluid", fidelity=fidelity, device=given.device) for fidelity in fidelities]
-        sizes, costs = [size(what, env) for env in envs], [cost(what, env, given.batch) for env in envs]
+        pairs = [measured(what, fidelity, given.device, given.batch) for fidelity in fidelities]
+        sizes, costs = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
         exponent = float(np.polyfit(np.log(sizes), np.log(costs), 1)[0])
         found[what] = sizes, costs, exponent
         print(f"{what}: {', '.join(f'{s:.0f}: {c:.3g} s' for s, c in zip(sizes, costs, strict=True))}; {exponent:.2f}")

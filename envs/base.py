@@ -69,7 +69,8 @@ class Environment(abc.ABC):
     A scene is written by deriving from this class: the class attributes say what it is, `_evaluate` simulates. An
     environment is an `Objective`, and a torch function: `env(x)` returns losses, shape (batch,), that can be
     differentiated. `fidelity` is a name from `fidelities`, the first unless said otherwise, or a record of one's own;
-    `device` is auto, cpu or cuda; `engine` is one of `engines`; options are those of the class's `Options`.
+    `device` is auto, cpu or cuda; `engine` is one of `engines`; options are those of the class's `Options`. On a GPU
+    two runs may differ by round-off, because atomic adds come in any order, unless `deterministic` says otherwise.
     """
 
     name: ClassVar[str]
@@ -79,6 +80,7 @@ class Environment(abc.ABC):
     devices: ClassVar[tuple[str, ...]] = ("cpu",)
     engines: ClassVar[tuple[str, ...]] = ("warp",)
     loss_unit: ClassVar[str] = ""
+    decisions: ClassVar[int] = 1  # how often controls are chosen in an episode: dim / decisions of them, time first
 
     space: ParameterSpace
     _solvers: Pool[Any] | None = None  # a scene on an engine sets both in `_setup`: what simulates,
@@ -90,11 +92,15 @@ class Environment(abc.ABC):
         fidelity: str | Fidelity | None = None,
         device: str = "auto",
         engine: str = "warp",
+        deterministic: bool = False,
         **options: Any,
     ) -> None:
         self.fidelity = self._named_fidelity(fidelity)
         self.device = self._available_device(device)
         self.engine = self.known_engine(engine)
+        self.deterministic = deterministic
+        if deterministic and engine == "taichi":
+            raise ValueError(f"{self.name} is deterministic on engine warp only; got engine taichi")
         self.options = read_options(self.name, self.Options, options)
         self._stop = threading.Event()
         self._setup()
@@ -152,6 +158,24 @@ class Environment(abc.ABC):
         return {}
 
     @final
+    def observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
+        """Return what the state is just before a decision, float64, in units that make it about one.
+
+        Parameters that this decision and later ones set do not matter. The last feature is the share of the episode
+        that is over. It is all there is to see where parameters say how an episode begins or what it is made of: such
+        a scene is a bandit, with a single decision.
+        """
+        x = self._checked(x)
+        if not 0 <= decision < self.decisions:
+            raise ValueError(f"{self.name} numbers its decisions 0 to {self.decisions - 1}; got {decision}")
+        ahead = self.space.center[self.space.dim * decision // self.decisions :]
+        x = torch.cat([x[:, : self.space.dim - len(ahead)], ahead.expand(len(x), -1)], dim=1)
+        parts = torch.split(x, self._share(len(x)))
+        with self._pool(len(parts)) as each:
+            seen = torch.cat(list(each(lambda part: self._observe(part, decision), parts)))
+        return torch.cat([seen, seen.new_full((len(x), 1), decision / self.decisions)], dim=1)
+
+    @final
     def prepare(self) -> None:
         """Compile the kernels, or fetch them from the cache, so that the first evaluation is as quick as the next."""
         if self._solvers is not None:
@@ -173,6 +197,10 @@ class Environment(abc.ABC):
         return _cores() if self._solvers is not None and self.device == "cpu" and self.engine == "warp" else 1
 
     @property
+    def _solvers_at_most(self) -> int | None:
+        return 1 if self.device == "cuda" else None  # one takes what memory a GPU has
+
+    @property
     def preferred_batch(self) -> int:
         """Number of points worth evaluating at once."""
         return 16 if self._solvers is None else self._capacity * self.threads
@@ -180,6 +208,10 @@ class Environment(abc.ABC):
     @abc.abstractmethod
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         """Simulate at least one point; called from several threads at once where `threads` is above one."""
+
+    def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
+        """Return the state just before a decision, in units that make it about one."""
+        return x.new_zeros(len(x), 0)
 
     def _simulate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         with torch.set_grad_enabled(grad):  # torch switches it off around `_Bridge.forward`; threads have their own

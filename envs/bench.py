@@ -67,7 +67,8 @@ def bench(
     """Measure the environment that `make` returns for an engine, in turn with another engine if `against` names one.
 
     Each of `batches` (default: 1 and the preferred one) is timed for about so many `seconds`; `follow` hears what is
-    done. `ratio_forward` and `ratio_with_gradient` say how many times as fast as the other the engine is in this run.
+    done. `ratio_forward` and `ratio_with_gradient` say how many times as fast as the other the engine is in this run:
+    in each row of `rates` that batch's, on top the largest batch's (None without another engine).
     """
     envs, starts = _started(make, engine, against, follow)
     env = envs[engine]
@@ -84,10 +85,17 @@ def bench(
         "against": against,
         "start": {name: asdict(start) for name, start in starts.items()},
         "memory": {"estimated": env.memory(), "measured": starts[engine].bytes_per_episode},
+        **{f"ratio_{way}": _ratio(rates, way) for way in WAYS},
         "rates": rates,
         "kernels": kernels,
         "sampler": _sampler(env, quickest * seconds / 2),
     }
+
+
+def _ratio(rates: Sequence[Mapping[str, Any]], way: str) -> float | None:
+    """Return the ratio of the largest batch."""
+    compared = [row for row in rates if f"ratio_{way}" in row]
+    return max(compared, key=lambda row: row["batch"])[f"ratio_{way}"] if compared else None
 
 
 def _started(
@@ -115,6 +123,7 @@ def _subject(env: Environment) -> dict[str, Any]:
         "device": env.device,
         "hardware": device_names()[0] if env.device == "cuda" else f"{cores()} cores",
         "engine": env.engine,
+        "deterministic": env.deterministic,
         "work": asdict(env.work()),
     }
 

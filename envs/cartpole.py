@@ -20,6 +20,7 @@ from .engines.runtime import Pool
 
 CHAIN = Chain(masses=(1.0, 0.5, 0.25), lengths=(1.0, 1.0, 1.0), gravity=9.81)
 CONTROLS, SPAN = 100, 0.02  # how many controls, and how long each is held [s]
+TEMPO = 0.2  # what a policy measures time by [s]
 CONTROL = ("cart velocity", "torque 1", "torque 2", "torque 3")
 BOUND, UNITS = (2.0, 10.0, 4.0, 1.0), ("m/s", "N m", "N m", "N m")
 
@@ -69,6 +70,7 @@ class Cartpole(Environment):
         "reference": Fidelity("reference", dt=SPAN / 8, precision="float64"),
     }
     loss_unit: ClassVar[str] = "m"
+    decisions: ClassVar[int] = CONTROLS
     Options: ClassVar[type[Any]] = CartpoleOptions
     examples: ClassVar[dict[str, tuple[float, ...]]] = {
         "upright": tuple(float(np.interp(k, KNOTS, values)) for k in range(CONTROLS) for values in UPRIGHT)
@@ -127,6 +129,15 @@ class Cartpole(Environment):
             loss = (tip - self.target).norm(dim=1)
             slope = _pull_back(solver, loss, phi, controls) if grad else None
         return Evaluation(loss.detach(), slope, torch.full((len(x),), Status.OK, dtype=torch.int8))
+
+    def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
+        """Watch the cart and the sines and cosines of angles, and how fast cart and angles changed in the last step."""
+        controls, step = x.view(len(x), CONTROLS, 4), decision * self.steps // CONTROLS
+        with self._solvers.lend() as solver:
+            phi = _swing(solver, controls).cpu().double().transpose(0, 1)
+        joints = torch.cat([self._cart(controls)[:, :, None], phi], dim=2)
+        rate = (joints[:, step] - joints[:, max(0, step - 1)]) * (TEMPO / self.fidelity.dt)
+        return torch.cat([joints[:, step, :1], phi[:, step].sin(), phi[:, step].cos(), rate], dim=1)
 
     def _cart(self, controls: Float[Tensor, "batch control 4"]) -> Float[Tensor, "batch step_plus_1"]:
         """Return where the cart is at the ends of steps [m]."""

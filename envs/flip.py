@@ -56,6 +56,7 @@ class Flip(SheetScene):
             *(0.045, -0.012, -0.138, 0.074, 0.003, -0.005),
         )
     }
+    decisions: ClassVar[int] = SEGMENTS
     duration: ClassVar[float] = 1.0
     surface: ClassVar[Pan] = Pan(flat=0.14, bend=0.07, sweep=math.asin(6 / 7), thickness=0.03)
     space = ParameterSpace(

@@ -21,6 +21,7 @@ from .engines.materials import Fluid as Liquid
 from .engines.model import Body, Model
 from .engines.mpm import Solver, capacity, memory
 from .engines.runtime import Pool
+from .observation import followed, motion
 
 TANK_WIDTH, TANK_HEIGHT, FILL = 0.4, 0.2, 0.15  # the tank, and the depth of the syrup [m]
 HEADROOM = 0.6  # what the grid covers above the floor [m]
@@ -78,6 +79,7 @@ class Fluid(Environment):
         "scoop": (1.41, -0.77, 0.15, 0.74, 0.08, 1.13, -1.3, 1.41, 0.17, 0.27)
     }
     loss_unit: ClassVar[str] = "m"
+    decisions: ClassVar[int] = SEGMENTS
     Options: ClassVar[type[Any]] = FluidOptions
     _solvers: Pool[Solver]
     space = ParameterSpace.box(
@@ -124,7 +126,9 @@ class Fluid(Environment):
         self.model = _model(self.fidelity, self.options)
         self._capacity = self._rows_at_once(capacity(self.model, self.device))
         settings: dict[str, Any] = {"capacity": self._capacity, "device": self.device, "stop": self._stop}
-        self._solvers = Pool(partial(self._engine("mpm").Solver, self.model, **settings))
+        settings |= {"deterministic": True} if self.deterministic else {}
+        make = partial(self._engine("mpm").Solver, self.model, **settings)
+        self._solvers = Pool(make, most=self._solvers_at_most)
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         x = x.clone().requires_grad_(grad)
@@ -135,6 +139,12 @@ class Fluid(Environment):
             loss = self._loss(self._center(end), tools[:, -1, 0])
             slope = _pull_back(solver, loss, end, tools, x) if grad else None
         return Evaluation(loss.detach(), slope, torch.where(escaped, int(Status.ESCAPED), int(Status.OK)))
+
+    def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
+        """Watch syrup, cube and ladle, in halves of the tank's width."""
+        with self._solvers.lend() as solver:
+            seen = followed(solver, self.ladle(x), decision * STEPS // SEGMENTS)
+        return motion(*seen, scale=TANK_WIDTH / 2, intervals=STEPS // SEGMENTS)
 
     def _center(self, end: Float[Tensor, "batch particle 3"]) -> Float[Tensor, "batch 3"]:
         return end[:, len(self.model.bodies[0].x) :].mean(dim=1)

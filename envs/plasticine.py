@@ -21,6 +21,7 @@ from .engines.model import Model
 from .engines.mpm import Solver, capacity, memory
 from .engines.raster import Raster
 from .engines.runtime import Pool
+from .observation import followed, motion
 from .plasticine_model import SPAN, STEPS, Scene, model, target
 from .registry import code_digest
 from .targets import Target, cached, contact
@@ -28,6 +29,7 @@ from .targets import Target, cached, contact
 SEGMENTS = 5  # of the controls
 DEMONSTRATION = "demonstration"  # the example that solves a scene
 TERMS = ("density", "sdf", "contact")
+REACH = 0.1  # what a policy measures lengths by [m]
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,7 @@ class Plasticine(Environment):
         "reference": Fidelity("reference", dt=SPAN / 40, resolution=64, particles=10_000, precision="float64"),
     }
     Options: ClassVar[type[Any]] = PlasticineOptions
+    decisions: ClassVar[int] = SEGMENTS
     scene: ClassVar[Scene]
     _solvers: Pool[Stage]
 
@@ -148,8 +151,10 @@ class Plasticine(Environment):
         self.model = model(self.scene, self.fidelity)
         self._judged = (STEPS,) if self.options.loss == "final" else tuple(range(1, STEPS + 1))
         self._capacity = self._rows_at_once(capacity(self.model, self.device))
-        solver = self._engine("mpm").Solver
-        self._solvers = Pool(partial(_stage, solver, self.model, self._capacity, self.device, self._stop))
+        settings: dict[str, Any] = {"capacity": self._capacity, "device": self.device}
+        settings |= {"deterministic": True} if self.deterministic else {}
+        make = partial(_stage, self._engine("mpm").Solver, self.model, self._stop, settings)
+        self._solvers = Pool(make, most=self._solvers_at_most)
         self._making = threading.Lock()
 
     def _prepare(self) -> None:
@@ -176,6 +181,16 @@ class Plasticine(Environment):
                 adj_paths += stage.solver.gradient(adj_x)
         slope = torch.autograd.grad(tools, x, adj_paths.cpu())[0] if grad else None
         return Evaluation(loss.cpu(), slope, torch.where(escaped, int(Status.ESCAPED), int(Status.OK)))
+
+    def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
+        """Watch plasticine and tools, in tenths of a metre; a roller's angles in radians."""
+        tools = self.tools(x)
+        with self._solvers.lend() as stage:
+            seen = followed(stage.solver, tools.to(self.device), decision * STEPS // SEGMENTS)
+        scale = tools.new_full((seen[0].shape[1], 1), REACH)
+        if any(anchor.tool.kind is Kind.ROLLER for anchor in self.scene.anchors):
+            scale[-tools.shape[2] + 1] = 1.0
+        return motion(*seen, scale=scale, intervals=STEPS // SEGMENTS)
 
     def _judge(
         self, stage: Stage, step: int, paths: Float[Tensor, "batch step_plus_1 slot 3"]
@@ -206,6 +221,5 @@ class Plasticine(Environment):
         return np.asarray(demonstration)
 
 
-def _stage(kind: type[Solver], model: Model, capacity: int, device: str, stop: threading.Event) -> Stage:
-    solver = kind(model, capacity=capacity, device=device, stop=stop)
-    return Stage(solver, Raster(model, model.mass, capacity=capacity, device=device))
+def _stage(kind: type[Solver], model: Model, stop: threading.Event, settings: dict[str, Any]) -> Stage:
+    return Stage(kind(model, stop=stop, **settings), Raster(model, model.mass, **settings))

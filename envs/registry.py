@@ -176,7 +176,9 @@ def make(
     fidelity: str | Fidelity | None = None,
     device: str = "auto",
     engine: str = "warp",
+    deterministic: bool = False,
     **options: Any,
 ) -> Environment:
     """Make a registered environment; `fidelity` defaults to its cheapest, `device` is auto, cpu or cuda."""
-    return environment_class(name)(fidelity=fidelity, device=device, engine=engine, **options)
+    settings: dict[str, Any] = {"fidelity": fidelity, "device": device, "engine": engine}
+    return environment_class(name)(**settings, deterministic=deterministic, **options)

@@ -17,8 +17,10 @@ from .base import Environment, Episode, Work
 from .engines.contact import Surface
 from .engines.runtime import Pool
 from .engines.springs import Sheet, Solver, capacity
+from .observation import motion, watched
 
 FRAME = 0.01  # between the frames of an episode [s]
+REACH = 0.1  # what a policy measures lengths by [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +121,19 @@ class SheetScene(Environment):
             loss = torch.stack([self._loss(row) for row in end])  # by row: batched sums round as the batch is split
             slope = self._pull_back(solver, loss, end, drive, x) if grad else None
         return Evaluation(loss.detach(), slope, torch.full((len(x),), Status.OK, dtype=torch.int8))
+
+    def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
+        """Watch the sheet in tenths of a metre, and its surface's pose beside it."""
+        if self.decisions == 1:
+            return super()._observe(x, decision)
+        drive, step = self._drive(x), decision * self.steps // self.decisions
+        with self._solvers.lend() as solver:
+            frames = solver.run(*drive.detached()).double().cpu()
+        seen = [
+            torch.cat([watched(frames[k], [frames.shape[2]]), drive.poses[:, k, None]], dim=1)
+            for k in (0, max(0, step - 1), step)
+        ]
+        return motion(*seen, scale=REACH, intervals=self.steps // self.decisions)
 
     def _pull_back(self, solver: Solver, loss: Tensor, end: Tensor, drive: Drive, x: Tensor) -> Tensor:
         (adj_end,) = torch.autograd.grad(loss.sum(), end)

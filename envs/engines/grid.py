@@ -5,19 +5,25 @@ from typing import Any, no_type_check
 
 import warp as wp
 
-from .runtime import precision
-from .transfers import transfers
+from .runtime import precision, promise
+from .transfers import lattice
+
+# A node is read once, so that its adjoint can be set, where Warp would add to it atomically.
+READ, ADJOINT_READ = "return wp::index(grid, e, i);", "wp::index(adj_grid, e, i) = adj_ret;"
 
 
 @cache
 @no_type_check
-def velocity_kernel(name: str, meet: Any, Data: Any) -> Any:
+def velocity_kernel(name: str, meet: Any, Data: Any, *, deterministic: bool = False) -> Any:
     """Return the kernel that turns a node's momentum into its velocity after gravity and boundary."""
     types = precision(name)
     real, vec3, vec4 = types.real, types.vec3, types.vec4
-    Lattice = transfers(name).Lattice
+    Lattice = lattice(name)
 
-    @wp.kernel(module="unique")
+    @wp.func_native(READ, adj_snippet=ADJOINT_READ)
+    def read(grid: wp.array2d[vec4], e: int, i: int) -> vec4: ...
+
+    @wp.kernel(module="unique", module_options={"deterministic": promise(deterministic)})
     def velocity(
         lattice: Lattice,
         boundary: Data,
@@ -34,7 +40,7 @@ def velocity_kernel(name: str, meet: Any, Data: Any) -> Any:
         grid_v: wp.array2d[vec4],
     ):
         e, i = wp.tid()
-        g = grid_m[e, i]
+        g = read(grid_m, e, i)
         if g[3] > empty:
             first = lattice.first
             k = i % lattice.nz

@@ -10,9 +10,9 @@ import warp as wp
 from .boundaries import Boundary
 from .materials import Fluid, Material
 from .runtime import precision
-from .transfers import transfers
+from .transfers import lattice
 
-MARGIN = 2  # cells around the particles that a control step begins with
+MARGIN = 1  # cells around the particles that a control step begins with
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +61,11 @@ class Model:
         return np.concatenate([body.mass for body in self.bodies])
 
     @property
+    def volume(self) -> np.ndarray:
+        """Volume of each particle of all bodies [m^3], shape (particle,)."""
+        return np.concatenate([body.volume for body in self.bodies])
+
+    @property
     def cells(self) -> int:
         """Number of nodes of the grid."""
         return int(np.prod(self.nodes))
@@ -68,14 +73,19 @@ class Model:
     def bytes_per_environment(self, windows: int) -> int:
         """Return about what one environment of a solver that keeps so many control steps takes, adjoints included.
 
-        Grids are counted as large as they are around the bodies at rest, and half as large again.
+        Grids are counted as large as they are around the bodies at rest, and as large again.
         """
         state = sum(len(body.x) * (1 if isinstance(body.material, Fluid) else 9) for body in self.bodies)
         frame = 15 * self.particles + state  # x, v, C and each material's own
-        at_rest = torch.from_numpy(np.concatenate([body.x for body in self.bodies]))
-        grid = 8 * min(self.cells, around(self, at_rest[None], MARGIN).cells * 3 // 2)
+        grid = 8 * min(self.cells, around(self, *self.corners, MARGIN).cells * 2)
         substep = frame + 9 * self.particles + grid
         return self.real_bytes * ((self.steps + 3) * frame + (windows * self.substeps + 1) * substep)
+
+    @property
+    def corners(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the lowest and highest coordinates of particles at rest [m], each of shape (3,)."""
+        x = torch.from_numpy(np.concatenate([body.x for body in self.bodies]))
+        return x.amin(dim=0), x.amax(dim=0)
 
     @property
     def real_bytes(self) -> int:
@@ -99,7 +109,7 @@ class Box:
 def place(model: Model, box: Box | None = None) -> Any:
     """Return where a model's grid lies, for the transfer kernels: the nodes in `box`, or all."""
     first, nodes = (box.first, box.nodes) if box else ((0, 0, 0), model.nodes)
-    placed = transfers(model.precision).Lattice()
+    placed = lattice(model.precision)()
     placed.origin = precision(model.precision).vec3(*model.origin)
     placed.inv_dx = 1.0 / model.dx
     placed.first = wp.vec3i(*first)
@@ -107,12 +117,11 @@ def place(model: Model, box: Box | None = None) -> Any:
     return placed
 
 
-def around(model: Model, x: torch.Tensor, margin: int, grain: int = 1) -> Box:
-    """Return the nodes that particles at x [m], shape (batch, particle, 3), meet while none moves `margin` cells.
+def around(model: Model, low: torch.Tensor, high: torch.Tensor, margin: int, grain: int = 1) -> Box:
+    """Return the nodes that particles between two corners [m], shape (3,), meet while none moves `margin` cells.
 
     It begins and ends at multiples of `grain`, or with the grid.
     """
-    low, high = x.amin(dim=(0, 1)).double().cpu(), x.amax(dim=(0, 1)).double().cpu()
     if not bool((low + high).isfinite().all()):
         return Box((0, 0, 0), model.nodes)
     origin = torch.tensor(model.origin, dtype=torch.float64)

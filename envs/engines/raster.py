@@ -14,11 +14,14 @@ from .transfers import transfers
 class Raster:
     """Spread particles' `mass`, shape (particle,), over the nodes of a model's grid, for up to `capacity` rows."""
 
-    def __init__(self, model: Model, mass: np.ndarray, *, capacity: int, device: str) -> None:
+    def __init__(
+        self, model: Model, mass: np.ndarray, *, capacity: int, device: str, deterministic: bool = False
+    ) -> None:
         types = precision(model.precision)
-        self.kernels, self.lattice, self.device = transfers(model.precision), place(model), device
+        self.kernels = transfers(model.precision, deterministic=deterministic)
+        self.lattice, self.device = place(model), device
         load([self.kernels.p2g, self.kernels.adjoint_p2g], device)
-        self.mass: wp.array = wp.array(mass, dtype=types.real, device=device)
+        self.mass: wp.array = wp.array(np.tile(mass, (capacity, 1)), dtype=types.real, device=device)
         kinds = types.vec3, types.vec3, types.mat33, types.vec3, types.vec3, types.mat33
         particles = [wp.zeros((capacity, len(mass)), dtype=kind, device=device) for kind in kinds]
         self.particles, self.adjoints = particles[:3], particles[3:]  # x, v, A: a mass does not depend on v and A
@@ -27,7 +30,7 @@ class Raster:
     @staticmethod
     def bytes_per_row(model: Model) -> int:
         """Return what a row takes."""
-        return model.real_bytes * (30 * model.particles + 4 * model.cells)
+        return model.real_bytes * (31 * model.particles + 4 * model.cells)
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
         """Return the mass at each node, shape (batch, node), of particles at x [m], shape (batch, particle, 3)."""
@@ -53,7 +56,7 @@ class Raster:
         places = to_torch(self.particles[0])
         places[: len(x)] = x.to(places)
         inputs = [self.lattice, self.mass, *self.particles, self.grid, *adjoints]
-        wp.launch(kernel, (len(x), len(self.mass)), inputs, device=self.device, record_tape=False)
+        wp.launch(kernel, (len(x), self.mass.shape[1]), inputs, device=self.device, record_tape=False)
 
 
 class _Spread(torch.autograd.Function):

@@ -9,7 +9,7 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
@@ -59,6 +59,11 @@ def precision(name: str) -> Precision:
     real, dtype = reals[name]
     vector, matrix = wp.types.vector, wp.types.matrix
     return Precision(name, real, vector(3, real), vector(4, real), matrix((3, 3), real), dtype)
+
+
+def promise(deterministic: bool) -> wp.DeterministicMode:
+    """Return what a module of kernels is told: whether its atomic adds must come in the same order every time."""
+    return wp.DeterministicMode.RUN_TO_RUN if deterministic else wp.DeterministicMode.NOT_GUARANTEED
 
 
 def cuda_available() -> bool:
@@ -132,32 +137,42 @@ def kernel_times(device: str) -> Iterator[dict[str, KernelTime]]:
 
 @contextmanager
 def _cpu_launches(times: dict[str, KernelTime]) -> Iterator[None]:
-    launch = wp.launch
+    launch, again = wp.launch, wp.Launch.launch
 
     def timed(kernel: Any, *arguments: Any, **named: Any) -> Any:
-        start = time.perf_counter()
-        launched = launch(kernel, *arguments, **named)
-        times[_kernel_name(kernel.key, backward=named.get("adjoint", False))].add(time.perf_counter() - start)
-        return launched
+        if named.get("record_cmd"):
+            return launch(kernel, *arguments, **named)
+        with clock(kernel, backward=named.get("adjoint", False)):
+            return launch(kernel, *arguments, **named)
 
-    wp.launch = timed
+    def timed_again(command: Any, *arguments: Any) -> None:
+        with clock(command.kernel, backward=command.adjoint):
+            again(command, *arguments)
+
+    @contextmanager
+    def clock(kernel: Any, *, backward: bool) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        times[_kernel_name(kernel.key, backward=backward)].add(time.perf_counter() - start)
+
+    wp.launch, wp.Launch.launch = timed, timed_again  # type: ignore[assignment, method-assign]
     try:
         yield
     finally:
-        wp.launch = launch
+        wp.launch, wp.Launch.launch = launch, again  # type: ignore[method-assign]
 
 
 @contextmanager
 def _cuda_kernels(times: dict[str, KernelTime]) -> Iterator[None]:
-    from .graphs import Replay
+    from .replay import Replay
 
-    replay = Replay.__call__
-    Replay.__call__ = lambda self, key, launches: launches()  # type: ignore[method-assign]  # a graph hides its kernels
+    graph = Replay._graph
+    Replay._graph = lambda self, key, known: known.run()  # type: ignore[method-assign]  # a graph hides its kernels
     wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
     try:
         yield
     finally:
-        Replay.__call__ = replay  # type: ignore[method-assign]
+        Replay._graph = graph  # type: ignore[method-assign]
         for run in wp.timing_end():
             way, _, name = run.name.partition(" kernel ")
             key = re.sub(r"_[0-9a-f]{8}$", "", name)  # without the hash of its code
@@ -170,22 +185,24 @@ def _kernel_name(key: str, *, backward: bool) -> str:
 
 
 class Pool(Generic[T]):
-    """Lend objects that serve one thread at a time, making a new one where none is idle."""
+    """Lend objects that serve one thread at a time, making a new one where none is idle; with `most` of them, wait."""
 
-    def __init__(self, make: Callable[[], T]) -> None:
+    def __init__(self, make: Callable[[], T], *, most: int | None = None) -> None:
         self._make = make
         self._idle: queue.LifoQueue[T] = queue.LifoQueue()
         self._making = threading.Lock()
+        self._room = threading.Semaphore(most) if most else nullcontext()
 
     @contextmanager
     def lend(self) -> Iterator[T]:
         """Give an idle object, or a new one, for the length of a with block."""
-        try:
-            item = self._idle.get_nowait()
-        except queue.Empty:
-            with self._making:
-                item = self._make()
-        try:
-            yield item
-        finally:
-            self._idle.put(item)
+        with self._room:
+            try:
+                item = self._idle.get_nowait()
+            except queue.Empty:
+                with self._making:
+                    item = self._make()
+            try:
+                yield item
+            finally:
+                self._idle.put(item)

@@ -94,16 +94,16 @@ class Solver:
 
     @one_torch_thread()
     def run(self, tools: torch.Tensor) -> torch.Tensor:
-        """Simulate with the boundary's `tools`, shape (batch, step + 1, slot, 3); return x at the end [m]."""
-        batch = len(tools)
+        """Simulate with the boundary's `tools`, shape (batch, step + 1, slot, 3); return x at their end [m]."""
+        batch, steps = len(tools), tools.shape[1] - 1
         self.escaped.zero_()
-        self.tools.detach()[:batch] = tools.detach().to(self.tools)
-        for step in range(self.model.steps):
+        self.tools.detach()[:batch, : steps + 1] = tools.detach().to(self.tools)
+        for step in range(steps):
             self._advance(step, batch)
             self.escaped |= self._outside()
             for kept, array in zip(self.kept.arrays(), self.window.arrays(), strict=True):
                 kept[step + 1] = array.detach()[-1]
-        return self.reached(self.model.steps, batch)
+        return self.reached(steps, batch)
 
     def reached(self, step: int, batch: int) -> torch.Tensor:
         """Return x [m] before control step `step` of the last run, shape (batch, particle, 3)."""

@@ -14,30 +14,18 @@ from typing import no_type_check
 
 import warp as wp
 
-from .runtime import precision
-
-# One instruction in place of four atomic adds, which is most of what a scatter costs (Hopper or later; PTX 8.1).
-ADD_FOUR = """
-#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
-    asm volatile("red.global.add.v4.f32 [%0], {%1, %2, %3, %4};" ::
-        "l"(__cvta_generic_to_global(&wp::index(grid, e, i))),
-        "f"(value[0]), "f"(value[1]), "f"(value[2]), "f"(value[3]) : "memory");
-#else
-    wp::atomic_add(grid, e, i, value);
-#endif
-"""
+from .runtime import precision, promise
+from .scatter import adding
 
 
 @cache
 @no_type_check
-def transfers(name: str) -> SimpleNamespace:
-    """Return the transfer kernels `wipe, p2g, g2p, adjoint_p2g, adjoint_g2p` of one precision."""
+def lattice(name: str) -> type:
+    """Return the struct that places a grid, in one precision."""
     types = precision(name)
-    real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
-    module = f"gradscape.transfers.{name}"
-    offset = wp.constant(vec3(0.0, 1.0, 2.0))  # real(i) on an unrolled index breaks the code generator in float64
+    real, vec3 = types.real, types.vec3
 
-    @partial(wp.struct, module=module)
+    @partial(wp.struct, module=f"gradscape.lattice.{name}")
     class Lattice:
         """Place the grid: node (0, 0, 0) at `origin` [m], spacing 1/`inv_dx` [m].
 
@@ -51,6 +39,21 @@ def transfers(name: str) -> SimpleNamespace:
         nx: int
         ny: int
         nz: int
+
+    return Lattice
+
+
+@cache
+@no_type_check
+def transfers(name: str, *, deterministic: bool = False) -> SimpleNamespace:
+    """Return the transfer kernels `wipe, p2g, g2p, adjoint_p2g, adjoint_g2p` of one precision."""
+    types = precision(name)
+    real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
+    module = f"gradscape.transfers.{name}{'.deterministic' if deterministic else ''}"
+    wp.set_module_options({"deterministic": promise(deterministic)}, module)
+    Lattice = lattice(name)
+    together, add = adding(name, module, native=name == "float32" and not deterministic)
+    offset = wp.constant(vec3(0.0, 1.0, 2.0))  # real(i) on an unrolled index breaks the code generator in float64
 
     @wp.func(module=module)
     def base_node(s: vec3, lattice: Lattice):
@@ -81,11 +84,6 @@ def transfers(name: str) -> SimpleNamespace:
     def head(g: vec4):
         return vec3(g[0], g[1], g[2])
 
-    def add(grid: wp.array2d[vec4], e: int, i: int, value: vec4):
-        wp.atomic_add(grid, e, i, value)
-
-    add = wp.func_native(ADD_FOUR)(add) if name == "float32" else wp.func(add, module=module)
-
     @wp.kernel(module=module, enable_backward=False)
     def wipe(grid: wp.array2d[vec4]):
         e, i = wp.tid()
@@ -94,7 +92,7 @@ def transfers(name: str) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def p2g(
         lattice: Lattice,
-        mass: wp.array[real],
+        mass: wp.array2d[real],
         x: wp.array2d[vec3],
         v: wp.array2d[vec3],
         A: wp.array2d[mat33],
@@ -107,10 +105,11 @@ def transfers(name: str) -> SimpleNamespace:
         f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
         corner = base - lattice.first
         wx, wy, wz = weights(f[0]), weights(f[1]), weights(f[2])
-        m = mass[p]
+        m = mass[e, p]
         a = A[e, p] * (real(1.0) / lattice.inv_dx)
         ax, ay, az = column(a, 0), column(a, 1), column(a, 2)
         q0 = m * v[e, p] - a * f
+        run = together(e, (corner[0] * lattice.ny + corner[1]) * lattice.nz + corner[2])
         for i in range(3):
             for j in range(3):
                 row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
@@ -119,12 +118,12 @@ def transfers(name: str) -> SimpleNamespace:
                 for k in range(3):
                     w = wij * wz[k]
                     q = w * (qij + offset[k] * az)
-                    add(grid_m, e, row + k, vec4(q[0], q[1], q[2], w * m))
+                    add(grid_m, e, row + k, vec4(q[0], q[1], q[2], w * m), run, 4)
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint_p2g(
         lattice: Lattice,
-        mass: wp.array[real],
+        mass: wp.array2d[real],
         x: wp.array2d[vec3],
         v: wp.array2d[vec3],
         A: wp.array2d[mat33],
@@ -141,7 +140,7 @@ def transfers(name: str) -> SimpleNamespace:
         corner = base - lattice.first
         wx, wy, wz = weights(f[0]), weights(f[1]), weights(f[2])
         dx_, dy_, dz_ = weight_slopes(f[0]), weight_slopes(f[1]), weight_slopes(f[2])
-        m = mass[p]
+        m = mass[e, p]
         dx = real(1.0) / lattice.inv_dx
         a = A[e, p] * dx
         ax, ay, az = column(a, 0), column(a, 1), column(a, 2)
@@ -239,6 +238,7 @@ def transfers(name: str) -> SimpleNamespace:
         q0 = adj_v_new[e, p] + dt * adj_x_new[e, p] - c * f
         slope = vec3()
         s0 = vec3()
+        run = together(e, (corner[0] * lattice.ny + corner[1]) * lattice.nz + corner[2])
         for i in range(3):
             for j in range(3):
                 row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
@@ -253,9 +253,7 @@ def transfers(name: str) -> SimpleNamespace:
                     sigma = wp.dot(q, vi)
                     s0 += w * vi
                     slope += sigma * vec3(gx * wz[k], gy * wz[k], wij * dz_[k])
-                    add(adj_grid_v, e, row + k, vec4(w * q[0], w * q[1], w * q[2], real(0.0)))
+                    add(adj_grid_v, e, row + k, vec4(w * q[0], w * q[1], w * q[2], real(0.0)), run, 3)
         adj_x[e, p] = adj_x_new[e, p] + lattice.inv_dx * (slope - wp.transpose(c) * s0)
 
-    return SimpleNamespace(
-        Lattice=Lattice, wipe=wipe, p2g=p2g, g2p=g2p, adjoint_p2g=adjoint_p2g, adjoint_g2p=adjoint_g2p
-    )
+    return SimpleNamespace(wipe=wipe, p2g=p2g, g2p=g2p, adjoint_p2g=adjoint_p2g, adjoint_g2p=adjoint_g2p)

@@ -10,7 +10,8 @@ import warp as wp
 from gradscape.envs.base import Environment, Fidelity, Work
 from gradscape.envs.bench import alternated, bench
 from gradscape.envs.bounce import Bounce
-from gradscape.envs.engines.graphs import Replay
+from gradscape.envs.engines.model import Box
+from gradscape.envs.engines.replay import Replay
 from gradscape.envs.engines.runtime import KernelTime, cuda_available, kernel_times
 from gradscape.envs.fluid import Fluid
 from gradscape.landscapes.objective import Evaluation, Status
@@ -144,11 +145,13 @@ def test_kernels_are_launched_one_by_one_to_be_timed(monkeypatch):
     monkeypatch.setattr(wp, "timing_end", list)
     monkeypatch.setattr(wp, "capture_launch", lambda graph: launched.append(graph))
     replay, launched = Replay("cuda"), []
-    replay.seen, replay.graphs = {"key"}, {"key": "graph"}
+    box = Box((0, 0, 0), (1, 1, 1))
+    replay("key", box, None, lambda: replay.call(lambda: launched.append("kernel")), small=True)
+    replay.seen, replay.graphs = {("key", box)}, {("key", box): "graph"}
     with kernel_times("cuda"):
-        replay("key", lambda: launched.append("kernel"))
-    replay("key", lambda: launched.append("kernel"))
-    assert launched == ["kernel", "graph"]
+        replay("key", box, None, launched.clear, small=True)
+    replay("key", box, None, launched.clear, small=True)
+    assert launched == ["kernel", "kernel", "graph"]
 
 
 @GPU

@@ -58,3 +58,18 @@ def test_scenes_that_only_warp_has_refuse_taichi():
         if "taichi" not in kind.engines:
             with pytest.raises(ValueError, match=f"{name} has engine warp; got engine 'taichi'"):
                 make(name, device="cpu", engine="taichi")
+
+
+def test_taichi_refuses_to_be_deterministic():
+    with pytest.raises(ValueError, match="fluid is deterministic on engine warp only; got engine taichi"):
+        make("fluid", device="cpu", engine="taichi", deterministic=True)
+
+
+@pytest.mark.parametrize(("name", "known"), [("fluid", "scoop"), ("assembly", "demonstration")])
+def test_drafts_agree_as_far_as_float32_does(name, known):
+    """Losses within 1e-3 and gradients within 1e-2 (here 7e-5 and 1e-4 at most)."""
+    ours, theirs = (make(name, device="cpu", engine=engine) for engine in ("warp", "taichi"))
+    x = ours.example(known)[None]
+    one, two = ours.evaluate(x), theirs.evaluate(x)
+    torch.testing.assert_close(two.loss, one.loss, rtol=1e-3, atol=0.0)
+    assert (two.grad - one.grad).norm() < 1e-2 * one.grad.norm()

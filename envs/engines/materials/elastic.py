@@ -23,8 +23,8 @@ def kernels(name: str) -> tuple[Any, Any]:
         scale: real,
         mu: real,
         lam: real,
-        mass: wp.array[real],
-        volume: wp.array[real],
+        mass: wp.array2d[real],
+        volume: wp.array2d[real],
         F: wp.array2d[mat33],
         C: wp.array2d[mat33],
         F_new: wp.array2d[mat33],
@@ -36,7 +36,7 @@ def kernels(name: str) -> tuple[Any, Any]:
         identity = wp.identity(n=3, dtype=real)
         tau = mu * (f * wp.transpose(f) - identity) + lam * wp.log(wp.determinant(f)) * identity
         F_new[e, p] = f
-        A[e, first + p] = scale * volume[first + p] * tau + mass[first + p] * c
+        A[e, first + p] = scale * volume[e, first + p] * tau + mass[e, first + p] * c
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint(
@@ -45,8 +45,8 @@ def kernels(name: str) -> tuple[Any, Any]:
         scale: real,
         mu: real,
         lam: real,
-        mass: wp.array[real],
-        volume: wp.array[real],
+        mass: wp.array2d[real],
+        volume: wp.array2d[real],
         F: wp.array2d[mat33],
         C: wp.array2d[mat33],
         adj_F_new: wp.array2d[mat33],
@@ -58,9 +58,9 @@ def kernels(name: str) -> tuple[Any, Any]:
         identity = wp.identity(n=3, dtype=real)
         advance = identity + dt * C[e, first + p]
         f = advance * F[e, p]
-        g = (scale * volume[first + p]) * adj_A[e, first + p]  # the adjoint of tau
+        g = (scale * volume[e, first + p]) * adj_A[e, first + p]  # the adjoint of tau
         adj_f = adj_F_new[e, p] + mu * (g + wp.transpose(g)) * f + lam * wp.trace(g) * wp.transpose(wp.inverse(f))
         adj_F[e, p] = wp.transpose(advance) * adj_f
-        adj_C[e, first + p] = mass[first + p] * adj_A[e, first + p] + dt * adj_f * wp.transpose(F[e, p])
+        adj_C[e, first + p] = mass[e, first + p] * adj_A[e, first + p] + dt * adj_f * wp.transpose(F[e, p])
 
     return update, adjoint

@@ -29,8 +29,8 @@ def kernels(name: str) -> tuple[Any, Any]:
         scale: real,
         bulk: real,
         viscosity: real,
-        mass: wp.array[real],
-        volume: wp.array[real],
+        mass: wp.array2d[real],
+        volume: wp.array2d[real],
         J: wp.array2d[real],
         C: wp.array2d[mat33],
         J_new: wp.array2d[real],
@@ -41,7 +41,7 @@ def kernels(name: str) -> tuple[Any, Any]:
         j = wp.min(wp.exp(dt * wp.trace(c)) * J[e, p], real(TORN))
         tau = bulk * wp.log(j) * wp.identity(n=3, dtype=real) + j * viscosity * shear(c)
         J_new[e, p] = j
-        A[e, first + p] = scale * volume[first + p] * tau + mass[first + p] * c
+        A[e, first + p] = scale * volume[e, first + p] * tau + mass[e, first + p] * c
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint(
@@ -50,8 +50,8 @@ def kernels(name: str) -> tuple[Any, Any]:
         scale: real,
         bulk: real,
         viscosity: real,
-        mass: wp.array[real],
-        volume: wp.array[real],
+        mass: wp.array2d[real],
+        volume: wp.array2d[real],
         J: wp.array2d[real],
         C: wp.array2d[mat33],
         adj_J_new: wp.array2d[real],
@@ -63,12 +63,12 @@ def kernels(name: str) -> tuple[Any, Any]:
         c = C[e, first + p]
         growth = wp.exp(dt * wp.trace(c))
         j = wp.min(growth * J[e, p], real(TORN))
-        g = (scale * volume[first + p]) * adj_A[e, first + p]  # the adjoint of tau
+        g = (scale * volume[e, first + p]) * adj_A[e, first + p]  # the adjoint of tau
         adj_j = adj_J_new[e, p] + bulk * wp.trace(g) / j + viscosity * wp.ddot(g, shear(c))
         if growth * J[e, p] > real(TORN):
             adj_j = real(0.0)
         adj_J[e, p] = growth * adj_j
         dilation = dt * j * adj_j * wp.identity(n=3, dtype=real)
-        adj_C[e, first + p] = mass[first + p] * adj_A[e, first + p] + j * viscosity * shear(g) + dilation
+        adj_C[e, first + p] = mass[e, first + p] * adj_A[e, first + p] + j * viscosity * shear(g) + dilation
 
     return update, adjoint

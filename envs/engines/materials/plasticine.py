@@ -100,8 +100,8 @@ def kernels(name: str) -> tuple[Any, Any]:
         mu: real,
         lam: real,
         kappa: real,
-        mass: wp.array[real],
-        volume: wp.array[real],
+        mass: wp.array2d[real],
+        volume: wp.array2d[real],
         F: wp.array2d[mat33],
         C: wp.array2d[mat33],
         F_new: wp.array2d[mat33],
@@ -115,7 +115,7 @@ def kernels(name: str) -> tuple[Any, Any]:
         J = f[0] * f[1] * f[2]
         t = real(2.0) * mu * wp.cw_mul(f, f - one) + lam * J * (J - real(1.0)) * one
         F_new[e, p] = U * wp.diag(f) * wp.transpose(V)
-        A[e, first + p] = scale * volume[first + p] * (U * wp.diag(t) * wp.transpose(U)) + mass[first + p] * c
+        A[e, first + p] = scale * volume[e, first + p] * (U * wp.diag(t) * wp.transpose(U)) + mass[e, first + p] * c
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint(
@@ -125,8 +125,8 @@ def kernels(name: str) -> tuple[Any, Any]:
         mu: real,
         lam: real,
         kappa: real,
-        mass: wp.array[real],
-        volume: wp.array[real],
+        mass: wp.array2d[real],
+        volume: wp.array2d[real],
         F: wp.array2d[mat33],
         C: wp.array2d[mat33],
         adj_F_new: wp.array2d[mat33],
@@ -153,7 +153,7 @@ def kernels(name: str) -> tuple[Any, Any]:
             a = vec3(a01, a02, a12)
         J = f[0] * f[1] * f[2]
         G = wp.transpose(U) * adj_F_new[n, p] * V
-        T = (scale * volume[first + p]) * (wp.transpose(U) * adj_A[n, first + p] * U)
+        T = (scale * volume[n, first + p]) * (wp.transpose(U) * adj_A[n, first + p] * U)
         g = vec3(G[0, 0], G[1, 1], G[2, 2])  # the adjoint of f
         g += real(2.0) * mu * wp.cw_mul(vec3(T[0, 0], T[1, 1], T[2, 2]), f + f - one)
         g += lam * (J + J - real(1.0)) * wp.trace(T) * vec3(f[1] * f[2], f[0] * f[2], f[0] * f[1])
@@ -167,6 +167,6 @@ def kernels(name: str) -> tuple[Any, Any]:
         P = mat33(g[0], p01, p02, p10, g[1], p12, p20, p21, g[2])
         adj_trial = U * P * wp.transpose(V)
         adj_F[n, p] = wp.transpose(advance) * adj_trial
-        adj_C[n, first + p] = mass[first + p] * adj_A[n, first + p] + dt * adj_trial * wp.transpose(F[n, p])
+        adj_C[n, first + p] = mass[n, first + p] * adj_A[n, first + p] + dt * adj_trial * wp.transpose(F[n, p])
 
     return update, adjoint

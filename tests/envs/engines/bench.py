@@ -65,7 +65,7 @@ class MaterialBench:
 
     def _launch(self, which, dt, given, wanted):
         count = len(given[0])
-        each = [wp.array(np.full(count, value), dtype=self.types.real) for value in (MASS, VOLUME)]
+        each = [wp.array(np.full((1, count), value), dtype=self.types.real) for value in (MASS, VOLUME)]
         results = [self._array(torch.zeros_like(like)) for like in wanted]
         inputs = [0, dt, SCALE, *self.material.constants(), *each, *map(self._array, given), *results]
         wp.launch(self.kernels[which], (1, count), inputs, record_tape=False)
