@@ -21,6 +21,9 @@ app = typer.Typer(
 
 Fidelity = Annotated[str | None, typer.Option(help="How accurately to simulate: draft, standard or reference.")]
 Device = Annotated[str, typer.Option(help="auto, cpu or cuda; auto takes CUDA where it is.")]
+Deterministic = Annotated[
+    bool, typer.Option("--deterministic", help="Add up in the same order every time on a GPU, some ten times slower.")
+]
 Engine = Annotated[str, typer.Option(help="warp, or taichi where a scene has it: the reference, to hold Warp against.")]
 Set = Annotated[list[str] | None, typer.Option("--set", help="A scene option, name=value; may be repeated.")]
 Out = Annotated[
@@ -28,6 +31,11 @@ Out = Annotated[
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print the summary as one JSON object on standard output.")]
 Force = Annotated[bool, typer.Option("--force", help="Begin anew where a slice exists already.")]
+Budget = Annotated[int, typer.Option(min=1, help="Episodes to evaluate, not one more.")]
+OutOfRun = Annotated[
+    str | None, typer.Option("--out", help="Folder for the results; by default one under out/ named after the run.")
+]
+ForceRun = Annotated[bool, typer.Option("--force", help="Begin anew where a run exists already.")]
 Extent = Annotated[
     str | None,
     typer.Option(help="What to cover: a fraction of the box around the point, or LOW:HIGH; the whole box by default."),
@@ -69,6 +77,7 @@ def slice_(
     fidelity: Fidelity = None,
     device: Device = "auto",
     engine: Engine = "warp",
+    deterministic: Deterministic = False,
     through: Through = "center",
     extent: Extent = None,
     set_: Set = None,
@@ -90,6 +99,7 @@ def slice_(
         fidelity=fidelity,
         device=device,
         engine=engine,
+        deterministic=deterministic,
         through=through,
         extent=extent,
         settings=set_ or [],
@@ -98,6 +108,155 @@ def slice_(
         as_json=json_,
         force=force,
     )
+
+
+@app.command()
+def methods(name: Annotated[str | None, typer.Argument(help="One method, to see all of it.")] = None) -> None:
+    """List the optimisation methods: what each does, its options and their defaults."""
+    from .search_report import describe_method, list_methods
+
+    describe_method(name) if name else list_methods()
+
+
+@app.command()
+def optimize(
+    env: Annotated[str, typer.Argument(help="The environment; `landscape envs` lists them.")],
+    method: Annotated[str, typer.Option(help="The method; `landscape methods` lists them.")],
+    budget: Budget = 1000,
+    seed: Annotated[int, typer.Option(min=0, help="What the method's random numbers begin with.")] = 0,
+    fidelity: Fidelity = None,
+    device: Device = "auto",
+    engine: Engine = "warp",
+    deterministic: Deterministic = False,
+    set_: Set = None,
+    option: Annotated[list[str] | None, typer.Option(help="A method's option, name=value; may be repeated.")] = None,
+    out: OutOfRun = None,
+    json_: Json = False,
+    force: ForceRun = False,
+) -> None:
+    """Search an environment's parameters for the least loss, and keep every point that was evaluated.
+
+    Stop it at any moment: the same command goes on where it stopped. With a larger budget it goes on from the end, to
+    the run that had this budget from the beginning.
+    """
+    from .search_report import optimize as report
+
+    report(
+        env,
+        method,
+        budget=budget,
+        seed=seed,
+        fidelity=fidelity,
+        device=device,
+        engine=engine,
+        deterministic=deterministic,
+        settings=set_ or [],
+        method_settings=option or [],
+        out=out,
+        as_json=json_,
+        force=force,
+    )
+
+
+@app.command()
+def race(
+    env: Annotated[str, typer.Argument(help="The environment; `landscape envs` lists them.")],
+    methods: Annotated[
+        list[str] | None,
+        typer.Option(help="Methods, a,b or repeated; by default all that can run here (`landscape methods`)."),
+    ] = None,
+    budget: Budget = 1000,
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each method, with seeds 0, 1, ...")] = 10,
+    workers: Annotated[
+        int, typer.Option(min=1, help="Runs at a time, each in a thread; losses do not depend on it, seconds do.")
+    ] = 1,
+    fidelity: Fidelity = None,
+    device: Device = "auto",
+    engine: Engine = "warp",
+    deterministic: Deterministic = False,
+    set_: Set = None,
+    option: Annotated[
+        list[str] | None, typer.Option(help="A method's option, METHOD.NAME=VALUE; may be repeated.")
+    ] = None,
+    out: Annotated[
+        str | None, typer.Option(help="Folder for the results; by default one under out/ named after the race.")
+    ] = None,
+    json_: Json = False,
+    report: Annotated[bool, typer.Option("--report", help="Say which of the paper's orderings hold.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Begin anew where these runs exist already.")] = False,
+) -> None:
+    """Let methods compete on the same budget, with several seeds each: best loss, targets reached, ranks.
+
+    Stop it at any moment: the same command goes on where it stopped. More methods, seeds or episodes go on from there
+    too; runs that are finished are not repeated.
+    """
+    from .race_report import race as report_race
+
+    report_race(
+        env,
+        methods or [],
+        budget=budget,
+        seeds=seeds,
+        workers=workers,
+        fidelity=fidelity,
+        device=device,
+        engine=engine,
+        deterministic=deterministic,
+        settings=set_ or [],
+        method_settings=option or [],
+        out=out,
+        as_json=json_,
+        report=report,
+        force=force,
+    )
+
+
+@app.command()
+def overlay(
+    slice_: Annotated[str, typer.Argument(metavar="SLICE", help="A slice's folder.")],
+    runs: Annotated[list[str], typer.Argument(metavar="RUN", help="Folders of runs; a race's for all of it.")],
+    out: Annotated[
+        str | None, typer.Option(help="Folder for the results; by default one under out/ named after the overlay.")
+    ] = None,
+    through: Annotated[
+        str | None, typer.Option(help="Cut anew through the best point of all runs (best) or of one run's folder.")
+    ] = None,
+    plane: Annotated[str | None, typer.Option(help="Cut anew along the runs' two principal directions: pca.")] = None,
+    resolution: Annotated[
+        int | None, typer.Option(min=2, help="Points along each axis of a new slice; by default as in SLICE.")
+    ] = None,
+    device: Device = "auto",
+    spawn: Annotated[bool, typer.Option("--spawn", help="Open it in rerun's viewer.")] = False,
+    serve: Annotated[bool, typer.Option("--serve", help="Serve it to a browser here, until Ctrl-C.")] = False,
+) -> None:
+    """Draw runs over a slice: where they went, how far off its plane, and what it does not show of what they found.
+
+    Writes overlay.png, and overlay.rrd to walk around in and to play back.
+    """
+    from .overlay_report import overlay as report
+
+    report(
+        slice_,
+        runs,
+        out=out,
+        through=through,
+        plane=plane,
+        resolution=resolution,
+        device=device,
+        spawn=spawn,
+        serve=serve,
+    )
+
+
+@app.command()
+def view(
+    file: Annotated[str, typer.Argument(help="A picture, a film, a page, a recording (.rrd), or a results folder.")],
+    serve: Annotated[bool, typer.Option("--serve", help="Serve a recording to a browser, until Ctrl-C.")] = False,
+) -> None:
+    """Open what the other verbs leave, with the viewer it is made for."""
+    from .overlay_report import view as show
+
+    show(file, serve=serve)
 
 
 @app.command()
@@ -125,6 +284,7 @@ def bounce(
         fidelity=fidelity,
         device=device,
         engine="warp",
+        deterministic=False,
         through=through,
         extent=extent,
         settings=set_ or [],
@@ -141,6 +301,7 @@ def bench(
     fidelity: Fidelity = None,
     device: Device = "auto",
     engine: Engine = "warp",
+    deterministic: Deterministic = False,
     against: Annotated[str | None, typer.Option(help="Another engine, to run in turn with the first.")] = None,
     batch: Annotated[
         list[int] | None,
@@ -161,6 +322,7 @@ def bench(
         fidelity=fidelity,
         device=device,
         engine=engine,
+        deterministic=deterministic,
         against=against,
         batches=batch or [],
         seconds=seconds,

@@ -4,6 +4,8 @@
 
 Prints the fitted exponents, 1 being linear, and draws what they were fitted to. Particles and grid points are varied
 alone, and timed by one launch of every kernel that runs over them, forward and backward; substeps by whole episodes.
+Grid points begin with those of standard: nodes at the ladle's surface cost more than others, and grow with the power
+2/3, which on smaller grids shows.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ UNIT = {"substeps": "episode"}
 SERIES: dict[str, list[Fidelity]] = {
     "particles": [Fidelity("", SPAN / 8, resolution=16, sampling=1.25 * 2 ** (k / 3)) for k in range(5)],
     "substeps": [Fidelity("", SPAN / n, resolution=12, sampling=1.4) for n in (4, 8, 16, 32)],
-    "grid points": [Fidelity("", SPAN / 20, resolution=n, sampling=16 / n) for n in (25, 32, 40, 50, 63)],
+    "grid points": [Fidelity("", SPAN / 20, resolution=n, sampling=16 / n) for n in (32, 40, 50, 63)],
 }
 
 

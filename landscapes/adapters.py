@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .objective import Evaluation, Objective
+from .objective import Evaluation, Objective, Status
 from .space import ParameterSpace
 
 TorchFunction = Callable[[Tensor], Tensor]
@@ -38,6 +39,11 @@ def from_numpy(
     if differences is not None and not differences > 0:
         raise ValueError(f"from_numpy takes differences as a positive fraction of the bounds; got {differences}")
     return _NumpyObjective(fn, space, name or _name(fn), differences)
+
+
+def within_box(objective: Objective) -> Objective:
+    """Evaluate an objective inside its box only; points beyond it have left the domain (status ESCAPED)."""
+    return _BoxedObjective(objective)
 
 
 @dataclass(frozen=True)
@@ -105,6 +111,32 @@ class _NumpyObjective:
             shift[axis] = step[axis]
             slopes.append((self._call(x + shift)[0] - self._call(x - shift)[0]) / (2 * step[axis]))
         return torch.stack(slopes, dim=1)
+
+
+class _BoxedObjective:
+    """What the objective knows of itself beside, such as its preferred batch, is passed on."""
+
+    ROUNDING = 1e-9  # of the box; points that far beyond it are moved back
+
+    def __init__(self, objective: Objective) -> None:
+        self.objective, self.space = objective, objective.space
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "objective":  # not made yet, while it is copied
+            raise AttributeError(name)
+        return getattr(self.objective, name)
+
+    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
+        unit = self.space.to_unit(x)
+        inside = ((unit >= -self.ROUNDING) & (unit <= 1 + self.ROUNDING)).all(dim=1)
+        found = self.objective.evaluate(torch.clamp(x[inside], self.space.lower, self.space.upper), grad=grad)
+        loss = x.new_full((len(x),), torch.nan)
+        slope = torch.full_like(x, torch.nan) if grad else None
+        status = torch.full((len(x),), Status.ESCAPED, dtype=torch.int8)
+        loss[inside], status[inside] = found.loss.to(loss), found.status.to(status)
+        if slope is not None and found.grad is not None:
+            slope[inside] = found.grad.to(slope)
+        return Evaluation(loss, slope, status)
 
 
 def _name(fn: Callable[..., object]) -> str:

@@ -1,12 +1,17 @@
-"""Files that appear whole or not at all."""
+"""Files and folders that appear whole or not at all."""
 
 from __future__ import annotations
 
+import contextlib
 import os
+import shutil
+import time
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+STALE = 60.0  # seconds after which a hidden folder of a creation that was killed is cleared away
 
 
 @contextmanager
@@ -19,3 +24,34 @@ def replacing(path: Path) -> Iterator[Path]:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def placing(path: Path, *, overwrite: bool) -> Iterator[Path]:
+    """Give a folder's path of its own to build at, and rename it to `path` at the end, unless that is taken by then."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _clear_stale(path)
+    new, old = _hidden(path), _hidden(path)
+    try:
+        yield new
+        if overwrite and path.exists():
+            os.rename(path, old)
+        try:
+            os.rename(new, path)
+        except OSError as error:
+            taken = FileExistsError(f"{path} was made by another process meanwhile; run the command again")
+            raise (taken if path.exists() else error) from None
+    finally:
+        for left in (new, old):
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def _hidden(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex}.making")
+
+
+def _clear_stale(path: Path) -> None:
+    for folder in path.parent.glob(f".{path.name}.*.making"):
+        with contextlib.suppress(OSError):
+            if time.time() - folder.stat().st_mtime > STALE:
+                shutil.rmtree(folder, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""What makes two slices the same, and the refusal to mix two that differ."""
+"""What makes two slices, or two runs, the same, and the refusal to mix two that differ."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SHOWN = 6
 
 
 class StoreError(ValueError):
-    """Say that a path does not hold the slice store that was asked for."""
+    """Say that a path does not hold the store that was asked for."""
 
 
 class StoreExistsError(StoreError):
@@ -31,19 +31,21 @@ def full_identity(identity: Mapping[str, Any], plane: Plane, space: ParameterSpa
     own = {"plane": plane.record(), "parameters": space.names, "gradients": grad, "gradscape": __version__}
     if clash := own.keys() & identity.keys():
         raise ValueError(f"a slice's identity gets {', '.join(sorted(clash))} from the slice; leave them out")
-    return plain_json({**identity, **own}, "identity")
+    return plain_json({**identity, **own}, "a slice's identity")
 
 
-def plain_json(settings: Mapping[str, Any], kind: str) -> dict[str, Any]:
+def plain_json(settings: Mapping[str, Any], what: str) -> dict[str, Any]:
     """Return settings as they come back from JSON: tuples are lists, keys are strings."""
     try:
         plain: dict[str, Any] = json.loads(json.dumps(settings, allow_nan=False))
     except (TypeError, ValueError) as error:
-        raise ValueError(f"a slice's {kind} must be plain JSON (numbers, strings, lists, dicts): {error}") from None
+        raise ValueError(f"{what} must be plain JSON (numbers, strings, lists, dicts): {error}") from None
     return plain
 
 
-def check_identity(path: Path | None, *, wanted: Mapping[str, Any], found: Mapping[str, Any]) -> None:
+def check_identity(
+    path: Path | None, *, wanted: Mapping[str, Any], found: Mapping[str, Any], what: str = "slice"
+) -> None:
     """Raise `StoreMismatchError`, naming each setting that differs, unless the two are equal."""
     if wanted == found:
         return
@@ -53,7 +55,7 @@ def check_identity(path: Path | None, *, wanted: Mapping[str, Any], found: Mappi
     if len(names) > SHOWN:
         said.append(f"and {len(names) - SHOWN} more")
     raise StoreMismatchError(
-        f"{path or 'the store'} holds a slice made by other settings ({'; '.join(said)}); "
+        f"{path or 'the store'} holds a {what} made by other settings ({'; '.join(said)}); "
         "write elsewhere with --out, or replace it with --force"
     )
 

@@ -74,3 +74,36 @@ class Objective(Protocol):
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
         """Return losses, and gradients if asked, at points `x` in the parameters' own units."""
+
+
+def evaluated(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+    """Evaluate an objective, hold the result against the protocol, and blank every failure."""
+    raw = objective.evaluate(x, grad=grad)
+    who, count = name_of(objective), len(x)
+    wanted: dict[str, tuple[Tensor, tuple[int, ...]]] = {"loss": (raw.loss, (count,)), "status": (raw.status, (count,))}
+    if grad:
+        wanted["grad"] = (_present(raw.grad, who), tuple(x.shape))
+    for field, (tensor, shape) in wanted.items():
+        if tuple(tensor.shape) != shape:
+            raise ValueError(
+                f"{who} must return {field} of shape {shape} for x of shape {tuple(x.shape)}; got {tuple(tensor.shape)}"
+            )
+    if bool((raw.status == Status.MISSING).any()):
+        raise ValueError(f"{who} must say how every point ended; got status MISSING")
+    loss, status = (tensor.detach().cpu() for tensor in (raw.loss, raw.status))
+    gradient = wanted["grad"][0].detach().cpu().double() if grad else None
+    return Evaluation.judged(loss.double(), gradient, status)
+
+
+def name_of(objective: Objective) -> str:
+    """Return what an objective is called."""
+    return str(getattr(objective, "name", type(objective).__name__))
+
+
+def _present(grad: Tensor | None, who: str) -> Tensor:
+    if grad is None:
+        raise ValueError(
+            f"{who} was asked for gradients and returned none; sample with grad=False (--no-gradients), "
+            "or search with a method that needs none"
+        )
+    return grad

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -171,6 +171,15 @@ class Plane:
     def slope(self, grad: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch rank"]:
         """Return the derivatives along the plane's axes [loss unit / plane unit] (chain rule, so any basis)."""
         return (grad[..., None, :] * self.basis).sum(dim=-1)
+
+    def moved(self, x: Float[Tensor, " dim"]) -> Plane:
+        """Return the parallel plane through `x`, with the same coordinates and the same window."""
+        return replace(self, origin=x - self.project(x) @ self.basis)
+
+    def window(self) -> tuple[Float[Tensor, " rank"], Float[Tensor, " rank"]]:
+        """Return what a picture of the samples covers: their box and half a sample's width around it."""
+        half = (self.upper - self.lower) / (torch.tensor(self.resolution, dtype=torch.float64) - 1) / 2
+        return self.lower - half, self.upper + half
 
     def axes(self) -> tuple[Float[Tensor, " points"], ...]:
         """Return the sampled coordinates of each axis, ascending, both ends included."""

@@ -8,11 +8,9 @@ from dataclasses import dataclass
 
 import torch
 import xarray as xr
-from jaxtyping import Float
-from torch import Tensor
 
 from .identity import check_identity
-from .objective import Evaluation, Objective, Status
+from .objective import Evaluation, Objective, Status, evaluated, name_of
 from .plane import Plane
 from .store import SliceStore
 from .tiling import Tile
@@ -52,7 +50,7 @@ def sample(
     objective whose rows do not depend on their batch.
     """
     if store is None:
-        store = SliceStore.in_memory(plane, objective.space, identity={"objective": _name(objective)}, grad=grad)
+        store = SliceStore.in_memory(plane, objective.space, identity={"objective": name_of(objective)}, grad=grad)
     _check_store(store, objective, plane, grad=grad)
     batch = getattr(objective, "preferred_batch", 1) if batch is None else batch
     status = store.status()
@@ -105,38 +103,9 @@ def _evaluate(
     if not tiles:
         return
     parts = [store.points(tile) for tile in tiles]
-    evaluation = _checked(objective, torch.cat(parts), grad=grad)
+    evaluation = evaluated(objective, torch.cat(parts), grad=grad)
     start = 0
     for tile, part in zip(tiles, parts, strict=True):
         rows = slice(start, start := start + len(part))
         gradient = None if evaluation.grad is None else evaluation.grad[rows]
         yield tile, Evaluation(evaluation.loss[rows], gradient, evaluation.status[rows])
-
-
-def _checked(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
-    """Evaluate, hold the result against the protocol, and blank every failure."""
-    raw = objective.evaluate(x, grad=grad)
-    who, count = _name(objective), len(x)
-    wanted: dict[str, tuple[Tensor, tuple[int, ...]]] = {"loss": (raw.loss, (count,)), "status": (raw.status, (count,))}
-    if grad:
-        wanted["grad"] = (_present(raw.grad, who), tuple(x.shape))
-    for field, (tensor, shape) in wanted.items():
-        if tuple(tensor.shape) != shape:
-            raise ValueError(
-                f"{who} must return {field} of shape {shape} for x of shape {tuple(x.shape)}; got {tuple(tensor.shape)}"
-            )
-    if bool((raw.status == Status.MISSING).any()):
-        raise ValueError(f"{who} must say how every point ended; got status MISSING")
-    loss, status = (tensor.detach().cpu() for tensor in (raw.loss, raw.status))
-    gradient = wanted["grad"][0].detach().cpu().double() if grad else None
-    return Evaluation.judged(loss.double(), gradient, status)
-
-
-def _name(objective: Objective) -> str:
-    return str(getattr(objective, "name", type(objective).__name__))
-
-
-def _present(grad: Tensor | None, who: str) -> Tensor:
-    if grad is None:
-        raise ValueError(f"{who} was asked for gradients and returned none; sample with grad=False (--no-gradients)")
-    return grad

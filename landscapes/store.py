@@ -12,11 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
-import shutil
-import time
-import uuid
-import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -28,10 +23,11 @@ import zarr
 from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
-from zarr.codecs import ZstdCodec
 from zarr.storage import MemoryStore
 
+from .files import placing
 from .identity import StoreError, StoreExistsError, check_identity, full_identity, plain_json
+from .layout import consolidate, create_array, flags
 from .objective import Evaluation, Status
 from .plane import Plane
 from .space import ParameterSpace
@@ -39,7 +35,6 @@ from .tiling import Tile, coarse_to_fine, tile_side
 
 FORMAT = 1
 AXES = ("u", "v")
-STALE = 60.0  # seconds after which a hidden folder of a creation that was killed is cleared away
 
 
 class SliceStore:
@@ -89,15 +84,13 @@ class SliceStore:
             raise StoreExistsError(f"{path} exists already; write elsewhere with --out, or replace it with --force")
         if path.exists() and not is_slice(path):
             raise StoreError(f"{path} is no slice store, so it is not replaced; move it away or write elsewhere")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _clear_stale(path)
-        new = _hidden(path)
-        group = zarr.create_group(new, zarr_format=3)
-        _lay_out(group, plane, space, whole, plain_json(provenance or {}, "provenance"), grad=grad)
-        with warnings.catch_warnings():  # readable by plain xarray.open_zarr; the layout never changes again
-            warnings.simplefilter("ignore")
-            zarr.consolidate_metadata(str(new))
-        _put_in_place(new, path, overwrite=overwrite)
+        try:
+            with placing(path, overwrite=overwrite) as new:
+                group = zarr.create_group(new, zarr_format=3)
+                _lay_out(group, plane, space, whole, plain_json(provenance or {}, "a slice's provenance"), grad=grad)
+                consolidate(new)
+        except FileExistsError as error:
+            raise StoreExistsError(str(error)) from None
         return cls.open(path)
 
     @classmethod
@@ -285,74 +278,23 @@ def _lay_out(
     side = tuple(tile_side(points) for points in shape)
     group.attrs.update({"gradscape_slice": FORMAT, "identity": identity, "provenance": provenance})
     loss_unit = str(provenance.get("loss_unit", ""))
-    _array(group, "loss", shape, side, names, "float64", long_name="loss", units=loss_unit)
+    create_array(group, "loss", shape, side, names, "float64", long_name="loss", units=loss_unit)
     if grad:
         deep = (*shape, space.dim), (*side, space.dim), (*names, "dim")
-        _array(group, "grad", *deep, "float64", long_name="gradient of the loss by each parameter in its own unit")
-    _array(group, "status", shape, side, names, "int8", long_name="how the evaluation ended", **_flags())
+        create_array(
+            group, "grad", *deep, "float64", long_name="gradient of the loss by each parameter in its own unit"
+        )
+    create_array(group, "status", shape, side, names, "int8", long_name="how the evaluation ended", **flags(Status))
     for name, axis in coordinates.items():
         number = AXES.index(name)
         label = {"label": plane.labels[number], "long_name": plane.names[number], "units": plane.units[number]}
-        _array(group, name, axis.shape, axis.shape, (name,), "float64", **label)[:] = axis
+        create_array(group, name, axis.shape, axis.shape, (name,), "float64", **label)[:] = axis
     parameters = np.array(space.names, dtype=object)
     about = {"long_name": "parameter", "units": list(space.units)}
-    _array(group, "dim", (space.dim,), (space.dim,), ("dim",), "string", **about)[:] = parameters
+    create_array(group, "dim", (space.dim,), (space.dim,), ("dim",), "string", **about)[:] = parameters
 
 
 def _coordinates(plane: Plane) -> Iterator[tuple[str, NDArray[np.float64]]]:
     for name, axis in zip(AXES, plane.axes(), strict=False):
         values = axis.numpy()
         yield name, values[coarse_to_fine(len(values), tile_side(len(values)))]
-
-
-def _flags() -> dict[str, Any]:
-    return {"flag_values": [int(s) for s in Status], "flag_meanings": " ".join(s.name.lower() for s in Status)}
-
-
-def _array(
-    group: zarr.Group,
-    name: str,
-    shape: tuple[int, ...],
-    chunks: tuple[int, ...],
-    dims: tuple[str, ...],
-    dtype: str,
-    **attributes: Any,
-) -> zarr.Array[Any]:
-    fill = {"float64": float("nan"), "int8": int(Status.MISSING), "string": ""}[dtype]
-    return group.create_array(
-        name,
-        shape=shape,
-        chunks=chunks,
-        dtype=dtype,
-        fill_value=fill,
-        dimension_names=dims,
-        compressors=[ZstdCodec(level=3, checksum=True)],  # a torn or altered chunk does not decode
-        config={"write_empty_chunks": True},  # a tile of NaN is a result too
-        attributes=attributes,
-    )
-
-
-def _hidden(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{uuid.uuid4().hex}.making")
-
-
-def _put_in_place(new: Path, path: Path, *, overwrite: bool) -> None:
-    """Rename a finished store to where it belongs, so that it is there whole or not at all."""
-    old = _hidden(path)
-    if overwrite and path.exists():
-        os.rename(path, old)
-    try:
-        os.rename(new, path)
-    except OSError:
-        shutil.rmtree(new, ignore_errors=True)
-        if is_slice(path):
-            raise StoreExistsError(f"{path} was made by another process meanwhile; run the command again") from None
-        raise
-    shutil.rmtree(old, ignore_errors=True)
-
-
-def _clear_stale(path: Path) -> None:
-    for folder in path.parent.glob(f".{path.name}.*.making"):
-        with contextlib.suppress(OSError):
-            if time.time() - folder.stat().st_mtime > STALE:
-                shutil.rmtree(folder, ignore_errors=True)

@@ -38,14 +38,15 @@ def landscape_figure(dataset: xr.Dataset) -> Figure:
     entries = _draw_loss(axes[0], dataset)
     entries += _draw_arrows(axes[1], dataset, plane) if panels == 2 else []
     for ax in axes:
-        _frame(ax, dataset, plane)
+        frame(ax, dataset, plane)
     axes[-1].set_xlabel(plane.labels[0], size=style.LABEL, parse_math=False)
     page.head(figure, axes[0], dataset)
     page.key(figure, [*entries, *page.failure_key(dataset)])
     return figure
 
 
-def _frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
+def frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
+    """Give a panel over a slice its limits, its ticks and its failures."""
     style.dress(ax)
     ax.set_box_aspect(1)
     ax.set_xlim(*_limits(plane, 0))
@@ -69,14 +70,9 @@ def _cells(u: Grid, v: Grid, where: NDArray[np.bool_]) -> Path:
 
 
 def _draw_loss(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
-    plane, loss = plane_of(dataset), dataset["loss"].to_numpy()
+    loss = dataset["loss"].to_numpy()
+    loss_map(ax, dataset, style.Scale.of_loss(loss))
     u, v = dataset["u"].to_numpy(), dataset["v"].to_numpy()
-    scale = style.Scale.of_loss(loss)
-    edges = _edges(u, plane, 0), _edges(v, plane, 1)
-    mesh = ax.pcolormesh(*edges, np.ma.masked_invalid(loss), cmap=style.LOSS_MAP, norm=scale.norm, rasterized=True)
-    unit = dataset["loss"].attrs.get("units", "")
-    bar = ax.figure.colorbar(mesh, ax=ax, extend=scale.extend, fraction=0.05, pad=0.02)
-    style.dress_bar(bar, f"loss [{unit}]" if unit else "loss")
     if not np.isfinite(loss).any():
         return []
     if np.nanmin(loss) == np.nanmax(loss):
@@ -86,8 +82,18 @@ def _draw_loss(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
     return [lowest]
 
 
+def loss_map(ax: Axes, dataset: xr.Dataset, scale: style.Scale) -> None:
+    """Draw every sample's loss as the colour of its cell, with the colour bar."""
+    plane, loss = plane_of(dataset), dataset["loss"].to_numpy()
+    edges = _edges(dataset["u"].to_numpy(), plane, 0), _edges(dataset["v"].to_numpy(), plane, 1)
+    mesh = ax.pcolormesh(*edges, np.ma.masked_invalid(loss), cmap=style.LOSS_MAP, norm=scale.norm, rasterized=True)
+    unit = dataset["loss"].attrs.get("units", "")
+    bar = ax.figure.colorbar(mesh, ax=ax, extend=scale.extend, fraction=0.05, pad=0.02)
+    style.dress_bar(bar, f"loss [{unit}]" if unit else "loss")
+
+
 def _draw_arrows(ax: Axes, dataset: xr.Dataset, plane: Plane) -> list[Artist]:
-    rows, columns = (_thinned(dataset.sizes[name]) for name in ("v", "u"))
+    rows, columns = (thinned(dataset.sizes[name]) for name in ("v", "u"))
     slope = plane.slope(torch.from_numpy(dataset["grad"].to_numpy())).numpy()
     size, label = magnitude(slope, plane, dataset["loss"].attrs.get("units", ""))
     flat = size == 0
@@ -139,10 +145,8 @@ def magnitude(slope: Grid, plane: Plane, loss_unit: str) -> tuple[Grid, str]:
 
 
 def _limits(plane: Plane, axis: int) -> tuple[float, float]:
-    """Return the box with half a sample's width around it."""
-    low, high = float(plane.lower[axis]), float(plane.upper[axis])
-    half = (high - low) / (plane.resolution[axis] - 1) / 2
-    return low - half, high + half
+    low, high = plane.window()
+    return float(low[axis]), float(high[axis])
 
 
 def _sides(plane: Plane) -> Grid:
@@ -161,6 +165,7 @@ def _edges(centers: Grid, plane: Plane, axis: int) -> Grid:
     return np.concatenate([[low], (centers[1:] + centers[:-1]) / 2, [high]])
 
 
-def _thinned(points: int) -> NDArray[np.intp]:
+def thinned(points: int) -> NDArray[np.intp]:
+    """Return which of so many points along an axis keep their arrow."""
     step = -(-points // style.ARROWS)
     return cast("NDArray[np.intp]", np.arange((points - 1) % step // 2, points, step))

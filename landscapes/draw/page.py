@@ -26,11 +26,14 @@ def blank_page(width: float, height: float) -> Figure:
     return figure
 
 
-def head(figure: Figure, ax: Axes, dataset: xr.Dataset) -> None:
-    """Write the title over the figure and where it comes from, small, over its uppermost panel."""
-    figure.suptitle(_wrapped(title(dataset), 56), size=style.TITLE, color=style.INK, parse_math=False)
+def head(figure: Figure, ax: Axes, dataset: xr.Dataset, name: str | None = None, *, width: int = 92) -> None:
+    """Write the title, a slice's unless named, over the figure and its provenance, small, over the uppermost panel.
+
+    `width` is how many characters of it fit over the panel.
+    """
+    figure.suptitle(_wrapped(name or title(dataset), 56), size=style.TITLE, color=style.INK, parse_math=False)
     if line := provenance(dataset):
-        ax.set_title(_wrapped(line, 92), size=style.SMALL, color=style.QUIET, parse_math=False)
+        ax.set_title(_wrapped(line, width), size=style.SMALL, color=style.QUIET, parse_math=False)
 
 
 def title(dataset: xr.Dataset) -> str:
@@ -63,13 +66,13 @@ def failure_key(dataset: xr.Dataset) -> list[Patch]:
     ]
 
 
-def key(figure: Figure, entries: Sequence[Artist]) -> None:
+def key(figure: Figure, entries: Sequence[Artist], *, columns: int = 2) -> None:
     """Put a legend under the panels."""
     if entries:
         legend = figure.legend(
             handles=list(entries),
             loc="outside lower center",
-            ncols=2,
+            ncols=columns,
             fontsize=style.TICK,
             frameon=False,
             handlelength=1.8,

@@ -6,11 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.colorbar import Colorbar
 from matplotlib.colors import Colormap, ListedColormap, LogNorm, Normalize
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
 from ..objective import Status
@@ -46,6 +48,36 @@ LOWEST: dict[str, Any] = {
 }  # fmt: skip
 FLAT: dict[str, Any] = {"marker": "o", "markersize": 2.6, "color": QUIET, "linestyle": "none"}
 
+# Okabe & Ito 2008, told apart without colour by line style and marker
+METHODS: dict[str, dict[str, Any]] = {
+    "random": {"color": "#7f7f7f", "linestyle": (0, (1, 1.4)), "marker": "X"},
+    "cma-es": {"color": "#e69f00", "linestyle": (0, (5, 1.5)), "marker": "s"},
+    "descents": {"color": "#56b4e9", "linestyle": (0, (5, 1.5, 1, 1.5)), "marker": "v"},
+    "bo": {"color": "#009e73", "linestyle": (0, (2.5, 1.2)), "marker": "^"},
+    "bo-descents": {"color": "#0072b2", "linestyle": "solid", "marker": "D"},
+    "bo-leap": {"color": "#d55e00", "linestyle": "solid", "marker": "o"},
+    "ppo": {"color": "#cc79a7", "linestyle": (0, (8, 1.5, 1, 1.5, 1, 1.5)), "marker": "P"},
+    "sac": {"color": "#5b2a86", "linestyle": (0, (8, 2.5)), "marker": "*", "markersize": 9.0},
+}
+OTHER_METHOD: dict[str, Any] = {"color": INK, "linestyle": "solid", "marker": "h"}
+METHOD_LINE: dict[str, Any] = {"linewidth": 1.4, "markersize": 6.0, "markeredgewidth": 0.7, "markeredgecolor": "white"}
+KINDS: dict[str, dict[str, Any]] = {  # what a run evaluated a point for
+    "random": {"color": "#7f7f7f", "marker": "P"},
+    "population": {"color": "#31688e", "marker": "o"},
+    "descent": {"color": "#b5367a", "marker": "v"},
+    "acquisition": {"color": "#009e73", "marker": "D"},
+    "policy": {"color": "#5b2a86", "marker": "s"},
+}
+METHOD_BAND: dict[str, Any] = {"alpha": 0.12, "linewidth": 0.0}
+OVERLAID: dict[str, Any] = {"linewidths": 0.6, "zorder": 3, "rasterized": True}  # the points of a run over a map
+HALO: dict[str, Any] = OVERLAID | {"linewidths": 1.5, "zorder": 2.9, "facecolors": "none", "edgecolors": "white"}
+NEAR, FAR = (4.0, 34.0), 0.2  # area of a point on the plane [pt^2], fewest of many; share of it left at the farthest
+TRAIL: dict[str, Any] = {"linewidths": 1.1, "zorder": 2.6, "capstyle": "round"}  # a descent
+FAINTEST = 0.25  # opacity of a descent at the farthest
+BEST: dict[str, Any] = {"marker": "*", "s": 190.0, "linewidths": 1.1, "zorder": 5}
+BROKEN: dict[str, Any] = {"marker": "x", "s": 18.0, "linewidths": 0.9, "color": INK, "zorder": 3.5}  # a failed episode
+BORDER: dict[str, Any] = {"s": 20.0, "facecolors": "none", "linewidths": 0.8, "zorder": 3.2, "clip_on": False}
+
 
 @dataclass(frozen=True, eq=False)
 class Scale:
@@ -67,6 +99,11 @@ class Scale:
         """Span the finite logarithms of magnitudes."""
         low, high, extend = _span(values)
         return cls(Normalize(low, high), extend)
+
+    @property
+    def logarithmic(self) -> bool:
+        """Whether equal ratios, not differences, are equally far apart."""
+        return isinstance(self.norm, LogNorm)
 
 
 def _span(values: NDArray[np.float64]) -> tuple[float, float, str]:
@@ -92,6 +129,16 @@ def dress(ax: Axes) -> None:
     ax.yaxis.set_major_locator(MaxNLocator(5))
 
 
+def log_axis(axis: Axis) -> None:
+    """Make an axis of what is drawn already logarithmic, with plain numbers at 1, 2 and 5 where decades are few."""
+    scale = axis.axes.set_xscale if axis is axis.axes.xaxis else axis.axes.set_yscale
+    scale("log")
+    low, high = sorted(axis.get_view_interval())
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 2e3 * low else (1,), numticks=9))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
+    axis.set_minor_formatter(NullFormatter())
+
+
 def dress_bar(bar: Colorbar, label: str) -> None:
     """Give a colour bar its label and ticks."""
     bar.set_label(label, size=LABEL, color=INK, parse_math=False)
@@ -102,6 +149,20 @@ def dress_bar(bar: Colorbar, label: str) -> None:
 def stroke(points: int) -> dict[str, Any]:
     """Return how a line of so many points is drawn: with its points where they can be told apart."""
     return {"linewidth": 1.1, "marker": "o" if points <= 100 else "", "markersize": 2.4}
+
+
+def method(run: xr.Dataset) -> dict[str, Any]:
+    """Return the look of a run's method."""
+    return METHODS.get(str(run.attrs["method"]), OTHER_METHOD)
+
+
+def point_areas(distance: NDArray[np.float64], reach: float, points: int) -> NDArray[np.float64]:
+    """Return how large so many points are drawn [pt^2]: smaller the farther off the plane, `reach` being farthest."""
+    least, most = NEAR
+    area = max(least, min(most, most * (150 / max(points, 1)) ** 0.35))
+    share: NDArray[np.float64] = 1 - (1 - FAR) * distance / reach if reach else np.ones_like(distance)
+    areas: NDArray[np.float64] = area * share
+    return areas
 
 
 def number(value: float) -> str:

@@ -27,6 +27,7 @@ def bench(
     fidelity: str | None,
     device: str,
     engine: str,
+    deterministic: bool,
     against: str | None,
     batches: Sequence[int],
     seconds: float,
@@ -39,7 +40,8 @@ def bench(
     from .envs.bench import bench as measure
 
     def made(engine: str) -> Environment:
-        return make(name, fidelity=fidelity, device=device, engine=engine, **options)
+        exact = deterministic and engine != against  # the other engine, Taichi, cannot
+        return make(name, fidelity=fidelity, device=device, engine=engine, deterministic=exact, **options)
 
     with Console(stderr=True).status("preparing") as status:
         found = measure(

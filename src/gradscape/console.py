@@ -98,6 +98,7 @@ def cut(
     fidelity: str | None,
     device: str,
     engine: str,
+    deterministic: bool,
     through: str,
     extent: str | None,
     settings: Sequence[str],
@@ -108,56 +109,84 @@ def cut(
 ) -> None:
     """Sample a slice into its folder and say what it costs, how far it is and what came out."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
-    env = make(name, fidelity=fidelity, device=device, engine=engine, **read_settings(settings))
+    how: dict[str, Any] = {"fidelity": fidelity, "device": device, "engine": engine, "deterministic": deterministic}
+    env = make(name, **how, **read_settings(settings))
     from .envs.points import point  # after make: a name that does not exist is refused before torch is loaded
     from .landscapes.plane import Plane
 
     window = _extent(extent)
     plane = Plane.through(env.space, point(env, through), dims, resolution=resolution, extent=window)
+    folder, summary = fill(console, env, plane, out=Path(out) if out else None, grad=grad, force=force)
+    if as_json:
+        print(json.dumps({**summary, "folder": str(folder)}))
+
+
+def fill(
+    console: Console,
+    env: Environment,
+    plane: Plane,
+    *,
+    out: Path | None = None,
+    root: Path = Path("out"),
+    grad: bool = True,
+    force: bool = False,
+    boxed: bool = False,
+) -> tuple[Path, dict[str, Any]]:
+    """Sample a slice into `out`, by default a folder named after it under `root`; stopping it ends the process.
+
+    `boxed` leaves out what lies beyond the parameters' bounds.
+    """
+    from .landscapes.adapters import within_box
+    from .landscapes.job import Job
+
     command = shlex.join(["landscape", *sys.argv[1:]])
-    job = _open(env, plane, out=out, grad=grad, force=force, command=command)
+    identity, provenance = identity_of(env) | ({"boxed": True} if boxed else {}), provenance_of(env, command)
+    job = Job.open(
+        within_box(env) if boxed else env, plane, out or root / _folder(identity, plane, grad), _picture(env, plane),
+        identity=identity, provenance=provenance, grad=grad, force=force,
+    )  # fmt: skip
     try:
         _announce(console, job, env)
         summary = _run(console, job, command)
     except KeyboardInterrupt:
         _farewell(console, job, command)
         sys.exit(130)
-    if as_json:
-        print(json.dumps({**summary, "folder": str(job.folder)}))
     console.print(_outcome(summary) + f"\n{job.folder}: {', '.join(summary['files'])}", markup=False)
+    return job.folder, summary
 
 
-def _open(env: Environment, plane: Plane, *, out: str | None, grad: bool, force: bool, command: str) -> Job:
-    from .landscapes.job import Job
-
-    identity = {
+def identity_of(env: Environment) -> dict[str, Any]:
+    """Return what decides an environment's numbers."""
+    return {
         "objective": env.name,
         "options": asdict(env.options),
         "fidelity": env.fidelity.name,
         "settings": asdict(env.fidelity),
         "device": env.device,
         "engine": env.engine,
+        "deterministic": env.deterministic,
         "code": code_digest(type(env)),
     }
-    provenance = {
+
+
+def provenance_of(env: Environment, command: str) -> dict[str, Any]:
+    """Return what else is worth keeping with results."""
+    return {
         "command": command,
         "created": datetime.now(UTC).strftime("%Y-%m-%d"),
         "versions": {package: _installed(package) for package in PACKAGES},
         "loss_unit": env.loss_unit,
     }
-    folder = Path(out) if out else _folder(identity, plane, grad)
-    return Job.open(
-        env, plane, folder, _picture(env, plane), identity=identity, provenance=provenance, grad=grad, force=force
-    )
 
 
-def _folder(identity: dict[str, Any], plane: Plane, grad: bool) -> Path:
-    """Return a folder of its own for every different slice, the same for the same one."""
+def _folder(identity: dict[str, Any], plane: Plane, grad: bool) -> str:
+    """Return a name of its own for every different slice, the same for the same one."""
     settings = json.dumps([identity, plane.record(), grad], sort_keys=True)
-    numbers = [int(row.nonzero()[0]) for row in plane.basis]
+    aligned = all(len(row.nonzero()) == 1 for row in plane.basis)
+    axes = [str(int(row.nonzero()[0])) for row in plane.basis] if aligned else ["plane"]
     points = "x".join(map(str, plane.resolution))
-    parts = [identity["objective"], *map(str, numbers), identity["fidelity"], points]
-    return Path("out") / "-".join([*parts, hashlib.sha256(settings.encode()).hexdigest()[:6]])
+    parts = [identity["objective"], *axes, identity["fidelity"], points]
+    return "-".join([*parts, hashlib.sha256(settings.encode()).hexdigest()[:6]])
 
 
 def _picture(env: Environment, plane: Plane) -> Any:
@@ -229,12 +258,12 @@ def _outcome(summary: dict[str, Any]) -> str:
     return f"{summary['episodes']} episodes in {duration(summary['seconds'])}; {said}; {losses}{flat}"
 
 
-def read_settings(settings: Sequence[str]) -> dict[str, str]:
-    """Return scene options given as name=value."""
+def read_settings(settings: Sequence[str], flag: str = "--set") -> dict[str, Any]:
+    """Return options given as name=value."""
     pairs = [setting.partition("=") for setting in settings]
     for setting, (name, equals, _) in zip(settings, pairs, strict=True):
         if not equals or not name:
-            raise ValueError(f"--set takes name=value; got {setting!r}")
+            raise ValueError(f"{flag} takes name=value; got {setting!r}")
     return {name: value for name, _, value in pairs}
 
 

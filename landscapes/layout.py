@@ -1,0 +1,48 @@
+"""What the arrays of every zarr store have in common."""
+
+from __future__ import annotations
+
+import warnings
+from enum import IntEnum
+from pathlib import Path
+from typing import Any
+
+import zarr
+from zarr.codecs import ZstdCodec
+
+FILL = {"float64": float("nan"), "int8": 0, "int64": 0, "string": ""}
+
+
+def create_array(
+    group: zarr.Group,
+    name: str,
+    shape: tuple[int, ...],
+    chunks: tuple[int, ...],
+    dims: tuple[str, ...],
+    dtype: str,
+    **attributes: Any,
+) -> zarr.Array[Any]:
+    """Make an empty array of named dimensions whose torn or altered chunks do not decode."""
+    return group.create_array(
+        name,
+        shape=shape,
+        chunks=chunks,
+        dtype=dtype,
+        fill_value=FILL[dtype],
+        dimension_names=dims,
+        compressors=[ZstdCodec(level=3, checksum=True)],
+        config={"write_empty_chunks": True},  # a chunk of NaN is a result too
+        attributes=attributes,
+    )
+
+
+def flags(kind: type[IntEnum]) -> dict[str, Any]:
+    """Return the attributes (CF conventions) that say what the codes of an int8 array mean."""
+    return {"flag_values": [int(k) for k in kind], "flag_meanings": " ".join(k.name.lower() for k in kind)}
+
+
+def consolidate(path: Path) -> None:
+    """Gather a store's layout in one file, so that plain xarray.open_zarr reads it."""
+    with warnings.catch_warnings():  # not in zarr's specification yet
+        warnings.simplefilter("ignore")
+        zarr.consolidate_metadata(str(path))

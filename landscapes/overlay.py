@@ -1,0 +1,146 @@
+"""Runs laid over a slice: where their points fall, how far off the plane they are, what the slice shows there."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+import xarray as xr
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .plane import Plane
+from .store import plane_of
+
+RECENT = 64  # how many evaluations ago an iterate's predecessor is looked for
+PARALLEL = 1e-12  # most by which the cosine between a step and the negative gradient may differ from 1
+
+
+def overlay(dataset: xr.Dataset, tables: Sequence[xr.Dataset]) -> list[xr.Dataset]:
+    """Lay runs over a slice of rank 2: return their tables with where each point falls.
+
+    Added are, over `evaluation`: `u` and `v` [plane units], the nearest point of the plane; `distance` to it
+    [half-widths of the box]; `outside`, whether it lies beyond what the slice's picture covers; `beneath` [loss unit],
+    the loss of the sample whose cell is there, NaN outside and where that sample failed; `previous`, the row whose
+    gradient led to this one, -1 for none; `best`, the least loss so far. Nearness is measured in the box scaled to
+    [-1, 1], so that the parameters' units do not count. The attribute `label` tells runs apart.
+    """
+    plane = plane_of(dataset)
+    if plane.rank != 2:
+        raise ValueError(f"runs are laid over planes; got a slice of rank {plane.rank}, so vary two parameters")
+    names = _labels(tables)
+    return [_laid(dataset, plane, table, label) for table, label in zip(tables, names, strict=True)]
+
+
+def best_point(tables: Sequence[xr.Dataset]) -> tuple[Float[Tensor, " dim"], float]:
+    """Return the point of least loss among all the runs, and its loss."""
+    losses = np.concatenate([table["loss"].to_numpy() for table in tables])
+    if not np.isfinite(losses).any():
+        raise ValueError("no episode of these runs succeeded, so there is no best point")
+    row = int(np.nanargmin(losses))
+    points = np.concatenate([table["x"].to_numpy() for table in tables])
+    return torch.from_numpy(points[row].copy()), float(losses[row])
+
+
+def principal_plane(
+    tables: Sequence[xr.Dataset], *, resolution: int | Sequence[int], through: Float[Tensor, " dim"] | None = None
+) -> Plane:
+    """Lay a plane through the principal directions of the runs' points, found in the box scaled to [-1, 1].
+
+    Its coordinates are in half-widths of the box. With `through` it is moved, parallel to itself, to hold that point.
+    """
+    center, half = _box(tables[0])
+    scaled = torch.cat([(_points(table) - center) / half for table in tables])
+    flat = Plane.principal(scaled, resolution=resolution)
+    if through is not None:
+        flat = flat.moved((through - center) / half)
+    return replace(flat, origin=center + half * flat.origin, basis=half * flat.basis)
+
+
+def _laid(dataset: xr.Dataset, plane: Plane, table: xr.Dataset, label: str) -> xr.Dataset:
+    parameters = [str(name) for name in dataset["dim"].to_numpy()]
+    if parameters != [str(name) for name in table["dim"].to_numpy()]:
+        raise ValueError(
+            f"{label} searched {table.sizes['dim']} parameters ({_shown(table)}), "
+            f"the slice has {len(parameters)} ({_shown(dataset)}); lay runs over slices of the same environment"
+        )
+    half, x = _box(table)[1], _points(table)
+    scaled = replace(plane, origin=plane.origin / half, basis=plane.basis / half)
+    place = scaled.project(x / half)
+    low, high = plane.window()
+    outside = ((place < low) | (place > high)).any(dim=1).numpy()
+    u, v = place.numpy().T
+    columns = {
+        "u": u,
+        "v": v,
+        "distance": scaled.distance(x / half).numpy(),
+        "outside": outside,
+        "beneath": np.where(outside, np.nan, _nearest(dataset, u, v)),
+        "previous": _previous(table),
+        "best": np.fmin.accumulate(table["loss"].to_numpy()),
+    }
+    added = {name: ("evaluation", values) for name, values in columns.items()}
+    return table.assign(added).assign_attrs(label=label)
+
+
+def _nearest(dataset: xr.Dataset, u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the loss of the samples whose cells hold these places: what a picture shows there."""
+    middles = {name: (axis[1:] + axis[:-1]) / 2 for name, axis in ((n, dataset[n].to_numpy()) for n in ("u", "v"))}
+    rows, columns = np.searchsorted(middles["v"], v), np.searchsorted(middles["u"], u)
+    found: NDArray[np.float64] = dataset["loss"].transpose("v", "u").to_numpy()[rows, columns]
+    return found
+
+
+def _previous(table: xr.Dataset) -> NDArray[np.intp]:
+    """Find the descents among a run's points: each iterate lies along the negative gradient of the one before it.
+
+    Both are taken in the scaled box, where descents step; parameters that a step stopped at the border do not count.
+    """
+    center, half = (part.numpy() for part in _box(table))
+    z, slope = (table["x"].to_numpy() - center) / half, -table["grad"].to_numpy() * half
+    found = np.full(len(z), -1)
+    free = np.isfinite(slope).all(axis=1) & (slope != 0).any(axis=1)  # may be followed, once
+    for row in np.flatnonzero(np.isfinite(slope).all(axis=1) | np.isnan(table["loss"].to_numpy())):
+        first = max(0, int(row) - RECENT)
+        earlier = first + np.flatnonzero(free[first:row])
+        if len(earlier) and (near := _aligned(z[row] - z[earlier], slope[earlier], np.abs(z[row]) < 1 - 1e-9)).any():
+            found[row] = earlier[near][np.argmin(np.linalg.norm(z[row] - z[earlier[near]], axis=1))]
+            free[found[row]] = False
+    return found
+
+
+def _aligned(step: NDArray[np.float64], slope: NDArray[np.float64], inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    step, slope = step[:, inside], slope[:, inside]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cosine = (step * slope).sum(axis=1) / np.linalg.norm(step, axis=1) / np.linalg.norm(slope, axis=1)
+    found: NDArray[np.bool_] = cosine > 1 - PARALLEL
+    return found
+
+
+def _labels(tables: Sequence[xr.Dataset]) -> list[str]:
+    named = [f"{table.attrs['method']}-s{table.attrs['seed']}" for table in tables]
+    seen: Counter[str] = Counter()
+    labels = []
+    for name in named:
+        seen[name] += 1
+        labels.append(f"{name}-{seen[name]}" if named.count(name) > 1 else name)
+    return labels
+
+
+def _box(table: xr.Dataset) -> tuple[Float[Tensor, " dim"], Float[Tensor, " dim"]]:
+    """Return the middle and the half-widths of the box a run searched."""
+    lower, upper = (torch.tensor(table.attrs[side], dtype=torch.float64) for side in ("lower", "upper"))
+    return (lower + upper) / 2, (upper - lower) / 2
+
+
+def _points(table: xr.Dataset) -> Float[Tensor, "evaluation dim"]:
+    return torch.from_numpy(table["x"].to_numpy().copy())
+
+
+def _shown(dataset: xr.Dataset) -> str:
+    names = [str(name) for name in dataset["dim"].to_numpy()]
+    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")

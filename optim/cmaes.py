@@ -1,0 +1,81 @@
+"""CMA-ES, by the library cma."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import cma
+import numpy as np
+import torch
+from cma.sigma_adaptation import CMAAdaptSigmaCSA
+
+from .base import Kind, Optimizer, Points, Proposal
+
+
+@dataclass(frozen=True)
+class CMAESOptions:
+    """`sigma` is the first step size in the box scaled to [-1, 1]; `population` 0 means 4 + 3 ln(dim) of them.
+
+    A quarter of the box's width is what the library's author advises: the minimum is then expected within three
+    standard deviations of wherever in the box the search starts.
+    """
+
+    sigma: float = 0.5
+    population: int = 0
+
+
+class CMAES(Optimizer):
+    """Adapt a normal distribution's mean, step size and covariance to what its samples are worth.
+
+    The mean starts at random. The box is kept by the library's `BoundTransform`: the distribution lives on an unbounded
+    space that is folded, smoothly, into the box, so that every sample is inside and none is on the border by force.
+    When the library finds that the search has ended (converged, stagnated, a flat loss), it begins again from another
+    random point, for there is a budget to spend. A failed episode counts as the worst loss so far.
+    """
+
+    name = "cma-es"
+    Options: ClassVar[type[CMAESOptions]] = CMAESOptions
+
+    def _setup(self) -> None:
+        if self.space.dim < 2:
+            raise ValueError(f"cma-es searches two parameters or more; this space has {self.space.dim}")
+        if self.options.sigma <= 0:
+            raise ValueError(f"cma-es option sigma takes a number above zero; got {self.options.sigma}")
+        if self.options.population and self.options.population < 3:
+            raise ValueError(f"cma-es option population takes 0 or at least 3; got {self.options.population}")
+        self._start()
+
+    def _start(self) -> None:
+        options: dict[str, Any] = {
+            "bounds": [-1.0, 1.0],
+            "AdaptSigma": CMAAdaptSigmaCSA,  # in every dimension, as published
+            "randn": Normal(self.random),
+            "seed": np.nan,  # leave numpy's global generator alone
+            "verbose": -10,  # no text, no files written or read
+            "verb_log": 0,
+        }
+        if self.options.population:
+            options["popsize"] = self.options.population
+        start = self.random.uniform(-1.0, 1.0, self.space.dim)
+        self.strategy = cma.CMAEvolutionStrategy(start, self.options.sigma, options)
+
+    def _ask(self) -> Proposal:
+        self._asked = self.strategy.ask()
+        return Proposal(torch.from_numpy(np.stack(self._asked)), Kind.POPULATION)
+
+    def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
+        self.strategy.tell(self._asked, self.penalised(loss).tolist())  # the very points, which it knows again
+        if self.strategy.stop():
+            self._start()
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Draw standard normal numbers of a shape, as numpy.random.randn does, from a generator of one's own."""
+
+    random: np.random.Generator
+
+    def __call__(self, *shape: int) -> Points:
+        """Return numbers of shape `shape`."""
+        return self.random.standard_normal(shape)

@@ -1,0 +1,112 @@
+"""Gradient descent: one descent as a state machine, and a search by descents from random starts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from .base import Kind, Optimizer, Points, Proposal
+
+
+@dataclass(frozen=True)
+class DescentOptions:
+    """How a descent moves in the box scaled to [-1, 1], and when it ends.
+
+    `step` [scaled parameter^2 / loss unit] is what gradients are multiplied by. A move whose largest component exceeds
+    `longest` is shortened to it; below that the step is plain. Both shrink by the factor `shrink` wherever the loss
+    has risen (1: never), or one step could not do for scenes whose gradients differ by a factor of a thousand. A
+    descent ends after `steps` iterates, or when the loss has failed more than `patience` times in a row to fall below
+    the best so far by `tolerance`, a fraction of it.
+    """
+
+    step: float = 1.0
+    longest: float = 0.2
+    shrink: float = 0.5
+    steps: int = 20
+    patience: int = 3
+    tolerance: float = 1e-4
+
+    def __post_init__(self) -> None:
+        if min(self.step, self.longest, self.steps) <= 0 or min(self.patience, self.tolerance) < 0:
+            raise ValueError(
+                f"a descent takes step, longest and steps above zero, patience and tolerance not below; got {self}"
+            )
+        if not 0 < self.shrink <= 1:
+            raise ValueError(f"a descent takes shrink above 0 and at most 1; got {self.shrink}")
+
+
+class Descent:
+    """Follow gradients from `start`: `at` is the iterate to evaluate next, in the scaled box, until `done`.
+
+    Every iterate is evaluated once, loss and gradient, and both are used; the one that ends it stays in `at`, unless
+    its episode failed: then the one before, the last that has a loss.
+    """
+
+    def __init__(self, start: Points, options: DescentOptions) -> None:
+        self.options = options
+        self.at = np.clip(start, -1.0, 1.0)
+        self.best = math.inf
+        self.done = False
+        self._last, self._last_loss = self.at, math.inf
+        self._scale = 1.0
+        self._evaluated = self._stalled = 0
+
+    def tell(self, loss: float, grad: Points) -> None:
+        """Take in the iterate's loss, +inf where the episode failed, and gradient, shape (dim,); move on or end."""
+        if not math.isfinite(loss):
+            self.at, self.done = self._last, True
+            return
+        self._evaluated += 1
+        improved = math.isinf(self.best) or loss < self.best - self.options.tolerance * abs(self.best)
+        self._stalled = 0 if improved else self._stalled + 1
+        self._scale *= self.options.shrink if loss > self._last_loss else 1.0
+        self.best = min(self.best, loss)
+        moved = self._moved(grad)
+        self.done = (
+            self._stalled > self.options.patience
+            or self._evaluated >= self.options.steps
+            or np.array_equal(moved, self.at)  # at a stationary point, or pushed against the border
+        )
+        if not self.done:
+            self._last, self._last_loss, self.at = self.at, loss, moved
+
+    def _moved(self, grad: Points) -> Points:
+        """Return z - step * gradient, kept inside the box."""
+        move = -self.options.step * grad
+        excess = float(np.abs(move).max()) / self.options.longest
+        return np.clip(self.at + self._scale * move / max(excess, 1.0), -1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class DescentsOptions(DescentOptions):
+    """Those of each descent; `together` descents are evaluated as one batch, 1 for one after the other."""
+
+    together: int = 4
+
+
+class Descents(Optimizer):
+    """Descend from uniformly random starts; where one descent ends the next begins, until the budget is spent."""
+
+    name = "descents"
+    Options = DescentsOptions
+    needs_grad = True
+
+    def _setup(self) -> None:
+        if self.options.together < 1:
+            raise ValueError(f"descents takes together of at least 1; got {self.options.together}")
+        self.descents = [self._begun() for _ in range(self.options.together)]
+
+    def _ask(self) -> Proposal:
+        return Proposal(torch.from_numpy(np.stack([one.at for one in self.descents])), Kind.DESCENT, grad=True)
+
+    def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
+        assert grad is not None  # as asked
+        for descent, one_loss, one_grad in zip(self.descents, loss, grad, strict=True):
+            descent.tell(float(one_loss), one_grad)
+        self.descents = [self._begun() if one.done else one for one in self.descents]
+
+    def _begun(self) -> Descent:
+        return Descent(self.random.uniform(-1.0, 1.0, self.space.dim), self.options)

@@ -1,0 +1,303 @@
+"""PPO and SAC of Stable-Baselines3: neural policies that see what an episode has come to, and decide what comes next.
+
+A point of the box is an episode: its parameters are the controls of `decisions` equally long stretches, one after the
+other. The objective's `observe` shows the policy what has come of the earlier ones, and the whole is then evaluated
+once: an episode. (That the simulator starts over for every look shows in a run's seconds, not in its episodes.) An
+objective without `decisions` leaves one action to decide and nothing to see: a bandit.
+
+The reward is the paper's, minus the episode's loss after its last decision and 0 before, as (m - loss) / s with the
+mean m and the deviation s of the first episodes: losses lie anywhere between 1e-3 and 1e2, and SB3 scales advantages
+but neither values nor SAC's entropy. A failed episode is rewarded like the worst so far. The paper has three layers of
+64; what it leaves open is as SB3 has it, but for rollouts and learning rates that suit budgets of 1000 episodes.
+"""
+
+from __future__ import annotations
+
+import abc
+import io
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from copy import copy
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+import stable_baselines3 as sb3
+import torch
+from numpy.typing import NDArray
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import DummyVecEnv
+from torch import Tensor
+
+from ..landscapes.objective import Objective
+from .base import Kind, Optimizer, Points, Proposal
+
+LAYERS = (64, 64, 64)  # CoRL 2022, appendix C
+_GLOBAL = threading.Lock()  # held while the process's generators are an optimiser's own
+
+Numbers = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class PPOOptions:
+    """`episodes` of a rollout, shared by so many `minibatches`; `epochs` over them; `learning_rate`; `discount`.
+
+    SB3's rollout of 2048 steps would outlast 1000 episodes with one decision and make three updates of 1000 with five.
+    Its learning rate is 3e-4, with which 600 episodes in a bowl (2-D) came to a mean loss of 2.4; they come to 1.5.
+    """
+
+    episodes: int = 20
+    minibatches: int = 4
+    epochs: int = 10
+    learning_rate: float = 1e-3
+    discount: float = 0.99
+
+
+@dataclass(frozen=True)
+class SACOptions:
+    """`warmup`: random episodes before the policy plays; then a gradient step on a `batch` for every transition.
+
+    `memory`: transitions that are kept; the default is all of 1000 episodes with 100 decisions. SB3's learning rate is
+    3e-4, with which 600 episodes of five decisions came to a mean loss of 1.3; they come to 0.3.
+    """
+
+    warmup: int = 20
+    batch: int = 256
+    learning_rate: float = 1e-3
+    discount: float = 0.99
+    memory: int = 100_000
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """Hold episodes as the policy saw and played them: what it saw, shape (decision, episode, feature), and did."""
+
+    seen: Numbers
+    actions: Numbers
+
+    def executed(self) -> Points:
+        """Return the episodes as points of the scaled box, shape (episode, dim)."""
+        by_episode = self.actions.astype(np.float64).clip(-1.0, 1.0).swapaxes(0, 1)
+        return by_episode.reshape(len(by_episode), -1)
+
+
+class PolicySearch(Optimizer):
+    """Play episodes with a policy, and train it by how they end.
+
+    SB3 draws from the process's generators. It does so here under a lock and with states of the optimiser's own, which
+    are put back afterwards: searches in other threads neither see nor change them. Simulations are not under the lock.
+    """
+
+    algorithm: ClassVar[Any]
+    _rollout: Rollout  # between `_ask` and `_tell`
+
+    def _setup(self) -> None:
+        self._model: Any = None
+        self._objective: Any = None
+        self._scale: tuple[float, float] | None = None  # mean and deviation of the first episodes' losses
+        self._generators = _seeded(int(self.random.integers(1 << 32)))
+
+    def attach(self, objective: Objective) -> None:
+        """Take the objective that the policy plays in."""
+        self._objective = objective
+        self.decisions = int(getattr(objective, "decisions", 1))
+        if self.space.dim % self.decisions:
+            raise ValueError(
+                f"{self.name} needs decisions with equally many controls; "
+                f"got {self.space.dim} parameters for {self.decisions} decisions"
+            )
+        if self._model is None:
+            features = self._seen(self.space.center[None], 0).shape[1]
+            with self._own_randomness():
+                self._model = self._untrained(_Spaces(features, self.space.dim // self.decisions))
+
+    @abc.abstractmethod
+    def _untrained(self, spaces: gymnasium.Env[Any, Any]) -> Any:
+        """Return the algorithm's model as it begins."""
+
+    @abc.abstractmethod
+    def _act(self, seen: Tensor) -> Tensor:
+        """Draw an action for every row of what is seen."""
+
+    @abc.abstractmethod
+    def _learn(self, rollout: Rollout, rewards: Numbers) -> None:
+        """Train on episodes that ended with these rewards, shape (episode,)."""
+
+    def _played(self, episodes: int) -> Rollout:
+        """Play episodes side by side."""
+        if self._objective is None:
+            raise ValueError(f"{self.name} plays in the objective itself; attach it before the first ask")
+        z = torch.zeros(episodes, self.decisions, self.space.dim // self.decisions, dtype=torch.float64)
+        seen, actions = [], []
+        for decision in range(self.decisions):
+            seen.append(self._seen(self.space.from_unit((z.flatten(start_dim=1) + 1) / 2), decision))
+            with self._own_randomness(), torch.no_grad():
+                actions.append(self._act(torch.from_numpy(seen[-1])).numpy())
+            z[:, decision] = torch.from_numpy(actions[-1]).double().clamp(-1, 1)
+        return Rollout(np.stack(seen), np.stack(actions))
+
+    def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
+        losses = self.penalised(loss)
+        if self._scale is None:
+            self._scale = float(losses.mean()), float(losses.std()) or 1.0
+        mean, deviation = self._scale
+        with self._own_randomness():
+            self._model.set_logger(Logger(folder=None, output_formats=[]))  # which a model lacks that was loaded
+            self._learn(self._rollout, ((mean - losses) / deviation).astype(np.float32))
+        del self._rollout
+
+    def _seen(self, x: Tensor, decision: int) -> Numbers:
+        """Return what is seen before a decision, shape (episode, feature); a zero where there is only one."""
+        if self.decisions == 1:
+            return np.zeros((len(x), 1), dtype=np.float32)
+        return np.asarray(self._objective.observe(x, decision).numpy(), dtype=np.float32)
+
+    @contextmanager
+    def _own_randomness(self) -> Iterator[None]:
+        with _GLOBAL:
+            others = _exchanged(self._generators)
+            try:
+                yield
+            finally:
+                self._generators = _exchanged(others)
+
+    def __getstate__(self) -> dict[str, Any]:
+        kept = io.BytesIO()
+        if self._model is not None:
+            self._model.save(kept)
+        return self.__dict__ | {"_model": kept.getvalue(), "_objective": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        generators = self._generators
+        with self._own_randomness():
+            self._model = self.algorithm.load(io.BytesIO(state["_model"]), device="cpu") if state["_model"] else None
+        self._generators = generators  # loading draws, for weights that are then replaced
+
+
+class PPO(PolicySearch):
+    """Proximal policy optimisation (Schulman et al. 2017): a stochastic policy, improved by every rollout."""
+
+    name: ClassVar[str] = "ppo"
+    Options: ClassVar[type[Any]] = PPOOptions
+    algorithm: ClassVar[Any] = sb3.PPO
+
+    def _untrained(self, spaces: gymnasium.Env[Any, Any]) -> sb3.PPO:
+        o = self.options
+        if o.episodes % o.minibatches or o.episodes < 2 * o.minibatches:
+            raise ValueError(
+                f"ppo shares a rollout's episodes equally by its minibatches, two or more for each; "
+                f"got episodes={o.episodes}, minibatches={o.minibatches}"
+            )
+        return sb3.PPO(
+            "MlpPolicy",
+            DummyVecEnv([lambda: spaces, *(lambda: copy(spaces) for _ in range(o.episodes - 1))]),
+            n_steps=self.decisions,
+            batch_size=o.episodes * self.decisions // o.minibatches,
+            n_epochs=o.epochs,
+            learning_rate=o.learning_rate,
+            gamma=o.discount,
+            policy_kwargs={"net_arch": list(LAYERS)},
+            device="cpu",
+        )
+
+    def _ask(self) -> Proposal:
+        self._rollout = self._played(self.options.episodes)
+        return Proposal(torch.from_numpy(self._rollout.executed()), Kind.POLICY)
+
+    def _act(self, seen: Tensor) -> Tensor:
+        action: Tensor = self._model.policy(seen)[0]
+        return action
+
+    def _learn(self, rollout: Rollout, rewards: Numbers) -> None:
+        buffer = self._model.rollout_buffer
+        buffer.reset()
+        for decision, (seen, actions) in enumerate(zip(rollout.seen, rollout.actions, strict=True)):
+            with torch.no_grad():
+                value, log_prob, _ = self._model.policy.evaluate_actions(*map(torch.from_numpy, (seen, actions)))
+            reward = rewards if decision == self.decisions - 1 else np.zeros_like(rewards)
+            buffer.add(seen, actions, reward, np.full(len(rewards), decision == 0), value, log_prob)
+        buffer.compute_returns_and_advantage(last_values=torch.zeros(len(rewards)), dones=np.ones(len(rewards)))
+        self._model.train()
+
+
+class SAC(PolicySearch):
+    """Soft actor-critic (Haarnoja et al. 2018): a stochastic policy, improved after every episode from all before."""
+
+    name: ClassVar[str] = "sac"
+    Options: ClassVar[type[Any]] = SACOptions
+    algorithm: ClassVar[Any] = sb3.SAC
+
+    def _setup(self) -> None:
+        super()._setup()
+        self._remembered: list[tuple[Rollout, Numbers]] = []
+
+    def _untrained(self, spaces: gymnasium.Env[Any, Any]) -> sb3.SAC:
+        o = self.options
+        return sb3.SAC(
+            "MlpPolicy",
+            DummyVecEnv([lambda: spaces]),
+            buffer_size=o.memory,
+            batch_size=o.batch,
+            learning_rate=o.learning_rate,
+            gamma=o.discount,
+            policy_kwargs={"net_arch": list(LAYERS)},
+            device="cpu",
+        )
+
+    def _ask(self) -> Proposal:
+        self._rollout = self._played(1 if self._remembered else self.options.warmup)
+        kind = Kind.POLICY if self._remembered else Kind.RANDOM
+        return Proposal(torch.from_numpy(self._rollout.executed()), kind)
+
+    def _act(self, seen: Tensor) -> Tensor:
+        if not self._remembered:
+            return torch.rand(len(seen), self._model.action_space.shape[0]) * 2 - 1
+        action: Tensor = self._model.actor(seen)
+        return action
+
+    def _learn(self, rollout: Rollout, rewards: Numbers) -> None:
+        trains = bool(self._remembered)
+        self._remembered.append((rollout, rewards))
+        self._remember(rollout, rewards)
+        if trains:
+            self._model.train(gradient_steps=self.decisions * len(rewards), batch_size=self.options.batch)
+
+    def _remember(self, rollout: Rollout, rewards: Numbers) -> None:
+        """Put episodes into the replay buffer, transition by transition."""
+        last = self.decisions - 1
+        for episode, reward in enumerate(rewards):
+            seen, actions = rollout.seen[:, episode], rollout.actions[:, episode]
+            for t in range(self.decisions):
+                what = seen[t][None], seen[min(t + 1, last)][None], actions[t][None]
+                end = np.array([t == last])
+                self._model.replay_buffer.add(*what, reward * end, end, [{}])
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        for rollout, rewards in self._remembered:
+            self._remember(rollout, rewards)
+
+
+class _Spaces(gymnasium.Env[Any, Any]):
+    """Say what is seen and done; the episodes themselves are played by the optimiser."""
+
+    def __init__(self, features: int, controls: int) -> None:
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (features,))
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (controls,))
+
+
+def _seeded(seed: int) -> tuple[Tensor, dict[str, Any]]:
+    """Return the states of torch's and of numpy's global generator after seeding them."""
+    numbers: dict[str, Any] = np.random.RandomState(seed).get_state(legacy=False)
+    return torch.Generator().manual_seed(seed).get_state(), numbers
+
+
+def _exchanged(states: tuple[Tensor, dict[str, Any]]) -> tuple[Tensor, dict[str, Any]]:
+    """Put the global generators into other states, and return those they were in."""
+    before = torch.get_rng_state(), np.random.get_state(legacy=False)
+    torch.set_rng_state(states[0])
+    np.random.set_state(states[1])
+    return before

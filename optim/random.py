@@ -1,0 +1,24 @@
+"""Random search: what every other method has to beat."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+
+from .base import Kind, NoOptions, Optimizer, Points, Proposal
+
+TOGETHER = 16  # points of a proposal: a simulator is quicker at several at once
+
+
+class RandomSearch(Optimizer):
+    """Draw points uniformly from the box."""
+
+    name = "random"
+    Options: ClassVar[type[NoOptions]] = NoOptions
+
+    def _ask(self) -> Proposal:
+        return Proposal(torch.from_numpy(self.random.uniform(-1.0, 1.0, (TOGETHER, self.space.dim))), Kind.RANDOM)
+
+    def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
+        pass

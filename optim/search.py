@@ -1,0 +1,139 @@
+"""The loop: ask, evaluate, keep, tell."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ..landscapes.objective import Objective, evaluated, name_of
+from .base import Optimizer, restored
+from .registry import optimizer_class
+from .run import Run
+
+MOMENT = 0.5  # seconds to spend on measuring what an episode costs
+LONG = 5.0  # seconds from which the first, which warms things up, must do
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Say how far a run is: `done` of `total` episodes, `resumed` of them before; `best` is NaN before a success."""
+
+    done: int
+    total: int
+    resumed: int
+    failed: int
+    best: float
+
+
+def search(
+    objective: Objective,
+    method: Optimizer | str,
+    run: Run | None = None,
+    *,
+    budget: int,
+    gradient_cost: float | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> Run:
+    """Let a method evaluate `budget` episodes, not one more, and return the run; what it holds already is not repeated.
+
+    A method is an optimiser or the name of one, made with the run's seed. Without a run one is made in memory. Stop it
+    at any instant: the same call goes on, and the rows are those of an uninterrupted one but for their `seconds`, given
+    an objective whose rows do not depend on their batch. A proposal that does not fit into the budget is cut short.
+    `gradient_cost` is what an episode with gradient costs in episodes without; it is measured if not given.
+    """
+    if run is None:
+        run = _in_memory(objective, method, budget)
+    with run.filling():
+        optimizer = _begun(objective, method, run, gradient_cost) if run.count < budget else None
+        resumed = run.count
+
+        def report() -> None:
+            if progress is not None:
+                progress(Progress(run.count, budget, resumed, run.failed, run.best))
+
+        report()
+        if optimizer is not None:
+            run.extend(budget)
+            _fill(objective, optimizer, run, budget, report)
+    return run
+
+
+def _in_memory(objective: Objective, method: Optimizer | str, budget: int) -> Run:
+    name, seed = (method, 0) if isinstance(method, str) else (method.name, method.seed)
+    identity = {"objective": name_of(objective), "method": name, "seed": seed}
+    return Run.in_memory(objective.space, identity=identity, budget=budget)
+
+
+def _fill(objective: Objective, optimizer: Optimizer, run: Run, budget: int, report: Callable[[], None]) -> None:
+    mark = time.perf_counter()
+    whole = True
+    while run.count < budget:
+        proposal = optimizer.ask()
+        _check(optimizer, len(proposal.x), grad=proposal.grad)
+        x = proposal.x[: budget - run.count]
+        whole = len(x) == len(proposal.x)
+        evaluation = evaluated(objective, x, grad=proposal.grad)
+        seconds, mark = time.perf_counter() - mark, time.perf_counter()
+        if whole:
+            optimizer.tell(x, evaluation)
+        run.append(x, evaluation, proposal.kind, seconds, optimizer.state if whole else None)
+        report()
+    run.save(optimizer.state if whole else None)
+
+
+def _begun(objective: Objective, method: Optimizer | str, run: Run, gradient_cost: float | None) -> Optimizer:
+    """Return the optimiser that the run goes on with, the one it kept or a new one, and take the run back to it."""
+    name = method if isinstance(method, str) else method.name
+    state = run.state()
+    if state is not None:
+        optimizer = restored(state)
+    elif isinstance(method, Optimizer):
+        optimizer = method
+    else:
+        optimizer = optimizer_class(method).on(objective, seed=int(run.attributes["seed"]))
+    if optimizer.name != name:
+        raise ValueError(f"{run.path} holds a run of {optimizer.name}, not of {name}; give each a run of its own")
+    optimizer.attach(objective)
+    run.rewind()
+    if state is None:
+        run.save(optimizer.state)  # what to go back to
+    getattr(objective, "prepare", lambda: None)()
+    if optimizer.needs_grad and run.gradient_cost is None:
+        run.begin(gradient_cost=gradient_cost or episode_cost(objective).ratio)
+    return optimizer
+
+
+def _check(optimizer: Optimizer, count: int, *, grad: bool) -> None:
+    if not count:
+        raise ValueError(f"{optimizer.name} proposed no point; a proposal holds at least one")
+    if grad and not optimizer.needs_grad:
+        raise ValueError(f"{optimizer.name} asks for gradients, so its class must say needs_grad = True")
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Say what an episode costs [s], alone, without gradient and with it; the latter NaN where it was not measured."""
+
+    forward: float
+    gradient: float
+
+    @property
+    def ratio(self) -> float:
+        """What an episode with gradient costs, in episodes without."""
+        return self.gradient / self.forward
+
+
+def episode_cost(objective: Objective, *, grad: bool = True) -> Cost:
+    """Measure one random episode, without and with gradient in turn: the best of those that fit into a moment."""
+    getattr(objective, "prepare", lambda: None)()
+    x = objective.space.uniform(1, seed=0)
+    best = {False: float("inf"), True: float("inf") if grad else float("nan")}
+    began, rounds = time.perf_counter(), 0
+    while time.perf_counter() - began < (MOMENT if rounds > 1 else LONG):
+        for way in (False, True) if grad else (False,):
+            start = time.perf_counter()
+            objective.evaluate(x, grad=way)
+            best[way] = min(best[way], time.perf_counter() - start)
+        rounds += 1
+    return Cost(best[False], best[True])

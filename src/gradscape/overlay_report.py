@@ -1,0 +1,229 @@
+"""What `landscape overlay` and `landscape view` do and print."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+
+from .console import fill
+from .envs.registry import make
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from .envs.base import Environment
+    from .landscapes.plane import Plane
+
+SLICE, RUN = "slice.zarr", "run.zarr"
+PICTURE, STREAM = "overlay.png", "overlay.rrd"
+SHOWN = ("overlay.rrd", "race.png", "landscape.png", "progress.png")  # of a folder, the first that is there
+PICTURES = (".png", ".html", ".mp4", ".gif")
+MUST, SHOULD = ("objective", "options"), ("fidelity", "settings", "engine", "code")  # agree between slice and runs
+
+
+def overlay(
+    slice_: str,
+    runs: Sequence[str],
+    *,
+    out: str | None,
+    through: str | None,
+    plane: str | None,
+    resolution: int | None,
+    device: str,
+    spawn: bool,
+    serve: bool,
+) -> None:
+    """Draw runs over a slice, or over one cut anew for them, and say what came out."""
+    if plane not in (None, "pca"):
+        raise ValueError(f"--plane takes pca, the runs' principal plane; got {plane!r}")
+    if resolution and not (through or plane):
+        raise ValueError("--resolution is that of a new slice; give --through or --plane too")
+    from .landscapes.overlay import overlay as laid
+    from .landscapes.store import open_slice
+
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    dataset, tables = open_slice(_inside(Path(slice_), SLICE)), _tables(runs)
+    for table in tables:
+        _check(console, dataset, table)
+    laid(dataset, tables)  # refuses what cannot be laid over it before anything is computed
+    folder = _folder(out, dataset, tables, [through, plane, resolution])
+    if through or plane:
+        env = _environment(dataset, device)
+        cut = _plane(env, dataset, tables, through=through, principal=plane is not None, resolution=resolution)
+        gradients = bool(dataset.attrs["identity"]["gradients"])
+        sampled, _ = fill(console, env, cut, root=folder, grad=gradients, boxed=plane is not None)
+        dataset = open_slice(sampled / SLICE)
+    placed = laid(dataset, tables)
+    _write(dataset, placed, folder)
+    console.print(f"{_outcome(placed)}\n{folder}: {PICTURE}, {STREAM}", markup=False)
+    if spawn or serve:
+        _show(console, folder / STREAM, serve=serve)
+
+
+def view(file: str, *, serve: bool) -> None:
+    """Open a file that one of the verbs left, or the picture of a folder."""
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    path = _shown(Path(file))
+    if path.suffix != ".rrd" and serve:
+        raise ValueError(f"--serve shows recordings (.rrd) in a browser; {path} is none")
+    if path.suffix == ".rrd":
+        _show(console, path, serve=serve)
+        return
+    _need_display(path, "copy it to where one is")
+    import typer
+
+    console.print(f"opening {path}", markup=False)
+    if typer.launch(str(path.resolve())):
+        raise OSError(f"no program of this system opens {path}; open it with one of your own")
+
+
+def _inside(path: Path, store: str) -> Path:
+    """Return the store in a results folder, or the path itself."""
+    return path / store if (path / store).exists() else path
+
+
+def _tables(paths: Sequence[str]) -> list[xr.Dataset]:
+    from .optim.run import Run
+
+    tables = []
+    for path in paths:
+        found = [_inside(Path(path), RUN)]
+        if not Path(path, RUN).exists() and (members := sorted(Path(path).glob(f"*/{RUN}"))):
+            found = members
+        tables += [Run.open(store).table() for store in found]
+    if not any(table.sizes["evaluation"] for table in tables):
+        raise ValueError(f"{', '.join(paths)}: there are no episodes yet; `landscape optimize` evaluates them")
+    return [table for table in tables if table.sizes["evaluation"]]
+
+
+def _check(console: Console, dataset: xr.Dataset, table: xr.Dataset) -> None:
+    """Refuse a run of another landscape; warn where it is simulated otherwise."""
+    ours, theirs = dataset.attrs["identity"], table.attrs["identity"]
+    name = f"{theirs.get('objective')}, {theirs.get('method')}, seed {theirs.get('seed')}"
+    for setting in MUST:
+        if ours.get(setting) != theirs.get(setting):
+            raise ValueError(
+                f"the slice and the run ({name}) are of different landscapes: {setting} is {ours.get(setting)!r} there "
+                f"and {theirs.get(setting)!r} here; lay runs over a slice of their own"
+            )
+    differ = [one for one in SHOULD if ours.get(one) != theirs.get(one)]
+    if differ:
+        said = (f"{one} {ours.get(one)!r} there, {theirs.get(one)!r} here" for one in differ if one != "settings")
+        console.print(
+            f"warning: slice and run ({name}) are simulated differently ({'; '.join(said)}), so losses differ",
+            markup=False,
+        )
+
+
+def _folder(out: str | None, dataset: xr.Dataset, tables: Sequence[xr.Dataset], how: list[Any]) -> Path:
+    """Return the folder to write to: a new one, an empty one, or that of an overlay."""
+    if out is None:
+        settings = [dataset.attrs["identity"], [table.attrs["identity"] for table in tables], how]
+        digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:6]
+        return Path("out") / f"overlay-{dataset.attrs['identity']['objective']}-{digest}"
+    folder = Path(out)
+    present = list(folder.iterdir()) if folder.exists() else []
+    if any(file.name not in (PICTURE, STREAM) and not (file / SLICE).exists() for file in present):
+        raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
+    return folder
+
+
+def _environment(dataset: xr.Dataset, device: str) -> Environment:
+    identity = dataset.attrs["identity"]
+    settings = {"fidelity": identity["fidelity"], "engine": identity["engine"], **identity["options"]}
+    return make(identity["objective"], device=device, **settings)
+
+
+def _plane(
+    env: Environment,
+    dataset: xr.Dataset,
+    tables: Sequence[xr.Dataset],
+    *,
+    through: str | None,
+    principal: bool,
+    resolution: int | None,
+) -> Plane:
+    """Return the plane of a new slice: parallel to the one there is, or the runs' principal one."""
+    from .landscapes.overlay import best_point, principal_plane
+    from .landscapes.store import plane_of
+
+    present = plane_of(dataset)
+    shape = (resolution,) * present.rank if resolution else present.resolution
+    point = None
+    if through:
+        point, _ = best_point(tables if through == "best" else _tables([through]))
+        if len(point) != env.space.dim:
+            raise ValueError(f"{through} searched {len(point)} parameters; {env.name} has {env.space.dim}")
+    if principal:
+        return principal_plane(tables, resolution=shape, through=point)
+    assert point is not None  # as --through is given where --plane is not
+    return replace(present.moved(point), resolution=shape)
+
+
+def _write(dataset: xr.Dataset, placed: Sequence[xr.Dataset], folder: Path) -> None:
+    from .landscapes.draw.overlay import overlay_figure
+    from .landscapes.draw.page import save
+    from .landscapes.draw.stream import save_stream
+
+    save(overlay_figure(dataset, placed), folder / PICTURE)
+    save_stream(dataset, placed, folder / STREAM)
+
+
+def _outcome(placed: Sequence[xr.Dataset]) -> str:
+    from .landscapes.objective import Status
+
+    points = sum(run.sizes["evaluation"] for run in placed)
+    outside = sum(int(run["outside"].sum()) for run in placed)
+    failed = sum(int((run["status"] != Status.OK).sum()) for run in placed)
+    away = max(float(run["distance"].max().round(9)) for run in placed)
+    said = (
+        f"{len(placed)} run{'s' if len(placed) > 1 else ''}, {points} points: {outside} beyond the map, {failed} failed"
+    )
+    return f"{said}; the farthest is {away:.2g} half-widths of the box off the plane"
+
+
+def _shown(path: Path) -> Path:
+    """Return what to open for a path."""
+    folder = path.parent if path.name in (SLICE, RUN) else path
+    if folder.is_dir():
+        for name in SHOWN:
+            if (folder / name).exists():
+                return folder / name
+        raise ValueError(f"{path} holds none of {', '.join(SHOWN)}; `landscape slice`, optimize, race and overlay do")
+    if not path.exists():
+        raise ValueError(f"there is no file {path}")
+    if path.suffix not in (*PICTURES, ".rrd"):
+        raise ValueError(f"view opens {', '.join(PICTURES)}, .rrd and results folders; got {path}")
+    return path
+
+
+def _show(console: Console, path: Path, *, serve: bool) -> None:
+    from .landscapes.draw.viewer import open_viewer, served
+
+    if not serve:
+        _need_display(path, f"look at it in a browser: landscape view {path} --serve")
+        console.print(f"opening {path} in rerun's viewer", markup=False)
+        open_viewer(path)
+        return
+    with served(path) as address:
+        console.print(f"{path} is at {address} until Ctrl-C", markup=False)
+        try:
+            while True:
+                time.sleep(3600)
+        except KeyboardInterrupt:
+            return
+
+
+def _need_display(path: Path, instead: str) -> None:
+    displays = ("DISPLAY", "WAYLAND_DISPLAY")
+    if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in displays):
+        raise ValueError(f"there is no display here to open {path} on; {instead}")

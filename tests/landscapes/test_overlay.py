@@ -1,0 +1,231 @@
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+from matplotlib.collections import LineCollection, PathCollection
+from matplotlib.colors import to_rgba
+
+from gradscape.landscapes.draw import style
+from gradscape.landscapes.draw.overlay import joint_scale, overlay_figure
+from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.overlay import best_point, overlay, principal_plane
+from gradscape.landscapes.plane import Plane
+from gradscape.landscapes.sampling import sample
+from gradscape.landscapes.space import ParameterSpace
+
+# Units that differ a thousandfold: half-widths 1 m/s, 1000 N and 10.
+LOWER, UPPER = [-1.0, 0.0, -10.0], [1.0, 2000.0, 10.0]
+SPACE = ParameterSpace(
+    ("speed", "force", "mass"), torch.tensor(LOWER).double(), torch.tensor(UPPER).double(), ("m/s", "N", "")
+)
+CENTER, HALF = np.array([0.0, 1000, 0]), np.array([1.0, 1000, 10])
+
+
+class Bowl:
+    """The squared distance from the middle of the scaled box, and a corner that is not finite."""
+
+    space = SPACE
+    name = "bowl"
+
+    def evaluate(self, x, *, grad=True):
+        z = 2 * self.space.to_unit(x) - 1
+        loss, slope = z.square().sum(dim=1), 2 * z / torch.from_numpy(HALF)
+        loss[(z[:, :2] > 0.75).all(dim=1)] = torch.nan
+        return Evaluation.judged(loss, slope if grad else None)
+
+
+def run(z, kind, *, seed=0, method="bo-leap", grad=True) -> xr.Dataset:
+    """Return the table of a run that evaluated these points of the scaled box."""
+    x = CENTER + HALF * np.asarray(z, dtype=float)
+    done = Bowl().evaluate(torch.from_numpy(x))
+    slope = done.grad.numpy() if grad else np.full_like(x, np.nan)
+    columns = {"x": x, "grad": slope, "loss": done.loss.numpy(), "status": done.status.numpy(), "kind": kind}
+    shaped = {name: (("evaluation", "dim")[: np.ndim(values)], values) for name, values in columns.items()}
+    names = ["random", "population", "descent", "acquisition", "policy"]
+    table = xr.Dataset(shaped, {"dim": list(SPACE.names)})
+    table["kind"].attrs = {"flag_values": list(range(5)), "flag_meanings": " ".join(names)}
+    return table.assign_attrs(method=method, seed=seed, lower=LOWER, upper=UPPER)
+
+
+def descent(start, *, step=0.1, count=6):
+    z = [np.asarray(start, dtype=float)]
+    while len(z) < count:
+        z.append(np.clip(z[-1] - step * 2 * z[-1], -1, 1))
+    return np.stack(z)
+
+
+PLANE = Plane.through(SPACE, SPACE.center, ("speed", "force"), resolution=(9, 5))
+SLICE = sample(Bowl(), PLANE)
+SPREAD = np.random.default_rng(0).uniform(-0.7, 0.7, (30, 3))
+
+
+def test_points_fall_on_the_plane_and_their_distance_is_in_half_widths_of_the_box():
+    (laid,) = overlay(SLICE, [run([[0.5, -0.5, 0.0], [0.25, 0.5, -0.4]], [0, 0])])
+    np.testing.assert_allclose(laid["u"], [0.5, 0.25])
+    np.testing.assert_allclose(laid["v"], [500, 1500])
+    np.testing.assert_allclose(laid["distance"], [0, 0.4], atol=1e-12)
+
+
+def test_a_skew_plane_is_nearest_in_the_scaled_box_whatever_the_units():
+    directions = torch.tensor([[1.0, 1000, 0], [0, 0, 10.0]]).double()  # (1, 1, 0) and (0, 0, 1) there
+    skew = Plane.spanned(SPACE.center, directions, resolution=5)
+    (laid,) = overlay(sample(Bowl(), skew), [run([[0.6, 0.0, 0.3]], [0])])
+    np.testing.assert_allclose([laid["u"][0], laid["v"][0]], [0.3, 0.3])
+    np.testing.assert_allclose(laid["distance"], np.hypot(0.3, 0.3))
+
+
+def test_the_loss_beneath_is_that_of_the_cell_the_point_is_drawn_in():
+    (laid,) = overlay(SLICE, [run([[0.1, 0.2, 0.9], [0.13, 0.26, 0], [0.9, 0.9, 0]], [0, 0, 0])])
+    by_hand = SLICE["loss"].sel(u=[0.0, 0.25], v=[1000, 1500], method="nearest").values.diagonal()
+    np.testing.assert_array_equal(laid["beneath"], [*by_hand, np.nan])  # the last lies over a sample that failed
+    assert laid["loss"][0] > laid["beneath"][0] + 0.8  # what the plane does not show
+
+
+def test_points_beyond_the_window_are_marked_and_have_nothing_beneath():
+    small = Plane.through(SPACE, SPACE.center, ("speed", "force"), resolution=5, extent=0.5)
+    (laid,) = overlay(sample(Bowl(), small), [run([[0.55, 0, 0], [0.6, 0, 0], [0, -0.99, 0]], [0, 0, 0])])
+    np.testing.assert_array_equal(laid["outside"], [False, False, True])  # a sample is 0.25 wide
+    np.testing.assert_array_equal(np.isnan(laid["beneath"]), laid["outside"])
+
+
+def test_descents_are_found_by_their_gradients_even_when_they_alternate():
+    one, two = descent([0.9, -0.8, 0.3]), descent([-0.5, 0.6, -0.9], count=6)
+    mixed = np.stack([one, two], axis=1).reshape(-1, 3)
+    (laid,) = overlay(SLICE, [run(mixed, [2] * 12)])
+    np.testing.assert_array_equal(laid["previous"], [-1, -1, *range(10)])
+
+
+def test_a_descent_that_overshoots_is_one_zigzag():
+    (laid,) = overlay(SLICE, [run(descent([0.9, -0.8, 0.3], step=0.9), [2] * 6)])
+    np.testing.assert_array_equal(laid["previous"], [-1, 0, 1, 2, 3, 4])  # not the nearest point on the same line
+
+
+def test_a_descent_along_the_border_is_one_descent():
+    z = np.array([[0.9, 0.2, 0.1], [1.0, 0.1, 0.05], [1.0, 0.05, 0.025]])
+    table = run(z, [2, 2, 2])
+    table["grad"].values[:] = np.array([-0.4, 2 * 0.1, 0.1]) * [1, 1, 1] / HALF  # pushes against the border
+    table["grad"].values[1] *= 0.5
+    np.testing.assert_array_equal(overlay(SLICE, [table])[0]["previous"], [-1, 0, 1])
+
+
+def test_points_without_gradients_are_no_descents():
+    (laid,) = overlay(SLICE, [run(descent([0.9, -0.8, 0.3]), [1] * 6, grad=False)])
+    assert (laid["previous"] == -1).all()
+
+
+def test_the_best_point_is_the_best_of_all_runs_and_failures_do_not_count():
+    tables = [run([[0.9, 0.9, 0.0], [0.3, 0, 0]], [0, 0]), run([[0.2, 0, 0]], [0], seed=1)]
+    x, loss = best_point(tables)
+    np.testing.assert_allclose(x, CENTER + HALF * [0.2, 0, 0])
+    assert loss == pytest.approx(0.04)
+    with pytest.raises(ValueError, match="no episode of these runs succeeded"):
+        best_point([run([[0.9, 0.9, 0.0]], [0])])
+
+
+def test_the_principal_plane_does_not_depend_on_units():
+    """Points on a disc that is tilted in the scaled box: with parameters as they are, force would be everything."""
+    angle = np.linspace(0, 6, 40)
+    flat = np.stack([np.cos(angle), np.sin(angle)], axis=1) * np.linspace(0.2, 0.8, 40)[:, None]
+    z = flat @ np.array([[1, 0, 0], [0, 0.6, 0.8]])
+    table = run(z, [0] * 40)
+    (laid,) = overlay(sample(Bowl(), principal_plane([table], resolution=4)), [table])
+    np.testing.assert_allclose(laid["distance"], 0, atol=1e-9)
+    assert not laid["outside"].any()
+    np.testing.assert_allclose(laid["u"] ** 2 + laid["v"] ** 2, ((z - z.mean(axis=0)) ** 2).sum(axis=1))
+    moved = principal_plane([table], resolution=4, through=SPACE.upper)
+    np.testing.assert_allclose(moved.lift(moved.project(SPACE.upper)), SPACE.upper)
+
+
+def test_runs_of_other_parameters_and_lines_are_refused():
+    other = run(SPREAD, [0] * 30).assign_coords(dim=["a", "b", "c"])
+    with pytest.raises(ValueError, match=r"bo-leap-s0 searched 3 parameters \(a, b, c\), the slice has 3 \(speed"):
+        overlay(SLICE, [other])
+    line = sample(Bowl(), Plane.through(SPACE, SPACE.center, ("speed",), resolution=5))
+    with pytest.raises(ValueError, match="laid over planes; got a slice of rank 1"):
+        overlay(line, [run(SPREAD, [0] * 30)])
+
+
+def test_runs_of_one_method_and_seed_are_told_apart():
+    tables = [run(SPREAD, [0] * 30), run(SPREAD, [0] * 30), run(SPREAD, [0] * 30, seed=1)]
+    assert [laid.attrs["label"] for laid in overlay(SLICE, tables)] == ["bo-leap-s0-1", "bo-leap-s0-2", "bo-leap-s1"]
+
+
+FAILING = np.concatenate([SPREAD, [[0.9, 0.9, 0.0], [0.95, 0.9, 0.1]]])
+LAID = overlay(SLICE, [run(FAILING, [1] * 16 + [3] * 16), run(descent([0.9, -0.8, 0.3]), [2] * 6, method="descents")])
+FIGURE = overlay_figure(SLICE, LAID)
+MAP, AGAINST = FIGURE.axes[:2]
+
+
+def drawn(ax, gid: str) -> list[PathCollection]:
+    return [artist for artist in ax.collections if artist.get_gid() == gid]
+
+
+def legend() -> list[str]:
+    return [text.get_text() for text in FIGURE.legends[0].get_texts()]
+
+
+def test_every_point_is_drawn_where_it_falls_in_the_colour_of_its_true_loss():
+    (dots,) = drawn(MAP, "population")
+    np.testing.assert_array_equal(dots.get_offsets(), np.stack([LAID[0]["u"], LAID[0]["v"]], 1)[:16])
+    np.testing.assert_array_equal(dots.get_array(), LAID[0]["loss"][:16])
+    (mesh,) = [artist for artist in MAP.collections if artist.get_array() is not None and artist.get_gid() is None]
+    assert (dots.norm.vmin, dots.norm.vmax) == (mesh.norm.vmin, mesh.norm.vmax)
+    assert dots.get_cmap() == mesh.get_cmap()
+
+
+def test_points_shrink_with_their_distance_from_the_plane():
+    (dots,) = drawn(MAP, "population")
+    order = np.argsort(LAID[0]["distance"][:16].values)
+    sizes = dots.get_sizes()[order]
+    assert (np.diff(sizes) < 0).all()
+    assert f"{max(float(laid['distance'].max()) for laid in LAID):.2g} half-widths of the box off it" in legend()
+
+
+def test_kinds_have_their_markers_and_descents_their_lines():
+    shapes = {gid: drawn(MAP, gid)[0].get_paths()[0].vertices.shape for gid in ("population", "descent", "acquisition")}
+    assert len(set(shapes.values())) == 3
+    lines = [artist for artist in MAP.collections if isinstance(artist, LineCollection)]
+    by_count = {len(line.get_segments()): line for line in lines}
+    assert set(by_count) == {0, 5}
+    np.testing.assert_allclose(by_count[5].get_segments()[0], np.stack([LAID[1]["u"], LAID[1]["v"]], 1)[:2])
+    faint = by_count[5].get_colors()[:, 3]
+    assert (np.diff(faint) > 0).all()  # it comes nearer to the plane as it goes
+    np.testing.assert_allclose(by_count[5].get_colors()[0, :3], to_rgba(style.METHODS["descents"]["color"])[:3])
+
+
+def test_failures_are_crosses_and_neither_points_nor_best():
+    (crosses,) = drawn(MAP, "failed")
+    np.testing.assert_array_equal(crosses.get_offsets(), np.stack([LAID[0]["u"], LAID[0]["v"]], 1)[-2:])
+    assert len(drawn(MAP, "acquisition")[0].get_offsets()) == 14
+    assert "failed episode: 2 of 38 points" in legend()
+    nothing = overlay(SLICE, [run([[0.9, 0.9, 0.0]] * 3, [0] * 3)])
+    figure = overlay_figure(SLICE, nothing)
+    assert not drawn(figure.axes[0], "best")
+    assert "bo-leap, seed 0: no episode succeeded" in [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_points_beyond_the_map_are_hollow_at_its_border_and_counted():
+    small = Plane.through(SPACE, SPACE.center, ("speed", "force"), resolution=5, extent=0.5)
+    dataset = sample(Bowl(), small)
+    laid = overlay(dataset, [run([[0.0, 0, 0], [0.9, 0, 0], [0, -0.99, 0]], [0, 0, 0])])
+    figure = overlay_figure(dataset, laid)
+    (hollow,) = drawn(figure.axes[0], "outside")
+    np.testing.assert_allclose(hollow.get_offsets(), [[0.625, 1000], [0, 375]])
+    assert len(hollow.get_facecolors()) == 0
+    assert "beyond the map: 2 of 3 points" in [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_losses_are_held_against_the_samples_beneath():
+    own = next(dots for dots in drawn(AGAINST, "descent") if len(dots.get_offsets()))
+    np.testing.assert_array_equal(own.get_offsets(), np.stack([LAID[1]["beneath"], LAID[1]["loss"]], 1))
+    assert AGAINST.get_xlim() == AGAINST.get_ylim()
+    assert AGAINST.get_title().startswith("36 of 38 points have a loss")
+
+
+def test_a_run_that_converged_leaves_the_map_its_colours():
+    lifted = SLICE.assign(loss=SLICE["loss"] + 1.0)
+    laid = overlay(lifted, [run(descent([0.5, 0.5, 0.5], step=0.49, count=9), [2] * 9)])
+    scale = joint_scale(lifted, laid)
+    assert laid[0]["loss"].min() < 1e-20
+    assert scale.norm.vmin == pytest.approx(0.1)
+    assert scale.extend == "min"

@@ -1,0 +1,189 @@
+import fcntl
+import json
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+
+from gradscape.landscapes.identity import StoreError
+from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.space import ParameterSpace
+from gradscape.optim.base import Kind
+from gradscape.optim.run import CHUNK, STATE, Run, is_run
+
+SPACE = ParameterSpace(("speed", "angle"), torch.tensor([-1.0, 0.0]), torch.tensor([1.0, 3.0]), ("m/s", "rad"))
+IDENTITY = {"objective": "hill", "fidelity": "draft", "method": "walk", "seed": 4}
+
+
+def run_at(path: Path, *, budget: int = 100, **changes: object) -> Run:
+    provenance = {"loss_unit": "m", "command": "landscape optimize"}
+    return Run.open_or_create(path, SPACE, identity=IDENTITY | changes, provenance=provenance, budget=budget)
+
+
+def points(count: int, *, grad: bool = True, start: int = 0) -> tuple[torch.Tensor, Evaluation]:
+    """Points whose losses count up and whose third one fails."""
+    x = torch.rand(count, 2, generator=torch.Generator().manual_seed(start), dtype=torch.float64)
+    loss = torch.arange(start, start + count, dtype=torch.float64)
+    failed = torch.where(loss == 2, Status.ESCAPED, Status.OK)
+    return x, Evaluation.judged(loss, torch.tensor([3.0, 4.0]).expand(count, 2).double() if grad else None, failed)
+
+
+def test_a_run_reads_back_as_it_was_written(tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run.zarr")
+    run.begin(gradient_cost=2.5)
+    run.append(*points(4), Kind.DESCENT, 1.5)
+    run.append(*points(2, grad=False, start=4), Kind.POPULATION, 0.5)
+    run.save(lambda: b"what\ncomes\nnext")
+    again = Run.open(tmp_path / "run.zarr")
+    xr.testing.assert_identical(again.table(), run.table())
+    assert (again.count, again.told, again.state()) == (6, 6, b"what\ncomes\nnext")
+    table = again.table()
+    np.testing.assert_array_equal(table["loss"], [0, 1, np.nan, 3, 4, 5])
+    np.testing.assert_array_equal(table["slope"], [5, 5, np.nan, 5, np.nan, np.nan])
+    np.testing.assert_array_equal(table["episodes"], [1, 2, 3, 4, 5, 6])
+    np.testing.assert_array_equal(table["forwards"], [2.5, 5, 7.5, 10, 11, 12])
+    np.testing.assert_array_equal(table["seconds"], [1.5] * 4 + [2.0] * 2)
+    np.testing.assert_array_equal(table["x"][4:], points(2, start=4)[0])
+    assert table["status"].values[2] == Status.ESCAPED
+    assert table["kind"].values.tolist() == [Kind.DESCENT] * 4 + [Kind.POPULATION] * 2
+    assert table["kind"].attrs["flag_meanings"].split()[Kind.POPULATION] == "population"
+    assert again.failed == 1
+    assert again.best == 0.0
+
+
+def test_plain_xarray_reads_the_table_with_its_units(tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run.zarr")
+    run.append(*points(5, grad=False), Kind.RANDOM, 1.0)
+    run.save(lambda: b"")
+    table = xr.open_zarr(tmp_path / "run.zarr").load()
+    there = table.isel(evaluation=table["status"] != Status.MISSING)
+    assert table.sizes == {"evaluation": 100, "dim": 2}
+    assert there.sizes["evaluation"] == 5
+    for name, values in run.table().items():
+        np.testing.assert_array_equal(there[name], values)
+    assert list(there["dim"].values) == ["speed", "angle"]
+    assert there["loss"].attrs["units"] == "m"
+    about = {"env": "hill", "method": "walk", "seed": 4, "budget": 100, "fidelity": "draft", "loss_unit": "m"}
+    assert there.attrs.items() >= (about | {"units": ["m/s", "rad"], "lower": [-1, 0], "upper": [1, 3]}).items()
+
+
+def test_rows_that_the_state_does_not_count_do_not_exist(tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run.zarr")
+    run.append(*points(3), Kind.RANDOM, 1.0)
+    run.save(lambda: b"three")
+    state = (tmp_path / "run.zarr" / STATE).read_bytes()
+    run.append(*points(3, start=3), Kind.RANDOM, 1.0)
+    run.save(lambda: b"six")
+    (tmp_path / "run.zarr" / STATE).write_bytes(state)  # as if killed between the rows and the state
+    again = Run.open(tmp_path / "run.zarr")
+    assert (again.count, again.state()) == (3, b"three")
+    assert again.table().sizes["evaluation"] == 3
+
+
+def test_a_proposal_cut_short_is_in_the_table_and_dropped_before_the_run_goes_on(tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run.zarr", budget=5)
+    run.append(*points(3), Kind.RANDOM, 1.0)
+    run.save(lambda: b"three")
+    run.append(*points(2, start=3), Kind.RANDOM, 1.0)
+    run.save(None)
+    again = Run.open(tmp_path / "run.zarr")
+    assert (again.count, again.told, again.state()) == (5, 3, b"three")
+    again.rewind()
+    assert (again.count, len(again.table()["loss"])) == (3, 3)
+    again.extend(8)
+    again.append(*points(5, start=3), Kind.RANDOM, 1.0)
+    again.save(lambda: b"eight")
+    assert Run.open(tmp_path / "run.zarr").table()["loss"].values[-5:].tolist() == [3, 4, 5, 6, 7]
+    assert xr.open_zarr(tmp_path / "run.zarr").sizes["evaluation"] == 8
+
+
+def test_a_run_killed_while_it_writes_anew_what_was_cut_short_keeps_what_was_told(tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run.zarr", budget=9)
+    run.append(*points(3), Kind.RANDOM, 1.0)
+    run.save(lambda: b"three")
+    run.append(*points(6, start=3), Kind.RANDOM, 1.0)
+    run.save(None)
+    state = (tmp_path / "run.zarr" / STATE).read_bytes()
+    run.rewind()
+    run.append(*points(2, start=3), Kind.RANDOM, 1.0)
+    run.save(lambda: b"five")
+    (tmp_path / "run.zarr" / STATE).write_bytes(state)  # nine rows, it says; five are there
+    again = Run.open(tmp_path / "run.zarr")
+    assert (again.count, again.told, again.state()) == (5, 3, b"three")
+
+
+def test_a_missing_row_is_damage_not_data(tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run.zarr", budget=3 * CHUNK)
+    run.append(*points(2 * CHUNK), Kind.RANDOM, 1.0)
+    run.save(lambda: b"")
+    (tmp_path / "run.zarr/status/c/1").unlink()
+    with pytest.raises(StoreError, match=f"row {CHUNK + 1} is missing; begin anew with --force"):
+        Run.open(tmp_path / "run.zarr")
+
+
+def test_the_budget_is_the_end_of_the_table(tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run.zarr", budget=4)
+    with pytest.raises(ValueError, match="4 episodes has 4 left; got 5 more"):
+        run.append(*points(5), Kind.RANDOM, 1.0)
+
+
+def test_other_settings_are_refused_by_name_and_another_budget_is_not(tmp_path: Path) -> None:
+    run_at(tmp_path / "run.zarr", budget=7)
+    with pytest.raises(StoreError, match=r"holds a run made by other settings \(seed: wanted 5, found 4\)"):
+        run_at(tmp_path / "run.zarr", seed=5)
+    assert run_at(tmp_path / "run.zarr", budget=70).budget == 7
+    wider = ParameterSpace(SPACE.names, SPACE.lower, torch.tensor([1.0, 4.0]), SPACE.units)
+    with pytest.raises(StoreError, match=r"upper\[1\]: wanted 4.0, found 3.0"):
+        Run.open_or_create(tmp_path / "run.zarr", wider, identity=IDENTITY, budget=7)
+
+
+def test_only_a_run_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/thesis.txt").write_text("precious")
+    with pytest.raises(StoreError, match="is no run, so it is not replaced"):
+        Run.create(tmp_path / "mine", SPACE, identity={}, budget=3, overwrite=True)
+    assert not is_run(tmp_path / "mine")
+    with pytest.raises(StoreError, match="is no run of format 1"):
+        Run.open(tmp_path / "mine")
+    with pytest.raises(StoreError, match="make one with `landscape optimize`"):
+        Run.open(tmp_path / "nothing")
+    run = run_at(tmp_path / "run.zarr")
+    run.append(*points(3), Kind.RANDOM, 1.0)
+    run.save(lambda: b"")
+    assert Run.create(tmp_path / "run.zarr", SPACE, identity={}, budget=3, overwrite=True).count == 0
+    with pytest.raises(StoreError, match="was replaced or removed"):
+        run.save(lambda: b"")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine", "run.zarr"]
+
+
+def test_one_process_at_a_time_fills_a_run(tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run.zarr")
+    other = os.open(tmp_path / "run.zarr", os.O_RDONLY)
+    fcntl.flock(other, fcntl.LOCK_EX)
+    with pytest.raises(StoreError, match="being filled by another process"), run.filling():
+        pass
+    os.close(other)
+    with run.filling():
+        pass
+
+
+def test_writing_takes_a_twentieth_of_the_time_at_most(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now, saved = 0.0, []
+    monkeypatch.setattr("gradscape.optim.run.time", SimpleNamespace(monotonic=lambda: now))
+    run = run_at(tmp_path / "run.zarr")
+
+    def slow_state() -> bytes:
+        nonlocal now
+        now += 0.4
+        saved.append(run.count)
+        return b""
+
+    for number in range(60):
+        now += 0.3
+        run.append(*points(1, start=number), Kind.RANDOM, 0.3, slow_state)
+    assert saved == [4, 31, 58]  # after the first second, then after 0.4 s / 5 % = 8 s each
+    assert json.loads((tmp_path / "run.zarr" / STATE).read_bytes().splitlines()[0])["rows"] == 58

@@ -1,0 +1,252 @@
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+
+from gradscape.landscapes.adapters import from_torch
+from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.space import ParameterSpace
+from gradscape.optim.base import Kind, NoOptions, Optimizer, Points, Proposal
+from gradscape.optim.cmaes import CMAES
+from gradscape.optim.random import RandomSearch
+from gradscape.optim.run import Run
+from gradscape.optim.search import Progress, episode_cost, search
+
+SPACE = ParameterSpace(("a", "b", "c"), torch.tensor([-2.0, 0, 5]), torch.tensor([2.0, 9, 6]), ("m", "s", ""))
+
+
+class Pit:
+    """A bowl with a strip at its bottom where episodes fail; it counts what it is asked."""
+
+    space, name = SPACE, "pit"
+
+    def __init__(self, *, stop_after: int | None = None, pause: float = 0.0):
+        self.batches: list[int] = []
+        self.with_gradient = 0
+        self.stop_after, self.pause = stop_after, pause
+
+    def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
+        if self.stop_after is not None and len(self.batches) >= self.stop_after:
+            raise KeyboardInterrupt
+        time.sleep(self.pause * len(x))
+        self.batches.append(len(x))
+        self.with_gradient += grad * len(x)
+        u = SPACE.to_unit(x)
+        failed = torch.where(u[:, 1] < 0.2, Status.ESCAPED, Status.OK)
+        width = SPACE.upper - SPACE.lower
+        return Evaluation.judged((u**2).sum(dim=1), 2 * u / width if grad else None, failed)
+
+
+class Mixed(Optimizer):
+    """Alternate seven random points and one with its gradient, which it steps along."""
+
+    name, needs_grad = "mixed", True
+    Options = NoOptions
+
+    def _setup(self) -> None:
+        self.at = np.zeros((1, self.space.dim))
+        self.turn = 0
+
+    def _ask(self) -> Proposal:
+        if self.turn % 2:
+            return Proposal(torch.from_numpy(self.at), Kind.DESCENT, grad=True)
+        return Proposal(torch.from_numpy(self.random.uniform(-1, 1, (7, self.space.dim))), Kind.POPULATION)
+
+    def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
+        self.turn += 1
+        self.at = z[[np.argmin(loss)]] if grad is None else z - 0.1 * grad
+
+
+METHODS = [RandomSearch, CMAES, Mixed]
+
+
+def run_at(path: Path, kind: type[Optimizer] = CMAES, *, budget: int = 60) -> Run:
+    return Run.open_or_create(path, SPACE, identity={"objective": "pit", "method": kind.name, "seed": 3}, budget=budget)
+
+
+def filled(path: Path, kind: type[Optimizer], *, budget: int, objective: Pit | None = None) -> xr.Dataset:
+    run = run_at(path, kind, budget=budget)
+    search(objective or Pit(), kind(SPACE, seed=3), run, budget=budget, gradient_cost=3.0)
+    return run.table().drop_vars("seconds")
+
+
+def test_the_table_holds_the_objective_at_the_points_that_were_asked_for() -> None:
+    table = search(Pit(), Mixed(SPACE), budget=40).table()
+    wanted = Pit().evaluate(torch.from_numpy(table["x"].values))
+    np.testing.assert_array_equal(table["loss"], wanted.loss)
+    np.testing.assert_array_equal(table["status"], wanted.status)
+    descent = table["kind"].values == Kind.DESCENT
+    np.testing.assert_array_equal(table["grad"][descent], wanted.grad[descent])
+    assert np.isnan(table["grad"][~descent]).all()
+    np.testing.assert_array_equal(table["slope"][descent], wanted.grad[descent].norm(dim=1))
+    assert (table["status"] == Status.ESCAPED).any()
+
+
+@pytest.mark.parametrize("kind", METHODS)
+@pytest.mark.parametrize("budget", [1, 16, 29, 30])
+def test_the_budget_is_met_and_not_exceeded_by_one_episode(kind: type[Optimizer], budget: int) -> None:
+    objective = Pit()
+    run = search(objective, kind(SPACE), budget=budget, gradient_cost=2.0)
+    assert sum(objective.batches) == run.count == budget
+    assert run.table()["episodes"].values.tolist() == list(range(1, budget + 1))
+
+
+@pytest.mark.parametrize("kind", METHODS)
+def test_a_run_stopped_at_every_instant_ends_as_an_undisturbed_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: type[Optimizer]
+) -> None:
+    monkeypatch.setattr("gradscape.optim.run.PAUSE", 0.0)
+    monkeypatch.setattr("gradscape.optim.run.SHARE", 1.0e9)  # write every time
+    whole, stops = filled(tmp_path / "whole.zarr", kind, budget=45), 0
+    while run_at(tmp_path / "run.zarr", kind, budget=45).count < 45:
+        before = run_at(tmp_path / "run.zarr", kind, budget=45).count
+        try:
+            filled(tmp_path / "run.zarr", kind, budget=45, objective=Pit(stop_after=1))
+        except KeyboardInterrupt:
+            stops += 1
+            assert run_at(tmp_path / "run.zarr", kind, budget=45).count > before  # nothing was computed twice
+    assert stops >= 2
+    xr.testing.assert_equal(run_at(tmp_path / "run.zarr", kind, budget=45).table().drop_vars("seconds"), whole)
+
+
+@pytest.mark.parametrize("kind", METHODS)
+def test_a_run_stopped_before_anything_was_written_begins_again(tmp_path: Path, kind: type[Optimizer]) -> None:
+    for stop in (0, 1, 2):
+        with pytest.raises(KeyboardInterrupt):
+            filled(tmp_path / "run.zarr", kind, budget=45, objective=Pit(stop_after=stop))
+        assert run_at(tmp_path / "run.zarr", kind, budget=45).count == 0
+    xr.testing.assert_equal(
+        filled(tmp_path / "run.zarr", kind, budget=45), filled(tmp_path / "whole.zarr", kind, budget=45)
+    )
+
+
+@pytest.mark.parametrize("kind", METHODS)
+def test_a_run_continued_to_a_larger_budget_is_the_one_that_had_it_from_the_beginning(
+    tmp_path: Path, kind: type[Optimizer]
+) -> None:
+    for budget in (5, 18, 19, 40):
+        continued = filled(tmp_path / "run.zarr", kind, budget=budget)
+    whole = filled(tmp_path / "whole.zarr", kind, budget=40)
+    xr.testing.assert_identical(continued, whole)
+    objective = Pit()
+    assert filled(tmp_path / "run.zarr", kind, budget=19, objective=objective).sizes["evaluation"] == 40
+    assert not objective.batches
+
+
+def test_a_run_in_memory_can_be_continued_too() -> None:
+    run = search(Pit(), Mixed(SPACE), budget=5, gradient_cost=3.0)
+    xr.testing.assert_equal(
+        search(Pit(), Mixed(SPACE), run, budget=33).table().drop_vars("seconds"),
+        search(Pit(), Mixed(SPACE), budget=33, gradient_cost=3.0).table().drop_vars("seconds"),
+    )
+
+
+KILLED_WHILE_SEARCHING = """
+import os, signal, sys, time
+from pathlib import Path
+from gradscape.optim import run
+from test_search import CMAES, Pit, filled
+run.PAUSE = 0.02
+path = Path(sys.argv[1])
+for delay in (0.3, 0.17, 0.41, 0.23):  # together too short for the budget, however fast the machine
+    if not (child := os.fork()):
+        filled(path, CMAES, budget=300, objective=Pit(pause=0.01))
+        os._exit(0)
+    time.sleep(delay)
+    os.kill(child, signal.SIGKILL)
+    _, status = os.waitpid(child, 0)
+    assert os.WIFSIGNALED(status), "finished before it was killed"
+"""
+
+
+def test_sigkill_at_any_instant_changes_no_bit(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", KILLED_WHILE_SEARCHING, str(tmp_path / "run.zarr")]
+    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    kept = run_at(tmp_path / "run.zarr", budget=300).count
+    assert 0 < kept < 300
+    objective = Pit()
+    resumed = filled(tmp_path / "run.zarr", CMAES, budget=300, objective=objective)
+    assert sum(objective.batches) == 300 - kept
+    xr.testing.assert_identical(resumed, filled(tmp_path / "whole.zarr", CMAES, budget=300))
+
+
+def test_forward_equivalents_count_a_gradient_for_what_it_costs(tmp_path: Path) -> None:
+    run, objective = run_at(tmp_path / "run.zarr", Mixed), Pit()
+    search(objective, Mixed(SPACE, seed=3), run, budget=24, gradient_cost=2.5)
+    assert run.table()["forwards"].values[[6, 7, 8, 23]].tolist() == [7.0, 9.5, 10.5, 28.5]
+    assert objective.with_gradient == 3
+    search(Pit(), Mixed(SPACE, seed=3), run, budget=60, gradient_cost=99.0)  # what was measured first stays
+    assert run.table()["forwards"].values[-1] == 60 + 7 * 1.5
+    assert Run.open(tmp_path / "run.zarr").gradient_cost == 2.5
+
+
+def test_what_a_gradient_costs_is_measured() -> None:
+    class Slow(Pit):
+        def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
+            time.sleep(0.03 if grad else 0.01)
+            return super().evaluate(x, grad=grad)
+
+    cost = episode_cost(Slow())
+    assert cost.forward == pytest.approx(0.01, rel=0.3)
+    assert cost.ratio == pytest.approx(3.0, rel=0.3)
+    assert search(Slow(), Mixed(SPACE), budget=3).gradient_cost == pytest.approx(3.0, rel=0.3)
+
+
+def test_seconds_add_up_to_the_time_it_took() -> None:
+    start = time.perf_counter()
+    seconds = search(Pit(pause=0.01), RandomSearch(SPACE), budget=40).table()["seconds"].values
+    assert 0.4 <= seconds[-1] <= time.perf_counter() - start
+    assert seconds[15] == pytest.approx(0.16, abs=0.05)
+    assert (np.diff(seconds) >= 0).all()
+
+
+def test_progress_counts_up_and_knows_the_best(tmp_path: Path) -> None:
+    seen: list[Progress] = []
+    run = run_at(tmp_path / "run.zarr")
+    search(Pit(), CMAES(SPACE, seed=3), run, budget=20, progress=seen.append)
+    assert [now.done for now in seen] == [0, 7, 14, 20]
+    assert np.isnan(seen[0].best)
+    table = run.table()
+    assert seen[2].best == float(table["loss"][:14].min())
+    assert seen[-1].failed == int((table["status"] != Status.OK).sum())
+    seen.clear()
+    search(Pit(), CMAES(SPACE, seed=3), run, budget=20, progress=seen.append)
+    assert [(now.done, now.resumed, now.total) for now in seen] == [(20, 20, 20)]
+    seen.clear()
+    search(Pit(), CMAES(SPACE, seed=3), run, budget=30, progress=seen.append)
+    assert [(now.done, now.resumed) for now in seen[::3]] == [(0, 0), (21, 0)]  # it was short: kept, but not told
+
+
+def test_a_method_is_known_by_its_name_and_not_exchanged(tmp_path: Path) -> None:
+    named = run_at(tmp_path / "named.zarr", budget=20)
+    search(Pit(), "cma-es", named, budget=20)
+    made = filled(tmp_path / "made.zarr", CMAES, budget=20)
+    xr.testing.assert_identical(named.table().drop_vars("seconds"), made)
+    with pytest.raises(ValueError, match="holds a run of cma-es, not of random"):
+        search(Pit(), "random", named, budget=30)
+    with pytest.raises(ValueError, match="no method is called 'cmaes'; did you mean cma-es"):
+        search(Pit(), "cmaes", budget=3)
+
+
+class Idle(RandomSearch):
+    def _ask(self) -> Proposal:
+        return Proposal(torch.zeros(0, 3, dtype=torch.float64), Kind.RANDOM)
+
+
+class Sly(RandomSearch):
+    def _ask(self) -> Proposal:
+        return Proposal(torch.zeros(1, 3, dtype=torch.float64), Kind.RANDOM, grad=True)
+
+
+def test_an_optimiser_that_breaks_the_contract_is_named() -> None:
+    objective = from_torch(lambda x: (x**2).sum(dim=1), SPACE)
+    with pytest.raises(ValueError, match="random proposed no point"):
+        search(objective, Idle(SPACE), budget=3)
+    with pytest.raises(ValueError, match="must say needs_grad = True"):
+        search(objective, Sly(SPACE), budget=3)

@@ -1,0 +1,155 @@
+import pickle
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+from botorch.acquisition.analytic import UpperConfidenceBound
+
+from gradscape.optim.surrogate import GROWTH, NegativeBound, Surrogate, SurrogateOptions
+
+
+def waves(z: np.ndarray) -> np.ndarray:
+    return 30.0 + 5.0 * np.sin(4.0 * z).sum(axis=1) + 8.0 * (z**2).sum(axis=1)
+
+
+def informed(count: int = 40, dim: int = 2, **options) -> Surrogate:
+    surrogate = Surrogate(dim, SurrogateOptions(initial=1, **options))
+    z = np.random.default_rng(1).uniform(-1.0, 1.0, (count, dim))
+    surrogate.add(z, waves(z))
+    return surrogate
+
+
+@pytest.mark.parametrize("count", [5, 40])
+@pytest.mark.parametrize("kernel", ["rbf", "matern"])
+def test_the_bounds_argmin_agrees_with_a_dense_grid(count, kernel):
+    surrogate = informed(count, kernel=kernel)
+    axis = torch.linspace(0.0, 1.0, 201, dtype=torch.float64)
+    grid = torch.cartesian_prod(axis, axis)
+    found = torch.from_numpy(surrogate.lowest(np.random.default_rng(0)) + 1.0)[None] / 2.0
+    bound = UpperConfidenceBound(surrogate.model(), beta=1.0, maximize=False)
+    with torch.no_grad():
+        values, value = -bound(grid[:, None]), -bound(found[:, None])
+    assert value <= values.min() + 1e-6 * (values.max() - values.min())
+    assert (found - grid[values.argmin()]).abs().max() < 0.006
+
+
+def test_the_process_is_the_posterior_of_a_zero_mean_with_squared_exponential_covariance():
+    surrogate = informed()
+    model = surrogate.model()
+    u, new = (surrogate.z + 1.0) / 2.0, np.random.default_rng(2).uniform(size=(5, 2))
+    mean, spread = surrogate.loss.mean(), surrogate.loss.std(ddof=1)
+    scale = model.covar_module.lengthscale.detach().numpy()
+    noise = model.likelihood.noise.item()
+
+    def k(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.exp(-0.5 * (((a[:, None] - b[None]) / scale) ** 2).sum(axis=2))
+
+    inverse = np.linalg.inv(k(u, u) + noise * np.eye(len(u)))  # Rasmussen & Williams 2006, eq. 2.25 and 2.26
+    wanted = k(new, u) @ inverse @ ((surrogate.loss - mean) / spread)
+    variance = 1.0 - np.einsum("ij,jk,ik->i", k(new, u), inverse, k(new, u))
+    posterior = model.posterior(torch.from_numpy(new))
+    np.testing.assert_allclose(posterior.mean.detach()[:, 0], mean + spread * wanted, rtol=1e-6)
+    np.testing.assert_allclose(posterior.variance.detach()[:, 0], spread**2 * variance, rtol=1e-4, atol=1e-8)
+
+
+def test_the_bound_lies_the_coefficient_below_the_mean():
+    model = informed().model()
+    points = torch.rand(7, 1, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    wanted = UpperConfidenceBound(model, beta=2.5**2, maximize=False)(points)
+    torch.testing.assert_close(NegativeBound(model, 2.5)(points), wanted, rtol=1e-9, atol=1e-9)
+
+
+def test_more_exploration_goes_further_from_what_is_known():
+    def distance(coefficient: float) -> float:
+        surrogate = informed(15, coefficient=coefficient)
+        return np.linalg.norm(surrogate.z - surrogate.lowest(np.random.default_rng(0)), axis=1).min()
+
+    assert distance(20.0) > 2.0 * distance(0.0)
+
+
+def test_fitting_raises_the_likelihood_that_a_parameter_without_effect_is_ignored():
+    surrogate = Surrogate(2, SurrogateOptions())
+    z = np.random.default_rng(1).uniform(-1.0, 1.0, (60, 2))
+    surrogate.add(z, np.sin(5.0 * z[:, 0]))
+    used, unused = surrogate.model().covar_module.lengthscale.detach().flatten().tolist()
+    assert unused > 10.0 * used
+
+
+def test_a_failure_counts_as_the_worst_loss():
+    surrogate, plain = informed(20), informed(20)
+    worst, failed = plain.loss.argmax(), plain.loss.argmin()
+    surrogate.loss[failed], plain.loss[failed] = np.inf, plain.loss[worst]
+    z = [one.lowest(np.random.default_rng(0)) for one in (surrogate, plain)]
+    np.testing.assert_array_equal(*z)
+
+
+@pytest.mark.parametrize("loss", [[3.0], [2.0, 2.0, 2.0], [1e6, 0.0, 1e-9], [np.inf, 5.0]])
+def test_few_equal_and_wildly_different_losses_are_no_obstacle(loss):
+    surrogate = Surrogate(3, SurrogateOptions(initial=1))
+    surrogate.add(np.random.default_rng(0).uniform(-1, 1, (len(loss), 3)), np.array(loss))
+    z = surrogate.lowest(np.random.default_rng(0))
+    assert np.isfinite(z).all()
+    assert (np.abs(z) <= 1.0).all()
+
+
+def test_points_are_drawn_at_random_until_there_are_enough_and_one_has_a_loss():
+    def drawn(count: int, loss: float) -> list[np.ndarray]:
+        surrogate = Surrogate(2, SurrogateOptions(initial=4))
+        z = np.random.default_rng(1).uniform(-1.0, 1.0, (count, 2))
+        surrogate.add(z, loss + waves(z))
+        assert surrogate.informed == (count == 4 and loss < np.inf)
+        return [surrogate.lowest(np.random.default_rng(seed)) for seed in (0, 1)]
+
+    np.testing.assert_array_equal(drawn(0, 0.0), drawn(3, 0.0))
+    np.testing.assert_array_equal(drawn(0, 0.0), drawn(4, np.inf))
+    assert not np.array_equal(drawn(3, 0.0), drawn(4, 0.0))
+
+
+def test_every_point_is_modelled_up_to_the_most_and_the_best_half_and_a_spread_past_it():
+    assert len(informed(50, most=50).model().train_targets) == 50
+    surrogate = informed(100, most=20)
+    kept = set(map(tuple, 2.0 * surrogate.model().train_inputs[0].numpy() - 1.0))
+    order = np.argsort(surrogate.loss)
+    assert len(kept) == 20
+
+    def held(rows: np.ndarray) -> np.ndarray:
+        return np.array([any(np.allclose(surrogate.z[row], one) for one in kept) for row in rows])
+
+    assert held(order[:10]).all()
+    others = np.sort(order[10:])
+    assert np.diff(np.flatnonzero(held(others))).max() <= 10
+
+
+def test_hyper_parameters_are_kept_until_the_data_have_grown_by_a_tenth():
+    surrogate = informed(40)
+    before = surrogate.model().covar_module.lengthscale.tolist()
+    z = np.random.default_rng(9).uniform(-1.0, 1.0, (4, 2))
+    surrogate.add(z[:3], 100.0 * waves(z[:3]))
+    assert surrogate.model().covar_module.lengthscale.tolist() == before
+    surrogate.add(z[3:], 100.0 * waves(z[3:]))
+    assert len(surrogate.loss) >= GROWTH * 40
+    assert surrogate.model().covar_module.lengthscale.tolist() != before
+
+
+def test_it_is_pickled_whole_and_leaves_no_trace_in_global_generators_or_warning_filters():
+    surrogate = informed(43)
+    surrogate.model()
+    before = torch.get_rng_state(), np.random.get_state()[1].copy(), list(warnings.filters)
+    copy = pickle.loads(pickle.dumps(surrogate))
+    z = [one.lowest(np.random.default_rng(4)) for one in (surrogate, copy)]
+    np.testing.assert_array_equal(*z)
+    assert torch.equal(before[0], torch.get_rng_state())
+    np.testing.assert_array_equal(before[1], np.random.get_state()[1])
+    assert before[2] == warnings.filters
+
+
+def test_threads_find_what_one_alone_finds():
+    def lowest(seed: int) -> list[np.ndarray]:
+        surrogate = informed(30 + seed)
+        return [surrogate.lowest(np.random.default_rng(seed)) for _ in range(3)]
+
+    alone = [lowest(seed) for seed in range(4)]
+    with ThreadPoolExecutor(4) as executor:
+        np.testing.assert_array_equal(list(executor.map(lowest, range(4))), alone)
