@@ -6,38 +6,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import xarray as xr
 
-from gradscape.cli import main
 from gradscape.optim.run import STATE, Run
 
+from .command import Said
+
 QUICK = ["optimize", "branin", "--method", "cma-es", "--budget", "50"]
-
-
-@dataclass(frozen=True)
-class Said:
-    returncode: int
-    stdout: str
-    stderr: str
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Said]:
-    """Run the command in this process, in a folder of its own."""
-
-    def command(*arguments: str, cwd: Path) -> Said:
-        monkeypatch.chdir(cwd)
-        monkeypatch.setattr(sys, "argv", ["landscape", *arguments])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as left:
-            main(list(arguments))
-        return Said(int(left.value.code or 0), *capsys.readouterr())
-
-    return command
 
 
 def test_optimize_leaves_run_picture_and_summary(run: Callable[..., Said], tmp_path: Path) -> None:

@@ -6,39 +6,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from gradscape.cli import main
 from gradscape.optim.run import Run
 
+from .command import Said
+
 RACE = ["race", "branin", "--methods", "random,cma-es", "--methods", "descents", "--budget", "40", "--seeds", "3"]
-
-
-@dataclass(frozen=True)
-class Said:
-    returncode: int
-    stdout: str
-    stderr: str
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Said]:
-    """Run the command in this process, in a folder of its own."""
-
-    def command(*arguments: str, cwd: Path) -> Said:
-        monkeypatch.chdir(cwd)
-        monkeypatch.setattr(sys, "argv", ["landscape", *arguments])
-        monkeypatch.setenv("COLUMNS", "160")
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as left:
-            main(list(arguments))
-        return Said(int(left.value.code or 0), *capsys.readouterr())
-
-    return command
 
 
 def test_race_leaves_runs_picture_and_figures(run: Callable[..., Said], tmp_path: Path) -> None:

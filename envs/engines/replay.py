@@ -12,7 +12,7 @@ import warp as wp
 
 from .model import Box
 
-GRAPHS, LISTS = 512, 4096  # that are kept; more are not worth their memory
+GRAPHS, LISTS = 512, 1024  # that are kept; more are not worth their memory
 
 BLOCK = 128  # threads of a GPU that share registers; scatters and gathers like few
 
