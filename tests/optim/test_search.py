@@ -153,10 +153,17 @@ from gradscape.optim import run
 from test_search import CMAES, Pit, filled
 run.PAUSE = 0.02
 path = Path(sys.argv[1])
-for delay in (0.3, 0.17, 0.41, 0.23):  # together too short for the budget, however fast the machine
+
+def told():
+    return run.Run.open(path).count if path.exists() else 0
+
+for delay in (0.02, 0.05, 0.03, 0.01):  # together too short for the budget, however fast the machine
+    before = told()
     if not (child := os.fork()):
         filled(path, CMAES, budget=300, objective=Pit(pause=0.01))
         os._exit(0)
+    while told() == before:  # however slow it is
+        time.sleep(0.002)
     time.sleep(delay)
     os.kill(child, signal.SIGKILL)
     _, status = os.waitpid(child, 0)
@@ -202,7 +209,7 @@ def test_seconds_add_up_to_the_time_it_took() -> None:
     start = time.perf_counter()
     seconds = search(Pit(pause=0.01), RandomSearch(SPACE), budget=40).table()["seconds"].values
     assert 0.4 <= seconds[-1] <= time.perf_counter() - start
-    assert seconds[15] == pytest.approx(0.16, abs=0.05)
+    assert 0.16 <= seconds[15] <= seconds[-1] - 0.24
     assert (np.diff(seconds) >= 0).all()
 
 
