@@ -111,6 +111,56 @@ def slice_(
 
 
 @app.command()
+def sweep(
+    env: Annotated[str, typer.Argument(help="The environment; `landscape envs` lists them.")],
+    dims: Annotated[tuple[str, str], typer.Option(help="The two parameters to vary, by number or by name.")],
+    over: Annotated[
+        str, typer.Option(help="What moves from frame to frame: a third parameter, over its bounds, or smoothing.")
+    ],
+    frames: Annotated[int, typer.Option(min=2, help="Values of it, both ends included.")] = 24,
+    resolution: Annotated[int, typer.Option(min=2, help="Points along each axis.")] = 16,
+    fidelity: Fidelity = None,
+    device: Device = "auto",
+    engine: Engine = "warp",
+    deterministic: Deterministic = False,
+    through: Through = "center",
+    extent: Extent = None,
+    set_: Set = None,
+    no_gradients: NoGradients = False,
+    out: Annotated[
+        str | None, typer.Option(help="Folder for the results; by default one under out/ named after the sweep.")
+    ] = None,
+    json_: Json = False,
+    force: Annotated[bool, typer.Option("--force", help="Begin anew where a sweep exists already.")] = False,
+) -> None:
+    """Sample slices as a third parameter moves, and film them on one colour scale.
+
+    Writes sweep.mp4, sweep.gif, and sweep.rrd to walk around in. Stop it at any moment: the same command goes on where
+    it stopped.
+    """
+    from .sweep_report import sweep as report
+
+    report(
+        env,
+        dims,
+        over,
+        frames=frames,
+        resolution=resolution,
+        fidelity=fidelity,
+        device=device,
+        engine=engine,
+        deterministic=deterministic,
+        through=through,
+        extent=extent,
+        settings=set_ or [],
+        grad=not no_gradients,
+        out=out,
+        as_json=json_,
+        force=force,
+    )
+
+
+@app.command()
 def methods(name: Annotated[str | None, typer.Argument(help="One method, to see all of it.")] = None) -> None:
     """List the optimisation methods: what each does, its options and their defaults."""
     from .search_report import describe_method, list_methods
@@ -249,6 +299,47 @@ def overlay(
 
 
 @app.command()
+def surface(
+    slice_: Annotated[str, typer.Argument(metavar="SLICE", help="A slice's folder.")],
+    runs: Annotated[
+        list[str] | None, typer.Argument(metavar="[RUN]...", help="Folders of runs; a race's for all of it.")
+    ] = None,
+    out: Annotated[
+        str | None, typer.Option(help="Folder for the results; by default one under out/ named after the surface.")
+    ] = None,
+) -> None:
+    """Draw a slice as a lit surface, its height and colour the loss, with runs draped on it.
+
+    Writes surface.png, and surface.gltf to turn around in any viewer of 3-D models. A sample that failed is a hole.
+    """
+    from .surface_report import surface as report
+
+    report(slice_, runs or [], out=out)
+
+
+@app.command()
+def replay(
+    env: Annotated[str, typer.Argument(help="The environment; `landscape envs` lists them.")],
+    params: Annotated[
+        str,
+        typer.Option(help="The episode: center, random:SEED, example:NAME, best:RUN or a file of parameters."),
+    ] = "center",
+    fidelity: Fidelity = None,
+    device: Device = "auto",
+    engine: Engine = "warp",
+    set_: Set = None,
+    out: Annotated[
+        str | None, typer.Option(help="Folder for the results; by default one under out/ named after the episode.")
+    ] = None,
+    film: Annotated[bool, typer.Option(help="Film it, too; that takes about a minute.")] = True,
+) -> None:
+    """Draw an episode: key frames side by side in episode.png, all of it in episode.mp4 and episode.gif."""
+    from .replay_report import replay as report
+
+    report(env, params=params, fidelity=fidelity, device=device, engine=engine, settings=set_ or [], out=out, film=film)
+
+
+@app.command()
 def view(
     file: Annotated[str, typer.Argument(help="A picture, a film, a page, a recording (.rrd), or a results folder.")],
     serve: Annotated[bool, typer.Option("--serve", help="Serve a recording to a browser, until Ctrl-C.")] = False,
@@ -329,6 +420,59 @@ def bench(
         settings=set_ or [],
         as_json=json_,
     )
+
+
+gallery = typer.Typer(help="Sample the paper's figures and ours, and build a site that shows them offline.")
+app.add_typer(gallery, name="gallery", no_args_is_help=True)
+Data = Annotated[str | None, typer.Option(help="Folder of the figures' slices; by default the gallery's own.")]
+
+
+@gallery.command("compute")
+def gallery_compute(
+    only: Annotated[
+        list[str] | None, typer.Option(help="A figure's id or an environment; may be repeated. By default all.")
+    ] = None,
+    fidelity: Fidelity = None,
+    device: Device = "auto",
+    resolution: Annotated[int | None, typer.Option(min=2, help="Points along each axis, for all figures.")] = None,
+    data: Data = None,
+) -> None:
+    """Sample what is missing of the figures: an estimate of the whole first, then one after the other.
+
+    Stop it at any moment: the same command goes on where it stopped. A figure that fails does not stop the others.
+    """
+    from .gallery_report import compute
+
+    compute(only=only or [], fidelity=fidelity, device=device, resolution=resolution, data=data)
+
+
+@gallery.command("list")
+def gallery_list(data: Data = None, json_: Json = False) -> None:
+    """List the figures, and how much of each is there."""
+    from .gallery_report import list_figures
+
+    list_figures(data=data, as_json=json_)
+
+
+@gallery.command("build")
+def gallery_build(
+    data: Data = None, out: Annotated[str, typer.Option(help="Folder of the site.")] = "out/gallery"
+) -> None:
+    """Build the site from what is there, without simulating; it opens from its index.html, offline."""
+    from .gallery_report import build
+
+    build(data=data, out=out)
+
+
+@gallery.command("serve")
+def gallery_serve(
+    out: Annotated[str, typer.Option(help="Folder of the site.")] = "out/gallery",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of this machine; 0 takes a free one.")] = 8000,
+) -> None:
+    """Serve the site to a browser of this machine, until Ctrl-C."""
+    from .gallery_report import serve
+
+    serve(out=out, port=port)
 
 
 def main(arguments: list[str] | None = None) -> Any:

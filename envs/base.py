@@ -8,7 +8,7 @@ import threading
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar, final
@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ..landscapes.episode import Episode as Episode
 from ..landscapes.objective import Evaluation
 from ..landscapes.space import ParameterSpace
 from .options import NoOptions, read_options
@@ -40,19 +41,6 @@ class Fidelity:
     resolution: int = 0
     sampling: float = 2.0
     particles: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Episode:
-    """Hold the frames of one episode to draw.
-
-    `time` [s], shape (frame,); `points` [m], body name -> shape (frame, point, axis); `tools` [m], tool name -> shape
-    (frame, axis).
-    """
-
-    time: Float[Tensor, " frame"]
-    points: Mapping[str, Float[Tensor, "frame point 3"]]
-    tools: Mapping[str, Float[Tensor, "frame 3"]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
 from .base import Environment, Episode, Fidelity, Work
@@ -19,6 +20,7 @@ from .engines.runtime import Pool
 
 START = (-0.5, 1.0, 0.0)  # [m]
 DURATION = 2.0  # [s]
+VIEW = View((-0.8, 0.0, -0.7), (2.6, 5.1, 0.7), eye=(0.1, 0.25, 1.0))
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,13 @@ class Bounce(Environment):
         with self._solvers.lend() as solver:
             flight = solver.run(torch.tensor(START), row[None]).double().cpu()
         time = self.fidelity.dt * torch.arange(self.steps + 1, dtype=torch.float64)
-        return Episode(time, {"ball": flight}, {"target": self.target.expand(len(time), 3)})
+        target = self.target.expand(len(time), 3)
+        parts = (
+            Part("sphere", "rubber", flight, (self.ball.radius,)),
+            Part("trail", "rubber", flight, (self.ball.radius / 8,)),
+            Part("sphere", "target", target[:, None], (self.ball.radius,)),
+        )
+        return Episode(time, {"ball": flight}, {"target": target}, parts, VIEW)
 
     @property
     def target(self) -> Float[Tensor, " 3"]:

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
 from .base import Environment, Episode, Fidelity, Work
@@ -21,6 +22,7 @@ from .engines.runtime import Pool
 CHAIN = Chain(masses=(1.0, 0.5, 0.25), lengths=(1.0, 1.0, 1.0), gravity=9.81)
 CONTROLS, SPAN = 100, 0.02  # how many controls, and how long each is held [s]
 TEMPO = 0.2  # what a policy measures time by [s]
+VIEW = View((-3.2, -3.2, -0.3), (3.2, 3.2, 0.3), eye=(0.12, 0.12, 1.0), ground=None)
 CONTROL = ("cart velocity", "torque 1", "torque 2", "torque 3")
 BOUND, UNITS = (2.0, 10.0, 4.0, 1.0), ("m/s", "N m", "N m", "N m")
 
@@ -106,7 +108,8 @@ class Cartpole(Environment):
         joints = torch.cat([joints, torch.zeros_like(joints[..., :1])], dim=2)
         time = self.fidelity.dt * torch.arange(self.steps + 1, dtype=torch.float64)
         target = torch.cat([self.target, self.target.new_zeros(1)]).expand(len(time), 3)
-        return Episode(time, {"cart": joints[:, :1], "links": joints}, {"target": target})
+        points = {"cart": joints[:, :1], "links": joints}
+        return Episode(time, points, {"target": target}, _parts(joints, target), VIEW)
 
     @property
     def target(self) -> Float[Tensor, " 2"]:
@@ -143,6 +146,21 @@ class Cartpole(Environment):
         """Return where the cart is at the ends of steps [m]."""
         path = (self.fidelity.dt * hold(controls[:, :, :1], self.steps)).cumsum(dim=1)[:, :, 0]
         return torch.cat([torch.zeros_like(path[:, :1]), path], dim=1)
+
+
+def _parts(joints: Float[Tensor, "frame 4 3"], target: Float[Tensor, "frame 3"]) -> tuple[Part, ...]:
+    """Return cart, rail, links and tip; links move in one plane in front of the rail."""
+    rail = joints.new_tensor([[-4.2, 0.0, -0.2], [4.2, 0.0, -0.2]]).expand(len(joints), 2, 3)
+    links = [Part("path", "steel", joints[:, k : k + 2], (0.07 - 0.012 * k,), tint=k) for k in range(3)]
+    return (
+        Part("path", "iron", rail, (0.03,)),
+        Part("box", "wood", joints[:, :1] + joints.new_tensor([0.0, 0.0, -0.2]), (0.7, 0.3, 0.2)),
+        *links,
+        Part("sphere", "iron", joints[:, :3], (0.1,)),
+        Part("sphere", "rubber", joints[:, 3:], (0.11,)),
+        Part("trail", "rubber", joints[:, 3:], (0.015,)),
+        Part("sphere", "target", target[:, None], (0.14,)),
+    )
 
 
 def _swing(solver: Solver, controls: Float[Tensor, "batch control 4"]) -> Float[Tensor, "step_plus_1 batch 3"]:

@@ -11,16 +11,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..landscapes.episode import Part, View
 from ..landscapes.space import ParameterSpace
 from . import lattice
 from .base import Fidelity
 from .controls import ramp
 from .engines.contact import Pan
 from .engines.springs import Sheet
+from .outlines import about, triangles
 from .sheets import Drive, SheetScene
 
 ACROSS = 0.2  # the pancake's diameter [m]
 AREAL_DENSITY, STIFFNESS = 3.0, 60.0  # [kg/m^2], [N/m]
+THICK = 0.01  # what the pancake is drawn [m]
 SEGMENTS = 5
 BEND = 0.8  # the bending springs' share
 LOWER, UPPER = (-0.075, -0.075, -0.6), (0.075, 0.15, 0.6)  # of a waypoint [m], [m], [rad]
@@ -59,6 +62,7 @@ class Flip(SheetScene):
     decisions: ClassVar[int] = SEGMENTS
     duration: ClassVar[float] = 1.0
     surface: ClassVar[Pan] = Pan(flat=0.14, bend=0.07, sweep=math.asin(6 / 7), thickness=0.03)
+    view: ClassVar[View] = View((-0.24, -0.12, -0.2), (0.24, 0.26, 0.2), eye=(0.2, 0.5, 1.0), ground=None)
     space = ParameterSpace(
         tuple(f"pan {what}, segment {k}" for k in range(1, SEGMENTS + 1) for what in ("x", "y", "tilt")),
         torch.tensor(LOWER * SEGMENTS, dtype=torch.float64),
@@ -91,3 +95,12 @@ class Flip(SheetScene):
 
     def _tools(self, poses: Float[Tensor, "frame 3"]) -> Mapping[str, Float[Tensor, "frame 3"]]:
         return {"pan": poses}
+
+    def _parts(self, frames: Float[Tensor, "frame vertex 3"], poses: Float[Tensor, "frame 3"]) -> tuple[Part, ...]:
+        faces = triangles(lattice.disc(self.fidelity.resolution))
+        place = torch.cat([poses[:, :2], torch.zeros_like(poses[:, :1])], dim=1)[:, None]
+        size = (self.surface.flat, self.surface.bend, self.surface.sweep)
+        return (
+            Part("sheet", "dough", frames, (THICK,), faces=faces),
+            Part("pan", "iron", place, size, about(2, poses[:, 2])),
+        )

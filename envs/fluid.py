@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
 from .base import Environment, Episode, Fidelity, Work
@@ -22,6 +23,7 @@ from .engines.model import Body, Model
 from .engines.mpm import Solver, capacity, memory
 from .engines.runtime import Pool
 from .observation import followed, motion
+from .outlines import skin
 
 TANK_WIDTH, TANK_HEIGHT, FILL = 0.4, 0.2, 0.15  # the tank, and the depth of the syrup [m]
 HEADROOM = 0.6  # what the grid covers above the floor [m]
@@ -33,6 +35,7 @@ SYRUP_DENSITY, SPEED_OF_SOUND = 1330.0, 5.0  # [kg/m^3], [m/s]
 GRAVITY = 9.81  # [m/s^2]
 SEGMENTS, STEPS, SPAN = 5, 50, 0.01  # control segments, control steps, length of a step [s]
 MARGIN = 2  # nodes outside the walls
+VIEW = View((-0.2, 0.0, -0.2), (0.2, 0.42, 0.2), eye=(0.4, 0.55, 1.0))
 
 
 @dataclass(frozen=True)
@@ -120,7 +123,19 @@ class Fluid(Environment):
             frames = solver.positions(0)
         first = len(self.model.bodies[0].x)
         time = SPAN * torch.arange(STEPS + 1, dtype=torch.float64)
-        return Episode(time, {"syrup": frames[:, :first], "cube": frames[:, first:]}, {"ladle": tools[0, :, 0]})
+        points = {"syrup": frames[:, :first], "cube": frames[:, first:]}
+        parts = self._parts(points["syrup"], points["cube"], tools[0])
+        return Episode(time, points, {"ladle": tools[0, :, 0]}, parts, VIEW)
+
+    def _parts(self, syrup: Tensor, cube: Tensor, ladle: Tensor) -> tuple[Part, ...]:
+        block, faces = skin(cube)
+        tank = torch.zeros(len(ladle), 1, 3, dtype=ladle.dtype)
+        return (
+            Part("sheet", "sugar", block, faces=faces),
+            Part("ladle", "steel", ladle, (BOWL, SHELL, HANDLE)),
+            Part("lump", "syrup", syrup, (self.model.dx / self.fidelity.sampling,)),
+            Part("tank", "glass", tank, (TANK_WIDTH, TANK_HEIGHT, TANK_WIDTH)),
+        )
 
     def _setup(self) -> None:
         self.model = _model(self.fidelity, self.options)

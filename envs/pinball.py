@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
+from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
 from .base import Environment, Episode, Fidelity, Work
@@ -23,6 +24,7 @@ WIDTH, HEIGHT = 8.0, 10.0  # the board [m]
 BALL, BAR = 0.25, 0.1  # radius of the ball, half the thickness of a bar [m]
 DURATION = 4.0  # [s]
 MEMORY = 1 << 28  # bytes a solver may take
+VIEW = View((0.0, 0.0, -0.5), (WIDTH, HEIGHT, 0.5), eye=(0.08, 0.1, 1.0), ground=None)
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,9 @@ class Pinball(Environment):
         pivots = torch.tensor(self.pivots, dtype=torch.float64)
         bars = _in_space(torch.stack([pivots - along, pivots + along], dim=1).view(-1, 2))
         points = {"ball": flight[:, None], "bars": bars.expand(len(time), -1, 3)}
-        return Episode(time, points, {"goal": _in_space(self.goal).expand(len(time), 3)})
+        goal = _in_space(self.goal).expand(len(time), 3)
+        parts = (*_case(len(time)), *_moving(points["ball"], points["bars"]), _ball("target", goal[:, None]))
+        return Episode(time, points, {"goal": goal}, parts, VIEW)
 
     def _setup(self) -> None:
         o = self.options
@@ -175,6 +179,27 @@ class Pinball16(Pinball):
     half_length = 0.47
     start = (3.5, 9.5)
     space = angles(16)
+
+
+def _ball(material: Literal["rubber", "target"], at: Float[Tensor, "frame 1 3"]) -> Part:
+    return Part("sphere", material, at, (BALL,))
+
+
+def _moving(ball: Float[Tensor, "frame 1 3"], bars: Float[Tensor, "frame end 3"]) -> tuple[Part, ...]:
+    rods = [Part("path", "steel", ends, (BAR,)) for ends in torch.split(bars, 2, dim=1)]
+    return (_ball("rubber", ball), Part("trail", "rubber", ball, (BALL / 8,)), *rods)
+
+
+def _case(frames: int) -> list[Part]:
+    """Return the board behind the ball, and the walls around it."""
+    depth, wall = 2 * BALL, 0.2
+    pieces = [
+        ((WIDTH / 2, HEIGHT / 2, -BALL - wall / 2), (WIDTH + 2 * wall, HEIGHT + 2 * wall, wall), "board"),
+        *(((x, HEIGHT / 2, 0.0), (wall, HEIGHT + 2 * wall, depth), "wood") for x in (-wall / 2, WIDTH + wall / 2)),
+        *(((WIDTH / 2, y, 0.0), (WIDTH, wall, depth), "wood") for y in (-wall / 2, HEIGHT + wall / 2)),
+    ]
+    still = torch.zeros(frames, 1, 3, dtype=torch.float64)
+    return [Part("box", material, still + still.new_tensor(at), size) for at, size, material in pieces]  # type: ignore[arg-type]
 
 
 def _in_space(p: Float[Tensor, "*frame 2"]) -> Float[Tensor, "*frame 3"]:

@@ -22,6 +22,7 @@ from .engines.mpm import Solver, capacity, memory
 from .engines.raster import Raster
 from .engines.runtime import Pool
 from .observation import followed, motion
+from .plasticine_look import parts, view
 from .plasticine_model import SPAN, STEPS, Scene, model, target
 from .registry import code_digest
 from .targets import Target, cached, contact
@@ -135,6 +136,8 @@ class Plasticine(Environment):
             SPAN * torch.arange(STEPS + 1, dtype=torch.float64),
             {f"plasticine {number}": body for number, body in enumerate(bodies, start=1)},
             {f"tool {number}": path for number, path in enumerate(tools[0].unbind(1), start=1)},
+            parts(self.scene, bodies, tools[0]),
+            view(self.scene),
         )
 
     def _setup(self) -> None:

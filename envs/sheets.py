@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from .base import Environment, Episode, Work
 from .engines.contact import Surface
@@ -49,6 +50,7 @@ class SheetScene(Environment):
     loss_unit: ClassVar[str] = "m"
     duration: ClassVar[float]  # of an episode [s]
     surface: ClassVar[Surface]
+    view: ClassVar[View]
     sheet: Sheet
     _solvers: Pool[Solver]
 
@@ -72,7 +74,9 @@ class SheetScene(Environment):
         shown = torch.arange(0, self.steps + 1, max(1, round(FRAME / self.fidelity.dt)))
         with self._solvers.lend() as solver:
             frames = solver.run(*drive.detached())[:, 0].double().cpu()[shown]
-        return Episode(self.fidelity.dt * shown, {"sheet": frames}, self._tools(drive.poses[0, shown]))
+        poses = drive.poses[0, shown].detach()
+        parts = self._parts(frames, poses)
+        return Episode(self.fidelity.dt * shown, {"sheet": frames}, self._tools(poses), parts, self.view)
 
     def end(self, x: Float[Tensor, " dim"]) -> Float[Tensor, "vertex 3"]:
         """Return where vertices are at the end of the episode at one point [m]."""
@@ -95,6 +99,10 @@ class SheetScene(Environment):
     @abc.abstractmethod
     def _tools(self, poses: Float[Tensor, "frame 3"]) -> Mapping[str, Float[Tensor, "frame 3"]]:
         """Return what stands around the sheet, from the surface's poses."""
+
+    @abc.abstractmethod
+    def _parts(self, frames: Float[Tensor, "frame vertex 3"], poses: Float[Tensor, "frame 3"]) -> tuple[Part, ...]:
+        """Return what is to be drawn."""
 
     def _setup(self) -> None:
         self.sheet = self._sheet()

@@ -12,11 +12,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..landscapes.episode import Part, View
 from ..landscapes.space import ParameterSpace
 from . import lattice
 from .base import Fidelity
 from .engines.contact import Floor
 from .engines.springs import Sheet
+from .outlines import triangles
 from .sheets import Drive, SheetScene
 
 SIDE, HEIGHT = 0.2, 0.1  # the cloth's edge, and how far above the floor it is held [m]
@@ -55,6 +57,7 @@ class Swing(SheetScene):
     Options: ClassVar[type[Any]] = SwingOptions
     duration: ClassVar[float] = 0.8
     surface: ClassVar[Floor] = Floor()
+    view: ClassVar[View] = View((-0.2, 0.0, -0.11), (0.15, 0.12, 0.11), eye=(-0.45, 0.5, 1.0), ground=-0.003)
 
     def _sheet(self) -> Sheet:
         cells = self.fidelity.resolution
@@ -86,6 +89,15 @@ class Swing(SheetScene):
     def _tools(self, poses: Float[Tensor, "frame 3"]) -> Mapping[str, Float[Tensor, "frame 3"]]:
         held = torch.from_numpy(self.sheet.x[list(self.sheet.held)])
         return {f"anchor {number}": place.expand(len(poses), 3) for number, place in enumerate(held, start=1)}
+
+    def _parts(self, frames: Float[Tensor, "frame vertex 3"], poses: Float[Tensor, "frame 3"]) -> tuple[Part, ...]:
+        faces = triangles(lattice.square(self.fidelity.resolution))
+        held = frames[:, list(self.sheet.held)]
+        return (
+            Part("sheet", "cloth", frames, faces=faces),
+            Part("sphere", "iron", held, (SIDE / 40,)),
+            Part("sheet", "target", self._target.expand_as(frames), faces=faces),
+        )
 
     def _still(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 3"]:
         return x.new_zeros(len(x), self.steps + 1, 3)

@@ -35,8 +35,8 @@ def landscape_figure(dataset: xr.Dataset) -> Figure:
     panels = 2 if "grad" in dataset else 1
     figure = page.blank_page(style.PANEL + 2.0, panels * style.PANEL + 1.4)
     axes: list[Axes] = list(figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0])
-    entries = _draw_loss(axes[0], dataset)
-    entries += _draw_arrows(axes[1], dataset, plane) if panels == 2 else []
+    entries = loss_panel(axes[0], dataset)
+    entries += arrow_panel(axes[1], dataset) if panels == 2 else []
     for ax in axes:
         frame(ax, dataset, plane)
     axes[-1].set_xlabel(plane.labels[0], size=style.LABEL, parse_math=False)
@@ -69,9 +69,10 @@ def _cells(u: Grid, v: Grid, where: NDArray[np.bool_]) -> Path:
     return Path.make_compound_path(*(Path([*corner, corner[0]], closed=True) for corner in corners))
 
 
-def _draw_loss(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
+def loss_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> list[Artist]:
+    """Draw the loss map and its lowest sample, on the slice's own scale unless given; return the legend's entries."""
     loss = dataset["loss"].to_numpy()
-    loss_map(ax, dataset, style.Scale.of_loss(loss))
+    loss_map(ax, dataset, scale or style.Scale.of_loss(loss))
     u, v = dataset["u"].to_numpy(), dataset["v"].to_numpy()
     if not np.isfinite(loss).any():
         return []
@@ -92,14 +93,16 @@ def loss_map(ax: Axes, dataset: xr.Dataset, scale: style.Scale) -> None:
     style.dress_bar(bar, f"loss [{unit}]" if unit else "loss")
 
 
-def _draw_arrows(ax: Axes, dataset: xr.Dataset, plane: Plane) -> list[Artist]:
+def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> list[Artist]:
+    """Draw the negated gradients as arrows, on the slice's own scale unless given; return the legend's entries."""
+    plane = plane_of(dataset)
     rows, columns = (thinned(dataset.sizes[name]) for name in ("v", "u"))
     slope = plane.slope(torch.from_numpy(dataset["grad"].to_numpy())).numpy()
     size, label = magnitude(slope, plane, dataset["loss"].attrs.get("units", ""))
     flat = size == 0
     with np.errstate(divide="ignore", invalid="ignore"):
         logarithm = np.where(flat, np.nan, np.log10(size))
-    scale = style.Scale.of_magnitude(logarithm)
+    scale = scale or style.Scale.of_magnitude(logarithm)
     at = np.ix_(rows, columns)
     u, v = np.meshgrid(dataset["u"].to_numpy()[columns], dataset["v"].to_numpy()[rows])
     sides = _sides(plane)
@@ -117,6 +120,15 @@ def _draw_arrows(ax: Axes, dataset: xr.Dataset, plane: Plane) -> list[Artist]:
         return []
     ax.plot(u[flat[at]], v[flat[at]], **style.FLAT, zorder=2.5)
     return [Line2D([], [], **style.FLAT, label=f"gradient exactly zero: {int(flat.sum())} of {flat.size}")]
+
+
+def log_magnitude(dataset: xr.Dataset) -> Grid:
+    """Return the decimal logarithm of the gradient's length along the plane; NaN where it is zero or unknown."""
+    plane = plane_of(dataset)
+    slope = plane.slope(torch.from_numpy(dataset["grad"].transpose("v", "u", "dim").to_numpy())).numpy()
+    size, _ = magnitude(slope, plane, "")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(size == 0, np.nan, np.log10(size))
 
 
 def descent(slope: Grid, plane: Plane) -> Grid:

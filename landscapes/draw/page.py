@@ -31,9 +31,9 @@ def head(figure: Figure, ax: Axes, dataset: xr.Dataset, name: str | None = None,
 
     `width` is how many characters of it fit over the panel.
     """
-    figure.suptitle(_wrapped(name or title(dataset), 56), size=style.TITLE, color=style.INK, parse_math=False)
+    figure.suptitle(wrapped(name or title(dataset), 56), size=style.TITLE, color=style.INK, parse_math=False)
     if line := provenance(dataset):
-        ax.set_title(_wrapped(line, width), size=style.SMALL, color=style.QUIET, parse_math=False)
+        ax.set_title(wrapped(line, width), size=style.SMALL, color=style.QUIET, parse_math=False)
 
 
 def title(dataset: xr.Dataset) -> str:
@@ -88,5 +88,6 @@ def save(figure: Figure, path: str | Path) -> None:
         figure.savefig(partial, format="png", dpi=style.DPI)
 
 
-def _wrapped(text: str, width: int) -> str:
+def wrapped(text: str, width: int) -> str:
+    """Break a text into at most two lines of so many characters."""
     return "\n".join(textwrap.wrap(text, width, max_lines=2, placeholder=" …"))

@@ -27,9 +27,11 @@ Runs = Sequence[xr.Dataset]
 Grid = NDArray[np.float64]
 
 TIMELINE = "evaluation"
+SURFACE, ARROWS = "landscape/surface", "landscape/descent_directions"
 SIDE, HEIGHT = 2.0, 1.0  # of the scene: the slice's window, and the scale of the losses
 LIFT = 0.004  # of arrows above the surface
 OUTSIDE, FAILED = "#f0e442", "#ffffff"  # on the viewer's dark ground
+EYE = rrb.EyeControls3D(position=(-1.5, -2.3, 2.1), look_target=(0.0, -0.1, 0.25), eye_up=(0.0, 0.0, 1.0))
 RADIUS, LINE = 0.015, 0.003  # of points on the plane, of lines
 
 
@@ -41,14 +43,15 @@ def save_stream(dataset: xr.Dataset, runs: Runs, path: str | Path) -> None:
     smaller the farther it lies off the plane. What is known after so many evaluations is what the timeline
     `evaluation` shows there; nothing else, no clock, is recorded, so that equal runs give equal recordings.
     """
-    scene = _Scene.of(dataset, runs)
+    scene = Scene.of(dataset, runs)
     with replacing(Path(path)) as partial:
         name = _digest(dataset, runs)  # of the application too: a viewer keeps one blueprint for each
         stream = rr.RecordingStream(f"gradscape-{name}", recording_id=name, send_properties=False)
         stream.save(partial, default_blueprint=_blueprint(dataset, scene))
-        _log_surface(stream, scene, dataset)
-        _log_arrows(stream, scene, dataset)
-        _log_axes(stream, scene, dataset)
+        _log(stream, SURFACE, surface(scene, dataset))
+        if "grad" in dataset:
+            _log(stream, ARROWS, descent_arrows(scene, dataset))
+        log_axes(stream, scene, dataset)
         for run in runs:
             _log_run(stream, scene, run)
             _log_best(stream, scene, run)
@@ -58,7 +61,7 @@ def save_stream(dataset: xr.Dataset, runs: Runs, path: str | Path) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Scene:
+class Scene:
     """Say where plane coordinates and losses are in the scene, which is centred on the slice's window."""
 
     plane: Plane
@@ -66,7 +69,8 @@ class _Scene:
     reach: float
 
     @classmethod
-    def of(cls, dataset: xr.Dataset, runs: Runs) -> _Scene:
+    def of(cls, dataset: xr.Dataset, runs: Runs) -> Scene:
+        """Return the scene of a slice and of runs laid over it."""
         return cls(plane_of(dataset), joint_scale(dataset, runs), farthest(runs))
 
     def at(self, u: Grid, v: Grid, loss: Grid) -> Grid:
@@ -81,6 +85,7 @@ class _Scene:
         return HEIGHT * np.clip(self.shade(loss), 0.0, 1.0)
 
     def shade(self, loss: Grid) -> Grid:
+        """Return where a loss is on the scale, 0 at its lower end and 1 at its upper."""
         with np.errstate(invalid="ignore", divide="ignore"):
             lowest = float(self.scale.norm.vmin or 0.0) if self.scale.logarithmic else -np.inf
             return np.asarray(self.scale.norm(np.maximum(loss, lowest)), dtype=np.float64)
@@ -94,7 +99,8 @@ def _log(stream: rr.RecordingStream, path: str, archetype: rr.AsComponents) -> N
     stream.log(path, archetype, static=True, strict=True)
 
 
-def _log_surface(stream: rr.RecordingStream, scene: _Scene, dataset: xr.Dataset) -> None:
+def surface(scene: Scene, dataset: xr.Dataset) -> rr.Mesh3D:
+    """Return a slice as a surface whose height and colour are the loss."""
     loss = dataset["loss"].transpose("v", "u").to_numpy()
     u, v = np.meshgrid(dataset["u"].to_numpy(), dataset["v"].to_numpy())
     positions = scene.at(u, v, loss)
@@ -102,13 +108,12 @@ def _log_surface(stream: rr.RecordingStream, scene: _Scene, dataset: xr.Dataset)
     a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
     triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
     triangles = triangles[np.isfinite(loss).ravel()[triangles].all(axis=1)]
-    mesh = rr.Mesh3D(
+    return rr.Mesh3D(
         vertex_positions=np.nan_to_num(positions).reshape(-1, 3),
         triangle_indices=triangles,
         vertex_normals=_normals(positions).reshape(-1, 3),
         vertex_colors=scene.tint(loss).reshape(-1, 4),
     )
-    _log(stream, "landscape/surface", mesh)
 
 
 def _normals(positions: Grid) -> Grid:
@@ -119,35 +124,30 @@ def _normals(positions: Grid) -> Grid:
     return np.where(np.isfinite(normals), normals, [0.0, 0.0, 1.0])
 
 
-def _log_arrows(stream: rr.RecordingStream, scene: _Scene, dataset: xr.Dataset) -> None:
+def descent_arrows(scene: Scene, dataset: xr.Dataset, scale: style.Scale | None = None) -> rr.Arrows3D:
     """Lay the directions of steepest descent on the surface, coloured by the gradient's magnitude."""
-    if "grad" not in dataset:
-        return
     rows, columns = (contour.thinned(dataset.sizes[name]) for name in ("v", "u"))
     at = np.ix_(rows, columns)
     slope = scene.plane.slope(torch.from_numpy(dataset["grad"].transpose("v", "u", "dim").to_numpy())).numpy()
-    size, _ = contour.magnitude(slope, scene.plane, dataset["loss"].attrs.get("units", ""))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        logarithm = np.where(size == 0, np.nan, np.log10(size))
-    norm = style.Scale.of_magnitude(logarithm).norm
+    logarithm = contour.log_magnitude(dataset)
+    norm = (scale or style.Scale.of_magnitude(logarithm)).norm
     u, v = np.meshgrid(dataset["u"].to_numpy(), dataset["v"].to_numpy())
-    surface = scene.at(u, v, dataset["loss"].transpose("v", "u").to_numpy())
-    normals, origins = _normals(surface)[at], surface[at]
+    places = scene.at(u, v, dataset["loss"].transpose("v", "u").to_numpy())
+    normals, origins = _normals(places)[at], places[at]
     flat = contour.descent(slope, scene.plane)[at] * 0.8 * SIDE / max(len(rows), len(columns))
     rise = -(normals[..., :2] * flat).sum(axis=-1) / normals[..., 2]
     vectors = np.concatenate([flat, rise[..., None]], axis=-1)
     vectors *= np.linalg.norm(flat, axis=-1, keepdims=True) / np.linalg.norm(vectors, axis=-1, keepdims=True)
     seen = np.isfinite(vectors).all(axis=-1) & np.isfinite(origins).all(axis=-1)
-    arrows = rr.Arrows3D(
+    return rr.Arrows3D(
         vectors=vectors[seen],
         origins=origins[seen] - vectors[seen] / 2 + [0.0, 0.0, LIFT],
         colors=style.SLOPE_MAP(norm(logarithm[at][seen]), bytes=True),
         radii=LINE,
     )
-    _log(stream, "landscape/descent_directions", arrows)
 
 
-def _log_axes(stream: rr.RecordingStream, scene: _Scene, dataset: xr.Dataset) -> None:
+def log_axes(stream: rr.RecordingStream, scene: Scene, dataset: xr.Dataset) -> None:
     """Frame the scene, with the ticks of both parameters and of the loss."""
     low, high = -SIDE / 2, SIDE / 2
     frame = [[low, high, HEIGHT], [low, high, 0], [low, low, 0], [high, low, 0], [high, high, 0], [low, high, 0]]
@@ -191,7 +191,7 @@ def _log_key(stream: rr.RecordingStream, runs: Runs) -> None:
     _log(stream, "landscape/key", points)
 
 
-def _log_run(stream: rr.RecordingStream, scene: _Scene, run: xr.Dataset) -> None:
+def _log_run(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None:
     path, loss, outside = f"landscape/runs/{run.attrs['label']}", run["loss"].to_numpy(), run["outside"].to_numpy()
     places = scene.at(run["u"].to_numpy(), run["v"].to_numpy(), np.nan_to_num(loss, nan=-np.inf))
     radii = RADIUS * np.sqrt(style.point_areas(run["distance"].to_numpy(), scene.reach, 1) / style.NEAR[1])
@@ -206,7 +206,7 @@ def _log_run(stream: rr.RecordingStream, scene: _Scene, run: xr.Dataset) -> None
     _log_gaps(stream, scene, run, f"{path}/gaps", places)
 
 
-def _log_gaps(stream: rr.RecordingStream, scene: _Scene, run: xr.Dataset, path: str, places: Grid) -> None:
+def _log_gaps(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset, path: str, places: Grid) -> None:
     """Join each point to the surface below or above it, where its loss is another."""
     feet = places.copy()
     feet[:, 2] = scene.height(run["beneath"].to_numpy())
@@ -215,7 +215,7 @@ def _log_gaps(stream: rr.RecordingStream, scene: _Scene, run: xr.Dataset, path: 
     _log_lines(stream, path, rows, np.stack([feet[rows], places[rows]], axis=1), style.FAINT)
 
 
-def _log_best(stream: rr.RecordingStream, scene: _Scene, run: xr.Dataset) -> None:
+def _log_best(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None:
     """Log the least loss so far as a curve and the points that lowered it in the scene."""
     label, color, best = run.attrs["label"], style.method(run)["color"], run["best"].to_numpy()
     known = np.flatnonzero(np.isfinite(best))
@@ -257,13 +257,12 @@ def _rgba(color: str) -> NDArray[np.uint8]:
     return found
 
 
-def _blueprint(dataset: xr.Dataset, scene: _Scene) -> rrb.Blueprint:
+def _blueprint(dataset: xr.Dataset, scene: Scene) -> rrb.Blueprint:
     so_far = rrb.VisibleTimeRange(
         TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
     )
-    eye = rrb.EyeControls3D(position=(-1.5, -2.3, 2.1), look_target=(0.0, -0.1, 0.25), eye_up=(0.0, 0.0, 1.0))
     space = rrb.Spatial3DView(
-        name=page.title(dataset), origin="landscape", time_ranges=so_far, eye_controls=eye, line_grid=False
+        name=page.title(dataset), origin="landscape", time_ranges=so_far, eye_controls=EYE, line_grid=False
     )
     what = "best loss so far, log10" if scene.scale.logarithmic else "best loss so far"
     curves = rrb.TimeSeriesView(name=what, origin="best", plot_legend=rrb.Corner2D.RightTop)
@@ -275,7 +274,7 @@ def _blueprint(dataset: xr.Dataset, scene: _Scene) -> rrb.Blueprint:
     )
 
 
-def _about(dataset: xr.Dataset, runs: Runs, scene: _Scene) -> str:
+def _about(dataset: xr.Dataset, runs: Runs, scene: Scene) -> str:
     """Say in Markdown what is to be seen, and where it comes from."""
     low, high = (style.number(float(end or 0.0)) for end in (scene.scale.norm.vmin, scene.scale.norm.vmax))
     kind = "logarithmic" if scene.scale.logarithmic else "linear"

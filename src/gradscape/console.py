@@ -114,7 +114,7 @@ def cut(
     from .envs.points import point  # after make: a name that does not exist is refused before torch is loaded
     from .landscapes.plane import Plane
 
-    window = _extent(extent)
+    window = read_extent(extent)
     plane = Plane.through(env.space, point(env, through), dims, resolution=resolution, extent=window)
     folder, summary = fill(console, env, plane, out=Path(out) if out else None, grad=grad, force=force)
     if as_json:
@@ -142,16 +142,16 @@ def fill(
     command = shlex.join(["landscape", *sys.argv[1:]])
     identity, provenance = identity_of(env) | ({"boxed": True} if boxed else {}), provenance_of(env, command)
     job = Job.open(
-        within_box(env) if boxed else env, plane, out or root / _folder(identity, plane, grad), _picture(env, plane),
+        within_box(env) if boxed else env, plane, out or root / _folder(identity, plane, grad), picture_of(env, plane),
         identity=identity, provenance=provenance, grad=grad, force=force,
     )  # fmt: skip
     try:
         _announce(console, job, env)
-        summary = _run(console, job, command)
+        summary = follow(console, job, command)
     except KeyboardInterrupt:
         _farewell(console, job, command)
         sys.exit(130)
-    console.print(_outcome(summary) + f"\n{job.folder}: {', '.join(summary['files'])}", markup=False)
+    console.print(outcome(summary) + f"\n{job.folder}: {', '.join(summary['files'])}", markup=False)
     return job.folder, summary
 
 
@@ -189,7 +189,9 @@ def _folder(identity: dict[str, Any], plane: Plane, grad: bool) -> str:
     return "-".join([*parts, hashlib.sha256(settings.encode()).hexdigest()[:6]])
 
 
-def _picture(env: Environment, plane: Plane) -> Any:
+def picture_of(env: Environment, plane: Plane) -> Any:
+    """Return how a slice of an environment is drawn: a map, or a profile over a line."""
+
     def surface(dataset: xr.Dataset) -> Figure:
         from .landscapes.draw.contour import landscape_figure
 
@@ -223,19 +225,20 @@ def _announce(console: Console, job: Job, env: Environment) -> None:
     )
 
 
-def _run(console: Console, job: Job, command: str) -> dict[str, Any]:
+def follow(console: Console, job: Job, command: str) -> dict[str, Any]:
+    """Run a job under a progress bar and return its summary."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=console) as bar:
         task: TaskID | None = None
 
-        def follow(now: sampling.Progress) -> None:
+        def advance(now: sampling.Progress) -> None:
             nonlocal task
             if task is None:
                 task = bar.add_task("episodes", total=now.total, completed=now.done)
             failed = sum(count for status, count in now.statuses.items() if status.name != "OK")
             bar.update(task, completed=now.done, description=f"episodes, {failed} failed" if failed else "episodes")
 
-        return job.run(follow, command=command)
+        return job.run(advance, command=command)
 
 
 def _farewell(console: Console, job: Job, command: str) -> None:
@@ -248,7 +251,8 @@ def _farewell(console: Console, job: Job, command: str) -> None:
     )
 
 
-def _outcome(summary: dict[str, Any]) -> str:
+def outcome(summary: dict[str, Any]) -> str:
+    """Say in a line what a slice cost and what came out."""
     counts = {kind: count for kind, count in summary["status"].items() if count}
     said = ", ".join(f"{count} {kind}" for kind, count in counts.items())
     low, high = summary["loss"]["lowest"], summary["loss"]["highest"]
@@ -267,7 +271,8 @@ def read_settings(settings: Sequence[str], flag: str = "--set") -> dict[str, Any
     return {name: value for name, _, value in pairs}
 
 
-def _extent(text: str | None) -> float | tuple[float, float] | None:
+def read_extent(text: str | None) -> float | tuple[float, float] | None:
+    """Return an extent given as a fraction or as LOW:HIGH."""
     if text is None:
         return None
     low, colon, high = text.partition(":")

@@ -16,6 +16,7 @@ from rich.console import Console
 
 from .console import fill
 from .envs.registry import make
+from .results import RUN, SLICE, inside, run_tables
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -23,9 +24,11 @@ if TYPE_CHECKING:
     from .envs.base import Environment
     from .landscapes.plane import Plane
 
-SLICE, RUN = "slice.zarr", "run.zarr"
 PICTURE, STREAM = "overlay.png", "overlay.rrd"
-SHOWN = ("overlay.rrd", "race.png", "landscape.png", "progress.png")  # of a folder, the first that is there
+SHOWN = (  # of a folder, the first that is there
+    *("overlay.rrd", "race.png", "landscape.png", "progress.png", "sweep.mp4"),
+    *("surface.png", "episode.mp4", "episode.png"),
+)
 PICTURES = (".png", ".html", ".mp4", ".gif")
 MUST, SHOULD = ("objective", "options"), ("fidelity", "settings", "engine", "code")  # agree between slice and runs
 
@@ -51,7 +54,7 @@ def overlay(
     from .landscapes.store import open_slice
 
     console = Console(stderr=True, soft_wrap=True, highlight=False)
-    dataset, tables = open_slice(_inside(Path(slice_), SLICE)), _tables(runs)
+    dataset, tables = open_slice(inside(Path(slice_), SLICE)), run_tables(runs)
     for table in tables:
         _check(console, dataset, table)
     laid(dataset, tables)  # refuses what cannot be laid over it before anything is computed
@@ -84,25 +87,6 @@ def view(file: str, *, serve: bool) -> None:
     console.print(f"opening {path}", markup=False)
     if typer.launch(str(path.resolve())):
         raise OSError(f"no program of this system opens {path}; open it with one of your own")
-
-
-def _inside(path: Path, store: str) -> Path:
-    """Return the store in a results folder, or the path itself."""
-    return path / store if (path / store).exists() else path
-
-
-def _tables(paths: Sequence[str]) -> list[xr.Dataset]:
-    from .optim.run import Run
-
-    tables = []
-    for path in paths:
-        found = [_inside(Path(path), RUN)]
-        if not Path(path, RUN).exists() and (members := sorted(Path(path).glob(f"*/{RUN}"))):
-            found = members
-        tables += [Run.open(store).table() for store in found]
-    if not any(table.sizes["evaluation"] for table in tables):
-        raise ValueError(f"{', '.join(paths)}: there are no episodes yet; `landscape optimize` evaluates them")
-    return [table for table in tables if table.sizes["evaluation"]]
 
 
 def _check(console: Console, dataset: xr.Dataset, table: xr.Dataset) -> None:
@@ -160,7 +144,7 @@ def _plane(
     shape = (resolution,) * present.rank if resolution else present.resolution
     point = None
     if through:
-        point, _ = best_point(tables if through == "best" else _tables([through]))
+        point, _ = best_point(tables if through == "best" else run_tables([through]))
         if len(point) != env.space.dim:
             raise ValueError(f"{through} searched {len(point)} parameters; {env.name} has {env.space.dim}")
     if principal:
@@ -198,7 +182,9 @@ def _shown(path: Path) -> Path:
         for name in SHOWN:
             if (folder / name).exists():
                 return folder / name
-        raise ValueError(f"{path} holds none of {', '.join(SHOWN)}; `landscape slice`, optimize, race and overlay do")
+        raise ValueError(
+            f"{path} holds none of {', '.join(SHOWN)}; `landscape slice`, sweep, optimize, race and overlay do"
+        )
     if not path.exists():
         raise ValueError(f"there is no file {path}")
     if path.suffix not in (*PICTURES, ".rrd"):

@@ -1,0 +1,72 @@
+"""The list of figures that the gallery shows, and where their data is."""
+
+from __future__ import annotations
+
+import shlex
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).parent
+DATA = HERE / "data"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A slice of an environment: `number` is the paper's, `says` what the paper says of it, in our words.
+
+    One dimension makes a line, two a plane; `through`, `options` and `fidelity` are those of `landscape slice`.
+    """
+
+    id: str
+    env: str
+    dims: tuple[int, ...]
+    says: str
+    number: int | None = None
+    through: str = "center"
+    resolution: int = 48
+    fidelity: str = "standard"
+    options: dict[str, Any] = field(default_factory=dict)
+
+    def command(self, device: str) -> str:
+        """Return the command that makes this slice alone."""
+        if len(self.dims) == 1:
+            axis = ["bounce", "--axis", "xyz"[self.dims[0]]]
+        else:
+            axis = ["slice", self.env, "--dims", *map(str, self.dims)]
+        how = ["--resolution", str(self.resolution), "--fidelity", self.fidelity, "--through", self.through]
+        chosen = [word for name, value in self.options.items() for word in ("--set", f"{name}={value}")]
+        return shlex.join(["landscape", *axis, *how, *chosen, "--device", device])
+
+
+def read_figures(path: Path = HERE / "figures.toml") -> list[Figure]:
+    """Read a list of figures."""
+    with path.open("rb") as file:
+        tables = tomllib.load(file).get("figure", [])
+    figures = [_figure(path, table) for table in tables]
+    repeated = {figure.id for figure in figures if [other.id for other in figures].count(figure.id) > 1}
+    if repeated or not figures:
+        raise ValueError(f"{path} needs figures, each with an id of its own; repeated: {', '.join(sorted(repeated))}")
+    return figures
+
+
+def chosen(figures: Sequence[Figure], only: Sequence[str]) -> list[Figure]:
+    """Return the figures of these ids or environments, all of them if none is named."""
+    for name in only:
+        if not any(name in (figure.id, figure.env) for figure in figures):
+            raise ValueError(f"no figure or environment {name!r} is in the gallery; `landscape gallery list` shows all")
+    return [figure for figure in figures if not only or {figure.id, figure.env} & set(only)]
+
+
+def _figure(path: Path, table: dict[str, Any]) -> Figure:
+    unknown = set(table) - {one.name for one in fields(Figure)}
+    missing = {"id", "env", "dims", "says"} - set(table)
+    if unknown or missing:
+        raise ValueError(
+            f"{path}: figure {table.get('id', '?')} has unknown {sorted(unknown)} and lacks {sorted(missing)}"
+        )
+    if len(table["dims"]) not in (1, 2) or (len(table["dims"]) == 1 and table["env"] != "bounce"):
+        raise ValueError(f"{path}: figure {table['id']} needs two dims, or one of bounce; got {table['dims']}")
+    return Figure(**(table | {"dims": tuple(table["dims"])}))

@@ -1,0 +1,81 @@
+"""Pictures as a film: MP4 and GIF by the ffmpeg that comes in the wheel of imageio-ffmpeg."""
+
+from __future__ import annotations
+
+import io
+import subprocess
+import tempfile
+from collections.abc import Iterable
+from contextlib import ExitStack
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from ..files import replacing
+
+Picture = NDArray[np.uint8]
+
+GIF_WIDTH = 800  # most pixels across
+GIF_PIXELS = 16e6  # most in all frames of a GIF, which then stays near 5 MB
+
+
+def picture(figure: Figure, *, dpi: int) -> Picture:
+    """Return a figure as an RGB picture, shape (height, width, 3), both even as films want them."""
+    figure.set_dpi(dpi)
+    width, height = figure.canvas.get_width_height()
+    raw = io.BytesIO()
+    figure.savefig(raw, format="rgba", dpi=dpi)
+    pixels: Picture = np.frombuffer(raw.getvalue(), np.uint8).reshape(height, width, 4)
+    return np.ascontiguousarray(pixels[: height // 2 * 2, : width // 2 * 2, :3])
+
+
+def save_film(pictures: Iterable[Picture], mp4: Path, gif: Path, *, count: int, rate: int) -> None:
+    """Write `count` pictures of one size as an MP4 and as a GIF with one palette, `rate` of them a second."""
+    pictures = iter(pictures)
+    first = next(pictures)
+    with ExitStack() as stack:
+        partial = [stack.enter_context(replacing(path)) for path in (mp4, gif)]
+        log = stack.enter_context(tempfile.TemporaryFile())
+        command = _command(first.shape[1], first.shape[0], count, rate, partial)
+        encoder = stack.enter_context(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=log, stderr=log))
+        try:
+            _feed(encoder, chain([first], pictures))
+        except BaseException:
+            encoder.kill()
+            raise
+        if encoder.wait():
+            log.seek(0)
+            said = log.read().decode(errors="replace").strip()[-500:]
+            raise OSError(f"ffmpeg could not write {mp4} and {gif}: {said}")
+
+
+def _feed(encoder: subprocess.Popen[bytes], pictures: Iterable[Picture]) -> None:
+    assert encoder.stdin is not None
+    try:
+        for one in pictures:
+            encoder.stdin.write(one.tobytes())
+        encoder.stdin.close()
+    except BrokenPipeError:  # it ended early and says why
+        return
+
+
+def _command(width: int, height: int, count: int, rate: int, paths: list[Path]) -> list[str]:
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    fits = (GIF_PIXELS / count * width / height) ** 0.5
+    across = int(min(GIF_WIDTH, width, fits)) // 2 * 2
+    graph = (
+        f"[0:v]split[film][small];[small]scale={across}:-2:flags=lanczos,split[a][b];"
+        "[a]palettegen=stats_mode=full[palette];[b][palette]paletteuse=dither=none[gif]"
+    )  # one palette, undithered: a colour means the same in every frame
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(rate), "-i", "-"]
+    film = ["-map", "[film]", "-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+    return [
+        *(get_ffmpeg_exe(), "-hide_banner", "-loglevel", "error", "-y"),
+        *(*source, "-filter_complex", graph),
+        *(*film, "-f", "mp4", str(paths[0])),
+        *("-map", "[gif]", "-loop", "0", "-f", "gif", str(paths[1])),
+    ]

@@ -1,0 +1,164 @@
+"""An episode as pictures: its parts lit, on their ground, from its view (pyvista, off-screen)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pyvista as pv
+from matplotlib.image import imsave
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from ..episode import Episode, Part, View
+from ..files import replacing
+from . import materials
+from .film import save_film
+from .solids import Grid, mesh, off_screen
+
+Picture = NDArray[np.uint8]
+
+HEIGHT = 600  # of a frame [pixel]
+LIKELY = (0.5, 1.6)  # narrowest and widest frame, its width per height
+KEYS = 5  # frames of a contact sheet
+GAP = 12  # between them [pixel]
+LONGEST, RATE = 100, 25  # most frames of a film, and how many of them a second
+EXTENT, CELLS = 3.0, 192  # of the ground in halves of the view's diagonal; of its shadow along each side
+SAMPLES = 40_000  # of the surfaces that throw it
+
+
+def save_sheet(episode: Episode, path: str | Path, *, keys: int = KEYS) -> None:
+    """Write evenly spaced frames, first and last among them, side by side as PNG."""
+    chosen = np.unique(np.linspace(0, len(episode.time) - 1, keys).round().astype(int))
+    pictures = list(frames(episode, chosen.tolist()))
+    gap = np.full((len(pictures[0]), GAP, 3), 255, dtype=np.uint8)
+    row = [piece for picture in pictures for piece in (gap, picture)][1:]
+    with replacing(Path(path)) as partial:
+        imsave(partial, np.concatenate(row, axis=1), format="png")
+
+
+def save_replay(episode: Episode, mp4: str | Path, gif: str | Path, *, longest: int = LONGEST) -> int:
+    """Write evenly spaced frames, first and last among them, as MP4 and GIF; return how many."""
+    count = min(longest, len(episode.time))
+    chosen = np.linspace(0, len(episode.time) - 1, count).round().astype(int).tolist()
+    save_film(frames(episode, chosen), Path(mp4), Path(gif), count=count, rate=RATE)
+    return count
+
+
+def frames(episode: Episode, chosen: Sequence[int], *, height: int = HEIGHT) -> Iterator[Picture]:
+    """Yield pictures of the chosen frames, shape (height, width, 3)."""
+    if not episode.parts:
+        raise ValueError("the episode says not what its parts look like; give Episode its `parts`")
+    view = episode.view or _around(episode)
+    with _stage(view, height) as plotter:
+        _place(plotter, [part for part in episode.parts if _still(part)], 0, "still")
+        moving = [part for part in episode.parts if not _still(part)]
+        for frame in chosen:
+            _place(plotter, moving, frame, "moving")
+            if view.ground is not None:
+                _lay_ground(plotter, view, [mesh(part, frame) for part in episode.parts if materials.solid(part)])
+            plotter.add_text(f"{float(episode.time[frame]):.3g} s", name="time", **materials.STAMP)
+            yield np.asarray(plotter.screenshot(return_img=True))
+
+
+@contextmanager
+def _stage(view: View, height: int) -> Iterator[pv.Plotter]:
+    """Give a plotter with lights and a camera that sees the view's box."""
+    low, high = np.array(view.lower), np.array(view.upper)
+    right, up, eye = axes(view)
+    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    center = (low + high) / 2
+    wide, tall = (np.ptp((corners - center) @ side) for side in (right, up))
+    width = round(height * float(np.clip(wide / tall, *LIKELY))) // 2 * 2
+    with off_screen((width, height)) as plotter:
+        for direction, strength in materials.LIGHTS:
+            light = pv.Light(position=tuple(center + direction), focal_point=tuple(center), intensity=strength)
+            light.positional = False
+            plotter.add_light(light)
+        size = max(tall, wide * height / width) / 2
+        far = 1.06 * size / np.tan(np.radians(materials.ANGLE) / 2) + np.ptp((corners - center) @ eye) / 2
+        plotter.camera.position, plotter.camera.focal_point = tuple(center + far * eye), tuple(center)
+        plotter.camera.up, plotter.camera.view_angle = (0.0, 1.0, 0.0), materials.ANGLE
+        plotter.camera.clipping_range = (far / 20, 20 * far)
+        plotter.enable_ssao(radius=float(np.linalg.norm(high - low)) / 14, bias=0.002 * size, kernel_size=64, blur=True)
+        plotter.enable_anti_aliasing("ssaa")
+        yield plotter
+
+
+def axes(view: View) -> tuple[Grid, Grid, Grid]:
+    """Return the directions right, up and towards the eye of a view."""
+    eye = np.array(view.eye) / np.linalg.norm(view.eye)
+    right = np.cross([0.0, 1.0, 0.0], eye)
+    right /= np.linalg.norm(right)
+    return right, np.cross(eye, right), eye
+
+
+def _place(plotter: pv.Plotter, parts: Sequence[Part], frame: int, label: str) -> None:
+    for number, part in enumerate(parts):
+        look, surface = materials.look(part), mesh(part, frame)
+        if "side" in surface.point_data:
+            look["scalars"], look["cmap"] = "side", [materials.BACK[part.material], look.pop("color")]
+            look["show_scalar_bar"] = False
+        elif part.material in materials.BACK:
+            look["backface_params"] = {**look, "color": materials.BACK[part.material]}
+        smooth = part.shape != "box" and part.material != "sugar"
+        name = f"{label} {number}"
+        plotter.add_mesh(surface, name=name, smooth_shading=smooth, reset_camera=False, render=False, **look)
+
+
+def _still(part: Part) -> bool:
+    return part.shape != "trail" and all(
+        bool((rows == rows[:1]).all()) for rows in (part.at, part.turn) if rows is not None
+    )
+
+
+def _around(episode: Episode) -> View:
+    every = np.concatenate([part.at.reshape(-1, 3).numpy() for part in episode.parts])
+    low, high = every.min(axis=0), every.max(axis=0)
+    room = 0.1 * float((high - low).max() or 1.0)
+    return View(tuple((low - room).tolist()), tuple((high + room).tolist()), ground=None)
+
+
+def _lay_ground(plotter: pv.Plotter, view: View, solids: Sequence[pv.PolyData]) -> None:
+    """Lay the ground under the view, darker where solids stand in the light, fading into the background."""
+    assert view.ground is not None  # the caller asked
+    low, high = np.array(view.lower), np.array(view.upper)
+    center, half = (low + high) / 2, EXTENT * float(np.linalg.norm(high - low)) / 2
+    x = center[0] + half * np.linspace(-1, 1, CELLS)
+    z = center[2] + half * np.linspace(-1, 1, CELLS)
+    dark = _shadow(solids, view.ground, x, z)
+    away = np.hypot((x[:, None] - center[0]) / half, (z[None, :] - center[2]) / half)
+    fade = np.clip((away - 0.45) / 0.5, 0.0, 1.0)[..., None]
+    ground, background = (np.array(pv.Color(name).float_rgb) for name in (materials.GROUND, materials.BACKGROUND))
+    color = ground * (1 - materials.SHADOW * dark[..., None]) * (1 - fade) + background * fade
+    grid = pv.StructuredGrid(*np.meshgrid(x, [view.ground], z, indexing="ij"))
+    rgb = (255 * color).round().astype(np.uint8).transpose(1, 0, 2).reshape(-1, 3)
+    plotter.add_mesh(
+        grid, scalars=rgb, rgb=True, lighting=False, name="ground", reset_camera=False, render=False, pickable=False
+    )
+
+
+def _shadow(solids: Sequence[pv.PolyData], ground: float, x: Grid, z: Grid) -> Grid:
+    """Return how much of the key light solids take from the ground, shape (x, z), 0 to 1."""
+    spots = np.concatenate([_scattered(solid) for solid in solids if solid.n_cells] or [np.zeros((0, 3))])
+    lift = spots[:, 1:2] - ground
+    shift = np.array(materials.KEY)
+    feet = (spots - lift * shift / shift[1])[lift[:, 0] > 0]
+    edges = [np.append(axis, 2 * axis[-1] - axis[-2]) - (axis[1] - axis[0]) / 2 for axis in (x, z)]
+    hits, *_ = np.histogram2d(feet[:, 0], feet[:, 2], bins=edges)
+    return np.clip(1.6 * gaussian_filter(np.minimum(hits / 3.0, 1.0), 1.6), 0.0, 1.0)
+
+
+def _scattered(solid: pv.PolyData) -> Grid:
+    """Return points spread evenly over a surface."""
+    corners = solid.points[solid.triangulate().regular_faces].astype(np.float64)
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    if not areas.sum() > 0:
+        return np.zeros((0, 3))
+    random = np.random.default_rng(0)
+    chosen = corners[random.choice(len(corners), SAMPLES, p=areas / areas.sum())]
+    share = np.sort(random.random((SAMPLES, 2)), axis=1)
+    weights = np.stack([share[:, 0], share[:, 1] - share[:, 0], 1 - share[:, 1]], axis=1)
+    return np.asarray(np.einsum("nk,nka->na", weights, chosen))

@@ -1,0 +1,76 @@
+"""What there is to draw of an episode: frames over time, and the things they show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+Point = tuple[float, float, float]
+Shape = Literal[
+    "lump",  # the body that particles fill: their mean distance
+    "sheet",  # a triangle surface whose vertices are given, with `faces`: its thickness, if it has any
+    "path",  # a tube through points, round at both ends: radius
+    "trail",  # where a point has been so far: radius
+    "sphere",  # radius
+    "capsule",  # half the length of its axis, which is y, radius
+    "torus",  # around the y axis: radius of the ring, of the tube
+    "cylinder",  # around the y axis: radius, half its height
+    "box",  # three widths
+    "ring",  # flat, standing on its place: inner and outer radius, height
+    "ladle",  # its place is the centre of the rim: radius of the bowl, half the thickness of its shell, handle's height
+    "pan",  # its place is the middle of the bottom: radius of the bottom, of the arc at its edge, the arc's angle [rad]
+    "tank",  # open at the top, standing on its place: three widths
+]
+Material = Literal[
+    "syrup", "sugar", "plasticine", "cloth", "dough", "rubber", "steel", "iron", "wood", "board", "glass", "target"
+]
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Say what one thing of an episode looks like.
+
+    `at` [m], shape (frame, point, 3), is where it is: the vertices of a sheet, the particles of a lump, the points of a
+    path, else the places of so many copies of a solid of `size` [m]. `turn`, shape (frame, 3, 3), rotates solids about
+    their places; `tint` tells parts of one material apart.
+    """
+
+    shape: Shape
+    material: Material
+    at: Float[Tensor, "frame point 3"]
+    size: tuple[float, ...] = ()
+    turn: Float[Tensor, "frame 3 3"] | None = None
+    faces: Int[Tensor, "face 3"] | None = None
+    tint: int = 0
+
+
+@dataclass(frozen=True)
+class View:
+    """Say what a picture shows: the box from `lower` to `upper` [m], seen from the direction `eye`, y upwards.
+
+    `ground` is the height of the ground that is drawn [m], None for none.
+    """
+
+    lower: Point
+    upper: Point
+    eye: Point = (0.35, 0.5, 1.0)
+    ground: float | None = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """Hold the frames of one episode to draw.
+
+    `time` [s], shape (frame,); `points` [m], body name -> shape (frame, point, axis); `tools` [m], tool name -> shape
+    (frame, axis). `parts` say what all of it looks like, and `view` from where.
+    """
+
+    time: Float[Tensor, " frame"]
+    points: Mapping[str, Float[Tensor, "frame point 3"]]
+    tools: Mapping[str, Float[Tensor, "frame 3"]] = field(default_factory=dict)
+    parts: tuple[Part, ...] = ()
+    view: View | None = None

@@ -1,0 +1,36 @@
+"""A slice as seen through a Gaussian: every loss an average over the samples around it."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from .store import plane_of
+
+
+def smoothed(dataset: xr.Dataset, width: float) -> xr.Dataset:
+    """Average a slice's losses by a Gaussian of standard deviation `width`, a fraction of each side of its box.
+
+    Only samples that are there count: weights beyond the box and on failed samples are left out and the others scaled
+    to sum to one, so that no value is invented; a failed sample stays failed. Gradients are left out. Width 0 is the
+    slice itself.
+    """
+    if not width >= 0:
+        raise ValueError(f"a slice is smoothed over a width that is not negative; got {width}")
+    losses = dataset.drop_vars("grad", errors="ignore").transpose("v", "u", ...)
+    if width == 0:
+        return losses
+    lower, upper = (side.numpy() for side in (plane_of(dataset).lower, plane_of(dataset).upper))
+    u, v = (_weights(losses[name].to_numpy(), width * (upper - lower)[axis]) for axis, name in enumerate(("u", "v")))
+    loss = losses["loss"].to_numpy()
+    there = np.isfinite(loss)
+    total, weight = (v @ np.where(there, part, 0.0) @ u.T for part in (loss, 1.0))
+    mean = np.where(there, total / np.where(there, weight, 1.0), np.nan)
+    return losses.assign(loss=losses["loss"].copy(data=mean))
+
+
+def _weights(places: NDArray[np.float64], width: float) -> NDArray[np.float64]:
+    apart = (places[:, None] - places) / width
+    weights: NDArray[np.float64] = np.exp(-(apart**2) / 2)
+    return weights

@@ -1,0 +1,103 @@
+"""What `landscape replay` does and prints."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+
+from .console import identity_of, provenance_of, read_settings
+from .envs.registry import make
+from .results import run_tables
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from .envs.base import Environment
+
+SHEET, FILM, LOOP, RECORD = "episode.png", "episode.mp4", "episode.gif", "episode.json"
+
+
+def replay(
+    name: str,
+    *,
+    params: str,
+    fidelity: str | None,
+    device: str,
+    engine: str,
+    settings: Sequence[str],
+    out: str | None,
+    film: bool,
+) -> None:
+    """Simulate one episode, draw it, and say what it cost."""
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    env = make(name, fidelity=fidelity, device=device, engine=engine, **read_settings(settings))
+    x = _point(env, params)
+    folder = _folder(out, env, x)
+    with console.status(f"{env.name}: simulating (kernels are compiled once, then kept)"):
+        episode = env.episode(x)
+        result = env.evaluate(x[None], grad=False)
+    loss, status = float(result.loss[0]), int(result.status[0])
+    from .landscapes.draw.replay import save_replay, save_sheet
+
+    with console.status(f"{env.name}: drawing"):
+        save_sheet(episode, folder / SHEET)
+        files = [SHEET]
+        if film:
+            save_replay(episode, folder / FILM, folder / LOOP)
+            files += [FILM, LOOP]
+    _write_record(env, x, loss, status, folder / RECORD)
+    console.print(
+        f"{env.name} · {env.fidelity.name} · {env.device}: loss {loss:.4g} {env.loss_unit}\n"
+        f"{folder}: {', '.join([*files, RECORD])}",
+        markup=False,
+    )
+
+
+def _point(env: Environment, text: str) -> Tensor:
+    """Return the parameters that `text` names: a point, or the best one that a run found."""
+    kind, _, run = text.partition(":")
+    if kind != "best":
+        from .envs.points import point
+
+        return point(env, text)
+    from .landscapes.overlay import best_point
+
+    tables = run_tables([run])
+    if {table.attrs["identity"].get("objective") for table in tables} != {env.name}:
+        raise ValueError(f"{run} holds no runs of {env.name} alone; replay the environment that was searched")
+    return best_point(tables)[0]
+
+
+def _folder(out: str | None, env: Environment, x: Tensor) -> Path:
+    if out is None:
+        settings = json.dumps([identity_of(env), x.tolist()], sort_keys=True)
+        return Path("out") / f"replay-{env.name}-{hashlib.sha256(settings.encode()).hexdigest()[:6]}"
+    folder = Path(out)
+    known = {SHEET, FILM, LOOP, RECORD}
+    if folder.exists() and any(file.name not in known for file in folder.iterdir()):
+        raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
+    return folder
+
+
+def _write_record(env: Environment, x: Tensor, loss: float, status: int, path: Path) -> None:
+    """Keep what was drawn, and how it came about."""
+    from .landscapes.files import replacing
+    from .landscapes.objective import Status
+
+    command = shlex.join(["landscape", *sys.argv[1:]])
+    record: dict[str, Any] = {
+        "identity": identity_of(env),
+        "provenance": provenance_of(env, command),
+        "parameters": dict(zip(env.space.names, x.tolist(), strict=True)),
+        "loss": loss if status == Status.OK else None,
+        "status": Status(status).name,
+    }
+    with replacing(path) as partial:
+        partial.write_text(json.dumps(record, indent=1) + "\n")

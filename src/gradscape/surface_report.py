@@ -1,0 +1,49 @@
+"""What `landscape surface` does and prints."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from .results import SLICE, inside, run_tables
+
+PICTURE, MODEL = "surface.png", "surface.gltf"
+
+
+def surface(slice_: str, runs: Sequence[str], *, out: str | None) -> None:
+    """Draw a slice as a surface, with runs on it."""
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    from .landscapes.overlay import overlay
+    from .landscapes.store import open_slice
+
+    dataset = open_slice(inside(Path(slice_), SLICE))
+    tables = run_tables(runs) if runs else []
+    ours = dataset.attrs["identity"]
+    for table in tables:
+        theirs = table.attrs["identity"]
+        if any(ours.get(one) != theirs.get(one) for one in ("objective", "options")):
+            raise ValueError(
+                f"the slice is of {ours.get('objective')} {ours.get('options')}, a run of {theirs.get('objective')} "
+                f"{theirs.get('options')}; lay runs over a slice of their own"
+            )
+    placed = overlay(dataset, tables) if tables else []
+    folder = _folder(out, [ours, [table.attrs["identity"] for table in tables]], str(ours["objective"]))
+    from .landscapes.draw.surface import save_surface
+
+    with console.status("drawing"):
+        save_surface(dataset, placed, folder / PICTURE, folder / MODEL)
+    console.print(f"{folder}: {PICTURE}, {MODEL}", markup=False)
+
+
+def _folder(out: str | None, content: list[object], objective: str) -> Path:
+    if out is None:
+        digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:6]
+        return Path("out") / f"surface-{objective}-{digest}"
+    folder = Path(out)
+    if folder.exists() and any(file.name not in (PICTURE, MODEL) for file in folder.iterdir()):
+        raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
+    return folder

@@ -1,0 +1,329 @@
+"""What `landscape sweep` does and prints."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shlex
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from .console import duration, identity_of, provenance_of, read_extent, read_settings, size
+from .envs.registry import make
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.figure import Figure
+    from torch import Tensor
+
+    from .envs.base import Environment
+    from .landscapes.draw.sweep import Sweep
+    from .landscapes.plane import Plane
+    from .landscapes.sampling import Progress as Sampled
+    from .landscapes.store import SliceStore
+
+FRAMES, SUMMARY = "frames", "summary.json"
+FILM, GIF, STREAM = "sweep.mp4", "sweep.gif", "sweep.rrd"
+SMOOTHING, WIDEST = "smoothing", 0.25  # the widest Gaussian's standard deviation, as a fraction of the box's sides
+
+
+def sweep(
+    name: str,
+    dims: Sequence[str],
+    over: str,
+    *,
+    frames: int,
+    resolution: int,
+    fidelity: str | None,
+    device: str,
+    engine: str,
+    deterministic: bool,
+    through: str,
+    extent: str | None,
+    settings: Sequence[str],
+    grad: bool,
+    out: str | None,
+    as_json: bool,
+    force: bool,
+) -> None:
+    """Sample a slice for each value of what moves, film them, and say what it costs and what came out."""
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    how: dict[str, Any] = {"fidelity": fidelity, "device": device, "engine": engine, "deterministic": deterministic}
+    env = make(name, **how, **read_settings(settings))
+    from .envs.points import point
+    from .landscapes.plane import Plane
+
+    plane = Plane.through(env.space, point(env, through), dims, resolution=resolution, extent=read_extent(extent))
+    if plane.rank != 2 or frames < 2:
+        raise ValueError(f"a sweep has two dims and two frames or more; got {', '.join(dims)} and {frames} frames")
+    moved = _Smoothing(env, plane, frames) if over == SMOOTHING else _Parameter.over(env, plane, over, frames)
+    grad = grad and over != SMOOTHING  # of smoothed losses there are no gradients to show
+    folder = Path(out) if out else Path("out") / _folder(env, moved, over, grad)
+    job = Job.open(env, moved, folder, grad=grad, force=force)
+    try:
+        job.announce(console)
+        summary = job.run(console)
+    except KeyboardInterrupt:
+        job.farewell(console)
+        sys.exit(130)
+    console.print(_outcome(summary) + f"\n{folder}: {', '.join(summary['files'])}", markup=False)
+    if as_json:
+        print(json.dumps({**summary, "folder": str(folder)}))
+
+
+@dataclass(frozen=True)
+class _Parameter:
+    """Move the plane along one of the parameters it holds still: a slice of its own for each value."""
+
+    env: Environment
+    planes: tuple[Plane, ...]
+    values: tuple[float, ...]
+    label: str
+
+    @classmethod
+    def over(cls, env: Environment, plane: Plane, parameter: str, frames: int) -> _Parameter:
+        import torch
+
+        number = env.space.index(parameter)
+        if bool(plane.basis[:, number].any()):
+            raise ValueError(
+                f"a sweep moves a third parameter, or {SMOOTHING}; got --over {parameter}, which the slice varies"
+            )
+        low, high = float(env.space.lower[number]), float(env.space.upper[number])
+        values = torch.linspace(low, high, frames, dtype=torch.float64)
+        planes = tuple(replace(plane, origin=_with(plane.origin, number, value)) for value in values.tolist())
+        return cls(env, planes, tuple(values.tolist()), env.space.labels[number])
+
+    @property
+    def stores(self) -> tuple[str, ...]:
+        return tuple(f"{FRAMES}/{number:03d}.zarr" for number in range(len(self.planes)))
+
+    def slices(self, sampled: Sequence[xr.Dataset]) -> list[xr.Dataset]:
+        return list(sampled)
+
+
+@dataclass(frozen=True)
+class _Smoothing:
+    """Average one slice over wider and wider Gaussians."""
+
+    env: Environment
+    plane: Plane
+    frames: int
+    label = "smoothing width [% of the box's sides]"
+    stores = ("slice.zarr",)
+
+    @property
+    def planes(self) -> tuple[Plane, ...]:
+        return (self.plane,)
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        return tuple((100 * np.linspace(0, WIDEST, self.frames)).tolist())
+
+    def slices(self, sampled: Sequence[xr.Dataset]) -> list[xr.Dataset]:
+        from .landscapes.smoothing import smoothed
+
+        return [smoothed(sampled[0], width / 100) for width in self.values]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A sweep to sample into `folder`, slice by slice, and to film."""
+
+    env: Environment
+    moved: _Parameter | _Smoothing
+    folder: Path
+    stores: tuple[SliceStore, ...]
+    command: str
+
+    @classmethod
+    def open(cls, env: Environment, moved: _Parameter | _Smoothing, folder: Path, *, grad: bool, force: bool) -> Job:
+        """Go on with the sweep in `folder`, or begin it there; `force` begins anew where another one is."""
+        from .landscapes.store import SliceStore
+
+        command = shlex.join(["landscape", *sys.argv[1:]])
+        _check(folder)
+        if force:
+            _clear(folder)
+        settings: dict[str, Any] = {"identity": identity_of(env), "provenance": provenance_of(env, command)}
+        stores = tuple(
+            SliceStore.open_or_create(folder / name, plane, env.space, grad=grad, **settings)
+            for name, plane in zip(moved.stores, moved.planes, strict=True)
+        )
+        return cls(env, moved, folder, stores, command)
+
+    @cached_property
+    def total(self) -> int:
+        """Points in all slices."""
+        return sum(int(np.prod(store.shape)) for store in self.stores)
+
+    def done(self) -> int:
+        """Count the points that are on disk."""
+        return sum(int((store.status() > 0).sum()) for store in self.stores)
+
+    def announce(self, console: Console) -> None:
+        """Say what is left to compute and what that costs."""
+        left, env, kind = self.total - self.done(), self.env, "episodes with gradients" if self._grad else "episodes"
+        console.print(f"{env.name} · {env.fidelity.name} · {env.device} · {self.folder}", markup=False)
+        if not left:
+            console.print(f"all {self.total} {kind} of {len(self.stores)} slices are there already")
+            return
+        with console.status(f"{env.name}: preparing (kernels are compiled once, then kept)"):
+            seconds, memory = self._cost(left)
+        kept = f", {self.total - left} are there already" if left < self.total else ""
+        slices = f"{len(self.stores)} slices" if len(self.stores) > 1 else "one slice"
+        console.print(
+            f"{left} {kind} of {slices} to compute{kept}: about {duration(seconds)}, {size(memory)} of memory"
+        )
+
+    def run(self, console: Console) -> dict[str, Any]:
+        """Sample what is missing, film it, write and return the summary."""
+        start, resumed = time.monotonic(), self.done()
+        sampled = self._sample(console)
+        from .landscapes.draw import sweep as draw
+
+        with console.status("drawing"):
+            drawn = draw.Sweep(self.moved.label, self.moved.values, self.moved.slices(sampled))
+            draw.save_films(drawn, self.folder / FILM, self.folder / GIF)
+            draw.save_stream(drawn, self.folder / STREAM)
+        return self._summarise(drawn, resumed, time.monotonic() - start)
+
+    def farewell(self, console: Console) -> None:
+        """Say what is kept of a sweep that was stopped, and how to go on."""
+        console.print(
+            f"stopped: {self.done()} of {self.total} points are kept in {self.folder}; "
+            f"the same command goes on from there: {self.command}",
+            markup=False,
+        )
+
+    @property
+    def _grad(self) -> bool:
+        return self.stores[0].grad
+
+    def _cost(self, left: int) -> tuple[float, int]:
+        """Return seconds and bytes that so many points should take, by those of the first slice not finished."""
+        from .landscapes import job
+
+        number = next(number for number, store in enumerate(self.stores) if store.pending())
+        plane, store = self.moved.planes[number], self.stores[number]
+        cost = job.Job(self.env, plane, self.folder, store, _never_drawn).cost()
+        return cost.seconds * left / cost.episodes, cost.memory
+
+    def _sample(self, console: Console) -> list[xr.Dataset]:
+        from .landscapes.objective import Status
+        from .landscapes.sampling import sample
+
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        sampled: list[xr.Dataset] = []
+        with Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=console) as bar:
+            task, finished, failed = bar.add_task("episodes", total=self.total), 0, 0
+
+            def follow(now: Sampled) -> None:
+                here = failed + now.done - now.statuses.get(Status.OK, 0)
+                said = f"slice {len(sampled) + 1} of {len(self.stores)}" + (f", {here} failed" if here else "")
+                bar.update(task, completed=finished + now.done, description=said)
+
+            for plane, store in zip(self.moved.planes, self.stores, strict=True):
+                dataset = sample(self.env, plane, store, grad=store.grad, progress=follow)
+                finished += dataset["status"].size
+                failed += int((dataset["status"] != Status.OK).sum())
+                sampled.append(dataset)
+        return sampled
+
+    def _summarise(self, drawn: Sweep, resumed: int, seconds: float) -> dict[str, Any]:
+        from .landscapes.files import replacing
+
+        identity = self.stores[0].identity
+        frames = [_frame(value, dataset) for value, dataset in zip(drawn.values, drawn.slices, strict=True)]
+        ends = [end for frame in frames for end in frame["loss"].values() if end is not None]
+        summary: dict[str, Any] = {
+            "env": self.env.name,
+            "dims": list(self.stores[0].plane.names),
+            "over": drawn.label,
+            **{key: identity[key] for key in ("fidelity", "device", "options")},
+            "resolution": list(self.stores[0].plane.resolution),
+            "gradients": self._grad,
+            "episodes": self.total - resumed,
+            "resumed": resumed,
+            "seconds": round(seconds, 3),
+            "loss": {"lowest": min(ends, default=None), "highest": max(ends, default=None)},
+            "frames": frames,
+            "command": self.command,
+            "files": [*sorted({name.split("/")[0] for name in self.moved.stores}), FILM, GIF, STREAM, SUMMARY],
+        }
+        with replacing(self.folder / SUMMARY) as partial:
+            partial.write_text(json.dumps(summary, indent=2) + "\n")
+        return summary
+
+
+def _with(origin: Tensor, number: int, value: float) -> Tensor:
+    origin = origin.clone()
+    origin[number] = value
+    return origin
+
+
+def _folder(env: Environment, moved: _Parameter | _Smoothing, over: str, grad: bool) -> str:
+    """Return a name of its own for every different sweep, the same for the same one."""
+    planes = [plane.record() for plane in moved.planes]
+    settings = json.dumps([identity_of(env), planes, moved.values, grad], sort_keys=True)
+    axes = [str(int(row.nonzero()[0])) for row in moved.planes[0].basis]
+    what = over if over == SMOOTHING else str(env.space.index(over))
+    points = "x".join(map(str, (*planes[0]["resolution"], len(moved.values))))
+    parts = ["sweep", env.name, *axes, "over", what, env.fidelity.name, points]
+    return "-".join([*parts, hashlib.sha256(settings.encode()).hexdigest()[:6]])
+
+
+def _check(folder: Path) -> None:
+    """Refuse a folder that holds anything but a sweep."""
+    ours = {FRAMES, *_Smoothing.stores, FILM, GIF, STREAM, SUMMARY}
+    present = {file.name for file in folder.iterdir() if not file.name.startswith(".")} if folder.exists() else set()
+    if present - ours or (present and not present & {FRAMES, *_Smoothing.stores}):
+        raise ValueError(f"{folder} holds other files and no sweep; give --out a new or an empty folder")
+
+
+def _clear(folder: Path) -> None:
+    """Remove the slices of a sweep, and what was made of them."""
+    from .landscapes.store import is_slice
+
+    for store in [*folder.glob(f"{FRAMES}/*.zarr"), *map(folder.joinpath, _Smoothing.stores)]:
+        if is_slice(store):
+            shutil.rmtree(store)
+    for name in (FILM, GIF, STREAM, SUMMARY):
+        (folder / name).unlink(missing_ok=True)
+
+
+def _never_drawn(dataset: xr.Dataset) -> Figure:
+    raise NotImplementedError("a sweep draws all of its slices on one scale")
+
+
+def _frame(value: float, dataset: xr.Dataset) -> dict[str, Any]:
+    from .landscapes.job import flat_points
+    from .landscapes.objective import Status
+
+    loss, status = dataset["loss"].to_numpy(), dataset["status"].to_numpy()
+    ends = [float(np.nanmin(loss)), float(np.nanmax(loss))] if np.isfinite(loss).any() else [None, None]
+    return {
+        "value": value,
+        "loss": {"lowest": ends[0], "highest": ends[1]},
+        "status": {kind.name.lower(): int((status == kind).sum()) for kind in Status},
+        "flat": flat_points(dataset),
+    }
+
+
+def _outcome(summary: dict[str, Any]) -> str:
+    failed = sum(count for frame in summary["frames"] for kind, count in frame["status"].items() if kind != "ok")
+    low, high = summary["loss"]["lowest"], summary["loss"]["highest"]
+    losses = "no finite loss" if low is None else f"losses from {low:.4g} to {high:.4g}"
+    failures = f"; {failed} failed" if failed else ""
+    done = f"{summary['episodes']} episodes in {duration(summary['seconds'])}"
+    return f"{done}; {len(summary['frames'])} frames; {losses}{failures}"

@@ -1,0 +1,50 @@
+"""The list of figures: it is the paper's and ours, and every figure can be made."""
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from gradscape.envs.points import point
+from gradscape.envs.registry import make
+from gradscape.gallery.figures import chosen, read_figures
+
+FIGURES = read_figures()
+
+
+def test_the_supplements_figures_are_all_there_and_ours() -> None:
+    panels = Counter(figure.number for figure in FIGURES if figure.number)
+    assert panels == {8: 2, 9: 2, 10: 3, 11: 3, 12: 3, 13: 3, 14: 3, 15: 3}
+    ours = Counter(figure.env for figure in FIGURES if not figure.number)
+    once = dict.fromkeys(("rope", "rolling-pin", "pinch", "torus", "cartpole"), 1)
+    assert ours == once | {"swing-velocity": 3, "swing-stiffness": 3}
+
+
+@pytest.mark.parametrize("figure", FIGURES, ids=lambda figure: figure.id)
+def test_a_figure_names_what_its_environment_has(figure) -> None:  # type: ignore[no-untyped-def]
+    env = make(figure.env, fidelity=figure.fidelity, device="cpu", **figure.options)
+    assert point(env, figure.through).shape == (env.space.dim,)
+    assert len({env.space.index(dim) for dim in figure.dims}) == len(figure.dims)
+    assert figure.resolution == (512 if len(figure.dims) == 1 else 48)
+
+
+def test_figures_are_chosen_by_id_and_by_environment() -> None:
+    assert [figure.id for figure in chosen(FIGURES, ["fluid-6-8", "bounce"])] == ["bounce-x", "bounce-y", "fluid-6-8"]
+    with pytest.raises(ValueError, match="no figure or environment 'fluids'"):
+        chosen(FIGURES, ["fluids"])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "needs figures"),
+        ('[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1]', "lacks .'says'"),
+        ('[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1]\nsays = ""\ndim = 3', "unknown .'dim'"),
+        ('[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0]\nsays = ""', "needs two dims"),
+        (2 * '[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1]\nsays = ""\n', "repeated: a"),
+    ],
+)
+def test_a_wrong_list_is_refused(text: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "figures.toml").write_text(text)
+    with pytest.raises(ValueError, match=said):
+        read_figures(tmp_path / "figures.toml")

@@ -1,0 +1,136 @@
+"""Pictures of episodes: they show what happens, where it happens."""
+
+import subprocess
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+from matplotlib.image import imread
+
+from gradscape.envs.base import Environment
+from gradscape.envs.fluid import TANK_HEIGHT, TANK_WIDTH
+from gradscape.envs.outlines import about, skin, triangles
+from gradscape.envs.registry import BUILTIN, make
+from gradscape.landscapes.draw.replay import axes, frames, save_replay, save_sheet
+from gradscape.landscapes.draw.solids import lump, mesh
+from gradscape.landscapes.episode import Episode, Part, View
+
+SCENES = [entry.name for entry in BUILTIN if "functions" not in entry.target]
+SMALL = 120  # height of a test's pictures [pixel]
+
+
+@cache
+def scene(name: str) -> tuple[Environment, Episode]:
+    env = make(name, fidelity="draft", device="cpu")
+    x = env.example(next(iter(env.examples))) if env.examples else env.space.center
+    return env, env.episode(x)
+
+
+def still(part: Part, low: float = -1.0, high: float = 1.0) -> Episode:
+    return Episode(torch.zeros(1), {}, {}, (part,), View((low,) * 3, (high,) * 3, eye=(0.0, 0.0, 1.0), ground=None))
+
+
+def tinted(picture: np.ndarray, color: str) -> np.ndarray:
+    """Return which pixels are more of one hue than of the others."""
+    red, green, blue = picture.astype(float).transpose(2, 0, 1)
+    return {"orange": (red > 1.3 * green) & (green > 1.2 * blue), "blue": (blue > 1.15 * red) & (blue > green)}[color]
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_every_scene_says_what_it_looks_like_and_is_drawn(name: str) -> None:
+    _, episode = scene(name)
+    assert episode.view is not None
+    assert all(len(part.at) == len(episode.time) for part in episode.parts)
+    (picture,) = frames(episode, [len(episode.time) - 1], height=SMALL)
+    assert picture.shape[0] == SMALL
+    assert (picture.min(axis=2) < 200).mean() > 0.01, "blank"
+    assert (picture[SMALL // 4 : -SMALL // 4].min(axis=2) < 200).any(), "nothing in the middle"
+
+
+def test_the_scooped_cube_rises_and_the_syrup_stays_in_the_tank() -> None:
+    _, episode = scene("fluid")
+    first, last = frames(episode, [0, len(episode.time) - 1], height=200)
+    heights = [np.flatnonzero(tinted(picture, "orange").any(axis=1)).mean() for picture in (first, last)]
+    assert heights[1] < heights[0] - 20  # rows count downwards
+    view = episode.view
+    assert view is not None
+    right, _, _ = axes(view)
+    half = TANK_WIDTH / 2
+    reach = max(abs(np.array([x, 0, z]) @ right) for x in (-half, half) for z in (-half, half))
+    rows, columns = np.nonzero(tinted(first, "blue"))
+    scale = 200 / np.ptp(_corners(view) @ axes(view)[1])
+    assert len(rows) > 2000
+    assert np.abs(columns - first.shape[1] / 2).max() < 1.1 * scale * reach
+    assert view.upper[1] > TANK_HEIGHT
+
+
+def _corners(view: View) -> np.ndarray:
+    low, high = view.lower, view.upper
+    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+
+
+def test_a_film_has_every_frame_and_a_sheet_every_key(tmp_path: Path) -> None:
+    at = torch.zeros(5, 1, 3)
+    at[:, 0, 0] = torch.linspace(-0.5, 0.5, 5)
+    episode = replace(still(Part("sphere", "rubber", at, (0.3,))), time=torch.arange(5) / 10)
+    assert save_replay(episode, tmp_path / "a.mp4", tmp_path / "a.gif") == 5
+    said = subprocess.run(
+        [imageio_ffmpeg.get_ffmpeg_exe(), "-i", tmp_path / "a.mp4", "-f", "null", "-"], capture_output=True, check=True
+    ).stderr.decode()
+    assert "frame=    5" in said
+    save_sheet(episode, tmp_path / "a.png", keys=2)
+    left, right = np.split(imread(tmp_path / "a.png")[:, :1200, :3], 2, axis=1)
+    middles = [np.nonzero(half[..., 0] > 1.5 * half[..., 1])[1].mean() for half in (left, right)]
+    assert middles[0] < 250 < 350 < middles[1]
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_an_episode_without_parts_is_refused() -> None:
+    with pytest.raises(ValueError, match="give Episode its `parts`"):
+        next(frames(Episode(torch.zeros(1), {}), [0]))
+
+
+def test_a_lump_encloses_what_its_particles_fill() -> None:
+    n, edge = 20, 0.2
+    axis = (np.arange(n) + 0.5) / n * edge
+    x = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    surface = lump(x, edge / n)
+    assert surface.volume == pytest.approx(edge**3, rel=0.08)
+    alone = lump(np.concatenate([x, [[0.5, 0.5, 0.5]]]), edge / n)
+    assert alone.bounds.x_max == pytest.approx(0.5, abs=edge / n)  # a stray particle is seen
+
+
+@pytest.mark.parametrize(
+    ("shape", "size", "volume"),
+    [
+        ("sphere", (0.3,), 4 / 3 * np.pi * 0.3**3),
+        ("capsule", (0.2, 0.1), np.pi * 0.1**2 * 0.4 + 4 / 3 * np.pi * 0.1**3),
+        ("torus", (0.3, 0.1), 2 * np.pi**2 * 0.3 * 0.1**2),
+        ("cylinder", (0.2, 0.3), np.pi * 0.2**2 * 0.6),
+        ("ring", (0.2, 0.3, 0.1), np.pi * (0.3**2 - 0.2**2) * 0.1),
+        ("box", (0.2, 0.3, 0.4), 0.024),
+    ],
+)
+def test_solids_have_their_sizes(shape: str, size: tuple[float, ...], volume: float) -> None:
+    body = mesh(Part(shape, "steel", torch.zeros(1, 1, 3), size), 0)  # type: ignore[arg-type]
+    assert body.triangulate().volume == pytest.approx(volume, rel=0.02)
+    outwards = (np.asarray(body.point_normals) * (body.points - body.center)).sum(axis=1)
+    assert (outwards > -1e-6).mean() > (0.45 if shape in ("torus", "ring") else 0.99)
+
+
+def test_turns_and_skins_and_triangles() -> None:
+    quarter = about(1, torch.tensor([torch.pi / 2]))[0] @ torch.tensor([0.0, 0.0, 1.0])
+    torch.testing.assert_close(quarter, torch.tensor([1.0, 0.0, 0.0]), atol=1e-6, rtol=0)
+    axis = (torch.arange(4) + 0.5) / 4
+    cube = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).view(1, -1, 3)
+    vertices, faces = skin(cube)
+    assert (vertices.amin(), vertices.amax()) == (0.0, 1.0)
+    corners = vertices[0][faces]
+    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=1).sum() / 2
+    assert float(area) == pytest.approx(6.0)
+    assert len(triangles(np.array([[0, 0], [1, 0], [0, 1]]))) == 1
+    assert len(triangles(np.array([[0, 0], [1, 0], [0, 1], [1, 1]]))) == 2

@@ -1,0 +1,172 @@
+"""`landscape sweep`: what it leaves, goes on from, and refuses."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import gradscape
+from gradscape.cli import main
+from gradscape.landscapes.sampling import sample
+from gradscape.landscapes.smoothing import smoothed
+from gradscape.landscapes.store import plane_of
+
+SWEEP = "sweep bounce --dims 0 1 --over 2 --frames 3 --resolution 5 --through example:aim --device cpu --out moved"
+FILES = ["frames", "summary.json", "sweep.gif", "sweep.mp4", "sweep.rrd"]
+
+
+@dataclass(frozen=True)
+class Said:
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+Command = Callable[[str], Said]
+
+
+@pytest.fixture
+def run(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Run the command in this process, in a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+
+    def command(text: str) -> Said:
+        monkeypatch.setattr(sys, "argv", ["landscape", *text.split()])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as left:
+            main(text.split())
+        return Said(int(left.value.code or 0), *capsys.readouterr())
+
+    return command
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(file.name for file in folder.iterdir())
+
+
+def test_each_frame_is_the_slice_at_its_value(run: Command, tmp_path: Path) -> None:
+    done = run(f"{SWEEP} --json")
+    assert done.returncode == 0, done.stderr
+    assert names(tmp_path / "moved") == FILES
+    summary = json.loads(done.stdout)
+    assert summary == {**json.loads((tmp_path / "moved/summary.json").read_text()), "folder": "moved"}
+    space, aim = gradscape.make("bounce", device="cpu").space, gradscape.make("bounce", device="cpu").example("aim")
+    low, high = float(space.lower[2]), float(space.upper[2])
+    assert [frame["value"] for frame in summary["frames"]] == [low, (low + high) / 2, high]
+    for number, frame in enumerate(summary["frames"]):
+        (tmp_path / "at.json").write_text(json.dumps([*aim.tolist()[:2], frame["value"]]))
+        cut = "slice bounce --dims 0 1 --resolution 5 --through at.json --device cpu --out"
+        assert run(f"{cut} cut{number}").returncode == 0
+        alone = gradscape.open_slice(f"cut{number}/slice.zarr")
+        moved = gradscape.open_slice(f"moved/frames/{number:03d}.zarr")
+        xr.testing.assert_identical(moved.drop_attrs(), alone.drop_attrs())
+        assert moved.attrs["identity"] == alone.attrs["identity"]
+        assert frame["loss"]["lowest"] == float(alone["loss"].min())
+    assert summary["loss"]["highest"] == max(frame["loss"]["highest"] for frame in summary["frames"])
+    assert summary["episodes"] == 75
+    assert "75 episodes with gradients of 3 slices to compute: about" in done.stderr
+
+
+def test_nothing_is_computed_twice(run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(SWEEP)
+    first = [gradscape.open_slice(f"moved/frames/{number:03d}.zarr") for number in range(3)]
+    shutil.rmtree("moved/frames/001.zarr")
+    again = run(f"{SWEEP} --json")
+    assert (json.loads(again.stdout)["episodes"], json.loads(again.stdout)["resumed"]) == (25, 50)
+    assert "25 episodes with gradients of 3 slices to compute, 50 are there already" in again.stderr
+    for number, before in enumerate(first):
+        xr.testing.assert_equal(gradscape.open_slice(f"moved/frames/{number:03d}.zarr"), before)
+    kind = type(gradscape.make("bounce", device="cpu"))
+    monkeypatch.setattr(kind, "evaluate", lambda *_, **__: pytest.fail("evaluated again"))
+    third = run(SWEEP)
+    assert "all 75 episodes with gradients of 3 slices are there already" in third.stderr
+    assert third.returncode == 0
+
+
+def test_force_begins_anew_and_another_sweep_is_not_overwritten(run: Command) -> None:
+    run(SWEEP)
+    before = {path: path.read_bytes() for path in Path("moved").rglob("*") if path.is_file()}
+    other = run(SWEEP.replace("--frames 3", "--frames 4"))
+    assert other.returncode == 2
+    assert "plane" in other.stderr
+    assert before == {path: path.read_bytes() for path in Path("moved").rglob("*") if path.is_file()}
+    done = run(SWEEP.replace("--frames 3", "--frames 2") + " --force --json")
+    assert json.loads(done.stdout)["episodes"] == 50
+    assert names(Path("moved/frames")) == ["000.zarr", "001.zarr"]
+
+
+def test_smoothing_averages_one_slice(run: Command) -> None:
+    done = run("sweep branin --dims 0 1 --over smoothing --frames 3 --resolution 9 --out soft --json")
+    assert done.returncode == 0, done.stderr
+    summary, dataset = json.loads(done.stdout), gradscape.open_slice("soft/slice.zarr")
+    assert [frame["value"] for frame in summary["frames"]] == [0.0, 12.5, 25.0]
+    assert summary["episodes"] == 81
+    for frame in summary["frames"]:
+        assert frame["loss"]["lowest"] == float(smoothed(dataset, frame["value"] / 100)["loss"].min())
+    assert names(Path("soft")) == ["slice.zarr", *FILES[1:]]
+
+
+def test_without_out_each_sweep_has_a_folder_of_its_own(run: Command) -> None:
+    short = "sweep ackley --dims 0 1 --frames 2 --resolution 2 --set dim=4 --no-gradients --over"
+    for over in ("2", "x3", "smoothing"):
+        done = run(f"{short} {over}")
+        assert done.returncode == 0, done.stderr
+    assert len(names(Path("out"))) == 3
+    dataset = gradscape.open_slice(next(Path("out").glob("*-over-3-*/frames/001.zarr")))
+    assert "grad" not in dataset
+    assert float(plane_of(dataset).origin[3]) == float(gradscape.make("ackley", dim=4).space.upper[3])
+
+
+@pytest.mark.parametrize(
+    ("over", "said"),
+    [
+        ("--dims 0 1 --over 1", "moves a third parameter, or smoothing; got --over 1, which the slice varies"),
+        ("--dims 0 1 --over x0", "got --over x0, which the slice varies"),
+        ("--dims 0 1 --over 9", "numbered 0 to 2; got 9"),
+        ("--dims 0 1 --over speed", "no parameter is called 'speed'"),
+        ("--dims 0 0 --over 2", "two different parameters; got 0, 0"),
+        ("--dims 0 1 --over 2 --frames 1", "--frames"),
+        ("--dims 0 1 --over 2 --out mine", "mine holds other files and no sweep"),
+        ("--dims 0 1 --over 2 --out mine --force", "mine holds other files and no sweep"),
+    ],
+)
+def test_bad_input_is_one_line_and_writes_nothing(run: Command, over: str, said: str) -> None:
+    Path("mine").mkdir()
+    Path("mine/sweep.mp4").write_text("precious")
+    done = run(f"sweep ackley --set dim=3 {over}")
+    assert done.returncode == 2
+    assert said in " ".join(done.stderr.split())
+    assert names(Path()) == ["mine"]
+    assert Path("mine/sweep.mp4").read_text() == "precious"
+
+
+def test_a_sweep_that_is_stopped_goes_on_to_the_same_bits(run: Command, tmp_path: Path) -> None:
+    text = "sweep bounce --dims 0 1 --over 2 --frames 4 --resolution 24 --device cpu --out"
+    command = [sys.executable, "-m", "gradscape", *text.split(), "stopped"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path) as process:
+        while not list(tmp_path.glob("stopped/frames/000.zarr/status/c/*/*")):
+            assert process.poll() is None
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert f"the same command goes on from there: landscape {text} stopped" in said
+    kept = int(said.split("stopped: ")[1].split(" of 2304 points")[0])
+    assert 0 < kept < 2304
+    again = json.loads(run(f"{text} stopped --json").stdout)
+    assert (again["resumed"], again["episodes"]) == (kept, 2304 - kept)
+    env = gradscape.make("bounce", device="cpu")
+    for number in range(4):
+        stopped = gradscape.open_slice(f"stopped/frames/{number:03d}.zarr")
+        whole = sample(env, plane_of(stopped))
+        for name in ("loss", "grad", "status"):
+            np.testing.assert_array_equal(stopped[name], whole[name])
