@@ -20,6 +20,13 @@ app = typer.Typer(
 )
 
 Fidelity = Annotated[str | None, typer.Option(help="How accurately to simulate: draft, standard or reference.")]
+Tolerance = Annotated[
+    str | None,
+    typer.Option(
+        help="Instead of --fidelity: the quickest that `landscape tradeoff` found within this loss error, 5% of the "
+        "losses' spread or a number in their unit."
+    ),
+]
 Device = Annotated[str, typer.Option(help="auto, cpu or cuda; auto takes CUDA where it is.")]
 Deterministic = Annotated[
     bool, typer.Option("--deterministic", help="Add up in the same order every time on a GPU, some ten times slower.")
@@ -75,6 +82,7 @@ def slice_(
     dims: Annotated[tuple[str, str], typer.Option(help="The two parameters to vary, by number or by name.")],
     resolution: Annotated[int, typer.Option(min=2, help="Points along each axis.")] = 16,
     fidelity: Fidelity = None,
+    tolerance: Tolerance = None,
     device: Device = "auto",
     engine: Engine = "warp",
     deterministic: Deterministic = False,
@@ -97,6 +105,7 @@ def slice_(
         dims,
         resolution=resolution,
         fidelity=fidelity,
+        tolerance=tolerance,
         device=device,
         engine=engine,
         deterministic=deterministic,
@@ -115,7 +124,8 @@ def sweep(
     env: Annotated[str, typer.Argument(help="The environment; `landscape envs` lists them.")],
     dims: Annotated[tuple[str, str], typer.Option(help="The two parameters to vary, by number or by name.")],
     over: Annotated[
-        str, typer.Option(help="What moves from frame to frame: a third parameter, over its bounds, or smoothing.")
+        str,
+        typer.Option(help="What moves from frame to frame: a third parameter over its bounds, horizon, or smoothing."),
     ],
     frames: Annotated[int, typer.Option(min=2, help="Values of it, both ends included.")] = 24,
     resolution: Annotated[int, typer.Option(min=2, help="Points along each axis.")] = 16,
@@ -175,6 +185,7 @@ def optimize(
     budget: Budget = 1000,
     seed: Annotated[int, typer.Option(min=0, help="What the method's random numbers begin with.")] = 0,
     fidelity: Fidelity = None,
+    tolerance: Tolerance = None,
     device: Device = "auto",
     engine: Engine = "warp",
     deterministic: Deterministic = False,
@@ -197,6 +208,7 @@ def optimize(
         budget=budget,
         seed=seed,
         fidelity=fidelity,
+        tolerance=tolerance,
         device=device,
         engine=engine,
         deterministic=deterministic,
@@ -333,7 +345,10 @@ def replay(
     ] = None,
     film: Annotated[bool, typer.Option(help="Film it, too; that takes about a minute.")] = True,
 ) -> None:
-    """Draw an episode: key frames side by side in episode.png, all of it in episode.mp4 and episode.gif."""
+    """Draw an episode: key frames side by side in episode.png, all of it in episode.mp4, episode.gif and episode.rrd.
+
+    The last is a scene to walk around in: `landscape view FOLDER/episode.rrd`, or `landscape view FOLDER --serve`.
+    """
     from .replay_report import replay as report
 
     report(env, params=params, fidelity=fidelity, device=device, engine=engine, settings=set_ or [], out=out, film=film)
@@ -422,6 +437,162 @@ def bench(
     )
 
 
+@app.command()
+def check(
+    env: Annotated[str, typer.Argument(help="The environment, ours or one that another package registers.")],
+    fidelity: Fidelity = None,
+    device: Device = "auto",
+    engine: Engine = "warp",
+    set_: Set = None,
+    points: Annotated[int, typer.Option(min=2, help="Random points of the box to check at.")] = 4,
+    seed: Annotated[int, typer.Option(min=0, help="What the points begin with.")] = 0,
+    json_: Json = False,
+) -> None:
+    """Check that an environment keeps what every environment promises, and what it says at the extremes.
+
+    Shapes, refusals, batches, determinism, gradients against differences over a ladder of steps, corners of the box and
+    beyond, long time steps, materials, horizons, precision. Exit code 0 says that it passes, 1 that it fails.
+    """
+    from .check_report import check as report
+
+    report(
+        env,
+        fidelity=fidelity,
+        device=device,
+        engine=engine,
+        settings=set_ or [],
+        points=points,
+        seed=seed,
+        as_json=json_,
+    )
+
+
+@app.command()
+def tradeoff(
+    env: Annotated[str, typer.Argument(help="The environment; `landscape envs` lists them.")],
+    points: Annotated[int, typer.Option(min=2, help="Sobol points at which every fidelity is measured.")] = 64,
+    seed: Annotated[int, typer.Option(min=0, help="What the points and the bootstrap begin with.")] = 0,
+    ladder: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="What to turn beside the named fidelities, a,b or repeated: dt, resolution, particles, precision, "
+            "stiffness, engine, device; by default all that the scene has."
+        ),
+    ] = None,
+    device: Device = "auto",
+    engine: Engine = "warp",
+    set_: Set = None,
+    out: Annotated[
+        str | None, typer.Option(help="Folder for the results; by default one under out/ named after the study.")
+    ] = None,
+    json_: Json = False,
+    force: Annotated[bool, typer.Option("--force", help="Begin anew where a study exists already.")] = False,
+) -> None:
+    """Measure accuracy against speed: the same points at a ladder of fidelities, each against the reference.
+
+    Writes tradeoff.png and tradeoff.json, and keeps the latter for --tolerance. Stop it at any moment: the same command
+    goes on with the next rung.
+    """
+    from .tradeoff_report import tradeoff as report
+
+    report(
+        env,
+        points=points,
+        seed=seed,
+        device=device,
+        engine=engine,
+        ladders=ladder or [],
+        settings=set_ or [],
+        out=out,
+        as_json=json_,
+        force=force,
+    )
+
+
+@app.command()
+def pairs(
+    env: Annotated[str, typer.Argument(help="The environment; `landscape envs` lists them.")],
+    samples: Annotated[
+        int | None,
+        typer.Option(
+            min=2,
+            help="Base points, each of 1 + 5 x dim + 28 episodes (fewer below 8 parameters); by default 16, from some "
+            "20 parameters on fewer, down to 4.",
+        ),
+    ] = None,
+    fidelity: Fidelity = None,
+    device: Device = "auto",
+    engine: Engine = "warp",
+    seed: Annotated[int, typer.Option(min=0, help="What the points begin with.")] = 0,
+    top: Annotated[int, typer.Option(min=1, help="Pairs to show.")] = 10,
+    set_: Set = None,
+    out: Annotated[
+        str | None, typer.Option(help="Folder for the results; by default one under out/ named after the study.")
+    ] = None,
+    json_: Json = False,
+    force: Annotated[bool, typer.Option("--force", help="Begin anew where a study exists already.")] = False,
+) -> None:
+    """Rank pairs of parameters by sensitivity, ruggedness and misleading gradients: which slices to look at.
+
+    Stop it at any moment: the same command goes on where it stopped.
+    """
+    from .pairs_report import pairs as report
+
+    report(
+        env,
+        samples=samples,
+        fidelity=fidelity,
+        device=device,
+        engine=engine,
+        seed=seed,
+        top=top,
+        settings=set_ or [],
+        out=out,
+        as_json=json_,
+        force=force,
+    )
+
+
+@app.command("report")
+def report_(
+    what: Annotated[
+        str | None,
+        typer.Argument(metavar="[SLICE|ENV]", help="A slice's folder, or an environment: its figures, else one slice."),
+    ] = None,
+    everything: Annotated[bool, typer.Option("--all", help="Every figure of the gallery that is sampled.")] = False,
+    fidelity: Fidelity = None,
+    device: Device = "auto",
+    points: Annotated[
+        int, typer.Option(min=2, help="Points along each axis where gradients are tested by new evaluations.")
+    ] = 6,
+    seed: Annotated[int, typer.Option(min=0, help="What random numbers begin with.")] = 0,
+    data: Annotated[
+        str | None, typer.Option(help="Folder of the figures' slices; by default the gallery's own.")
+    ] = None,
+    out: Annotated[
+        str | None, typer.Option(help="Folder for the results; by default one under out/ named after the report.")
+    ] = None,
+    json_: Json = False,
+) -> None:
+    """Say what a landscape is like: minima, flatness, jumps, correlation, gradient quality, and the verdict.
+
+    Writes report.json, measures.json and gradient-quality.png. Stop it at any moment: finished slices are kept.
+    """
+    from .measure_report import report
+
+    report(
+        what,
+        everything=everything,
+        fidelity=fidelity,
+        device=device,
+        points=points,
+        seed=seed,
+        data=data,
+        out=out,
+        as_json=json_,
+    )
+
+
 gallery = typer.Typer(help="Sample the paper's figures and ours, and build a site that shows them offline.")
 app.add_typer(gallery, name="gallery", no_args_is_help=True)
 Data = Annotated[str | None, typer.Option(help="Folder of the figures' slices; by default the gallery's own.")]
@@ -432,18 +603,24 @@ def gallery_compute(
     only: Annotated[
         list[str] | None, typer.Option(help="A figure's id or an environment; may be repeated. By default all.")
     ] = None,
+    part: Annotated[
+        list[str] | None,
+        typer.Option(help="slices, sweeps, episodes or searches; may be repeated. By default all of them."),
+    ] = None,
     fidelity: Fidelity = None,
     device: Device = "auto",
     resolution: Annotated[int | None, typer.Option(min=2, help="Points along each axis, for all figures.")] = None,
     data: Data = None,
 ) -> None:
-    """Sample what is missing of the figures: an estimate of the whole first, then one after the other.
+    """Make what is missing of the figures: an estimate first, then one after the other.
+
+    Slices have the figures' fidelity, and so have episodes at some of their nodes; sweeps and searches are drafts.
 
     Stop it at any moment: the same command goes on where it stopped. A figure that fails does not stop the others.
     """
     from .gallery_report import compute
 
-    compute(only=only or [], fidelity=fidelity, device=device, resolution=resolution, data=data)
+    compute(only=only or [], parts=part or [], fidelity=fidelity, device=device, resolution=resolution, data=data)
 
 
 @gallery.command("list")

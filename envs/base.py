@@ -151,9 +151,12 @@ class Environment(abc.ABC):
 
         Parameters that this decision and later ones set do not matter. The last feature is the share of the episode
         that is over. It is all there is to see where parameters say how an episode begins or what it is made of: such
-        a scene is a bandit, with a single decision.
+        a scene is a bandit, with a single decision. Decisions share an episode of horizon 1; others have none to see.
         """
         x = self._checked(x)
+        horizon = getattr(self.options, "horizon", 1.0)
+        if self.decisions > 1 and horizon != 1.0:
+            raise ValueError(f"{self.name} is decided step by step at horizon 1 only; got horizon {horizon:g}")
         if not 0 <= decision < self.decisions:
             raise ValueError(f"{self.name} numbers its decisions 0 to {self.decisions - 1}; got {decision}")
         ahead = self.space.center[self.space.dim * decision // self.decisions :]

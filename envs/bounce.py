@@ -17,6 +17,7 @@ from ..landscapes.space import ParameterSpace
 from .base import Environment, Episode, Fidelity, Work
 from .engines.rigid import Ball, Solver
 from .engines.runtime import Pool
+from .options import EpisodeOptions
 
 START = (-0.5, 1.0, 0.0)  # [m]
 DURATION = 2.0  # [s]
@@ -24,7 +25,7 @@ VIEW = View((-0.8, 0.0, -0.7), (2.6, 5.1, 0.7), eye=(0.1, 0.25, 1.0))
 
 
 @dataclass(frozen=True)
-class BounceOptions:
+class BounceOptions(EpisodeOptions):
     """Contact: stiffness `ke` [N/m], damping `kd` and viscous friction `kf` [N s/m], Coulomb's `mu`; target [m]."""
 
     ke: float = 1e4
@@ -43,8 +44,8 @@ class Bounce(Environment):
     Warp's relaxed contact (penalty stiffness 1e4 N/m, damping 10 N s/m while approaching, friction); semi-implicit
     Euler, dt 1/480 s at standard.
     Parameters: initial velocity x, y, z [m/s].
-    Loss: squared distance of the ball's centre to the target (2, 1, 0) m at 2 s [m^2]. One bounce reaches it (example
-    `aim`).
+    Loss: squared distance of the ball's centre to the target (2, 1, 0) m at the end, after 2 s [m^2]. One bounce
+    reaches it (example `aim`).
     Simplifications: the ball does not spin, since friction on a point keeps the discontinuity the scene is about; there
     is no wall, since the policy has to use the ground. Viscous friction is capped so that a step cannot reverse
     sliding.
@@ -80,7 +81,8 @@ class Bounce(Environment):
     @property
     def steps(self) -> int:
         """Number of time steps of an episode."""
-        return round(DURATION / self.fidelity.dt)
+        steps: int = self.options.lasting(round(DURATION / self.fidelity.dt))
+        return steps
 
     def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""

@@ -15,9 +15,10 @@ from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
 from .base import Environment, Episode, Fidelity, Work
-from .controls import hold
+from .controls import hold, lasting
 from .engines.chain import Chain, Solver
 from .engines.runtime import Pool
+from .options import EpisodeOptions
 
 CHAIN = Chain(masses=(1.0, 0.5, 0.25), lengths=(1.0, 1.0, 1.0), gravity=9.81)
 CONTROLS, SPAN = 100, 0.02  # how many controls, and how long each is held [s]
@@ -36,7 +37,7 @@ UPRIGHT = (
 
 
 @dataclass(frozen=True)
-class CartpoleOptions:
+class CartpoleOptions(EpisodeOptions):
     """Where the tip is wanted [m]; the cart starts at (0, 0), its chain hanging down to (0, -3)."""
 
     target_x: float = 0.0
@@ -86,13 +87,19 @@ class Cartpole(Environment):
     )
 
     @property
+    def held(self) -> int:
+        """Number of control steps of an episode."""
+        count: int = self.options.lasting(CONTROLS)
+        return count
+
+    @property
     def steps(self) -> int:
         """Number of time steps of an episode."""
-        return round(CONTROLS * SPAN / self.fidelity.dt)
+        return round(self.held * SPAN / self.fidelity.dt)
 
     def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
-        numbers = (self.steps + 1) * 4 * 3 + CONTROLS * 2 * 4
+        numbers = (self.steps + 1) * 4 * 3 + self.held * 2 * 4
         return numbers * (8 if self.fidelity.precision == "float64" else 4)
 
     def work(self) -> Work:
@@ -101,7 +108,7 @@ class Cartpole(Environment):
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return the cart, and the joints of the chain with its tip."""
-        controls = self._checked(x[None]).view(1, CONTROLS, 4)
+        controls = self._controls(self._checked(x[None]))
         with self._solvers.lend() as solver:
             phi = _swing(solver, controls)[:, 0].cpu().double()
         joints = _joints(self._cart(controls)[0], phi)
@@ -122,25 +129,30 @@ class Cartpole(Environment):
             raise ValueError(f"{self.name} holds a control for {SPAN} s, which must be whole steps; got dt {dt} s")
         self._capacity = 256 if self.device == "cpu" else 1 << 14
         settings: dict[str, Any] = {"capacity": self._capacity, "device": self.device, "name": self.fidelity.precision}
-        self._solvers = Pool(partial(Solver, CHAIN, dt=dt, hold=round(SPAN / dt), controls=CONTROLS, **settings))
+        self._solvers = Pool(partial(Solver, CHAIN, dt=dt, hold=round(SPAN / dt), controls=self.held, **settings))
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
-        controls = x.view(len(x), CONTROLS, 4).requires_grad_(grad)
+        x = x.clone().requires_grad_(grad)
+        controls = self._controls(x)
         with self._solvers.lend() as solver:
             phi = _swing(solver, controls.detach())[-1].cpu().double().requires_grad_(grad)
             tip = _joints(self._cart(controls)[:, -1], phi)[:, -1]
             loss = (tip - self.target).norm(dim=1)
-            slope = _pull_back(solver, loss, phi, controls) if grad else None
+            slope = _pull_back(solver, loss, phi, controls, x) if grad else None
         return Evaluation(loss.detach(), slope, torch.full((len(x),), Status.OK, dtype=torch.int8))
 
     def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
         """Watch the cart and the sines and cosines of angles, and how fast cart and angles changed in the last step."""
-        controls, step = x.view(len(x), CONTROLS, 4), decision * self.steps // CONTROLS
+        controls, step = self._controls(x), decision * self.steps // CONTROLS
         with self._solvers.lend() as solver:
             phi = _swing(solver, controls).cpu().double().transpose(0, 1)
         joints = torch.cat([self._cart(controls)[:, :, None], phi], dim=2)
         rate = (joints[:, step] - joints[:, max(0, step - 1)]) * (TEMPO / self.fidelity.dt)
         return torch.cat([joints[:, step, :1], phi[:, step].sin(), phi[:, step].cos(), rate], dim=1)
+
+    def _controls(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch control 4"]:
+        """Return cart velocity and torques in each control step; none after the last that parameters set."""
+        return lasting(x.view(len(x), CONTROLS, 4), self.held, then=x.new_zeros(len(x), 1, 4))
 
     def _cart(self, controls: Float[Tensor, "batch control 4"]) -> Float[Tensor, "batch step_plus_1"]:
         """Return where the cart is at the ends of steps [m]."""
@@ -176,7 +188,8 @@ def _joints(cart: Float[Tensor, "*batch"], phi: Float[Tensor, "*batch 3"]) -> Fl
     return torch.cat([hinge, hinge + links.cumsum(dim=-2)], dim=-2)
 
 
-def _pull_back(solver: Solver, loss: Tensor, phi: Tensor, controls: Tensor) -> Tensor:
-    """Return the gradient by the parameters of a loss that depends on the last angles and on the cart's path."""
-    adj_phi, adj_controls = torch.autograd.grad(loss.sum(), (phi, controls))
-    return (adj_controls + solver.gradient(adj_phi).cpu().double()).flatten(start_dim=1)
+def _pull_back(solver: Solver, loss: Tensor, phi: Tensor, controls: Tensor, x: Tensor) -> Tensor:
+    """Return the gradient by x of a loss that depends on the last angles and on the cart's path."""
+    adj_phi, adj_controls = torch.autograd.grad(loss.sum(), (phi, controls), retain_graph=True)
+    (slope,) = torch.autograd.grad(controls, x, adj_controls + solver.gradient(adj_phi).cpu().double())
+    return slope

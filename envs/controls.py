@@ -15,6 +15,13 @@ def hold(segments: Float[Tensor, "batch segment axis"], steps: int) -> Float[Ten
     return segments.repeat_interleave(steps // count, dim=1)
 
 
+def lasting(
+    rows: Float[Tensor, "batch row axis"], count: int, *, then: Float[Tensor, "batch 1 axis"]
+) -> Float[Tensor, "batch count axis"]:
+    """Return the first `count` rows of a course in time, those that it lacks being `then`."""
+    return torch.cat([rows[:, :count], then.expand(-1, max(0, count - rows.shape[1]), -1)], dim=1)
+
+
 def ramp(
     start: Float[Tensor, " axis"], waypoints: Float[Tensor, "batch segment axis"], steps: int
 ) -> Float[Tensor, "batch step_plus_1 axis"]:

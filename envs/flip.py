@@ -15,7 +15,7 @@ from ..landscapes.episode import Part, View
 from ..landscapes.space import ParameterSpace
 from . import lattice
 from .base import Fidelity
-from .controls import ramp
+from .controls import lasting, ramp
 from .engines.contact import Pan
 from .engines.springs import Sheet
 from .outlines import about, triangles
@@ -23,7 +23,7 @@ from .sheets import Drive, SheetScene
 
 ACROSS = 0.2  # the pancake's diameter [m]
 AREAL_DENSITY, STIFFNESS = 3.0, 60.0  # [kg/m^2], [N/m]
-THICK = 0.01  # what the pancake is drawn [m]
+THICK, MARK = 0.01, 0.009  # of the pancake and of the mark on its rim, as they are drawn [m]
 SEGMENTS = 5
 BEND = 0.8  # the bending springs' share
 LOWER, UPPER = (-0.075, -0.075, -0.6), (0.075, 0.15, 0.6)  # of a waypoint [m], [m], [rad]
@@ -79,7 +79,8 @@ class Flip(SheetScene):
         return Sheet(x, pairs, rest * pitch, weight, mass, damping=0.02)
 
     def _drive(self, x: Float[Tensor, "batch dim"]) -> Drive:
-        poses = ramp(x.new_zeros(3), x.view(len(x), SEGMENTS, 3), self.steps)
+        course = ramp(x.new_zeros(3), x.view(len(x), SEGMENTS, 3), self.own_steps)
+        poses = lasting(course, self.steps + 1, then=course[:, -1:])
         return Drive(x.new_zeros(len(x), 3), x.new_full((len(x), len(self.sheet.x)), STIFFNESS), poses)
 
     def _extremes(self) -> list[int]:
@@ -89,9 +90,12 @@ class Flip(SheetScene):
 
     def _loss(self, end: Float[Tensor, "vertex 3"]) -> Float[Tensor, ""]:
         extremes = self._extremes()
-        flipped = end.new_tensor(self.sheet.x[extremes] * (-1.0, 1.0, 1.0))
-        loss: Tensor = (end[extremes] - flipped).norm(dim=1).mean()
+        loss: Tensor = (end[extremes] - self._flipped().to(end)).norm(dim=1).mean()
         return loss
+
+    def _flipped(self) -> Float[Tensor, "vertex 3"]:
+        """Return where those vertices are wanted [m]."""
+        return torch.from_numpy(self.sheet.x[self._extremes()] * (-1.0, 1.0, 1.0))
 
     def _tools(self, poses: Float[Tensor, "frame 3"]) -> Mapping[str, Float[Tensor, "frame 3"]]:
         return {"pan": poses}
@@ -103,4 +107,6 @@ class Flip(SheetScene):
         return (
             Part("sheet", "dough", frames, (THICK,), faces=faces),
             Part("pan", "iron", place, size, about(2, poses[:, 2])),
+            Part("sphere", "rubber", frames[:, self._extremes()[:1]], (MARK,)),  # one of the four, to tell its sides
+            Part("sphere", "target", self._flipped()[:1].expand(len(frames), 1, 3), (1.5 * MARK,)),
         )

@@ -15,7 +15,7 @@ from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
 from .base import Environment, Episode, Fidelity, Work
-from .controls import hold, travel
+from .controls import hold, lasting, travel
 from .engines.boundaries import LadleInTank
 from .engines.materials import Elastic
 from .engines.materials import Fluid as Liquid
@@ -23,6 +23,7 @@ from .engines.model import Body, Model
 from .engines.mpm import Solver, capacity, memory
 from .engines.runtime import Pool
 from .observation import followed, motion
+from .options import EpisodeOptions
 from .outlines import skin
 
 TANK_WIDTH, TANK_HEIGHT, FILL = 0.4, 0.2, 0.15  # the tank, and the depth of the syrup [m]
@@ -39,7 +40,7 @@ VIEW = View((-0.2, 0.0, -0.2), (0.2, 0.42, 0.2), eye=(0.4, 0.55, 1.0))
 
 
 @dataclass(frozen=True)
-class FluidOptions:
+class FluidOptions(EpisodeOptions):
     """`goal`: high rewards a cube lifted above the tank's edge; printed is the sign the paper prints, for a low one.
 
     `viscosity` of the syrup [Pa s], density of the cube [kg/m^3], `friction` of the ladle (Coulomb).
@@ -59,8 +60,9 @@ class Fluid(Environment):
     with an upright handle) as a signed distance at grid nodes, with Coulomb friction. The tank is 0.4 m x 0.4 m and 0.2
     m high, filled 0.15 m deep; x right, y up, z to the front.
     Parameters: ladle speed x, y [m/s] in each of 5 segments of 0.1 s; even numbers are horizontal, odd ones vertical.
-    Loss at 0.5 s [m], cube's centre (x, y, z): max(0, 0.2 - y) + 3 |(x, z) - ladle| + |(x, z) - tank's axis|. The paper
-    prints max(0, y - 0.2), which rewards a low cube although the goal is "as high as possible"; that is goal=printed.
+    Loss at the end, after 0.5 s [m], cube's centre (x, y, z): max(0, 0.2 - y) + 3 |(x, z) - ladle| + |(x, z) - tank's
+    axis|. The paper prints max(0, y - 0.2), which rewards a low cube although the goal is "as high as possible"; that
+    is goal=printed.
     Simplifications: sound travels at 5 m/s, so that the syrup compresses by some percent and a step may be long; walls
     are slippery and reach up to a lid at 0.6 m, so that no syrup is lost; the ladle has no mass and stops where it
     would leave the tank; the cube is as soft as that speed of sound makes it (26 kPa), which is stiff beside the loads
@@ -103,6 +105,7 @@ class Fluid(Environment):
     def ladle(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 1 3"]:
         """Return where the centre of the ladle's rim is at the ends of control steps [m]."""
         velocity = hold(x.view(len(x), SEGMENTS, 2), STEPS)
+        velocity = lasting(velocity, self.model.steps, then=x.new_zeros(len(x), 1, 2))
         reach = TANK_WIDTH / 2 - BOWL - SHELL
         start, lower, upper = (x.new_tensor(p) for p in (RIM[:2], (-reach, LOWEST), (reach, HIGHEST)))
         path = travel(start, velocity, SPAN, lower=lower, upper=upper)
@@ -122,7 +125,7 @@ class Fluid(Environment):
             solver.run(tools)
             frames = solver.positions(0)
         first = len(self.model.bodies[0].x)
-        time = SPAN * torch.arange(STEPS + 1, dtype=torch.float64)
+        time = SPAN * torch.arange(self.model.steps + 1, dtype=torch.float64)
         points = {"syrup": frames[:, :first], "cube": frames[:, first:]}
         parts = self._parts(points["syrup"], points["cube"], tools[0])
         return Episode(time, points, {"ladle": tools[0, :, 0]}, parts, VIEW)
@@ -174,7 +177,7 @@ class Fluid(Environment):
 def _pull_back(solver: Solver, loss: Tensor, end: Tensor, tools: Tensor, x: Tensor) -> Tensor:
     """Return the gradient by x of a loss that depends on where particles end and on the ladle's path."""
     adj_end, adj_tools = torch.autograd.grad(loss.sum(), (end, tools), retain_graph=True)
-    adj_tools = adj_tools + solver.gradient({STEPS: adj_end}).to(adj_tools)
+    adj_tools = adj_tools + solver.gradient({solver.model.steps: adj_end}).to(adj_tools)
     (slope,) = torch.autograd.grad(tools, x, adj_tools)
     return slope
 
@@ -192,7 +195,7 @@ def _model(fidelity: Fidelity, options: FluidOptions) -> Model:
         nodes=(across, int(np.ceil(HEADROOM / dx)) + 1 + 2 * MARGIN, across),
         dt=fidelity.dt,
         substeps=round(SPAN / fidelity.dt),
-        steps=STEPS,
+        steps=options.lasting(STEPS),
         gravity=GRAVITY,
     )
 

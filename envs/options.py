@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import math
 from collections.abc import Mapping
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -13,25 +14,71 @@ class NoOptions:
     """The options of a scene that has none."""
 
 
+@dataclasses.dataclass(frozen=True)
+class EpisodeOptions:
+    """`horizon`: how long an episode lasts, as a multiple of the scene's own duration.
+
+    Steps and controls stay what they are and when they are. A shorter episode ends earlier, so that controls it does
+    not reach have no effect and no gradient; in a longer one tools, pan, cart and joints rest after the last control,
+    and bodies go on. The loss is that of the state at the episode's end, or of the steps there are; targets that a
+    demonstration makes stay those of horizon 1.
+    """
+
+    horizon: float = dataclasses.field(default=1.0, kw_only=True, metadata={"most": 8.0})
+
+    def lasting(self, steps: int) -> int:
+        """Return how many steps an episode has where the scene's own duration takes so many."""
+        return max(1, round(self.horizon * steps))
+
+
 def read_options(owner: str, declared: type[Any], given: Mapping[str, Any]) -> Any:
     """Return `declared` filled from `given`; values may be text.
 
     Raises ValueError where an option does not exist or a value is not of its type; `owner` says whose options they are.
     """
-    hints = get_type_hints(declared)
+    known = _declared(declared)
     for name in given:
-        if name not in hints:
+        if name not in known:
             raise ValueError(f"{owner} has no option {name!r}; it has {describe(declared) or 'none'}")
-    return declared(**{name: _read(owner, name, hints[name], value) for name, value in given.items()})
+    return declared(**{name: _read(owner, known[name], value) for name, value in given.items()})
 
 
 def describe(declared: type[Any]) -> str:
     """Return every option with what it takes and its default, as one line."""
+    return ", ".join(f"{o.name}={o.wanted} (default {o.default})" for o in _declared(declared).values())
+
+
+def explain(declared: type[Any]) -> str:
+    """Return what the options mean, in the words of the classes that declare them."""
+    kinds = [kind for kind in declared.__mro__ if dataclasses.is_dataclass(kind)]
+    return "\n\n".join(inspect.cleandoc(kind.__doc__) for kind in kinds if kind.__doc__)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Option:
+    """An option as it is declared; a number that has a `most` is above 0."""
+
+    name: str
+    kind: Any
+    default: Any
+    most: float | None
+
+    @property
+    def wanted(self) -> str:
+        if get_origin(self.kind) is Literal:
+            return "|".join(map(str, get_args(self.kind)))
+        names = {bool: "true|false", int: "a whole number", float: "a number"}
+        return names.get(self.kind, str(self.kind)) + (f" above 0, at most {self.most:g}" if self.most else "")
+
+
+def _declared(declared: type[Any]) -> dict[str, _Option]:
     hints = get_type_hints(declared)
-    return ", ".join(f"{f.name}={_wanted(hints[f.name])} (default {f.default})" for f in dataclasses.fields(declared))
+    own_first = sorted(dataclasses.fields(declared), key=lambda field: bool(field.kw_only))
+    return {f.name: _Option(f.name, hints[f.name], f.default, f.metadata.get("most")) for f in own_first}
 
 
-def _read(owner: str, name: str, kind: Any, value: Any) -> Any:
+def _read(owner: str, option: _Option, value: Any) -> Any:
+    kind = option.kind
     choices = get_args(kind) if get_origin(kind) is Literal else (True, False) if kind is bool else ()
     if choices:
         by_text = {str(choice).lower(): choice for choice in choices}
@@ -39,22 +86,18 @@ def _read(owner: str, name: str, kind: Any, value: Any) -> Any:
             return by_text[str(value).lower()]
     else:
         try:
-            return _number(kind, value)
+            return _number(kind, value, option.most)
         except (TypeError, ValueError, OverflowError):
             pass
-    raise ValueError(f"{owner} option {name} takes {_wanted(kind)}; got {value!r}")
+    raise ValueError(f"{owner} option {option.name} takes {option.wanted}; got {value!r}")
 
 
-def _number(kind: Any, value: Any) -> Any:
+def _number(kind: Any, value: Any, most: float | None) -> Any:
     number = kind(value)
+    if most is not None and not 0 < number <= most:
+        raise ValueError("out of range")
     if kind is float and not math.isfinite(number):
         raise ValueError("not finite")
     if kind is int and not isinstance(value, str) and number != value:
         raise ValueError("not whole")
     return number
-
-
-def _wanted(kind: Any) -> str:
-    if get_origin(kind) is Literal:
-        return "|".join(map(str, get_args(kind)))
-    return {bool: "true|false", int: "a whole number", float: "a number"}.get(kind, str(kind))

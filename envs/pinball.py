@@ -19,16 +19,17 @@ from .base import Environment, Episode, Fidelity, Work
 from .engines.board import Board
 from .engines.impacts import Solver
 from .engines.runtime import Pool
+from .options import EpisodeOptions
 
 WIDTH, HEIGHT = 8.0, 10.0  # the board [m]
 BALL, BAR = 0.25, 0.1  # radius of the ball, half the thickness of a bar [m]
 DURATION = 4.0  # [s]
 MEMORY = 1 << 28  # bytes a solver may take
-VIEW = View((0.0, 0.0, -0.5), (WIDTH, HEIGHT, 0.5), eye=(0.08, 0.1, 1.0), ground=None)
+VIEW = View((0.0, -0.8, -0.5), (WIDTH, HEIGHT, 0.5), eye=(0.08, 0.1, 1.0), ground=None)
 
 
 @dataclass(frozen=True)
-class PinballOptions:
+class PinballOptions(EpisodeOptions):
     """`contacts`: impact follows the ball to the time of impact, step reflects it in fixed steps, whose gradients err.
 
     `restitution` and Coulomb's `friction` of walls and bars; where the ball is wanted [m].
@@ -55,7 +56,7 @@ class Pinball(Environment):
     contacts=step reflects the velocity in steps that find the ball overlapping, as many simulators do: it can pass
     through a bar, and its gradients lack the time of impact.
     Parameters: angles of the bars [rad], row by row from the top, 0 horizontal, counterclockwise.
-    Loss: distance of the ball's centre to the goal (7, 0.65) m at 4 s [m].
+    Loss: distance of the ball's centre to the goal (7, 0.65) m at the end, after 4 s [m].
     Simplifications: bars are held, since their angles are the parameters; there is no drag and no rolling resistance,
     since 4 s are short; a ball jammed between surfaces, at 8 impacts in a step, stays where it is until the next step.
     Source: task Pinball of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
@@ -80,7 +81,8 @@ class Pinball(Environment):
     @property
     def steps(self) -> int:
         """Number of time steps of an episode."""
-        return round(DURATION / self.fidelity.dt)
+        steps: int = self.options.lasting(round(DURATION / self.fidelity.dt))
+        return steps
 
     @property
     def goal(self) -> Float[Tensor, " 2"]:

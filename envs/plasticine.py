@@ -15,13 +15,14 @@ from torch import Tensor
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
 from .base import Environment, Episode, Fidelity, Work
-from .controls import hold, roll, travel
+from .controls import hold, lasting, roll, travel
 from .engines.manipulators import Kind
 from .engines.model import Model
 from .engines.mpm import Solver, capacity, memory
 from .engines.raster import Raster
 from .engines.runtime import Pool
 from .observation import followed, motion
+from .options import EpisodeOptions
 from .plasticine_look import parts, view
 from .plasticine_model import SPAN, STEPS, Scene, model, target
 from .registry import code_digest
@@ -34,7 +35,7 @@ REACH = 0.1  # what a policy measures lengths by [m]
 
 
 @dataclass(frozen=True)
-class PlasticineOptions:
+class PlasticineOptions(EpisodeOptions):
     """`loss` of the final frame, or summed over all control steps; and what each of its terms weighs."""
 
     loss: Literal["final", "sum"] = "final"
@@ -96,7 +97,8 @@ class Plasticine(Environment):
 
     def tools(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 slot 3"]:
         """Return where tools are at the ends of control steps [m]; a roller's second slot is (spin, yaw, 0) [rad]."""
-        steps = hold(x.view(len(x), SEGMENTS, -1), STEPS).view(len(x), STEPS, -1, 3)
+        shares, count = hold(x.view(len(x), SEGMENTS, -1), STEPS), self.model.steps
+        steps = lasting(shares, count, then=torch.zeros_like(shares[:, :1])).view(len(x), count, -1, 3)
         slots: list[Tensor] = []
         for anchor, share in zip(self.scene.anchors, steps.unbind(dim=2), strict=True):
             step, start, lower, upper = (
@@ -106,7 +108,7 @@ class Plasticine(Environment):
                 slots += roll(start, share * step, anchor.tool.size[1], lower=lower, upper=upper)
             else:
                 slots.append(travel(start, share * step, 1.0, lower=lower, upper=upper))
-        slots += [x.new_tensor(place).expand(len(x), STEPS + 1, 3) for _, place in self.scene.posts]
+        slots += [x.new_tensor(place).expand(len(x), count + 1, 3) for _, place in self.scene.posts]
         return torch.stack(slots, dim=2)
 
     def terms(self, x: Float[Tensor, "batch dim"]) -> dict[str, Float[Tensor, " batch"]]:
@@ -133,10 +135,10 @@ class Plasticine(Environment):
             frames = stage.solver.positions(0)
         bodies = torch.split(frames, [len(body.x) for body in self.model.bodies], dim=1)
         return Episode(
-            SPAN * torch.arange(STEPS + 1, dtype=torch.float64),
+            SPAN * torch.arange(self.model.steps + 1, dtype=torch.float64),
             {f"plasticine {number}": body for number, body in enumerate(bodies, start=1)},
             {f"tool {number}": path for number, path in enumerate(tools[0].unbind(1), start=1)},
-            parts(self.scene, bodies, tools[0]),
+            parts(self.scene, bodies, tools[0], self._wanted()),
             view(self.scene),
         )
 
@@ -151,8 +153,9 @@ class Plasticine(Environment):
             -1.0,
             1.0,
         )
-        self.model = model(self.scene, self.fidelity)
-        self._judged = (STEPS,) if self.options.loss == "final" else tuple(range(1, STEPS + 1))
+        steps = self.options.lasting(STEPS)
+        self.model = model(self.scene, self.fidelity, steps)
+        self._judged = (steps,) if self.options.loss == "final" else tuple(range(1, steps + 1))
         self._capacity = self._rows_at_once(capacity(self.model, self.device))
         settings: dict[str, Any] = {"capacity": self._capacity, "device": self.device}
         settings |= {"deterministic": True} if self.deterministic else {}

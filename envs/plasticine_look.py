@@ -26,18 +26,28 @@ SHAPES: dict[Kind, episode.Shape] = {
 
 
 def parts(
-    scene: Scene, bodies: Sequence[Float[Tensor, "frame particle 3"]], tools: Float[Tensor, "frame slot 3"]
+    scene: Scene,
+    bodies: Sequence[Float[Tensor, "frame particle 3"]],
+    tools: Float[Tensor, "frame slot 3"],
+    target: np.ndarray,
 ) -> tuple[Part, ...]:
-    """Return the bodies, the tools at their slots' poses, and the targets that are shapes."""
-    lumps = []
-    for number, (lump, body) in enumerate(zip(scene.lumps, bodies, strict=True)):
-        pitch = (lump.shape.volume / body.shape[1]) ** (1 / 3)
-        lumps.append(Part("lump", "plasticine", body, (pitch,), tint=number))
+    """Return bodies, tools at their slots' poses, and targets: shapes, or the bodies' particles where they belong."""
+    pitches = [(lump.shape.volume / x.shape[1]) ** (1 / 3) for lump, x in zip(scene.lumps, bodies, strict=True)]
+    lumps = [
+        Part("lump", "plasticine", x, (pitch,), tint=number)
+        for number, (x, pitch) in enumerate(zip(bodies, pitches, strict=True))
+    ]
     movers, slot = [], 0
     for tool in scene.tools:
         movers.append(_tool(tool, tools[:, slot : slot + tool.slots]))
         slot += tool.slots
-    return (*lumps, *movers, *(_target(shape, len(tools)) for shape in scene.target))
+    if scene.target:
+        return (*lumps, *movers, *(_target(shape, len(tools)) for shape in scene.target))
+    wanted = torch.split(torch.from_numpy(target), [x.shape[1] for x in bodies])
+    goals = [
+        Part("lump", "target", x.expand(len(tools), -1, 3), (pitch,)) for x, pitch in zip(wanted, pitches, strict=True)
+    ]
+    return (*lumps, *movers, *goals)
 
 
 def view(scene: Scene) -> View:

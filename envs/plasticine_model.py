@@ -76,8 +76,8 @@ class Scene:
         return np.maximum(lower, [WALLS[0], 0.0, WALLS[0]]), np.minimum(upper, WALLS[1])
 
 
-def model(scene: Scene, fidelity: Fidelity) -> Model:
-    """Return a scene's model: bodies at rest, tools, and a grid that covers its room."""
+def model(scene: Scene, fidelity: Fidelity, steps: int = STEPS) -> Model:
+    """Return a scene's model of so many control steps: bodies at rest, tools, and a grid that covers its room."""
     dx = 1.0 / fidelity.resolution
     lower, upper = scene.room()
     first = np.floor(lower / dx).astype(int) - MARGIN
@@ -93,7 +93,7 @@ def model(scene: Scene, fidelity: Fidelity) -> Model:
         nodes=tuple((last - first + 1).tolist()),
         dt=fidelity.dt,
         substeps=round(SPAN / fidelity.dt),
-        steps=STEPS,
+        steps=steps,
         gravity=GRAVITY,
     )
 

@@ -6,7 +6,7 @@ import abc
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -19,6 +19,7 @@ from .engines.contact import Surface
 from .engines.runtime import Pool
 from .engines.springs import Sheet, Solver, capacity
 from .observation import motion, watched
+from .options import EpisodeOptions
 
 FRAME = 0.01  # between the frames of an episode [s]
 REACH = 0.1  # what a policy measures lengths by [m]
@@ -48,16 +49,23 @@ class SheetScene(Environment):
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
     engines: ClassVar[tuple[str, ...]] = ("warp", "taichi")
     loss_unit: ClassVar[str] = "m"
-    duration: ClassVar[float]  # of an episode [s]
+    Options: ClassVar[type[Any]] = EpisodeOptions
+    duration: ClassVar[float]  # of an episode of horizon 1 [s]
     surface: ClassVar[Surface]
     view: ClassVar[View]
     sheet: Sheet
     _solvers: Pool[Solver]
 
     @property
+    def own_steps(self) -> int:
+        """Number of time steps of an episode of horizon 1."""
+        return round(self.duration / self.fidelity.dt)
+
+    @property
     def steps(self) -> int:
         """Number of time steps of an episode."""
-        return round(self.duration / self.fidelity.dt)
+        steps: int = self.options.lasting(self.own_steps)
+        return steps
 
     def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
@@ -69,9 +77,11 @@ class SheetScene(Environment):
         return Work(len(self.sheet.x) * self.steps, "vertex-step")
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
-        """Return the sheet and its surroundings every hundredth of a second."""
+        """Return the sheet and its surroundings every hundredth of a second, and at the end."""
         drive = self._drive(self._checked(x[None]))
         shown = torch.arange(0, self.steps + 1, max(1, round(FRAME / self.fidelity.dt)))
+        if shown[-1] != self.steps:
+            shown = torch.cat([shown, shown.new_tensor([self.steps])])
         with self._solvers.lend() as solver:
             frames = solver.run(*drive.detached())[:, 0].double().cpu()[shown]
         poses = drive.poses[0, shown].detach()

@@ -18,6 +18,7 @@ from . import lattice
 from .base import Fidelity
 from .engines.contact import Floor
 from .engines.springs import Sheet
+from .options import EpisodeOptions
 from .outlines import triangles
 from .sheets import Drive, SheetScene
 
@@ -29,7 +30,7 @@ BEND = 0.4  # the bending springs' share
 
 
 @dataclass(frozen=True)
-class SwingOptions:
+class SwingOptions(EpisodeOptions):
     """`loss`: the distance of the centre of mass (single), or the mean one of the corners or of all vertices (mesh)."""
 
     loss: Literal["single", "corner", "mesh"] = "single"

@@ -1,8 +1,12 @@
 """The static site: what is in the figures' data, as pages that need no network and no server.
 
 A figure's folder in the data holds `slice.zarr`; whatever else of these is there gets a section of its own:
-`surface.png`, `.html`, `.gltf` or `.glb`, `sweep.mp4` or `.gif`, `episode-ROW-COLUMN.mp4` or `.png` (the node whose
-episode it shows), `overlay.json` (trajectories) and `measures.json` (names and numbers).
+`surface.png`, `.html`, `.gltf` or `.glb`; `sweep.mp4` with `sweep.json` (label, low, high, fidelity, frames,
+resolution, command); `episodes.json`, a list of nodes (row, column, why, loss, status), each with
+`episode-ROW-COLUMN.mp4` and `.webp`, its last frame; `measures.json` (names and numbers). Runs in
+`runs/ENVIRONMENT-OPTIONS/` are laid over every slice of their environment and options.
+
+`manifest.json` lists all of it for programs; `schema` counts up whenever the meaning of a name in it changes.
 """
 
 from __future__ import annotations
@@ -18,14 +22,19 @@ from typing import Any
 import xarray as xr
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from ..envs.registry import entries
 from ..landscapes.files import placing
 from ..landscapes.job import PICTURE, STORE
 from ..landscapes.store import SliceStore, is_slice, open_slice
 from .figures import HERE, Figure
-from .page_data import episodes, nodes, numbers
+from .page_data import nodes, numbers, read_episodes, read_json
+from .runs import FOLDER
+from .trajectories import read_runs, trajectories
 
-MANIFEST, NODES, THUMBNAIL = "manifest.json", "nodes.js", "thumbnail.png"
-EXTRAS = ("surface.png", "surface.html", "surface.gltf", "surface.glb", "sweep.mp4", "sweep.gif")
+SCHEMA = 1
+MANIFEST, NODES, THUMBNAIL, SWEEP = "manifest.json", "nodes.js", "thumbnail.png", "sweep.mp4"
+SURFACES = ("surface.png", "surface.html", "surface.gltf", "surface.glb")
+POINTS = ("u", "v", "loss", "radius", "path", "hidden")  # of a trajectory, for the map alone
 
 
 def build_site(figures: Sequence[Figure], data: Path, out: Path) -> dict[str, Any]:
@@ -35,44 +44,60 @@ def build_site(figures: Sequence[Figure], data: Path, out: Path) -> dict[str, An
         raise ValueError(f"{data} holds no slice of a figure; `landscape gallery compute` samples them")
     if out.exists() and any(out.iterdir()) and not (out / MANIFEST).exists():
         raise ValueError(f"{out} holds other files and no gallery; give --out a new or an empty folder")
+    pages, tables = _templates(), read_runs(data / FOLDER)
+    with placing(out.resolve(), overwrite=True) as new:
+        shutil.copytree(HERE / "static", new / "static")
+        made = [_page(pages, figure, data / figure.id, new / figure.id, tables) for figure in there]
+        missing = [figure.id for figure in figures if figure not in there]
+        manifest = {"schema": SCHEMA, "gradscape": version("gradscape"), "figures": made, "missing": missing}
+        (new / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n")
+        groups = [(env, list(group)) for env, group in groupby(made, key=lambda entry: str(entry["env"]))]
+        index = pages.get_template("index.html").render(groups=groups, manifest=manifest, scenes=entries())
+        (new / "index.html").write_text(index)
+    return manifest
+
+
+def _templates() -> Environment:
     pages = Environment(
         loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    with placing(out.resolve(), overwrite=True) as new:
-        shutil.copytree(HERE / "static", new / "static")
-        entries = [_page(pages, figure, data / figure.id, new / figure.id) for figure in there]
-        missing = [figure.id for figure in figures if figure not in there]
-        manifest = {"gradscape": version("gradscape"), "figures": entries, "missing": missing}
-        (new / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n")
-        groups = [(env, list(group)) for env, group in groupby(entries, key=lambda entry: str(entry["env"]))]
-        (new / "index.html").write_text(pages.get_template("index.html").render(groups=groups, manifest=manifest))
-    return manifest
+    pages.filters["number"] = _number
+    return pages
+
+
+def _number(value: Any, digits: int = 4) -> str:
+    """Write a number with a minus sign, and anything else as it is."""
+    return f"{value:.{digits}g}".replace("-", "\N{MINUS SIGN}") if isinstance(value, int | float) else str(value)
 
 
 def _sampled(store: Path) -> bool:
     return is_slice(store) and bool((SliceStore.open(store).status() > 0).any())
 
 
-def _page(pages: Environment, figure: Figure, source: Path, folder: Path) -> dict[str, Any]:
+def _page(
+    pages: Environment, figure: Figure, source: Path, folder: Path, tables: Sequence[xr.Dataset]
+) -> dict[str, Any]:
     """Write a slice's page and all it shows into `folder`, and return its entry in the manifest."""
     folder.mkdir()
     dataset = open_slice(source / STORE)
     _draw(dataset, source, folder)
-    (folder / NODES).write_text(f"const SLICE = {json.dumps(nodes(dataset, source), separators=(',', ':'))};\n")
-    extras = [name for name in EXTRAS if (source / name).exists()]
-    shown = episodes(source)
-    films = [episode[kind] for episode in shown for kind in ("mp4", "png") if kind in episode]
-    for name in (*extras, *films):
+    shown, runs = read_episodes(source, dataset), trajectories(dataset, tables)
+    (folder / NODES).write_text(f"const SLICE = {json.dumps(nodes(dataset, shown, runs), separators=(',', ':'))};\n")
+    sweep = (read_json(source / "sweep.json") or {}) if (source / SWEEP).exists() else None
+    surfaces = [name for name in SURFACES if (source / name).exists()]
+    films = [episode[kind] for episode in shown for kind in ("mp4", "webp") if kind in episode]
+    copied = [*surfaces, *([] if sweep is None else [SWEEP]), *films]
+    for name in copied:
         shutil.copyfile(source / name, folder / name)
-    entry = _entry(figure, dataset) | {"files": [NODES, PICTURE, THUMBNAIL, "index.html", *extras, *films]}
-    measures = source / "measures.json"
-    about = {
-        "entry": entry,
+    entry = _entry(figure, dataset) | {
+        "files": [NODES, PICTURE, THUMBNAIL, "index.html", *copied],
         "episodes": shown,
-        "measures": json.loads(measures.read_text()) if measures.exists() else {},
-        "origin": _origin(dataset),
+        "sweep": sweep,
+        "runs": [{name: value for name, value in run.items() if name not in POINTS} for run in runs],
+        "measures": read_json(source / "measures.json") or {},
     }
+    about = {"entry": entry, "held": _held(dataset), "scene": entries().get(figure.env)}
     (folder / "index.html").write_text(pages.get_template("slice.html").render(**about))
     return entry
 
@@ -113,9 +138,10 @@ def _draw(dataset: xr.Dataset, source: Path, folder: Path) -> None:
         save(profile_figure(dataset), folder / PICTURE)
 
 
-def _origin(dataset: xr.Dataset) -> list[tuple[str, float]]:
-    """Return the parameters that the slice holds, and what at."""
+def _held(dataset: xr.Dataset) -> list[tuple[str, float, str]]:
+    """Return the parameters that the slice holds, at what value and in what unit."""
     plane = dataset.attrs["identity"]["plane"]
-    varied = [any(row[number] for row in plane["basis"]) for number in range(len(plane["origin"]))]
-    rows = zip(dataset["dim"].values.tolist(), plane["origin"], varied, strict=True)
-    return [(str(name), float(value)) for name, value, varies in rows if not varies]
+    names = [str(name) for name in dataset["dim"].to_numpy()]
+    rows = zip(names, plane["origin"], dataset["dim"].attrs["units"], strict=True)
+    varied = [any(row[number] for row in plane["basis"]) for number in range(len(names))]
+    return [row for row, varies in zip(rows, varied, strict=True) if not varies]

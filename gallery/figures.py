@@ -17,7 +17,8 @@ DATA = HERE / "data"
 class Figure:
     """A slice of an environment: `number` is the paper's, `says` what the paper says of it, in our words.
 
-    One dimension makes a line, two a plane; `through`, `options` and `fidelity` are those of `landscape slice`.
+    One dimension makes a line, two a plane; `through`, `options` and `fidelity` are those of `landscape slice`, and
+    `over` is what its sweep moves, nothing if empty.
     """
 
     id: str
@@ -29,6 +30,7 @@ class Figure:
     resolution: int = 48
     fidelity: str = "standard"
     options: dict[str, Any] = field(default_factory=dict)
+    over: str = "horizon"
 
     def command(self, device: str) -> str:
         """Return the command that makes this slice alone."""
@@ -37,8 +39,22 @@ class Figure:
         else:
             axis = ["slice", self.env, "--dims", *map(str, self.dims)]
         how = ["--resolution", str(self.resolution), "--fidelity", self.fidelity, "--through", self.through]
-        chosen = [word for name, value in self.options.items() for word in ("--set", f"{name}={value}")]
-        return shlex.join(["landscape", *axis, *how, *chosen, "--device", device])
+        return shlex.join(["landscape", *axis, *how, *self._set, "--device", device])
+
+    def sweep_command(self, *, frames: int, resolution: int, fidelity: str, device: str) -> str:
+        """Return the command that makes its sweep."""
+        axes = ["--dims", *map(str, self.dims), "--over", self.over, "--frames", str(frames)]
+        how = ["--resolution", str(resolution), "--fidelity", fidelity, "--through", self.through]
+        return shlex.join(["landscape", "sweep", self.env, *axes, *how, *self._set, "--device", device])
+
+    def search_command(self, method: str, *, budget: int, seed: int, fidelity: str, device: str) -> str:
+        """Return the command that searches its environment."""
+        how = ["--method", method, "--budget", str(budget), "--seed", str(seed), "--fidelity", fidelity]
+        return shlex.join(["landscape", "optimize", self.env, *how, *self._set, "--device", device])
+
+    @property
+    def _set(self) -> list[str]:
+        return [word for name, value in self.options.items() for word in ("--set", f"{name}={value}")]
 
 
 def read_figures(path: Path = HERE / "figures.toml") -> list[Figure]:

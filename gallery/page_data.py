@@ -1,9 +1,9 @@
-"""What a page needs of a slice: its numbers, and its nodes for the map to hover over."""
+"""What a page needs of a slice: its numbers, its nodes for the map to hover over, and its films."""
 
 from __future__ import annotations
 
 import json
-import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,6 @@ import xarray as xr
 from ..landscapes.job import flat_points
 from ..landscapes.objective import Status
 from ..landscapes.store import plane_of
-
-EPISODE = re.compile(r"episode-(\d+)(?:-(\d+))?\.(mp4|png)")
 
 
 def numbers(dataset: xr.Dataset) -> dict[str, Any]:
@@ -33,61 +31,79 @@ def numbers(dataset: xr.Dataset) -> dict[str, Any]:
     }
 
 
-def nodes(dataset: xr.Dataset, folder: Path) -> dict[str, Any]:
+def nodes(dataset: xr.Dataset, episodes: Sequence[dict[str, Any]], runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return a slice as plain lists, row by row from the lowest v: what the map draws and says of a node.
 
-    `slope` is the gradient along the axes, `gradient` its length in all dimensions, `shade` a colour's number in
-    `palette` (-1 where there is no loss). `episodes` and `runs` are what `folder` has of them.
+    `slope` is the gradient along the axes, `gradient` its length in all dimensions.
     """
+    from ..landscapes.draw.style import LOSS_MAP, round_values
+
     plane, loss = plane_of(dataset), dataset["loss"].to_numpy()
-    shade, palette = _shades(loss)
-    labelled = zip(plane.labels, plane.axes(), strict=True)
+    labelled = zip(plane.labels, (axis.tolist() for axis in plane.axes()), strict=True)
     found: dict[str, Any] = {
-        "axes": [{"label": label, "values": axis.tolist()} for label, axis in labelled],
+        "axes": [
+            {"label": label, "values": values, "ticks": round_values(values[0], values[-1])}
+            for label, values in labelled
+        ],
         "unit": str(dataset["loss"].attrs.get("units", "")),
-        "loss": _rounded(loss.ravel()),
+        "loss": rounded(loss.ravel()),
         "status": [Status(code).name for code in dataset["status"].to_numpy().ravel()],
-        "shade": shade,
-        "palette": palette,
-        "episodes": episodes(folder),
-        "runs": _runs(folder),
+        "scale": _scale(loss, [run["best"] for run in runs if run["best"] is not None]),
+        "palette": [bytes(round(255 * part) for part in LOSS_MAP(number)[:3]).hex() for number in range(256)],
+        "episodes": list(episodes),
+        "runs": list(runs),
     }
     if "grad" in dataset:
         grad = dataset["grad"].to_numpy().reshape(loss.size, -1)
-        found["slope"] = [_rounded(column) for column in plane.slope(torch.from_numpy(grad)).numpy().T]
-        found["gradient"] = _rounded(np.linalg.norm(grad, axis=1))
+        found["slope"] = [rounded(column) for column in plane.slope(torch.from_numpy(grad)).numpy().T]
+        found["gradient"] = rounded(np.linalg.norm(grad, axis=1))
     return found
 
 
-def episodes(folder: Path) -> list[dict[str, Any]]:
-    """Return the episodes of a slice: `episode-ROW-COLUMN.mp4` or `.png` at a node, `episode-COLUMN` on a line."""
+def _scale(loss: np.ndarray[Any, Any], below: Sequence[float]) -> dict[str, Any]:
+    """Return the scale of a map's colours, or of a line's height: that is linear and goes down to what lies below."""
+    from ..landscapes.draw.style import Scale
+
+    scale = Scale.of_loss(loss)
+    if loss.ndim == 1 and np.isfinite(loss).any():
+        low, high = float(np.nanmin([*loss, *below])), float(np.nanmax(loss))
+        room = 0.04 * (high - low) or 0.5
+        scale = Scale.linear(low - room, high + room)
+    return {
+        "low": float(scale.norm.vmin or 0.0),
+        "high": float(scale.norm.vmax or 0.0),
+        "logarithmic": scale.logarithmic,
+        "extend": scale.extend,
+        "ticks": scale.ticks(),
+    }
+
+
+def read_episodes(folder: Path, dataset: xr.Dataset) -> list[dict[str, Any]]:
+    """Return the episodes that `episodes.json` lists, one a node, with their files and the parameters varied."""
+    listed = folder / "episodes.json"
+    plane = plane_of(dataset)
+    axes = [axis.tolist() for axis in plane.axes()]
     found: dict[tuple[int, int], dict[str, Any]] = {}
-    for file in sorted(folder.glob("episode-*")):
-        if match := EPISODE.fullmatch(file.name):
-            first, second, kind = int(match[1]), match[2], match[3]
-            row, column = (first, int(second)) if second else (0, first)
-            found.setdefault((row, column), {"row": row, "column": column})[kind] = file.name
-    return [found[at] for at in sorted(found)]
+    for said in json.loads(listed.read_text()) if listed.exists() else []:
+        row, column = place = int(said["row"]), int(said["column"])
+        if place in found:
+            found[place]["why"] += ", " + str(said["why"])
+            continue
+        values = (axis[at] for axis, at in zip(axes, (column, row), strict=False))
+        files = {kind: f"episode-{row}-{column}.{kind}" for kind in ("mp4", "webp")}
+        found[place] = {
+            **{name: said[name] for name in ("row", "column", "why", "loss", "status")},
+            "at": dict(zip(plane.labels, values, strict=True)),
+            **{kind: name for kind, name in files.items() if (folder / name).exists()},
+        }
+    return [episode for episode in found.values() if "mp4" in episode or "webp" in episode]
 
 
-def _runs(folder: Path) -> list[dict[str, Any]]:
-    """Return the trajectories in `overlay.json`, a list of {method, u, v, loss}, each with its method's colour."""
-    from ..landscapes.draw.style import METHODS, OTHER_METHOD
-
-    path = folder / "overlay.json"
-    runs = json.loads(path.read_text()) if path.exists() else []
-    return [run | {"colour": METHODS.get(run["method"], OTHER_METHOD)["color"]} for run in runs]
+def read_json(path: Path) -> Any:
+    """Return what a file says, None where there is none."""
+    return json.loads(path.read_text()) if path.exists() else None
 
 
-def _shades(loss: np.ndarray[Any, Any]) -> tuple[list[int], list[str]]:
-    from ..landscapes.draw.style import LOSS_MAP, Scale
-
-    finite = np.isfinite(loss)
-    share = np.clip(np.ma.getdata(Scale.of_loss(loss).norm(np.where(finite, loss, 1.0))), 0, 1)
-    shade = np.where(finite, np.round(255 * share), -1).astype(int)
-    palette = [bytes(round(255 * part) for part in LOSS_MAP(number)[:3]).hex() for number in range(256)]
-    return shade.ravel().tolist(), palette
-
-
-def _rounded(values: np.ndarray[Any, Any]) -> list[float | None]:
+def rounded(values: np.ndarray[Any, Any]) -> list[float | None]:
+    """Return numbers to six digits, None for what is not finite."""
     return [float(f"{value:.6g}") if np.isfinite(value) else None for value in values.tolist()]

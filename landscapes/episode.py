@@ -26,7 +26,19 @@ Shape = Literal[
     "tank",  # open at the top, standing on its place: three widths
 ]
 Material = Literal[
-    "syrup", "sugar", "plasticine", "cloth", "dough", "rubber", "steel", "iron", "wood", "board", "glass", "target"
+    "syrup",
+    "sugar",
+    "plasticine",
+    "cloth",
+    "dough",
+    "rubber",
+    "steel",
+    "iron",
+    "wood",
+    "board",
+    "glass",
+    "target",
+    "goal",  # a target drawn alone
 ]
 
 

@@ -6,7 +6,7 @@ import json
 import resource
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,13 +22,14 @@ from .objective import Objective, Status
 from .plane import Plane
 from .sampling import Progress, sample
 from .store import SliceStore, is_slice, plane_of
+from .tiling import Tile
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STORE, PICTURE, SUMMARY = "slice.zarr", "landscape.png", "summary.json"
 PAUSE = 10.0  # least seconds between two pictures of an unfinished slice
-PATIENCE = 1.0  # seconds per episode from which a single one must do for an estimate
+PATIENCE, FIRST_PATIENCE = 1.0, 10.0  # seconds that do for an estimate, and those that a first evaluation is given
 
 
 @dataclass(frozen=True)
@@ -77,19 +78,38 @@ class Job:
         return cls(objective, plane, folder, store, draw)
 
     def cost(self) -> Cost:
-        """Estimate what is left from its own first points: a batch, or one episode where that is long already."""
+        """Estimate what is left from its own first points, evaluated as they will be but for at most a few seconds."""
         pending = self.store.pending()
         left = sum(self.store.count(tile) for tile in pending)
         if not left:
             return Cost(0, 0.0, _peak_memory())
-        points = self.store.points(pending[0])
-        trial = points[: min(len(points), getattr(self.objective, "preferred_batch", 1))]
         getattr(self.objective, "prepare", lambda: None)()
-        seconds = left * self._seconds(trial[:1]) / getattr(self.objective, "threads", 1)
-        if seconds < left * PATIENCE:
-            seconds = left * self._seconds(trial) / len(trial)
+        seconds = left * self._seconds_per_point(self._first_batch(pending))
         arrays = 8 * int(np.prod(self.plane.resolution)) * (2 + self.plane.dim * self.store.grad)
         return Cost(left, seconds, _peak_memory() + arrays)
+
+    def _first_batch(self, pending: Sequence[Tile]) -> Float[Tensor, "batch dim"]:
+        batch, parts, size = getattr(self.objective, "preferred_batch", 1), list[Tensor](), 0
+        for tile in pending:
+            if size < batch:
+                parts.append(self.store.points(tile))
+                size += len(parts[-1])
+        return torch.cat(parts)[:batch]
+
+    def _seconds_per_point(self, points: Float[Tensor, "batch dim"]) -> float:
+        """Time as many points as there are threads, again (a first time is longer), then more until they take long.
+
+        A GPU takes a whole batch at once: of one point most would be launches.
+        """
+        whole = getattr(self.objective, "device", "cpu") == "cuda"
+        rows = len(points) if whole else min(len(points), getattr(self.objective, "threads", 1))
+        seconds = self._seconds(points[:rows])
+        if seconds < FIRST_PATIENCE:
+            seconds = self._seconds(points[:rows])
+        while seconds < PATIENCE and rows < len(points):
+            rows = min(4 * rows, len(points))
+            seconds = self._seconds(points[:rows])
+        return seconds / rows
 
     def _seconds(self, points: Float[Tensor, "batch dim"]) -> float:
         start = time.perf_counter()

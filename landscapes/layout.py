@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
 import zarr
-from zarr.codecs import ZstdCodec
+from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
 
 FILL = {"float64": float("nan"), "int8": 0, "int64": 0, "string": ""}
+CODECS = [ZstdCodec(level=3, checksum=True)]
+SMALL = [BloscCodec(cname="zstd", clevel=9, shuffle="shuffle"), Crc32cCodec()]
 
 
 def create_array(
@@ -20,6 +23,7 @@ def create_array(
     chunks: tuple[int, ...],
     dims: tuple[str, ...],
     dtype: str,
+    codecs: Sequence[Any] = CODECS,
     **attributes: Any,
 ) -> zarr.Array[Any]:
     """Make an empty array of named dimensions whose torn or altered chunks do not decode."""
@@ -30,7 +34,7 @@ def create_array(
         dtype=dtype,
         fill_value=FILL[dtype],
         dimension_names=dims,
-        compressors=[ZstdCodec(level=3, checksum=True)],
+        compressors=list(codecs),
         config={"write_empty_chunks": True},  # a chunk of NaN is a result too
         attributes=attributes,
     )

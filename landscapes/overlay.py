@@ -32,8 +32,34 @@ def overlay(dataset: xr.Dataset, tables: Sequence[xr.Dataset]) -> list[xr.Datase
     plane = plane_of(dataset)
     if plane.rank != 2:
         raise ValueError(f"runs are laid over planes; got a slice of rank {plane.rank}, so vary two parameters")
-    names = _labels(tables)
-    return [_laid(dataset, plane, table, label) for table, label in zip(tables, names, strict=True)]
+    return [lay(dataset, table, label) for table, label in zip(tables, _labels(tables), strict=True)]
+
+
+def lay(dataset: xr.Dataset, table: xr.Dataset, label: str) -> xr.Dataset:
+    """Lay one run over a line, where no point has a `v`, or a plane, as `overlay` does."""
+    plane = plane_of(dataset)
+    parameters = [str(name) for name in dataset["dim"].to_numpy()]
+    if parameters != [str(name) for name in table["dim"].to_numpy()]:
+        raise ValueError(
+            f"{label} searched {table.sizes['dim']} parameters ({_shown(table)}), "
+            f"the slice has {len(parameters)} ({_shown(dataset)}); lay runs over slices of the same environment"
+        )
+    half, x = _box(table)[1], _points(table)
+    scaled = replace(plane, origin=plane.origin / half, basis=plane.basis / half)
+    place = scaled.project(x / half)
+    low, high = plane.window()
+    outside = ((place < low) | (place > high)).any(dim=1).numpy()
+    axes = dict(zip(("u", "v"), place.numpy().T, strict=False))
+    columns = {
+        **axes,
+        "distance": scaled.distance(x / half).numpy(),
+        "outside": outside,
+        "beneath": np.where(outside, np.nan, _nearest(dataset, axes)),
+        "previous": _previous(table),
+        "best": np.fmin.accumulate(table["loss"].to_numpy()),
+    }
+    added = {name: ("evaluation", values) for name, values in columns.items()}
+    return table.assign(added).assign_attrs(label=label)
 
 
 def best_point(tables: Sequence[xr.Dataset]) -> tuple[Float[Tensor, " dim"], float]:
@@ -61,37 +87,11 @@ def principal_plane(
     return replace(flat, origin=center + half * flat.origin, basis=half * flat.basis)
 
 
-def _laid(dataset: xr.Dataset, plane: Plane, table: xr.Dataset, label: str) -> xr.Dataset:
-    parameters = [str(name) for name in dataset["dim"].to_numpy()]
-    if parameters != [str(name) for name in table["dim"].to_numpy()]:
-        raise ValueError(
-            f"{label} searched {table.sizes['dim']} parameters ({_shown(table)}), "
-            f"the slice has {len(parameters)} ({_shown(dataset)}); lay runs over slices of the same environment"
-        )
-    half, x = _box(table)[1], _points(table)
-    scaled = replace(plane, origin=plane.origin / half, basis=plane.basis / half)
-    place = scaled.project(x / half)
-    low, high = plane.window()
-    outside = ((place < low) | (place > high)).any(dim=1).numpy()
-    u, v = place.numpy().T
-    columns = {
-        "u": u,
-        "v": v,
-        "distance": scaled.distance(x / half).numpy(),
-        "outside": outside,
-        "beneath": np.where(outside, np.nan, _nearest(dataset, u, v)),
-        "previous": _previous(table),
-        "best": np.fmin.accumulate(table["loss"].to_numpy()),
-    }
-    added = {name: ("evaluation", values) for name, values in columns.items()}
-    return table.assign(added).assign_attrs(label=label)
-
-
-def _nearest(dataset: xr.Dataset, u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+def _nearest(dataset: xr.Dataset, axes: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
     """Return the loss of the samples whose cells hold these places: what a picture shows there."""
-    middles = {name: (axis[1:] + axis[:-1]) / 2 for name, axis in ((n, dataset[n].to_numpy()) for n in ("u", "v"))}
-    rows, columns = np.searchsorted(middles["v"], v), np.searchsorted(middles["u"], u)
-    found: NDArray[np.float64] = dataset["loss"].transpose("v", "u").to_numpy()[rows, columns]
+    samples = {name: dataset[name].to_numpy() for name in reversed(axes)}
+    cells = tuple(np.searchsorted((at[1:] + at[:-1]) / 2, axes[name]) for name, at in samples.items())
+    found: NDArray[np.float64] = dataset["loss"].transpose(*samples).to_numpy()[cells]
     return found
 
 

@@ -27,7 +27,7 @@ from zarr.storage import MemoryStore
 
 from .files import placing
 from .identity import StoreError, StoreExistsError, check_identity, full_identity, plain_json
-from .layout import consolidate, create_array, flags
+from .layout import CODECS, SMALL, consolidate, create_array, flags
 from .objective import Evaluation, Status
 from .plane import Plane
 from .space import ParameterSpace
@@ -242,7 +242,24 @@ class SliceStore:
             {name: (name, values, self._attributes[name]) for name, values in coordinates.items()},
             {"identity": self.identity, "provenance": self.provenance},
         )
-        return dataset.assign_coords(dim=self._parameters).sortby(list(self.dims))
+        parameters = ("dim", self._parameters, self._attributes["dim"])
+        return dataset.assign_coords(dim=parameters).sortby(list(self.dims))
+
+
+def pack(path: Path) -> None:
+    """Rewrite a finished slice as a few small files, one chunk an array; it reads as before."""
+    if SliceStore.open(path).pending():
+        raise StoreError(f"{path} is not finished, so it is not packed; run the command that samples it again")
+    present = zarr.open_group(path, mode="r", use_consolidated=False)
+    with placing(path.resolve(), overwrite=True) as new:
+        group = zarr.create_group(new, zarr_format=3, attributes=dict(present.attrs))
+        for name, array in present.arrays():
+            dims = tuple(str(dim) for dim in getattr(array.metadata, "dimension_names", None) or ())
+            numbers = array.dtype.kind in "fi"
+            kind, codecs = (array.dtype.name, SMALL) if numbers else ("string", CODECS)
+            attributes: dict[str, Any] = dict(array.attrs)
+            create_array(group, name, array.shape, array.shape, dims, kind, codecs=codecs, **attributes)[...] = array[:]
+        consolidate(new)
 
 
 def open_slice(path: str | Path) -> xr.Dataset:

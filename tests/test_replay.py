@@ -29,7 +29,7 @@ def test_the_best_episode_of_a_run_is_replayed(run: Callable[[str], tuple[int, s
     assert run("optimize bounce --method random --budget 8 --out r --device cpu")[0] == 0
     code, said = run("replay bounce --params best:r --no-film --out e --device cpu")
     assert code == 0, said
-    assert sorted(file.name for file in Path("e").iterdir()) == ["episode.json", "episode.png"]
+    assert sorted(file.name for file in Path("e").iterdir()) == ["episode.json", "episode.png", "episode.rrd"]
     best = json.loads(Path("r/summary.json").read_text())
     record = json.loads(Path("e/episode.json").read_text())
     assert record["status"] == "OK"

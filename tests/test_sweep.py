@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import xarray as xr
 
 import gradscape
@@ -115,6 +116,28 @@ def test_smoothing_averages_one_slice(run: Command) -> None:
     assert names(Path("soft")) == ["slice.zarr", *FILES[1:]]
 
 
+def test_over_the_horizon_each_frame_is_a_shorter_episode(run: Command) -> None:
+    sweep = (
+        "sweep bounce --dims 0 1 --over horizon --frames 2 --resolution 4 --through example:aim --device cpu --out late"
+    )
+    done = run(f"{sweep} --json")
+    assert done.returncode == 0, done.stderr
+    assert [frame["value"] for frame in json.loads(done.stdout)["frames"]] == [50.0, 100.0]
+    half, whole = (gradscape.open_slice(f"late/frames/{number:03d}.zarr") for number in range(2))
+    assert [one.attrs["identity"]["options"]["horizon"] for one in (half, whole)] == [0.5, 1.0]
+    env = gradscape.make("bounce", device="cpu", horizon=0.5)
+    points = plane_of(half).lift(torch.tensor([[float(half["u"][1]), float(half["v"][2])]]).double())
+    assert float(half["loss"].sel(u=half["u"][1], v=half["v"][2])) == float(env.evaluate(points).loss[0])
+    assert not np.allclose(half["loss"], whole["loss"])
+    assert "all 32 episodes" in run(sweep).stderr
+    for wrong, said in (("--set horizon=2", "moves that option itself"), ("", "branin has no horizon")):
+        refused = run(
+            f"{sweep.replace('bounce', 'branin').replace('example:aim', 'center') if not wrong else sweep} {wrong}"
+        )
+        assert refused.returncode == 2
+        assert said in " ".join(refused.stderr.split())
+
+
 def test_without_out_each_sweep_has_a_folder_of_its_own(run: Command) -> None:
     short = "sweep ackley --dims 0 1 --frames 2 --resolution 2 --set dim=4 --no-gradients --over"
     for over in ("2", "x3", "smoothing"):
@@ -129,7 +152,7 @@ def test_without_out_each_sweep_has_a_folder_of_its_own(run: Command) -> None:
 @pytest.mark.parametrize(
     ("over", "said"),
     [
-        ("--dims 0 1 --over 1", "moves a third parameter, or smoothing; got --over 1, which the slice varies"),
+        ("--dims 0 1 --over 1", "moves a third parameter, horizon or smoothing; got --over 1, which the slice varies"),
         ("--dims 0 1 --over x0", "got --over x0, which the slice varies"),
         ("--dims 0 1 --over 9", "numbered 0 to 2; got 9"),
         ("--dims 0 1 --over speed", "no parameter is called 'speed'"),

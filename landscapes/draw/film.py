@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from PIL import Image
 
 from ..files import replacing
 
@@ -32,14 +33,19 @@ def picture(figure: Figure, *, dpi: int) -> Picture:
     return np.ascontiguousarray(pixels[: height // 2 * 2, : width // 2 * 2, :3])
 
 
-def save_film(pictures: Iterable[Picture], mp4: Path, gif: Path, *, count: int, rate: int) -> None:
-    """Write `count` pictures of one size as an MP4 and as a GIF with one palette, `rate` of them a second."""
+def save_film(
+    pictures: Iterable[Picture], mp4: Path, gif: Path | None, *, count: int, rate: int, loss: int = 18
+) -> None:
+    """Write `count` pictures of one size as an MP4, and as a GIF with one palette, `rate` of them a second.
+
+    `loss` is x264's constant rate factor: 18 looks as the pictures do, 28 takes about a third of the bytes.
+    """
     pictures = iter(pictures)
     first = next(pictures)
     with ExitStack() as stack:
-        partial = [stack.enter_context(replacing(path)) for path in (mp4, gif)]
+        paths = [stack.enter_context(replacing(path)) for path in (mp4, gif) if path]
         log = stack.enter_context(tempfile.TemporaryFile())
-        command = _command(first.shape[1], first.shape[0], count, rate, partial)
+        command = _command(first.shape[1], first.shape[0], count, rate, paths, loss)
         encoder = stack.enter_context(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=log, stderr=log))
         try:
             _feed(encoder, chain([first], pictures))
@@ -49,7 +55,7 @@ def save_film(pictures: Iterable[Picture], mp4: Path, gif: Path, *, count: int, 
         if encoder.wait():
             log.seek(0)
             said = log.read().decode(errors="replace").strip()[-500:]
-            raise OSError(f"ffmpeg could not write {mp4} and {gif}: {said}")
+            raise OSError(f"ffmpeg could not write {mp4}{f' and {gif}' if gif else ''}: {said}")
 
 
 def _feed(encoder: subprocess.Popen[bytes], pictures: Iterable[Picture]) -> None:
@@ -62,20 +68,28 @@ def _feed(encoder: subprocess.Popen[bytes], pictures: Iterable[Picture]) -> None
         return
 
 
-def _command(width: int, height: int, count: int, rate: int, paths: list[Path]) -> list[str]:
+def save_still(picture: Picture, path: Path) -> None:
+    """Write a picture as a small WebP."""
+    with replacing(path) as partial:
+        Image.fromarray(picture).save(partial, "WEBP", quality=80, method=6)
+
+
+def _command(width: int, height: int, count: int, rate: int, paths: list[Path], loss: int) -> list[str]:
     from imageio_ffmpeg import get_ffmpeg_exe
 
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(rate), "-i", "-"]
+    film = ["-c:v", "libx264", "-preset", "slow", "-crf", str(loss), "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+    call = [get_ffmpeg_exe(), "-hide_banner", "-loglevel", "error", "-y", *source]
+    if len(paths) == 1:
+        return [*call, *film, "-f", "mp4", str(paths[0])]
     fits = (GIF_PIXELS / count * width / height) ** 0.5
     across = int(min(GIF_WIDTH, width, fits)) // 2 * 2
     graph = (
         f"[0:v]split[film][small];[small]scale={across}:-2:flags=lanczos,split[a][b];"
         "[a]palettegen=stats_mode=full[palette];[b][palette]paletteuse=dither=none[gif]"
     )  # one palette, undithered: a colour means the same in every frame
-    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(rate), "-i", "-"]
-    film = ["-map", "[film]", "-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
     return [
-        *(get_ffmpeg_exe(), "-hide_banner", "-loglevel", "error", "-y"),
-        *(*source, "-filter_complex", graph),
-        *(*film, "-f", "mp4", str(paths[0])),
+        *(*call, "-filter_complex", graph),
+        *("-map", "[film]", *film, "-f", "mp4", str(paths[0])),
         *("-map", "[gif]", "-loop", "0", "-f", "gif", str(paths[1])),
     ]

@@ -30,6 +30,7 @@ LOOKS: dict[str, dict[str, Any]] = {
     "wood": _MATT | {"color": "#b98a5e"},
     "board": _MATT | {"color": "#f3efe6"},
     "glass": _GLOSS | {"color": "#aebfca"},
+    "goal": _MATT | {"color": "#58ab65"},
     "target": _CLEAR | {"color": "#3fa34d", "opacity": 0.32},
 }
 BACK = {"cloth": "#b9cfe2", "dough": "#a86b2d"}  # the other side of sheets

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pyvista as pv
 from matplotlib.image import imsave
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
 
 from ..episode import Episode, Part, View
 from ..files import replacing
@@ -22,6 +24,7 @@ Picture = NDArray[np.uint8]
 
 HEIGHT = 600  # of a frame [pixel]
 LIKELY = (0.5, 1.6)  # narrowest and widest frame, its width per height
+APART = 2.0  # from where on a target's surface is away from a body's particles, in their distances
 KEYS = 5  # frames of a contact sheet
 GAP = 12  # between them [pixel]
 LONGEST, RATE = 100, 25  # most frames of a film, and how many of them a second
@@ -30,9 +33,12 @@ SAMPLES = 40_000  # of the surfaces that throw it
 
 
 def save_sheet(episode: Episode, path: str | Path, *, keys: int = KEYS) -> None:
-    """Write evenly spaced frames, first and last among them, side by side as PNG."""
+    """Write evenly spaced frames, first and last among them, side by side as PNG; then a target of particles."""
     chosen = np.unique(np.linspace(0, len(episode.time) - 1, keys).round().astype(int))
     pictures = list(frames(episode, chosen.tolist()))
+    goals = tuple(replace(part, material="goal") for part in episode.parts if _sought(part))
+    if goals:
+        pictures += frames(replace(episode, parts=goals), [0], said="target")
     gap = np.full((len(pictures[0]), GAP, 3), 255, dtype=np.uint8)
     row = [piece for picture in pictures for piece in (gap, picture)][1:]
     with replacing(Path(path)) as partial:
@@ -47,19 +53,26 @@ def save_replay(episode: Episode, mp4: str | Path, gif: str | Path, *, longest: 
     return count
 
 
-def frames(episode: Episode, chosen: Sequence[int], *, height: int = HEIGHT) -> Iterator[Picture]:
-    """Yield pictures of the chosen frames, shape (height, width, 3)."""
+def frames(
+    episode: Episode, chosen: Sequence[int], *, height: int = HEIGHT, said: str | None = None
+) -> Iterator[Picture]:
+    """Yield pictures of the chosen frames, shape (height, width, 3); each says its time, unless something else."""
     if not episode.parts:
         raise ValueError("the episode says not what its parts look like; give Episode its `parts`")
-    view = episode.view or _around(episode)
+    view = episode.view or around(episode)
     with _stage(view, height) as plotter:
-        _place(plotter, [part for part in episode.parts if _still(part)], 0, "still")
-        moving = [part for part in episode.parts if not _still(part)]
+        sought = [part for part in episode.parts if _sought(part)]
+        still = [part for part in episode.parts if rests(part) and part not in sought]
+        moving = [part for part in episode.parts if part not in still and part not in sought]
+        bodies = [part for part in episode.parts if part.shape == "lump" and part not in sought]
+        goals = [mesh(part, 0) for part in sought]
+        _place(plotter, still, [mesh(part, 0) for part in still], "still")
         for frame in chosen:
-            _place(plotter, moving, frame, "moving")
+            _place(plotter, moving, [mesh(part, frame) for part in moving], "moving")
+            _place(plotter, sought, [missing(goal, bodies, frame) for goal in goals], "sought")
             if view.ground is not None:
                 _lay_ground(plotter, view, [mesh(part, frame) for part in episode.parts if materials.solid(part)])
-            plotter.add_text(f"{float(episode.time[frame]):.3g} s", name="time", **materials.STAMP)
+            plotter.add_text(said or f"{float(episode.time[frame]):.3g} s", name="time", **materials.STAMP)
             yield np.asarray(plotter.screenshot(return_img=True))
 
 
@@ -95,9 +108,22 @@ def axes(view: View) -> tuple[Grid, Grid, Grid]:
     return right, np.cross(eye, right), eye
 
 
-def _place(plotter: pv.Plotter, parts: Sequence[Part], frame: int, label: str) -> None:
-    for number, part in enumerate(parts):
-        look, surface = materials.look(part), mesh(part, frame)
+def _sought(part: Part) -> bool:
+    """Whether a part is a target that bodies are to become: of it, what they miss is drawn."""
+    return part.shape == "lump" and part.material == "target"
+
+
+def missing(goal: pv.PolyData, bodies: Sequence[Part], frame: int) -> pv.PolyData:
+    """Return what of a target's surface bodies do not reach: what is away from their particles."""
+    pitch = max(part.size[0] for part in bodies)
+    every = np.concatenate([part.at[frame].numpy() for part in bodies])
+    away, _ = cKDTree(every).query(goal.points, distance_upper_bound=2 * APART * pitch)
+    return goal.extract_points(away > APART * pitch, adjacent_cells=False).extract_surface(algorithm=None)
+
+
+def _place(plotter: pv.Plotter, parts: Sequence[Part], surfaces: Sequence[pv.PolyData], label: str) -> None:
+    for number, (part, surface) in enumerate(zip(parts, surfaces, strict=True)):
+        look = materials.look(part)
         if "side" in surface.point_data:
             look["scalars"], look["cmap"] = "side", [materials.BACK[part.material], look.pop("color")]
             look["show_scalar_bar"] = False
@@ -105,16 +131,21 @@ def _place(plotter: pv.Plotter, parts: Sequence[Part], frame: int, label: str) -
             look["backface_params"] = {**look, "color": materials.BACK[part.material]}
         smooth = part.shape != "box" and part.material != "sugar"
         name = f"{label} {number}"
+        if not surface.n_cells:
+            plotter.remove_actor(name, reset_camera=False, render=False)
+            continue
         plotter.add_mesh(surface, name=name, smooth_shading=smooth, reset_camera=False, render=False, **look)
 
 
-def _still(part: Part) -> bool:
+def rests(part: Part) -> bool:
+    """Whether a part is the same in all frames."""
     return part.shape != "trail" and all(
         bool((rows == rows[:1]).all()) for rows in (part.at, part.turn) if rows is not None
     )
 
 
-def _around(episode: Episode) -> View:
+def around(episode: Episode) -> View:
+    """Return a view of all that the parts of an episode that has none take up."""
     every = np.concatenate([part.at.reshape(-1, 3).numpy() for part in episode.parts])
     low, high = every.min(axis=0), every.max(axis=0)
     room = 0.1 * float((high - low).max() or 1.0)

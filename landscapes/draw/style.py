@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.colorbar import Colorbar
 from matplotlib.colors import Colormap, ListedColormap, LogNorm, Normalize
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
@@ -78,6 +79,40 @@ BEST: dict[str, Any] = {"marker": "*", "s": 190.0, "linewidths": 1.1, "zorder": 
 BROKEN: dict[str, Any] = {"marker": "x", "s": 18.0, "linewidths": 0.9, "color": INK, "zorder": 3.5}  # a failed episode
 BORDER: dict[str, Any] = {"s": 20.0, "facecolors": "none", "linewidths": 0.8, "zorder": 3.2, "clip_on": False}
 
+_MAP: dict[str, Any] = {"origin": "lower", "aspect": "auto", "interpolation": "nearest", "rasterized": True}
+COSINE: dict[str, Any] = _MAP | {"cmap": colormaps["RdBu"], "vmin": -1.0, "vmax": 1.0}  # of a gradient and a slope
+APART: dict[str, Any] = _MAP | {"cmap": colormaps["cividis"], "vmin": 0.0, "vmax": 1.0}  # of two estimates
+UNSEEN: dict[str, Any] = {"facecolor": "#dcdcdc", "linewidth": 0.0}  # no slope above the noise
+SURE: dict[str, Any] = {
+    "marker": "D", "markersize": 5.0, "markerfacecolor": "white", "markeredgecolor": INK, "linestyle": "none"
+}  # fmt: skip
+
+LADDERS: dict[str, dict[str, Any]] = {  # what was turned to make a rung of a trade-off
+    "dt": {"color": "#0072b2", "marker": "o"},
+    "resolution": {"color": "#009e73", "marker": "s"},
+    "particles": {"color": "#e69f00", "marker": "^"},
+    "precision": {"color": "#cc79a7", "marker": "D"},
+    "stiffness": {"color": "#d55e00", "marker": "v"},
+    "engine": {"color": "#5b2a86", "marker": "P"},
+    "device": {"color": "#7f7f7f", "marker": "X"},
+    "named": {"color": INK, "marker": "*", "markersize": 13.0},
+}
+RUNG: dict[str, Any] = {
+    "linestyle": "none", "markersize": 6.5, "markeredgewidth": 0.7, "markeredgecolor": "white", "zorder": 3
+}  # fmt: skip
+WHISKER: dict[str, Any] = {"color": FAINT, "linewidth": 1.0, "zorder": 1.5, "solid_capstyle": "butt"}
+FRONT: dict[str, Any] = {"color": QUIET, "linewidth": 1.2, "zorder": 2}
+AGAINST: dict[str, Any] = {"color": INK, "linewidth": 0.9, "linestyle": (0, (4, 2)), "zorder": 1}
+NAME: dict[str, Any] = {
+    "fontsize": LABEL, "color": INK, "zorder": 4, "path_effects": [withStroke(linewidth=2.5, foreground="white")]
+}  # fmt: skip
+BESIDE: tuple[tuple[str, tuple[float, float], dict[str, Any]], ...] = (  # where a name may stand [pt]
+    ("above", (0.0, 9.0), {"ha": "center", "va": "bottom"}),
+    ("below", (0.0, -9.0), {"ha": "center", "va": "top"}),
+    ("right", (9.0, 0.0), {"ha": "left", "va": "center"}),
+    ("left", (-9.0, 0.0), {"ha": "right", "va": "center"}),
+)
+
 
 @dataclass(frozen=True, eq=False)
 class Scale:
@@ -95,6 +130,11 @@ class Scale:
         return cls(Normalize(low, high), extend)
 
     @classmethod
+    def linear(cls, low: float, high: float) -> Scale:
+        """Span a range."""
+        return cls(Normalize(low, high), "neither")
+
+    @classmethod
     def of_magnitude(cls, values: NDArray[np.float64]) -> Scale:
         """Span the finite logarithms of magnitudes."""
         low, high, extend = _span(values)
@@ -104,6 +144,23 @@ class Scale:
     def logarithmic(self) -> bool:
         """Whether equal ratios, not differences, are equally far apart."""
         return isinstance(self.norm, LogNorm)
+
+    def ticks(self) -> list[float]:
+        """Return round values along the scale."""
+        low, high = float(self.norm.vmin or 0.0), float(self.norm.vmax or 0.0)
+        if self.logarithmic:
+            values = LogLocator(subs=(1, 2, 5) if high < 2e3 * low else (1,), numticks=9).tick_values(low, high)
+            return [float(value) for value in values if low <= value <= high]
+        return round_values(low, high)
+
+
+def round_values(low: float, high: float) -> list[float]:
+    """Return about five round values in a range."""
+    return [
+        float(value)
+        for value in MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
+        if low <= value <= high
+    ]
 
 
 def _span(values: NDArray[np.float64]) -> tuple[float, float, str]:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
-    from .envs.base import Environment
+    from .envs.base import Environment, Fidelity
     from .landscapes import sampling
     from .landscapes.job import Job
     from .landscapes.plane import Plane
@@ -59,7 +59,7 @@ def list_environments() -> None:
 
 def describe_environment(name: str) -> None:
     """Print all there is to know about one environment."""
-    from .envs.options import describe
+    from .envs.options import describe, explain
 
     env, console = make(name, device="cpu"), Console(soft_wrap=True, highlight=False)
     said = f"{name}: {env.space.dim} parameters\n\n{env.about()}\n"
@@ -72,7 +72,7 @@ def describe_environment(name: str) -> None:
     for fidelity in env.fidelities.values():
         console.print(f"fidelity {asdict(fidelity)}", markup=False)
     console.print(f"engines: {', '.join(env.engines)}", markup=False)
-    console.print(f"options: {describe(env.Options) or 'none'}", markup=False)
+    console.print(f"options: {describe(env.Options) or 'none'}\n{explain(env.Options)}", markup=False)
     console.print(f"examples: {', '.join(env.examples) or 'none'}", markup=False)
 
 
@@ -96,6 +96,7 @@ def cut(
     *,
     resolution: int,
     fidelity: str | None,
+    tolerance: str | None = None,
     device: str,
     engine: str,
     deterministic: bool,
@@ -109,8 +110,10 @@ def cut(
 ) -> None:
     """Sample a slice into its folder and say what it costs, how far it is and what came out."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
-    how: dict[str, Any] = {"fidelity": fidelity, "device": device, "engine": engine, "deterministic": deterministic}
-    env = make(name, **how, **read_settings(settings))
+    how: dict[str, Any] = {"device": device, "engine": engine}
+    options = read_settings(settings)
+    accuracy = chosen_fidelity(console, name, tolerance, fidelity=fidelity, **how, options=options)
+    env = make(name, fidelity=accuracy, deterministic=deterministic, **how, **options)
     from .envs.points import point  # after make: a name that does not exist is refused before torch is loaded
     from .landscapes.plane import Plane
 
@@ -153,6 +156,17 @@ def fill(
         sys.exit(130)
     console.print(outcome(summary) + f"\n{job.folder}: {', '.join(summary['files'])}", markup=False)
     return job.folder, summary
+
+
+def chosen_fidelity(
+    console: Console, name: str, tolerance: str | None, *, fidelity: str | None, **how: Any
+) -> str | Fidelity | None:
+    """Return the fidelity that was named, or the one that a tolerance chooses."""
+    if tolerance is None:
+        return fidelity
+    from .tolerance import chosen
+
+    return chosen(console, name, tolerance, fidelity=fidelity, **how)
 
 
 def identity_of(env: Environment) -> dict[str, Any]:

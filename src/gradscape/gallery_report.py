@@ -1,4 +1,4 @@
-"""What `landscape gallery` does and prints: sampling the figures, what is there, building and serving the site."""
+"""What `landscape gallery` does and prints: making the figures, what is there, building and serving the site."""
 
 from __future__ import annotations
 
@@ -9,56 +9,43 @@ import shlex
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from .console import duration, follow, identity_of, outcome, picture_of, provenance_of, size
-from .envs.registry import make
+from .console import duration, size
 from .gallery.figures import DATA, Figure, chosen, read_figures
-
-if TYPE_CHECKING:
-    from .landscapes.job import Job
-    from .landscapes.plane import Plane
+from .gallery_episodes import Episodes
+from .gallery_parts import Part, Searches, Slice, State, Sweep
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class State:
-    """How much of a figure is sampled: `done` of `points`, or None where the data is another slice's."""
-
-    points: int
-    done: int | None
-
-    @property
-    def finished(self) -> bool:
-        """Whether nothing is left to compute."""
-        return self.done == self.points
+PARTS: dict[str, type[Part]] = {"slices": Slice, "sweeps": Sweep, "episodes": Episodes, "searches": Searches}
 
 
 def compute(
-    *, only: Sequence[str], fidelity: str | None, device: str, resolution: int | None, data: str | None
+    *,
+    only: Sequence[str],
+    parts: Sequence[str],
+    fidelity: str | None,
+    device: str,
+    resolution: int | None,
+    data: str | None,
 ) -> None:
-    """Sample what is missing of the figures, say first what it should cost, and leave with 1 where one failed."""
+    """Make what is missing of the figures, say first what it should cost, and leave with 1 where something failed."""
+    if unknown := set(parts) - set(PARTS):
+        raise ValueError(f"--part takes {', '.join(PARTS)}; got {', '.join(sorted(unknown))}")
     console, root = Console(stderr=True, soft_wrap=True, highlight=False), Path(data) if data else DATA
     figures = [_changed(figure, fidelity, resolution) for figure in chosen(read_figures(), only)]
-    wanted = [figure for figure in figures if not _state(figure, root).finished]
-    console.print(f"{len(figures) - len(wanted)} of {len(figures)} figures are in {root} already", markup=False)
-    failed = _estimate(console, wanted, root, device)
-    for figure in wanted:
-        if figure.id not in failed:
-            console.print(f"{figure.id}: {figure.command(device)}", markup=False)
-            if (summary := _try(console, figure, partial(_sample, console, figure, root, device))) is None:
-                failed.add(figure.id)
-            else:
-                console.print(outcome(summary), markup=False)
+    failed: set[str] = set()
+    for name, kind in PARTS.items():  # slices first: the others are made of them
+        if name in parts or not parts:
+            _make(console, name, [kind(figure, root, device) for figure in figures if figure.id not in failed], failed)
     if failed:
         console.print(
             f"{len(failed)} of {len(figures)} figures failed: {', '.join(sorted(failed))}\n"
@@ -68,10 +55,55 @@ def compute(
         sys.exit(1)
 
 
+def _make(console: Console, name: str, parts: Sequence[Part], failed: set[str]) -> None:
+    """Make what is missing of one kind of part, adding to `failed` the figures where that was not possible."""
+    wanted = [part for part in parts if not _try(console, part, part.there, failed)]
+    wanted = [part for part in wanted if part.figure.id not in failed]
+    console.print(f"{name}: {len(parts) - len(wanted)} of {len(parts)} are there already", markup=False)
+    _estimate(console, name, wanted, failed)
+    for part in wanted:
+        if part.figure.id not in failed and not part.there():  # figures may share what one of them made
+            console.print(f"{part.figure.id}: {part.label()}", markup=False)
+            if said := _try(console, part, partial(part.make, console), failed):
+                console.print(said, markup=False)
+
+
+def _estimate(console: Console, name: str, parts: Sequence[Part], failed: set[str]) -> None:
+    """Say what all of it should take, from the first figure of each scene."""
+    rates: dict[str, float] = {}
+    total = 0.0
+    for part in parts:
+        kind = json.dumps([part.figure.env, part.figure.options])
+        if kind not in rates:
+            rate = _try(console, part, part.seconds_each, failed)
+            if rate is None:
+                continue
+            rates[kind] = rate
+        total += rates[kind] * part.left()
+    if parts:
+        console.print(f"{name}: {len(parts)} to make, about {duration(total)} in all", markup=False)
+
+
+def _try(console: Console, part: Part, work: Callable[[], T], failed: set[str]) -> T | None:
+    """Return what a part's work returns, or say why it failed."""
+    try:
+        return work()
+    except KeyboardInterrupt:
+        console.print(f"stopped in {part.figure.id}; the same command goes on from there", markup=False)
+        sys.exit(130)
+    except Exception as error:  # one figure that fails, by whatever cause, leaves the others to be computed
+        said = " ".join(str(error).split())
+        console.print(f"{part.figure.id} failed: {type(error).__name__}: {said}", markup=False)
+        failed.add(part.figure.id)
+        return None
+    finally:
+        gc.collect()  # an environment may hold gigabytes of the GPU
+
+
 def list_figures(*, data: str | None, as_json: bool) -> None:
     """Print every figure with how much of it is there."""
     root = Path(data) if data else DATA
-    found = [(figure, _state(figure, root)) for figure in read_figures()]
+    found = [(figure, Slice(figure, root, "cpu").state()) for figure in read_figures()]
     if as_json:
         print(json.dumps([{"id": figure.id, "points": of.points, "done": of.done} for figure, of in found]))
         return
@@ -99,93 +131,6 @@ def _said(state: State) -> str:
     if state.done is None:
         return "other settings"
     return f"{state.done} of {state.points} points" if state.done else "missing"
-
-
-def _state(figure: Figure, root: Path) -> State:
-    """Look at a figure's data without making its environment; who sampled it, and on what device, does not matter."""
-    from .landscapes.job import STORE
-    from .landscapes.store import SliceStore, is_slice
-
-    points = figure.resolution ** len(figure.dims)
-    if not is_slice(root / figure.id / STORE):
-        return State(points, 0)
-    store = SliceStore.open(root / figure.id / STORE)
-    return State(points, int((store.status() > 0).sum()) if _same(figure, store.identity) else None)
-
-
-def _same(figure: Figure, identity: dict[str, Any]) -> bool:
-    """Whether a slice has the figure's environment, fidelity, options, resolution and dimensions."""
-    plane = identity["plane"]
-    dims = tuple(row.index(1.0) for row in plane["basis"] if row.count(1.0) == 1)
-    same = identity["objective"] == figure.env and identity["fidelity"] == figure.fidelity and dims == figure.dims
-    options = {name: identity["options"].get(name) for name in figure.options}
-    return bool(same and options == figure.options and plane["resolution"] == [figure.resolution] * len(dims))
-
-
-def _open(figure: Figure, root: Path, device: str) -> Job:
-    from .landscapes.job import Job
-
-    env = make(figure.env, fidelity=figure.fidelity, device=device, **figure.options)
-    return Job.open(
-        env, _plane(figure, env), root / figure.id, picture_of(env, _plane(figure, env)),
-        identity=identity_of(env), provenance=provenance_of(env, figure.command(device)),
-        force=_state(figure, root).done == 0,  # nothing is lost of a store made by other code or for another device
-    )  # fmt: skip
-
-
-def _plane(figure: Figure, env: Any) -> Plane:
-    from .envs.points import point
-    from .landscapes.plane import Plane
-
-    return Plane.through(env.space, point(env, figure.through), figure.dims, resolution=figure.resolution)
-
-
-def _estimate(console: Console, figures: Sequence[Figure], root: Path, device: str) -> set[str]:
-    """Say what all of it should take, from the first points of one figure of each kind; return those that failed."""
-    rates: dict[str, float] = {}
-    failed: set[str] = set()
-    total = 0.0
-    for figure in figures:
-        kind = json.dumps([figure.env, figure.options])
-        state = _state(figure, root)
-        if kind not in rates:
-            rate = _try(console, figure, partial(_rate, figure, root, device))
-            if rate is None:
-                failed.add(figure.id)
-                continue
-            rates[kind] = rate
-        total += rates[kind] * (state.points - (state.done or 0))
-    if figures:
-        console.print(f"{len(figures) - len(failed)} figures to compute: about {duration(total)} in all", markup=False)
-    return failed
-
-
-def _rate(figure: Figure, root: Path, device: str) -> float:
-    """Return the measured seconds per episode."""
-    cost = _open(figure, root, device).cost()
-    gc.collect()  # an environment may hold gigabytes of the GPU
-    return cost.seconds / max(cost.episodes, 1)
-
-
-def _sample(console: Console, figure: Figure, root: Path, device: str) -> dict[str, Any]:
-    job = _open(figure, root, device)
-    try:
-        return follow(console, job, figure.command(device))
-    except KeyboardInterrupt:
-        console.print(f"stopped in {figure.id}; the same command goes on from there", markup=False)
-        sys.exit(130)
-    finally:
-        del job
-        gc.collect()
-
-
-def _try(console: Console, figure: Figure, work: Callable[[], T]) -> T | None:
-    """Return what a figure's work returns, or say why it failed."""
-    try:
-        return work()
-    except Exception as error:  # one figure that fails, by whatever cause, leaves the others to be computed
-        console.print(f"{figure.id} failed: {type(error).__name__}: {' '.join(str(error).split())}", markup=False)
-        return None
 
 
 def build(*, data: str | None, out: str) -> None:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 PICTURE, STREAM = "overlay.png", "overlay.rrd"
 SHOWN = (  # of a folder, the first that is there
     *("overlay.rrd", "race.png", "landscape.png", "progress.png", "sweep.mp4"),
-    *("surface.png", "episode.mp4", "episode.png"),
+    *("surface.png", "episode.mp4", "episode.png", "sweep.rrd", "episode.rrd"),
 )
 PICTURES = (".png", ".html", ".mp4", ".gif")
 MUST, SHOULD = ("objective", "options"), ("fidelity", "settings", "engine", "code")  # agree between slice and runs
@@ -75,7 +75,7 @@ def overlay(
 def view(file: str, *, serve: bool) -> None:
     """Open a file that one of the verbs left, or the picture of a folder."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
-    path = _shown(Path(file))
+    path = _shown(Path(file), serve=serve)
     if path.suffix != ".rrd" and serve:
         raise ValueError(f"--serve shows recordings (.rrd) in a browser; {path} is none")
     if path.suffix == ".rrd":
@@ -122,8 +122,10 @@ def _folder(out: str | None, dataset: xr.Dataset, tables: Sequence[xr.Dataset], 
 
 
 def _environment(dataset: xr.Dataset, device: str) -> Environment:
+    from .envs.base import Fidelity
+
     identity = dataset.attrs["identity"]
-    settings = {"fidelity": identity["fidelity"], "engine": identity["engine"], **identity["options"]}
+    settings = {"fidelity": Fidelity(**identity["settings"]), "engine": identity["engine"], **identity["options"]}
     return make(identity["objective"], device=device, **settings)
 
 
@@ -175,15 +177,15 @@ def _outcome(placed: Sequence[xr.Dataset]) -> str:
     return f"{said}; the farthest is {away:.2g} half-widths of the box off the plane"
 
 
-def _shown(path: Path) -> Path:
-    """Return what to open for a path."""
+def _shown(path: Path, *, serve: bool) -> Path:
+    """Return what to open for a path; of a folder that is to be served, first a recording."""
     folder = path.parent if path.name in (SLICE, RUN) else path
     if folder.is_dir():
-        for name in SHOWN:
+        for name in sorted(SHOWN, key=lambda name: serve and not name.endswith(".rrd")):
             if (folder / name).exists():
                 return folder / name
         raise ValueError(
-            f"{path} holds none of {', '.join(SHOWN)}; `landscape slice`, sweep, optimize, race and overlay do"
+            f"{path} holds none of {', '.join(SHOWN)}; `landscape slice`, sweep, optimize, race, overlay and replay do"
         )
     if not path.exists():
         raise ValueError(f"there is no file {path}")

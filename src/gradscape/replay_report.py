@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .envs.base import Environment
 
 SHEET, FILM, LOOP, RECORD = "episode.png", "episode.mp4", "episode.gif", "episode.json"
+STREAM = "episode.rrd"
 
 
 def replay(
@@ -44,11 +45,14 @@ def replay(
         episode = env.episode(x)
         result = env.evaluate(x[None], grad=False)
     loss, status = float(result.loss[0]), int(result.status[0])
+    from .landscapes.draw.episode_stream import save_episode
     from .landscapes.draw.replay import save_replay, save_sheet
 
     with console.status(f"{env.name}: drawing"):
         save_sheet(episode, folder / SHEET)
-        files = [SHEET]
+        said = f"{env.name}, {env.fidelity.name}: loss {loss:.4g} {env.loss_unit}".strip()
+        save_episode(episode, folder / STREAM, title=said)
+        files = [SHEET, STREAM]
         if film:
             save_replay(episode, folder / FILM, folder / LOOP)
             files += [FILM, LOOP]
@@ -80,7 +84,7 @@ def _folder(out: str | None, env: Environment, x: Tensor) -> Path:
         settings = json.dumps([identity_of(env), x.tolist()], sort_keys=True)
         return Path("out") / f"replay-{env.name}-{hashlib.sha256(settings.encode()).hexdigest()[:6]}"
     folder = Path(out)
-    known = {SHEET, FILM, LOOP, RECORD}
+    known = {SHEET, STREAM, FILM, LOOP, RECORD}
     if folder.exists() and any(file.name not in known for file in folder.iterdir()):
         raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
     return folder

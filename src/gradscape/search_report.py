@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from .console import duration, identity_of, provenance_of, read_settings
+from .console import chosen_fidelity, duration, identity_of, provenance_of, read_settings
 from .envs.registry import make
 from .optim.registry import METHODS, code_digest, optimizer_class
 
@@ -88,6 +88,7 @@ def optimize(
     budget: int,
     seed: int,
     fidelity: str | None,
+    tolerance: str | None,
     device: str,
     engine: str,
     deterministic: bool,
@@ -100,10 +101,13 @@ def optimize(
     """Run a method into its folder and say what it costs, how far it is and what came out."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     options = read_settings(method_settings, "--option")
-    how: dict[str, Any] = {"fidelity": fidelity, "device": device, "engine": engine, "deterministic": deterministic}
-    env = make(name, **how, **read_settings(settings))
+    how: dict[str, Any] = {"device": device, "engine": engine}
+    scene = read_settings(settings)
+    accuracy = chosen_fidelity(console, name, tolerance, fidelity=fidelity, **how, options=scene)
+    env = make(name, fidelity=accuracy, deterministic=deterministic, **how, **scene)
     give_torch_one_thread()
-    job = Job.open(env, made(method, env, seed=seed, options=options), budget=budget, out=out, force=force)
+    optimizer, command = made(method, env, seed=seed, options=options), shlex.join(["landscape", *sys.argv[1:]])
+    job = Job.open(env, optimizer, budget=budget, command=command, out=out, force=force)
     try:
         summary = job.run(console)
     except KeyboardInterrupt:
@@ -126,11 +130,20 @@ class Job:
     command: str
 
     @classmethod
-    def open(cls, env: Environment, optimizer: Optimizer, *, budget: int, out: str | None, force: bool) -> Job:
+    def open(
+        cls,
+        env: Environment,
+        optimizer: Optimizer,
+        *,
+        budget: int,
+        command: str,
+        out: str | None = None,
+        force: bool = False,
+    ) -> Job:
         """Go on with the run in its folder, or begin it there; `force` begins anew where another run is."""
         from .optim.run import Run, is_run
 
-        identity, command = run_identity(env, optimizer), shlex.join(["landscape", *sys.argv[1:]])
+        identity = run_identity(env, optimizer)
         folder = Path(out) if out else run_folder(identity)
         path = folder / STORE
         if folder.exists() and not path.exists() and any(folder.iterdir()):

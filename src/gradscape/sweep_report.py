@@ -9,8 +9,8 @@ import shutil
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,21 +20,19 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from .console import duration, identity_of, provenance_of, read_extent, read_settings, size
 from .envs.registry import make
+from .swept import FRAMES, HORIZON, ONLY, SMOOTHING, Moved, moved
 
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
-    from torch import Tensor
 
     from .envs.base import Environment
     from .landscapes.draw.sweep import Sweep
-    from .landscapes.plane import Plane
     from .landscapes.sampling import Progress as Sampled
     from .landscapes.store import SliceStore
 
-FRAMES, SUMMARY = "frames", "summary.json"
+SUMMARY = "summary.json"
 FILM, GIF, STREAM = "sweep.mp4", "sweep.gif", "sweep.rrd"
-SMOOTHING, WIDEST = "smoothing", 0.25  # the widest Gaussian's standard deviation, as a fraction of the box's sides
 
 
 def sweep(
@@ -59,17 +57,18 @@ def sweep(
     """Sample a slice for each value of what moves, film them, and say what it costs and what came out."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     how: dict[str, Any] = {"fidelity": fidelity, "device": device, "engine": engine, "deterministic": deterministic}
-    env = make(name, **how, **read_settings(settings))
+    made = partial(make, name, **how, **read_settings(settings))
+    env = made()
     from .envs.points import point
     from .landscapes.plane import Plane
 
     plane = Plane.through(env.space, point(env, through), dims, resolution=resolution, extent=read_extent(extent))
     if plane.rank != 2 or frames < 2:
         raise ValueError(f"a sweep has two dims and two frames or more; got {', '.join(dims)} and {frames} frames")
-    moved = _Smoothing(env, plane, frames) if over == SMOOTHING else _Parameter.over(env, plane, over, frames)
+    swept = moved(over, env, plane, frames, made)
     grad = grad and over != SMOOTHING  # of smoothed losses there are no gradients to show
-    folder = Path(out) if out else Path("out") / _folder(env, moved, over, grad)
-    job = Job.open(env, moved, folder, grad=grad, force=force)
+    folder = Path(out) if out else sweep_folder(env, swept, over, grad=grad)
+    job = Job.open(env, swept, folder, command=shlex.join(["landscape", *sys.argv[1:]]), grad=grad, force=force)
     try:
         job.announce(console)
         summary = job.run(console)
@@ -82,83 +81,31 @@ def sweep(
 
 
 @dataclass(frozen=True)
-class _Parameter:
-    """Move the plane along one of the parameters it holds still: a slice of its own for each value."""
-
-    env: Environment
-    planes: tuple[Plane, ...]
-    values: tuple[float, ...]
-    label: str
-
-    @classmethod
-    def over(cls, env: Environment, plane: Plane, parameter: str, frames: int) -> _Parameter:
-        import torch
-
-        number = env.space.index(parameter)
-        if bool(plane.basis[:, number].any()):
-            raise ValueError(
-                f"a sweep moves a third parameter, or {SMOOTHING}; got --over {parameter}, which the slice varies"
-            )
-        low, high = float(env.space.lower[number]), float(env.space.upper[number])
-        values = torch.linspace(low, high, frames, dtype=torch.float64)
-        planes = tuple(replace(plane, origin=_with(plane.origin, number, value)) for value in values.tolist())
-        return cls(env, planes, tuple(values.tolist()), env.space.labels[number])
-
-    @property
-    def stores(self) -> tuple[str, ...]:
-        return tuple(f"{FRAMES}/{number:03d}.zarr" for number in range(len(self.planes)))
-
-    def slices(self, sampled: Sequence[xr.Dataset]) -> list[xr.Dataset]:
-        return list(sampled)
-
-
-@dataclass(frozen=True)
-class _Smoothing:
-    """Average one slice over wider and wider Gaussians."""
-
-    env: Environment
-    plane: Plane
-    frames: int
-    label = "smoothing width [% of the box's sides]"
-    stores = ("slice.zarr",)
-
-    @property
-    def planes(self) -> tuple[Plane, ...]:
-        return (self.plane,)
-
-    @property
-    def values(self) -> tuple[float, ...]:
-        return tuple((100 * np.linspace(0, WIDEST, self.frames)).tolist())
-
-    def slices(self, sampled: Sequence[xr.Dataset]) -> list[xr.Dataset]:
-        from .landscapes.smoothing import smoothed
-
-        return [smoothed(sampled[0], width / 100) for width in self.values]
-
-
-@dataclass(frozen=True)
 class Job:
     """A sweep to sample into `folder`, slice by slice, and to film."""
 
     env: Environment
-    moved: _Parameter | _Smoothing
+    moved: Moved
     folder: Path
     stores: tuple[SliceStore, ...]
     command: str
 
     @classmethod
-    def open(cls, env: Environment, moved: _Parameter | _Smoothing, folder: Path, *, grad: bool, force: bool) -> Job:
+    def open(
+        cls, env: Environment, moved: Moved, folder: Path, *, command: str, grad: bool = True, force: bool = False
+    ) -> Job:
         """Go on with the sweep in `folder`, or begin it there; `force` begins anew where another one is."""
         from .landscapes.store import SliceStore
 
-        command = shlex.join(["landscape", *sys.argv[1:]])
         _check(folder)
         if force:
             _clear(folder)
-        settings: dict[str, Any] = {"identity": identity_of(env), "provenance": provenance_of(env, command)}
+        provenance = provenance_of(env, command)
         stores = tuple(
-            SliceStore.open_or_create(folder / name, plane, env.space, grad=grad, **settings)
-            for name, plane in zip(moved.stores, moved.planes, strict=True)
+            SliceStore.open_or_create(
+                folder / name, plane, env.space, grad=grad, identity=identity_of(moved.env_at(i)), provenance=provenance
+            )
+            for i, (name, plane) in enumerate(zip(moved.stores, moved.planes, strict=True))
         )
         return cls(env, moved, folder, stores, command)
 
@@ -179,7 +126,7 @@ class Job:
             console.print(f"all {self.total} {kind} of {len(self.stores)} slices are there already")
             return
         with console.status(f"{env.name}: preparing (kernels are compiled once, then kept)"):
-            seconds, memory = self._cost(left)
+            seconds, memory = self.cost()
         kept = f", {self.total - left} are there already" if left < self.total else ""
         slices = f"{len(self.stores)} slices" if len(self.stores) > 1 else "one slice"
         console.print(
@@ -189,14 +136,21 @@ class Job:
     def run(self, console: Console) -> dict[str, Any]:
         """Sample what is missing, film it, write and return the summary."""
         start, resumed = time.monotonic(), self.done()
-        sampled = self._sample(console)
-        from .landscapes.draw import sweep as draw
+        drawn = self.sampled(console)
+        from .landscapes.draw.sweep import save_films
+        from .landscapes.draw.sweep_stream import save_stream
 
         with console.status("drawing"):
-            drawn = draw.Sweep(self.moved.label, self.moved.values, self.moved.slices(sampled))
-            draw.save_films(drawn, self.folder / FILM, self.folder / GIF)
-            draw.save_stream(drawn, self.folder / STREAM)
+            save_films(drawn, self.folder / FILM, self.folder / GIF)
+            save_stream(drawn, self.folder / STREAM)
         return self._summarise(drawn, resumed, time.monotonic() - start)
+
+    def sampled(self, console: Console) -> Sweep:
+        """Sample what is missing, and return what there is to draw."""
+        slices = self._sample(console)
+        from .landscapes.draw.sweep import Sweep
+
+        return Sweep(self.moved.label, self.moved.values, self.moved.slices(slices))
 
     def farewell(self, console: Console) -> None:
         """Say what is kept of a sweep that was stopped, and how to go on."""
@@ -210,14 +164,18 @@ class Job:
     def _grad(self) -> bool:
         return self.stores[0].grad
 
-    def _cost(self, left: int) -> tuple[float, int]:
-        """Return seconds and bytes that so many points should take, by those of the first slice not finished."""
+    def cost(self) -> tuple[float, int]:
+        """Return seconds and bytes that what is left should take, by points of the last slice not finished."""
         from .landscapes import job
 
-        number = next(number for number, store in enumerate(self.stores) if store.pending())
-        plane, store = self.moved.planes[number], self.stores[number]
-        cost = job.Job(self.env, plane, self.folder, store, _never_drawn).cost()
-        return cost.seconds * left / cost.episodes, cost.memory
+        pending = {number: int((store.status() == 0).sum()) for number, store in enumerate(self.stores)}
+        work = {number: self.moved.env_at(number).work().count * count for number, count in pending.items() if count}
+        if not work:
+            return 0.0, 0
+        last = max(work)
+        plane, store = self.moved.planes[last], self.stores[last]
+        cost = job.Job(self.moved.env_at(last), plane, self.folder, store, _never_drawn).cost()
+        return cost.seconds * sum(work.values()) / work[last], cost.memory
 
     def _sample(self, console: Console) -> list[xr.Dataset]:
         from .landscapes.objective import Status
@@ -233,8 +191,8 @@ class Job:
                 said = f"slice {len(sampled) + 1} of {len(self.stores)}" + (f", {here} failed" if here else "")
                 bar.update(task, completed=finished + now.done, description=said)
 
-            for plane, store in zip(self.moved.planes, self.stores, strict=True):
-                dataset = sample(self.env, plane, store, grad=store.grad, progress=follow)
+            for number, (plane, store) in enumerate(zip(self.moved.planes, self.stores, strict=True)):
+                dataset = sample(self.moved.env_at(number), plane, store, grad=store.grad, progress=follow)
                 finished += dataset["status"].size
                 failed += int((dataset["status"] != Status.OK).sum())
                 sampled.append(dataset)
@@ -266,28 +224,22 @@ class Job:
         return summary
 
 
-def _with(origin: Tensor, number: int, value: float) -> Tensor:
-    origin = origin.clone()
-    origin[number] = value
-    return origin
-
-
-def _folder(env: Environment, moved: _Parameter | _Smoothing, over: str, grad: bool) -> str:
-    """Return a name of its own for every different sweep, the same for the same one."""
+def sweep_folder(env: Environment, moved: Moved, over: str, *, grad: bool = True) -> Path:
+    """Return a folder of its own for every different sweep, the same for the same one."""
     planes = [plane.record() for plane in moved.planes]
     settings = json.dumps([identity_of(env), planes, moved.values, grad], sort_keys=True)
     axes = [str(int(row.nonzero()[0])) for row in moved.planes[0].basis]
-    what = over if over == SMOOTHING else str(env.space.index(over))
+    what = over if over in (SMOOTHING, HORIZON) else str(env.space.index(over))
     points = "x".join(map(str, (*planes[0]["resolution"], len(moved.values))))
     parts = ["sweep", env.name, *axes, "over", what, env.fidelity.name, points]
-    return "-".join([*parts, hashlib.sha256(settings.encode()).hexdigest()[:6]])
+    return Path("out") / "-".join([*parts, hashlib.sha256(settings.encode()).hexdigest()[:6]])
 
 
 def _check(folder: Path) -> None:
     """Refuse a folder that holds anything but a sweep."""
-    ours = {FRAMES, *_Smoothing.stores, FILM, GIF, STREAM, SUMMARY}
+    ours = {FRAMES, ONLY, FILM, GIF, STREAM, SUMMARY}
     present = {file.name for file in folder.iterdir() if not file.name.startswith(".")} if folder.exists() else set()
-    if present - ours or (present and not present & {FRAMES, *_Smoothing.stores}):
+    if present - ours or (present and not present & {FRAMES, ONLY}):
         raise ValueError(f"{folder} holds other files and no sweep; give --out a new or an empty folder")
 
 
@@ -295,7 +247,7 @@ def _clear(folder: Path) -> None:
     """Remove the slices of a sweep, and what was made of them."""
     from .landscapes.store import is_slice
 
-    for store in [*folder.glob(f"{FRAMES}/*.zarr"), *map(folder.joinpath, _Smoothing.stores)]:
+    for store in [*folder.glob(f"{FRAMES}/*.zarr"), folder / ONLY]:
         if is_slice(store):
             shutil.rmtree(store)
     for name in (FILM, GIF, STREAM, SUMMARY):

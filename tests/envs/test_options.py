@@ -5,7 +5,7 @@ from typing import Literal
 
 import pytest
 
-from gradscape.envs.options import NoOptions, describe, read_options
+from gradscape.envs.options import EpisodeOptions, NoOptions, describe, explain, read_options
 
 
 @dataclass(frozen=True)
@@ -62,3 +62,17 @@ def test_a_description_names_every_option_with_its_default():
     line = describe(Options)
     for part in ("goal=high|low (default high)", "mu=a number (default 0.5)", "count=a whole number (default 3)"):
         assert part in line
+
+
+def test_an_episodes_horizon_stands_last_and_is_explained():
+    @dataclass(frozen=True)
+    class Scene(EpisodeOptions):
+        """`mu`: friction."""
+
+        mu: float = 0.5
+
+    assert Scene(0.1).mu == 0.1
+    assert describe(Scene) == "mu=a number (default 0.5), horizon=a number above 0, at most 8 (default 1.0)"
+    assert explain(Scene).startswith("`mu`: friction.\n\n`horizon`: how long an episode lasts")
+    assert read_options("scene", Scene, {"horizon": "0.5"}).lasting(5) == 2
+    assert Scene(horizon=1e-3).lasting(5) == 1

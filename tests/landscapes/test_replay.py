@@ -15,7 +15,8 @@ from gradscape.envs.base import Environment
 from gradscape.envs.fluid import TANK_HEIGHT, TANK_WIDTH
 from gradscape.envs.outlines import about, skin, triangles
 from gradscape.envs.registry import BUILTIN, make
-from gradscape.landscapes.draw.replay import axes, frames, save_replay, save_sheet
+from gradscape.landscapes.draw import materials
+from gradscape.landscapes.draw.replay import axes, frames, missing, save_replay, save_sheet
 from gradscape.landscapes.draw.solids import lump, mesh
 from gradscape.landscapes.episode import Episode, Part, View
 
@@ -66,6 +67,61 @@ def test_the_scooped_cube_rises_and_the_syrup_stays_in_the_tank() -> None:
     assert len(rows) > 2000
     assert np.abs(columns - first.shape[1] / 2).max() < 1.1 * scale * reach
     assert view.upper[1] > TANK_HEIGHT
+
+
+def pixel(view: View, point: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the column and row of a point through a pinhole that sees the view's box whole, with 6 % to spare."""
+    right, up, eye = axes(view)
+    corners, center = _corners(view), (np.array(view.lower) + view.upper) / 2
+    tangent = np.tan(np.radians(materials.ANGLE) / 2)
+    half = max(np.ptp(corners @ up), np.ptp(corners @ right) * shape[0] / shape[1]) / 2
+    distance = 1.06 * half / tangent + np.ptp(corners @ eye) / 2 - (point - center) @ eye
+    scale = shape[0] / 2 / (distance * tangent)
+    return np.array([shape[1] / 2 + scale * (point - center) @ right, shape[0] / 2 - scale * (point - center) @ up])
+
+
+@pytest.mark.parametrize("name", ["bounce", "pinball-2", "cartpole"])
+def test_a_ball_is_seen_where_the_episode_has_it(name: str) -> None:
+    _, episode = scene(name)
+    (ball,) = [part for part in episode.parts if (part.shape, part.material) == ("sphere", "rubber")]
+    chosen = np.linspace(0, len(episode.time) - 1, 4).round().astype(int).tolist()
+    view = episode.view
+    assert view is not None
+    for frame, picture in zip(chosen, frames(replace(episode, parts=(ball,)), chosen, height=300), strict=True):
+        red, green, _ = picture.astype(float).transpose(2, 0, 1)
+        rows, columns = np.nonzero(red > 1.8 * green)
+        middle = np.array([(columns.min() + columns.max()) / 2, (rows.min() + rows.max()) / 2])
+        wanted = pixel(view, ball.at[frame, 0].numpy(), picture.shape)
+        assert np.abs(middle - wanted).max() < 2.0, (frame, middle, wanted)
+
+
+def cube(low: float, high: float) -> torch.Tensor:
+    axis = torch.linspace(low, high, 12, dtype=torch.float64)
+    return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).view(1, -1, 3)
+
+
+def test_a_target_of_particles_is_drawn_where_the_body_is_not_yet_and_alone_at_the_end(tmp_path: Path) -> None:
+    shift = torch.tensor([1.1, 0.0, 0.0], dtype=torch.float64)
+    body, goal = torch.cat([cube(-0.9, -0.1), cube(-0.9, -0.1) + shift]), cube(-0.9, -0.1) + shift
+    parts = (
+        Part("lump", "plasticine", body, (0.8 / 11,)),
+        Part("lump", "target", goal.expand(2, -1, -1), (0.8 / 11,)),
+    )
+    episode = replace(still(parts[0]), time=torch.arange(2) / 10, parts=parts)
+    away, there = frames(episode, [0, 1], height=200)
+    assert green(away)[:, 110:].mean() > 0.1
+    assert not green(there).any()
+    left = [missing(mesh(parts[1], 0), parts[:1], frame).n_cells for frame in (0, 1)]
+    assert left == [mesh(parts[1], 0).n_cells, 0]
+    save_sheet(episode, tmp_path / "a.png", keys=2)
+    sheet = (255 * imread(tmp_path / "a.png")[..., :3]).astype(np.uint8)
+    assert green(sheet[:, -600:]).mean() > 0.1
+    assert sheet.shape[1] == 3 * 600 + 2 * 12
+
+
+def green(picture: np.ndarray) -> np.ndarray:
+    red, green, blue = picture.astype(float).transpose(2, 0, 1)
+    return (green > 1.06 * red) & (green > 1.04 * blue)
 
 
 def _corners(view: View) -> np.ndarray:

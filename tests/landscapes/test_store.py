@@ -13,7 +13,7 @@ from gradscape.landscapes.identity import StoreError, StoreMismatchError
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.landscapes.store import SliceStore, open_slice, plane_of
+from gradscape.landscapes.store import SliceStore, open_slice, pack, plane_of
 
 SPACE = ParameterSpace(
     ("x", "y", "z"), -torch.ones(3).double(), torch.tensor([1.0, 2.0, 3.0]).double(), ("m", "m/s", "")
@@ -254,3 +254,36 @@ def test_a_store_of_another_format_is_refused(tmp_path):
     (path / "zarr.json").write_text(json.dumps(about))
     with pytest.raises(StoreError, match="format 1"):
         make(path)
+
+
+def test_a_packed_slice_is_the_same_in_few_files_and_still_finished(tmp_path):
+    path = tmp_path / "slice.zarr"
+    fill(make(path))
+    before, files = open_slice(path), len(chunks(path))
+    pack(path)
+    assert open_slice(path).identical(before)
+    assert len(chunks(path)) == 3 < files
+    assert make(path).pending() == []
+    xr.testing.assert_equal(xr.open_zarr(path)["loss"].sortby(["u", "v"]), before["loss"])
+    assert [file.name for file in tmp_path.iterdir()] == ["slice.zarr"]
+
+
+def test_a_slice_that_is_not_finished_is_not_packed(tmp_path):
+    store = make(tmp_path / "slice.zarr")
+    fill(store, store.tiles()[:2])
+    with pytest.raises(StoreError, match="not finished, so it is not packed"):
+        pack(tmp_path / "slice.zarr")
+    assert len(make(tmp_path / "slice.zarr").pending()) == len(store.tiles()) - 2
+
+
+def test_a_damaged_packed_slice_is_as_if_never_sampled(tmp_path):
+    path = tmp_path / "slice.zarr"
+    fill(make(path))
+    pack(path)
+    torn = path / "loss" / "c" / "0" / "0"
+    content = bytearray(torn.read_bytes())
+    content[len(content) // 2] ^= 1
+    torn.write_bytes(bytes(content))
+    assert (SliceStore.open(path).status() == Status.MISSING).all()
+    fill(make(path))
+    assert SliceStore.open(path).pending() == []

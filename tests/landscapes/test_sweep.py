@@ -14,7 +14,8 @@ from matplotlib.quiver import Quiver
 from rerun.chunk import RrdReader
 
 from gradscape.landscapes.draw.film import picture, save_film
-from gradscape.landscapes.draw.sweep import Scales, Sweep, frame_figure, save_films, save_stream
+from gradscape.landscapes.draw.sweep import Scales, Sweep, frame_figure, save_films
+from gradscape.landscapes.draw.sweep_stream import save_stream
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling import sample

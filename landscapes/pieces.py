@@ -1,0 +1,62 @@
+"""A study kept piece by piece: arrays by name in a folder, each written whole, so that a study can be stopped."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .files import replacing
+from .identity import check_identity, plain_json
+
+SETTINGS, PIECES = "settings.json", "pieces"
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Hold the arrays of a study in `folder`, together with what decides its numbers."""
+
+    folder: Path
+
+    @classmethod
+    def open(cls, folder: Path, identity: Mapping[str, Any], *, what: str, force: bool = False) -> Pieces:
+        """Go on with a study of the same settings, or begin one; `force` begins anew where another one is.
+
+        Raises ValueError where the folder holds something else, StoreMismatchError where it holds another study.
+        """
+        wanted, path = plain_json({"kind": what, **identity}, f"a {what}'s identity"), folder / SETTINGS
+        if folder.exists() and not path.exists() and any(folder.iterdir()):
+            raise ValueError(f"{folder} holds other files and no {what}; give --out a new or an empty folder")
+        if force:
+            shutil.rmtree(folder / PIECES, ignore_errors=True)
+        elif path.exists():
+            check_identity(folder, wanted=wanted, found=json.loads(path.read_text()), what="study")
+        with replacing(path) as partial:
+            partial.write_text(json.dumps(wanted, indent=1) + "\n")
+        return cls(folder)
+
+    def load(self, name: str) -> dict[str, NDArray[Any]] | None:
+        """Return the arrays of a piece, None where it is not there."""
+        path = self._path(name)
+        if not path.exists():
+            return None
+        with np.load(path, allow_pickle=False) as arrays:
+            return dict(arrays)
+
+    def save(self, name: str, **arrays: Any) -> None:
+        """Write a piece, whole or not at all."""
+        with replacing(self._path(name)) as partial, partial.open("wb") as file:
+            np.savez(file, **arrays)
+
+    def count(self) -> int:
+        """Return how many pieces are there."""
+        return len(list((self.folder / PIECES).glob("[!.]*.npz")))
+
+    def _path(self, name: str) -> Path:
+        return self.folder / PIECES / f"{name}.npz"

@@ -1,0 +1,365 @@
+"""What `landscape report` does and prints: what landscapes are like, in numbers and in words, beside the paper's."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shlex
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from .console import duration, fill, identity_of, size
+from .envs.registry import code_digest, entries, make
+from .gallery.figures import DATA, read_figures
+from .results import SLICE, inside
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from torch import Tensor
+
+    from .envs.base import Environment
+    from .gallery.words import Said
+    from .landscapes.character import Character
+    from .landscapes.objective import Evaluation, Objective
+
+REPORT, TABLE, PICTURE, MEASURES = "report.json", "report.md", "gradient-quality.png", "measures.json"
+PRECISION = {"float32": 2.0**-23, "float64": 2.0**-52}
+RESOLUTION = 24  # points per axis of a slice that is sampled for its report
+TRIAL = 32  # most episodes that are timed beforehand
+HEADINGS = ("slice", "minima", "flat", "jumps", "cosine", "measured", "the paper's words", "measured too")
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A slice to report on: what it is called, and where its store is."""
+
+    name: str
+    store: Path
+
+
+def report(
+    what: str | None,
+    *,
+    everything: bool,
+    fidelity: str | None,
+    device: str,
+    points: int,
+    seed: int,
+    data: str | None,
+    out: str | None,
+    as_json: bool,
+) -> None:
+    """Measure slices, say what it costs, print the numbers and leave them in files."""
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    if (what is None) != everything:
+        raise ValueError("report takes a slice's folder, an environment, or --all for every figure of the gallery")
+    root = Path(data) if data else DATA
+    subjects = _all(root) if what is None else _subjects(console, what, root, fidelity, device)
+    settings = {"points": points, "seed": seed}
+    folder = Path(out) if out else Path("out") / _folder_name(what or "all", subjects, settings)
+    single = len(subjects) == 1 and what is not None
+    _check(folder, single)
+    places = [folder if single else folder / subject.name for subject in subjects]
+    records = _measured(console, subjects, places, settings, device)
+    if single:
+        _show(records[0], as_json, folder)
+        return
+    summary = {"reports": records, "environments": _by_environment(records)}
+    _write(folder / REPORT, json.dumps(summary, indent=2) + "\n")
+    _write(folder / TABLE, _markdown(records))
+    console.print(f"{folder}: {REPORT}, {TABLE}, and a folder of each slice", markup=False)
+    if as_json:
+        print(json.dumps({**summary, "folder": str(folder)}))
+    else:
+        Console().print(_table(records))
+
+
+def _all(root: Path) -> list[Subject]:
+    found = [Subject(figure.id, root / figure.id / SLICE) for figure in read_figures()]
+    there = [subject for subject in found if _finished(subject.store)]
+    if not there:
+        raise ValueError(f"{root} holds no figures yet; `landscape gallery compute` samples them")
+    return there
+
+
+def _subjects(console: Console, what: str, root: Path, fidelity: str | None, device: str) -> list[Subject]:
+    """Return a slice, or an environment's figures, or a slice sampled now for want of any."""
+    path = Path(what)
+    if path.exists():
+        return [Subject(path.parent.name if path.name == SLICE else path.name, inside(path, SLICE))]
+    if what not in entries():
+        make(what)  # refuses it, with the names that come close
+    figures = [figure for figure in read_figures() if figure.env == what and fidelity in (None, figure.fidelity)]
+    there = [Subject(figure.id, root / figure.id / SLICE) for figure in figures]
+    if found := [subject for subject in there if _finished(subject.store)]:
+        return found
+    env = make(what, fidelity=fidelity, device=device)
+    from .landscapes.plane import Plane
+
+    plane = Plane.through(env.space, env.space.center, list(range(min(2, env.space.dim))), resolution=RESOLUTION)
+    sampled, _ = fill(console, env, plane)
+    return [Subject(sampled.name, sampled / SLICE)]
+
+
+def _finished(store: Path) -> bool:
+    from .landscapes.store import SliceStore, is_slice
+
+    return is_slice(store) and not SliceStore.open(store).pending()
+
+
+def _measured(
+    console: Console, subjects: Sequence[Subject], places: Sequence[Path], settings: dict[str, Any], device: str
+) -> list[dict[str, Any]]:
+    """Return a record of each slice, in the order given: those on disk as they are, the others measured now."""
+    from .gallery.words import paper_words
+
+    records: list[dict[str, Any]] = []
+    for number, (subject, folder) in enumerate(zip(subjects, places, strict=True)):
+        if len(subjects) > 1:
+            console.print(f"slice {number + 1} of {len(subjects)}: {subject.name}", markup=False)
+        try:
+            records.append(_one(console, subject, folder, settings, device, paper_words()))
+        except KeyboardInterrupt:
+            again = shlex.join(["landscape", *sys.argv[1:]])
+            console.print(
+                f"stopped: {number} of {len(subjects)} reports are kept in {places[0].parent}; "
+                f"the same command goes on with the next: {again}",
+                markup=False,
+            )
+            sys.exit(130)
+    return records
+
+
+def _one(
+    console: Console, subject: Subject, folder: Path, settings: dict[str, Any], device: str, said: dict[str, Said]
+) -> dict[str, Any]:
+    from .landscapes.store import open_slice
+
+    dataset = open_slice(subject.store)
+    if "grad" not in dataset or min(dataset["loss"].shape) < 3:
+        raise ValueError(f"{subject.name}: report needs a slice with gradients and three samples per axis; got another")
+    env = _environment(dataset, device)
+    key = {**settings, "slice": _digest(dataset), "code": code_digest(type(env)), "device": env.device}
+    if (folder / REPORT).exists():
+        kept: dict[str, Any] = json.loads((folder / REPORT).read_text())
+        if kept.get("key") != key:
+            raise ValueError(f"{folder} holds a report of other settings; write elsewhere with --out, or delete it")
+        console.print(f"{folder} is there already", markup=False)
+        return kept
+    _warn(console, subject, dataset, env)
+    start = time.monotonic()
+    character = _character(console, env, dataset, settings)
+    record = {
+        "name": subject.name,
+        "env": env.name,
+        "options": dataset.attrs["identity"]["options"],
+        "fidelity": env.fidelity.name,
+        "device": env.device,
+        **character.record(),
+        "paper": _beside(character, said.get(env.name)),
+        "seconds": round(time.monotonic() - start, 3),
+        "command": shlex.join(["landscape", *sys.argv[1:]]),
+        "key": key,
+    }
+    _leave(console, dataset, character, record, folder)
+    return record
+
+
+def _character(console: Console, env: Environment, dataset: xr.Dataset, settings: dict[str, Any]) -> Character:
+    """Measure a slice under a progress bar, its cost announced."""
+    from .landscapes.adapters import within_box
+    from .landscapes.character import characterise, effort
+
+    losses, gradients = effort(dataset["loss"].ndim, settings["points"])
+    _announce(console, env, losses, gradients)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    objective = within_box(env) if dataset.attrs["identity"].get("boxed") else env
+    with Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=console) as bar:
+        task = bar.add_task("episodes", total=losses + gradients)
+        counted = _Counted(objective, env.preferred_batch, lambda rows: bar.advance(task, rows))
+        found = characterise(
+            counted, dataset, rounding=PRECISION[env.fidelity.precision], events=env.events, **settings
+        )
+        bar.update(task, completed=losses + gradients)
+    return found
+
+
+class _Counted:
+    """Evaluate an objective a batch at a time, and say how many rows are done."""
+
+    def __init__(self, objective: Objective, batch: int, advance: Any) -> None:
+        self.objective, self.space, self.batch, self.advance = objective, objective.space, batch, advance
+        self.name = getattr(objective, "name", type(objective).__name__)
+
+    def evaluate(self, x: Tensor, *, grad: bool = True) -> Evaluation:
+        """Return losses, and gradients if asked, at points `x` in the parameters' own units."""
+        import torch
+
+        from .landscapes.objective import Evaluation
+
+        parts = []
+        for rows in torch.split(x, self.batch):
+            parts.append(self.objective.evaluate(rows, grad=grad))
+            self.advance(len(rows))
+        if not parts:
+            return Evaluation.empty(self.space.dim, grad=grad)
+        slopes = torch.cat([part.grad for part in parts if part.grad is not None]) if grad else None
+        return Evaluation(torch.cat([p.loss for p in parts]), slopes, torch.cat([p.status for p in parts]))
+
+
+def _announce(console: Console, env: Environment, losses: int, gradients: int) -> None:
+    with console.status(f"{env.name}: preparing (kernels are compiled once, then kept)"):
+        env.prepare()
+        seconds = sum(count * _rate(env, grad) for grad, count in ((False, losses), (True, gradients)))
+    memory = f", {size(env.memory() * env.preferred_batch)} of memory" if env.memory() else ""
+    console.print(
+        f"{env.name} · {env.fidelity.name} · {env.device}: up to {losses} episodes and {gradients} with gradients: "
+        f"about {duration(seconds)}{memory}",
+        markup=False,
+    )
+
+
+def _rate(env: Environment, grad: bool) -> float:
+    """Return seconds per episode: of one, or of a batch where one is quick."""
+    for count in (1, min(env.preferred_batch, TRIAL)):
+        x = env.space.uniform(count, seed=0)
+        start = time.perf_counter()
+        env.evaluate(x, grad=grad)
+        seconds = (time.perf_counter() - start) / count
+        if seconds > 1:
+            return seconds / env.threads
+    return seconds
+
+
+def _environment(dataset: xr.Dataset, device: str) -> Environment:
+    """Return the environment that a slice was sampled from."""
+    from .envs.base import Fidelity
+
+    identity = dataset.attrs["identity"]
+    how = {"engine": identity["engine"], "deterministic": identity["deterministic"], **identity["options"]}
+    return make(identity["objective"], fidelity=Fidelity(**identity["settings"]), device=device, **how)
+
+
+def _warn(console: Console, subject: Subject, dataset: xr.Dataset, env: Environment) -> None:
+    theirs, ours = dataset.attrs["identity"], identity_of(env)
+    differ = [name for name in ("code", "device") if theirs.get(name) != ours[name]]
+    if differ:
+        said = "; ".join(f"{name} {theirs.get(name)} there, {ours[name]} here" for name in differ)
+        console.print(f"warning: {subject.name} was sampled otherwise ({said}), so losses may differ", markup=False)
+
+
+def _beside(character: Character, said: Said | None) -> dict[str, Any] | None:
+    if said is None:
+        return None
+    return {"words": character.verdict.beside(said.words), "where": said.where}
+
+
+def _leave(console: Console, dataset: xr.Dataset, character: Character, record: dict[str, Any], folder: Path) -> None:
+    from .landscapes.character import named_measures
+    from .landscapes.draw.page import save
+    from .landscapes.draw.quality import quality_figure
+
+    save(quality_figure(dataset, character.steps, character.samples, character.smooth), folder / PICTURE)
+    _write(folder / MEASURES, json.dumps(named_measures(record), indent=2, ensure_ascii=False) + "\n")
+    _write(folder / REPORT, json.dumps(record, indent=2) + "\n")
+    console.print(f"{folder}: {REPORT}, {MEASURES}, {PICTURE}", markup=False)
+
+
+def _write(path: Path, text: str) -> None:
+    from .landscapes.files import replacing
+
+    with replacing(path) as partial:
+        partial.write_text(text)
+
+
+def _digest(dataset: xr.Dataset) -> str:
+    text = json.dumps(dataset.attrs["identity"], sort_keys=True).encode()
+    return hashlib.sha256(text + dataset["loss"].to_numpy().tobytes()).hexdigest()[:12]
+
+
+def _folder_name(what: str, subjects: Sequence[Subject], settings: dict[str, Any]) -> str:
+    name = subjects[0].name if len(subjects) == 1 else Path(what).name
+    text = json.dumps([[str(subject.store) for subject in subjects], settings], sort_keys=True)
+    return f"report-{name}-{hashlib.sha256(text.encode()).hexdigest()[:6]}"
+
+
+def _check(folder: Path, single: bool) -> None:
+    """Refuse a folder that holds anything but reports."""
+    present = [file for file in folder.iterdir() if not file.name.startswith(".")] if folder.exists() else []
+    ours = {REPORT, MEASURES, PICTURE} if single else {REPORT, TABLE}
+    others = [file for file in present if file.name not in ours and (single or not (file / PICTURE).exists())]
+    if others:
+        raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
+
+
+def _show(record: dict[str, Any], as_json: bool, folder: Path) -> None:
+    """Print one slice's measures and verdict."""
+    if as_json:
+        print(json.dumps({**record, "folder": str(folder)}))
+        return
+    from .landscapes.character import named_measures
+
+    console = Console(highlight=False)
+    table = Table("measure", "value, 95 % interval", title=f"{record['name']} ({record['env']})", title_justify="left")
+    for name, text in named_measures(record).items():
+        table.add_row(escape(name), escape(text))
+    console.print(table)
+    for word in record["verdict"]["words"]:
+        console.print(f"{word}: {record['verdict']['reasons'][word]}", markup=False)
+    if record["paper"]:
+        said = "; ".join(f"{one['word']}: {'yes' if one['measured'] else 'no'}" for one in record["paper"]["words"])
+        console.print(f"the paper's words ({record['paper']['where']}), measured too? {said}", markup=False)
+
+
+def _by_environment(records: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return by environment in how many of its slices each word was measured, and each of the paper's."""
+    found: dict[str, dict[str, Any]] = {}
+    for record in records:
+        entry = found.setdefault(record["env"], {"slices": 0, "measured": {}, "paper": {}})
+        entry["slices"] += 1
+        for word in record["verdict"]["words"]:
+            entry["measured"][word] = entry["measured"].get(word, 0) + 1
+        for one in (record["paper"] or {"words": []})["words"]:
+            entry["paper"][one["word"]] = entry["paper"].get(one["word"], 0) + one["measured"]
+    return found
+
+
+def _row(record: dict[str, Any]) -> tuple[str, ...]:
+    losses, near = record["losses"], record["differences_of_samples"][0]
+    words = (record["paper"] or {"words": []})["words"]
+    hits = sum(one["measured"] for one in words)
+    return (
+        record["name"],
+        str(losses["notable"]),
+        _percent(losses["flat"]),
+        _percent(record["jumps"]["share"]),
+        "" if near["cosine"]["value"] is None else f"{near['cosine']['value']:.2f}",
+        ", ".join(record["verdict"]["words"]),
+        ", ".join(one["word"] for one in words),
+        f"{hits} of {len(words)}" if words else "",
+    )
+
+
+def _percent(estimate: dict[str, float | None] | None) -> str:
+    return "" if estimate is None or estimate["value"] is None else f"{100 * estimate['value']:.1f} %"
+
+
+def _table(records: Sequence[dict[str, Any]]) -> Table:
+    table = Table(*HEADINGS, title="what landscapes are like", title_justify="left")
+    for record in records:
+        table.add_row(*map(escape, _row(record)))
+    return table
+
+
+def _markdown(records: Sequence[dict[str, Any]]) -> str:
+    rows = [HEADINGS, ("---",) * len(HEADINGS), *map(_row, records)]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)

@@ -1,0 +1,153 @@
+"""What a built site holds, without a browser."""
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import urldefrag
+
+import numpy as np
+import pytest
+
+from gradscape.gallery.build import build_site
+from gradscape.gallery.figures import HERE
+from gradscape.gallery.runs import open_run
+from gradscape.landscapes.store import open_slice
+
+from .conftest import FIGURES, MEASURES, SWEEP
+
+
+class Page(HTMLParser):
+    """Collect what a page refers to, its anchors, its pictures and what labels its controls."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.references: list[str] = []
+        self.ids: list[str] = []
+        self.pictures: list[dict[str, str | None]] = []
+        self.named: list[str] = []
+        self.feed(path.read_text())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        found = dict(attrs)
+        self.references += [value for name in ("href", "src", "poster") if (value := found.get(name))]
+        self.ids += [value for value in [found.get("id")] if value]
+        self.pictures += [found] if tag == "img" else []
+        for name in ("aria-labelledby", "aria-describedby", "for", "data-copy"):
+            self.named += (found.get(name) or "").split()
+
+
+def test_every_link_and_picture_is_in_the_site(site: Path) -> None:
+    pages = {path: Page(path) for path in site.rglob("*.html")}
+    assert len(pages) == 1 + len(FIGURES)
+    for path, page in pages.items():
+        assert len(set(page.ids)) == len(page.ids)
+        assert set(page.named) <= set(page.ids)
+        assert all("alt" in picture for picture in page.pictures)
+        for reference in page.references:
+            file, anchor = urldefrag(reference)
+            if file != "data:,":
+                target = (path.parent / file).resolve() if file else path
+                assert target.is_file(), f"{path}: {reference}"
+                assert not anchor or anchor in Page(target).ids
+
+
+def test_no_file_of_the_site_names_an_address(site: Path) -> None:
+    texts = [path for path in site.rglob("*") if path.suffix in {".html", ".css", ".js", ".json"}]
+    assert len(texts) >= 4 + 2 * len(FIGURES)
+    assert not [path for path in texts if re.search(r"(https?:)?//[\w.]+\.\w|@import|url\(", path.read_text())]
+
+
+def test_the_manifest_lists_everything_of_a_page(site: Path, data: Path) -> None:
+    manifest = json.loads((site / "manifest.json").read_text())
+    assert manifest["schema"] == 1
+    assert manifest["missing"] == ["later"]
+    assert [entry["id"] for entry in manifest["figures"]] == [figure.id for figure in FIGURES]
+    for entry in manifest["figures"]:
+        assert {path.name for path in (site / entry["id"]).iterdir()} == set(entry["files"])
+        loss = open_slice(data / entry["id"] / "slice.zarr")["loss"]
+        assert entry["numbers"]["lowest"] == float(loss.min())
+        assert entry["numbers"]["status"]["ok"] == int(np.isfinite(loss).sum())
+        assert entry["command"].startswith("landscape ")
+    full = manifest["figures"][-1]
+    assert full["numbers"]["status"]["nonfinite"] > 0
+    assert (full["sweep"], full["measures"]) == (SWEEP, MEASURES)
+    assert [(one["row"], one["column"], one["why"]) for one in full["episodes"]] == [
+        (6, 5, "lowest loss, through the slice's point"), (11, 11, "highest loss")
+    ]  # fmt: skip
+    assert full["episodes"][0]["at"] == {"speed [m/s]": pytest.approx(-1 / 11), "force [N]": pytest.approx(120 / 11)}
+    for run in full["runs"]:
+        table = open_run(data / f"runs/fluid/{run['method']}-0.zarr.zip")
+        assert (run["budget"], run["episodes"], run["best"]) == (24, 24, float(table["loss"].min()))
+    assert [run["method"] for run in full["runs"]] == ["descents", "random"]
+
+
+def test_a_search_lies_where_its_parameters_say(site: Path, data: Path) -> None:
+    """On the slice through the middle of the box a point's place is its own two parameters, its distance the third."""
+    text = (site / "full/nodes.js").read_text().removeprefix("const SLICE = ").rstrip(";\n")
+    for run in json.loads(text)["runs"]:
+        table = open_run(data / f"runs/fluid/{run['method']}-0.zarr.zip")
+        x, loss = table["x"].to_numpy(), table["loss"].to_numpy()
+        np.testing.assert_allclose([run["u"], run["v"]], x[:, :2].T, rtol=1e-5)
+        np.testing.assert_allclose(run["distance"], [np.abs(x[:, 2]).min() / 10, np.abs(x[:, 2]).max() / 10], rtol=1e-9)
+        order = np.argsort(np.abs(x[:, 2]))
+        assert (np.diff(np.array(run["radius"])[order]) <= 0).all()
+        assert run["path"] == [
+            row for row in range(24) if np.isfinite(loss[row]) and not (loss[:row] <= loss[row]).any()
+        ]
+
+
+def test_a_search_of_other_options_is_not_laid_over_a_slice(data: Path) -> None:
+    from gradscape.gallery.trajectories import read_runs, trajectories
+
+    tables, dataset = read_runs(data / "runs"), open_slice(data / "full/slice.zarr")
+    assert len(tables) == 4
+    assert len(trajectories(dataset, tables)) == 2
+    dataset.attrs["identity"]["options"] = {"goal": "high"}
+    tables[-1].attrs["identity"]["options"] = {"goal": "low"}
+    assert [run["method"] for run in trajectories(dataset, tables)] == ["descents"]
+
+
+def test_words_of_a_figure_are_escaped(site: Path) -> None:
+    assert "All of it &lt;b&gt;&amp;&lt;/b&gt; no network." in (site / "full/index.html").read_text()
+
+
+def test_a_page_says_what_it_has_and_nothing_of_what_it_has_not(site: Path) -> None:
+    full, bare = ((site / name / "index.html").read_text() for name in ("full", "bare"))
+    sections = ("sweep-title", "episodes-title", 'id="surface"')
+    assert [section in full for section in sections] == [True, True, True]
+    assert [section in bare for section in sections] == [False, False, True]
+    assert "Mass from −10 to 10: 12 slices" in full.replace("\n", " ")
+    assert SWEEP["command"] in full
+    assert '<th scope="row">mass</th><td>0</td><td>none</td>' in full
+    assert '<th scope="row">force</th><td>10</td><td>N</td>' in (site / "line/index.html").read_text()
+
+
+def test_a_folder_of_other_files_is_left_alone(data: Path, tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("words")
+    with pytest.raises(ValueError, match="holds other files and no gallery"):
+        build_site(FIGURES, data, tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def colours(scheme: str) -> dict[str, str]:
+    """Return the colours that the style sheet names for light, or for dark where it has its own."""
+    light, dark = re.findall(r":root \{(.*?)\}", (HERE / "static/style.css").read_text(), re.DOTALL)
+    return dict(re.findall(r"--(\w+): (#\w{6})", light if scheme == "light" else light + dark))
+
+
+def luminance(colour: str) -> float:
+    parts = np.array([int(colour[start : start + 2], 16) / 255 for start in (1, 3, 5)])
+    linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_contrast_of_text_is_that_of_wcag_aa(scheme: str) -> None:
+    """WCAG 2.2, 1.4.3: 4.5 for text; 1.4.11: 3 for edges of controls, the focus and the curve."""
+    named = colours(scheme)
+    wanted = dict.fromkeys(("ink", "quiet", "link"), 4.5) | dict.fromkeys(("edge", "focus", "curve"), 3.0)
+    for ground in ("ground", "panel"):
+        for name, least in wanted.items():
+            low, high = sorted((luminance(named[name]), luminance(named[ground])))
+            assert (high + 0.05) / (low + 0.05) >= least, f"{name} on {ground}"

@@ -1,0 +1,288 @@
+"""`landscape tradeoff`, `--tolerance` and `landscape pairs`: what they leave, say, go on from and refuse."""
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+import torch
+from torch import Tensor
+
+import gradscape
+from gradscape import ladder
+from gradscape.envs import registry
+from gradscape.envs.base import Environment, Fidelity, Work
+from gradscape.landscapes import tradeoff
+from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.space import ParameterSpace
+from gradscape.tolerance import read_tolerance
+
+from .command import Said
+
+Command = Callable[..., Said]
+TRADE = ["tradeoff", "converging", "--points", "16", "--device", "cpu", "--out", "trade"]
+
+
+class Converging(Environment):
+    """A bowl whose loss is off by (1 + x0) dt^2, in float32 by 1e-7 more.
+
+    Refuses dt of 0.4 or more, diverges at 0.2 where x0 is large.
+    """
+
+    name: ClassVar[str] = "converging"
+    fidelities: ClassVar[dict[str, Fidelity]] = {
+        "draft": Fidelity("draft", dt=0.1),
+        "standard": Fidelity("standard", dt=0.05),
+        "reference": Fidelity("reference", dt=1e-4, precision="float64"),
+    }
+    space = ParameterSpace.box(["x0", "x1"], 0.0, 1.0)
+
+    def _setup(self) -> None:
+        if self.fidelity.dt >= 0.4:
+            raise ValueError(f"converging takes dt below 0.4; got {self.fidelity.dt}")
+
+    def work(self) -> Work:
+        return Work(round(1 / self.fidelity.dt), "step")
+
+    def _evaluate(self, x: Tensor, *, grad: bool) -> Evaluation:
+        dt = self.fidelity.dt
+        time.sleep(1e-6 / dt)
+        rounding = 1e-7 if self.fidelity.precision == "float32" else 0.0
+        loss = x.square().sum(dim=1) + (1 + x[:, 0]) * dt**2 + rounding
+        loss[(x[:, 0] > 0.5) & (dt >= 0.2)] = torch.nan
+        return Evaluation.judged(loss, 2 * x + dt**2 * x.new_tensor([1.0, 0.0]) if grad else None)
+
+
+@pytest.fixture(autouse=True)
+def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Keep measurements in a folder of the test's own, and take little time for timing."""
+    monkeypatch.setattr("gradscape.tolerance.user_data_path", lambda name: tmp_path / "data" / name)
+    monkeypatch.setattr(tradeoff, "TIMING", 0.002)
+    monkeypatch.setattr(tradeoff, "RESAMPLES", 99)
+    monkeypatch.setitem(registry.entries(), "converging", registry.Entry("converging", f"{__name__}:Converging"))
+    return tmp_path / "data"
+
+
+def by_name(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    return {row["name"]: row for row in report["rungs"]}
+
+
+def without_seconds(report: dict[str, Any]) -> dict[str, Any]:
+    rungs = [{key: value for key, value in row.items() if key != "seconds"} for row in report["rungs"]]
+    return {**report, "rungs": rungs, "command": None, "folder": None, "provenance": None}
+
+
+def test_errors_and_order_of_convergence_are_those_of_the_scene(run: Command, tmp_path: Path) -> None:
+    done = run(*TRADE, "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert {**json.loads((tmp_path / "trade/tradeoff.json").read_text()), "folder": "trade"} == report
+    assert (tmp_path / "trade/tradeoff.png").read_bytes().startswith(b"\x89PNG")
+    rungs = by_name(report)
+    x = tradeoff.sobol_points(Converging.space, 16, seed=0)
+    for name, dt in (("draft", 0.1), ("standard", 0.05), ("standard-dt-x0.5", 0.025)):
+        off = (1 + x[:, 0]) * (dt**2 - 1e-8) + 1e-7
+        assert rungs[name]["loss_error"]["median"]["value"] == pytest.approx(float(off.quantile(0.5)))
+        assert rungs[name]["loss_error"]["p95"]["value"] == pytest.approx(float(off.sort().values[-1]))
+    (fit,) = report["orders"]  # of rungs in float32, without the reference's own
+    assert fit["rungs"] == ["draft", "standard", "standard-dt-x0.5"]
+    assert fit["order"] == pytest.approx(2, abs=0.01)
+
+
+def test_rungs_that_are_refused_are_listed_and_those_that_diverge_are_counted(run: Command, tmp_path: Path) -> None:
+    done = run(*TRADE, "--json", cwd=tmp_path)
+    report = json.loads(done.stdout)
+    assert report["refused"] == [{"name": "draft-dt-x4", "why": "converging takes dt below 0.4; got 0.4"}]
+    assert "refused: draft-dt-x4: converging takes dt below 0.4; got 0.4" in done.stderr
+    coarse = by_name(report)["draft-dt-x2"]
+    x = tradeoff.sobol_points(Converging.space, 16, seed=0)
+    assert coarse["diverged"] == pytest.approx(float((x[:, 0] > 0.5).double().mean()))
+    assert coarse["loss_error"]["p95"]["value"] is None
+
+
+def test_a_rung_whose_engine_gives_up_is_listed_too(
+    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulate = Converging._evaluate
+
+    def short_of_memory(self: Converging, x: Tensor, *, grad: bool) -> Evaluation:
+        if self.fidelity.name == "standard":
+            raise RuntimeError("out of memory")
+        return simulate(self, x, grad=grad)
+
+    monkeypatch.setattr(Converging, "_evaluate", short_of_memory)
+    report = json.loads(run(*TRADE, "--ladder", "precision", "--json", cwd=tmp_path).stdout)
+    assert report["refused"] == [{"name": "standard", "why": "out of memory"}]
+    assert {"draft", "draft-float64", "standard-float64", "reference"} < set(by_name(report))
+
+
+def test_a_dt_that_does_not_divide_the_episode_is_refused() -> None:
+    base = ladder.Rung.of(Converging(fidelity="draft"))
+    thirds = base.turned("thirds", "dt", fidelity=Fidelity("thirds", dt=0.3))
+    with pytest.raises(ValueError, match=r"with dt 0.3 s it would be 0.9 times as long"):
+        thirds.make("converging")
+    assert base.turned("halves", "dt", fidelity=Fidelity("halves", dt=0.05)).make("converging").fidelity.dt == 0.05
+
+
+@pytest.mark.parametrize(
+    ("scene", "wanted"),
+    [
+        ("bounce", {"draft-ke-x4", "draft-dt-x2", "draft-float64", "reference-float32", "draft on cuda"}),
+        ("fluid", {"standard-resolution-32", "draft-particles-x2", "draft on taichi", "standard-dt-x4"}),
+        ("table", {"standard-particles-x0.5", "standard-resolution-42"}),
+        ("flip", {"standard-resolution-24", "draft on taichi"}),
+    ],
+)
+def test_scenes_have_the_rungs_of_their_knobs(scene: str, wanted: set[str]) -> None:
+    found = ladder.rungs(registry.make(scene, fidelity="reference", device="cpu"), ladder.LADDERS)
+    names = [rung.name for rung in found]
+    assert names[0] == "reference"
+    assert wanted <= set(names)
+    assert len({rung.key() for rung in found}) == len(found)
+    assert ("draft-ke-x4" in names) == (scene == "bounce")
+    particles = {rung.ladder for rung in found} & {"particles"}
+    assert bool(particles) == (scene in ("fluid", "table"))
+
+
+def test_a_stopped_study_goes_on_with_the_next_rung(
+    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "whole").mkdir()
+    whole = json.loads(run(*TRADE, "--json", cwd=tmp_path / "whole").stdout)
+    measure, measured = tradeoff.measure, []
+
+    def stopped(env: Any, x: Tensor, **how: Any) -> tradeoff.Sample:
+        if len(measured) == 3:
+            raise KeyboardInterrupt
+        measured.append(env.fidelity.name)
+        return measure(env, x, **how)
+
+    monkeypatch.setattr(tradeoff, "measure", stopped)
+    done = run(*TRADE, "--json", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (130, "")
+    assert "stopped: 3 of" in done.stderr
+    assert not (tmp_path / "trade/tradeoff.json").exists()
+    kept = {path.name: path.read_bytes() for path in (tmp_path / "trade/pieces").iterdir()}
+    monkeypatch.setattr(tradeoff, "measure", measure)
+    resumed = json.loads(run(*TRADE, "--json", cwd=tmp_path).stdout)
+    assert without_seconds(resumed) == without_seconds(whole)
+    assert kept == {name: (tmp_path / "trade/pieces" / name).read_bytes() for name in kept}
+
+
+def test_another_study_is_not_overwritten(run: Command, tmp_path: Path) -> None:
+    run(*TRADE, "--ladder", "dt", cwd=tmp_path)
+    before = (tmp_path / "trade/tradeoff.json").read_bytes()
+    other = run(*TRADE, "--seed", "1", cwd=tmp_path)
+    assert other.returncode == 2
+    assert "seed: wanted 1, found 0" in other.stderr
+    assert (tmp_path / "trade/tradeoff.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["tradeoff", "branin"], "branin has fidelity exact only; there is nothing to trade"),
+        (["tradeoff", "bounce", "--ladder", "speed"], "--ladder takes dt, resolution"),
+        (["slice", "bounce", "--dims", "0", "1", "--tolerance", "5%"], "`landscape tradeoff bounce` measures them"),
+        (["slice", "bounce", "--dims", "0", "1", "--tolerance", "5%", "--fidelity", "draft"], "leave out one"),
+        (["slice", "bounce", "--dims", "0", "1", "--tolerance", "close"], "a share such as 5%"),
+        (["optimize", "bounce", "--method", "random", "--tolerance", "-1"], "a share such as 5%"),
+    ],
+)
+def test_what_cannot_be_is_refused(arguments: list[str], said: str, run: Command, tmp_path: Path) -> None:
+    done = run(*arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+
+
+def test_a_tolerance_takes_the_quickest_fidelity_within_it(run: Command, tmp_path: Path) -> None:
+    report = json.loads(run(*TRADE, "--json", cwd=tmp_path).stdout)
+    limit = 0.02 * report["spread"]  # above draft's errors at the 95th percentile, of 0.02 at most
+    within = [
+        row for row in report["rungs"]
+        if row["loss_error"]["p95"]["value"] is not None and row["loss_error"]["p95"]["value"] <= limit
+    ]  # fmt: skip
+    wanted = min(within, key=lambda row: row["seconds"]["with_gradient"])
+    assert len(report["rungs"]) > len(within) > 1
+    how = ["converging", "--device", "cpu", "--tolerance", "2%"]
+    cut = run("slice", *how, "--dims", "0", "1", "--resolution", "3", "--out", "cut", cwd=tmp_path)
+    assert cut.returncode == 0, cut.stderr
+    assert f"{wanted['name']}: the quickest of" in cut.stderr
+    dataset = gradscape.open_slice(tmp_path / "cut/slice.zarr")
+    assert dataset.attrs["identity"]["settings"] == wanted["fidelity"]
+    searched = run("optimize", *how, "--method", "random", "--budget", "3", "--json", cwd=tmp_path)
+    assert searched.returncode == 0, searched.stderr
+    assert json.loads(searched.stdout)["fidelity"] == wanted["fidelity"]["name"]
+
+
+def test_a_tolerance_that_nothing_meets_names_the_best(run: Command, tmp_path: Path) -> None:
+    kept = Path(tmp_path / "data").rglob("*.json")
+    run(*TRADE, cwd=tmp_path)
+    (path,) = kept
+    report = json.loads(path.read_text())
+    report["rungs"] = [row for row in report["rungs"] if row["name"] != "reference" and "reference" not in row["name"]]
+    report["identity"]["code"] = "older"
+    path.write_text(json.dumps(report))
+    how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--tolerance"]
+    none = run(*how, "1e-9", cwd=tmp_path)
+    assert none.returncode == 2
+    assert "the best is standard-dt-x0.5" in none.stderr
+    some = run(*how, "50%", cwd=tmp_path)
+    assert some.returncode == 0
+    assert "warning: measured with another version of the code, older" in some.stderr
+
+
+def test_the_gallerys_rungs_of_the_same_problem_are_found_where_nothing_of_the_users_own_is(
+    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    report = json.loads(run(*TRADE, "--json", cwd=tmp_path).stdout)
+    for kept in (tmp_path / "data").rglob("*.json"):
+        kept.unlink()
+    softer = json.loads(json.dumps(by_name(report)["draft"])) | {"name": "softer", "options": {"ke": 1.0}}
+    softer["seconds"] = {"forward": 0.0, "with_gradient": 0.0}
+    path = tmp_path / "data" / "tradeoff" / "converging.json"
+    path.parent.mkdir(parents=True)
+    monkeypatch.setattr("gradscape.tolerance.resources.files", lambda package: tmp_path)
+    how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--tolerance", "50%"]
+    path.write_text(json.dumps({**report, "rungs": [softer, *report["rungs"]]}))
+    done = run(*how, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert str(path) in done.stderr
+    assert "softer: " not in done.stderr
+    path.write_text(json.dumps({**report, "identity": {**report["identity"], "options": {"ke": 1.0}}}))
+    assert "no fidelities of converging with these options are measured" in run(*how, cwd=tmp_path).stderr
+
+
+def test_a_slice_at_a_measured_fidelity_can_be_cut_anew(run: Command, tmp_path: Path) -> None:
+    how = ["converging", "--device", "cpu", "--tolerance", "0.002"]
+    run(*TRADE, "--ladder", "dt", cwd=tmp_path)
+    run("slice", *how, "--dims", "0", "1", "--resolution", "3", "--out", "cut", cwd=tmp_path)
+    run("optimize", *how, "--method", "random", "--budget", "3", "--out", "searched", cwd=tmp_path)
+    assert json.loads((tmp_path / "cut/summary.json").read_text())["fidelity"] == "standard-dt-x0.5"
+    anew = run("overlay", "cut", "searched", "--through", "best", "--device", "cpu", "--out", "over", cwd=tmp_path)
+    assert anew.returncode == 0, anew.stderr
+
+
+def test_pairs_prints_the_command_that_slices_the_first(run: Command, tmp_path: Path) -> None:
+    how = ["pairs", "rastrigin", "--set", "dim=3", "--samples", "8", "--top", "2"]
+    done = run(*how, "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert len(report["pairs"]) == 2
+    assert report["episodes"] == 8 * (1 + 5 * 3 + 3)
+    first = " ".join(map(str, report["pairs"][0]["dims"]))
+    assert f"landscape slice rastrigin --dims {first} --fidelity exact --set dim=3" in done.stderr
+    shown = run(*how, cwd=tmp_path)
+    assert "152 episodes" in shown.stdout
+    assert len(json.loads((tmp_path / report["folder"] / "pairs.json").read_text())["pairs"]) == 3
+
+
+def test_pairs_needs_two_parameters(run: Command, tmp_path: Path) -> None:
+    assert "a pair takes two" in run("pairs", "rastrigin", "--set", "dim=1", cwd=tmp_path).stderr
+
+
+def test_a_tolerance_is_a_share_or_a_number() -> None:
+    assert read_tolerance("5%") == (0.05, True)
+    assert read_tolerance("0.2") == (0.2, False)
