@@ -69,6 +69,7 @@ class Environment(abc.ABC):
     engines: ClassVar[tuple[str, ...]] = ("warp",)
     loss_unit: ClassVar[str] = ""
     decisions: ClassVar[int] = 1  # how often controls are chosen in an episode: dim / decisions of them, time first
+    control_step: ClassVar[float] = 0.0  # how long a control is held [s], in whole time steps; 0 where that is no matter
 
     space: ParameterSpace
     _solvers: Pool[Any] | None = None  # a scene on an engine sets both in `_setup`: what simulates,
@@ -84,6 +85,7 @@ class Environment(abc.ABC):
         **options: Any,
     ) -> None:
         self.fidelity = self._named_fidelity(fidelity)
+        self._refuse_broken_steps()
         self.device = self._available_device(device)
         self.engine = self.known_engine(engine)
         self.deterministic = deterministic
@@ -121,6 +123,12 @@ class Environment(abc.ABC):
         """Return what a scene says of itself, and after it what its family says."""
         family = cls.__mro__[: cls.__mro__.index(Environment)]
         return "\n\n".join(inspect.cleandoc(kind.__doc__) for kind in family if kind.__doc__)
+
+    @final
+    @classmethod
+    def nearest_dt(cls, dt: float) -> float:
+        """Return the time step nearest to `dt` [s] that the scene takes: whole ones fit into a control step."""
+        return cls.control_step / max(1, round(cls.control_step / dt)) if cls.control_step else dt
 
     @final
     @classmethod
@@ -227,6 +235,14 @@ class Environment(abc.ABC):
     def _rows_at_once(self, capacity: int) -> int:
         """Return the rows a solver takes where one on Warp takes `capacity`: Taichi's has every core to itself."""
         return capacity * (_cores() if self.engine == "taichi" and self.device == "cpu" else 1)
+
+    def _refuse_broken_steps(self) -> None:
+        dt, nearest = self.fidelity.dt, self.nearest_dt(self.fidelity.dt)
+        if abs(nearest - dt) > 1e-6 * dt:
+            raise ValueError(
+                f"{self.name} holds a control for {self.control_step:g} s, which must be whole time steps; got dt "
+                f"{dt:.6g} s, nearest to it is {nearest:.6g} s"
+            )
 
     def _share(self, rows: int) -> int:
         return max(1, min(-(-rows // self.threads), self._capacity))

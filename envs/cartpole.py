@@ -74,6 +74,7 @@ class Cartpole(Environment):
     }
     loss_unit: ClassVar[str] = "m"
     decisions: ClassVar[int] = CONTROLS
+    control_step: ClassVar[float] = SPAN
     Options: ClassVar[type[Any]] = CartpoleOptions
     examples: ClassVar[dict[str, tuple[float, ...]]] = {
         "upright": tuple(float(np.interp(k, KNOTS, values)) for k in range(CONTROLS) for values in UPRIGHT)
@@ -125,8 +126,6 @@ class Cartpole(Environment):
 
     def _setup(self) -> None:
         dt = self.fidelity.dt
-        if round(SPAN / dt) < 1 or abs(round(SPAN / dt) * dt - SPAN) > 1e-9:
-            raise ValueError(f"{self.name} holds a control for {SPAN} s, which must be whole steps; got dt {dt} s")
         self._capacity = 256 if self.device == "cpu" else 1 << 14
         settings: dict[str, Any] = {"capacity": self._capacity, "device": self.device, "name": self.fidelity.precision}
         self._solvers = Pool(partial(Solver, CHAIN, dt=dt, hold=round(SPAN / dt), controls=self.held, **settings))

@@ -85,6 +85,7 @@ class Fluid(Environment):
     }
     loss_unit: ClassVar[str] = "m"
     decisions: ClassVar[int] = SEGMENTS
+    control_step: ClassVar[float] = SPAN
     Options: ClassVar[type[Any]] = FluidOptions
     _solvers: Pool[Solver]
     space = ParameterSpace.box(

@@ -84,6 +84,7 @@ class Plasticine(Environment):
     }
     Options: ClassVar[type[Any]] = PlasticineOptions
     decisions: ClassVar[int] = SEGMENTS
+    control_step: ClassVar[float] = SPAN
     scene: ClassVar[Scene]
     _solvers: Pool[Stage]
 

@@ -127,6 +127,7 @@ class _BoxedObjective:
         return getattr(self.objective, name)
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
+        x = _points(x, self.space, getattr(self.objective, "name", type(self.objective).__name__))
         unit = self.space.to_unit(x)
         inside = ((unit >= -self.ROUNDING) & (unit <= 1 + self.ROUNDING)).all(dim=1)
         found = self.objective.evaluate(torch.clamp(x[inside], self.space.lower, self.space.upper), grad=grad)

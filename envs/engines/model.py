@@ -126,8 +126,9 @@ def around(model: Model, low: torch.Tensor, high: torch.Tensor, margin: int, gra
         return Box((0, 0, 0), model.nodes)
     origin = torch.tensor(model.origin, dtype=torch.float64)
     last = torch.tensor(model.nodes) - 1
-    first = ((low - origin) / model.dx - 0.5).floor().int() - margin
-    end = ((high - origin) / model.dx + 1.5).floor().int() + margin
+    farthest = max(model.nodes)  # from the grid that matters; an exploded body may be beyond what an integer holds
+    first = ((low - origin) / model.dx - 0.5).floor().clamp(-farthest, farthest).int() - margin
+    end = ((high - origin) / model.dx + 1.5).floor().clamp(-farthest, farthest).int() + margin
     first, end = first // grain * grain, -(-end // grain) * grain
     first, end = first.clamp_min(0).minimum(last - 2), end.minimum(last)
     return Box(tuple(first.tolist()), tuple((end - first).clamp_min(2).add(1).tolist()))

@@ -95,7 +95,8 @@ def _length(env: Environment) -> float:
 
 def _dts(base: Rung, env: Environment) -> Iterator[Rung]:
     for factor in STEPS:
-        fidelity = _changed(base, f"dt-x{factor:g}", dt=base.fidelity.dt * factor)
+        dt = env.nearest_dt(base.fidelity.dt * factor)
+        fidelity = _changed(base, f"dt-x{dt / base.fidelity.dt:.3g}", dt=dt)
         yield base.turned(fidelity.name, "dt", fidelity=fidelity)
 
 
