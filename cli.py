@@ -50,6 +50,13 @@ Extent = Annotated[
 Through = Annotated[
     str, typer.Option(help="The point it goes through: center, random:SEED, example:NAME or a file of parameters.")
 ]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        help="Dask workers to compute on: the address of a scheduler, or local:N for N of them here; local alone has "
+        "one per GPU, or per core."
+    ),
+]
 NoGradients = Annotated[bool, typer.Option("--no-gradients", help="Sample losses only.")]
 
 
@@ -90,6 +97,7 @@ def slice_(
     extent: Extent = None,
     set_: Set = None,
     no_gradients: NoGradients = False,
+    scheduler: Scheduler = None,
     out: Out = None,
     json_: Json = False,
     force: Force = False,
@@ -116,6 +124,7 @@ def slice_(
         out=out,
         as_json=json_,
         force=force,
+        scheduler=scheduler,
     )
 
 
@@ -137,6 +146,7 @@ def sweep(
     extent: Extent = None,
     set_: Set = None,
     no_gradients: NoGradients = False,
+    scheduler: Scheduler = None,
     out: Annotated[
         str | None, typer.Option(help="Folder for the results; by default one under out/ named after the sweep.")
     ] = None,
@@ -167,6 +177,7 @@ def sweep(
         out=out,
         as_json=json_,
         force=force,
+        scheduler=scheduler,
     )
 
 
@@ -232,6 +243,7 @@ def race(
     workers: Annotated[
         int, typer.Option(min=1, help="Runs at a time, each in a thread; losses do not depend on it, seconds do.")
     ] = 1,
+    scheduler: Scheduler = None,
     fidelity: Fidelity = None,
     device: Device = "auto",
     engine: Engine = "warp",
@@ -270,6 +282,7 @@ def race(
         as_json=json_,
         report=report,
         force=force,
+        scheduler=scheduler,
     )
 
 
@@ -398,6 +411,55 @@ def bounce(
         out=out,
         as_json=json_,
         force=force,
+    )
+
+
+@app.command()
+def plan(
+    what: Annotated[str, typer.Argument(metavar="ENV|FIGURES.toml", help="An environment, or a list of figures.")],
+    dims: Annotated[tuple[str, str], typer.Option(help="The two parameters to vary, by number or by name.")] = (
+        "0",
+        "1",
+    ),
+    over: Annotated[
+        str | None, typer.Option(help="Plan a sweep: what moves from frame to frame, as for `landscape sweep`.")
+    ] = None,
+    frames: Annotated[int, typer.Option(min=2, help="Frames of the sweep.")] = 24,
+    resolution: Annotated[
+        int | None, typer.Option(min=2, help="Points along each axis; 16, or what the figures say.")
+    ] = None,
+    fidelity: Fidelity = None,
+    device: Device = "auto",
+    engine: Engine = "warp",
+    through: Through = "center",
+    extent: Extent = None,
+    set_: Set = None,
+    no_gradients: NoGradients = False,
+    workers: Annotated[int, typer.Option(min=1, help="Workers, each with a device such as this one.")] = 1,
+    json_: Json = False,
+) -> None:
+    """Predict episodes, time, memory and disk of a slice, a sweep or the gallery's slices, without making them.
+
+    A few episodes, tiles and pictures are made and thrown away. For a CUDA device that is not here, what
+    `landscape tradeoff` kept of one counts.
+    """
+    from .plan_report import plan as report
+
+    report(
+        what,
+        dims=dims,
+        over=over,
+        frames=frames,
+        resolution=resolution,
+        fidelity=fidelity,
+        device=device,
+        engine=engine,
+        through=through,
+        extent=extent,
+        settings=set_ or [],
+        grad=not no_gradients,
+        workers=workers,
+        as_json=json_,
     )
 
 
@@ -576,7 +638,8 @@ def report_(
 ) -> None:
     """Say what a landscape is like: minima, flatness, jumps, correlation, gradient quality, and the verdict.
 
-    Writes report.json, measures.json and gradient-quality.png. Stop it at any moment: finished slices are kept.
+    Writes report.json, measures.json and gradient-quality.png. Stop it at any moment: finished slices are kept. With
+    --all a slice that fails is named at the end, and exit code is 1. docs/measures.md says what each number means.
     """
     from .measure_report import report
 
@@ -610,6 +673,7 @@ def gallery_compute(
     fidelity: Fidelity = None,
     device: Device = "auto",
     resolution: Annotated[int | None, typer.Option(min=2, help="Points along each axis, for all figures.")] = None,
+    scheduler: Scheduler = None,
     data: Data = None,
 ) -> None:
     """Make what is missing of the figures: an estimate first, then one after the other.
@@ -620,7 +684,15 @@ def gallery_compute(
     """
     from .gallery_report import compute
 
-    compute(only=only or [], parts=part or [], fidelity=fidelity, device=device, resolution=resolution, data=data)
+    compute(
+        only=only or [],
+        parts=part or [],
+        fidelity=fidelity,
+        device=device,
+        resolution=resolution,
+        data=data,
+        scheduler=scheduler,
+    )
 
 
 @gallery.command("list")
@@ -658,6 +730,8 @@ def main(arguments: list[str] | None = None) -> Any:
 
     try:
         code = app(args=arguments, standalone_mode=False)
+        if code == 130:  # what typer makes of Ctrl-C where a verb has not said what is kept
+            raise KeyboardInterrupt
     except TyperException as error:
         code = _fail(error.format_message(), 2)
     except ValueError as error:

@@ -3,8 +3,9 @@
 A figure's folder in the data holds `slice.zarr`; whatever else of these is there gets a section of its own:
 `surface.png`, `.html`, `.gltf` or `.glb`; `sweep.mp4` with `sweep.json` (label, low, high, fidelity, frames,
 resolution, command); `episodes.json`, a list of nodes (row, column, why, loss, status), each with
-`episode-ROW-COLUMN.mp4` and `.webp`, its last frame; `measures.json` (names and numbers). Runs in
-`runs/ENVIRONMENT-OPTIONS/` are laid over every slice of their environment and options.
+`episode-ROW-COLUMN.mp4` and `.webp`, its last frame; `report.json`, `measures.json` (names and numbers) and
+`gradient-quality.png`, of `landscape report`. Runs in `runs/ENVIRONMENT-OPTIONS/` are laid over every slice of their
+environment and options; `tradeoff/ENVIRONMENT.json` and `.png` are shown with every slice of theirs.
 
 `manifest.json` lists all of it for programs; `schema` counts up whenever the meaning of a name in it changes.
 """
@@ -12,8 +13,9 @@ resolution, command); `episodes.json`, a list of nodes (row, column, why, loss, 
 from __future__ import annotations
 
 import json
+import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from itertools import groupby
 from pathlib import Path
@@ -27,6 +29,7 @@ from ..landscapes.files import placing
 from ..landscapes.job import PICTURE, STORE
 from ..landscapes.store import SliceStore, is_slice, open_slice
 from .figures import HERE, Figure
+from .measured import MEASURES, QUALITY, REPORT, place_tradeoffs, read_report
 from .page_data import nodes, numbers, read_episodes, read_json
 from .runs import FOLDER
 from .trajectories import read_runs, trajectories
@@ -47,7 +50,8 @@ def build_site(figures: Sequence[Figure], data: Path, out: Path) -> dict[str, An
     pages, tables = _templates(), read_runs(data / FOLDER)
     with placing(out.resolve(), overwrite=True) as new:
         shutil.copytree(HERE / "static", new / "static")
-        made = [_page(pages, figure, data / figure.id, new / figure.id, tables) for figure in there]
+        traded = place_tradeoffs(data, new, [figure.env for figure in there])
+        made = [_page(pages, figure, data / figure.id, new / figure.id, tables, traded) for figure in there]
         missing = [figure.id for figure in figures if figure not in there]
         manifest = {"schema": SCHEMA, "gradscape": version("gradscape"), "figures": made, "missing": missing}
         (new / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n")
@@ -63,6 +67,7 @@ def _templates() -> Environment:
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     pages.filters["number"] = _number
+    pages.filters["times"] = lambda text: re.sub(r"(?<=\d) x (?=[\d(])", " \N{MULTIPLICATION SIGN} ", text)
     return pages
 
 
@@ -76,7 +81,12 @@ def _sampled(store: Path) -> bool:
 
 
 def _page(
-    pages: Environment, figure: Figure, source: Path, folder: Path, tables: Sequence[xr.Dataset]
+    pages: Environment,
+    figure: Figure,
+    source: Path,
+    folder: Path,
+    tables: Sequence[xr.Dataset],
+    traded: Mapping[str, dict[str, Any]],
 ) -> dict[str, Any]:
     """Write a slice's page and all it shows into `folder`, and return its entry in the manifest."""
     folder.mkdir()
@@ -87,7 +97,8 @@ def _page(
     sweep = (read_json(source / "sweep.json") or {}) if (source / SWEEP).exists() else None
     surfaces = [name for name in SURFACES if (source / name).exists()]
     films = [episode[kind] for episode in shown for kind in ("mp4", "webp") if kind in episode]
-    copied = [*surfaces, *([] if sweep is None else [SWEEP]), *films]
+    reported = [name for name in (REPORT, MEASURES, QUALITY) if (source / name).exists()]
+    copied = [*surfaces, *([] if sweep is None else [SWEEP]), *films, *reported]
     for name in copied:
         shutil.copyfile(source / name, folder / name)
     entry = _entry(figure, dataset) | {
@@ -95,7 +106,9 @@ def _page(
         "episodes": shown,
         "sweep": sweep,
         "runs": [{name: value for name, value in run.items() if name not in POINTS} for run in runs],
-        "measures": read_json(source / "measures.json") or {},
+        "measures": read_json(source / MEASURES) or {},
+        "report": read_report(source),
+        "tradeoff": traded.get(figure.env),
     }
     about = {"entry": entry, "held": _held(dataset), "scene": entries().get(figure.env)}
     (folder / "index.html").write_text(pages.get_template("slice.html").render(**about))

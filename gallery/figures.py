@@ -11,6 +11,10 @@ from typing import Any
 
 HERE = Path(__file__).parent
 DATA = HERE / "data"
+KINDS: dict[str, type] = {  # of a figure's fields in TOML
+    **dict.fromkeys(("id", "env", "says", "through", "fidelity", "over"), str),
+    **{"dims": list, "number": int, "resolution": int, "options": dict},
+}
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,8 @@ def read_figures(path: Path = HERE / "figures.toml") -> list[Figure]:
     """Read a list of figures."""
     with path.open("rb") as file:
         tables = tomllib.load(file).get("figure", [])
+    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+        raise ValueError(f"{path} needs figures, each a table [[figure]]")
     figures = [_figure(path, table) for table in tables]
     repeated = {figure.id for figure in figures if [other.id for other in figures].count(figure.id) > 1}
     if repeated or not figures:
@@ -83,6 +89,9 @@ def _figure(path: Path, table: dict[str, Any]) -> Figure:
         raise ValueError(
             f"{path}: figure {table.get('id', '?')} has unknown {sorted(unknown)} and lacks {sorted(missing)}"
         )
+    for name, kind in KINDS.items():
+        if not isinstance(value := table.get(name, kind()), kind):
+            raise ValueError(f"{path}: figure {table['id']} has {name} {value!r}, which is no {kind.__name__}")
     if len(table["dims"]) not in (1, 2) or (len(table["dims"]) == 1 and table["env"] != "bounce"):
         raise ValueError(f"{path}: figure {table['id']} needs two dims, or one of bounce; got {table['dims']}")
     return Figure(**(table | {"dims": tuple(table["dims"])}))

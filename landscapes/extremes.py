@@ -19,6 +19,7 @@ from .subject import Subject, difference
 CORNERS = 16  # a box of no more corners is checked at all of them
 BEYOND = (0.01, 0.1)  # how far outside the box, as shares of it
 ROWS = 2  # points that a variant is checked at
+RISE = 0.1  # of the energy there is at first: what semi-implicit steps may add for a while in a stiff contact
 KINDS = {"finite": Status.OK, "non-finite": Status.NONFINITE, "escaped": Status.ESCAPED, "error": Status.ERROR}
 
 
@@ -52,7 +53,7 @@ def checks(
     yield "float32 against float64", lambda: _precisions(subject, "float32 against float64", other)
     for variant in variants:
         yield variant.name, partial(_variant, subject, variant)
-    yield "energy drift", lambda: Finding("energy drift", SKIP, "n/a", "the objective offers no energy")
+    yield "energy drift", lambda: _energy(subject, "energy drift")
 
 
 def corners(dim: int) -> Float[Tensor, "corner dim"]:
@@ -98,11 +99,16 @@ def _at(
     name: str, objective: Objective, x: Float[Tensor, "batch dim"], what: str = "", *, may_refuse: bool = False
 ) -> Finding:
     try:
-        counts, wrong = answers(objective.evaluate(x))
+        found = objective.evaluate(x)
     except ValueError as refusal:
         if not may_refuse:
             raise
         return verdict(name, True, f"refused: {' '.join(str(refusal).split())}")
+    return _judged(name, found, what)
+
+
+def _judged(name: str, found: Evaluation, what: str = "") -> Finding:
+    counts, wrong = answers(found)
     figure = f"{what}: {said(counts)}" if what else said(counts)
     return replace(verdict(name, not wrong, figure, wrong), numbers=counts)
 
@@ -114,8 +120,28 @@ def _variant(subject: Subject, variant: Variant) -> Finding:
         objective = variant.make()
     except ValueError as refusal:
         return verdict(variant.name, True, f"refused: {' '.join(str(refusal).split())}")
-    found = _at(variant.name, objective, subject.x[:ROWS] if variant.x is None else variant.x)
+    if objective is subject.objective and variant.x is None:
+        found = _judged(variant.name, subject.rows(torch.arange(ROWS)))
+    else:
+        found = _at(variant.name, objective, subject.x[:ROWS] if variant.x is None else variant.x)
     return replace(found, why="; ".join(filter(None, (found.why, variant.why))))
+
+
+def _energy(subject: Subject, name: str) -> Finding:
+    """Want the energy of motions that nothing drives to stay or to fall, where the objective offers it.
+
+    `energy(x)` returns it over time, shape (batch, step), counted from rest at the lowest place, or None.
+    """
+    offered = getattr(subject.objective, "energy", None)
+    found = None if offered is None else offered(subject.x[:ROWS])
+    if found is None:
+        return Finding(name, SKIP, "n/a", "the objective offers no energy")
+    first = found[:, :1]
+    rise = difference((found - found.cummin(dim=1).values) / first, torch.zeros_like(found))
+    left = float((found[:, -1:] / first).mean())
+    figure = f"rises by up to {rise:.1e} of what there is at first, of which {left:.4g} are left at the end"
+    judged = verdict(name, rise <= RISE, figure, f"at most {RISE:g} is wanted: the steps add energy")
+    return replace(judged, numbers={"rise": rise, "left": left, "limit": RISE})
 
 
 def _precisions(subject: Subject, name: str, other: Callable[[], Subject] | None) -> Finding:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 import resource
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,9 +20,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .files import replacing
+from .halving import Halving
 from .objective import Objective, Status
 from .plane import Plane
 from .sampling import Progress, sample
+from .spread import RemoteSite, Site, results, workers_of
 from .store import SliceStore, is_slice, plane_of
 from .tiling import Tile
 
@@ -43,13 +47,15 @@ class Cost:
 
 @dataclass(frozen=True)
 class Job:
-    """A slice to sample into `folder`, and how to draw it."""
+    """A slice to sample into `folder`, and how to draw it; `executor` and `made` are those of `sample`."""
 
     objective: Objective
     plane: Plane
     folder: Path
     store: SliceStore
     draw: Callable[[xr.Dataset], Figure]
+    executor: Executor | None = None
+    made: Callable[[], Objective] | None = None
 
     @classmethod
     def open(
@@ -63,6 +69,8 @@ class Job:
         provenance: Mapping[str, Any],
         grad: bool = True,
         force: bool = False,
+        executor: Executor | None = None,
+        made: Callable[[], Objective] | None = None,
     ) -> Job:
         """Go on with the slice in `folder`, or begin it there; `force` begins anew where another slice is."""
         path = folder / STORE
@@ -75,46 +83,16 @@ class Job:
             (folder / SUMMARY).unlink(missing_ok=True)
         else:
             store = SliceStore.open_or_create(path, plane, objective.space, **settings)
-        return cls(objective, plane, folder, store, draw)
+        return cls(objective, plane, folder, store, draw, executor, made)
 
     def cost(self) -> Cost:
-        """Estimate what is left from its own first points, evaluated as they will be but for at most a few seconds."""
-        pending = self.store.pending()
-        left = sum(self.store.count(tile) for tile in pending)
-        if not left:
-            return Cost(0, 0.0, _peak_memory())
-        getattr(self.objective, "prepare", lambda: None)()
-        seconds = left * self._seconds_per_point(self._first_batch(pending))
-        arrays = 8 * int(np.prod(self.plane.resolution)) * (2 + self.plane.dim * self.store.grad)
-        return Cost(left, seconds, _peak_memory() + arrays)
-
-    def _first_batch(self, pending: Sequence[Tile]) -> Float[Tensor, "batch dim"]:
-        batch, parts, size = getattr(self.objective, "preferred_batch", 1), list[Tensor](), 0
-        for tile in pending:
-            if size < batch:
-                parts.append(self.store.points(tile))
-                size += len(parts[-1])
-        return torch.cat(parts)[:batch]
-
-    def _seconds_per_point(self, points: Float[Tensor, "batch dim"]) -> float:
-        """Time as many points as there are threads, again (a first time is longer), then more until they take long.
-
-        A GPU takes a whole batch at once: of one point most would be launches.
-        """
-        whole = getattr(self.objective, "device", "cpu") == "cuda"
-        rows = len(points) if whole else min(len(points), getattr(self.objective, "threads", 1))
-        seconds = self._seconds(points[:rows])
-        if seconds < FIRST_PATIENCE:
-            seconds = self._seconds(points[:rows])
-        while seconds < PATIENCE and rows < len(points):
-            rows = min(4 * rows, len(points))
-            seconds = self._seconds(points[:rows])
-        return seconds / rows
-
-    def _seconds(self, points: Float[Tensor, "batch dim"]) -> float:
-        start = time.perf_counter()
-        self.objective.evaluate(points, grad=self.store.grad)
-        return time.perf_counter() - start
+        """Estimate what is left; workers that compute it do, which warms them, and leaves a GPU of theirs alone."""
+        if self.executor is None:
+            return cost_of(self.objective, self.store)
+        site = Site(Halving(self.objective), self.store, self.made)
+        costs = list(results(self.executor, _cost_there, [(site,)] * workers_of(self.executor)))
+        shares = [1 / cost.seconds for cost in costs if cost.seconds]
+        return replace(costs[0], seconds=1 / sum(shares) if shares else 0.0)
 
     def run(self, progress: Callable[[Progress], None], *, command: str) -> dict[str, Any]:
         """Sample what is missing, draw each finer picture as it completes, write and return the summary."""
@@ -129,7 +107,8 @@ class Job:
                 self.picture()
                 drawn = time.monotonic()
 
-        dataset = sample(self.objective, self.plane, self.store, grad=self.store.grad, progress=follow)
+        how: dict[str, Any] = {"grad": self.store.grad, "executor": self.executor, "made": self.made}
+        dataset = sample(self.objective, self.plane, self.store, progress=follow, **how)
         self._save(dataset)
         computed = last.done - last.resumed if last else 0
         summary = self._summary(dataset, computed, time.monotonic() - start, command)
@@ -168,6 +147,54 @@ class Job:
             "command": command,
             "files": [STORE, PICTURE, SUMMARY],
         }
+
+
+def cost_of(objective: Objective, store: SliceStore) -> Cost:
+    """Estimate what is left of a slice from its own first points, evaluated as they will be; that takes seconds."""
+    pending = store.pending()
+    left = sum(store.count(tile) for tile in pending)
+    if not left:
+        return Cost(0, 0.0, _peak_memory())
+    getattr(objective, "prepare", lambda: None)()
+    seconds = left * _seconds_per_point(objective, _first_batch(objective, store, pending), grad=store.grad)
+    arrays = 8 * math.prod(store.shape) * (2 + store.plane.dim * store.grad)
+    return Cost(left, seconds, _peak_memory() + arrays)
+
+
+def _cost_there(site: Site | RemoteSite) -> Cost:
+    here = site.here()
+    return cost_of(here.objective.objective, here.store)
+
+
+def _first_batch(objective: Objective, store: SliceStore, pending: Sequence[Tile]) -> Float[Tensor, "batch dim"]:
+    batch, parts, size = getattr(objective, "preferred_batch", 1), list[Tensor](), 0
+    for tile in pending:
+        if size < batch:
+            parts.append(store.points(tile))
+            size += len(parts[-1])
+    return torch.cat(parts)[:batch]
+
+
+def _seconds_per_point(objective: Objective, points: Float[Tensor, "batch dim"], *, grad: bool) -> float:
+    """Time as many points as there are threads, again (a first time is longer), then more until they take long.
+
+    A GPU takes a whole batch at once: of one point most would be launches.
+    """
+    whole = getattr(objective, "device", "cpu") == "cuda"
+    rows = len(points) if whole else min(len(points), getattr(objective, "threads", 1))
+    seconds = _seconds(objective, points[:rows], grad=grad)
+    if seconds < FIRST_PATIENCE:
+        seconds = _seconds(objective, points[:rows], grad=grad)
+    while seconds < PATIENCE and rows < len(points):
+        rows = min(4 * rows, len(points))
+        seconds = _seconds(objective, points[:rows], grad=grad)
+    return seconds / rows
+
+
+def _seconds(objective: Objective, points: Float[Tensor, "batch dim"], *, grad: bool) -> float:
+    start = time.perf_counter()
+    objective.evaluate(points, grad=grad)
+    return time.perf_counter() - start
 
 
 def flat_points(dataset: xr.Dataset) -> int | None:

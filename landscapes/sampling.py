@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import errno
+import math
+import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 
-import torch
 import xarray as xr
 
+from .halving import Halving
 from .identity import check_identity
-from .objective import Evaluation, Objective, Status, evaluated, name_of
+from .objective import Objective, Status, name_of
 from .plane import Plane
+from .spread import Filled, Site, WorkersLostError, equal_batches, spread, workers_of
 from .store import SliceStore
 from .tiling import Tile
 
@@ -41,13 +47,19 @@ def sample(
     grad: bool = True,
     batch: int | None = None,
     progress: Callable[[Progress], None] | None = None,
+    executor: Executor | None = None,
+    made: Callable[[], Objective] | None = None,
 ) -> xr.Dataset:
     """Evaluate an objective on a plane and return the slice; what `store` holds already is not evaluated again.
 
-    Without a store the slice lives in memory. `batch` is the least number of points per evaluation (default: the
-    objective's `preferred_batch`, else one tile); `progress` is called once at the start and after every tile. Stop it
-    at any instant: the same call goes on, and the result is bit for bit that of an uninterrupted one, given an
-    objective whose rows do not depend on their batch.
+    Without a store the slice lives in memory. `batch` is the number of points per evaluation, rounded up to whole tiles
+    (default: the objective's `preferred_batch`, else one tile); `progress` is called once at the start and after every
+    tile. Stop it at any instant: the same call goes on, and the result is bit for bit that of an uninterrupted one,
+    given an objective whose rows do not depend on their batch. A batch that does not fit into memory is halved.
+
+    With an `executor` its workers evaluate batches and write them to the store, which processes must see at the same
+    path. Threads share the objective; in a process `made`, a function that can be pickled, makes it once, or else it is
+    pickled itself. Batches are equal then, and of at most `batch` points. Where workers are lost, `WorkersLostError`.
     """
     if store is None:
         store = SliceStore.in_memory(plane, objective.space, identity={"objective": name_of(objective)}, grad=grad)
@@ -57,6 +69,7 @@ def sample(
     counts: Counter[Status] = Counter({kind: int((status == kind).sum()) for kind in Status if kind != Status.MISSING})
     resumed, pending = counts.total(), store.pending(status)
     levels = _levels(store, pending)
+    _warn_of_damage(store, pending)
 
     def report(left: Sequence[Tile]) -> None:
         nonlocal levels
@@ -66,13 +79,45 @@ def sample(
 
     report(pending)
     left = list(pending)
-    for tiles in _batches(store, batch, set(pending)):
-        for tile, part in _evaluate(objective, store, tiles, grad=grad):
-            store.write(tile, part)
-            counts.update(Status(int(kind)) for kind in part.status)
-            left.remove(tile)
+    site = Site(Halving(objective), store, made)
+    with _resumable(store, counts), closing(_filled(site, pending, batch, executor)) as tiles:
+        for filled in tiles:
+            for note in filled.notes:
+                warnings.warn(note, RuntimeWarning, stacklevel=2)
+            counts.update(filled.statuses)
+            left.remove(filled.tile)
             report(left)
     return store.dataset()
+
+
+def _filled(
+    site: Site, pending: Sequence[Tile], batch: int, executor: Executor | None
+) -> Generator[Filled, None, None]:
+    if executor is None:
+        for tiles in _batches(site.store, batch, set(pending)):
+            yield from site.fill(tiles)
+    elif pending:
+        yield from spread(site, equal_batches(site.store, pending, batch, workers_of(executor)), executor)
+
+
+def _warn_of_damage(store: SliceStore, pending: Sequence[Tile]) -> None:
+    for tile in store.damaged(pending):
+        warnings.warn(f"{store.path}: tile {tile.index} is damaged and computed again", RuntimeWarning, stacklevel=3)
+
+
+@contextmanager
+def _resumable(store: SliceStore, counts: Counter[Status]) -> Iterator[None]:
+    """Say what is kept where the disk is full or the workers are lost."""
+    try:
+        yield
+    except OSError as error:
+        kept = f"{counts.total()} of {math.prod(store.shape)} points are kept in {store.path or 'memory'}"
+        if isinstance(error, WorkersLostError):
+            raise WorkersLostError(f"{error}; {kept}, and the same command goes on from there") from error
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            said = f"the disk is full; {kept}: make room, and the same command goes on from there"
+            raise OSError(error.errno, said) from error
+        raise
 
 
 def _check_store(store: SliceStore, objective: Objective, plane: Plane, *, grad: bool) -> None:
@@ -95,17 +140,3 @@ def _batches(store: SliceStore, batch: int, pending: set[Tile]) -> Iterator[list
             yield [member for member in group if member in pending]
             group, size = [], 0
     yield [member for member in group if member in pending]
-
-
-def _evaluate(
-    objective: Objective, store: SliceStore, tiles: Sequence[Tile], *, grad: bool
-) -> Iterator[tuple[Tile, Evaluation]]:
-    if not tiles:
-        return
-    parts = [store.points(tile) for tile in tiles]
-    evaluation = evaluated(objective, torch.cat(parts), grad=grad)
-    start = 0
-    for tile, part in zip(tiles, parts, strict=True):
-        rows = slice(start, start := start + len(part))
-        gradient = None if evaluation.grad is None else evaluation.grad[rows]
-        yield tile, Evaluation(evaluation.loss[rows], gradient, evaluation.status[rows])

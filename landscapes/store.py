@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from zarr.storage import MemoryStore
 
 from .files import placing
 from .identity import StoreError, StoreExistsError, check_identity, full_identity, plain_json
+from .integrity import check_integrity
 from .layout import CODECS, SMALL, consolidate, create_array, flags
 from .objective import Evaluation, Status
 from .plane import Plane
@@ -101,7 +103,16 @@ class SliceStore:
             raise StoreError(f"there is no slice store at {path}; make one with `landscape slice`")
         if not is_slice(path):
             raise StoreError(f"{path} is no slice store of format {FORMAT}; move it away or write elsewhere")
-        return cls(zarr.open_group(path, mode="r+", use_consolidated=False), path)
+        try:
+            group = zarr.open_group(path, mode="r+", use_consolidated=False)
+            store = cls(group, path)
+            axes = {**dict(_coordinates(store.plane)), "dim": np.array(store.identity["parameters"], dtype=object)}
+            check_integrity(path, group, axes, ["loss", "status", *(["grad"] if store.identity["gradients"] else [])])
+            return store
+        except StoreError:
+            raise
+        except Exception as error:  # a damaged axis or layout raises whatever reads it; of tiles nothing is read here
+            raise StoreError(f"{path} is damaged ({type(error).__name__}: {error}); begin anew with --force") from error
 
     @classmethod
     def open_or_create(
@@ -149,6 +160,27 @@ class SliceStore:
         """Return the tiles that are not finished, coarse to fine; `status` spares reading it again."""
         status = self.status() if status is None else status
         return [tile for tile in self.tiles() if (status[self._place(tile)] == Status.MISSING).any()]
+
+    def damaged(self, pending: Sequence[Tile]) -> list[Tile]:
+        """Return those of the tiles not finished that once were: their status is there, or torn.
+
+        A tile that another process has finished in the meantime is none of them.
+        """
+        try:
+            status = np.asarray(self._values["status"][:])
+            written = [tile for tile in pending if status[self._place(tile)].any()]
+        except Exception:  # as in `_read`
+            written = [tile for tile in pending if self._has_status(tile)]
+        return [tile for tile in written if not self.statuses(tile)]
+
+    def statuses(self, tile: Tile) -> Counter[Status]:
+        """Count how the points of a finished tile ended; nothing of one that is not finished."""
+        try:
+            values = {name: np.asarray(array[self._place(tile)]) for name, array in self._values.items()}
+        except Exception:  # as in `_read`
+            return Counter()
+        status = self._judged(values)
+        return Counter() if (status == Status.MISSING).any() else Counter(map(Status, status.ravel().tolist()))
 
     def count(self, tile: Tile) -> int:
         """Return how many points a tile has."""
@@ -200,17 +232,28 @@ class SliceStore:
         sizes = zip(tile.index, self.side, self.shape, strict=True)
         return tuple(slice(at * side, min((at + 1) * side, points)) for at, side, points in sizes)
 
+    def _has_status(self, tile: Tile) -> bool:
+        try:
+            return bool(np.asarray(self._values["status"][self._place(tile)]).any())
+        except Exception:  # as in `_read`
+            return True
+
+    def _judged(self, values: Mapping[str, NDArray[Any]]) -> NDArray[np.int8]:
+        """Return the status, MISSING where it and the numbers contradict each other."""
+        intact = np.isfinite(values["loss"])
+        if self.grad:
+            intact &= np.isfinite(values["grad"]).all(axis=-1)
+        status: NDArray[np.int8] = values["status"]
+        status[(status == Status.OK) != intact] = Status.MISSING
+        return status
+
     def _read(self, box: tuple[slice, ...]) -> dict[str, NDArray[Any]]:
         """Read a box of whole tiles, each array at once; where that fails, tile by tile, leaving out what is torn."""
         try:
             values = {name: np.asarray(array[box]) for name, array in self._values.items()}
         except Exception:  # a damaged chunk raises whatever its codec does
             values = self._salvage(box)
-        intact = np.isfinite(values["loss"])
-        if self.grad:
-            intact &= np.isfinite(values["grad"]).all(axis=-1)
-        status = values["status"]
-        status[(status == Status.OK) != intact] = Status.MISSING
+        status = self._judged(values)
         for tile in self.tiles() if (status == Status.MISSING).any() else ():  # finished whole or not at all
             if (status[self._place(tile)] == Status.MISSING).any():
                 status[self._place(tile)] = Status.MISSING

@@ -50,13 +50,14 @@ def judge(found: Ruggedness, jumps: Jumps | None, cosine: Values) -> Verdict:
     """Put a landscape into words.
 
     `cosine` is that of its gradients with differences over two samples, NaN where neither shows a slope. A gradient
-    of zero is no direction, so it counts for the word zero only.
+    of zero is no direction, so it counts for the word zero only. What jumps is not called very smooth.
     """
     reasons = dict([_surface(found)])
     if found.level.value >= MUCH:
         reasons[LARGE_FLAT] = f"{found.level.value:.0%} of the samples are level with their neighbours"
     if jumps is not None and len(jumps.height):
         share = jumps.share
+        reasons.pop(VERY_SMOOTH, None)
         reasons[DISCONTINUOUS] = f"{len(jumps.height)} jumps found, between {share.value:.1%} of neighbouring samples"
     return Verdict(reasons | _gradients(found, cosine))
 

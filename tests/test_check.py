@@ -1,17 +1,22 @@
 """`landscape check`: ours and anyone's, what it prints, how it leaves."""
 
 import json
+import re
 import sys
 from collections.abc import Callable, Iterator
+from itertools import takewhile
 from pathlib import Path
 
 import pytest
 
 from gradscape import check_report
-from gradscape.envs.registry import Entry, entries
+from gradscape.envs.registry import Entry, entries, make
 from gradscape.landscapes import conformance
 
 from .command import Said
+
+FUNCTIONS = [name for name, entry in entries().items() if set(entry.fidelities) == {"exact"}]
+BENCHMARKS = Path(__file__).parent.parent / "BENCHMARKS.md"
 
 # Another package's environment: its gradient is wrong where asked to be.
 BOWL = '''
@@ -67,6 +72,37 @@ def test_bounce_passes_at_draft(run: Callable[..., Said], tmp_path: Path) -> Non
         assert sum(checks[name]["numbers"][kind] for kind in ("finite", "non-finite", "escaped", "error")) >= 2
     assert "bounce · draft · cpu · warp · 4 points: some 148 episodes and" in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", [*FUNCTIONS, "pinball-2", "pinball-16"])
+def test_quick_environments_pass_at_draft(name: str, run: Callable[..., Said], tmp_path: Path) -> None:
+    done = run("check", name, "--points", "2", "--device", "cpu", "--json", cwd=tmp_path)
+    assert [found for found in json.loads(done.stdout)["checks"] if found["outcome"] not in ("pass", "skip")] == []
+    assert done.returncode == 0
+
+
+@pytest.mark.parametrize("name", ["flip", "fluid"])
+def test_slow_environments_keep_their_promises_at_draft(name: str) -> None:
+    scene = check_report.Scene(name, make(name, device="cpu"), {})
+    findings = takewhile(lambda found: found.check != "finite differences", check_report._findings(scene, 2, 0, print))
+    assert {found.check: found.outcome for found in findings} == dict.fromkeys(
+        ["shapes", *conformance.PROMISES], "pass"
+    )
+
+
+def test_a_time_step_is_checked_once_however_it_is_called(run: Callable[..., Said], tmp_path: Path) -> None:
+    done = run("check", "cartpole", "--points", "2", "--device", "cpu", cwd=tmp_path)
+    nearest = "the nearest step that fits into a control step is that of dt 1x"
+    lines = [line for line in done.stdout.splitlines() if " dt " in line.partition("(")[0]]
+    assert [line.split("(")[-1].rstrip(")") for line in lines[1:]] == [nearest] * 3
+    assert lines[0].startswith("pass ")
+    assert done.returncode == 0
+
+
+def test_the_whole_check_of_every_environment_is_on_record() -> None:
+    """It takes minutes for the soft bodies: its results stand in BENCHMARKS.md, with the command."""
+    rows = re.findall(r"^\| `([\w-]+)` \| (passes|fails) \|", BENCHMARKS.read_text(), re.MULTILINE)
+    assert dict(rows) == dict.fromkeys(set(entries()) - set(FUNCTIONS), "passes")
 
 
 def test_anyone_s_environment_is_checked_and_each_check_has_a_line(

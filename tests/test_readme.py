@@ -1,9 +1,13 @@
 """The README's worked examples run as they stand."""
 
+import json
 import re
 import subprocess
 import sys
 from pathlib import Path
+
+from gradscape.gallery.figures import DATA, read_figures
+from gradscape.measure_tables import environments_table
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -38,3 +42,12 @@ def test_every_picture_and_file_the_readme_names_is_there() -> None:
     named = [name for name in re.findall(r"\]\(([^)]+)\)", README) if "://" not in name]
     assert len(named) >= 3
     assert [name for name in named if not (ROOT / name).exists()] == []
+
+
+def test_the_table_of_environments_is_what_the_reports_say() -> None:
+    """It stands between two marks, and nowhere without reports; a failure prints what has to stand there."""
+    files = [DATA / figure.id / "report.json" for figure in read_figures()]
+    records = [json.loads(file.read_text()) for file in files if file.exists()]
+    found = re.findall(r"<!-- measured -->\n\n(.*?)\n<!-- /measured -->", README, flags=re.DOTALL)
+    wanted = [environments_table(records)] if records else []
+    assert found == wanted, "between <!-- measured --> and <!-- /measured --> has to stand:\n\n" + "\n".join(wanted)

@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -11,6 +12,7 @@ from gradscape import measure_report
 from gradscape.envs.registry import entries
 from gradscape.gallery.figures import read_figures
 from gradscape.gallery.words import paper_words
+from gradscape.measure_tables import environments_table
 
 from .command import Said
 
@@ -41,7 +43,7 @@ def test_a_slice_is_reported_in_numbers_and_words(run: Run, cut: Path, tmp_path:
     assert "smooth with local minima: minima deeper than 1 % of the range: 3" in again.stdout
     other = run("report", "cut", "--points", "3", "--out", "told", cwd=tmp_path)
     assert other.returncode == 2
-    assert "holds a report of other settings" in other.stderr
+    assert "holds another report (points 2 there, 3 here)" in other.stderr
 
 
 def test_an_environment_without_figures_is_sampled_first(run: Run, tmp_path: Path) -> None:
@@ -73,6 +75,84 @@ def test_all_makes_a_table_with_the_papers_words(run: Run, tmp_path: Path) -> No
     assert "all/bounce-x is there already" in again.stderr
     assert (tmp_path / "all/pinball-2-0-1/report.json").exists()
     assert "pinball-2-0-1" in again.stdout
+    measured = environments_table(summary["reports"]).splitlines()
+    assert len({line.count("|") for line in measured}) == 1
+    assert measured[3].startswith("| `pinball-2` | 1 |")
+
+
+def test_one_slice_that_fails_does_not_lose_the_others(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("bounce-x", "bounce-y"):  # quick ones, in the places of figures
+        run("slice", "branin", "--dims", "0", "1", "--resolution", "4", "--out", f"data/{name}", cwd=tmp_path)
+    measured, calls = measure_report._character, iter((True, False))
+
+    def failing(*parts: Any) -> object:
+        if next(calls):
+            raise RuntimeError("out of\nmemory")
+        return measured(*parts)
+
+    monkeypatch.setattr(measure_report, "_character", failing)
+    command = ("report", "--all", "--data", "data", "--points", "2", "--out", "all")
+    done = run(*command, "--json", cwd=tmp_path)
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1] == "not reported: bounce-x: RuntimeError: out of memory"
+    summary = json.loads(done.stdout)
+    assert [record["name"] for record in summary["reports"]] == ["bounce-y"]
+    assert list(summary["failed"]) == ["bounce-x"]
+    monkeypatch.setattr(measure_report, "_character", measured)
+    again = run(*command, cwd=tmp_path)
+    assert again.returncode == 0
+    assert "all/bounce-y is there already" in again.stderr
+    assert "bounce-x" in again.stdout
+
+
+def test_a_report_measured_on_another_device_is_taken_and_named(run: Run, cut: Path, tmp_path: Path) -> None:
+    run("report", "cut", "--points", "2", "--out", "told", cwd=tmp_path)
+    file = tmp_path / "told/report.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "device": "cuda"}))
+    done = run("report", "cut", "--points", "2", "--out", "told", cwd=tmp_path)
+    assert done.returncode == 0
+    assert "told is there already, measured on cuda" in done.stderr
+
+
+def test_a_report_beside_its_slice_is_copied_unless_it_is_another(run: Run, cut: Path, tmp_path: Path) -> None:
+    run("report", "cut", "--points", "2", "--out", "told", cwd=tmp_path)
+    for file in (tmp_path / "told").iterdir():
+        shutil.copyfile(file, cut / file.name)
+    same = run("report", "cut", "--points", "2", "--out", "same", cwd=tmp_path)
+    assert "same is copied from cut" in same.stderr
+    assert "episodes" not in same.stderr
+    for file in (tmp_path / "told").iterdir():
+        assert (tmp_path / "same" / file.name).read_bytes() == file.read_bytes()
+    other = run("report", "cut", "--points", "3", "--out", "other", cwd=tmp_path)
+    assert "copied" not in other.stderr
+    assert json.loads((tmp_path / "other/report.json").read_text())["key"]["points"] == 3
+
+
+def test_a_row_of_an_environment_spans_its_slices_and_says_whether_the_paper_agrees() -> None:
+    def record(notable: int, cosine: float, words: list[str]) -> dict[str, Any]:
+        def scale(points: int, value: float) -> dict[str, Any]:
+            return {"points": points, "cosine": {"value": value}}
+
+        return {
+            "env": "fluid",
+            "losses": {"notable": notable, "flat": {"value": notable / 100}},
+            "jumps": {"share": {"value": None}},
+            "differences": [scale(3, -1.0), scale(20, cosine), scale(36, 0.0)],  # the first: few show any slope
+            "differences_of_samples": [scale(30, cosine / 2)],
+            "verdict": {"words": words},
+            "paper": {"words": [{"word": word, "measured": word in words} for word in ("rugged", "gradients good")]},
+        }
+
+    two = [record(2, 0.5, ["rugged"]), record(12, -0.25, ["rugged", "gradients good"])]
+    row = environments_table(two).splitlines()[2]
+    assert row == (
+        "| `fluid` | 2 | 2 to 12 | 2 to 12 % |  | −0.25 to 0.50 | −0.12 to 0.25 | "
+        "rugged, gradients good (1 of 2) | rugged, gradients good (1 of 2) | in part |"
+    )
+    assert environments_table(two[1:]).endswith("| yes |\n")
+    assert environments_table([record(0, 0.0, [])]).endswith("| no |\n")
 
 
 def test_a_stopped_report_says_what_is_kept(

@@ -60,14 +60,18 @@ function draped(run, row) {
   return under && flat([right, back, under[2] + 0.015]);
 }
 
-// Beside the edge that is nearer to the viewer.
-function beside(brush, axis, along, aside) {
+// Beside the edge that is nearer to the viewer; below the other axis' label, where both would be in one place.
+function beside(brush, axis, along, other) {
   const edge = (side, share, off) => along(share, side ? 1 + off : -off);
   const side = project(edge(1, 0.5, 0))[2] > project(edge(0, 0.5, 0))[2] ? 1 : 0;
   brush.textAlign = "center";
   const [middle, under] = flat(edge(side, 0.5, 0.2));
-  const room = brush.measureText(aside).width / 2 + 6;
-  brush.fillText(aside, clamp(middle, room, stage.clientWidth - room), under);
+  const room = brush.measureText(axis.label).width / 2 + 6;
+  const label = { middle: clamp(middle, room, stage.clientWidth - room), under, room };
+  if (other && Math.abs(label.middle - other.middle) < room + other.room && Math.abs(under - other.under) < 16) {
+    label.under = other.under + 16;
+  }
+  brush.fillText(axis.label, label.middle, label.under);
   const share = (value) => (value - ends(axis)[0]) / (ends(axis)[1] - ends(axis)[0]);
   brush.font = "12px system-ui, sans-serif";
   for (const value of [axis.ticks[0], axis.ticks[axis.ticks.length - 1]]) {
@@ -75,6 +79,7 @@ function beside(brush, axis, along, aside) {
     brush.fillText(number(value), right, down + 4);
   }
   brush.font = "13px system-ui, sans-serif";
+  return label;
 }
 
 // The height's scale at the corner that is farthest to the left.
@@ -121,8 +126,8 @@ const repaint = fit(stage, (brush, width, height) => {
   brush.fillStyle = ink("ink");
   brush.lineWidth = 1;
   brush.font = "13px system-ui, sans-serif";
-  beside(brush, across, (share, off) => [share, off, 0], across.label);
-  beside(brush, up, (share, off) => [off, share, 0], up.label);
+  const first = beside(brush, across, (share, off) => [share, off, 0]);
+  beside(brush, up, (share, off) => [off, share, 0], first);
   heights(brush);
 });
 

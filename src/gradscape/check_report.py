@@ -140,14 +140,25 @@ def _time_steps(scene: Scene) -> list[Variant]:
 
     if not scene.env.fidelity.dt:
         return [Variant("dt 1x to 8x", why="it has no time step")]
-    return [_time_step(scene, factor) for factor in FACTORS]
+    found: list[Variant] = []
+    taken: dict[float, int] = {}
+    for factor in FACTORS:
+        dt = scene.env.nearest_dt(factor * scene.env.fidelity.dt)
+        if dt in taken:
+            why = f"the nearest step that fits into a control step is that of dt {taken[dt]}x"
+            found.append(Variant(f"dt {factor}x", why=why))
+        else:
+            found.append(_time_step(scene, factor, dt))
+            taken[dt] = factor
+    return found
 
 
-def _time_step(scene: Scene, factor: int) -> Variant:
+def _time_step(scene: Scene, factor: int, dt: float) -> Variant:
     from .landscapes.extremes import Variant
 
+    if factor == 1:
+        return Variant("dt 1x", lambda: scene.env)
     own = scene.env.fidelity
-    dt = scene.env.nearest_dt(factor * own.dt)
     fidelity = replace(own, name=f"{own.name}, dt {factor}x", dt=dt)
     made, note = partial(scene.remade, fidelity=fidelity), ""
     if abs(dt - factor * own.dt) > 1e-6 * dt:
@@ -185,7 +196,8 @@ def _horizons(scene: Scene) -> list[Variant]:
     if "horizon" not in {field.name for field in fields(scene.env.options)}:
         return [Variant("horizon 1x to 8x", why="it has no option `horizon`")]
     own = scene.env.options.horizon
-    return [Variant(f"horizon {factor}x", partial(scene.remade, horizon=factor * own)) for factor in FACTORS]
+    longer = [Variant(f"horizon {factor}x", partial(scene.remade, horizon=factor * own)) for factor in FACTORS[1:]]
+    return [Variant("horizon 1x", lambda: scene.env), *longer]
 
 
 def _show(finding: Finding, console: Console) -> None:

@@ -30,6 +30,8 @@ from rich.table import Table
 from .envs.registry import code_digest, entries, make
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     import xarray as xr
     from matplotlib.figure import Figure
 
@@ -107,6 +109,7 @@ def cut(
     out: str | None,
     as_json: bool,
     force: bool,
+    scheduler: str | None = None,
 ) -> None:
     """Sample a slice into its folder and say what it costs, how far it is and what came out."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
@@ -119,7 +122,11 @@ def cut(
 
     window = read_extent(extent)
     plane = Plane.through(env.space, point(env, through), dims, resolution=resolution, extent=window)
-    folder, summary = fill(console, env, plane, out=Path(out) if out else None, grad=grad, force=force)
+    from .cluster import workers
+
+    with workers(scheduler, env.device) as executor:
+        into = Path(out) if out else None
+        folder, summary = fill(console, env, plane, out=into, grad=grad, force=force, executor=executor)
     if as_json:
         print(json.dumps({**summary, "folder": str(folder)}))
 
@@ -134,11 +141,13 @@ def fill(
     grad: bool = True,
     force: bool = False,
     boxed: bool = False,
+    executor: Executor | None = None,
 ) -> tuple[Path, dict[str, Any]]:
     """Sample a slice into `out`, by default a folder named after it under `root`; stopping it ends the process.
 
-    `boxed` leaves out what lies beyond the parameters' bounds.
+    `boxed` leaves out what lies beyond the parameters' bounds. With an `executor` its workers compute.
     """
+    from .cluster import recipe
     from .landscapes.adapters import within_box
     from .landscapes.job import Job
 
@@ -146,7 +155,8 @@ def fill(
     identity, provenance = identity_of(env) | ({"boxed": True} if boxed else {}), provenance_of(env, command)
     job = Job.open(
         within_box(env) if boxed else env, plane, out or root / _folder(identity, plane, grad), picture_of(env, plane),
-        identity=identity, provenance=provenance, grad=grad, force=force,
+        identity=identity, provenance=provenance, grad=grad, force=force, executor=executor,
+        made=None if boxed else recipe(env),
     )  # fmt: skip
     try:
         _announce(console, job, env)

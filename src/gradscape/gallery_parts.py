@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import abc
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
+from .cluster import recipe
 from .console import follow, identity_of, outcome, picture_of, provenance_of
 from .envs.registry import environment_class, make
 from .gallery.figures import Figure
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from .envs.base import Environment
     from .landscapes.job import Job
     from .landscapes.plane import Plane
@@ -47,6 +50,7 @@ class Part(abc.ABC):
     figure: Figure
     root: Path
     device: str
+    executor: Executor | None = None  # whose workers sample slices and sweeps
 
     @property
     def folder(self) -> Path:
@@ -127,6 +131,7 @@ class Slice(Part):
             env, plane, self.folder, picture_of(env, plane),
             identity=identity_of(env), provenance=provenance_of(env, self.figure.command(self.device)),
             force=self.state().done == 0,  # nothing is lost of a store made by other code or for another device
+            executor=self.executor, made=recipe(env),
         )  # fmt: skip
 
 
@@ -173,7 +178,7 @@ class Sweep(Part):
         swept = moved(self.figure.over, env, plane_of_figure(self.figure, env, COARSE), FRAMES, made)
         grad = self.figure.over != SMOOTHING
         folder = sweep_folder(env, swept, self.figure.over, grad=grad)
-        return Job.open(env, swept, folder, command=self.label(), grad=grad)
+        return replace(Job.open(env, swept, folder, command=self.label(), grad=grad), executor=self.executor)
 
 
 class Searches(Part):

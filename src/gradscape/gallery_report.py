@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from .cluster import workers
 from .console import duration, size
 from .gallery.figures import DATA, Figure, chosen, read_figures
 from .gallery_episodes import Episodes
@@ -36,6 +37,7 @@ def compute(
     device: str,
     resolution: int | None,
     data: str | None,
+    scheduler: str | None = None,
 ) -> None:
     """Make what is missing of the figures, say first what it should cost, and leave with 1 where something failed."""
     if unknown := set(parts) - set(PARTS):
@@ -43,9 +45,11 @@ def compute(
     console, root = Console(stderr=True, soft_wrap=True, highlight=False), Path(data) if data else DATA
     figures = [_changed(figure, fidelity, resolution) for figure in chosen(read_figures(), only)]
     failed: set[str] = set()
-    for name, kind in PARTS.items():  # slices first: the others are made of them
-        if name in parts or not parts:
-            _make(console, name, [kind(figure, root, device) for figure in figures if figure.id not in failed], failed)
+    with workers(scheduler, device) as executor:
+        for name, kind in PARTS.items():  # slices first: the others are made of them
+            if name in parts or not parts:
+                sound = [figure for figure in figures if figure.id not in failed]
+                _make(console, name, [kind(figure, root, device, executor) for figure in sound], failed)
     if failed:
         console.print(
             f"{len(failed)} of {len(figures)} figures failed: {', '.join(sorted(failed))}\n"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shlex
+import shutil
 import sys
 import time
 from collections.abc import Sequence
@@ -20,7 +21,8 @@ from rich.table import Table
 from .console import duration, fill, identity_of, size
 from .envs.registry import code_digest, entries, make
 from .gallery.figures import DATA, read_figures
-from .results import SLICE, inside
+from .measure_tables import by_environment, slices_markdown, slices_table
+from .results import SLICE, environment_of, inside
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -35,7 +37,6 @@ REPORT, TABLE, PICTURE, MEASURES = "report.json", "report.md", "gradient-quality
 PRECISION = {"float32": 2.0**-23, "float64": 2.0**-52}
 RESOLUTION = 24  # points per axis of a slice that is sampled for its report
 TRIAL = 32  # most episodes that are timed beforehand
-HEADINGS = ("slice", "minima", "flat", "jumps", "cosine", "measured", "the paper's words", "measured too")
 
 
 @dataclass(frozen=True)
@@ -69,18 +70,22 @@ def report(
     single = len(subjects) == 1 and what is not None
     _check(folder, single)
     places = [folder if single else folder / subject.name for subject in subjects]
-    records = _measured(console, subjects, places, settings, device)
+    records, failed = _measured(console, subjects, places, settings, device)
     if single:
         _show(records[0], as_json, folder)
         return
-    summary = {"reports": records, "environments": _by_environment(records)}
+    summary = {"reports": records, "environments": by_environment(records), "failed": failed}
     _write(folder / REPORT, json.dumps(summary, indent=2) + "\n")
-    _write(folder / TABLE, _markdown(records))
+    _write(folder / TABLE, slices_markdown(records))
     console.print(f"{folder}: {REPORT}, {TABLE}, and a folder of each slice", markup=False)
     if as_json:
         print(json.dumps({**summary, "folder": str(folder)}))
     else:
-        Console().print(_table(records))
+        Console().print(slices_table(records))
+    for name, why in failed.items():
+        console.print(f"not reported: {name}: {why}", markup=False)
+    if failed:
+        sys.exit(1)
 
 
 def _all(root: Path) -> list[Subject]:
@@ -118,11 +123,15 @@ def _finished(store: Path) -> bool:
 
 def _measured(
     console: Console, subjects: Sequence[Subject], places: Sequence[Path], settings: dict[str, Any], device: str
-) -> list[dict[str, Any]]:
-    """Return a record of each slice, in the order given: those on disk as they are, the others measured now."""
+) -> tuple[list[dict[str, Any]], dict[str, str]]:
+    """Return a record of each slice, in the order given: those on disk as they are, the others measured now.
+
+    One that fails among several is left out, and returned by name with what was wrong.
+    """
     from .gallery.words import paper_words
 
     records: list[dict[str, Any]] = []
+    failed: dict[str, str] = {}
     for number, (subject, folder) in enumerate(zip(subjects, places, strict=True)):
         if len(subjects) > 1:
             console.print(f"slice {number + 1} of {len(subjects)}: {subject.name}", markup=False)
@@ -131,12 +140,17 @@ def _measured(
         except KeyboardInterrupt:
             again = shlex.join(["landscape", *sys.argv[1:]])
             console.print(
-                f"stopped: {number} of {len(subjects)} reports are kept in {places[0].parent}; "
+                f"stopped: {len(records)} of {len(subjects)} reports are kept in {places[0].parent}; "
                 f"the same command goes on with the next: {again}",
                 markup=False,
             )
             sys.exit(130)
-    return records
+        except Exception as error:  # whatever one slice meets, the others are not lost by it
+            if len(subjects) == 1:
+                raise
+            failed[subject.name] = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            console.print(f"{subject.name} failed: {failed[subject.name]}", markup=False)
+    return records, failed
 
 
 def _one(
@@ -147,14 +161,11 @@ def _one(
     dataset = open_slice(subject.store)
     if "grad" not in dataset or min(dataset["loss"].shape) < 3:
         raise ValueError(f"{subject.name}: report needs a slice with gradients and three samples per axis; got another")
-    env = _environment(dataset, device)
-    key = {**settings, "slice": _digest(dataset), "code": code_digest(type(env)), "device": env.device}
+    env = environment_of(dataset, device)
+    key = {**settings, "slice": _digest(dataset), "code": code_digest(type(env))}
+    _fetch(console, subject.store.parent, folder, key)
     if (folder / REPORT).exists():
-        kept: dict[str, Any] = json.loads((folder / REPORT).read_text())
-        if kept.get("key") != key:
-            raise ValueError(f"{folder} holds a report of other settings; write elsewhere with --out, or delete it")
-        console.print(f"{folder} is there already", markup=False)
-        return kept
+        return _kept(console, folder, key, env.device)
     _warn(console, subject, dataset, env)
     start = time.monotonic()
     character = _character(console, env, dataset, settings)
@@ -172,6 +183,37 @@ def _one(
     }
     _leave(console, dataset, character, record, folder)
     return record
+
+
+def _fetch(console: Console, source: Path, folder: Path, key: dict[str, Any]) -> None:
+    """Copy the same report from beside its slice, where the gallery has it, rather than measure again."""
+    files = [source / name for name in (PICTURE, MEASURES, REPORT)]
+    if (folder / REPORT).exists() or not all(file.exists() for file in files):
+        return
+    if _same(json.loads((source / REPORT).read_text()), key):
+        folder.mkdir(parents=True, exist_ok=True)
+        for file in files:
+            shutil.copyfile(file, folder / file.name)
+        console.print(f"{folder} is copied from {source}", markup=False)
+
+
+def _same(record: dict[str, Any], key: dict[str, Any]) -> bool:
+    theirs = record.get("key", {})
+    return all(theirs.get(name) == key[name] for name in key)
+
+
+def _kept(console: Console, folder: Path, key: dict[str, Any], device: str) -> dict[str, Any]:
+    """Return the report that is there, on whatever device it was measured."""
+    kept: dict[str, Any] = json.loads((folder / REPORT).read_text())
+    if not _same(kept, key):
+        theirs = kept.get("key", {})
+        said = ", ".join(
+            f"{name} {theirs.get(name)} there, {key[name]} here" for name in key if theirs.get(name) != key[name]
+        )
+        raise ValueError(f"{folder} holds another report ({said}); write elsewhere with --out, or delete it")
+    elsewhere = f", measured on {kept['device']}" if kept["device"] != device else ""
+    console.print(f"{folder} is there already{elsewhere}", markup=False)
+    return kept
 
 
 def _character(console: Console, env: Environment, dataset: xr.Dataset, settings: dict[str, Any]) -> Character:
@@ -238,15 +280,6 @@ def _rate(env: Environment, grad: bool) -> float:
         if seconds > 1:
             return seconds / env.threads
     return seconds
-
-
-def _environment(dataset: xr.Dataset, device: str) -> Environment:
-    """Return the environment that a slice was sampled from."""
-    from .envs.base import Fidelity
-
-    identity = dataset.attrs["identity"]
-    how = {"engine": identity["engine"], "deterministic": identity["deterministic"], **identity["options"]}
-    return make(identity["objective"], fidelity=Fidelity(**identity["settings"]), device=device, **how)
 
 
 def _warn(console: Console, subject: Subject, dataset: xr.Dataset, env: Environment) -> None:
@@ -318,48 +351,3 @@ def _show(record: dict[str, Any], as_json: bool, folder: Path) -> None:
     if record["paper"]:
         said = "; ".join(f"{one['word']}: {'yes' if one['measured'] else 'no'}" for one in record["paper"]["words"])
         console.print(f"the paper's words ({record['paper']['where']}), measured too? {said}", markup=False)
-
-
-def _by_environment(records: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return by environment in how many of its slices each word was measured, and each of the paper's."""
-    found: dict[str, dict[str, Any]] = {}
-    for record in records:
-        entry = found.setdefault(record["env"], {"slices": 0, "measured": {}, "paper": {}})
-        entry["slices"] += 1
-        for word in record["verdict"]["words"]:
-            entry["measured"][word] = entry["measured"].get(word, 0) + 1
-        for one in (record["paper"] or {"words": []})["words"]:
-            entry["paper"][one["word"]] = entry["paper"].get(one["word"], 0) + one["measured"]
-    return found
-
-
-def _row(record: dict[str, Any]) -> tuple[str, ...]:
-    losses, near = record["losses"], record["differences_of_samples"][0]
-    words = (record["paper"] or {"words": []})["words"]
-    hits = sum(one["measured"] for one in words)
-    return (
-        record["name"],
-        str(losses["notable"]),
-        _percent(losses["flat"]),
-        _percent(record["jumps"]["share"]),
-        "" if near["cosine"]["value"] is None else f"{near['cosine']['value']:.2f}",
-        ", ".join(record["verdict"]["words"]),
-        ", ".join(one["word"] for one in words),
-        f"{hits} of {len(words)}" if words else "",
-    )
-
-
-def _percent(estimate: dict[str, float | None] | None) -> str:
-    return "" if estimate is None or estimate["value"] is None else f"{100 * estimate['value']:.1f} %"
-
-
-def _table(records: Sequence[dict[str, Any]]) -> Table:
-    table = Table(*HEADINGS, title="what landscapes are like", title_justify="left")
-    for record in records:
-        table.add_row(*map(escape, _row(record)))
-    return table
-
-
-def _markdown(records: Sequence[dict[str, Any]]) -> str:
-    rows = [HEADINGS, ("---",) * len(HEADINGS), *map(_row, records)]
-    return "".join(f"| {' | '.join(row)} |\n" for row in rows)

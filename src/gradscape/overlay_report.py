@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from .console import fill
-from .envs.registry import make
-from .results import RUN, SLICE, inside, run_tables
+from .results import RUN, SLICE, environment_of, inside, run_tables
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -60,7 +59,7 @@ def overlay(
     laid(dataset, tables)  # refuses what cannot be laid over it before anything is computed
     folder = _folder(out, dataset, tables, [through, plane, resolution])
     if through or plane:
-        env = _environment(dataset, device)
+        env = environment_of(dataset, device)
         cut = _plane(env, dataset, tables, through=through, principal=plane is not None, resolution=resolution)
         gradients = bool(dataset.attrs["identity"]["gradients"])
         sampled, _ = fill(console, env, cut, root=folder, grad=gradients, boxed=plane is not None)
@@ -119,14 +118,6 @@ def _folder(out: str | None, dataset: xr.Dataset, tables: Sequence[xr.Dataset], 
     if any(file.name not in (PICTURE, STREAM) and not (file / SLICE).exists() for file in present):
         raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
     return folder
-
-
-def _environment(dataset: xr.Dataset, device: str) -> Environment:
-    from .envs.base import Fidelity
-
-    identity = dataset.attrs["identity"]
-    settings = {"fidelity": Fidelity(**identity["settings"]), "engine": identity["engine"], **identity["options"]}
-    return make(identity["objective"], device=device, **settings)
 
 
 def _plane(

@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import pickle
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
+from . import cluster
+from .cluster import recipe
 from .console import duration, identity_of, provenance_of, read_settings
 from .envs.registry import make
 from .optim.registry import METHODS
@@ -22,9 +25,11 @@ from .race_tables import seeds_said, show
 from .search_report import STORE, give_torch_one_thread, made, run_identity, search_progress
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from .envs.base import Environment
     from .optim import race as racing
-    from .optim.search import Progress
+    from .optim.search import Cost, Progress
 
 PICTURE, FIGURES = "race.png", "race.json"
 
@@ -46,6 +51,7 @@ def race(
     as_json: bool,
     report: bool,
     force: bool,
+    scheduler: str | None = None,
 ) -> None:
     """Let methods compete on an environment; say what it costs, how far it is and what came out."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
@@ -55,12 +61,15 @@ def race(
     env = make(name, **how, **read_settings(settings))
     if workers > 1 and env.engine == "taichi":
         raise ValueError(f"engine taichi runs in one thread only, so --workers is 1; got {workers}")
+    if workers > 1 and scheduler:
+        raise ValueError(f"--scheduler has workers of its own, so --workers is 1; got {workers}")
     give_torch_one_thread()
     if not methods:
         chosen = _able(console, env, chosen)
     job = Job.open(env, chosen, options, seeds=seeds, budget=budget, workers=workers, out=out, force=force)
     try:
-        job.run(console)
+        with cluster.workers(scheduler, env.device) as executor:
+            job.run(console, executor)
         with console.status("resampling seeds"):
             figures = job.save()
     except KeyboardInterrupt:
@@ -158,11 +167,11 @@ class Job:
         """How many seeds each of them has."""
         return len(self.entries) // len(self.methods)
 
-    def run(self, console: Console) -> None:
-        """Compute what is missing."""
+    def run(self, console: Console, executor: Executor | None = None) -> None:
+        """Compute what is missing, here or by an executor's workers, a run each."""
         from .optim.race import race as run
 
-        ratio = self._announce(console)
+        ratio = self._announce(console, executor)
         with search_progress(console) as bar:
             lines = Lines(self)
             tasks = {
@@ -175,6 +184,9 @@ class Job:
                 method = entry.method
                 bar.update(tasks[method], completed=lines.done(method), description=lines.text(method))
 
+            if executor:
+                self._spread(executor, ratio, follow)
+                return
             run(
                 self.env,
                 self.entries,
@@ -183,6 +195,20 @@ class Job:
                 gradient_cost=ratio,
                 progress=follow,
             )
+
+    def _spread(
+        self, executor: Executor, ratio: float | None, follow: Callable[[racing.Entry, Progress], None]
+    ) -> None:
+        """Let workers search, and read what they wrote."""
+        from .landscapes.spread import results
+
+        made_there = pickle.dumps(recipe(self.env))
+        left = [number for number, entry in enumerate(self.entries) if self._left(entry)]
+        entries = {number: self.entries[number] for number in left}
+        tasks = [(number, made_there, _searched(entry), self.budget, ratio) for number, entry in entries.items()]
+        for number, now in results(executor, _search_there, tasks):
+            with entries[number].run.filling():  # reads it
+                follow(entries[number], now)
 
     def save(self) -> dict[str, Any]:
         """Draw the race, write its figures and return them."""
@@ -237,10 +263,10 @@ class Job:
             markup=False,
         )
 
-    def _announce(self, console: Console) -> float | None:
+    def _announce(self, console: Console, executor: Executor | None) -> float | None:
         """Say what is left to compute, and return what an episode with gradient costs if any method asks for it."""
+        from .landscapes.spread import workers_of
         from .optim.registry import optimizer_class
-        from .optim.search import episode_cost
 
         env = self.env
         console.print(f"{env.name} · {env.fidelity.name} · {env.device} · {self.folder}", markup=False)
@@ -252,17 +278,27 @@ class Job:
             console.print(f"{racers}: all {whole} episodes are there already", markup=False)
             return None
         with console.status(f"{env.name}: preparing (kernels are compiled once, then kept)"):
-            cost = episode_cost(env, grad=any(needs.values()))
+            cost = self._cost(executor, grad=any(needs.values()))
         known = [entry.run.gradient_cost for entry in self.entries if entry.run.gradient_cost]
         seconds = cost.forward * left[0] + (cost.gradient * left[1] if left[1] else 0.0)
         there = f", {whole - sum(left.values())} are there already" if sum(left.values()) < whole else ""
-        at_once = f", {self.workers} runs at a time" if self.workers > 1 else ""
+        many = workers_of(executor) if executor else self.workers
+        at_once = f", {many} runs at a time" if many > 1 else ""
         console.print(
             f"{racers}: {sum(left.values())} episodes to compute{there}: {duration(seconds)} one by one, "
             f"and what the methods take themselves{at_once}",
             markup=False,
         )
         return (known[0] if known else cost.ratio) if any(needs.values()) else None
+
+    def _cost(self, executor: Executor | None, *, grad: bool) -> Cost:
+        from .landscapes.spread import results
+        from .optim.search import episode_cost
+
+        if executor is None:
+            return episode_cost(self.env, grad=grad)
+        (cost,) = results(executor, _cost_there, [(pickle.dumps(recipe(self.env)), grad)])
+        return cost
 
     def _left(self, entry: racing.Entry) -> int:
         return max(0, self.budget - entry.run.count)
@@ -315,6 +351,44 @@ def _entry(env: Environment, maker: Any, folder: Path, *, budget: int, command: 
     else:
         run = Run.open_or_create(path, env.space, **wanted)
     return Entry(method, seed, run, maker)
+
+
+@dataclass(frozen=True)
+class _Searched:
+    """A run as a worker is told of it."""
+
+    method: str
+    seed: int
+    options: Mapping[str, Any]
+    path: str
+
+
+def _searched(entry: racing.Entry) -> _Searched:
+    options = entry.made.keywords["options"]  # type: ignore[attr-defined]
+    return _Searched(entry.method, entry.seed, options, str(entry.run.path))
+
+
+def _search_there(
+    number: int, made_there: bytes, run: _Searched, budget: int, ratio: float | None
+) -> tuple[int, Progress]:
+    """Fill a run in a worker's process, and return how far it came."""
+    from .landscapes.spread import kept
+    from .optim.run import Run
+    from .optim.search import search
+
+    give_torch_one_thread()
+    env: Any = kept(made_there).objective
+    seen: list[Progress] = []
+    optimizer = made(run.method, env, seed=run.seed, options=dict(run.options))
+    search(env, optimizer, Run.open(run.path), budget=budget, gradient_cost=ratio, progress=seen.append)
+    return number, seen[-1]
+
+
+def _cost_there(made_there: bytes, grad: bool) -> Cost:
+    from .landscapes.spread import kept
+    from .optim.search import episode_cost
+
+    return episode_cost(kept(made_there).objective, grad=grad)
 
 
 def _folder(env: Environment, options: Mapping[str, dict[str, str]]) -> Path:

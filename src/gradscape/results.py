@@ -6,8 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .envs.registry import make
+
 if TYPE_CHECKING:
     import xarray as xr
+
+    from .envs.base import Environment
 
 SLICE, RUN = "slice.zarr", "run.zarr"
 
@@ -15,6 +19,20 @@ SLICE, RUN = "slice.zarr", "run.zarr"
 def inside(path: Path, store: str) -> Path:
     """Return the store in a results folder, or the path itself."""
     return path / store if (path / store).exists() else path
+
+
+def environment_of(dataset: xr.Dataset, device: str) -> Environment:
+    """Return the environment that a slice was sampled from, on a device."""
+    from .envs.base import Fidelity
+
+    identity = dataset.attrs["identity"]
+    if missing := {"objective", "settings", "engine", "options", "deterministic"} - set(identity):
+        raise ValueError(
+            f"the slice is not one of an environment, its identity lacks {', '.join(sorted(missing))}; "
+            "`landscape slice ENV` samples one"
+        )
+    how = {"engine": identity["engine"], "deterministic": identity["deterministic"], **identity["options"]}
+    return make(identity["objective"], fidelity=Fidelity(**identity["settings"]), device=device, **how)
 
 
 def run_tables(paths: Sequence[str]) -> list[xr.Dataset]:

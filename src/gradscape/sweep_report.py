@@ -9,7 +9,7 @@ import shutil
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,11 +18,14 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from .cluster import recipe, workers
 from .console import duration, identity_of, provenance_of, read_extent, read_settings, size
 from .envs.registry import make
 from .swept import FRAMES, HORIZON, ONLY, SMOOTHING, Moved, moved
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     import xarray as xr
     from matplotlib.figure import Figure
 
@@ -53,6 +56,7 @@ def sweep(
     out: str | None,
     as_json: bool,
     force: bool,
+    scheduler: str | None = None,
 ) -> None:
     """Sample a slice for each value of what moves, film them, and say what it costs and what came out."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
@@ -69,12 +73,14 @@ def sweep(
     grad = grad and over != SMOOTHING  # of smoothed losses there are no gradients to show
     folder = Path(out) if out else sweep_folder(env, swept, over, grad=grad)
     job = Job.open(env, swept, folder, command=shlex.join(["landscape", *sys.argv[1:]]), grad=grad, force=force)
-    try:
-        job.announce(console)
-        summary = job.run(console)
-    except KeyboardInterrupt:
-        job.farewell(console)
-        sys.exit(130)
+    with workers(scheduler, env.device) as executor:
+        job = replace(job, executor=executor)
+        try:
+            job.announce(console)
+            summary = job.run(console)
+        except KeyboardInterrupt:
+            job.farewell(console)
+            sys.exit(130)
     console.print(_outcome(summary) + f"\n{folder}: {', '.join(summary['files'])}", markup=False)
     if as_json:
         print(json.dumps({**summary, "folder": str(folder)}))
@@ -82,13 +88,14 @@ def sweep(
 
 @dataclass(frozen=True)
 class Job:
-    """A sweep to sample into `folder`, slice by slice, and to film."""
+    """A sweep to sample into `folder`, slice by slice, and to film; `executor` is that of `sample`."""
 
     env: Environment
     moved: Moved
     folder: Path
     stores: tuple[SliceStore, ...]
     command: str
+    executor: Executor | None = None
 
     @classmethod
     def open(
@@ -174,7 +181,8 @@ class Job:
             return 0.0, 0
         last = max(work)
         plane, store = self.moved.planes[last], self.stores[last]
-        cost = job.Job(self.moved.env_at(last), plane, self.folder, store, _never_drawn).cost()
+        env, how = self.moved.env_at(last), (store, _never_drawn, self.executor)
+        cost = job.Job(env, plane, self.folder, *how, recipe(env)).cost()
         return cost.seconds * sum(work.values()) / work[last], cost.memory
 
     def _sample(self, console: Console) -> list[xr.Dataset]:
@@ -192,7 +200,9 @@ class Job:
                 bar.update(task, completed=finished + now.done, description=said)
 
             for number, (plane, store) in enumerate(zip(self.moved.planes, self.stores, strict=True)):
-                dataset = sample(self.moved.env_at(number), plane, store, grad=store.grad, progress=follow)
+                env = self.moved.env_at(number)
+                how: dict[str, Any] = {"executor": self.executor, "made": recipe(env)}
+                dataset = sample(env, plane, store, grad=store.grad, progress=follow, **how)
                 finished += dataset["status"].size
                 failed += int((dataset["status"] != Status.OK).sum())
                 sampled.append(dataset)

@@ -73,6 +73,18 @@ def chosen(
     return Fidelity(**row["fidelity"])
 
 
+def kept_rung(env: Environment, device: str) -> tuple[Mapping[str, Any], Path]:
+    """Return what was measured of an environment's fidelity on a device, and the file that says so."""
+    found = _found(env.name, asdict(env.options), device)
+    for row in _rows(found[0], env.engine, device) if found else []:
+        if found and row["device"] == device and row["fidelity"] == asdict(env.fidelity):
+            return row, found[1]
+    raise ValueError(
+        f"there is no {device} device here, and no rate of {env.name} at {env.fidelity.name} on one is kept; "
+        f"`landscape tradeoff {env.name} --device {device}` measures it where there is one"
+    )
+
+
 def read_tolerance(text: str) -> tuple[float, bool]:
     """Return a tolerance and whether it is a share of the spread (5%) or in the loss's unit (0.05)."""
     try:

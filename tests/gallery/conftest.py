@@ -5,6 +5,7 @@ import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import imageio_ffmpeg
 import pytest
@@ -42,6 +43,43 @@ SWEEP = {
 MEASURES = {"local minima": 7, "noise floor": "none"}
 
 
+def cosine(scale: float, points: int, value: float | None) -> dict[str, Any]:
+    return {"scale": scale, "points": points, "of": 36, "cosine": {"value": value, "low": value, "high": value}}
+
+
+REPORT: dict[str, Any] = {
+    "fidelity": "standard", "device": "cuda",
+    "verdict": {"words": ["rugged", "gradients noisy"], "reasons": {"rugged": "minima: 12", "gradients noisy": "0.5"}},
+    "paper": {"where": "A.2.1", "words": [
+        {"word": "rugged", "measured": True}, {"word": "gradients good", "measured": False}
+    ]},
+    "differences": [cosine(1e-6, 2, 0.1), cosine(1e-5, 30, 0.99)],
+    "differences_of_samples": [cosine(0.04, 36, -0.5)],
+    "smoothing": [{"width": 0.01, "points": 36, "biased": {"value": 0.25}}],
+}  # fmt: skip
+
+
+def rung(name: str, ladder: str, milliseconds: float, error: float | None) -> dict[str, Any]:
+    """Return what a trade-off says of a rung, its error in percent of the spread of 2 J."""
+    found = None if error is None else {"value": error / 100, "low": error / 200, "high": error / 50}
+    none = {"value": None, "low": None, "high": None}
+    return {
+        "name": name, "ladder": ladder, "loss_error": {"p95_relative": found or none, "p95": none},
+        "spearman": {"value": 0.987}, "gradient": {"cosine": {"value": 0.654}}, "diverged": 0.25,
+        "seconds": {"forward": milliseconds / 2e3, "with_gradient": milliseconds / 1e3}, "memory": 2_500_000,
+    }  # fmt: skip
+
+
+TRADEOFF = {
+    "env": "fluid", "reference": "reference", "points": 64, "spread": 2.0, "loss_unit": "J", "refused": [],
+    "command": "landscape tradeoff fluid", "identity": {"options": {"goal": "high"}, "device": "cuda"},
+    "rungs": [
+        rung("reference", "named", 400, 0), rung("draft", "named", 4, 9), rung("coarse", "dt", 2, None),
+        rung("standard", "named", 40, 3), rung("slow", "dt", 50, 4),
+    ],
+}  # fmt: skip
+
+
 class Bowl:
     """The squared distance from a point of the scaled box, and a corner that is not finite."""
 
@@ -66,12 +104,18 @@ def keep(figure: Figure, folder: Path) -> None:
     sample(bowl, plane, store)
 
 
+def picture(path: Path) -> None:
+    """Write a picture."""
+    program = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-f", "lavfi", "-i", "testsrc=size=160x120"]
+    subprocess.run([*program, "-frames:v", "1", str(path)], check=True)
+
+
 def film(path: Path) -> None:
     """Write a short film and its last frame."""
     program = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-f", "lavfi", "-i"]
     test = "testsrc=size=160x120:rate=10:duration=1"
     subprocess.run([*program, test, "-pix_fmt", "yuv420p", f"{path}.mp4"], check=True)
-    subprocess.run([*program, test, "-frames:v", "1", f"{path}.webp"], check=True)
+    picture(Path(f"{path}.webp"))
 
 
 @pytest.fixture(scope="session")
@@ -94,6 +138,11 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (full / "episodes.json").write_text(json.dumps(EPISODES))
     (full / "sweep.json").write_text(json.dumps(SWEEP))
     (full / "measures.json").write_text(json.dumps(MEASURES))
+    (full / "report.json").write_text(json.dumps(REPORT))
+    picture(full / "gradient-quality.png")
+    (folder / "tradeoff").mkdir()
+    (folder / "tradeoff/fluid.json").write_text(json.dumps(TRADEOFF))
+    picture(folder / "tradeoff/fluid.png")
     for name in ("episode-6-5", "episode-11-11", "sweep"):
         film(full / name)
     (full / "episode-11-11.mp4").unlink()

@@ -74,11 +74,12 @@ def test_every_page_opens(way: str, visit: Visit, request: pytest.FixtureRequest
     for figure in FIGURES:
         page.click(f"a[href='{figure.id}/index.html']")
         page.wait_for_url(f"**/{figure.id}/index.html")
-        seen = page.eval_on_selector_all(
-            "img:not([hidden]):not(#player img)", "all => all.map(one => one.naturalWidth)"
+        shown = "img:not([hidden]):not(#player img)"
+        assert page.locator(shown).count()
+        page.evaluate("(all) => document.querySelectorAll(all).forEach((one) => { one.loading = 'eager'; })", shown)
+        page.wait_for_function(
+            "(all) => Array.from(document.querySelectorAll(all)).every((one) => one.naturalWidth > 100)", arg=shown
         )
-        assert seen
-        assert min(seen) > 100
         for film in page.locator("video[src]").all():
             film.evaluate(
                 "(one) => new Promise((done) => { one.onloadeddata = done; one.load(); one.preload = 'auto'; })"

@@ -82,6 +82,30 @@ def test_the_manifest_lists_everything_of_a_page(site: Path, data: Path) -> None
     assert [run["method"] for run in full["runs"]] == ["descents", "random"]
 
 
+def test_words_are_beside_the_papers_and_a_trade_off_is_ranked(site: Path) -> None:
+    bare, full = json.loads((site / "manifest.json").read_text())["figures"][1:]
+    assert (bare["report"], bare["tradeoff"]) == (None, None)
+    agreed = {one["word"]: (one["measured"], one["agree"]) for one in full["report"]["words"]}
+    assert agreed == {
+        "rugged": (True, True), "gradients good": (False, False), "gradients noisy": (True, None)
+    }  # fmt: skip
+    assert full["report"]["picture"] == (
+        "Gradient quality over the slice: mean cosine of gradient and difference 0.99 over 1e-05 of the box; "
+        "mean cosine of gradient and difference −0.50 over 0.04 of the box; "
+        "smoothed over 1% of it, first order is biased at 9 of 36"
+    )
+    trade = full["tradeoff"]
+    assert {path.name for path in (site / "tradeoff").iterdir()} == {"fluid.json", "fluid.png"}
+    assert [(row["name"], row["front"]) for row in trade["rungs"]] == [
+        ("coarse", False), ("draft", True), ("standard", True), ("slow", False), ("reference", False)
+    ]  # fmt: skip
+    assert trade["alt"] == (
+        "Loss error of 5 ways to simulate fluid over the time of an episode: draft takes 4 ms and is off by 9 %; "
+        "standard takes 40 ms and is off by 3 %; the quickest within 5% is standard with 40 ms; "
+        "the reference takes 400 ms"
+    )
+
+
 def test_a_search_lies_where_its_parameters_say(site: Path, data: Path) -> None:
     """On the slice through the middle of the box a point's place is its own two parameters, its distance the third."""
     text = (site / "full/nodes.js").read_text().removeprefix("const SLICE = ").rstrip(";\n")
@@ -108,15 +132,28 @@ def test_a_search_of_other_options_is_not_laid_over_a_slice(data: Path) -> None:
     assert [run["method"] for run in trajectories(dataset, tables)] == ["descents"]
 
 
+def test_counts_are_multiplied_and_axes_are_not(site: Path) -> None:
+    page = (site / "full/index.html").read_text()
+    assert "5 × (ladle speed x, ladle speed y) [m/s]" in page
+
+
 def test_words_of_a_figure_are_escaped(site: Path) -> None:
     assert "All of it &lt;b&gt;&amp;&lt;/b&gt; no network." in (site / "full/index.html").read_text()
 
 
 def test_a_page_says_what_it_has_and_nothing_of_what_it_has_not(site: Path) -> None:
     full, bare = ((site / name / "index.html").read_text() for name in ("full", "bare"))
-    sections = ("sweep-title", "episodes-title", 'id="surface"')
-    assert [section in full for section in sections] == [True, True, True]
-    assert [section in bare for section in sections] == [False, False, True]
+    sections = ("sweep-title", "episodes-title", "measures-title", "tradeoff-title", 'id="surface"')
+    assert [section in full for section in sections] == [True, True, True, True, True]
+    assert [section in bare for section in sections] == [False, False, False, False, True]
+    words = re.findall(r'<th scope="row">([\w ]+)</th><td>(.*?)</td>\s*<td>(.*?)</td></tr>', full)
+    assert words[:3] == [
+        ("rugged", "yes: minima: 12", "agrees"), ("gradients good", "no", "disagrees: it says so"),
+        ("gradients noisy", "yes: 0.5", "says nothing of it"),
+    ]  # fmt: skip
+    assert '<th scope="row">local minima</th><td>7</td>' in full
+    assert re.sub(r"\s+", " ", full).count("<td>9 (4.5 to 18)</td> <td>0.987</td> <td>0.654</td> <td>25 %</td>") == 1
+    assert "2 J from the 5th to the 95th percentile" in full.replace("\n", " ")
     assert "Mass from −10 to 10: 12 slices" in full.replace("\n", " ")
     assert SWEEP["command"] in full
     assert '<th scope="row">mass</th><td>0</td><td>none</td>' in full

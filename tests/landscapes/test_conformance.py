@@ -334,3 +334,31 @@ def test_the_same_seed_gives_the_same_figures_and_two_points_are_the_least():
     with pytest.raises(ValueError, match="at least 2 points, to compare rows of a batch; got 1"):
         list(check(Sound(), points=1))
     assert math.isfinite(first.numbers["error"])
+
+
+class Oscillator(Sound):
+    """A unit oscillator let go at x0, its steps explicit or semi-implicit."""
+
+    explicit = False
+
+    def energy(self, x):
+        place, speed, found = x[:, 0].clone(), torch.zeros(len(x)).double(), []
+        for _ in range(400):
+            force = -place
+            speed, before = speed + 0.05 * force, speed
+            place = place + 0.05 * (before if self.explicit else speed)
+            found.append((place.square() + speed.square()) / 2)
+        return torch.stack(found, dim=1)
+
+
+class Explicit(Oscillator):
+    explicit = True
+
+
+def test_energy_that_rises_where_nothing_drives_is_a_failure():
+    kept, added = (outcomes(kind())["energy drift"] for kind in (Oscillator, Explicit))
+    assert kept.outcome == "pass"
+    assert 0.01 < kept.numbers["rise"] < 0.06  # of the order of the step, and not growing
+    assert added.outcome == "fail"
+    assert added.numbers["left"] == pytest.approx(1.0025**399, rel=0.01)  # explicit steps add dt^2 each
+    assert outcomes(Sound())["energy drift"].outcome == "skip"

@@ -1,0 +1,175 @@
+"""Kill slices, sweeps, races and gallery runs at random moments, and compare what they end in with undisturbed runs.
+
+    python benchmarks/kills.py [--count 50] [--seed 0] [--json]
+
+A job is begun in a folder of its own, killed (SIGKILL) up to four times, each time at a moment drawn from the time that
+it takes undisturbed, begun again by the same command, and then left to end. Every stored value must have the bits of
+the undisturbed run; `seconds` of searches, which are measured, are left out, and so is `forwards`, which follows from
+them. Exit code 1 says that a job ended in other bits. Jobs are forked from a process that has loaded what they need, so
+that moments fall into the work and not into its start.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import importlib
+import json
+import multiprocessing
+import os
+import random
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import torch
+
+from gradscape.cli import main as landscape
+
+JOBS = {
+    "slice": "slice bounce --dims 0 1 --resolution 32 --fidelity draft --out made",
+    "sweep": "sweep bounce --dims 0 1 --over 2 --frames 3 --resolution 12 --fidelity draft --out made",
+    "race": "race bounce --methods random,descents --seeds 2 --budget 40 --fidelity draft --out made",
+    "gallery": "gallery compute --only bounce --part slices --resolution 96 --fidelity draft --device cpu --data made",
+}
+LOADED = (  # by all jobs together
+    *("search_report", "race_report", "sweep_report", "gallery_report", "envs.bounce", "envs.engines.rigid"),
+    *("envs.points", "optim.race", "optim.random", "optim.descent", "landscapes.adapters", "landscapes.job"),
+    *(f"landscapes.draw.{name}" for name in ("contour", "profile", "sweep", "sweep_stream", "race")),
+)
+MOST = 4  # times that one job is killed
+FORK = multiprocessing.get_context("fork")
+
+
+@dataclass
+class Tally:
+    """What was done to one kind of job: kills by how much of it was on disk, and jobs that ended in other bits."""
+
+    seconds: float
+    jobs: int = 0
+    other_bits: int = 0
+    kills: Counter[str] = field(default_factory=Counter)
+
+
+def work(command: str, folder: Path) -> None:
+    """Run a command in a folder, silently."""
+    os.chdir(folder)
+    with open(os.devnull, "w") as nowhere:
+        for stream in (1, 2):
+            os.dup2(nowhere.fileno(), stream)
+    torch.set_num_threads(1)
+    landscape(command.split())
+
+
+def run(command: str, folder: Path, patience: float | None = None) -> bool:
+    """Run a command, kill it when patience is over, and say whether it ended before."""
+    process = FORK.Process(target=work, args=(command, folder))
+    process.start()
+    process.join(patience)
+    if process.is_alive():
+        process.kill()
+    process.join()
+    if process.exitcode not in (0, -9):
+        raise RuntimeError(f"{command} left with exit code {process.exitcode} in {folder}")
+    return process.exitcode == 0
+
+
+def bits(folder: Path, answer: Connection) -> None:
+    """Send how many points the stores in a folder hold, and a digest of all their values."""
+    from gradscape.landscapes.store import SliceStore, is_slice
+    from gradscape.optim.run import Run, is_run
+
+    digest, done = hashlib.sha256(), 0
+    for path in sorted(folder.rglob("*.zarr")):
+        if any(part.startswith(".") for part in path.relative_to(folder).parts):
+            continue  # a store that was being made
+        if is_slice(path):
+            dataset = SliceStore.open(path).dataset()
+        elif is_run(path):
+            dataset = Run.open(path).table().drop_vars(["seconds", "forwards"])
+        else:
+            continue
+        digest.update(str(path.relative_to(folder)).encode())
+        done += int((dataset["status"] > 0).sum())
+        for name in sorted(dataset.data_vars):
+            digest.update(str(name).encode() + dataset[name].to_numpy().tobytes())
+    answer.send((done, digest.hexdigest()))
+
+
+def held(folder: Path) -> tuple[int, str]:
+    """Return what `bits` finds, from a process of its own: none that has read a store is forked."""
+    here, there = FORK.Pipe()
+    process = FORK.Process(target=bits, args=(folder, there))
+    process.start()
+    found: tuple[int, str] = here.recv()
+    process.join()
+    return found
+
+
+def disturbed(command: str, folder: Path, kills: int, moment: Callable[[], float], whole: int, tally: Tally) -> int:
+    """Kill a job so often unless it ends before, let it end, and return how often it was killed."""
+    done = 0
+    while done < kills and not run(command, folder, moment()):
+        points = held(folder)[0]
+        tally.kills["nothing" if not points else "all" if points == whole else "a part"] += 1
+        done += 1
+    run(command, folder)
+    return done
+
+
+def trial(count: int, seed: int, root: Path) -> dict[str, Tally]:
+    """Kill jobs of all kinds in turn until so many kills are done."""
+    chance, tallies, wanted = random.Random(seed), dict[str, Tally](), dict[str, tuple[int, str]]()
+    left, number = count, 0
+    while left:
+        kind = list(JOBS)[number % len(JOBS)]
+        if kind not in tallies:
+            folder = root / f"{kind}-undisturbed"
+            folder.mkdir()
+            began = time.monotonic()
+            run(JOBS[kind], folder)
+            tallies[kind] = Tally(time.monotonic() - began)
+            wanted[kind] = held(folder)
+        tally, folder = tallies[kind], root / f"{kind}-{number}"
+        folder.mkdir()
+        kills = min(left, chance.randint(1, MOST))
+        left -= disturbed(
+            JOBS[kind], folder, kills, lambda tally=tally: chance.uniform(0, tally.seconds), wanted[kind][0], tally
+        )
+        tally.jobs += 1
+        tally.other_bits += held(folder) != wanted[kind]
+        number += 1
+        print(f"{count - left} of {count} kills, {kind}", file=sys.stderr, flush=True)
+    return tallies
+
+
+def main() -> None:
+    """Print what was killed, and whether it ended in the same bits."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", action="store_true")
+    given = parser.parse_args()
+    for module in LOADED:
+        importlib.import_module(f"gradscape.{module}")
+    with tempfile.TemporaryDirectory() as root:
+        tallies = trial(given.count, given.seed, Path(root))
+    if given.json:
+        said = {kind: {"jobs": one.jobs, "kills": one.kills, "other_bits": one.other_bits}
+                for kind, one in tallies.items()}  # fmt: skip
+        print(json.dumps(said))
+    else:
+        print("| job | jobs | kills | with nothing, a part, all on disk | other bits |\n|---|---|---|---|---|")
+        for kind, one in tallies.items():
+            at = ", ".join(str(one.kills[where]) for where in ("nothing", "a part", "all"))
+            print(f"| {kind} | {one.jobs} | {one.kills.total()} | {at} | {one.other_bits} |")
+    sys.exit(int(any(one.other_bits for one in tallies.values())))
+
+
+if __name__ == "__main__":
+    main()

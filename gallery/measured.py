@@ -1,0 +1,150 @@
+"""What a page says of a slice's report, and of its environment's accuracy against time."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ..landscapes.tradeoff import cheapest, front, p95
+from ..landscapes.verdict import WORDS
+from .page_data import read_json
+
+Record = Mapping[str, Any]
+REPORT, QUALITY, MEASURES = "report.json", "gradient-quality.png", "measures.json"
+TRADEOFF = "tradeoff"  # folder of ENV.json and ENV.png, as `landscape tradeoff` leaves them
+TOLERANCE = 0.05  # of the loss error that a picture's description names the quickest rung for
+
+
+def read_report(folder: Path) -> dict[str, Any] | None:
+    """Return what `landscape report` found of a slice, None where there is no report."""
+    record = read_json(folder / REPORT)
+    if record is None:
+        return None
+    return {
+        "words": _words(record),
+        "where": record["paper"]["where"] if record["paper"] else "",
+        "device": record["device"],
+        "fidelity": record["fidelity"],
+        "picture": _quality(record),
+        "file": REPORT,
+    }
+
+
+def _words(record: Record) -> list[dict[str, Any]]:
+    """Return every word that was measured or that the paper says: `agree` is None where the paper is silent."""
+    reasons = record["verdict"]["reasons"]
+    said = [one["word"] for one in (record["paper"] or {"words": []})["words"]]
+    return [
+        {
+            "word": word,
+            "measured": word in reasons,
+            "reason": reasons.get(word, ""),
+            "agree": word in reasons if word in said else None,
+        }
+        for word in WORDS
+        if word in reasons or word in said
+    ]
+
+
+def _quality(record: Record) -> str:
+    """Say what the picture of gradient quality shows."""
+    said = [
+        f"mean cosine of gradient and difference {_signed(row['cosine']['value'])} over {row['scale']:.2g} of the box"
+        for row in [_small(record["differences"]), *record["differences_of_samples"]]
+        if row and row["cosine"]["value"] is not None
+    ]
+    for row in record["smoothing"]:
+        if row["biased"]["value"] is not None:
+            biased = round(row["biased"]["value"] * row["points"])
+            said.append(f"smoothed over {row['width']:.0%} of it, first order is biased at {biased} of {row['points']}")
+    return "Gradient quality over the slice: " + ("; ".join(said) or "no slope above the noise")
+
+
+def _small(rows: list[Record]) -> Record | None:
+    return next((row for row in rows if row["points"] >= row["of"] / 2), None)
+
+
+def _signed(value: float) -> str:
+    return f"{value:.2f}".replace("-", "\N{MINUS SIGN}")
+
+
+def place_tradeoffs(data: Path, out: Path, envs: list[str]) -> dict[str, dict[str, Any]]:
+    """Copy what was measured of these environments' accuracy into the site, and return it by environment."""
+    found = {}
+    for env in dict.fromkeys(envs):
+        record = read_json(data / TRADEOFF / f"{env}.json")
+        picture = data / TRADEOFF / f"{env}.png"
+        if record is None or not picture.exists():
+            continue
+        (out / TRADEOFF).mkdir(exist_ok=True)
+        for file in (data / TRADEOFF / f"{env}.json", picture):
+            shutil.copyfile(file, out / TRADEOFF / file.name)
+        found[env] = _tradeoff(record)
+    return found
+
+
+def _tradeoff(record: Record) -> dict[str, Any]:
+    rows = sorted(record["rungs"], key=_time)
+    reference = next(row for row in rows if row["name"] == record["reference"])
+    quicker = [row for row in rows if _time(row) < _time(reference)]
+    errors = [math.inf if (off := _error(row, record)) is None else off for row in quicker]
+    best = {quicker[number]["name"] for number in front([_time(row) for row in quicker], errors)}
+    return {
+        **{name: record[name] for name in ("env", "reference", "points", "spread", "loss_unit", "refused", "command")},
+        "options": record["identity"]["options"],
+        "device": record["identity"]["device"],
+        "picture": f"{TRADEOFF}/{record['env']}.png",
+        "file": f"{TRADEOFF}/{record['env']}.json",
+        "alt": _accuracy(record, reference),
+        "rungs": [_rung(row, record, best) for row in rows],
+    }
+
+
+def _rung(row: Record, record: Record, best: set[str]) -> dict[str, Any]:
+    error = row["loss_error"]["p95_relative" if record["spread"] else "p95"]
+    return {
+        "name": row["name"],
+        "front": row["name"] in best,
+        "error": error,
+        "spearman": row["spearman"]["value"],
+        "cosine": row["gradient"]["cosine"]["value"],
+        "diverged": row["diverged"],
+        "seconds": row["seconds"],
+        "memory": row["memory"],
+    }
+
+
+def _accuracy(record: Record, reference: Record) -> str:
+    """Say what the picture of accuracy against time shows."""
+    named = [row for row in record["rungs"] if row["ladder"] == "named" and row is not reference]
+    said = [
+        f"{row['name']} takes {_milliseconds(row)} and is off by {_share(_error(row, record), record)}" for row in named
+    ]
+    others = [row for row in record["rungs"] if row is not reference]
+    if quickest := cheapest(others, TOLERANCE, relative=True):
+        said.append(f"the quickest within {TOLERANCE:.0%} is {quickest['name']} with {_milliseconds(quickest)}")
+    count = len(record["rungs"])
+    return f"Loss error of {count} ways to simulate {record['env']} over the time of an episode: " + "; ".join(
+        [*said, f"the reference takes {_milliseconds(reference)}"]
+    )
+
+
+def _time(row: Record) -> float:
+    return float(row["seconds"]["with_gradient"])
+
+
+def _error(row: Record, record: Record) -> float | None:
+    return p95(row, relative=record["spread"] is not None)
+
+
+def _milliseconds(row: Record) -> str:
+    return f"{1e3 * _time(row):.3g} ms"
+
+
+def _share(error: float | None, record: Record) -> str:
+    if error is None:
+        return "more than a number can say (it failed too often)"
+    return f"{error:.2g} {record['loss_unit']}".rstrip() if record["spread"] is None else f"{100 * error:.2g} %"

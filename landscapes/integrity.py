@@ -1,0 +1,55 @@
+"""Whether a slice on disk agrees with itself: its layout is there twice, its axes follow from its identity."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from .identity import StoreError
+
+
+def check_integrity(path: Path, group: zarr.Group, axes: Mapping[str, NDArray[Any]], values: Sequence[str]) -> None:
+    """Raise StoreError, naming the file, where a slice store's layout or axes are not what they were made.
+
+    `axes` hold what its coordinates must be, in stored order; `values` name the other arrays. Chunks of those have
+    checksums, and are looked at when they are read.
+    """
+    index = _read(path).get("consolidated_metadata")
+    known = index.get("metadata") if isinstance(index, dict) else None
+    wanted, found = {*axes, *values}, set(group.array_keys())
+    if not isinstance(known, dict) or not wanted == found == set(known):
+        raise _damaged(path, f"it needs the arrays {', '.join(sorted(wanted))} and an index of them")
+    for name in sorted(wanted):
+        if _read(path / name) != known[name]:
+            raise _damaged(path / name, "its layout is not what the store's index says")
+    for name, axis in axes.items():
+        if not np.array_equal(_values(path / name, group[name]), axis):
+            raise _damaged(path / name, "it is not what the store's identity says")
+
+
+def _values(path: Path, array: Any) -> NDArray[Any]:
+    try:
+        return np.asarray(array[...])
+    except Exception as error:  # whatever a codec raises
+        raise _damaged(path, str(error)) from None
+
+
+def _read(folder: Path) -> dict[str, Any]:
+    path = folder / "zarr.json"
+    try:
+        found = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise _damaged(path, str(error)) from None
+    if not isinstance(found, dict):
+        raise _damaged(path, "it is no JSON object")
+    return found
+
+
+def _damaged(path: Path, why: str) -> StoreError:
+    return StoreError(f"{path} is damaged: {why}; restore it, or begin the slice anew with --force")

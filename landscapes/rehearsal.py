@@ -1,0 +1,167 @@
+"""What a slice takes beside its episodes, measured before it is computed: writing it, drawing it, room on the disk.
+
+A few true evaluations are repeated, each time a little different so that they compress as results do, and go the way
+that a slice goes, into a store that is thrown away.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import xarray as xr
+import zarr
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+from zarr.storage import MemoryStore
+
+from .job import PAUSE
+from .layout import SMALL, create_array
+from .objective import Evaluation, Objective
+from .sampling import Progress, sample
+from .space import ParameterSpace
+from .store import SliceStore
+
+PATIENCE = 2.0  # seconds that a rehearsal goes on writing tiles
+SEEN = 1.0  # seconds for the evaluations that are repeated
+JITTER = 1e-3  # by how much, relatively, a repeated value differs from the true one
+MOST = 1 << 16  # points that are packed to see how well they compress
+
+
+class Alike:
+    """An objective that repeats the evaluations of another, each where it is nearest, slightly altered, at no cost.
+
+    `rows` true evaluations are made, at the first points of `store`, which spread over all of it.
+    """
+
+    def __init__(self, objective: Objective, store: SliceStore, rows: int) -> None:
+        self.space: ParameterSpace = objective.space
+        self.preferred_batch: int = getattr(objective, "preferred_batch", 1)
+        x = _first(store, rows)
+        self._tree = cKDTree(self.space.to_unit(x).numpy())
+        self._seen = objective.evaluate(x, grad=store.grad)
+        self._random = torch.Generator().manual_seed(0)
+
+    @classmethod
+    def of(cls, objective: Objective, store: SliceStore, seconds_each: float) -> Alike:
+        """Make as many true evaluations as fit into a moment, at least one."""
+        return cls(objective, store, max(1, int(SEEN / max(seconds_each, 1e-9))))
+
+    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
+        """Return for each row of `x` what was found nearest to it."""
+        rows = torch.from_numpy(self._tree.query(self.space.to_unit(x).numpy())[1])
+        slopes = None if self._seen.grad is None or not grad else self._altered(self._seen.grad[rows])
+        return Evaluation(self._altered(self._seen.loss[rows]), slopes, self._seen.status[rows])
+
+    def dataset(self, store: SliceStore) -> xr.Dataset:
+        """Return a slice of the shape of `store` without a gap."""
+        blank = store.dataset()
+        grid = np.meshgrid(*(blank[name].to_numpy() for name in store.dims), indexing="ij")[::-1]
+        x = store.plane.lift(torch.from_numpy(np.stack([axis.ravel() for axis in grid], axis=1)))
+        said = self.evaluate(x, grad=store.grad)
+        values = {"loss": said.loss, "grad": said.grad, "status": said.status}
+        return blank.copy(
+            data={
+                name: value.reshape(blank[name].shape).numpy().astype(blank[name].dtype)
+                for name, value in values.items()
+                if value is not None
+            }
+        )
+
+    def _altered(self, values: Tensor) -> Tensor:
+        values = values.detach().cpu()
+        noise = torch.rand(values.shape, generator=self._random, dtype=torch.float64)
+        altered = values.double() * (1 + JITTER * noise)
+        single = bool(torch.equal(values.nan_to_num().double(), values.nan_to_num().float().double()))
+        return altered.float().double() if single else altered  # what was computed in float32 compresses better
+
+
+@dataclass(frozen=True)
+class Stored:
+    """Say what writing a slice takes [s], and its room [bytes], its files and folders as it is filled, and packed."""
+
+    seconds: float
+    bytes: int
+    inodes: int
+    packed: int
+
+
+class _Enough(Exception):  # noqa: N818 -- nothing went wrong
+    """Stop a rehearsal."""
+
+
+def stored(alike: Alike, store: SliceStore) -> Stored:
+    """Fill an empty slice store on disk with what is `alike`, or as much of it as patience allows."""
+    path = store.path
+    if path is None:
+        raise ValueError("a rehearsal needs a store on disk; got one in memory")
+    tiles, began = len(store.tiles()), time.perf_counter()
+    before, done, ended = _room(path), 0, began
+
+    def follow(now: Progress) -> None:
+        nonlocal done, ended
+        done, ended = now.done, time.perf_counter()
+        if done and ended - began > PATIENCE:
+            raise _Enough
+
+    with contextlib.suppress(_Enough):
+        sample(alike, store.plane, store, grad=store.grad, progress=follow)
+    after, total = _room(path), math.prod(store.shape)
+    grown = [round(old + (new - old) * total / done) for old, new in zip(before, after, strict=True)]
+    return Stored((ended - began) * total / done, grown[0], min(grown[1], before[1] + 6 * tiles), _packed(alike, store))
+
+
+def drawn(draw: Callable[[], object]) -> tuple[float, float]:
+    """Return seconds of a first drawing beyond those of any other (what it loads), and those of another."""
+    took = []
+    for _ in range(2):
+        began = time.perf_counter()
+        draw()
+        took.append(time.perf_counter() - began)
+    return max(0.0, took[0] - took[1]), took[1]
+
+
+def pictures(store: SliceStore, batches: int, seconds: float, once: float) -> int:
+    """Return how often `Job.run` should draw: at the end, and a coarse picture now and then before."""
+    levels = store.tiles()[-1].level
+    return 1 + min(levels, batches, 1 + int(seconds / (PAUSE + once)))
+
+
+def _room(path: Path) -> tuple[int, int]:
+    """Return the bytes, and the number of files and folders."""
+    there = list(path.rglob("*"))
+    return sum(one.stat().st_size for one in there if one.is_file()), len(there)
+
+
+def _first(store: SliceStore, count: int) -> Float[Tensor, "point dim"]:
+    """Return the first points of a store, or all there are."""
+    parts, size = list[Tensor](), 0
+    for tile in store.tiles():
+        if size < count:
+            parts.append(store.points(tile))
+            size += len(parts[-1])
+    return torch.cat(parts)[:count]
+
+
+def _packed(alike: Alike, store: SliceStore) -> int:
+    """Return the bytes of the values once packed."""
+    total = math.prod(store.shape)
+    count = min(total, MOST)
+    said = alike.evaluate(_first(store, count), grad=store.grad)
+    group = zarr.create_group(MemoryStore(), zarr_format=3)
+    size = 0
+    for name, values in (("loss", said.loss), ("grad", said.grad), ("status", said.status)):
+        if values is not None:
+            kind = "int8" if name == "status" else "float64"
+            shape = tuple(values.shape)
+            array = create_array(group, name, shape, shape, (), kind, codecs=SMALL)
+            array[...] = values.numpy()
+            size += array.nbytes_stored()
+    return size * total // count

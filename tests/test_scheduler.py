@@ -1,0 +1,185 @@
+"""Dask distributed: a cluster of two here, workers that die, a scheduler that is gone, the command over an address."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import cloudpickle
+import numpy as np
+import pytest
+import torch
+
+from gradscape.cluster import recipe, workers
+from gradscape.envs.registry import make
+from gradscape.landscapes.adapters import from_torch
+from gradscape.landscapes.job import STORE
+from gradscape.landscapes.plane import Plane
+from gradscape.landscapes.sampling import sample
+from gradscape.landscapes.space import ParameterSpace
+from gradscape.landscapes.spread import WorkersLostError
+from gradscape.landscapes.store import SliceStore, open_slice
+from gradscape.optim.run import Run
+
+cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers need not find the tests
+SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
+PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 16))
+
+
+@pytest.fixture(scope="module")
+def executor():
+    with workers("local:2", "cpu") as found:
+        yield found
+
+
+@pytest.fixture
+def address(executor):
+    return executor._client.scheduler.address
+
+
+def store_at(path: Path, plane: Plane = PLANE, space: ParameterSpace = SPACE) -> SliceStore:
+    return SliceStore.open_or_create(path, plane, space, identity={})
+
+
+def same(one, other) -> bool:
+    return all(
+        one[name].to_numpy().tobytes() == other[name].to_numpy().tobytes() for name in ("loss", "grad", "status")
+    )
+
+
+def wave(x: torch.Tensor) -> torch.Tensor:
+    return (3 * x).sin().prod(dim=1) + x.exp().sum(dim=1)
+
+
+def test_two_workers_write_the_bits_of_one_process(tmp_path, executor):
+    env = make("bounce", fidelity="draft", device="cpu")
+    plane = Plane.through(env.space, env.example("aim"), [0, 1], resolution=20)
+    alone = sample(env, plane, store_at(tmp_path / "alone.zarr", plane, env.space))
+    shared = store_at(tmp_path / "shared.zarr", plane, env.space)
+    assert same(sample(env, plane, shared, batch=32, executor=executor, made=recipe(env)), alone)
+
+
+def test_a_worker_has_a_core_and_a_thread_of_its_own(executor):
+    client = executor._client
+    cores = client.run(lambda: tuple(sorted(os.sched_getaffinity(0))))
+    assert set().union(*cores.values()) == os.sched_getaffinity(0)
+    assert len(set(cores.values())) == min(2, os.cpu_count() or 1)
+    assert set(client.run(torch.get_num_threads).values()) == {1}
+
+
+def deadly(x: torch.Tensor, marks: Path) -> torch.Tensor:
+    """Kill the process that evaluates the third batch, once, and leave a mark of every evaluation."""
+    mark = marks / f"{time.time_ns()}-{os.getpid()}"
+    mark.write_text(" ".join(str(row) for row in x.tolist()))
+    if len(list(marks.iterdir())) == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return wave(x)
+
+
+def test_killing_a_worker_loses_nothing_and_duplicates_nothing(tmp_path, executor):
+    marks, seen = tmp_path / "marks", []
+    marks.mkdir()
+    store = store_at(tmp_path / "s.zarr")
+    objective = from_torch(partial(deadly, marks=marks), SPACE, name="deadly")
+    dataset = sample(objective, PLANE, store, batch=20, executor=executor, progress=seen.append)
+    assert same(dataset, sample(from_torch(wave, SPACE), PLANE))
+    assert [now.done for now in seen] == sorted({now.done for now in seen})
+    points = [mark.read_text() for mark in marks.iterdir()]
+    assert len(points) == len(set(points)) + 1  # the killed batch, which had written nothing
+
+
+SCHEDULER, WORKER = "distributed.cli.dask_scheduler", "distributed.cli.dask_worker"
+
+
+@pytest.fixture
+def mortal(tmp_path):
+    """Give the address and the process of a scheduler that may be killed."""
+    file = tmp_path / "scheduler.json"
+    common = ["--no-dashboard", "--scheduler-file", str(file)]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    at = ["--host", "127.0.0.1", "--port", "0"]
+    scheduler = subprocess.Popen([sys.executable, "-m", SCHEDULER, *at, *common], **quiet)
+    worker = subprocess.Popen([sys.executable, "-m", WORKER, "--no-nanny", "--nthreads", "1", *common], **quiet)
+    try:
+        yield file, scheduler
+    finally:
+        for process in (scheduler, worker):
+            process.kill()
+            process.wait()
+
+
+def test_a_scheduler_that_is_gone_ends_it_with_a_slice_to_go_on_with(tmp_path, mortal):
+    file, scheduler = mortal
+    store = store_at(tmp_path / "s.zarr")
+
+    def kill(now):
+        if now.done:
+            scheduler.kill()
+
+    def slow(x: torch.Tensor) -> torch.Tensor:
+        time.sleep(0.1)
+        return wave(x)
+
+    while not file.exists():
+        time.sleep(0.05)
+    said = r"the workers are gone .*; \d+ of 288 points are kept in .*s\.zarr.*the same command goes on"
+    with (
+        pytest.raises(WorkersLostError, match=said),
+        workers(json.loads(file.read_text())["address"], "cpu") as executor,
+    ):
+        sample(from_torch(slow, SPACE), PLANE, store, batch=1, executor=executor, progress=kill)
+    assert 0 < len(store.pending()) < len(store.tiles())
+    assert same(sample(from_torch(wave, SPACE), PLANE, store), sample(from_torch(wave, SPACE), PLANE))
+
+
+def test_a_slice_and_a_sweep_go_over_an_address(tmp_path, run, address):
+    how = ["--dims", "0", "1", "--resolution", "8", "--device", "cpu"]
+    film = ["--over", "2", "--frames", "2", "--no-gradients"]
+    for verb, more, stores in (("slice", [], [STORE]), ("sweep", film, ["frames/000.zarr", "frames/001.zarr"])):
+        alone = run(verb, "bounce", *how, *more, "--out", f"{verb}-alone", cwd=tmp_path)
+        spread = run(verb, "bounce", *how, *more, "--out", f"{verb}-spread", "--scheduler", address, cwd=tmp_path)
+        assert (alone.returncode, spread.returncode) == (0, 0), alone.stderr + spread.stderr
+        for store in stores:
+            assert same(open_slice(tmp_path / f"{verb}-alone" / store), open_slice(tmp_path / f"{verb}-spread" / store))
+
+
+def test_a_race_has_the_same_runs_whoever_searches(tmp_path, run, address):
+    how = ["race", "bounce", "--methods", "random,cma-es", "--budget", "20", "--seeds", "2", "--device", "cpu"]
+    assert run(*how, "--out", "alone", cwd=tmp_path).returncode == 0
+    assert run(*how, "--out", "spread", "--scheduler", address, cwd=tmp_path).returncode == 0
+    runs = sorted(path.relative_to(tmp_path / "alone") for path in (tmp_path / "alone").glob("*/run.zarr"))
+    assert len(runs) == 4
+    for path in runs:
+        one, other = (Run.open(tmp_path / where / path).table() for where in ("alone", "spread"))
+        np.testing.assert_array_equal(one["x"], other["x"])
+        np.testing.assert_array_equal(one["loss"], other["loss"])
+
+
+def test_the_gallerys_slices_go_over_an_address(tmp_path, run, address):
+    how = ["gallery", "compute", "--only", "bounce", "--part", "slices", "--fidelity", "draft", "--device", "cpu"]
+    done = run(*how, "--resolution", "8", "--data", str(tmp_path / "data"), "--scheduler", address, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert list((tmp_path / "data").glob(f"*/{STORE}"))
+
+
+@pytest.mark.parametrize("wrong", ["local:0", "local:two"])
+def test_a_number_of_workers_that_is_none_is_refused(tmp_path, run, wrong):
+    said = run("slice", "bounce", "--dims", "0", "1", "--device", "cpu", "--scheduler", wrong, cwd=tmp_path)
+    assert said.returncode == 2
+    assert "local:N for N workers" in said.stderr
+
+
+def test_an_address_where_nothing_answers_and_a_missing_dask_are_said(tmp_path, run, monkeypatch):
+    monkeypatch.setattr("gradscape.cluster.ANSWER", "1s")
+    how = ["slice", "bounce", "--dims", "0", "1", "--device", "cpu", "--scheduler", "tcp://127.0.0.1:9"]
+    said = run(*how, cwd=tmp_path)
+    assert said.returncode == 1
+    assert "no Dask scheduler answers at tcp://127.0.0.1:9" in said.stderr
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    said = run(*how, cwd=tmp_path)
+    assert said.returncode == 2
+    assert "pip install 'gradscape[distributed]'" in said.stderr
