@@ -69,7 +69,7 @@ class Environment(abc.ABC):
     engines: ClassVar[tuple[str, ...]] = ("warp",)
     loss_unit: ClassVar[str] = ""
     decisions: ClassVar[int] = 1  # how often controls are chosen in an episode: dim / decisions of them, time first
-    control_step: ClassVar[float] = 0.0  # how long a control is held [s], in whole time steps; 0 where that is no matter
+    control_step: ClassVar[float] = 0.0  # how long a control is held [s], in whole time steps; 0 where any step does
 
     space: ParameterSpace
     _solvers: Pool[Any] | None = None  # a scene on an engine sets both in `_setup`: what simulates,
@@ -154,6 +154,17 @@ class Environment(abc.ABC):
         return {}
 
     @final
+    def energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"] | None:
+        """Return the mechanical energy [J] after each step of a motion that nothing drives, begun as `x` says.
+
+        Counted from rest at the lowest place, so that what there is at first is its scale: it may fall, never rise.
+        None where a scene has no such motion.
+        """
+        parts = [self._energy(part) for part in torch.split(self._checked(x), self._capacity)]
+        known = [part for part in parts if part is not None]
+        return torch.cat(known) if known else None
+
+    @final
     def observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
         """Return what the state is just before a decision, float64, in units that make it about one.
 
@@ -211,6 +222,10 @@ class Environment(abc.ABC):
     def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
         """Return the state just before a decision, in units that make it about one."""
         return x.new_zeros(len(x), 0)
+
+    def _energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"] | None:
+        """Return the energy over time of a motion that nothing drives [J], of no more rows than a solver takes."""
+        return None
 
     def _simulate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         with torch.set_grad_enabled(grad):  # torch switches it off around `_Bridge.forward`; threads have their own

@@ -138,3 +138,13 @@ class Bounce(Environment):
             miss = solver.run(torch.tensor(START), x)[-1].cpu().double() - self.target
             slope = solver.gradient(2 * miss) if grad else None
         return Evaluation(miss.square().sum(dim=1), slope, torch.full((len(x),), Status.OK, dtype=torch.int8))
+
+    def _energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"]:
+        """Return kinetic and potential energy of each flight, that of the ground's spring included."""
+        with self._solvers.lend() as solver:
+            flight = solver.run(torch.tensor(START), x).double().cpu()
+        ball, speed = self.ball, flight.diff(dim=0) / self.fidelity.dt  # semi-implicit Euler: the step's own
+        height = flight[1:, :, 1] - ball.radius
+        spring = ball.ke / 2 * height.clamp(max=0.0).square()
+        found: Tensor = ball.mass / 2 * speed.square().sum(dim=2) + ball.mass * ball.gravity * height + spring
+        return found.T

@@ -140,6 +140,18 @@ class Cartpole(Environment):
             slope = _pull_back(solver, loss, phi, controls, x) if grad else None
         return Evaluation(loss.detach(), slope, torch.full((len(x),), Status.OK, dtype=torch.int8))
 
+    def _energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"]:
+        """Return the energy of the chain that swings from a cart at rest, let go at angles that the first torques set.
+
+        A torque's bounds stand for half a turn either way.
+        """
+        torque = x.view(len(x), CONTROLS, 4)[:, 0, 1:]
+        with self._solvers.lend() as solver:
+            still = x.new_zeros(len(x), self.held, 4)
+            phi = solver.run(torch.pi * torque / x.new_tensor(BOUND[1:]), x.new_zeros(3), still).cpu().double()
+            energy: Tensor = solver.energy(len(x), phi)
+        return energy.T
+
     def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
         """Watch the cart and the sines and cosines of angles, and how fast cart and angles changed in the last step."""
         controls, step = self._controls(x), decision * self.steps // CONTROLS

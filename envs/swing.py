@@ -71,6 +71,19 @@ class Swing(SheetScene):
         mass = AREAL_DENSITY * SIDE**2 / len(points)
         return Sheet(x, pairs, rest * pitch, weight, mass, damping=8e-3, drag=0.5, held=self._corners()[2:])
 
+    def _energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"]:
+        """Return kinetic energy, that of height above the floor, and that of the springs."""
+        drive, sheet = self._drive(x), self.sheet
+        with self._solvers.lend() as solver:
+            frames = solver.run(*drive.detached()).double().cpu()
+        kinetic = (frames.diff(dim=0) / self.fidelity.dt).square().sum(dim=(2, 3)) / 2  # the step's own velocities
+        ends = torch.from_numpy(sheet.pairs).T.long()
+        stretch = (frames[1:, :, ends[0]] - frames[1:, :, ends[1]]).norm(dim=3) - torch.from_numpy(sheet.rest)
+        stiffness = drive.stiffness.detach()[:, ends].mean(dim=1) * torch.from_numpy(sheet.weight)
+        potential = sheet.mass * sheet.gravity * frames[1:, :, :, 1].sum(dim=2)
+        found: Tensor = sheet.mass * kinetic + potential + (stiffness * stretch.square()).sum(dim=2) / 2
+        return found.T
+
     def _corners(self) -> tuple[int, int, int, int]:
         """Return the numbers of the corners: left back, left front, right back, right front."""
         n = self.fidelity.resolution

@@ -53,7 +53,7 @@ class Solver:
     def __init__(
         self, chain: Chain, *, dt: float, hold: int, controls: int, name: str, capacity: int, device: str
     ) -> None:
-        self.dt, self.hold, self.steps, self.device = dt, hold, controls * hold, device
+        self.chain, self.dt, self.hold, self.steps, self.device = chain, dt, hold, controls * hold, device
         self.types = precision(name)
         self.kernel = step_kernel(name)
         load([self.kernel], device)
@@ -75,6 +75,16 @@ class Solver:
         for step in range(self.steps):
             wp.launch(self.kernel, batch, self._inputs(step), device=self.device, record_tape=False)
         return to_torch(self.phi)[:, :batch]
+
+    def energy(self, batch: int, phi: torch.Tensor) -> torch.Tensor:
+        """Return the energy [J] of the last run under a cart at rest, from hanging, shape (step + 1, batch)."""
+        p = to_torch(self.p)[:, :batch].cpu().double()
+        apart = (phi[..., :, None] - phi[..., None, :]).cos()
+        mass = phi.new_tensor(self.chain.inertia).view(3, 3) * apart
+        kinetic = (p * torch.linalg.solve(mass, p)).sum(dim=-1) / 2
+        height = ((1 - phi.cos()) * phi.new_tensor(self.chain.beta)).sum(dim=-1)
+        found: torch.Tensor = kinetic + self.chain.gravity * height
+        return found
 
     def gradient(self, adj_phi: torch.Tensor) -> torch.Tensor:
         """Return the adjoint of the controls, shape (batch, control, 4), from that of the last phi, (batch, 3)."""

@@ -198,8 +198,9 @@ def _fetch(console: Console, source: Path, folder: Path, key: dict[str, Any]) ->
 
 
 def _same(record: dict[str, Any], key: dict[str, Any]) -> bool:
+    """Say whether a report is of the slice and the settings; its code may be an older one, which is said."""
     theirs = record.get("key", {})
-    return all(theirs.get(name) == key[name] for name in key)
+    return all(theirs.get(name) == key[name] for name in key if name != "code")
 
 
 def _kept(console: Console, folder: Path, key: dict[str, Any], device: str) -> dict[str, Any]:
@@ -213,6 +214,9 @@ def _kept(console: Console, folder: Path, key: dict[str, Any], device: str) -> d
         raise ValueError(f"{folder} holds another report ({said}); write elsewhere with --out, or delete it")
     elsewhere = f", measured on {kept['device']}" if kept["device"] != device else ""
     console.print(f"{folder} is there already{elsewhere}", markup=False)
+    if kept["key"]["code"] != key["code"]:
+        said = f"by other code of the scenes, {kept['key']['code']}; this is {key['code']}"
+        console.print(f"warning: it was measured {said}. Delete the folder to measure it anew", markup=False)
     return kept
 
 
