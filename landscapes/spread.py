@@ -10,9 +10,10 @@ import gc
 import math
 import pickle
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -28,6 +29,7 @@ from .store import SliceStore
 from .tiling import Tile
 
 T = TypeVar("T")
+POLL, PATIENCE = 1.0, 60.0  # seconds between looks at the workers, and without any worker before they are given up
 
 
 class WorkersLostError(OSError):
@@ -173,13 +175,34 @@ def results(executor: Executor, work: Callable[..., T], tasks: Iterable[Sequence
     futures: list[Future[T]] = []
     try:
         futures += [executor.submit(work, *task) for task in tasks]
-        for future in as_completed(futures):
+        for future in _finished(executor, futures):
             yield future.result()
     except (CancelledError, BrokenExecutor) as error:
         raise WorkersLostError(f"the workers are gone ({str(error) or type(error).__name__})") from error
     finally:
         for future in futures:
             future.cancel()
+
+
+def _finished(executor: Executor, futures: Iterable[Future[T]]) -> Iterator[Future[T]]:
+    """Yield futures as they end, and give up where nobody is left to work on them."""
+    pending, seen = set(futures), time.monotonic()
+    while pending:
+        done, pending = wait(pending, timeout=POLL, return_when=FIRST_COMPLETED)
+        yield from done
+        if done or _manned(executor):
+            seen = time.monotonic()
+        elif time.monotonic() - seen > PATIENCE:
+            raise WorkersLostError(f"the workers are gone (none was there for {PATIENCE:g} s)")
+
+
+def _manned(executor: Executor) -> bool:
+    """Say whether an executor has a worker, as far as it can be asked."""
+    client = getattr(executor, "_client", None)  # Dask's
+    try:
+        return client is None or bool(client.nthreads())
+    except OSError:  # nobody is there to answer
+        return False
 
 
 def _filled(site: Site | RemoteSite, tiles: Sequence[Tile]) -> list[Filled]:

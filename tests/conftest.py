@@ -1,5 +1,6 @@
 """What tests of the command share."""
 
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,10 @@ import pytest
 from gradscape.cli import main
 
 from .command import Said
+
+# A shell that is not interactive starts what it sends to the background deaf to Ctrl-C; commands that tests interrupt
+# would inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture

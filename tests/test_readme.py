@@ -41,7 +41,15 @@ def test_the_example_package_registers_an_environment(tmp_path: Path) -> None:
 def test_every_picture_and_file_the_readme_names_is_there() -> None:
     named = [name for name in re.findall(r"\]\(([^)]+)\)", README) if "://" not in name]
     assert len(named) >= 3
-    assert [name for name in named if not (ROOT / name).exists()] == []
+    assert [name for name in named if not (ROOT / name.partition("#")[0]).exists()] == []
+    headings = {name: _headings(ROOT / name.partition("#")[0]) for name in named if "#" in name}
+    assert [name for name, there in headings.items() if name.partition("#")[2] not in there] == []
+
+
+def _headings(file: Path) -> set[str]:
+    """Return the anchors that headings have on GitHub."""
+    titles = re.findall(r"^#+ (.+)$", file.read_text(), flags=re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
 def test_the_table_of_environments_is_what_the_reports_say() -> None:

@@ -165,6 +165,24 @@ def test_workers_that_are_gone_end_it_with_what_is_kept(tmp_path):
         sample(from_torch(wave, SPACE), PLANE, store, batch=32, executor=slow, progress=lose)
 
 
+class Deserted(Executor):
+    """Like Dask's, with a scheduler that answers and no worker."""
+
+    class _client:  # noqa: N801 -- Dask's name for it
+        nthreads = staticmethod(dict)
+
+    def submit(self, fn, /, *args, **kwargs):
+        return Future()
+
+
+def test_workers_that_never_come_back_are_given_up(tmp_path, monkeypatch):
+    monkeypatch.setattr("gradscape.landscapes.spread.POLL", 0.02)
+    monkeypatch.setattr("gradscape.landscapes.spread.PATIENCE", 0.1)
+    store = store_at(tmp_path / "s.zarr")
+    with pytest.raises(WorkersLostError, match=r"none was there for 0\.1 s.*0 of .* the same command goes on"):
+        sample(from_torch(wave, SPACE), PLANE, store, executor=Deserted())
+
+
 def test_a_worker_of_another_store_or_without_the_file_system_says_so(tmp_path):
     store = store_at(tmp_path / "s.zarr")
     make, arguments = Site(
