@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import gc
 import inspect
 import threading
 from collections.abc import Iterator, Mapping
@@ -73,7 +74,8 @@ class Environment(abc.ABC):
 
     space: ParameterSpace
     _solvers: Pool[Any] | None = None  # a scene on an engine sets both in `_setup`: what simulates,
-    _capacity = 1 << 20  # and how many rows it takes at once
+    _capacity = 1 << 20  # and how many rows it takes at once,
+    _most_rows = 1 << 20  # at most
 
     def __init__(
         self,
@@ -193,6 +195,13 @@ class Environment(abc.ABC):
                 pass
         self._prepare()
 
+    @final
+    def shrink(self, rows: int) -> None:
+        """Take at most `rows` rows at once from now on: solvers hold room for all they take, and it was too much."""
+        self._most_rows, self._solvers = rows, None
+        gc.collect()  # a solver and its launches refer to each other
+        self._setup()
+
     def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
         return 0
@@ -249,7 +258,7 @@ class Environment(abc.ABC):
     @final
     def _rows_at_once(self, capacity: int) -> int:
         """Return the rows a solver takes where one on Warp takes `capacity`: Taichi's has every core to itself."""
-        return capacity * (_cores() if self.engine == "taichi" and self.device == "cpu" else 1)
+        return min(self._most_rows, capacity * (_cores() if self.engine == "taichi" and self.device == "cpu" else 1))
 
     def _refuse_broken_steps(self) -> None:
         dt, nearest = self.fidelity.dt, self.nearest_dt(self.fidelity.dt)

@@ -20,7 +20,8 @@ SAID = re.compile(
 class Halving:
     """Evaluate an objective at fewer points at a time once its device ran out of memory, down to one.
 
-    That changes no result, given an objective whose rows do not depend on their batch.
+    That changes no result, given an objective whose rows do not depend on their batch. One that holds memory for all
+    rows it takes at once, such as an environment, is told to hold less by its method `shrink(rows)`.
     """
 
     def __init__(self, objective: Objective) -> None:
@@ -40,6 +41,7 @@ class Halving:
             if part is None:
                 gc.collect()  # the arrays of the attempt that failed
                 self._most = len(rows) // 2
+                getattr(self.objective, "shrink", _keep)(self._most)
                 self._notes.append(f"{self.name} ran out of memory at {len(rows)} points; going on with {self._most}")
                 continue
             parts.append(part)
@@ -64,6 +66,10 @@ class Halving:
                     "or take a lower --fidelity or another --device"
                 ) from error
             return None
+
+
+def _keep(rows: int) -> None:
+    """Leave an objective that holds no memory between evaluations as it is."""
 
 
 def ran_out(error: BaseException) -> bool:

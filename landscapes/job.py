@@ -154,11 +154,11 @@ def cost_of(objective: Objective, store: SliceStore) -> Cost:
     pending = store.pending()
     left = sum(store.count(tile) for tile in pending)
     if not left:
-        return Cost(0, 0.0, _peak_memory())
+        return Cost(0, 0.0, peak_memory())
     getattr(objective, "prepare", lambda: None)()
     seconds = left * _seconds_per_point(objective, _first_batch(objective, store, pending), grad=store.grad)
     arrays = 8 * math.prod(store.shape) * (2 + store.plane.dim * store.grad)
-    return Cost(left, seconds, _peak_memory() + arrays)
+    return Cost(left, seconds, peak_memory() + arrays)
 
 
 def _cost_there(site: Site | RemoteSite) -> Cost:
@@ -205,7 +205,7 @@ def flat_points(dataset: xr.Dataset) -> int | None:
     return int((slope == 0).all(dim=-1).sum())
 
 
-def _peak_memory() -> int:
+def peak_memory() -> int:
     """Return the most memory this process has held [bytes]."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak

@@ -62,7 +62,7 @@ class Plan:
 
 def of_slice(env: Environment, plane: Plane, folder: Path, *, grad: bool, began: float) -> Plan:
     """Plan a slice whose command would have begun at `began` on `time.perf_counter`'s clock."""
-    from .landscapes.job import Job, _peak_memory
+    from .landscapes.job import Job, peak_memory
     from .landscapes.rehearsal import Alike, drawn, pictures, stored
 
     job = Job.open(
@@ -70,7 +70,7 @@ def of_slice(env: Environment, plane: Plane, folder: Path, *, grad: bool, began:
         identity=identity_of(env), provenance=provenance_of(env, ""), grad=grad,
     )  # fmt: skip
     cost = job.cost()
-    start, memory = time.perf_counter() - began, cost.memory - _peak_memory()
+    start, memory = time.perf_counter() - began, cost.memory - peak_memory()
     alike = Alike.of(env, job.store, cost.seconds / cost.episodes)
     room = stored(alike, job.store)
     loading, once = drawn(lambda: job._save(alike.dataset(job.store)))
@@ -79,7 +79,7 @@ def of_slice(env: Environment, plane: Plane, folder: Path, *, grad: bool, began:
     extra = SUMMARY + sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
     return Plan(
         cost.episodes, batches, start, cost.seconds, room.seconds, loading + count * once,
-        memory + _peak_memory(), _gpu(env), room.bytes + extra, room.packed + extra, room.inodes + 2,
+        memory + peak_memory(), _gpu(env), room.bytes + extra, room.packed + extra, room.inodes + 2,
     )  # fmt: skip
 
 
@@ -99,17 +99,17 @@ def of_sweep(
     job = SweepJob.open(env, swept, folder, command="", grad=grad and over != SMOOTHING)
     seconds, memory = job.cost()
     start, last = time.perf_counter() - began, len(job.stores) - 1
-    from .landscapes.job import _peak_memory
+    from .landscapes.job import peak_memory
     from .landscapes.rehearsal import Alike, stored
 
-    memory -= _peak_memory()
+    memory -= peak_memory()
     alike = Alike.of(swept.env_at(last), job.stores[last], seconds / job.total)
     room = stored(alike, job.stores[last])
     drawing, films = _filming(job, seconds / job.total, folder / "films", frames)
     count, batches = len(job.stores), sum(-(-math.prod(s.shape) // env.preferred_batch) for s in job.stores)
     extra = films + SUMMARY + 250 * frames
     return Plan(
-        job.total, batches, start, seconds, count * room.seconds, drawing, memory + _peak_memory(), _gpu(env),
+        job.total, batches, start, seconds, count * room.seconds, drawing, memory + peak_memory(), _gpu(env),
         count * room.bytes + extra, count * room.packed + extra, count * (room.inodes + 1) + 5,
     )  # fmt: skip
 

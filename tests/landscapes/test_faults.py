@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from gradscape.envs.engines import springs
+from gradscape.envs.registry import make
 from gradscape.landscapes.adapters import from_torch
 from gradscape.landscapes.halving import Halving, ran_out
 from gradscape.landscapes.identity import StoreError
@@ -75,6 +77,30 @@ def test_a_batch_that_does_not_fit_is_halved_with_a_warning_and_the_same_bits(wh
     ]
     assert small.asked[:3] == [64, 32, 16]
     assert max(small.asked[2:]) == 16  # learnt
+
+
+def test_a_solver_that_does_not_fit_is_made_smaller(monkeypatch):
+    def sampled():
+        env = make("flip", fidelity="draft", device="cpu", horizon=0.1)
+        plane = Plane.through(env.space, env.space.center, [0, 1], resolution=4)
+        return env, sample(env, plane, batch=16)
+
+    _, wanted = sampled()
+    fitting, made = springs.Solver.__init__, []
+
+    def init(self, *args, capacity, **settings):
+        made.append(capacity)
+        if capacity > 2:
+            raise RuntimeError("Failed to allocate 1 bytes on device 'cuda:0'")
+        fitting(self, *args, capacity=capacity, **settings)
+
+    monkeypatch.setattr("gradscape.envs.sheets.capacity", lambda memory, device: 16)
+    monkeypatch.setattr(springs.Solver, "__init__", init)
+    with pytest.warns(RuntimeWarning, match="flip ran out of memory at"):
+        env, found = sampled()
+    assert same(found, wanted)
+    assert env.preferred_batch == 2 * env.threads
+    assert {16, 8, 4, 2} == set(made)
 
 
 def test_memory_for_no_point_at_all_ends_it_and_other_errors_pass():
