@@ -668,7 +668,9 @@ def gallery_compute(
     ] = None,
     part: Annotated[
         list[str] | None,
-        typer.Option(help="slices, sweeps, episodes or searches; may be repeated. By default all of them."),
+        typer.Option(
+            help="slices, sweeps, episodes, searches, reports or tradeoffs; may be repeated. By default all of them."
+        ),
     ] = None,
     fidelity: Fidelity = None,
     device: Device = "auto",

@@ -185,7 +185,10 @@ def test_another_study_is_not_overwritten(run: Command, tmp_path: Path) -> None:
     [
         (["tradeoff", "branin"], "branin has fidelity exact only; there is nothing to trade"),
         (["tradeoff", "bounce", "--ladder", "speed"], "--ladder takes dt, resolution"),
-        (["slice", "bounce", "--dims", "0", "1", "--tolerance", "5%"], "`landscape tradeoff bounce` measures them"),
+        (
+            ["slice", "bounce", "--dims", "0", "1", "--tolerance", "5%", "--set", "horizon=0.5"],
+            "`landscape tradeoff bounce --set=horizon=0.5` measures them",
+        ),
         (["slice", "bounce", "--dims", "0", "1", "--tolerance", "5%", "--fidelity", "draft"], "leave out one"),
         (["slice", "bounce", "--dims", "0", "1", "--tolerance", "close"], "a share such as 5%"),
         (["optimize", "bounce", "--method", "random", "--tolerance", "-1"], "a share such as 5%"),

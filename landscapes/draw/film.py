@@ -74,6 +74,13 @@ def save_still(picture: Picture, path: Path) -> None:
         Image.fromarray(picture).save(partial, "WEBP", quality=80, method=6)
 
 
+def lighten(path: Path) -> None:
+    """Write a PNG anew with 256 colours, which is a third of its weight where it is a diagram."""
+    with Image.open(path) as picture, replacing(path) as partial:
+        few = picture.convert("RGB").quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        few.save(partial, "PNG", optimize=True)
+
+
 def _command(width: int, height: int, count: int, rate: int, paths: list[Path], loss: int) -> list[str]:
     from imageio_ffmpeg import get_ffmpeg_exe
 

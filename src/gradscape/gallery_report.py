@@ -23,10 +23,18 @@ from .cluster import workers
 from .console import duration, size
 from .gallery.figures import DATA, Figure, chosen, read_figures
 from .gallery_episodes import Episodes
+from .gallery_measures import Reports, Tradeoffs
 from .gallery_parts import Part, Searches, Slice, State, Sweep
 
 T = TypeVar("T")
-PARTS: dict[str, type[Part]] = {"slices": Slice, "sweeps": Sweep, "episodes": Episodes, "searches": Searches}
+PARTS: dict[str, type[Part]] = {
+    "slices": Slice,
+    "sweeps": Sweep,
+    "episodes": Episodes,
+    "searches": Searches,
+    "reports": Reports,
+    "tradeoffs": Tradeoffs,
+}
 
 
 def compute(

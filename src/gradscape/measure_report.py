@@ -136,7 +136,7 @@ def _measured(
         if len(subjects) > 1:
             console.print(f"slice {number + 1} of {len(subjects)}: {subject.name}", markup=False)
         try:
-            records.append(_one(console, subject, folder, settings, device, paper_words()))
+            records.append(measured(console, subject, folder, settings, device, paper_words()))
         except KeyboardInterrupt:
             again = shlex.join(["landscape", *sys.argv[1:]])
             console.print(
@@ -153,16 +153,17 @@ def _measured(
     return records, failed
 
 
-def _one(
+def measured(
     console: Console, subject: Subject, folder: Path, settings: dict[str, Any], device: str, said: dict[str, Said]
 ) -> dict[str, Any]:
+    """Return the record of a slice that is in `folder`, or else is measured now and left there."""
     from .landscapes.store import open_slice
 
     dataset = open_slice(subject.store)
     if "grad" not in dataset or min(dataset["loss"].shape) < 3:
         raise ValueError(f"{subject.name}: report needs a slice with gradients and three samples per axis; got another")
     env = environment_of(dataset, device)
-    key = {**settings, "slice": _digest(dataset), "code": code_digest(type(env))}
+    key = {**settings, "slice": digest(dataset), "code": code_digest(type(env))}
     _fetch(console, subject.store.parent, folder, key)
     if (folder / REPORT).exists():
         return _kept(console, folder, key, env.device)
@@ -265,13 +266,18 @@ class _Counted:
 def _announce(console: Console, env: Environment, losses: int, gradients: int) -> None:
     with console.status(f"{env.name}: preparing (kernels are compiled once, then kept)"):
         env.prepare()
-        seconds = sum(count * _rate(env, grad) for grad, count in ((False, losses), (True, gradients)))
+        seconds = seconds_of(env, losses, gradients)
     memory = f", {size(env.memory() * env.preferred_batch)} of memory" if env.memory() else ""
     console.print(
         f"{env.name} · {env.fidelity.name} · {env.device}: up to {losses} episodes and {gradients} with gradients: "
         f"about {duration(seconds)}{memory}",
         markup=False,
     )
+
+
+def seconds_of(env: Environment, losses: int, gradients: int) -> float:
+    """Estimate the seconds of so many episodes without and with gradient."""
+    return sum(count * _rate(env, grad) for grad, count in ((False, losses), (True, gradients)))
 
 
 def _rate(env: Environment, grad: bool) -> float:
@@ -318,7 +324,8 @@ def _write(path: Path, text: str) -> None:
         partial.write_text(text)
 
 
-def _digest(dataset: xr.Dataset) -> str:
+def digest(dataset: xr.Dataset) -> str:
+    """Return what a slice is known by in its report."""
     text = json.dumps(dataset.attrs["identity"], sort_keys=True).encode()
     return hashlib.sha256(text + dataset["loss"].to_numpy().tobytes()).hexdigest()[:12]
 

@@ -108,14 +108,15 @@ class Study:
 
     def announce(self, console: Console) -> None:
         """Say what is left to measure and about how long that takes, from the cheapest fidelity's time for its work."""
-        left = [rung for rung in self.rungs if self.pieces.load(rung.name) is None]
+        left = self.left()
         kept = f", {len(self.rungs) - len(left)} are there already" if len(left) < len(self.rungs) else ""
         where = f"{self.env.name} · {self.env.device} · {self.env.engine} · {self.pieces.folder}"
         console.print(f"{where}\n{len(left)} rungs to measure at {len(self.x)} points{kept}", markup=False)
         if not left:
             return
         with console.status(f"{self.env.name}: preparing (kernels are compiled once, then kept)"):
-            seconds, dearest = self._estimate(left)
+            seconds = self.estimate()
+        dearest = max(seconds, key=lambda name: seconds[name])
         first = f"{duration(seconds[dearest])} of it {dearest}, " if len(seconds) > 1 else ""
         console.print(
             f"about {duration(sum(seconds.values()))}, {first}by the work of an episode; compiling kernels comes on "
@@ -123,10 +124,15 @@ class Study:
             markup=False,
         )
 
-    def _estimate(self, left: Sequence[Rung]) -> tuple[dict[str, float], str]:
-        """Return seconds by rung, and which takes most; a rung that is refused takes none."""
+    def left(self) -> list[Rung]:
+        """Return the rungs that are not measured yet."""
+        return [rung for rung in self.rungs if self.pieces.load(rung.name) is None]
+
+    def estimate(self) -> dict[str, float]:
+        """Return the seconds that each rung that is left should take; one that is refused takes none."""
         from .landscapes.tradeoff import TIMING
 
+        left = self.left()
         base = make(self.env.name, fidelity=next(iter(self.env.fidelities)), **self._how())
         base.prepare()
         batch = self.x[: base.preferred_batch]
@@ -138,7 +144,7 @@ class Study:
         for rung, env in self._made(left):
             each = rate * env.work().count * (SLOWER if env.fidelity.precision == "float64" else 1)
             seconds[rung.name] = len(self.x) * each + 2 * max(TIMING, min(len(self.x), env.preferred_batch) * each / 3)
-        return seconds, max(seconds, key=lambda name: seconds[name])
+        return seconds
 
     def _how(self) -> dict[str, Any]:
         return {"device": self.env.device, "engine": self.env.engine, **asdict(self.env.options)}

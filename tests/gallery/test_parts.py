@@ -8,7 +8,7 @@ import pytest
 import torch
 import xarray as xr
 
-from gradscape import gallery_episodes, gallery_parts, gallery_report
+from gradscape import gallery_episodes, gallery_measures, gallery_parts, gallery_report
 from gradscape.cli import main
 from gradscape.gallery.figures import Figure
 from gradscape.gallery.runs import open_run, save_run
@@ -76,6 +76,9 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         monkeypatch.setattr(gallery_parts, name, value)
     for name, value in (("HEIGHT", 60), ("LONGEST", 2)):
         monkeypatch.setattr(gallery_episodes, name, value)
+    for name, value in (("REPORT_POINTS", 2), ("TRADEOFF_POINTS", 4), ("TURNED", ["precision"])):
+        monkeypatch.setattr(gallery_measures, name, value)
+    monkeypatch.setattr("gradscape.landscapes.tradeoff.TIMING", 0.01)
     monkeypatch.chdir(tmp_path)
     return tmp_path / "data"
 
@@ -104,12 +107,19 @@ def test_everything_is_made_once(small: Path, capsys: pytest.CaptureFixture[str]
     methods = ("cma-es", "random")
     assert kept == [f"runs/{env}/{method}-0.zarr.zip" for env in ("bounce", "branin") for method in methods]
     assert not list((small / "branin").glob("episode*"))
+    for figure in ("ball", "ball-y", "branin"):
+        report = json.loads((small / figure / "report.json").read_text())
+        assert report["name"] == figure
+        assert (small / figure / "gradient-quality.png").read_bytes().startswith(b"\x89PNG")
+    assert sorted(file.name for file in (small / "tradeoff").iterdir()) == ["bounce.json", "bounce.png"]
+    rungs = {row["name"] for row in json.loads((small / "tradeoff/bounce.json").read_text())["rungs"]}
+    assert rungs > {"draft", "standard", "reference", "draft-float64"}
     before = {file: file.stat().st_mtime_ns for file in small.rglob("*") if file.is_file()}
     capsys.readouterr()
     assert compute(small) == 0
     assert {file: file.stat().st_mtime_ns for file in small.rglob("*") if file.is_file()} == before
     said = capsys.readouterr().err
-    assert all(f"{part}: 3 of 3 are there already" in said for part in ("slices", "sweeps", "episodes", "searches"))
+    assert all(f"{part}: 3 of 3 are there already" in said for part in gallery_report.PARTS)
 
 
 def test_films_of_other_nodes_go_when_the_slice_changes(small: Path) -> None:
@@ -125,4 +135,6 @@ def test_films_of_other_nodes_go_when_the_slice_changes(small: Path) -> None:
 
 def test_an_unknown_part_is_refused(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert compute(small, "--part", "films") == 2
-    assert "--part takes slices, sweeps, episodes, searches; got films" in " ".join(capsys.readouterr().err.split())
+    assert "--part takes slices, sweeps, episodes, searches, reports, tradeoffs; got films" in " ".join(
+        capsys.readouterr().err.split()
+    )

@@ -1,0 +1,102 @@
+"""What `landscape gallery compute` measures: the report of a figure's slice, the trade-off of its environment."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from . import measure_report, tradeoff_report
+from .envs.registry import environment_class, make
+from .gallery.measured import TRADEOFF
+from .gallery_parts import Part, read_record, write_record
+from .ladder import LADDERS
+from .measure_report import MEASURES, REPORT, Subject
+from .results import SLICE
+
+if TYPE_CHECKING:
+    from .tradeoff_report import Study
+
+SEED = 0
+REPORT_POINTS, TRADEOFF_POINTS = 6, 64  # those of `landscape report` and `landscape tradeoff`
+TURNED = [ladder for ladder in LADDERS if ladder not in ("engine", "device")]  # those take hours on another device
+
+
+class Reports(Part):
+    """What the slice is like, beside it."""
+
+    def label(self) -> str:
+        """Return the command that measures it elsewhere."""
+        return f"landscape report {self.folder} --device {self.device}"
+
+    def left(self) -> int:
+        """Return 1 where there is no report of this slice."""
+        from .landscapes.store import is_slice, open_slice
+
+        kept, store = read_record(self.folder / REPORT), self.folder / SLICE
+        if not isinstance(kept, dict) or not is_slice(store):
+            return 1
+        return int(kept.get("key", {}).get("slice") != measure_report.digest(open_slice(store)))
+
+    def seconds_each(self) -> float:
+        """Estimate a report by the first episodes."""
+        from .landscapes.character import effort
+
+        return measure_report.seconds_of(self._env(self.figure.fidelity), *effort(len(self.figure.dims), REPORT_POINTS))
+
+    def make(self, console: Console) -> str:
+        """Measure the slice, in the place of a report of another one."""
+        from .gallery.words import paper_words
+        from .landscapes.draw.film import lighten
+
+        files = [self.folder / name for name in (REPORT, MEASURES, measure_report.PICTURE)]
+        for file in files:
+            file.unlink(missing_ok=True)
+        settings = {"points": REPORT_POINTS, "seed": SEED}
+        subject = Subject(self.figure.id, self.folder / SLICE)
+        record = measure_report.measured(console, subject, self.folder, settings, self.device, paper_words())
+        lighten(self.folder / measure_report.PICTURE)
+        return ", ".join(record["verdict"]["words"])
+
+
+class Tradeoffs(Part):
+    """Accuracy against time of the figure's environment, which its other figures share."""
+
+    def label(self) -> str:
+        """Return the command that measures it elsewhere."""
+        turned = ",".join(TURNED)
+        return f"landscape tradeoff {self.figure.env} --device {self.device} --ladder {turned}"
+
+    def left(self) -> int:
+        """Return 1 where there is none, of an environment that has fidelities to trade."""
+        some = len(environment_class(self.figure.env).fidelities) > 1
+        return int(some and not all(file.exists() for file in self._files))
+
+    def seconds_each(self) -> float:
+        """Estimate all rungs by the work of their episodes."""
+        return sum(self._study().estimate().values())
+
+    def make(self, console: Console) -> str:
+        """Measure every rung; those that are measured stay in the study's own folder under out/ until the last is."""
+        from .landscapes.draw.film import lighten
+
+        study = self._study()
+        report = study.run(console)
+        record, picture = self._files
+        record.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(study.pieces.folder / tradeoff_report.PICTURE, picture)
+        lighten(picture)
+        write_record(record, report)
+        return f"{len(report['rungs'])} rungs at {report['points']} points"
+
+    @property
+    def _files(self) -> tuple[Path, Path]:
+        where = self.root / TRADEOFF
+        return where / f"{self.figure.env}.json", where / f"{self.figure.env}.png"
+
+    def _study(self) -> Study:
+        reference = list(environment_class(self.figure.env).fidelities)[-1]
+        env = make(self.figure.env, fidelity=reference, device=self.device)
+        return tradeoff_report.Study.open(env, points=TRADEOFF_POINTS, seed=SEED, ladders=TURNED, out=None, force=False)
