@@ -258,6 +258,15 @@ def test_print_is_dark_on_white_and_has_the_picture(filed: str, visit: Visit) ->
     assert not page.is_visible("#map")
 
 
+def test_a_browser_that_never_lets_it_copy_has_the_command_selected(filed: str, visit: Visit) -> None:
+    page = visit(filed, "full/index.html")
+    page.evaluate("Object.assign(navigator.clipboard ?? {}, { writeText: () => new Promise(() => {}) })")
+    button = page.locator("[data-copy=command]")
+    button.click()
+    page.wait_for_function("document.querySelector('[data-copy=command]').textContent === 'Selected'")
+    assert "landscape slice" in page.evaluate("getSelection().toString()")
+
+
 def test_the_command_is_copied(filed: str, visit: Visit) -> None:
     page = visit(filed, "full/index.html")
     button = page.locator("[data-copy=command]")
