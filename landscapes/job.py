@@ -156,7 +156,8 @@ def cost_of(objective: Objective, store: SliceStore) -> Cost:
     if not left:
         return Cost(0, 0.0, peak_memory())
     getattr(objective, "prepare", lambda: None)()
-    seconds = left * _seconds_per_point(objective, _first_batch(objective, store, pending), grad=store.grad)
+    batch = first_points(store, pending, getattr(objective, "preferred_batch", 1))
+    seconds = left * _seconds_per_point(objective, batch, grad=store.grad)
     arrays = 8 * math.prod(store.shape) * (2 + store.plane.dim * store.grad)
     return Cost(left, seconds, peak_memory() + arrays)
 
@@ -166,13 +167,14 @@ def _cost_there(site: Site | RemoteSite) -> Cost:
     return cost_of(here.objective.objective, here.store)
 
 
-def _first_batch(objective: Objective, store: SliceStore, pending: Sequence[Tile]) -> Float[Tensor, "batch dim"]:
-    batch, parts, size = getattr(objective, "preferred_batch", 1), list[Tensor](), 0
-    for tile in pending:
-        if size < batch:
+def first_points(store: SliceStore, tiles: Sequence[Tile], count: int) -> Float[Tensor, "point dim"]:
+    """Return the first points of tiles, or all there are where they are fewer."""
+    parts, size = list[Tensor](), 0
+    for tile in tiles:
+        if size < count:
             parts.append(store.points(tile))
             size += len(parts[-1])
-    return torch.cat(parts)[:batch]
+    return torch.cat(parts)[:count]
 
 
 def _seconds_per_point(objective: Objective, points: Float[Tensor, "batch dim"], *, grad: bool) -> float:

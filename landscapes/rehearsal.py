@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from zarr.storage import MemoryStore
 
-from .job import PAUSE
+from .job import PAUSE, first_points
 from .layout import SMALL, create_array
 from .objective import Evaluation, Objective
 from .sampling import Progress, sample
@@ -44,7 +44,7 @@ class Alike:
     def __init__(self, objective: Objective, store: SliceStore, rows: int) -> None:
         self.space: ParameterSpace = objective.space
         self.preferred_batch: int = getattr(objective, "preferred_batch", 1)
-        x = _first(store, rows)
+        x = first_points(store, store.tiles(), rows)
         self._tree = cKDTree(self.space.to_unit(x).numpy())
         self._seen = objective.evaluate(x, grad=store.grad)
         self._random = torch.Generator().manual_seed(0)
@@ -140,21 +140,11 @@ def _room(path: Path) -> tuple[int, int]:
     return sum(one.stat().st_size for one in there if one.is_file()), len(there)
 
 
-def _first(store: SliceStore, count: int) -> Float[Tensor, "point dim"]:
-    """Return the first points of a store, or all there are."""
-    parts, size = list[Tensor](), 0
-    for tile in store.tiles():
-        if size < count:
-            parts.append(store.points(tile))
-            size += len(parts[-1])
-    return torch.cat(parts)[:count]
-
-
 def _packed(alike: Alike, store: SliceStore) -> int:
     """Return the bytes of the values once packed."""
     total = math.prod(store.shape)
     count = min(total, MOST)
-    said = alike.evaluate(_first(store, count), grad=store.grad)
+    said = alike.evaluate(first_points(store, store.tiles(), count), grad=store.grad)
     group = zarr.create_group(MemoryStore(), zarr_format=3)
     size = 0
     for name, values in (("loss", said.loss), ("grad", said.grad), ("status", said.status)):

@@ -1,10 +1,8 @@
 """Recordings of episodes hold what the episode says, once where it rests, and are equal where episodes are."""
 
-import os
-import subprocess
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +10,6 @@ import pytest
 import torch
 from rerun.chunk import RrdReader
 
-from gradscape.landscapes.draw import viewer
 from gradscape.landscapes.draw.episode_stream import save_episode
 from gradscape.landscapes.draw.solids import mesh
 from gradscape.landscapes.episode import Episode, Part, View
@@ -105,15 +102,9 @@ def test_many_points_are_thinned_and_many_frames_skipped(tmp_path: Path, monkeyp
     assert [len(row) for row in rows] == [250, 250]
 
 
-def rerun(*arguments: str) -> int:
-    spec = find_spec("rerun_cli")
-    assert spec is not None
-    program = Path(next(iter(spec.submodule_search_locations or ()))) / "rerun"
-    done = subprocess.run([program, *arguments], env=os.environ | viewer.SILENT, capture_output=True, timeout=60)
-    return done.returncode
-
-
-def test_equal_episodes_give_equal_recordings_and_others_do_not(path: Path, tmp_path: Path) -> None:
+def test_equal_episodes_give_equal_recordings_and_others_do_not(
+    path: Path, tmp_path: Path, rerun: Callable[..., int]
+) -> None:
     again, other = tmp_path / "again.rrd", tmp_path / "other.rrd"
     save_episode(EPISODE, again, title="test")
     save_episode(replace(EPISODE, time=2 * TIME), other, title="test")

@@ -1,8 +1,5 @@
-import os
-import subprocess
 import urllib.request
-from collections.abc import Iterator
-from importlib.util import find_spec
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from urllib.error import HTTPError
 
@@ -137,15 +134,9 @@ def test_the_legend_says_where_it_comes_from_and_what_failed(held) -> None:
     assert "gradscape 0." in text
 
 
-def rerun(*arguments: str) -> int:
-    spec = find_spec("rerun_cli")
-    assert spec is not None
-    program = Path(next(iter(spec.submodule_search_locations or ()))) / "rerun"
-    done = subprocess.run([program, *arguments], env=os.environ | viewer.SILENT, capture_output=True, timeout=60)
-    return done.returncode
-
-
-def test_equal_runs_give_equal_recordings_and_others_do_not(path: Path, tmp_path: Path) -> None:
+def test_equal_runs_give_equal_recordings_and_others_do_not(
+    path: Path, tmp_path: Path, rerun: Callable[..., int]
+) -> None:
     again, other = tmp_path / "again.rrd", tmp_path / "other.rrd"
     save_stream(SLICE, LAID, again)
     save_stream(SLICE, overlay(SLICE, [run(POINTS + 1e-3, [1] * 12)]), other)
