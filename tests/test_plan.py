@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import pytest
@@ -20,7 +21,7 @@ JOBS = {
     "flip": ["flip", "--dims", "0", "1", "--resolution", "14", "--fidelity", "draft"],
     "sweep": ["bounce", "--dims", "0", "1", "--over", "2", "--frames", "6", "--resolution", "16"],
 }
-TRIES = 3
+TRIES = 6
 
 
 def plan(run: Callable[..., Said], cwd: Path, *arguments: str) -> dict[str, Any]:
@@ -40,23 +41,23 @@ def test_a_job_takes_what_was_planned_within_a_quarter(
 ) -> None:
     """Seconds are those of all cores that the process has used: what else the machine does falls on those of the clock.
 
-    The best of a few tries counts, since caches are shared, too; all but `start`, which in this process is over.
+    Medians of a few tries count, since caches are shared, too; all but `start`, which in this process is over.
     """
     verb = "sweep" if name == "sweep" else "slice"
     small = [*JOBS[name], "--resolution", "2"] + (["--frames", "2"] if verb == "sweep" else [])
     assert run(verb, *small, "--out", "loads", cwd=tmp_path).returncode == 0
     for clock in ("perf_counter", "monotonic"):
         monkeypatch.setattr(time, clock, time.process_time)
-    off = []
+    expected, took = [], []
     for number in range(TRIES):
         planned = plan(run, tmp_path, *JOBS[name])
         done = json.loads(run(verb, *JOBS[name], "--out", str(number), "--json", cwd=tmp_path).stdout)
         assert planned["episodes"] == done["episodes"]
-        expected = sum(planned["seconds"][part] for part in ("simulating", "writing", "drawing"))
-        off.append(expected / done["seconds"] - 1)
-        if abs(off[-1]) < 0.25:
+        expected.append(sum(planned["seconds"][part] for part in ("simulating", "writing", "drawing")))
+        took.append(done["seconds"])
+        if (off := abs(median(expected) / median(took) - 1)) < 0.25:
             break
-    assert min(map(abs, off)) < 0.25, off
+    assert off < 0.25, (expected, took)
     there = tmp_path / str(number)
     assert planned["disk"]["bytes"] == pytest.approx(size(there), rel=0.25)
     assert planned["disk"]["files"] == pytest.approx(len(list(there.rglob("*"))), rel=0.02)

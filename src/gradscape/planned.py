@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from .landscapes.plane import Plane
 
 HERE = "measured here, now"
-FEW, MORE = 2, 4  # frames of which films are made, to see what each frame takes
+FEW, MORE = 2, 8  # frames of which films are made, to see what each frame takes
 SUMMARY = 1000  # bytes of a slice's summary, about
 
 
@@ -121,8 +121,9 @@ def _filming(job: SweepJob, seconds_each: float, folder: Path, frames: int) -> t
     from .landscapes.rehearsal import Alike, drawn
 
     folder.mkdir()
-    shown = [round(at * (len(job.stores) - 1) / (MORE - 1)) for at in range(MORE)]
-    alike = {at: Alike.of(job.moved.env_at(at), job.stores[at], MORE * seconds_each) for at in set(shown)}
+    most, last = min(MORE, max(frames, FEW + 1)), len(job.stores) - 1
+    shown = [round(at * last / (most - 1)) for at in range(most)]
+    alike = {at: Alike.of(job.moved.env_at(at), job.stores[at], most * seconds_each) for at in set(shown)}
     datasets = [alike[at].dataset(job.stores[at]) for at in shown]
 
     def film(count: int) -> None:
@@ -132,8 +133,8 @@ def _filming(job: SweepJob, seconds_each: float, folder: Path, frames: int) -> t
 
     loading, few = drawn(partial(film, FEW))
     small, began = _bytes(folder), time.perf_counter()
-    film(MORE)
-    more, grown = time.perf_counter() - began, (frames - FEW) / (MORE - FEW)
+    film(most)
+    more, grown = time.perf_counter() - began, (frames - FEW) / (most - FEW)
     return loading + few + grown * (more - few), round(small + grown * (_bytes(folder) - small))
 
 
