@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import shutil
 import time
@@ -24,6 +25,12 @@ def replacing(path: Path) -> Iterator[Path]:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def write_json(path: Path, record: object) -> None:
+    """Write a JSON file; its numbers are as Python writes them, NaN and Infinity included."""
+    with replacing(path) as partial:
+        partial.write_text(json.dumps(record, indent=1) + "\n")
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .files import replacing
+from .files import replacing, write_json
 from .identity import check_identity, plain_json
 
 SETTINGS, PIECES = "settings.json", "pieces"
@@ -37,8 +37,7 @@ class Pieces:
             shutil.rmtree(folder / PIECES, ignore_errors=True)
         elif path.exists():
             check_identity(folder, wanted=wanted, found=json.loads(path.read_text()), what="study")
-        with replacing(path) as partial:
-            partial.write_text(json.dumps(wanted, indent=1) + "\n")
+        write_json(path, wanted)
         return cls(folder)
 
     def load(self, name: str) -> dict[str, NDArray[Any]] | None:

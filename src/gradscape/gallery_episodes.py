@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from .envs.registry import environment_class, make
-from .gallery_parts import LOSS, Part, read_record, seconds_of_one, write_record
+from .gallery_parts import LOSS, Part, read_record, seconds_of_one
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -60,6 +60,7 @@ class Episodes(Part):
 
     def make(self, console: Console) -> str:
         """Film every episode that is not there, and clear away those of other nodes."""
+        from .landscapes.files import write_json
         from .landscapes.store import plane_of
 
         dataset, env = self._dataset, self._env(self.figure.fidelity)
@@ -68,12 +69,12 @@ class Episodes(Part):
             if node not in kept:
                 with console.status(f"{self.figure.id}: the episode of {node.why}"):
                     self._draw(env, plane, node)
-                write_record(self.folder / "episodes.json", [asdict(one) for one in [*kept, node]])
+                write_json(self.folder / "episodes.json", [asdict(one) for one in [*kept, node]])
                 kept.append(node)
         for file in self.folder.glob("episode-*"):
             if file.stem not in {node.name for node in self._nodes}:
                 file.unlink()
-        write_record(self.folder / "episodes.json", [asdict(node) for node in self._nodes])
+        write_json(self.folder / "episodes.json", [asdict(node) for node in self._nodes])
         return f"{len(self._nodes)} episodes"
 
     def _draw(self, env: Environment, plane: Plane, node: Node) -> None:

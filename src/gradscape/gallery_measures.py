@@ -11,7 +11,7 @@ from rich.console import Console
 from . import measure_report, tradeoff_report
 from .envs.registry import environment_class, make
 from .gallery.measured import TRADEOFF
-from .gallery_parts import Part, read_record, write_record
+from .gallery_parts import Part, read_record
 from .ladder import LADDERS
 from .measure_report import MEASURES, REPORT, Subject
 from .results import SLICE
@@ -81,6 +81,7 @@ class Tradeoffs(Part):
     def make(self, console: Console) -> str:
         """Measure every rung; those that are measured stay in the study's own folder under out/ until the last is."""
         from .landscapes.draw.film import lighten
+        from .landscapes.files import write_json
 
         study = self._study()
         report = study.run(console)
@@ -88,7 +89,7 @@ class Tradeoffs(Part):
         record.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(study.pieces.folder / tradeoff_report.PICTURE, picture)
         lighten(picture)
-        write_record(record, report)
+        write_json(record, report)
         return f"{len(report['rungs'])} rungs at {report['points']} points"
 
     @property

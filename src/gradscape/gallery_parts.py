@@ -157,12 +157,13 @@ class Sweep(Part):
     def make(self, console: Console) -> str:
         """Sample the sweep's slices and film them."""
         from .landscapes.draw.sweep import save_films
+        from .landscapes.files import write_json
 
         job = self._job()
         drawn = job.sampled(console)
         save_films(drawn, self.folder / FILM, None, dpi=DPI, loss=LOSS)
         about = {"label": drawn.label, "low": drawn.values[0], "high": drawn.values[-1], "command": self.label()}
-        write_record(self.folder / ABOUT, {**self._settings, **about})
+        write_json(self.folder / ABOUT, {**self._settings, **about})
         return f"{FRAMES} frames of {COARSE} x {COARSE} points over {drawn.label}"
 
     @property
@@ -258,11 +259,3 @@ def read_record(path: Path) -> Any:
         return json.loads(path.read_text())
     except (OSError, ValueError):
         return None
-
-
-def write_record(path: Path, record: object) -> None:
-    """Write a JSON file, whole or not at all."""
-    from .landscapes.files import replacing
-
-    with replacing(path) as partial:
-        partial.write_text(json.dumps(record, indent=1) + "\n")

@@ -60,6 +60,8 @@ def report(
     as_json: bool,
 ) -> None:
     """Measure slices, say what it costs, print the numbers and leave them in files."""
+    from .landscapes.files import replacing, write_json
+
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     if (what is None) != everything:
         raise ValueError("report takes a slice's folder, an environment, or --all for every figure of the gallery")
@@ -75,8 +77,9 @@ def report(
         _show(records[0], as_json, folder)
         return
     summary = {"reports": records, "environments": by_environment(records), "failed": failed}
-    _write(folder / REPORT, json.dumps(summary, indent=2) + "\n")
-    _write(folder / TABLE, slices_markdown(records))
+    write_json(folder / REPORT, summary)
+    with replacing(folder / TABLE) as partial:
+        partial.write_text(slices_markdown(records))
     console.print(f"{folder}: {REPORT}, {TABLE}, and a folder of each slice", markup=False)
     if as_json:
         print(json.dumps({**summary, "folder": str(folder)}))
@@ -310,18 +313,12 @@ def _leave(console: Console, dataset: xr.Dataset, character: Character, record: 
     from .landscapes.character import named_measures
     from .landscapes.draw.page import save
     from .landscapes.draw.quality import quality_figure
+    from .landscapes.files import write_json
 
     save(quality_figure(dataset, character.steps, character.samples, character.smooth), folder / PICTURE)
-    _write(folder / MEASURES, json.dumps(named_measures(record), indent=2, ensure_ascii=False) + "\n")
-    _write(folder / REPORT, json.dumps(record, indent=2) + "\n")
+    write_json(folder / MEASURES, named_measures(record))
+    write_json(folder / REPORT, record)
     console.print(f"{folder}: {REPORT}, {MEASURES}, {PICTURE}", markup=False)
-
-
-def _write(path: Path, text: str) -> None:
-    from .landscapes.files import replacing
-
-    with replacing(path) as partial:
-        partial.write_text(text)
 
 
 def digest(dataset: xr.Dataset) -> str:

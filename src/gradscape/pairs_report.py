@@ -48,6 +48,7 @@ def pairs(
     env = make(name, fidelity=fidelity, device=device, engine=engine, **read_settings(settings))
     if env.space.dim < 2:
         raise ValueError(f"{name} has one parameter; a pair takes two")
+    from .landscapes.files import write_json
     from .landscapes.pairs import Design, default_samples, explore
     from .landscapes.pieces import Pieces
 
@@ -68,7 +69,7 @@ def pairs(
         sys.exit(130)
     provenance = provenance_of(env, command)
     report = {**identity, "set": read_settings(settings), **_record(env, design, found), "provenance": provenance}
-    _write(report, folder)
+    write_json(folder / RECORD, report)
     if as_json:
         print(json.dumps({**report, "pairs": report["pairs"][:top], "folder": str(folder)}))
     show(report, Console(stderr=as_json), top)
@@ -108,13 +109,6 @@ def _announce(console: Console, env: Environment, design: Design, folder: Path) 
         f"{duration(design.episodes * each)}; --samples lowers it",
         markup=False,
     )
-
-
-def _write(report: dict[str, Any], folder: Path) -> None:
-    from .landscapes.files import replacing
-
-    with replacing(folder / RECORD) as partial:
-        partial.write_text(json.dumps(report) + "\n")
 
 
 def show(report: dict[str, Any], console: Console, top: int) -> None:

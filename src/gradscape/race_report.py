@@ -214,7 +214,7 @@ class Job:
         """Draw the race, write its figures and return them."""
         from .landscapes.draw.page import save
         from .landscapes.draw.race import race_figure
-        from .landscapes.files import replacing
+        from .landscapes.files import write_json
         from .optim.race import judged, picture, tables
         from .optim.standings import targets
 
@@ -248,8 +248,7 @@ class Job:
             provenance=provenance_of(self.env, self.command),
         )
         save(race_figure(dataset), self.folder / PICTURE)
-        with replacing(self.folder / FIGURES) as partial_file:
-            partial_file.write_text(json.dumps(figures, allow_nan=False) + "\n")
+        write_json(self.folder / FIGURES, figures)
         return figures
 
     def farewell(self, console: Console) -> None:

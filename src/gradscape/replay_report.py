@@ -92,7 +92,7 @@ def _folder(out: str | None, env: Environment, x: Tensor) -> Path:
 
 def _write_record(env: Environment, x: Tensor, loss: float, status: int, path: Path) -> None:
     """Keep what was drawn, and how it came about."""
-    from .landscapes.files import replacing
+    from .landscapes.files import write_json
     from .landscapes.objective import Status
 
     command = shlex.join(["landscape", *sys.argv[1:]])
@@ -103,5 +103,4 @@ def _write_record(env: Environment, x: Tensor, loss: float, status: int, path: P
         "loss": loss if status == Status.OK else None,
         "status": Status(status).name,
     }
-    with replacing(path) as partial:
-        partial.write_text(json.dumps(record, indent=1) + "\n")
+    write_json(path, record)

@@ -225,11 +225,10 @@ class Job:
         return f"{self.env.name} · {self.env.fidelity.name} · {self.env.device} · {self.optimizer.name} · {self.folder}"
 
     def _summarise(self, resumed: int, seconds: float) -> dict[str, Any]:
-        from .landscapes.files import replacing
+        from .landscapes.files import write_json
 
         summary = _summary(self.filled, resumed, seconds, self.command)
-        with replacing(self.folder / SUMMARY) as partial:
-            partial.write_text(json.dumps(summary, indent=2) + "\n")
+        write_json(self.folder / SUMMARY, summary)
         return summary
 
 

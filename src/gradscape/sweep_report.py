@@ -209,7 +209,7 @@ class Job:
         return sampled
 
     def _summarise(self, drawn: Sweep, resumed: int, seconds: float) -> dict[str, Any]:
-        from .landscapes.files import replacing
+        from .landscapes.files import write_json
 
         identity = self.stores[0].identity
         frames = [_frame(value, dataset) for value, dataset in zip(drawn.values, drawn.slices, strict=True)]
@@ -229,8 +229,7 @@ class Job:
             "command": self.command,
             "files": [*sorted({name.split("/")[0] for name in self.moved.stores}), FILM, GIF, STREAM, SUMMARY],
         }
-        with replacing(self.folder / SUMMARY) as partial:
-            partial.write_text(json.dumps(summary, indent=2) + "\n")
+        write_json(self.folder / SUMMARY, summary)
         return summary
 
 

@@ -23,12 +23,11 @@ if TYPE_CHECKING:
 
 def keep(report: Mapping[str, Any]) -> Path:
     """Keep a report where `chosen` finds it, in the user's data folder, in the place of an earlier one."""
-    from .landscapes.files import replacing
+    from .landscapes.files import write_json
 
     identity = report["identity"]
     path = _kept(str(report["env"]), identity["options"], identity["device"])
-    with replacing(path) as partial:
-        partial.write_text(json.dumps(report, indent=1) + "\n")
+    write_json(path, report)
     return path
 
 

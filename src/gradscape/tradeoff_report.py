@@ -163,12 +163,11 @@ class Study:
         report = self._report(samples)
         from .landscapes.draw.page import save
         from .landscapes.draw.tradeoff import tradeoff_figure
-        from .landscapes.files import replacing
+        from .landscapes.files import write_json
 
         folder = self.pieces.folder
         save(tradeoff_figure(report), folder / PICTURE)
-        with replacing(folder / RECORD) as partial:
-            partial.write_text(json.dumps(report, indent=1) + "\n")
+        write_json(folder / RECORD, report)
         return report
 
     def _measure(self, console: Console) -> dict[str, Sample]:
