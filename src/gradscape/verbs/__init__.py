@@ -1,0 +1,1 @@
+"""The verbs of the command `landscape`, one function each; nothing heavy is imported before it is used."""

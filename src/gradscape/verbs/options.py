@@ -1,0 +1,48 @@
+"""Options that several verbs have."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+Fidelity = Annotated[str | None, typer.Option(help="How accurately to simulate: draft, standard or reference.")]
+Tolerance = Annotated[
+    str | None,
+    typer.Option(
+        help="Instead of --fidelity: the quickest that `landscape tradeoff` found within this loss error, 5% of the "
+        "losses' spread or a number in their unit."
+    ),
+]
+Device = Annotated[str, typer.Option(help="auto, cpu or cuda; auto takes CUDA where it is.")]
+Deterministic = Annotated[
+    bool, typer.Option("--deterministic", help="Add up in the same order every time on a GPU, some ten times slower.")
+]
+Engine = Annotated[str, typer.Option(help="warp, or taichi where a scene has it: the reference, to hold Warp against.")]
+Set = Annotated[list[str] | None, typer.Option("--set", help="A scene option, name=value; may be repeated.")]
+Out = Annotated[
+    str | None, typer.Option(help="Folder for the results; by default one under out/ named after the slice.")
+]
+Json = Annotated[bool, typer.Option("--json", help="Print the summary as one JSON object on standard output.")]
+Force = Annotated[bool, typer.Option("--force", help="Begin anew where a slice exists already.")]
+Budget = Annotated[int, typer.Option(min=1, help="Episodes to evaluate, not one more.")]
+OutOfRun = Annotated[
+    str | None, typer.Option("--out", help="Folder for the results; by default one under out/ named after the run.")
+]
+ForceRun = Annotated[bool, typer.Option("--force", help="Begin anew where a run exists already.")]
+Extent = Annotated[
+    str | None,
+    typer.Option(help="What to cover: a fraction of the box around the point, or LOW:HIGH; the whole box by default."),
+]
+Through = Annotated[
+    str, typer.Option(help="The point it goes through: center, random:SEED, example:NAME or a file of parameters.")
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        help="Dask workers to compute on: the address of a scheduler, or local:N for N of them here; local alone has "
+        "one per GPU, or per core."
+    ),
+]
+NoGradients = Annotated[bool, typer.Option("--no-gradients", help="Sample losses only.")]
+Data = Annotated[str | None, typer.Option(help="Folder of the figures' slices; by default the gallery's own.")]
