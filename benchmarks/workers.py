@@ -1,15 +1,17 @@
 """How the rate of a slice grows with the workers of one machine.
 
-    python benchmarks/workers.py fluid --device cuda --fidelity draft --resolution 64 --workers 1 2 4 [--json FILE]
+    python benchmarks/workers.py fluid --device cuda --fidelity draft --workers 1 2 4 [--json FILE]
 
 For each number of workers a cluster of them is started and warmed by a slice of its own; then the same slice is sampled
-some times into a store of its own, and the best counts. Ratios are of one run, to its first number of workers.
+some times into a store of its own, and the best counts. Ratios are of one run, to its first number of workers. By
+default the slice is of two whole batches for each of the most workers, so that fewer workers do the same batches.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import tempfile
 import time
 from concurrent.futures import Executor
@@ -54,7 +56,7 @@ def main() -> None:
     parser.add_argument("env")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--fidelity")
-    parser.add_argument("--resolution", type=int, default=64)
+    parser.add_argument("--resolution", type=int)
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--repetitions", type=int, default=3)
     parser.add_argument("--json", type=Path)
@@ -62,11 +64,12 @@ def main() -> None:
     from gradscape.envs.registry import make
 
     env = make(given.env, fidelity=given.fidelity, device=given.device)
-    print(f"{env.name} · {env.fidelity.name} · {env.device} · {given.resolution}² points · batch {env.preferred_batch}")
+    resolution = given.resolution or math.isqrt(2 * max(given.workers) * env.preferred_batch)
+    print(f"{env.name} · {env.fidelity.name} · {env.device} · {resolution}² points · batch {env.preferred_batch}")
     print("workers  episodes/s  ratio  of linear")
     rows: list[dict[str, Any]] = []
     for count in given.workers:
-        row = measured(env, count, given.resolution, given.repetitions)
+        row = measured(env, count, resolution, given.repetitions)
         rows.append(row)
         row["ratio"] = row["episodes_per_second"] / rows[0]["episodes_per_second"]
         row["of_linear"] = row["ratio"] / count * given.workers[0]
@@ -75,7 +78,7 @@ def main() -> None:
         )
     if given.json:
         about = {"env": env.name, "fidelity": env.fidelity.name, "device": env.device, "batch": env.preferred_batch}
-        given.json.write_text(json.dumps({**about, "resolution": given.resolution, "rows": rows}, indent=1) + "\n")
+        given.json.write_text(json.dumps({**about, "resolution": resolution, "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

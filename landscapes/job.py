@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import resource
 import sys
@@ -19,7 +18,7 @@ import xarray as xr
 from jaxtyping import Float
 from torch import Tensor
 
-from .files import replacing
+from .files import write_json
 from .halving import Halving
 from .objective import Objective, Status
 from .plane import Plane
@@ -112,8 +111,7 @@ class Job:
         self._save(dataset)
         computed = last.done - last.resumed if last else 0
         summary = self._summary(dataset, computed, time.monotonic() - start, command)
-        with replacing(self.folder / SUMMARY) as partial:
-            partial.write_text(json.dumps(summary, indent=2) + "\n")
+        write_json(self.folder / SUMMARY, summary)
         return summary
 
     def picture(self) -> None:

@@ -18,6 +18,7 @@ import torch
 import xarray as xr
 import zarr
 from jaxtyping import Float
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 from zarr.storage import MemoryStore
@@ -32,55 +33,74 @@ from .store import SliceStore
 PATIENCE = 2.0  # seconds that a rehearsal goes on writing tiles
 SEEN = 1.0  # seconds for the evaluations that are repeated
 JITTER = 1e-3  # by how much, relatively, a repeated value differs from the true one
-MOST = 1 << 16  # points that are packed to see how well they compress
+BLOCK = 1024  # points that are made up at a time
+MOST = 1 << 20  # numbers that are packed to see how well they compress
 
 
 class Alike:
-    """An objective that repeats the evaluations of another, each where it is nearest, slightly altered, at no cost.
+    """An objective that repeats the evaluations of another, each where it is nearest, slightly altered.
 
-    `rows` true evaluations are made, at the first points of `store`, which spread over all of it.
+    `rows` true evaluations are made, at the first points of `store`, which spread over all of it. `seconds` were spent
+    on repeating them, which a job does not spend.
     """
+
+    seconds = 0.0
 
     def __init__(self, objective: Objective, store: SliceStore, rows: int) -> None:
         self.space: ParameterSpace = objective.space
         self.preferred_batch: int = getattr(objective, "preferred_batch", 1)
         x = first_points(store, store.tiles(), rows)
-        self._tree = cKDTree(self.space.to_unit(x).numpy())
+        self._plane = store.plane
+        self._tree = cKDTree(self._place(x))
         self._seen = objective.evaluate(x, grad=store.grad)
+        loss = self._seen.loss.detach().cpu().nan_to_num().double()
+        self._single = bool(torch.equal(loss, loss.float().double()))  # then numbers compress better
         self._random = torch.Generator().manual_seed(0)
 
     @classmethod
     def of(cls, objective: Objective, store: SliceStore, seconds_each: float) -> Alike:
-        """Make as many true evaluations as fit into a moment, at least one."""
-        return cls(objective, store, max(1, int(SEEN / max(seconds_each, 1e-9))))
+        """Make as many true evaluations as fit into a moment and a batch, at least one."""
+        rows = min(int(SEEN / max(seconds_each, 1e-9)), getattr(objective, "preferred_batch", 1))
+        return cls(objective, store, max(1, rows))
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
         """Return for each row of `x` what was found nearest to it."""
-        rows = torch.from_numpy(self._tree.query(self.space.to_unit(x).numpy())[1])
-        slopes = None if self._seen.grad is None or not grad else self._altered(self._seen.grad[rows])
-        return Evaluation(self._altered(self._seen.loss[rows]), slopes, self._seen.status[rows])
+        began = time.perf_counter()
+        repeated = self._repeated(x, grad=grad)
+        self.seconds += time.perf_counter() - began
+        return repeated
 
     def dataset(self, store: SliceStore) -> xr.Dataset:
         """Return a slice of the shape of `store` without a gap."""
         blank = store.dataset()
+        began = time.perf_counter()
         grid = np.meshgrid(*(blank[name].to_numpy() for name in store.dims), indexing="ij")[::-1]
-        x = store.plane.lift(torch.from_numpy(np.stack([axis.ravel() for axis in grid], axis=1)))
-        said = self.evaluate(x, grad=store.grad)
-        values = {"loss": said.loss, "grad": said.grad, "status": said.status}
-        return blank.copy(
-            data={
-                name: value.reshape(blank[name].shape).numpy().astype(blank[name].dtype)
-                for name, value in values.items()
-                if value is not None
-            }
-        )
+        nodes = torch.from_numpy(np.stack([axis.ravel() for axis in grid], axis=1))
+        filled = {name: np.empty(one.shape, one.dtype) for name, one in blank.items()}
+        for start in range(0, len(nodes), BLOCK):
+            rows = slice(start, start + BLOCK)
+            said = self._repeated(store.plane.lift(nodes[rows]), grad=store.grad)
+            for name, values in filled.items():
+                flat = values.reshape(len(nodes), -1)
+                flat[rows] = getattr(said, str(name)).reshape(-1, flat.shape[1])
+        self.seconds += time.perf_counter() - began
+        return blank.copy(data=filled)
+
+    def _repeated(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+        rows = torch.from_numpy(self._tree.query(self._place(x))[1])
+        slopes = None if self._seen.grad is None or not grad else self._altered(self._seen.grad[rows])
+        return Evaluation(self._altered(self._seen.loss[rows]), slopes, self._seen.status[rows])
+
+    def _place(self, x: Float[Tensor, "batch dim"]) -> NDArray[np.float64]:
+        """Return where points are on the plane, which has sides of length 1."""
+        plane = self._plane
+        return ((plane.project(x) - plane.lower) / (plane.upper - plane.lower)).numpy()
 
     def _altered(self, values: Tensor) -> Tensor:
-        values = values.detach().cpu()
+        """Return other values; in place, since the memory of a rehearsal is to be that of the job."""
         noise = torch.rand(values.shape, generator=self._random, dtype=torch.float64)
-        altered = values.double() * (1 + JITTER * noise)
-        single = bool(torch.equal(values.nan_to_num().double(), values.nan_to_num().float().double()))
-        return altered.float().double() if single else altered  # what was computed in float32 compresses better
+        altered = noise.mul_(JITTER).add_(1).mul_(values.detach().cpu())
+        return altered.float().double() if self._single else altered
 
 
 @dataclass(frozen=True)
@@ -102,29 +122,32 @@ def stored(alike: Alike, store: SliceStore) -> Stored:
     path = store.path
     if path is None:
         raise ValueError("a rehearsal needs a store on disk; got one in memory")
-    tiles, began = len(store.tiles()), time.perf_counter()
-    before, done, ended = _room(path), 0, began
+    tiles, began = len(store.tiles()), time.perf_counter() - alike.seconds
+    before, done, took = _room(path), 0, 0.0
 
     def follow(now: Progress) -> None:
-        nonlocal done, ended
-        done, ended = now.done, time.perf_counter()
-        if done and ended - began > PATIENCE:
+        nonlocal done, took
+        done, took = now.done, time.perf_counter() - alike.seconds - began
+        if done and took > PATIENCE:
             raise _Enough
 
     with contextlib.suppress(_Enough):
         sample(alike, store.plane, store, grad=store.grad, progress=follow)
     after, total = _room(path), math.prod(store.shape)
     grown = [round(old + (new - old) * total / done) for old, new in zip(before, after, strict=True)]
-    return Stored((ended - began) * total / done, grown[0], min(grown[1], before[1] + 6 * tiles), _packed(alike, store))
+    return Stored(took * total / done, grown[0], min(grown[1], before[1] + 6 * tiles), _packed(alike, store))
 
 
-def drawn(draw: Callable[[], object]) -> tuple[float, float]:
-    """Return seconds of a first drawing beyond those of any other (what it loads), and those of another."""
+def drawn(draw: Callable[[], object], alike: Alike | None = None) -> tuple[float, float]:
+    """Return seconds of a first drawing beyond those of any other (what it loads), and those of another.
+
+    What `alike` spends on making up what is drawn does not count.
+    """
     took = []
     for _ in range(2):
-        began = time.perf_counter()
+        before, began = alike.seconds if alike else 0.0, time.perf_counter()
         draw()
-        took.append(time.perf_counter() - began)
+        took.append(time.perf_counter() - began - (alike.seconds - before if alike else 0.0))
     return max(0.0, took[0] - took[1]), took[1]
 
 
@@ -143,7 +166,7 @@ def _room(path: Path) -> tuple[int, int]:
 def _packed(alike: Alike, store: SliceStore) -> int:
     """Return the bytes of the values once packed."""
     total = math.prod(store.shape)
-    count = min(total, MOST)
+    count = min(total, MOST // (2 + alike.space.dim * store.grad))
     said = alike.evaluate(first_points(store, store.tiles(), count), grad=store.grad)
     group = zarr.create_group(MemoryStore(), zarr_format=3)
     size = 0

@@ -1,6 +1,9 @@
 """The verb `plan`: what it predicts against what jobs then take."""
 
 import json
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -61,6 +64,34 @@ def test_a_job_takes_what_was_planned_within_a_quarter(
     there = tmp_path / str(number)
     assert planned["disk"]["bytes"] == pytest.approx(size(there), rel=0.25)
     assert planned["disk"]["files"] == pytest.approx(len(list(there.rglob("*"))), rel=0.02)
+
+
+def test_a_job_needs_the_memory_that_was_planned_within_a_quarter(tmp_path: Path) -> None:
+    job = [
+        "cartpole",
+        "--dims",
+        "0",
+        "1",
+        "--resolution",
+        "128",
+        "--json",
+    ]  # a third of it is gradients of 400 components
+    planned, _ = alone("plan", *job, cwd=tmp_path)
+    _, peak = alone("slice", *job, cwd=tmp_path)
+    assert planned["memory"]["host"] == pytest.approx(peak, rel=0.25)
+
+
+def alone(*arguments: str, cwd: Path) -> tuple[dict[str, Any], int]:
+    """Run the command in a process of its own; return what it printed and the most memory it held [bytes]."""
+    said = cwd / "said.json"
+    with (
+        said.open("w") as out,
+        subprocess.Popen([sys.executable, "-m", "gradscape", *arguments], stdout=out, cwd=cwd) as process,
+    ):
+        _, code, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(code)
+    assert process.returncode == 0
+    return json.loads(said.read_text()), used.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def test_a_plan_leaves_nothing_behind_and_workers_share_what_can_be_shared(

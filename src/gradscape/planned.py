@@ -73,7 +73,7 @@ def of_slice(env: Environment, plane: Plane, folder: Path, *, grad: bool, began:
     start, memory = time.perf_counter() - began, cost.memory - peak_memory()
     alike = Alike.of(env, job.store, cost.seconds / cost.episodes)
     room = stored(alike, job.store)
-    loading, once = drawn(lambda: job._save(alike.dataset(job.store)))
+    loading, once = drawn(lambda: job._save(alike.dataset(job.store)), alike)
     batches = -(-cost.episodes // env.preferred_batch)
     count = pictures(job.store, batches, cost.seconds + room.seconds, once)
     extra = SUMMARY + sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
