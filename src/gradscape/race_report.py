@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import pickle
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -16,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from . import cluster
-from .cluster import recipe
+from . import cluster, race_workers
 from .console import duration, identity_of, provenance_of, read_settings
 from .envs.registry import make
 from .optim.registry import METHODS
@@ -200,15 +198,10 @@ class Job:
         self, executor: Executor, ratio: float | None, follow: Callable[[racing.Entry, Progress], None]
     ) -> None:
         """Let workers search, and read what they wrote."""
-        from .landscapes.spread import results
-
-        made_there = pickle.dumps(recipe(self.env))
-        left = [number for number, entry in enumerate(self.entries) if self._left(entry)]
-        entries = {number: self.entries[number] for number in left}
-        tasks = [(number, made_there, _searched(entry), self.budget, ratio) for number, entry in entries.items()]
-        for number, now in results(executor, _search_there, tasks):
-            with entries[number].run.filling():  # reads it
-                follow(entries[number], now)
+        left = [entry for entry in self.entries if self._left(entry)]
+        for entry, now in race_workers.search_all(executor, self.env, left, budget=self.budget, ratio=ratio):
+            with entry.run.filling():  # reads it
+                follow(entry, now)
 
     def save(self) -> dict[str, Any]:
         """Draw the race, write its figures and return them."""
@@ -291,13 +284,9 @@ class Job:
         return (known[0] if known else cost.ratio) if any(needs.values()) else None
 
     def _cost(self, executor: Executor | None, *, grad: bool) -> Cost:
-        from .landscapes.spread import results
         from .optim.search import episode_cost
 
-        if executor is None:
-            return episode_cost(self.env, grad=grad)
-        (cost,) = results(executor, _cost_there, [(pickle.dumps(recipe(self.env)), grad)])
-        return cost
+        return race_workers.cost(executor, self.env, grad=grad) if executor else episode_cost(self.env, grad=grad)
 
     def _left(self, entry: racing.Entry) -> int:
         return max(0, self.budget - entry.run.count)
@@ -350,44 +339,6 @@ def _entry(env: Environment, maker: Any, folder: Path, *, budget: int, command: 
     else:
         run = Run.open_or_create(path, env.space, **wanted)
     return Entry(method, seed, run, maker)
-
-
-@dataclass(frozen=True)
-class _Searched:
-    """A run as a worker is told of it."""
-
-    method: str
-    seed: int
-    options: Mapping[str, Any]
-    path: str
-
-
-def _searched(entry: racing.Entry) -> _Searched:
-    options = entry.made.keywords["options"]  # type: ignore[attr-defined]
-    return _Searched(entry.method, entry.seed, options, str(entry.run.path))
-
-
-def _search_there(
-    number: int, made_there: bytes, run: _Searched, budget: int, ratio: float | None
-) -> tuple[int, Progress]:
-    """Fill a run in a worker's process, and return how far it came."""
-    from .landscapes.spread import kept
-    from .optim.run import Run
-    from .optim.search import search
-
-    give_torch_one_thread()
-    env: Any = kept(made_there).objective
-    seen: list[Progress] = []
-    optimizer = made(run.method, env, seed=run.seed, options=dict(run.options))
-    search(env, optimizer, Run.open(run.path), budget=budget, gradient_cost=ratio, progress=seen.append)
-    return number, seen[-1]
-
-
-def _cost_there(made_there: bytes, grad: bool) -> Cost:
-    from .landscapes.spread import kept
-    from .optim.search import episode_cost
-
-    return episode_cost(kept(made_there).objective, grad=grad)
 
 
 def _folder(env: Environment, options: Mapping[str, dict[str, str]]) -> Path:
