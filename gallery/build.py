@@ -5,7 +5,7 @@ A figure's folder in the data holds `slice.zarr`; whatever else of these is ther
 resolution, command); `episodes.json`, a list of nodes (row, column, why, loss, status), each with
 `episode-ROW-COLUMN.mp4` and `.webp`, its last frame; `report.json`, `measures.json` (names and numbers) and
 `gradient-quality.png`, of `landscape report`. Runs in `runs/ENVIRONMENT-OPTIONS/` are laid over every slice of their
-environment and options; `tradeoff/ENVIRONMENT.json` and `.png` are shown with every slice of theirs.
+environment and options; `tradeoff/ENVIRONMENT-DEVICE.json` and `.png` are shown with every slice of theirs.
 
 `manifest.json` lists all of it for programs; `schema` counts up whenever the meaning of a name in it changes.
 """
@@ -34,7 +34,7 @@ from .page_data import nodes, numbers, read_episodes, read_json
 from .runs import FOLDER
 from .trajectories import read_runs, trajectories
 
-SCHEMA = 1
+SCHEMA = 2
 MANIFEST, NODES, THUMBNAIL, SWEEP = "manifest.json", "nodes.js", "thumbnail.png", "sweep.mp4"
 SURFACES = ("surface.png", "surface.html", "surface.gltf", "surface.glb")
 POINTS = ("u", "v", "loss", "radius", "path", "hidden")  # of a trajectory, for the map alone
@@ -86,7 +86,7 @@ def _page(
     source: Path,
     folder: Path,
     tables: Sequence[xr.Dataset],
-    traded: Mapping[str, dict[str, Any]],
+    traded: Mapping[str, list[dict[str, Any]]],
 ) -> dict[str, Any]:
     """Write a slice's page and all it shows into `folder`, and return its entry in the manifest."""
     folder.mkdir()
@@ -108,7 +108,7 @@ def _page(
         "runs": [{name: value for name, value in run.items() if name not in POINTS} for run in runs],
         "measures": read_json(source / MEASURES) or {},
         "report": read_report(source),
-        "tradeoff": traded.get(figure.env),
+        "tradeoffs": traded.get(figure.env, []),
     }
     about = {"entry": entry, "held": _held(dataset), "scene": entries().get(figure.env)}
     (folder / "index.html").write_text(pages.get_template("slice.html").render(**about))

@@ -14,7 +14,8 @@ from .page_data import read_json
 
 Record = Mapping[str, Any]
 REPORT, QUALITY, MEASURES = "report.json", "gradient-quality.png", "measures.json"
-TRADEOFF = "tradeoff"  # folder of ENV.json and ENV.png, as `landscape tradeoff` leaves them
+TRADEOFF = "tradeoff"  # folder of ENV-DEVICE.json and .png, as `landscape tradeoff` leaves them
+DEVICES = ("cuda", "cpu")
 TOLERANCE = 0.05  # of the loss error that a picture's description names the quickest rung for
 
 
@@ -71,22 +72,22 @@ def _signed(value: float) -> str:
     return f"{value:.2f}".replace("-", "\N{MINUS SIGN}")
 
 
-def place_tradeoffs(data: Path, out: Path, envs: list[str]) -> dict[str, dict[str, Any]]:
+def place_tradeoffs(data: Path, out: Path, envs: list[str]) -> dict[str, list[dict[str, Any]]]:
     """Copy what was measured of these environments' accuracy into the site, and return it by environment."""
-    found = {}
+    found: dict[str, list[dict[str, Any]]] = {}
     for env in dict.fromkeys(envs):
-        record = read_json(data / TRADEOFF / f"{env}.json")
-        picture = data / TRADEOFF / f"{env}.png"
-        if record is None or not picture.exists():
-            continue
-        (out / TRADEOFF).mkdir(exist_ok=True)
-        for file in (data / TRADEOFF / f"{env}.json", picture):
-            shutil.copyfile(file, out / TRADEOFF / file.name)
-        found[env] = _tradeoff(record)
+        for file in (data / TRADEOFF / f"{env}-{device}.json" for device in DEVICES):
+            record, picture = read_json(file), file.with_suffix(".png")
+            if record is None or not picture.exists():
+                continue
+            (out / TRADEOFF).mkdir(exist_ok=True)
+            for one in (file, picture):
+                shutil.copyfile(one, out / TRADEOFF / one.name)
+            found.setdefault(env, []).append(_tradeoff(record, file.stem))
     return found
 
 
-def _tradeoff(record: Record) -> dict[str, Any]:
+def _tradeoff(record: Record, name: str) -> dict[str, Any]:
     rows = sorted(record["rungs"], key=_time)
     reference = next(row for row in rows if row["name"] == record["reference"])
     quicker = [row for row in rows if _time(row) < _time(reference)]
@@ -96,8 +97,8 @@ def _tradeoff(record: Record) -> dict[str, Any]:
         **{name: record[name] for name in ("env", "reference", "points", "spread", "loss_unit", "refused", "command")},
         "options": record["identity"]["options"],
         "device": record["identity"]["device"],
-        "picture": f"{TRADEOFF}/{record['env']}.png",
-        "file": f"{TRADEOFF}/{record['env']}.json",
+        "picture": f"{TRADEOFF}/{name}.png",
+        "file": f"{TRADEOFF}/{name}.json",
         "alt": _accuracy(record, reference),
         "rungs": [_rung(row, record, best) for row in rows],
     }

@@ -245,7 +245,7 @@ def test_the_gallerys_rungs_of_the_same_problem_are_found_where_nothing_of_the_u
         kept.unlink()
     softer = json.loads(json.dumps(by_name(report)["draft"])) | {"name": "softer", "options": {"ke": 1.0}}
     softer["seconds"] = {"forward": 0.0, "with_gradient": 0.0}
-    path = tmp_path / "data" / "tradeoff" / "converging.json"
+    path = tmp_path / "data" / "tradeoff" / "converging-cpu.json"
     path.parent.mkdir(parents=True)
     monkeypatch.setattr("gradscape.tolerance.resources.files", lambda package: tmp_path)
     how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--tolerance", "50%"]

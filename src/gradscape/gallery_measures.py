@@ -10,7 +10,7 @@ from rich.console import Console
 
 from . import measure_report, tradeoff_report
 from .envs.registry import environment_class, make
-from .gallery.measured import TRADEOFF
+from .gallery.measured import DEVICES, TRADEOFF
 from .gallery_parts import Part, read_record
 from .ladder import LADDERS
 from .measure_report import MEASURES, REPORT, Subject
@@ -72,7 +72,7 @@ class Tradeoffs(Part):
     def left(self) -> int:
         """Return 1 where there is none, of an environment that has fidelities to trade."""
         some = len(environment_class(self.figure.env).fidelities) > 1
-        return int(some and not all(file.exists() for file in self._files))
+        return int(some and not any(all(file.exists() for file in files) for files in self._places()))
 
     def seconds_each(self) -> float:
         """Estimate all rungs by the work of their episodes."""
@@ -85,17 +85,20 @@ class Tradeoffs(Part):
 
         study = self._study()
         report = study.run(console)
-        record, picture = self._files
+        record, picture = self._files(study.env.device)
         record.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(study.pieces.folder / tradeoff_report.PICTURE, picture)
         lighten(picture)
         write_json(record, report)
         return f"{len(report['rungs'])} rungs at {report['points']} points"
 
-    @property
-    def _files(self) -> tuple[Path, Path]:
-        where = self.root / TRADEOFF
-        return where / f"{self.figure.env}.json", where / f"{self.figure.env}.png"
+    def _places(self) -> list[tuple[Path, Path]]:
+        """Return where a record may be: of the device asked for, of any where none is."""
+        return [self._files(device) for device in (DEVICES if self.device == "auto" else (self.device,))]
+
+    def _files(self, device: str) -> tuple[Path, Path]:
+        name = f"{self.figure.env}-{device}"
+        return self.root / TRADEOFF / f"{name}.json", self.root / TRADEOFF / f"{name}.png"
 
     def _study(self) -> Study:
         reference = list(environment_class(self.figure.env).fidelities)[-1]

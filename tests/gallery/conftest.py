@@ -141,8 +141,10 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (full / "report.json").write_text(json.dumps(REPORT))
     picture(full / "gradient-quality.png")
     (folder / "tradeoff").mkdir()
-    (folder / "tradeoff/fluid.json").write_text(json.dumps(TRADEOFF))
-    picture(folder / "tradeoff/fluid.png")
+    for device in ("cuda", "cpu"):
+        identity = {**TRADEOFF["identity"], "device": device}
+        (folder / f"tradeoff/fluid-{device}.json").write_text(json.dumps({**TRADEOFF, "identity": identity}))
+        picture(folder / f"tradeoff/fluid-{device}.png")
     for name in ("episode-6-5", "episode-11-11", "sweep"):
         film(full / name)
     (full / "episode-11-11.mp4").unlink()

@@ -111,8 +111,8 @@ def test_everything_is_made_once(small: Path, capsys: pytest.CaptureFixture[str]
         report = json.loads((small / figure / "report.json").read_text())
         assert report["name"] == figure
         assert (small / figure / "gradient-quality.png").read_bytes().startswith(b"\x89PNG")
-    assert sorted(file.name for file in (small / "tradeoff").iterdir()) == ["bounce.json", "bounce.png"]
-    rungs = {row["name"] for row in json.loads((small / "tradeoff/bounce.json").read_text())["rungs"]}
+    assert sorted(file.name for file in (small / "tradeoff").iterdir()) == ["bounce-cpu.json", "bounce-cpu.png"]
+    rungs = {row["name"] for row in json.loads((small / "tradeoff/bounce-cpu.json").read_text())["rungs"]}
     assert rungs > {"draft", "standard", "reference", "draft-float64"}
     before = {file: file.stat().st_mtime_ns for file in small.rglob("*") if file.is_file()}
     capsys.readouterr()

@@ -60,7 +60,7 @@ def test_no_file_of_the_site_names_an_address(site: Path) -> None:
 
 def test_the_manifest_lists_everything_of_a_page(site: Path, data: Path) -> None:
     manifest = json.loads((site / "manifest.json").read_text())
-    assert manifest["schema"] == 1
+    assert manifest["schema"] == 2
     assert manifest["missing"] == ["later"]
     assert [entry["id"] for entry in manifest["figures"]] == [figure.id for figure in FIGURES]
     for entry in manifest["figures"]:
@@ -84,7 +84,7 @@ def test_the_manifest_lists_everything_of_a_page(site: Path, data: Path) -> None
 
 def test_words_are_beside_the_papers_and_a_trade_off_is_ranked(site: Path) -> None:
     bare, full = json.loads((site / "manifest.json").read_text())["figures"][1:]
-    assert (bare["report"], bare["tradeoff"]) == (None, None)
+    assert (bare["report"], bare["tradeoffs"]) == (None, [])
     agreed = {one["word"]: (one["measured"], one["agree"]) for one in full["report"]["words"]}
     assert agreed == {
         "rugged": (True, True), "gradients good": (False, False), "gradients noisy": (True, None)
@@ -94,8 +94,10 @@ def test_words_are_beside_the_papers_and_a_trade_off_is_ranked(site: Path) -> No
         "mean cosine of gradient and difference −0.50 over 0.04 of the box; "
         "smoothed over 1% of it, first order is biased at 9 of 36"
     )
-    trade = full["tradeoff"]
-    assert {path.name for path in (site / "tradeoff").iterdir()} == {"fluid.json", "fluid.png"}
+    trade, another = full["tradeoffs"]
+    assert (trade["device"], another["device"]) == ("cuda", "cpu")
+    files = {path.name for path in (site / "tradeoff").iterdir()}
+    assert files == {f"fluid-{device}.{kind}" for device in ("cuda", "cpu") for kind in ("json", "png")}
     assert [(row["name"], row["front"]) for row in trade["rungs"]] == [
         ("coarse", False), ("draft", True), ("standard", True), ("slow", False), ("reference", False)
     ]  # fmt: skip
@@ -152,7 +154,8 @@ def test_a_page_says_what_it_has_and_nothing_of_what_it_has_not(site: Path) -> N
         ("gradients noisy", "yes: 0.5", "says nothing of it"),
     ]  # fmt: skip
     assert '<th scope="row">local minima</th><td>7</td>' in full
-    assert re.sub(r"\s+", " ", full).count("<td>9 (4.5 to 18)</td> <td>0.987</td> <td>0.654</td> <td>25 %</td>") == 1
+    assert re.sub(r"\s+", " ", full).count("<td>9 (4.5 to 18)</td> <td>0.987</td> <td>0.654</td> <td>25 %</td>") == 2
+    assert re.findall(r"<h3>(On .*?)</h3>", full) == ["On cuda", "On cpu"]
     assert "2 J from the 5th to the 95th percentile" in full.replace("\n", " ")
     assert "Mass from −10 to 10: 12 slices" in full.replace("\n", " ")
     assert SWEEP["command"] in full
