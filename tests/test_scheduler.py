@@ -3,9 +3,11 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -32,8 +34,13 @@ PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 16))
 
 @pytest.fixture(scope="module")
 def executor():
-    with workers("local:2", "cpu") as found:
-        yield found
+    """Give two workers, where another cluster has Dask's usual port."""
+    with socket.socket() as usual:
+        with suppress(OSError):  # another cluster has it indeed
+            usual.bind(("127.0.0.1", 8787))
+            usual.listen()
+        with workers("local:2", "cpu") as found:
+            yield found
 
 
 @pytest.fixture
