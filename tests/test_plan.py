@@ -67,15 +67,8 @@ def test_a_job_takes_what_was_planned_within_a_quarter(
 
 
 def test_a_job_needs_the_memory_that_was_planned_within_a_quarter(tmp_path: Path) -> None:
-    job = [
-        "cartpole",
-        "--dims",
-        "0",
-        "1",
-        "--resolution",
-        "128",
-        "--json",
-    ]  # a third of it is gradients of 400 components
+    # a third of what it holds is gradients of 400 components
+    job = ["cartpole", "--dims", "0", "1", "--resolution", "128", "--json"]
     planned, _ = alone("plan", *job, cwd=tmp_path)
     _, peak = alone("slice", *job, cwd=tmp_path)
     assert planned["memory"]["host"] == pytest.approx(peak, rel=0.25)
