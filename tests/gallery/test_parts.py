@@ -78,7 +78,8 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         monkeypatch.setattr(gallery_episodes, name, value)
     for name, value in (("REPORT_POINTS", 2), ("TRADEOFF_POINTS", 4), ("TURNED", ["precision"])):
         monkeypatch.setattr(gallery_measures, name, value)
-    monkeypatch.setattr("gradscape.landscapes.tradeoff.TIMING", 0.01)
+    for name in ("TIMING", "PATIENCE"):
+        monkeypatch.setattr(f"gradscape.landscapes.tradeoff.{name}", 0.01)
     monkeypatch.chdir(tmp_path)
     return tmp_path / "data"
 
