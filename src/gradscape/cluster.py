@@ -92,6 +92,7 @@ def _local(count: int | None, device: str) -> Any:
     places = _gpus(count) if device == "cuda" or (device == "auto" and _names()) else _cores(count)
     common = {"nthreads": 1, "memory_limit": 0, "dashboard": False, "silence_logs": logging.CRITICAL}
     specs = {number: {"cls": Nanny, "options": common | place} for number, place in enumerate(places)}
+    # without a dashboard, too, its web server wants a port, and warns where the usual one is taken
     quiet = {"dashboard": False, "dashboard_address": "127.0.0.1:0", "host": "127.0.0.1", "port": 0}
     return SpecCluster(workers=specs, scheduler={"cls": Scheduler, "options": quiet}, silence_logs=False)  # type: ignore[no-untyped-call]
 

@@ -9,13 +9,16 @@ import typer
 from .options import (
     Deterministic,
     Device,
+    Dims,
     Engine,
+    Env,
     Extent,
     Fidelity,
     Force,
     Json,
     NoGradients,
     Out,
+    Resolution,
     Scheduler,
     Set,
     Through,
@@ -38,9 +41,9 @@ def info() -> None:
 
 
 def slice_(
-    env: Annotated[str, typer.Argument(help="The environment; `landscape envs` lists them.")],
-    dims: Annotated[tuple[str, str], typer.Option(help="The two parameters to vary, by number or by name.")],
-    resolution: Annotated[int, typer.Option(min=2, help="Points along each axis.")] = 16,
+    env: Env,
+    dims: Dims,
+    resolution: Resolution = 16,
     fidelity: Fidelity = None,
     tolerance: Tolerance = None,
     device: Device = "auto",
@@ -82,14 +85,14 @@ def slice_(
 
 
 def sweep(
-    env: Annotated[str, typer.Argument(help="The environment; `landscape envs` lists them.")],
-    dims: Annotated[tuple[str, str], typer.Option(help="The two parameters to vary, by number or by name.")],
+    env: Env,
+    dims: Dims,
     over: Annotated[
         str,
         typer.Option(help="What moves from frame to frame: a third parameter over its bounds, horizon, or smoothing."),
     ],
     frames: Annotated[int, typer.Option(min=2, help="Values of it, both ends included.")] = 24,
-    resolution: Annotated[int, typer.Option(min=2, help="Points along each axis.")] = 16,
+    resolution: Resolution = 16,
     fidelity: Fidelity = None,
     device: Device = "auto",
     engine: Engine = "warp",
@@ -152,7 +155,7 @@ def surface(
 
 
 def replay(
-    env: Annotated[str, typer.Argument(help="The environment; `landscape envs` lists them.")],
+    env: Env,
     params: Annotated[
         str,
         typer.Option(help="The episode: center, random:SEED, example:NAME, best:RUN or a file of parameters."),

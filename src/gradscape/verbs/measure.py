@@ -6,15 +6,26 @@ from typing import Annotated
 
 import typer
 
-from .options import Deterministic, Device, Engine, Extent, Fidelity, Json, NoGradients, Set, Through
+from .options import (
+    Deterministic,
+    Device,
+    Dims,
+    Engine,
+    Env,
+    Extent,
+    Fidelity,
+    ForceStudy,
+    Json,
+    NoGradients,
+    OutOfStudy,
+    Set,
+    Through,
+)
 
 
 def plan(
     what: Annotated[str, typer.Argument(metavar="ENV|FIGURES.toml", help="An environment, or a list of figures.")],
-    dims: Annotated[tuple[str, str], typer.Option(help="The two parameters to vary, by number or by name.")] = (
-        "0",
-        "1",
-    ),
+    dims: Dims = ("0", "1"),
     over: Annotated[
         str | None, typer.Option(help="Plan a sweep: what moves from frame to frame, as for `landscape sweep`.")
     ] = None,
@@ -58,7 +69,7 @@ def plan(
 
 
 def bench(
-    env: Annotated[str, typer.Argument(help="The environment; `landscape envs` lists them.")],
+    env: Env,
     fidelity: Fidelity = None,
     device: Device = "auto",
     engine: Engine = "warp",
@@ -122,7 +133,7 @@ def check(
 
 
 def tradeoff(
-    env: Annotated[str, typer.Argument(help="The environment; `landscape envs` lists them.")],
+    env: Env,
     points: Annotated[int, typer.Option(min=2, help="Sobol points at which every fidelity is measured.")] = 64,
     seed: Annotated[int, typer.Option(min=0, help="What the points and the bootstrap begin with.")] = 0,
     ladder: Annotated[
@@ -135,11 +146,9 @@ def tradeoff(
     device: Device = "auto",
     engine: Engine = "warp",
     set_: Set = None,
-    out: Annotated[
-        str | None, typer.Option(help="Folder for the results; by default one under out/ named after the study.")
-    ] = None,
+    out: OutOfStudy = None,
     json_: Json = False,
-    force: Annotated[bool, typer.Option("--force", help="Begin anew where a study exists already.")] = False,
+    force: ForceStudy = False,
 ) -> None:
     """Measure accuracy against speed: the same points at a ladder of fidelities, each against the reference.
 
@@ -163,7 +172,7 @@ def tradeoff(
 
 
 def pairs(
-    env: Annotated[str, typer.Argument(help="The environment; `landscape envs` lists them.")],
+    env: Env,
     samples: Annotated[
         int | None,
         typer.Option(
@@ -178,11 +187,9 @@ def pairs(
     seed: Annotated[int, typer.Option(min=0, help="What the points begin with.")] = 0,
     top: Annotated[int, typer.Option(min=1, help="Pairs to show.")] = 10,
     set_: Set = None,
-    out: Annotated[
-        str | None, typer.Option(help="Folder for the results; by default one under out/ named after the study.")
-    ] = None,
+    out: OutOfStudy = None,
     json_: Json = False,
-    force: Annotated[bool, typer.Option("--force", help="Begin anew where a study exists already.")] = False,
+    force: ForceStudy = False,
 ) -> None:
     """Rank pairs of parameters by sensitivity, ruggedness and misleading gradients: which slices to look at.
 

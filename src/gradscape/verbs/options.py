@@ -6,6 +6,9 @@ from typing import Annotated
 
 import typer
 
+Env = Annotated[str, typer.Argument(help="The environment; `landscape envs` lists them.")]
+Dims = Annotated[tuple[str, str], typer.Option(help="The two parameters to vary, by number or by name.")]
+Resolution = Annotated[int, typer.Option(min=2, help="Points along each axis.")]
 Fidelity = Annotated[str | None, typer.Option(help="How accurately to simulate: draft, standard or reference.")]
 Tolerance = Annotated[
     str | None,
@@ -30,6 +33,10 @@ OutOfRun = Annotated[
     str | None, typer.Option("--out", help="Folder for the results; by default one under out/ named after the run.")
 ]
 ForceRun = Annotated[bool, typer.Option("--force", help="Begin anew where a run exists already.")]
+OutOfStudy = Annotated[
+    str | None, typer.Option("--out", help="Folder for the results; by default one under out/ named after the study.")
+]
+ForceStudy = Annotated[bool, typer.Option("--force", help="Begin anew where a study exists already.")]
 Extent = Annotated[
     str | None,
     typer.Option(help="What to cover: a fraction of the box around the point, or LOW:HIGH; the whole box by default."),

@@ -11,6 +11,7 @@ from .options import (
     Deterministic,
     Device,
     Engine,
+    Env,
     Fidelity,
     ForceRun,
     Json,
@@ -29,7 +30,7 @@ def methods(name: Annotated[str | None, typer.Argument(help="One method, to see 
 
 
 def optimize(
-    env: Annotated[str, typer.Argument(help="The environment; `landscape envs` lists them.")],
+    env: Env,
     method: Annotated[str, typer.Option(help="The method; `landscape methods` lists them.")],
     budget: Budget = 1000,
     seed: Annotated[int, typer.Option(min=0, help="What the method's random numbers begin with.")] = 0,
@@ -70,7 +71,7 @@ def optimize(
 
 
 def race(
-    env: Annotated[str, typer.Argument(help="The environment; `landscape envs` lists them.")],
+    env: Env,
     methods: Annotated[
         list[str] | None,
         typer.Option(help="Methods, a,b or repeated; by default all that can run here (`landscape methods`)."),
