@@ -67,7 +67,7 @@ def failure_key(dataset: xr.Dataset) -> list[Patch]:
 
 
 def key(figure: Figure, entries: Sequence[Artist], *, columns: int = 2) -> None:
-    """Put a legend under the panels."""
+    """Put a legend under the panels, in fewer columns where it would be wider than the page."""
     if entries:
         legend = figure.legend(
             handles=list(entries),
@@ -80,6 +80,9 @@ def key(figure: Figure, entries: Sequence[Artist], *, columns: int = 2) -> None:
         )
         for text in legend.get_texts():
             text.set_parse_math(False)
+        if columns > 1 and legend.get_window_extent().width > figure.bbox.width:
+            legend.remove()
+            key(figure, entries, columns=columns - 1)
 
 
 def save(figure: Figure, path: str | Path) -> None:

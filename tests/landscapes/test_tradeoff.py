@@ -176,6 +176,21 @@ def test_the_picture_draws_the_front_and_stands_broken_rungs_on_the_edge(figure:
     assert "dt (1 failed too often: on the edge)" in [text.get_text() for text in legend.get_texts()]
 
 
+def test_no_legend_is_wider_than_its_page(tmp_path: Any) -> None:
+    lost = [
+        rung(f"{ladder} {number}", 0.05, None, ladder) for ladder in ("resolution", "particles") for number in range(12)
+    ]
+    more = [rung(ladder, 0.3, 0.2, ladder) for ladder in ("precision", "engine")]
+    drawn = tradeoff_figure({**REPORT, "rungs": [*REPORT["rungs"], *lost, *more]})
+    save(drawn, tmp_path / "tradeoff.png")
+    (legend,) = drawn.legends
+    assert {"resolution (12 failed too often: on the edge)", "engine"} < {
+        text.get_text() for text in legend.get_texts()
+    }
+    box = legend.get_window_extent()
+    assert 0 <= box.x0 < box.x1 <= drawn.bbox.width
+
+
 def test_names_of_fidelities_cover_nothing(figure: Figure) -> None:
     (ax,) = figure.axes
     names = [text for text in ax.texts if text.get_text() in ("draft", "standard")]
