@@ -259,11 +259,13 @@ def test_print_is_dark_on_white_and_has_the_picture(filed: str, visit: Visit) ->
 
 
 def test_a_browser_that_never_lets_it_copy_has_the_command_selected(filed: str, visit: Visit) -> None:
+    from playwright.sync_api import expect
+
     page = visit(filed, "full/index.html")
-    page.evaluate("Object.assign(navigator.clipboard ?? {}, { writeText: () => new Promise(() => {}) })")
+    page.evaluate("() => { if (window.Clipboard) Clipboard.prototype.writeText = () => new Promise(() => {}) }")
     button = page.locator("[data-copy=command]")
     button.click()
-    page.wait_for_function("document.querySelector('[data-copy=command]').textContent === 'Selected'")
+    expect(button).to_have_text("Selected", timeout=30_000)
     assert "landscape slice" in page.evaluate("getSelection().toString()")
 
 
