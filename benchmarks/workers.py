@@ -4,7 +4,8 @@
 
 For each number of workers a cluster of them is started and warmed by a slice of its own; then the same slice is sampled
 some times into a store of its own, and the best counts. Ratios are of one run, to its first number of workers. By
-default the slice is of two whole batches for each of the most workers, so that fewer workers do the same batches.
+default the slice is of four whole batches for each of the most workers, and of 8 x 8 equal tiles, so that fewer workers
+do the same batches.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ def main() -> None:
     from gradscape.envs.registry import make
 
     env = make(given.env, fidelity=given.fidelity, device=given.device)
-    resolution = given.resolution or math.isqrt(2 * max(given.workers) * env.preferred_batch)
+    resolution = given.resolution or max(8, math.isqrt(4 * max(given.workers) * env.preferred_batch) // 8 * 8)
     print(f"{env.name} · {env.fidelity.name} · {env.device} · {resolution}² points · batch {env.preferred_batch}")
     print("workers  episodes/s  ratio  of linear")
     rows: list[dict[str, Any]] = []

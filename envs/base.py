@@ -200,6 +200,8 @@ class Environment(abc.ABC):
         """Take at most `rows` rows at once from now on: solvers hold room for all they take, and it was too much."""
         self._most_rows, self._solvers = rows, None
         gc.collect()  # a solver and its launches refer to each other
+        if self.device == "cuda":
+            torch.cuda.empty_cache()
         self._setup()
 
     def memory(self) -> int:

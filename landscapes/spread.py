@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
@@ -100,9 +101,11 @@ class RemoteSite:
 
     def here(self) -> Site:
         """Return the site with its objective, made where this process has not made it yet, and its store."""
-        if not Path(self.path).exists():
-            raise StoreError(f"a worker finds no {self.path}; workers need a file system that they share")
-        store = SliceStore.open(self.path)
+        try:
+            at = Path(self.path).stat()
+        except FileNotFoundError:
+            raise StoreError(f"a worker finds no {self.path}; workers need a file system that they share") from None
+        store = opened(self.path, at.st_ino, at.st_mtime_ns)
         check_identity(store.path, wanted=self.identity, found=store.identity)
         return Site(kept(self.recipe), store)
 
@@ -122,6 +125,12 @@ class _Itself:
 
     def __call__(self) -> Objective:
         return self.objective
+
+
+@lru_cache(maxsize=1)
+def opened(path: str, inode: int, changed: int) -> SliceStore:
+    """Return an open store, the last one as it is; `inode` and `changed` [ns] tell it from one that replaced it."""
+    return SliceStore.open(path)
 
 
 _objectives: dict[bytes, Halving] = {}

@@ -176,7 +176,7 @@ class SliceStore:
     def statuses(self, tile: Tile) -> Counter[Status]:
         """Count how the points of a finished tile ended; nothing of one that is not finished."""
         try:
-            values = {name: np.asarray(array[self._place(tile)]) for name, array in self._values.items()}
+            values = self._stored(self._place(tile))
         except Exception:  # as in `_read`
             return Counter()
         status = self._judged(values)
@@ -250,7 +250,7 @@ class SliceStore:
     def _read(self, box: tuple[slice, ...]) -> dict[str, NDArray[Any]]:
         """Read a box of whole tiles, each array at once; where that fails, tile by tile, leaving out what is torn."""
         try:
-            values = {name: np.asarray(array[box]) for name, array in self._values.items()}
+            values = self._stored(box)
         except Exception:  # a damaged chunk raises whatever its codec does
             values = self._salvage(box)
         status = self._judged(values)
@@ -262,15 +262,25 @@ class SliceStore:
             values["grad"][status == Status.MISSING] = np.nan
         return values
 
-    def _salvage(self, box: tuple[slice, ...]) -> dict[str, NDArray[Any]]:
+    def _stored(self, box: tuple[slice, ...]) -> dict[str, NDArray[Any]]:
+        """Read a box of every array; where its status says that nothing is there, nothing else is looked for."""
+        status = np.asarray(self._values["status"][box])
+        if not status.any():
+            return self._blank(box)
+        return {name: status if name == "status" else np.asarray(array[box]) for name, array in self._values.items()}
+
+    def _blank(self, box: tuple[slice, ...]) -> dict[str, NDArray[Any]]:
         shape = tuple(len(range(points)[at]) for at, points in zip(box, self.shape, strict=True))
-        values = {
+        return {
             name: np.full(shape + array.shape[len(shape) :], array.fill_value, array.dtype)
             for name, array in self._values.items()
         }
+
+    def _salvage(self, box: tuple[slice, ...]) -> dict[str, NDArray[Any]]:
+        values = self._blank(box)
         for tile in self.tiles():
             place = self._place(tile)
-            if all(at.stop <= size for at, size in zip(place, shape, strict=True)):
+            if all(at.stop <= size for at, size in zip(place, values["status"].shape, strict=True)):
                 with contextlib.suppress(Exception):  # as above; status comes last, so it stays MISSING
                     for name, array in self._values.items():
                         values[name][place] = array[place]

@@ -184,15 +184,28 @@ class Solver:
         self.again(("forward", step, batch), step, batch, lambda: self._substeps(step, batch))
 
     def _hold(self, step: int) -> None:
-        """Make room for a control step, at the cost of others where memory has run out."""
+        """Make room for a control step, at the cost of others where memory runs out."""
+        while len(self.windows) > 1 and not self._fits(step):
+            self._keep_fewer()
         try:
             self.window(step).hold(step, self)
-        except RuntimeError:
+        except RuntimeError:  # what is free need not be of one piece
             if len(self.windows) == 1:
                 raise
-            self.replay.forget()
-            del self.windows[len(self.windows) // 2 :]
+            self._keep_fewer()
             self._hold(step)
+
+    def _fits(self, step: int) -> bool:
+        """Say whether a window can grow to what a control step needs and leave a GPU as much memory as it takes.
+
+        Torch, and Warp's sorting, want some, and of an allocation that fails Warp says so on standard error.
+        """
+        growth = self.window(step).growth(self.boxes[step].cells, self)
+        return self.device == "cpu" or not growth or growth <= free_memory() // 2
+
+    def _keep_fewer(self) -> None:
+        self.replay.forget()
+        del self.windows[len(self.windows) // 2 :]
 
     def again(self, key: tuple[Any, ...], step: int, batch: int, work: Callable[[], None]) -> None:
         """Do a control step's work, by the launches kept from the last time if there was one."""

@@ -77,7 +77,8 @@ def device_names() -> list[str]:
 
 
 def free_memory() -> int:
-    """Return the free bytes of the CUDA device."""
+    """Return the free bytes of the CUDA device, what was given up until now included."""
+    wp.synchronize_device("cuda")
     return int(wp.get_device("cuda").free_memory)
 
 

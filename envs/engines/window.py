@@ -45,18 +45,35 @@ class Window:
         self.lattice = place(model)
 
     @property
+    def _cells(self) -> int:
+        """How many nodes all its grids have room for."""
+        return min(int(grid.v.shape[1]) for grid in self.grids)
+
+    @property
     def bytes(self) -> int:
         """What its arrays take."""
         grids = [array for grid in self.grids for array in (grid.m, grid.v)]
         frames = [array for frame in self.frames for array in frame.arrays()]
         return sum(array.capacity for array in (*frames, *self.A, *grids))
 
+    def growth(self, cells: int, solver: "Solver") -> int:
+        """Return the bytes that grids of so many nodes take beyond those that are there, 0 where these suffice."""
+        if self._cells >= cells:
+            return 0
+        more = _ample(cells, solver) - self._cells
+        return 2 * len(self.grids) * solver.capacity * more * int(wp.types.type_size_in_bytes(solver.types.vec4))
+
     def hold(self, step: int, solver: "Solver") -> None:
         """Make room for a control step."""
         cells, self.step = solver.boxes[step].cells, -1
-        if min(grid.v.shape[1] for grid in self.grids) < cells:
+        if self._cells < cells:
             solver.replay.forget()
             for substep in range(len(self.grids)):
                 self.grids[substep] = solver.grid(0)  # the old one goes first
-                self.grids[substep] = solver.grid(min(cells * 5 // 4, solver.model.cells))
+                self.grids[substep] = solver.grid(_ample(cells, solver))
         self.step, self.lattice = step, place(solver.model, solver.boxes[step])
+
+
+def _ample(cells: int, solver: "Solver") -> int:
+    """Return how many nodes to make room for where so many are needed."""
+    return int(min(cells * 5 // 4, solver.model.cells))

@@ -1,4 +1,6 @@
 import functools
+import pickle
+import shutil
 import sys
 import threading
 import time
@@ -206,6 +208,18 @@ def test_a_batch_that_was_half_done_by_a_worker_that_died_is_not_done_again(tmp_
     assert [filled.tile for filled in remote.fill([first])] == [first]  # found: evaluated it would break
     with pytest.raises(RuntimeError, match="broken cable"):
         list(remote.fill(store.tiles()))
+
+
+def test_a_worker_keeps_a_store_open_until_another_lies_there(tmp_path):
+    site = Site(Halving(from_torch(wave, SPACE)), store_at(tmp_path / "s.zarr"), lambda: from_torch(wave, SPACE))
+    remote = pickle.loads(pickle.dumps(site))
+    tiles = site.store.tiles()
+    assert list(remote.fill(tiles[:1]))
+    assert remote.here().store is remote.here().store
+    shutil.rmtree(site.store.path)
+    again = store_at(site.store.path)
+    assert list(remote.fill(tiles[:1]))
+    assert again.statuses(tiles[0])
 
 
 @given(batch=st.integers(1, 400), workers=st.integers(1, 9))

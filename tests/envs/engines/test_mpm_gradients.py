@@ -1,0 +1,67 @@
+"""Gradients of MLS-MPM: they are the slope, add up, and have the same bits every time."""
+
+import pytest
+import torch
+
+from .bodies import kneaded, kneading, weights
+from .bodies import stirred as stirring
+
+
+@pytest.fixture(scope="module")
+def stirred():
+    return stirring()
+
+
+def test_the_gradient_by_tools_on_plasticine_is_the_slope():
+    model, paths = kneading()
+    adj_x = {model.steps: weights(model, 3, 1)}
+    solver, _, gradient = kneaded(model, paths, adj_x)
+    direction = torch.rand(paths.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64) - 0.5
+    slope, errors = (gradient * direction).sum(dim=(1, 2, 3)), []
+    for step in (1e-4, 1e-5, 1e-6, 1e-7):
+        ends = [(solver.run(paths + s * step * direction) * adj_x[model.steps]).sum(dim=(1, 2)) for s in (1, -1)]
+        errors.append(float((((ends[0] - ends[1]) / (2 * step) - slope) / slope).abs().max()))
+    assert min(errors) < 1e-6
+
+
+def test_adjoints_at_several_control_steps_add_up():
+    model, paths = kneading()
+    at = {step: weights(model, 3, step) for step in (1, 2, model.steps)}
+    solver, _, together = kneaded(model, paths, at)
+    separate = [solver.gradient({step: adj_x}) for step, adj_x in at.items()]
+    torch.testing.assert_close(together, sum(separate), rtol=0, atol=1e-12 * float(together.abs().max()))
+    assert not separate[0][:, 2:].any()  # what comes later has no say
+    assert separate[0].abs().max() > 0
+
+
+def test_the_gradient_by_the_tools_is_the_slope_on_a_ladder_of_steps(stirred):
+    solver, path = stirred
+    generator = torch.Generator().manual_seed(1)
+    adj_x = torch.rand((2, solver.model.particles, 3), generator=generator, dtype=torch.float64) - 0.5
+    direction = torch.rand(path.shape, generator=generator, dtype=torch.float64) - 0.5
+    solver.run(path)
+    slope = (solver.gradient({solver.model.steps: adj_x}) * direction).sum(dim=(1, 2, 3))
+    errors = []
+    for step in (1e-3, 1e-4, 1e-5, 1e-6, 1e-7):
+        ends = [(solver.run(path + sign * step * direction) * adj_x).sum(dim=(1, 2)) for sign in (1, -1)]
+        errors.append(float((((ends[0] - ends[1]) / (2 * step) - slope) / slope).abs().max()))
+    assert min(errors) < 1e-7
+    assert errors[0] > 100 * min(errors)  # the slope over a millimetre is another one
+
+
+def test_gradients_have_the_same_bits_every_time(stirred):
+    solver, path = stirred
+    adj_x = torch.ones((2, solver.model.particles, 3), dtype=torch.float64)
+    gradients = []
+    for _ in range(2):
+        solver.run(path)
+        gradients.append(solver.gradient({solver.model.steps: adj_x}))
+    assert torch.equal(*gradients)
+    assert gradients[0].abs().max() > 0
+
+
+def test_a_second_gradient_of_one_run_has_the_same_bits(stirred):
+    solver, path = stirred
+    adj_x = torch.ones((2, solver.model.particles, 3), dtype=torch.float64)
+    solver.run(path)
+    assert torch.equal(solver.gradient({solver.model.steps: adj_x}), solver.gradient({solver.model.steps: adj_x}))
