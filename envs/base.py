@@ -199,9 +199,7 @@ class Environment(abc.ABC):
     def shrink(self, rows: int) -> None:
         """Take at most `rows` rows at once from now on: solvers hold room for all they take, and it was too much."""
         self._most_rows, self._solvers = rows, None
-        gc.collect()  # a solver and its launches refer to each other
-        if self.device == "cuda":
-            torch.cuda.empty_cache()
+        collect()
         self._setup()
 
     def memory(self) -> int:
@@ -334,6 +332,12 @@ class _Bridge(torch.autograd.Function):
     def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor, None]:
         (grad,) = ctx.saved_tensors
         return grad_loss[:, None] * grad, None
+
+
+def collect() -> None:
+    """Free what objects that are gone held, of a GPU's memory too."""
+    gc.collect()  # a solver and its launches refer to each other
+    torch.cuda.empty_cache()
 
 
 def _kind(x: object) -> str:

@@ -2,6 +2,7 @@
 
 import json
 import time
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
@@ -116,6 +117,25 @@ def test_a_rung_whose_engine_gives_up_is_listed_too(
     report = json.loads(run(*TRADE, "--ladder", "precision", "--json", cwd=tmp_path).stdout)
     assert report["refused"] == [{"name": "standard", "why": "out of memory"}]
     assert {"draft", "draft-float64", "standard-float64", "reference"} < set(by_name(report))
+
+
+def test_a_rung_is_gone_when_the_next_one_is_measured(
+    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a GPU it would hold the memory that the next one measures how quick it is with."""
+    simulate, simulated = Converging._evaluate, list[weakref.ref[Converging]]()
+
+    def followed(self: Converging, x: Tensor, *, grad: bool) -> Evaluation:
+        if not simulated or simulated[-1]() is not self:
+            assert all(env() is None for env in simulated)
+            self.cycle = self  # type: ignore[attr-defined]
+            simulated.append(weakref.ref(self))
+        return simulate(self, x, grad=grad)
+
+    monkeypatch.setattr(Converging, "_evaluate", followed)
+    done = run(*TRADE, "--ladder", "precision", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert len(simulated) == 1 + len(json.loads(done.stdout)["rungs"])  # one for the estimate
 
 
 def test_a_dt_that_does_not_divide_the_episode_is_refused() -> None:

@@ -8,7 +8,7 @@ import math
 import shlex
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -171,7 +171,7 @@ class Study:
         return report
 
     def _measure(self, console: Console) -> dict[str, Sample]:
-        from .landscapes.tradeoff import Sample, measure
+        from .landscapes.tradeoff import Sample
 
         samples: dict[str, Sample] = {}
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -182,18 +182,30 @@ class Study:
                 if (arrays := self.pieces.load(rung.name)) is not None:
                     samples[rung.name] = Sample.of_arrays(arrays)
                     continue
-                for _, env in self._made([rung]):
-                    follow = partial(self._follow, bar, task, rung.name)
-                    try:
-                        samples[rung.name] = measure(env, self.x, follow=follow)
-                    except RuntimeError as error:  # no room for it, or an engine that gives up
-                        self.refused[rung.name] = " ".join(str(error).split())
-                    else:
-                        self.pieces.save(rung.name, **samples[rung.name].arrays())
+                if (sample := self._sampled(rung, partial(self._follow, bar, task, rung.name))) is not None:
+                    samples[rung.name] = sample
+                    self.pieces.save(rung.name, **sample.arrays())
                 if number == 0 and rung.name in self.refused:
                     raise ValueError(f"{self.env.name} has no reference to measure by: {self.refused[rung.name]}")
             bar.update(task, completed=len(self.rungs), description="rungs")
         return samples
+
+    def _sampled(self, rung: Rung, follow: Callable[[int], None]) -> Sample | None:
+        """Measure a rung, if that can be done.
+
+        The one before must be gone by then: a solver takes what memory a GPU has, and a rung that got the rest would
+        seem slow.
+        """
+        from .envs.base import collect
+        from .landscapes.tradeoff import measure
+
+        collect()
+        for _, env in self._made([rung]):
+            try:
+                return measure(env, self.x, follow=follow)
+            except RuntimeError as error:  # no room for it, or an engine that gives up
+                self.refused[rung.name] = " ".join(str(error).split())
+        return None
 
     def _follow(self, bar: Progress, task: TaskID, name: str, done: int) -> None:
         bar.update(task, description=f"{name}, {done} of {len(self.x)} points")
