@@ -17,7 +17,7 @@ from .halving import Halving
 from .identity import check_identity
 from .objective import Objective, Status, name_of
 from .plane import Plane
-from .spread import Filled, Site, WorkersLostError, equal_batches, spread, workers_of
+from .spread import Filled, ReadBack, Site, WorkersLostError, equal_batches, spread, workers_of
 from .store import SliceStore
 from .tiling import Tile
 
@@ -78,7 +78,7 @@ def sample(
             progress(Progress(counts.total(), status.size, resumed, dict(counts), levels, levels > before))
 
     report(pending)
-    left = list(pending)
+    left, back = list(pending), ReadBack(store)
     site = Site(Halving(objective), store, made)
     with _resumable(store, counts), closing(_filled(site, pending, batch, executor)) as tiles:
         for filled in tiles:
@@ -87,7 +87,9 @@ def sample(
             counts.update(filled.statuses)
             left.remove(filled.tile)
             report(left)
-    return store.dataset()
+            if executor is not None:
+                back.look(filled.tile)
+    return store.dataset(back.values())
 
 
 def _filled(

@@ -22,6 +22,7 @@ from typing import Any, TypeVar
 
 import cloudpickle
 import torch
+from numpy.typing import NDArray
 
 from .halving import Halving
 from .identity import StoreError, check_identity
@@ -31,6 +32,7 @@ from .tiling import Tile
 
 T = TypeVar("T")
 POLL, PATIENCE = 1.0, 60.0  # seconds between looks at the workers, and without any worker before they are given up
+LATE = 120.0  # seconds in which what a worker wrote must appear here: NFS remembers for up to 60 what was not there
 
 
 class WorkersLostError(OSError):
@@ -164,6 +166,39 @@ def equal_batches(store: SliceStore, tiles: Sequence[Tile], batch: int, workers:
         groups[(2 * before + size) * count // (2 * total)].append(tile)
         before += size
     return [group for group in groups if group]
+
+
+class ReadBack:
+    """Read the tiles that workers have finished, while they go on with others."""
+
+    def __init__(self, store: SliceStore) -> None:
+        self._store = store
+        self._values: dict[Tile, dict[str, NDArray[Any]]] = {}
+        self._late: list[Tile] = []
+
+    def look(self, tile: Tile) -> None:
+        """Read a tile if it is to be seen already: a file system that machines share may show it later."""
+        values = self._store.finished(tile)
+        if values is None:
+            self._late.append(tile)
+        else:
+            self._values[tile] = values
+
+    def values(self) -> Mapping[Tile, dict[str, NDArray[Any]]]:
+        """Return the arrays of all tiles looked for, when they have appeared; StoreError where they do not."""
+        since = time.monotonic()
+        while self._late:
+            late, self._late = self._late, []
+            for tile in late:
+                self.look(tile)
+            if self._late and time.monotonic() - since > LATE:
+                raise StoreError(
+                    f"{self._store.path}: {len(self._late)} tiles that workers finished have not appeared here for "
+                    f"{LATE:g} s; see that they write to the same folder, and the same command goes on"
+                )
+            if self._late:
+                time.sleep(POLL)
+        return self._values
 
 
 def workers_of(executor: Executor) -> int:

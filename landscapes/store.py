@@ -173,14 +173,18 @@ class SliceStore:
             written = [tile for tile in pending if self._has_status(tile)]
         return [tile for tile in written if not self.statuses(tile)]
 
-    def statuses(self, tile: Tile) -> Counter[Status]:
-        """Count how the points of a finished tile ended; nothing of one that is not finished."""
+    def finished(self, tile: Tile) -> dict[str, NDArray[Any]] | None:
+        """Return the arrays of a tile that is finished, None of one that is not."""
         try:
             values = self._stored(self._place(tile))
         except Exception:  # as in `_read`
-            return Counter()
-        status = self._judged(values)
-        return Counter() if (status == Status.MISSING).any() else Counter(map(Status, status.ravel().tolist()))
+            return None
+        return None if (self._judged(values) == Status.MISSING).any() else values
+
+    def statuses(self, tile: Tile) -> Counter[Status]:
+        """Count how the points of a finished tile ended; nothing of one that is not finished."""
+        values = self.finished(tile)
+        return Counter() if values is None else Counter(map(Status, values["status"].ravel().tolist()))
 
     def count(self, tile: Tile) -> int:
         """Return how many points a tile has."""
@@ -209,9 +213,12 @@ class SliceStore:
         """Return the status of every point in stored order, MISSING wherever a tile is not finished."""
         return self._read(tuple(slice(points) for points in self.shape))["status"]
 
-    def dataset(self) -> xr.Dataset:
-        """Return everything sampled so far, axes ascending; MISSING and NaN where nothing is."""
-        return self._dataset(tuple(slice(points) for points in self.shape))
+    def dataset(self, known: Mapping[Tile, Mapping[str, NDArray[Any]]] | None = None) -> xr.Dataset:
+        """Return everything sampled so far, axes ascending; MISSING and NaN where nothing is.
+
+        `known` spares reading tiles again: what `finished` returned of them.
+        """
+        return self._dataset(tuple(slice(points) for points in self.shape), known)
 
     def coarse(self) -> xr.Dataset | None:
         """Return the largest coarse picture of the whole that is complete, axes ascending; None before the first."""
@@ -247,10 +254,15 @@ class SliceStore:
         status[(status == Status.OK) != intact] = Status.MISSING
         return status
 
-    def _read(self, box: tuple[slice, ...]) -> dict[str, NDArray[Any]]:
-        """Read a box of whole tiles, each array at once; where that fails, tile by tile, leaving out what is torn."""
+    def _read(
+        self, box: tuple[slice, ...], known: Mapping[Tile, Mapping[str, NDArray[Any]]] | None = None
+    ) -> dict[str, NDArray[Any]]:
+        """Read a box of whole tiles, each array at once; where that fails, tile by tile, leaving out what is torn.
+
+        Of the whole slice, tiles that are `known` are not read.
+        """
         try:
-            values = self._stored(box)
+            values = self._completed(known) if known else self._stored(box)
         except Exception:  # a damaged chunk raises whatever its codec does
             values = self._salvage(box)
         status = self._judged(values)
@@ -269,6 +281,14 @@ class SliceStore:
             return self._blank(box)
         return {name: status if name == "status" else np.asarray(array[box]) for name, array in self._values.items()}
 
+    def _completed(self, known: Mapping[Tile, Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+        values = self._blank(tuple(slice(points) for points in self.shape))
+        for tile in self.tiles():
+            place = self._place(tile)
+            for name, part in (known.get(tile) or self._stored(place)).items():
+                values[name][place] = part
+        return values
+
     def _blank(self, box: tuple[slice, ...]) -> dict[str, NDArray[Any]]:
         shape = tuple(len(range(points)[at]) for at, points in zip(box, self.shape, strict=True))
         return {
@@ -286,8 +306,10 @@ class SliceStore:
                         values[name][place] = array[place]
         return values
 
-    def _dataset(self, box: tuple[slice, ...]) -> xr.Dataset:
-        values = self._read(box)
+    def _dataset(
+        self, box: tuple[slice, ...], known: Mapping[Tile, Mapping[str, NDArray[Any]]] | None = None
+    ) -> xr.Dataset:
+        values = self._read(box, known)
         shaped = {"loss": self.dims, "grad": (*self.dims, "dim"), "status": self.dims}
         coordinates = {name: self._coordinates[name][at] for name, at in zip(self.dims, box, strict=True)}
         dataset = xr.Dataset(

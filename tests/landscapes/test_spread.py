@@ -1,10 +1,12 @@
 import functools
+import math
 import pickle
 import shutil
 import sys
 import threading
 import time
 import uuid
+from collections import defaultdict
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -16,6 +18,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gradscape.landscapes import spread
 from gradscape.landscapes.adapters import from_torch
 from gradscape.landscapes.halving import Halving
 from gradscape.landscapes.identity import StoreError
@@ -208,6 +211,39 @@ def test_a_batch_that_was_half_done_by_a_worker_that_died_is_not_done_again(tmp_
     assert [filled.tile for filled in remote.fill([first])] == [first]  # found: evaluated it would break
     with pytest.raises(RuntimeError, match="broken cable"):
         list(remote.fill(store.tiles()))
+
+
+@pytest.fixture
+def hidden(monkeypatch):
+    """Return how often each tile is still looked for in vain, as on a file system that shows files late."""
+    finished, times = SliceStore.finished, defaultdict[object, float](lambda: 2)
+
+    def late(store, tile):
+        times[tile] -= 1
+        return None if times[tile] >= 0 else finished(store, tile)
+
+    monkeypatch.setattr(SliceStore, "finished", late)
+    monkeypatch.setattr(spread, "POLL", 0.01)
+    return times
+
+
+def test_what_workers_wrote_is_waited_for(tmp_path, alone, hidden):
+    store = store_at(tmp_path / "s.zarr")
+    with ThreadPoolExecutor(2) as threads:
+        dataset = sample(from_torch(wave, SPACE), PLANE, store, batch=40, executor=threads)
+    assert dataset["loss"].equals(alone.dataset()["loss"])
+    assert set(hidden.values()) == {-1}  # and read once
+
+
+def test_what_workers_wrote_and_never_appears_is_an_error(tmp_path, hidden, monkeypatch):
+    monkeypatch.setattr(spread, "LATE", 0.05)
+    store = store_at(tmp_path / "s.zarr")
+    hidden[store.tiles()[3]] = math.inf
+    with (
+        ThreadPoolExecutor(2) as threads,
+        pytest.raises(StoreError, match=r"s\.zarr: 1 tiles that workers finished have not appeared here"),
+    ):
+        sample(from_torch(wave, SPACE), PLANE, store, batch=40, executor=threads)
 
 
 def test_a_worker_keeps_a_store_open_until_another_lies_there(tmp_path):
