@@ -211,11 +211,17 @@ LONG = ["slice", "bounce", "--dims", "0", "1", "--resolution", str(SIDE), "--fid
 LONG += ["--json", "--out", "cut"]
 
 
+def written(folder: Path) -> list[Path]:
+    """Return the files of finished tiles, neither their folders nor what is about to be renamed to one."""
+    found = folder.glob("cut/slice.zarr/status/c/**/[0-9]*")
+    return [path for path in found if path.name.isdecimal() and path.is_file()]
+
+
 def begun(folder: Path) -> subprocess.Popen[str]:
     """Start the long slice and return once it has written a tile."""
     process = subprocess.Popen([*COMMAND, *LONG], cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 120
-    while not list(folder.glob("cut/slice.zarr/status/c/**/[0-9]*")) and time.monotonic() < deadline:
+    while not written(folder) and time.monotonic() < deadline:
         time.sleep(0.02)
     assert process.poll() is None, "the slice ended before it could be stopped"
     return process
