@@ -25,7 +25,7 @@ import xarray as xr
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from ..envs.registry import entries
-from ..landscapes.files import placing
+from ..landscapes.files import placing, visible
 from ..landscapes.job import PICTURE, STORE
 from ..landscapes.store import SliceStore, is_slice, open_slice
 from .figures import HERE, Figure
@@ -45,7 +45,7 @@ def build_site(figures: Sequence[Figure], data: Path, out: Path) -> dict[str, An
     there = [figure for figure in figures if _sampled(data / figure.id / STORE)]
     if not there:
         raise ValueError(f"{data} holds no slice of a figure; `landscape gallery compute` samples them")
-    if out.exists() and any(out.iterdir()) and not (out / MANIFEST).exists():
+    if visible(out) and not (out / MANIFEST).exists():
         raise ValueError(f"{out} holds other files and no gallery; give --out a new or an empty folder")
     pages, tables = _templates(), read_runs(data / FOLDER)
     with placing(out.resolve(), overwrite=True) as new:

@@ -27,6 +27,11 @@ def replacing(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
+def visible(folder: Path) -> list[Path]:
+    """Return what a folder holds, but for hidden files: a process that was killed may have left what it was making."""
+    return [path for path in folder.iterdir() if not path.name.startswith(".")] if folder.exists() else []
+
+
 def write_json(path: Path, record: object) -> None:
     """Write a JSON file; its numbers are as Python writes them, NaN and Infinity included."""
     with replacing(path) as partial:

@@ -18,7 +18,7 @@ import xarray as xr
 from jaxtyping import Float
 from torch import Tensor
 
-from .files import write_json
+from .files import visible, write_json
 from .halving import Halving
 from .objective import Objective, Status
 from .plane import Plane
@@ -73,7 +73,7 @@ class Job:
     ) -> Job:
         """Go on with the slice in `folder`, or begin it there; `force` begins anew where another slice is."""
         path = folder / STORE
-        if folder.exists() and not path.exists() and any(folder.iterdir()):
+        if not path.exists() and visible(folder):
             raise ValueError(f"{folder} holds other files and no slice; give --out a new or an empty folder")
         settings: dict[str, Any] = {"identity": identity, "provenance": provenance, "grad": grad}
         if force and is_slice(path):

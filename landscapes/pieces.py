@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .files import replacing, write_json
+from .files import replacing, visible, write_json
 from .identity import check_identity, plain_json
 
 SETTINGS, PIECES = "settings.json", "pieces"
@@ -31,7 +31,7 @@ class Pieces:
         Raises ValueError where the folder holds something else, StoreMismatchError where it holds another study.
         """
         wanted, path = plain_json({"kind": what, **identity}, f"a {what}'s identity"), folder / SETTINGS
-        if folder.exists() and not path.exists() and any(folder.iterdir()):
+        if not path.exists() and visible(folder):
             raise ValueError(f"{folder} holds other files and no {what}; give --out a new or an empty folder")
         if force:
             shutil.rmtree(folder / PIECES, ignore_errors=True)

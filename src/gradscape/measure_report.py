@@ -21,6 +21,7 @@ from rich.table import Table
 from .console import duration, fill, identity_of, size
 from .envs.registry import code_digest, entries, make
 from .gallery.figures import DATA, read_figures
+from .landscapes.files import visible
 from .measure_tables import by_environment, slices_markdown, slices_table
 from .results import SLICE, environment_of, inside
 
@@ -335,9 +336,8 @@ def _folder_name(what: str, subjects: Sequence[Subject], settings: dict[str, Any
 
 def _check(folder: Path, single: bool) -> None:
     """Refuse a folder that holds anything but reports."""
-    present = [file for file in folder.iterdir() if not file.name.startswith(".")] if folder.exists() else []
     ours = {REPORT, MEASURES, PICTURE} if single else {REPORT, TABLE}
-    others = [file for file in present if file.name not in ours and (single or not (file / PICTURE).exists())]
+    others = [file for file in visible(folder) if file.name not in ours and (single or not (file / PICTURE).exists())]
     if others:
         raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from .console import fill
+from .landscapes.files import visible
 from .results import RUN, SLICE, environment_of, inside, run_tables
 
 if TYPE_CHECKING:
@@ -114,8 +115,7 @@ def _folder(out: str | None, dataset: xr.Dataset, tables: Sequence[xr.Dataset], 
         digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:6]
         return Path("out") / f"overlay-{dataset.attrs['identity']['objective']}-{digest}"
     folder = Path(out)
-    present = list(folder.iterdir()) if folder.exists() else []
-    if any(file.name not in (PICTURE, STREAM) and not (file / SLICE).exists() for file in present):
+    if any(file.name not in (PICTURE, STREAM) and not (file / SLICE).exists() for file in visible(folder)):
         raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
     return folder
 

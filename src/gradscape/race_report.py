@@ -18,6 +18,7 @@ from rich.console import Console
 from . import cluster, race_workers
 from .console import duration, identity_of, provenance_of, read_settings
 from .envs.registry import make
+from .landscapes.files import visible
 from .optim.registry import METHODS
 from .race_tables import seeds_said, show
 from .search_report import STORE, give_torch_one_thread, made, run_identity, search_progress
@@ -142,7 +143,7 @@ class Job:
     ) -> Job:
         """Go on with the race in its folder, or begin it there; seeds go by turns, so that methods stay level."""
         folder, command = Path(out) if out else _folder(env, options), shlex.join(["landscape", *sys.argv[1:]])
-        if folder.exists() and any(folder.iterdir()) and not any(folder.glob(f"*-*/{STORE}")):
+        if any(not file.is_dir() or visible(file) for file in visible(folder)) and not any(folder.glob(f"*-*/{STORE}")):
             raise ValueError(f"{folder} holds other files and no race; give --out a new or an empty folder")
         makers = {
             (method, seed): partial(made, method, env, seed=seed, options=options.get(method, {}))

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from .console import identity_of, provenance_of, read_settings
 from .envs.registry import make
+from .landscapes.files import visible
 from .results import run_tables
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ def _folder(out: str | None, env: Environment, x: Tensor) -> Path:
         return Path("out") / f"replay-{env.name}-{hashlib.sha256(settings.encode()).hexdigest()[:6]}"
     folder = Path(out)
     known = {SHEET, STREAM, FILM, LOOP, RECORD}
-    if folder.exists() and any(file.name not in known for file in folder.iterdir()):
+    if any(file.name not in known for file in visible(folder)):
         raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
     return folder
 

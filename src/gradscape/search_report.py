@@ -18,6 +18,7 @@ from rich.table import Table
 
 from .console import chosen_fidelity, duration, identity_of, provenance_of, read_settings
 from .envs.registry import make
+from .landscapes.files import visible
 from .optim.registry import METHODS, code_digest, optimizer_class
 
 if TYPE_CHECKING:
@@ -146,7 +147,7 @@ class Job:
         identity = run_identity(env, optimizer)
         folder = Path(out) if out else run_folder(identity)
         path = folder / STORE
-        if folder.exists() and not path.exists() and any(folder.iterdir()):
+        if not path.exists() and visible(folder):
             raise ValueError(f"{folder} holds other files and no run; give --out a new or an empty folder")
         wanted: dict[str, Any] = {"identity": identity, "provenance": provenance_of(env, command), "budget": budget}
         if force and is_run(path):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from .landscapes.files import visible
 from .results import SLICE, inside, run_tables
 
 PICTURE, MODEL = "surface.png", "surface.gltf"
@@ -44,6 +45,6 @@ def _folder(out: str | None, content: list[object], objective: str) -> Path:
         digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:6]
         return Path("out") / f"surface-{objective}-{digest}"
     folder = Path(out)
-    if folder.exists() and any(file.name not in (PICTURE, MODEL) for file in folder.iterdir()):
+    if any(file.name not in (PICTURE, MODEL) for file in visible(folder)):
         raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
     return folder

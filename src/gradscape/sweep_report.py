@@ -21,6 +21,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from .cluster import recipe, workers
 from .console import duration, identity_of, provenance_of, read_extent, read_settings, size
 from .envs.registry import make
+from .landscapes.files import visible
 from .swept import FRAMES, HORIZON, ONLY, SMOOTHING, Moved, moved
 
 if TYPE_CHECKING:
@@ -247,7 +248,7 @@ def sweep_folder(env: Environment, moved: Moved, over: str, *, grad: bool = True
 def _check(folder: Path) -> None:
     """Refuse a folder that holds anything but a sweep."""
     ours = {FRAMES, ONLY, FILM, GIF, STREAM, SUMMARY}
-    present = {file.name for file in folder.iterdir() if not file.name.startswith(".")} if folder.exists() else set()
+    present = {file.name for file in visible(folder)}
     if present - ours or (present and not present & {FRAMES, ONLY}):
         raise ValueError(f"{folder} holds other files and no sweep; give --out a new or an empty folder")
 
