@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-import gc
 import inspect
 import threading
 from collections.abc import Iterator, Mapping
@@ -19,6 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..landscapes.episode import Episode as Episode
+from ..landscapes.halving import collect
 from ..landscapes.objective import Evaluation
 from ..landscapes.space import ParameterSpace
 from .options import NoOptions, read_options
@@ -332,12 +332,6 @@ class _Bridge(torch.autograd.Function):
     def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor, None]:
         (grad,) = ctx.saved_tensors
         return grad_loss[:, None] * grad, None
-
-
-def collect() -> None:
-    """Free what objects that are gone held, of a GPU's memory too."""
-    gc.collect()  # a solver and its launches refer to each other
-    torch.cuda.empty_cache()
 
 
 def _kind(x: object) -> str:

@@ -39,7 +39,7 @@ class Halving:
             rows = x[start : start + (self._most or len(x))]
             part = self._tried(rows, grad=grad)
             if part is None:
-                gc.collect()  # the arrays of the attempt that failed
+                collect()  # the arrays of the attempt that failed
                 self._most = len(rows) // 2
                 getattr(self.objective, "shrink", _keep)(self._most)
                 self._notes.append(f"{self.name} ran out of memory at {len(rows)} points; going on with {self._most}")
@@ -66,6 +66,12 @@ class Halving:
                     "or take a lower --fidelity or another --device"
                 ) from error
             return None
+
+
+def collect() -> None:
+    """Free what objects that are gone held, of a GPU's memory too."""
+    gc.collect()  # some, such as a solver and its launches, refer to each other
+    torch.cuda.empty_cache()
 
 
 def _keep(rows: int) -> None:

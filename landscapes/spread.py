@@ -6,7 +6,6 @@ finished and how their points ended. A tile is the same whoever writes it, so a 
 
 from __future__ import annotations
 
-import gc
 import math
 import pickle
 import threading
@@ -24,7 +23,7 @@ import cloudpickle
 import torch
 from numpy.typing import NDArray
 
-from .halving import Halving
+from .halving import Halving, collect
 from .identity import StoreError, check_identity
 from .objective import Evaluation, Objective, Status, name_of
 from .store import SliceStore
@@ -147,7 +146,7 @@ def kept(recipe: bytes) -> Halving:
     with _making:
         if recipe not in _objectives:
             _objectives.clear()
-            gc.collect()
+            collect()
             _objectives[recipe] = Halving(pickle.loads(recipe)())
         return _objectives[recipe]
 

@@ -259,12 +259,12 @@ class SliceStore:
     ) -> dict[str, NDArray[Any]]:
         """Read a box of whole tiles, each array at once; where that fails, tile by tile, leaving out what is torn.
 
-        Of the whole slice, tiles that are `known` are not read.
+        Where some tiles are `known`, the others are read one by one, too.
         """
         try:
-            values = self._completed(known) if known else self._stored(box)
+            values = self._by_tile(box, known) if known else self._stored(box)
         except Exception:  # a damaged chunk raises whatever its codec does
-            values = self._salvage(box)
+            values = self._by_tile(box, {})
         status = self._judged(values)
         for tile in self.tiles() if (status == Status.MISSING).any() else ():  # finished whole or not at all
             if (status[self._place(tile)] == Status.MISSING).any():
@@ -281,14 +281,6 @@ class SliceStore:
             return self._blank(box)
         return {name: status if name == "status" else np.asarray(array[box]) for name, array in self._values.items()}
 
-    def _completed(self, known: Mapping[Tile, Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
-        values = self._blank(tuple(slice(points) for points in self.shape))
-        for tile in self.tiles():
-            place = self._place(tile)
-            for name, part in (known.get(tile) or self._stored(place)).items():
-                values[name][place] = part
-        return values
-
     def _blank(self, box: tuple[slice, ...]) -> dict[str, NDArray[Any]]:
         shape = tuple(len(range(points)[at]) for at, points in zip(box, self.shape, strict=True))
         return {
@@ -296,14 +288,16 @@ class SliceStore:
             for name, array in self._values.items()
         }
 
-    def _salvage(self, box: tuple[slice, ...]) -> dict[str, NDArray[Any]]:
+    def _by_tile(
+        self, box: tuple[slice, ...], known: Mapping[Tile, Mapping[str, NDArray[Any]]]
+    ) -> dict[str, NDArray[Any]]:
         values = self._blank(box)
         for tile in self.tiles():
             place = self._place(tile)
-            if all(at.stop <= size for at, size in zip(place, values["status"].shape, strict=True)):
-                with contextlib.suppress(Exception):  # as above; status comes last, so it stays MISSING
-                    for name, array in self._values.items():
-                        values[name][place] = array[place]
+            inside = all(at.stop <= size for at, size in zip(place, values["status"].shape, strict=True))
+            if inside and (part := known.get(tile) or self.finished(tile)):
+                for name, array in part.items():
+                    values[name][place] = array
         return values
 
     def _dataset(

@@ -21,7 +21,7 @@ from rich.table import Table
 from .console import duration, fill, identity_of, size
 from .envs.registry import code_digest, entries, make
 from .gallery.figures import DATA, read_figures
-from .landscapes.files import visible
+from .landscapes.files import replacing, visible, write_json
 from .measure_tables import by_environment, slices_markdown, slices_table
 from .results import SLICE, environment_of, inside
 
@@ -61,8 +61,6 @@ def report(
     as_json: bool,
 ) -> None:
     """Measure slices, say what it costs, print the numbers and leave them in files."""
-    from .landscapes.files import replacing, write_json
-
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     if (what is None) != everything:
         raise ValueError("report takes a slice's folder, an environment, or --all for every figure of the gallery")
@@ -314,7 +312,6 @@ def _leave(console: Console, dataset: xr.Dataset, character: Character, record: 
     from .landscapes.character import named_measures
     from .landscapes.draw.page import save
     from .landscapes.draw.quality import quality_figure
-    from .landscapes.files import write_json
 
     save(quality_figure(dataset, character.steps, character.samples, character.smooth), folder / PICTURE)
     write_json(folder / MEASURES, named_measures(record))

@@ -18,7 +18,7 @@ from rich.console import Console
 from . import cluster, race_workers
 from .console import duration, identity_of, provenance_of, read_settings
 from .envs.registry import make
-from .landscapes.files import visible
+from .landscapes.files import visible, write_json
 from .optim.registry import METHODS
 from .race_tables import seeds_said, show
 from .search_report import STORE, give_torch_one_thread, made, run_identity, search_progress
@@ -208,7 +208,6 @@ class Job:
         """Draw the race, write its figures and return them."""
         from .landscapes.draw.page import save
         from .landscapes.draw.race import race_figure
-        from .landscapes.files import write_json
         from .optim.race import judged, picture, tables
         from .optim.standings import targets
 

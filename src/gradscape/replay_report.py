@@ -14,7 +14,7 @@ from rich.console import Console
 
 from .console import identity_of, provenance_of, read_settings
 from .envs.registry import make
-from .landscapes.files import visible
+from .landscapes.files import visible, write_json
 from .results import run_tables
 
 if TYPE_CHECKING:
@@ -93,7 +93,6 @@ def _folder(out: str | None, env: Environment, x: Tensor) -> Path:
 
 def _write_record(env: Environment, x: Tensor, loss: float, status: int, path: Path) -> None:
     """Keep what was drawn, and how it came about."""
-    from .landscapes.files import write_json
     from .landscapes.objective import Status
 
     command = shlex.join(["landscape", *sys.argv[1:]])

@@ -18,7 +18,7 @@ from rich.table import Table
 
 from .console import chosen_fidelity, duration, identity_of, provenance_of, read_settings
 from .envs.registry import make
-from .landscapes.files import visible
+from .landscapes.files import visible, write_json
 from .optim.registry import METHODS, code_digest, optimizer_class
 
 if TYPE_CHECKING:
@@ -226,7 +226,6 @@ class Job:
         return f"{self.env.name} · {self.env.fidelity.name} · {self.env.device} · {self.optimizer.name} · {self.folder}"
 
     def _summarise(self, resumed: int, seconds: float) -> dict[str, Any]:
-        from .landscapes.files import write_json
 
         summary = _summary(self.filled, resumed, seconds, self.command)
         write_json(self.folder / SUMMARY, summary)

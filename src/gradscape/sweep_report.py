@@ -21,7 +21,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from .cluster import recipe, workers
 from .console import duration, identity_of, provenance_of, read_extent, read_settings, size
 from .envs.registry import make
-from .landscapes.files import visible
+from .landscapes.files import visible, write_json
 from .swept import FRAMES, HORIZON, ONLY, SMOOTHING, Moved, moved
 
 if TYPE_CHECKING:
@@ -210,7 +210,6 @@ class Job:
         return sampled
 
     def _summarise(self, drawn: Sweep, resumed: int, seconds: float) -> dict[str, Any]:
-        from .landscapes.files import write_json
 
         identity = self.stores[0].identity
         frames = [_frame(value, dataset) for value, dataset in zip(drawn.values, drawn.slices, strict=True)]

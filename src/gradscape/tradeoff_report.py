@@ -196,7 +196,7 @@ class Study:
         The one before must be gone by then: a solver takes what memory a GPU has, and a rung that got the rest would
         seem slow.
         """
-        from .envs.base import collect
+        from .landscapes.halving import collect
         from .landscapes.tradeoff import measure
 
         collect()
