@@ -206,7 +206,7 @@ def test_a_slice_of_one_engine_is_not_continued_by_another(run: Callable[..., Sa
 
 
 # So many flights of a ball take seconds, in many tiles: time enough to be stopped in the middle.
-SIDE = 112
+SIDE = 64
 LONG = ["slice", "bounce", "--dims", "0", "1", "--resolution", str(SIDE), "--fidelity", "standard"]
 LONG += ["--json", "--out", "cut"]
 

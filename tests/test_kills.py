@@ -44,7 +44,8 @@ def test_what_a_kill_left_in_a_folder_is_no_other_file(
     (tmp_path / "made" / left / "zarr.json").write_text("{}")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("gradscape.tolerance.user_data_path", lambda name: tmp_path / "data" / name)
-    monkeypatch.setattr("gradscape.landscapes.tradeoff.TIMING", 0.002)
+    for name in ("TIMING", "PATIENCE"):
+        monkeypatch.setattr(f"gradscape.landscapes.tradeoff.{name}", 0.002)
     with pytest.raises(SystemExit) as ended:
         main([*command, "--device", "cpu", "--out", "made"])
     assert not ended.value.code

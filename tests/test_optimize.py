@@ -144,7 +144,7 @@ def test_help_and_list_import_nothing_heavy(arguments: list[str]) -> None:
 
 
 # So many episodes take seconds: time enough to be stopped in the middle.
-BUDGET = 7000
+BUDGET = 4000
 LONG = ["optimize", "rastrigin", "--set", "dim=5", "--method", "cma-es", "--budget", str(BUDGET), "--json"]
 LONG += ["--out", "run"]
 
