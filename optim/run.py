@@ -285,14 +285,15 @@ class Run:
 
     def _load(self, path: Path) -> None:
         """Read the rows that the state counts."""
+        head, _, state = _kept(path).partition(b"\n")
+        counts = json.loads(head)
         self.attributes = self._group("r").attrs.asdict()
         self._columns = self._empty(self.budget)
         for name, array in self._arrays().items():
-            self._columns[name][: array.shape[0]] = array[:]
-        head, _, state = _kept(path).partition(b"\n")
-        counts = json.loads(head)
+            rows = slice(min(counts["rows"], *array.shape[:1], self.budget))
+            self._columns[name][rows] = array[rows]
         missing = np.append(self._columns["status"] == Status.MISSING, True)
-        self.count, self.told = min(counts["rows"], int(missing.argmax())), counts["told"]
+        self.count, self.told = int(missing.argmax()), counts["told"]
         if self.count < self.told:
             raise StoreError(f"{self.path} is damaged: row {self.count + 1} is missing; begin anew with --force")
         self._state = state or None

@@ -144,34 +144,33 @@ def test_help_and_list_import_nothing_heavy(arguments: list[str]) -> None:
 
 
 # So many episodes take seconds: time enough to be stopped in the middle.
-BUDGET = 4000
-LONG = ["optimize", "rastrigin", "--set", "dim=5", "--method", "cma-es", "--budget", str(BUDGET), "--json"]
-LONG += ["--out", "run"]
+BUDGET = 7000
+LONG = ["optimize", "rastrigin", "--set", "dim=5", "--method", "cma-es", "--json", "--out", "run", "--budget"]
 
 
-def begun(folder: Path, rows: int) -> subprocess.Popen[str]:
+def begun(folder: Path, rows: int, budget: int = BUDGET) -> subprocess.Popen[str]:
     """Start the long run and return once so many rows are written."""
-    command = [sys.executable, "-m", "gradscape", *LONG]
+    command = [sys.executable, "-m", "gradscape", *LONG, str(budget)]
     process = subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    deadline, state = time.monotonic() + 120, folder / "run/run.zarr" / STATE
-    while time.monotonic() < deadline and process.poll() is None:
+    deadline, state = time.monotonic() + 60, folder / "run/run.zarr" / STATE
+    while process.poll() is None:
         if state.exists() and json.loads(state.read_bytes().split(b"\n")[0])["rows"] > rows:
-            break
+            return process
+        if time.monotonic() > deadline:
+            process.kill()
         time.sleep(0.01)
-    if process.poll() is not None:
-        pytest.fail(f"the run ended before it could be stopped: {process.communicate()}")
-    return process
+    pytest.fail(f"the run could not be stopped in the middle: {process.communicate()}")
 
 
 def test_sigkill_at_several_moments_changes_no_bit(run: Callable[..., Said], tmp_path: Path) -> None:
     (tmp_path / "whole").mkdir()
     (tmp_path / "killed").mkdir()
-    assert run(*LONG, cwd=tmp_path / "whole").returncode == 0
+    assert run(*LONG, str(BUDGET), cwd=tmp_path / "whole").returncode == 0
     for rows in (-1, 0):  # before its first rows, and after
         process = begun(tmp_path / "killed", rows)
         process.send_signal(signal.SIGKILL)
         process.communicate()
-    resumed = json.loads(run(*LONG, cwd=tmp_path / "killed").stdout)
+    resumed = json.loads(run(*LONG, str(BUDGET), cwd=tmp_path / "killed").stdout)
     assert 0 < resumed["resumed"] < BUDGET
     assert resumed["episodes"] + resumed["resumed"] == BUDGET
     one, two = (Run.open(tmp_path / name / "run/run.zarr").table() for name in ("whole", "killed"))
@@ -179,14 +178,15 @@ def test_sigkill_at_several_moments_changes_no_bit(run: Callable[..., Said], tmp
 
 
 def test_interrupt_ends_cleanly_and_says_how_to_go_on(tmp_path: Path) -> None:
-    process = begun(tmp_path, 0)
+    budget = 100 * BUDGET
+    process = begun(tmp_path, 0, budget)
     process.send_signal(signal.SIGINT)
     out, said = process.communicate(timeout=60)
     assert process.returncode == 130
     assert out == ""
     assert "Traceback" not in said
     kept = Run.open(tmp_path / "run/run.zarr").count
-    assert f"stopped: {kept} of {BUDGET} episodes are kept in run" in said
+    assert f"stopped: {kept} of {budget} episodes are kept in run" in said
     assert "the same command goes on from there: landscape optimize rastrigin" in said
-    assert 0 < kept < BUDGET
+    assert 0 < kept < budget
     assert (tmp_path / "run/progress.png").exists()
