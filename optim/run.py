@@ -290,7 +290,7 @@ class Run:
         self.attributes = self._group("r").attrs.asdict()
         self._columns = self._empty(self.budget)
         for name, array in self._arrays().items():
-            rows = slice(min(counts["rows"], *array.shape[:1], self.budget))
+            rows = slice(min(counts["rows"], array.shape[0], self.budget))
             self._columns[name][rows] = array[rows]
         missing = np.append(self._columns["status"] == Status.MISSING, True)
         self.count, self.told = int(missing.argmax()), counts["told"]

@@ -226,7 +226,6 @@ class Job:
         return f"{self.env.name} · {self.env.fidelity.name} · {self.env.device} · {self.optimizer.name} · {self.folder}"
 
     def _summarise(self, resumed: int, seconds: float) -> dict[str, Any]:
-
         summary = _summary(self.filled, resumed, seconds, self.command)
         write_json(self.folder / SUMMARY, summary)
         return summary

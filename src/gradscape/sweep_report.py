@@ -210,7 +210,6 @@ class Job:
         return sampled
 
     def _summarise(self, drawn: Sweep, resumed: int, seconds: float) -> dict[str, Any]:
-
         identity = self.stores[0].identity
         frames = [_frame(value, dataset) for value, dataset in zip(drawn.values, drawn.slices, strict=True)]
         ends = [end for frame in frames for end in frame["loss"].values() if end is not None]
