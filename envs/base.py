@@ -8,7 +8,7 @@ import threading
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar, final
@@ -96,6 +96,22 @@ class Environment(abc.ABC):
         self.options = read_options(self.name, self.Options, options)
         self._stop = threading.Event()
         self._setup()
+
+    @final
+    def identity(self) -> dict[str, Any]:
+        """Return what decides the numbers, as plain JSON: scene, options, fidelity, device, engine and code."""
+        from .registry import code_digest
+
+        return {
+            "objective": self.name,
+            "options": asdict(self.options),
+            "fidelity": self.fidelity.name,
+            "settings": asdict(self.fidelity),
+            "device": self.device,
+            "engine": self.engine,
+            "deterministic": self.deterministic,
+            "code": code_digest(type(self)),
+        }
 
     @final
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:

@@ -16,7 +16,6 @@ import json
 import re
 import shutil
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -24,10 +23,14 @@ from typing import Any
 import xarray as xr
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from .. import __version__
 from ..envs.registry import entries
 from ..landscapes.files import placing, visible
+from ..landscapes.identity import stored_identity, stored_provenance
 from ..landscapes.job import PICTURE, STORE
-from ..landscapes.store import SliceStore, is_slice, open_slice
+from ..landscapes.slice_arrays import parameters_of, plane_of
+from ..landscapes.slice_paths import is_slice
+from ..landscapes.store import SliceStore, open_slice
 from .figures import HERE, Figure
 from .measured import MEASURES, QUALITY, REPORT, place_tradeoffs, read_report
 from .page_data import nodes, numbers, read_episodes, read_json
@@ -53,7 +56,7 @@ def build_site(figures: Sequence[Figure], data: Path, out: Path) -> dict[str, An
         traded = place_tradeoffs(data, new, [figure.env for figure in there])
         made = [_page(pages, figure, data / figure.id, new / figure.id, tables, traded) for figure in there]
         missing = [figure.id for figure in figures if figure not in there]
-        manifest = {"schema": SCHEMA, "gradscape": version("gradscape"), "figures": made, "missing": missing}
+        manifest = {"schema": SCHEMA, "gradscape": __version__, "figures": made, "missing": missing}
         (new / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n")
         groups = [(env, list(group)) for env, group in groupby(made, key=lambda entry: str(entry["env"]))]
         index = pages.get_template("index.html").render(groups=groups, manifest=manifest, scenes=entries())
@@ -116,7 +119,7 @@ def _page(
 
 
 def _entry(figure: Figure, dataset: xr.Dataset) -> dict[str, Any]:
-    identity, provenance = dataset.attrs["identity"], dataset.attrs["provenance"]
+    identity, provenance = stored_identity(dataset), stored_provenance(dataset)
     return {
         "id": figure.id,
         "env": figure.env,
@@ -153,8 +156,7 @@ def _draw(dataset: xr.Dataset, source: Path, folder: Path) -> None:
 
 def _held(dataset: xr.Dataset) -> list[tuple[str, float, str]]:
     """Return the parameters that the slice holds, at what value and in what unit."""
-    plane = dataset.attrs["identity"]["plane"]
-    names = [str(name) for name in dataset["dim"].to_numpy()]
-    rows = zip(names, plane["origin"], dataset["dim"].attrs["units"], strict=True)
-    varied = [any(row[number] for row in plane["basis"]) for number in range(len(names))]
-    return [row for row, varies in zip(rows, varied, strict=True) if not varies]
+    plane = plane_of(dataset)
+    varied = plane.basis.any(dim=0).tolist()
+    rows = zip(parameters_of(dataset), plane.origin.tolist(), varied, strict=True)
+    return [(name, value, unit) for (name, unit), value, varies in rows if not varies]

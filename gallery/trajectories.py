@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from ..landscapes.identity import stored_identity, stored_provenance
 from ..landscapes.objective import Status
 from ..landscapes.overlay import lay
 from .page_data import rounded
@@ -30,7 +31,7 @@ def trajectories(dataset: xr.Dataset, tables: Sequence[xr.Dataset]) -> list[dict
     """
     from ..landscapes.draw.overlay import farthest
 
-    own = [table for table in tables if _same(table.attrs["identity"], dataset.attrs["identity"])]
+    own = [table for table in tables if _same(stored_identity(table), stored_identity(dataset))]
     runs = [lay(dataset, table, f"{table.attrs['method']}, seed {table.attrs['seed']}") for table in own]
     reach = farthest(runs)
     points = sum(run.sizes["evaluation"] for run in runs)
@@ -68,7 +69,7 @@ def _trajectory(run: xr.Dataset, reach: float, points: int, top: float) -> dict[
         "outside": int(outside.sum()),
         "failed": int(failed.sum()),
         "distance": [float(distance.min()), float(distance.max())],
-        "command": run.attrs["provenance"].get("command", ""),
+        "command": stored_provenance(run).get("command", ""),
         **{name: rounded(run[name].to_numpy()) for name in ("u", "v", "loss") if name in run},
         "radius": [round(float(size), 1) for size in radius],
         "path": np.flatnonzero(improved).tolist(),

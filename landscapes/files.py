@@ -58,6 +58,15 @@ def placing(path: Path, *, overwrite: bool) -> Iterator[Path]:
             shutil.rmtree(left, ignore_errors=True)
 
 
+def discard(folder: Path) -> None:
+    """Remove a folder at once: killed in the middle of it, nothing is left under its name."""
+    _clear_stale(folder)
+    gone = _hidden(folder)
+    with contextlib.suppress(FileNotFoundError):  # another process was quicker
+        os.rename(folder, gone)
+        shutil.rmtree(gone, ignore_errors=True)
+
+
 def _hidden(path: Path) -> Path:
     return path.with_name(f".{path.name}.{uuid.uuid4().hex}.making")
 

@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from .. import __version__
 from .plane import Plane
 from .space import ParameterSpace
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 SHOWN = 6
 
@@ -32,6 +35,26 @@ def full_identity(identity: Mapping[str, Any], plane: Plane, space: ParameterSpa
     if clash := own.keys() & identity.keys():
         raise ValueError(f"a slice's identity gets {', '.join(sorted(clash))} from the slice; leave them out")
     return plain_json({**identity, **own}, "a slice's identity")
+
+
+def stored_identity(dataset: xr.Dataset) -> dict[str, Any]:
+    """Return what decides the numbers of a slice or a run: objective, options, fidelity, device and so on."""
+    return _decoded(dataset, "identity")
+
+
+def stored_provenance(dataset: xr.Dataset) -> dict[str, Any]:
+    """Return what else is known of how a slice or a run was made: command, date, versions, the loss's unit."""
+    return _decoded(dataset, "provenance")
+
+
+def _decoded(dataset: xr.Dataset, name: str) -> dict[str, Any]:
+    try:
+        found = json.loads(dataset.attrs[name])
+    except (KeyError, TypeError, ValueError):
+        found = None
+    if not isinstance(found, dict):
+        raise ValueError(f"no slice or run of gradscape: the dataset's attribute {name} is missing or no JSON object")
+    return found
 
 
 def plain_json(settings: Mapping[str, Any], what: str) -> dict[str, Any]:

@@ -1,4 +1,7 @@
-"""Whether a slice on disk agrees with itself: its layout is there twice, its axes follow from its identity."""
+"""Whether a slice on disk agrees with itself: its layout is there twice, its axes follow from its identity.
+
+A copy that xarray wrote (`Dataset.to_zarr`) has its layout once; its axes are held against its identity all the same.
+"""
 
 from __future__ import annotations
 
@@ -20,17 +23,28 @@ def check_integrity(path: Path, group: zarr.Group, axes: Mapping[str, NDArray[An
     `axes` hold what its coordinates must be, in stored order; `values` name the other arrays. Chunks of those have
     checksums, and are looked at when they are read.
     """
-    index = _read(path).get("consolidated_metadata")
-    known = index.get("metadata") if isinstance(index, dict) else None
     wanted, found = {*axes, *values}, set(group.array_keys())
-    if not isinstance(known, dict) or not wanted == found == set(known):
+    known = _index(path)
+    if not wanted <= found or known.keys() not in (set(), found):
         raise _damaged(path, f"it needs the arrays {', '.join(sorted(wanted))} and an index of them")
-    for name in sorted(wanted):
-        if _read(path / name) != known[name]:
+    for name, layout in known.items():
+        if _read(path / name) != layout:
             raise _damaged(path / name, "its layout is not what the store's index says")
     for name, axis in axes.items():
         if not np.array_equal(_values(path / name, group[name]), axis):
             raise _damaged(path / name, "it is not what the store's identity says")
+
+
+def _index(path: Path) -> dict[str, Any]:
+    """Return the layout of every array as the store's index has it, nothing where it has no index."""
+    root = _read(path)
+    if "consolidated_metadata" not in root:
+        return {}
+    index = root["consolidated_metadata"]
+    known = index.get("metadata") if isinstance(index, dict) else None
+    if not isinstance(known, dict) or not known:
+        raise _damaged(path, "the index of its arrays is not what it was made")
+    return known
 
 
 def _values(path: Path, array: Any) -> NDArray[Any]:

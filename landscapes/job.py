@@ -23,14 +23,15 @@ from .halving import Halving
 from .objective import Objective, Status
 from .plane import Plane
 from .sampling import Progress, sample
+from .slice_paths import SLICE, is_slice, there
 from .spread import RemoteSite, Site, results, workers_of
-from .store import SliceStore, is_slice, plane_of
+from .store import SliceStore, plane_of
 from .tiling import Tile
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-STORE, PICTURE, SUMMARY = "slice.zarr", "landscape.png", "summary.json"
+STORE, PICTURE, SUMMARY = SLICE, "landscape.png", "summary.json"
 PAUSE = 10.0  # least seconds between two pictures of an unfinished slice
 PATIENCE, FIRST_PATIENCE = 1.0, 10.0  # seconds that do for an estimate, and those that a first evaluation is given
 
@@ -73,7 +74,7 @@ class Job:
     ) -> Job:
         """Go on with the slice in `folder`, or begin it there; `force` begins anew where another slice is."""
         path = folder / STORE
-        if not path.exists() and visible(folder):
+        if not there(path) and visible(folder):
             raise ValueError(f"{folder} holds other files and no slice; give --out a new or an empty folder")
         settings: dict[str, Any] = {"identity": identity, "provenance": provenance, "grad": grad}
         if force and is_slice(path):

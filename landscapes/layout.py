@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from enum import IntEnum
@@ -14,6 +15,7 @@ from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
 FILL = {"float64": float("nan"), "int8": 0, "int64": 0, "string": ""}
 CODECS = [ZstdCodec(level=3, checksum=True)]
 SMALL = [BloscCodec(cname="zstd", clevel=9, shuffle="shuffle"), Crc32cCodec()]
+SIDE, VALUES = 256, 1 << 20  # of a chunk of a finished slice: samples along an axis and values in all, at most
 
 
 def create_array(
@@ -38,6 +40,15 @@ def create_array(
         config={"write_empty_chunks": True},  # a chunk of NaN is a result too
         attributes=attributes,
     )
+
+
+def analysis_chunks(samples: Sequence[int], *deep: int) -> tuple[int, ...]:
+    """Return the chunk of an array over so many samples along each axis, which may have another dimension after them.
+
+    A chunk holds a whole map where that is not large, and of as many components of the gradient as make 8 MB.
+    """
+    sides = tuple(min(count, SIDE) for count in samples)
+    return (*sides, *(min(size, max(1, VALUES // math.prod(sides))) for size in deep))
 
 
 def flags(kind: type[IntEnum]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import xarray as xr
 
@@ -62,7 +63,7 @@ def sample(
     pickled itself. Batches are equal then, and of at most `batch` points. Where workers are lost, `WorkersLostError`.
     """
     if store is None:
-        store = SliceStore.in_memory(plane, objective.space, identity={"objective": name_of(objective)}, grad=grad)
+        store = SliceStore.in_memory(plane, objective.space, **_described(objective), grad=grad)
     _check_store(store, objective, plane, grad=grad)
     batch = getattr(objective, "preferred_batch", 1) if batch is None else batch
     status = store.status()
@@ -89,7 +90,16 @@ def sample(
             report(left)
             if executor is not None:
                 back.look(filled.tile)
-    return store.dataset(back.values())
+        dataset = store.dataset(back.values())
+        if not bool((dataset["status"] == Status.MISSING).any()):
+            store.finish(dataset)
+    return dataset
+
+
+def _described(objective: Objective) -> dict[str, dict[str, Any]]:
+    """Return what an objective says of itself: an environment its fidelity and options, any its name and unit."""
+    about: Callable[[], dict[str, Any]] = getattr(objective, "identity", lambda: {"objective": name_of(objective)})
+    return {"identity": about(), "provenance": {"loss_unit": getattr(objective, "loss_unit", "")}}
 
 
 def _filled(

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from .halving import Halving, collect
 from .identity import StoreError, check_identity
 from .objective import Evaluation, Objective, Status, name_of
+from .slice_paths import place_of
 from .store import SliceStore
 from .tiling import Tile
 
@@ -103,7 +104,7 @@ class RemoteSite:
     def here(self) -> Site:
         """Return the site with its objective, made where this process has not made it yet, and its store."""
         try:
-            at = Path(self.path).stat()
+            at = place_of(Path(self.path)).stat()
         except FileNotFoundError:
             raise StoreError(f"a worker finds no {self.path}; workers need a file system that they share") from None
         store = opened(self.path, at.st_ino, at.st_mtime_ns)

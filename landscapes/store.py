@@ -1,21 +1,27 @@
-"""The zarr layout of a slice; nothing else knows it.
+"""A slice on disk: tiles while it is being filled, and plain ascending arrays once it is finished.
 
 A slice is a group of arrays: `loss(v, u)`, `grad(v, u, dim)` unless sampled without gradients, `status(v, u)` and the
-coordinates `u`, `v`, `dim`; a line has no `v`. Axes are stored coarse to fine (`tiling.coarse_to_fine`) and one chunk
-is one tile, so the first tile is a coarse picture of the whole box and every square of tiles from it a finer one.
+coordinates `u`, `v`, `dim`, `unit(dim)`; a line has no `v`. It lies in one of two places:
 
-A tile is finished when its chunks decode, its status has no MISSING, and loss and gradient are finite exactly where the
-status is OK. Everything else, a torn file included, is as if it had never been written.
+- `slice.filling.zarr` while it is being filled. Axes are stored coarse to fine (`tiling.coarse_to_fine`) and one chunk
+  is one tile, so the first tile is a coarse picture of the whole box and every square of tiles from it a finer one.
+- `slice.zarr` once every point is there. Axes ascend, and chunks are as large as analysis wants them
+  (`layout.analysis_chunks`), so that anybody's xarray or zarr reads it right. It appears whole, and only then the
+  tiles go: a process killed at any instant leaves one or the other.
+
+A tile, or a chunk of a finished slice, counts when it decodes, its status has no MISSING, and loss and gradient are
+finite exactly where the status is OK. Everything else, a torn file included, is as if it had never been written.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -26,41 +32,49 @@ from numpy.typing import NDArray
 from torch import Tensor
 from zarr.storage import MemoryStore
 
-from .files import placing
+from .files import discard, placing
 from .identity import StoreError, StoreExistsError, check_identity, full_identity, plain_json
 from .integrity import check_integrity
-from .layout import CODECS, SMALL, consolidate, create_array, flags
+from .layout import consolidate
 from .objective import Evaluation, Status
 from .plane import Plane
+from .slice_arrays import AXES, FORMAT, attributes_of, axes_of, lay_out, write_finished
+from .slice_arrays import plane_of as plane_of
+from .slice_paths import SLICE, filling, finished, place_of, there
+from .slice_paths import is_slice as is_slice
 from .space import ParameterSpace
-from .tiling import Tile, coarse_to_fine, tile_side
+from .tiling import Tile
 
-FORMAT = 1
-AXES = ("u", "v")
+T = TypeVar("T")
 
 
 class SliceStore:
     """Keep a slice on disk tile by tile, so that a run stopped at any instant can go on.
 
-    Make one with `create`, `open`, `open_or_create` or `in_memory`. Two processes may fill the same store: a tile is
-    the same whoever writes it, and each file appears whole or not at all.
+    Make one with `create`, `open`, `open_or_create` or `in_memory`, all by the `path` of the finished slice; `place` is
+    where its arrays are now. Two processes may fill the same store: a tile is the same whoever writes it, and each file
+    appears whole or not at all.
     """
 
-    def __init__(self, group: zarr.Group, path: Path | None) -> None:
+    def __init__(self, group: zarr.Group, path: Path | None, place: Path | None) -> None:
+        self._adopt(group, path, place)
+
+    def _adopt(self, group: zarr.Group, path: Path | None, place: Path | None) -> None:
         arrays = dict(group.arrays())
-        self.path = path
-        self._inode = path.stat().st_ino if path else None
-        self.identity: dict[str, Any] = dict(group.attrs["identity"])  # type: ignore[arg-type]
-        self.provenance: dict[str, Any] = dict(group.attrs["provenance"])  # type: ignore[arg-type]
+        self.path, self.place = path, place
+        self._inode = place.stat().st_ino if place else None
+        self._about = attributes_of(group)
+        self.identity: dict[str, Any] = json.loads(str(self._about["identity"]))
+        self.provenance: dict[str, Any] = json.loads(str(self._about["provenance"]))
         self.plane = Plane.from_record(self.identity["plane"])
         self.dims = AXES[: self.plane.rank][::-1]
         self._values: dict[str, zarr.Array[Any]] = {
             name: arrays[name] for name in ("loss", "grad", "status") if name in arrays
         }
         self._coordinates = {name: np.asarray(arrays[name][:]) for name in self.dims}
-        self._parameters = [str(name) for name in np.asarray(arrays["dim"][:])]
-        self._attributes = {name: dict(array.attrs) for name, array in arrays.items()}
-        self.side = self._values["status"].chunks
+        self._parameters, self._units = ([str(one) for one in np.asarray(arrays[name][:])] for name in ("dim", "unit"))
+        self._attributes = {name: attributes_of(array) for name, array in arrays.items()}
+        self.side = self._values["status"].chunks[: self.plane.rank]
 
     @classmethod
     def create(
@@ -82,37 +96,42 @@ class SliceStore:
         """
         path = Path(path).resolve()
         whole = full_identity(identity, plane, space, grad=grad)
-        if path.exists() and not overwrite:
-            raise StoreExistsError(f"{path} exists already; write elsewhere with --out, or replace it with --force")
-        if path.exists() and not is_slice(path):
-            raise StoreError(f"{path} is no slice store, so it is not replaced; move it away or write elsewhere")
+        for taken in (path, filling(path)):
+            if taken.exists() and not overwrite:
+                raise StoreExistsError(f"{path} exists already; write elsewhere with --out, or replace it with --force")
+            if taken.exists() and not is_slice(taken):
+                raise StoreError(f"{taken} is no slice store, so it is not replaced; move it away or write elsewhere")
         try:
-            with placing(path, overwrite=overwrite) as new:
+            with placing(filling(path), overwrite=overwrite) as new:
                 group = zarr.create_group(new, zarr_format=3)
-                _lay_out(group, plane, space, whole, plain_json(provenance or {}, "a slice's provenance"), grad=grad)
+                lay_out(group, plane, space, whole, plain_json(provenance or {}, "a slice's provenance"), grad=grad)
                 consolidate(new)
         except FileExistsError as error:
             raise StoreExistsError(str(error)) from None
+        discard(path)
         return cls.open(path)
 
     @classmethod
     def open(cls, path: str | Path) -> SliceStore:
-        """Open a store that exists."""
-        path = Path(path).resolve()
-        if not path.exists():
+        """Open a store that exists, the finished slice where there is one."""
+        path = finished(Path(path).resolve())
+        place = place_of(path)
+        if not place.exists():
             raise StoreError(f"there is no slice store at {path}; make one with `landscape slice`")
-        if not is_slice(path):
-            raise StoreError(f"{path} is no slice store of format {FORMAT}; move it away or write elsewhere")
+        if not is_slice(place):
+            raise StoreError(f"{place} is no slice store of format {FORMAT}; move it away or write elsewhere")
         try:
-            group = zarr.open_group(path, mode="r+", use_consolidated=False)
-            store = cls(group, path)
-            axes = {**dict(_coordinates(store.plane)), "dim": np.array(store.identity["parameters"], dtype=object)}
-            check_integrity(path, group, axes, ["loss", "status", *(["grad"] if store.identity["gradients"] else [])])
+            group = zarr.open_group(place, mode="r+", use_consolidated=False)
+            store = cls(group, path, place)
+            axes = axes_of(store.plane, store.identity["parameters"], store._units, ascending=store.ascending)
+            check_integrity(place, group, axes, ["loss", "status", *(["grad"] if store.identity["gradients"] else [])])
             return store
         except StoreError:
             raise
         except Exception as error:  # a damaged axis or layout raises whatever reads it; of tiles nothing is read here
-            raise StoreError(f"{path} is damaged ({type(error).__name__}: {error}); begin anew with --force") from error
+            raise StoreError(
+                f"{place} is damaged ({type(error).__name__}: {error}); begin anew with --force"
+            ) from error
 
     @classmethod
     def open_or_create(
@@ -130,16 +149,30 @@ class SliceStore:
             cls.create(path, plane, space, identity=identity, provenance=provenance, grad=grad)
         store = cls.open(path)
         check_identity(store.path, wanted=full_identity(identity, plane, space, grad=grad), found=store.identity)
+        if store.ascending and store.path:
+            discard(filling(store.path))  # left by a process that was killed when it had finished the slice
         return store
 
     @classmethod
     def in_memory(
-        cls, plane: Plane, space: ParameterSpace, *, identity: Mapping[str, Any] | None = None, grad: bool = True
+        cls,
+        plane: Plane,
+        space: ParameterSpace,
+        *,
+        identity: Mapping[str, Any] | None = None,
+        provenance: Mapping[str, Any] | None = None,
+        grad: bool = True,
     ) -> SliceStore:
         """Make a store that lives as long as the object."""
         group = zarr.create_group(MemoryStore(), zarr_format=3)
-        _lay_out(group, plane, space, full_identity(identity or {}, plane, space, grad=grad), {}, grad=grad)
-        return cls(group, None)
+        whole = full_identity(identity or {}, plane, space, grad=grad)
+        lay_out(group, plane, space, whole, plain_json(provenance or {}, "a slice's provenance"), grad=grad)
+        return cls(group, None, None)
+
+    @property
+    def ascending(self) -> bool:
+        """Whether this is a slice that was complete once, and so lies in its final place and order."""
+        return self.place is not None and self.place == self.path
 
     @property
     def grad(self) -> bool:
@@ -204,36 +237,78 @@ class SliceStore:
             raise ValueError("this slice holds gradients; got an evaluation without, so evaluate with grad=True")
         if bool((evaluation.status == Status.MISSING).any()):
             raise ValueError("a tile is written whole; got an evaluation with status MISSING")
-        self._check_in_place()
-        for name, values in self._values.items():  # loss, grad, status
-            tensor: Tensor = getattr(evaluation, name)
-            values[place] = tensor.detach().cpu().numpy().reshape(shape + tensor.shape[1:]).astype(values.dtype)
+        if self._taken_over():
+            return
+        try:
+            for name, values in self._values.items():  # loss, grad, status
+                tensor: Tensor = getattr(evaluation, name)
+                values[place] = tensor.detach().cpu().numpy().reshape(shape + tensor.shape[1:]).astype(values.dtype)
+        except FileNotFoundError:
+            if not self._taken_over():
+                raise
 
     def status(self) -> NDArray[np.int8]:
         """Return the status of every point in stored order, MISSING wherever a tile is not finished."""
-        return self._read(tuple(slice(points) for points in self.shape))["status"]
+        return self._steady(lambda: self._read(self._whole())["status"])
 
     def dataset(self, known: Mapping[Tile, Mapping[str, NDArray[Any]]] | None = None) -> xr.Dataset:
         """Return everything sampled so far, axes ascending; MISSING and NaN where nothing is.
 
         `known` spares reading tiles again: what `finished` returned of them.
         """
-        return self._dataset(tuple(slice(points) for points in self.shape), known)
+        return self._steady(lambda: self._dataset(self._whole(), None if self.ascending else known))
+
+    def finish(self, dataset: xr.Dataset) -> None:
+        """Put the whole slice, which `dataset` returned, in the place of its tiles: ascending, in large chunks.
+
+        It appears at once, and only then the tiles go.
+        """
+        if self.path is None or self.ascending or self._taken_over():
+            return
+        if bool((dataset["status"] == Status.MISSING).any()):
+            raise StoreError(f"{self.path} is not complete; run the command that samples it again")
+        with contextlib.suppress(FileExistsError), placing(self.path, overwrite=False) as new:
+            write_finished(zarr.create_group(new, zarr_format=3), dataset)
+            consolidate(new)
+        self._move_on(self.path)
 
     def coarse(self) -> xr.Dataset | None:
         """Return the largest coarse picture of the whole that is complete, axes ascending; None before the first."""
         pending = self.pending()
         if not pending:
             return self.dataset()
-        level = pending[0].level
+        level = 0 if self.ascending else pending[0].level
         return self._dataset(tuple(slice(level * side) for side in self.side)) if level else None
 
-    def _check_in_place(self) -> None:
-        """Refuse to write into a store that was replaced or removed since it was opened."""
+    def _steady(self, read: Callable[[], T]) -> T:
+        """Return what is read, once more where another process has finished the slice meanwhile."""
+        self._taken_over()
+        found = read()
+        return read() if self._taken_over() else found
+
+    def _taken_over(self) -> bool:
+        """Go on with the finished slice where another process has finished this one meanwhile, and say whether it has.
+
+        Raise StoreError where the store was replaced or removed.
+        """
+        if self.path is None or self.place is None:
+            return False
         with contextlib.suppress(FileNotFoundError):
-            if self.path is None or self.path.stat().st_ino == self._inode:
-                return
+            if self.place.stat().st_ino == self._inode:
+                return False
+        with contextlib.suppress(StoreError):
+            if not self.ascending and SliceStore.open(self.path).identity == self.identity:
+                self._move_on(self.path)
+                return True
         raise StoreError(f"{self.path} was replaced or removed while it was being filled; run the command again")
+
+    def _move_on(self, path: Path) -> None:
+        """Become the finished slice, and clear the tiles away."""
+        self._adopt(zarr.open_group(path, mode="r+", use_consolidated=False), path, path)
+        discard(filling(path))
+
+    def _whole(self) -> tuple[slice, ...]:
+        return tuple(slice(points) for points in self.shape)
 
     def _place(self, tile: Tile) -> tuple[slice, ...]:
         sizes = zip(tile.index, self.side, self.shape, strict=True)
@@ -309,78 +384,17 @@ class SliceStore:
         dataset = xr.Dataset(
             {name: (shaped[name], values[name], self._attributes[name]) for name in values},
             {name: (name, values, self._attributes[name]) for name, values in coordinates.items()},
-            {"identity": self.identity, "provenance": self.provenance},
+            self._about,
         )
-        parameters = ("dim", self._parameters, self._attributes["dim"])
-        return dataset.assign_coords(dim=parameters).sortby(list(self.dims))
-
-
-def pack(path: Path) -> None:
-    """Rewrite a finished slice as a few small files, one chunk an array; it reads as before."""
-    if SliceStore.open(path).pending():
-        raise StoreError(f"{path} is not finished, so it is not packed; run the command that samples it again")
-    present = zarr.open_group(path, mode="r", use_consolidated=False)
-    with placing(path.resolve(), overwrite=True) as new:
-        group = zarr.create_group(new, zarr_format=3, attributes=dict(present.attrs))
-        for name, array in present.arrays():
-            dims = tuple(str(dim) for dim in getattr(array.metadata, "dimension_names", None) or ())
-            numbers = array.dtype.kind in "fi"
-            kind, codecs = (array.dtype.name, SMALL) if numbers else ("string", CODECS)
-            attributes: dict[str, Any] = dict(array.attrs)
-            create_array(group, name, array.shape, array.shape, dims, kind, codecs=codecs, **attributes)[...] = array[:]
-        consolidate(new)
+        words = {"dim": self._parameters, "unit": self._units}
+        named = {name: ("dim", np.array(said, object), self._attributes[name]) for name, said in words.items()}
+        return dataset.assign_coords(named).sortby(list(self.dims))
 
 
 def open_slice(path: str | Path) -> xr.Dataset:
-    """Read a slice from disk: loss and gradient in float64, axes ascending, MISSING where it is not sampled yet."""
-    return SliceStore.open(path).dataset()
+    """Read a slice from disk: loss and gradient in float64, axes ascending, MISSING where it is not sampled yet.
 
-
-def plane_of(dataset: xr.Dataset) -> Plane:
-    """Return the plane that a slice was sampled on."""
-    return Plane.from_record(dataset.attrs["identity"]["plane"])
-
-
-def is_slice(path: Path) -> bool:
-    """Say whether a slice store of this format is at `path`."""
-    try:
-        return zarr.open_group(path, mode="r", use_consolidated=False).attrs.get("gradscape_slice") == FORMAT
-    except Exception:  # whatever else is there is none
-        return False
-
-
-def _lay_out(
-    group: zarr.Group,
-    plane: Plane,
-    space: ParameterSpace,
-    identity: dict[str, Any],
-    provenance: dict[str, Any],
-    *,
-    grad: bool,
-) -> None:
-    names = AXES[: plane.rank][::-1]
-    coordinates = dict(_coordinates(plane))
-    shape = tuple(len(coordinates[name]) for name in names)
-    side = tuple(tile_side(points) for points in shape)
-    group.attrs.update({"gradscape_slice": FORMAT, "identity": identity, "provenance": provenance})
-    loss_unit = str(provenance.get("loss_unit", ""))
-    create_array(group, "loss", shape, side, names, "float64", long_name="loss", units=loss_unit)
-    if grad:
-        deep = (*shape, space.dim), (*side, space.dim), (*names, "dim")
-        create_array(
-            group, "grad", *deep, "float64", long_name="gradient of the loss by each parameter in its own unit"
-        )
-    create_array(group, "status", shape, side, names, "int8", long_name="how the evaluation ended", **flags(Status))
-    for name, axis in coordinates.items():
-        number = AXES.index(name)
-        label = {"label": plane.labels[number], "long_name": plane.names[number], "units": plane.units[number]}
-        create_array(group, name, axis.shape, axis.shape, (name,), "float64", **label)[:] = axis
-    parameters = np.array(space.names, dtype=object)
-    about = {"long_name": "parameter", "units": list(space.units)}
-    create_array(group, "dim", (space.dim,), (space.dim,), ("dim",), "string", **about)[:] = parameters
-
-
-def _coordinates(plane: Plane) -> Iterator[tuple[str, NDArray[np.float64]]]:
-    for name, axis in zip(AXES, plane.axes(), strict=False):
-        values = axis.numpy()
-        yield name, values[coarse_to_fine(len(values), tile_side(len(values)))]
+    `path` is the slice, or the folder that `landscape slice` left it in.
+    """
+    path = Path(path)
+    return SliceStore.open(path / SLICE if there(path / SLICE) else path).dataset()

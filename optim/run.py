@@ -169,14 +169,17 @@ class Run:
         return self._state
 
     def table(self) -> xr.Dataset:
-        """Return every row as a long table: shapes (evaluation,) or (evaluation, dim)."""
+        """Return every row as a long table: shapes (evaluation,) or (evaluation, dim).
+
+        Its attributes are plain numbers and strings, identity and provenance among them as JSON.
+        """
         units = {"loss": {"units": self.attributes["loss_unit"]}}
         columns = {
             name: (_dims(name), self._columns[name][: self.count].copy(), {**about, **units.get(name, {})})
             for name, (_, about) in COLUMNS.items()
         }
-        parameters = ("dim", self.identity["parameters"], {"units": self.attributes["units"]})
-        return xr.Dataset(columns, {"dim": parameters}, self.attributes)
+        names = {"dim": ("dim", self.identity["parameters"]), "unit": ("dim", self.attributes["units"])}
+        return xr.Dataset(columns, names, _plain(self.attributes))
 
     @contextlib.contextmanager
     def filling(self) -> Iterator[None]:
@@ -343,6 +346,12 @@ def _kept(path: Path) -> bytes:
         return (path / STATE).read_bytes()
     except FileNotFoundError:
         return b'{"rows": 0, "told": 0}\n'
+
+
+def _plain(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a run's attributes as any format of files has them; what is not known yet is left out."""
+    known = {name: value for name, value in attributes.items() if value is not None and name != "units"}
+    return {name: json.dumps(value) if isinstance(value, dict) else value for name, value in known.items()}
 
 
 def _dims(column: str) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from gradscape import Environment, ParameterSpace, Plane, from_torch, open_slice, sample
 from gradscape.cli import app, main
-from gradscape.landscapes.store import SliceStore, pack
+from gradscape.landscapes.store import SliceStore
 
 from .command import Said
 
@@ -113,13 +113,19 @@ def store(path: Path) -> SliceStore:
     return found
 
 
+def tiles(path: Path) -> None:
+    """Leave the tiles of a slice as they are just before it is finished."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SliceStore, "finish", lambda *_: None)
+        store(path)
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("whole")
-    for name in ("tiles", "packed"):
-        store(folder / f"{name}.zarr")
-    pack(folder / "packed.zarr")
-    return {name: folder / f"{name}.zarr" for name in ("tiles", "packed")}
+    tiles(folder / "tiles.zarr")
+    store(folder / "finished.zarr")
+    return {"tiles": folder / "tiles.filling.zarr", "finished": folder / "finished.zarr"}
 
 
 def damaged(draw: st.DrawFn, file: Path) -> None:
@@ -163,9 +169,9 @@ def test_a_damaged_store_is_refused_by_name_or_read_right(
     whole: dict[str, Path], tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
     """Finished points have their values, places and status; what is lost is MISSING, and never a wrong number."""
-    kind = data.draw(st.sampled_from(["tiles", "packed"]))
-    path = tmp_path_factory.getbasetemp() / "damaged.zarr"
-    shutil.rmtree(path, ignore_errors=True)
+    kind = data.draw(st.sampled_from(sorted(whole)))
+    path = tmp_path_factory.getbasetemp() / "damaged" / whole[kind].name
+    shutil.rmtree(path.parent, ignore_errors=True)
     shutil.copytree(whole[kind], path)
     file = data.draw(st.sampled_from(sorted(one for one in path.rglob("*") if one.is_file())))
     damaged(data.draw, file)

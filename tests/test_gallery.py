@@ -16,6 +16,7 @@ from gradscape import gallery_parts, gallery_report
 from gradscape.cli import main
 from gradscape.envs.functions import Branin
 from gradscape.gallery.figures import Figure
+from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.store import open_slice
 
 FIGURES = [
@@ -117,15 +118,14 @@ def test_build_refuses_an_empty_folder_of_data_and_foreign_files(listed: None, d
 def test_a_figure_of_which_nothing_is_sampled_begins_anew_by_other_code(
     listed: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    identity = gallery_parts.identity_of
-    monkeypatch.setattr(gallery_parts, "identity_of", lambda env: identity(env) | {"code": "other"})
+    monkeypatch.setattr("gradscape.envs.registry.code_digest", lambda kind: "other")
     monkeypatch.setattr(gallery_parts, "follow", stop)
     assert compute(tmp_path, "--only", "branin") == 1
-    assert open_slice(tmp_path / "branin/slice.zarr").attrs["identity"]["code"] == "other"
+    assert stored_identity(open_slice(tmp_path / "branin/slice.zarr"))["code"] == "other"
     monkeypatch.undo()
     monkeypatch.setattr(gallery_report, "read_figures", lambda: list(FIGURES))
     assert compute(tmp_path, "--only", "branin") == 0
-    assert open_slice(tmp_path / "branin/slice.zarr").attrs["identity"]["code"] != "other"
+    assert stored_identity(open_slice(tmp_path / "branin/slice.zarr"))["code"] != "other"
 
 
 def stop(*_: object) -> None:

@@ -17,6 +17,7 @@ import xarray as xr
 
 import gradscape
 from gradscape.cli import main
+from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.sampling import sample
 from gradscape.landscapes.smoothing import smoothed
 from gradscape.landscapes.store import plane_of
@@ -124,7 +125,7 @@ def test_over_the_horizon_each_frame_is_a_shorter_episode(run: Command) -> None:
     assert done.returncode == 0, done.stderr
     assert [frame["value"] for frame in json.loads(done.stdout)["frames"]] == [50.0, 100.0]
     half, whole = (gradscape.open_slice(f"late/frames/{number:03d}.zarr") for number in range(2))
-    assert [one.attrs["identity"]["options"]["horizon"] for one in (half, whole)] == [0.5, 1.0]
+    assert [stored_identity(one)["options"]["horizon"] for one in (half, whole)] == [0.5, 1.0]
     env = gradscape.make("bounce", device="cpu", horizon=0.5)
     points = plane_of(half).lift(torch.tensor([[float(half["u"][1]), float(half["v"][2])]]).double())
     assert float(half["loss"].sel(u=half["u"][1], v=half["v"][2])) == float(env.evaluate(points).loss[0])

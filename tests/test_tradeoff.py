@@ -16,6 +16,7 @@ from gradscape import ladder
 from gradscape.envs import registry
 from gradscape.envs.base import Environment, Fidelity, Work
 from gradscape.landscapes import tradeoff
+from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.tolerance import read_tolerance
@@ -234,7 +235,7 @@ def test_a_tolerance_takes_the_quickest_fidelity_within_it(run: Command, tmp_pat
     assert cut.returncode == 0, cut.stderr
     assert f"{wanted['name']}: the quickest of" in cut.stderr
     dataset = gradscape.open_slice(tmp_path / "cut/slice.zarr")
-    assert dataset.attrs["identity"]["settings"] == wanted["fidelity"]
+    assert stored_identity(dataset)["settings"] == wanted["fidelity"]
     searched = run("optimize", *how, "--method", "random", "--budget", "3", "--json", cwd=tmp_path)
     assert searched.returncode == 0, searched.stderr
     assert json.loads(searched.stdout)["fidelity"] == wanted["fidelity"]["name"]

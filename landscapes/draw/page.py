@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from ..files import replacing
+from ..identity import stored_identity, stored_provenance
 from ..objective import Status
 from . import style
 
@@ -38,7 +39,7 @@ def head(figure: Figure, ax: Axes, dataset: xr.Dataset, name: str | None = None,
 
 def title(dataset: xr.Dataset) -> str:
     """Return objective, fidelity and resolution, and how much of it is sampled if not all."""
-    identity = dataset.attrs["identity"]
+    identity = stored_identity(dataset)
     points = " \N{MULTIPLICATION SIGN} ".join(str(dataset.sizes[name]) for name in dataset["loss"].dims[::-1])
     said = [str(identity[key]) for key in ("objective", "fidelity") if identity.get(key)]
     whole = int(np.prod(identity["plane"]["resolution"]))
@@ -49,7 +50,7 @@ def title(dataset: xr.Dataset) -> str:
 
 def provenance(dataset: xr.Dataset) -> str:
     """Return version, device, date and command, as far as they are known."""
-    known = {**dataset.attrs["provenance"], **dataset.attrs["identity"]}
+    known = {**stored_provenance(dataset), **stored_identity(dataset)}
     said = [f"gradscape {known['gradscape']}"]
     said += [str(known[key]) for key in ("device", "created", "command") if known.get(key)]
     return " · ".join(said)

@@ -27,7 +27,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from .envs.registry import code_digest, entries, make
+from .envs.registry import entries, make
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -152,7 +152,7 @@ def fill(
     from .landscapes.job import Job
 
     command = shlex.join(["landscape", *sys.argv[1:]])
-    identity, provenance = identity_of(env) | ({"boxed": True} if boxed else {}), provenance_of(env, command)
+    identity, provenance = env.identity() | ({"boxed": True} if boxed else {}), provenance_of(env, command)
     job = Job.open(
         within_box(env) if boxed else env, plane, out or root / _folder(identity, plane, grad), picture_of(env, plane),
         identity=identity, provenance=provenance, grad=grad, force=force, executor=executor,
@@ -177,20 +177,6 @@ def chosen_fidelity(
     from .tolerance import chosen
 
     return chosen(console, name, tolerance, fidelity=fidelity, **how)
-
-
-def identity_of(env: Environment) -> dict[str, Any]:
-    """Return what decides an environment's numbers."""
-    return {
-        "objective": env.name,
-        "options": asdict(env.options),
-        "fidelity": env.fidelity.name,
-        "settings": asdict(env.fidelity),
-        "device": env.device,
-        "engine": env.engine,
-        "deterministic": env.deterministic,
-        "code": code_digest(type(env)),
-    }
 
 
 def provenance_of(env: Environment, command: str) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from .cluster import recipe
-from .console import follow, identity_of, outcome, picture_of, provenance_of
+from .console import follow, outcome, picture_of, provenance_of
 from .envs.registry import environment_class, make
 from .gallery.figures import Figure
 
@@ -111,13 +111,11 @@ class Slice(Part):
         return cost.seconds / max(cost.episodes, 1)
 
     def make(self, console: Console) -> str:
-        """Sample the slice and pack it."""
-        from .landscapes.job import PICTURE, STORE
-        from .landscapes.store import pack
+        """Sample the slice."""
+        from .landscapes.job import PICTURE
 
         job = self._open()
         said = outcome(follow(console, job, self.figure.command(self.device)))
-        pack(self.folder / STORE)
         if len(self.figure.dims) == 2:
             (self.folder / PICTURE).unlink()  # `landscape gallery build` draws planes; a line's events need episodes
         return said
@@ -129,7 +127,7 @@ class Slice(Part):
         plane = plane_of_figure(self.figure, env, self.figure.resolution)
         return Job.open(
             env, plane, self.folder, picture_of(env, plane),
-            identity=identity_of(env), provenance=provenance_of(env, self.figure.command(self.device)),
+            identity=env.identity(), provenance=provenance_of(env, self.figure.command(self.device)),
             force=self.state().done == 0,  # nothing is lost of a store made by other code or for another device
             executor=self.executor, made=recipe(env),
         )  # fmt: skip

@@ -18,10 +18,11 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from .console import duration, fill, identity_of, size
+from .console import duration, fill, size
 from .envs.registry import code_digest, entries, make
 from .gallery.figures import DATA, read_figures
 from .landscapes.files import replacing, visible, write_json
+from .landscapes.identity import stored_identity
 from .measure_tables import by_environment, slices_markdown, slices_table
 from .results import SLICE, environment_of, inside
 
@@ -175,7 +176,7 @@ def measured(
     record = {
         "name": subject.name,
         "env": env.name,
-        "options": dataset.attrs["identity"]["options"],
+        "options": stored_identity(dataset)["options"],
         "fidelity": env.fidelity.name,
         "device": env.device,
         **character.record(),
@@ -231,7 +232,7 @@ def _character(console: Console, env: Environment, dataset: xr.Dataset, settings
     losses, gradients = effort(dataset["loss"].ndim, settings["points"])
     _announce(console, env, losses, gradients)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    objective = within_box(env) if dataset.attrs["identity"].get("boxed") else env
+    objective = within_box(env) if stored_identity(dataset).get("boxed") else env
     with Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=console) as bar:
         task = bar.add_task("episodes", total=losses + gradients)
         counted = _Counted(objective, env.preferred_batch, lambda rows: bar.advance(task, rows))
@@ -295,7 +296,7 @@ def _rate(env: Environment, grad: bool) -> float:
 
 
 def _warn(console: Console, subject: Subject, dataset: xr.Dataset, env: Environment) -> None:
-    theirs, ours = dataset.attrs["identity"], identity_of(env)
+    theirs, ours = stored_identity(dataset), env.identity()
     differ = [name for name in ("code", "device") if theirs.get(name) != ours[name]]
     if differ:
         said = "; ".join(f"{name} {theirs.get(name)} there, {ours[name]} here" for name in differ)
@@ -321,7 +322,7 @@ def _leave(console: Console, dataset: xr.Dataset, character: Character, record: 
 
 def digest(dataset: xr.Dataset) -> str:
     """Return what a slice is known by in its report."""
-    text = json.dumps(dataset.attrs["identity"], sort_keys=True).encode()
+    text = json.dumps(stored_identity(dataset), sort_keys=True).encode()
     return hashlib.sha256(text + dataset["loss"].to_numpy().tobytes()).hexdigest()[:12]
 
 

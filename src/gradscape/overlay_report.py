@@ -16,6 +16,8 @@ from rich.console import Console
 
 from .console import fill
 from .landscapes.files import visible
+from .landscapes.identity import stored_identity
+from .landscapes.slice_paths import there
 from .results import RUN, SLICE, environment_of, inside, run_tables
 
 if TYPE_CHECKING:
@@ -62,7 +64,7 @@ def overlay(
     if through or plane:
         env = environment_of(dataset, device)
         cut = _plane(env, dataset, tables, through=through, principal=plane is not None, resolution=resolution)
-        gradients = bool(dataset.attrs["identity"]["gradients"])
+        gradients = "grad" in dataset
         sampled, _ = fill(console, env, cut, root=folder, grad=gradients, boxed=plane is not None)
         dataset = open_slice(sampled / SLICE)
     placed = laid(dataset, tables)
@@ -91,7 +93,7 @@ def view(file: str, *, serve: bool) -> None:
 
 def _check(console: Console, dataset: xr.Dataset, table: xr.Dataset) -> None:
     """Refuse a run of another landscape; warn where it is simulated otherwise."""
-    ours, theirs = dataset.attrs["identity"], table.attrs["identity"]
+    ours, theirs = stored_identity(dataset), stored_identity(table)
     name = f"{theirs.get('objective')}, {theirs.get('method')}, seed {theirs.get('seed')}"
     for setting in MUST:
         if ours.get(setting) != theirs.get(setting):
@@ -111,11 +113,12 @@ def _check(console: Console, dataset: xr.Dataset, table: xr.Dataset) -> None:
 def _folder(out: str | None, dataset: xr.Dataset, tables: Sequence[xr.Dataset], how: list[Any]) -> Path:
     """Return the folder to write to: a new one, an empty one, or that of an overlay."""
     if out is None:
-        settings = [dataset.attrs["identity"], [table.attrs["identity"] for table in tables], how]
+        ours = stored_identity(dataset)
+        settings = [ours, [stored_identity(table) for table in tables], how]
         digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:6]
-        return Path("out") / f"overlay-{dataset.attrs['identity']['objective']}-{digest}"
+        return Path("out") / f"overlay-{ours['objective']}-{digest}"
     folder = Path(out)
-    if any(file.name not in (PICTURE, STREAM) and not (file / SLICE).exists() for file in visible(folder)):
+    if any(file.name not in (PICTURE, STREAM) and not there(file / SLICE) for file in visible(folder)):
         raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
     return folder
 

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from .console import duration, identity_of, provenance_of, read_settings
+from .console import duration, provenance_of, read_settings
 from .envs.registry import make
 from .search_report import search_progress
 
@@ -54,7 +54,7 @@ def pairs(
 
     samples = samples or default_samples(env.space.dim)
     design = Design.sobol(env.space, samples, seed=seed)
-    identity = {**identity_of(env), "samples": samples, "seed": seed}
+    identity = {**env.identity(), "samples": samples, "seed": seed}
     folder = Path(out) if out else Path("out") / _folder(identity)
     pieces = Pieces.open(folder, identity, what="pairs", force=force)
     command = shlex.join(["landscape", *sys.argv[1:]])

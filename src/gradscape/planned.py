@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .console import identity_of, picture_of, provenance_of
+from .console import picture_of, provenance_of
 from .sweep_report import Job as SweepJob
 from .swept import SMOOTHING, moved
 
@@ -67,7 +67,7 @@ def of_slice(env: Environment, plane: Plane, folder: Path, *, grad: bool, began:
 
     job = Job.open(
         env, plane, folder, picture_of(env, plane),
-        identity=identity_of(env), provenance=provenance_of(env, ""), grad=grad,
+        identity=env.identity(), provenance=provenance_of(env, ""), grad=grad,
     )  # fmt: skip
     cost = job.cost()
     start, memory = time.perf_counter() - began, cost.memory - peak_memory()

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from . import cluster, race_workers
-from .console import duration, identity_of, provenance_of, read_settings
+from .console import duration, provenance_of, read_settings
 from .envs.registry import make
 from .landscapes.files import visible, write_json
 from .optim.registry import METHODS
@@ -237,8 +237,8 @@ class Job:
             loss_unit=self.env.loss_unit,
             spacing=goals.spacing,
             targets=(len(goals.loss), *(goals.loss[[0, -1]] if len(goals.loss) else (math.nan, math.nan))),
-            identity=self.entries[0].run.identity,
-            provenance=provenance_of(self.env, self.command),
+            identity=json.dumps(self.entries[0].run.identity),
+            provenance=json.dumps(provenance_of(self.env, self.command)),
         )
         save(race_figure(dataset), self.folder / PICTURE)
         write_json(self.folder / FIGURES, figures)
@@ -343,7 +343,7 @@ def _entry(env: Environment, maker: Any, folder: Path, *, budget: int, command: 
 
 def _folder(env: Environment, options: Mapping[str, dict[str, str]]) -> Path:
     """Return a folder of its own for every different race; more methods, seeds or episodes go on in the same one."""
-    settings = json.dumps([identity_of(env), options], sort_keys=True)
+    settings = json.dumps([env.identity(), options], sort_keys=True)
     digest = hashlib.sha256(settings.encode()).hexdigest()[:6]
     return Path("out") / f"race-{env.name}-{env.fidelity.name}-{digest}"
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from .console import identity_of, provenance_of, read_settings
+from .console import provenance_of, read_settings
 from .envs.registry import make
 from .landscapes.files import visible, write_json
 from .results import run_tables
@@ -72,17 +72,18 @@ def _point(env: Environment, text: str) -> Tensor:
         from .envs.points import point
 
         return point(env, text)
+    from .landscapes.identity import stored_identity
     from .landscapes.overlay import best_point
 
     tables = run_tables([run])
-    if {table.attrs["identity"].get("objective") for table in tables} != {env.name}:
+    if {stored_identity(table).get("objective") for table in tables} != {env.name}:
         raise ValueError(f"{run} holds no runs of {env.name} alone; replay the environment that was searched")
     return best_point(tables)[0]
 
 
 def _folder(out: str | None, env: Environment, x: Tensor) -> Path:
     if out is None:
-        settings = json.dumps([identity_of(env), x.tolist()], sort_keys=True)
+        settings = json.dumps([env.identity(), x.tolist()], sort_keys=True)
         return Path("out") / f"replay-{env.name}-{hashlib.sha256(settings.encode()).hexdigest()[:6]}"
     folder = Path(out)
     known = {SHEET, STREAM, FILM, LOOP, RECORD}
@@ -97,7 +98,7 @@ def _write_record(env: Environment, x: Tensor, loss: float, status: int, path: P
 
     command = shlex.join(["landscape", *sys.argv[1:]])
     record: dict[str, Any] = {
-        "identity": identity_of(env),
+        "identity": env.identity(),
         "provenance": provenance_of(env, command),
         "parameters": dict(zip(env.space.names, x.tolist(), strict=True)),
         "loss": loss if status == Status.OK else None,

@@ -7,25 +7,28 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .envs.registry import make
+from .landscapes.slice_paths import SLICE as SLICE
+from .landscapes.slice_paths import there
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from .envs.base import Environment
 
-SLICE, RUN = "slice.zarr", "run.zarr"
+RUN = "run.zarr"
 
 
 def inside(path: Path, store: str) -> Path:
-    """Return the store in a results folder, or the path itself."""
-    return path / store if (path / store).exists() else path
+    """Return the store in a results folder, finished or not, or the path itself."""
+    return path / store if there(path / store) else path
 
 
 def environment_of(dataset: xr.Dataset, device: str) -> Environment:
     """Return the environment that a slice was sampled from, on a device."""
     from .envs.base import Fidelity
+    from .landscapes.identity import stored_identity
 
-    identity = dataset.attrs["identity"]
+    identity = stored_identity(dataset)
     if missing := {"objective", "settings", "engine", "options", "deterministic"} - set(identity):
         raise ValueError(
             f"the slice is not one of an environment, its identity lacks {', '.join(sorted(missing))}; "

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from .console import chosen_fidelity, duration, identity_of, provenance_of, read_settings
+from .console import chosen_fidelity, duration, provenance_of, read_settings
 from .envs.registry import make
 from .landscapes.files import visible, write_json
 from .optim.registry import METHODS, code_digest, optimizer_class
@@ -74,7 +74,7 @@ def give_torch_one_thread() -> None:
 def run_identity(env: Environment, optimizer: Optimizer) -> dict[str, Any]:
     """Return what decides a run's numbers; the budget does not, so that a run can be continued to a larger one."""
     return {
-        **identity_of(env),
+        **env.identity(),
         "method": optimizer.name,
         "method_options": asdict(optimizer.options),
         "method_code": code_digest(type(optimizer)),

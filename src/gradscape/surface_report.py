@@ -18,21 +18,22 @@ PICTURE, MODEL = "surface.png", "surface.gltf"
 def surface(slice_: str, runs: Sequence[str], *, out: str | None) -> None:
     """Draw a slice as a surface, with runs on it."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
+    from .landscapes.identity import stored_identity
     from .landscapes.overlay import overlay
     from .landscapes.store import open_slice
 
     dataset = open_slice(inside(Path(slice_), SLICE))
     tables = run_tables(runs) if runs else []
-    ours = dataset.attrs["identity"]
+    ours = stored_identity(dataset)
     for table in tables:
-        theirs = table.attrs["identity"]
+        theirs = stored_identity(table)
         if any(ours.get(one) != theirs.get(one) for one in ("objective", "options")):
             raise ValueError(
                 f"the slice is of {ours.get('objective')} {ours.get('options')}, a run of {theirs.get('objective')} "
                 f"{theirs.get('options')}; lay runs over a slice of their own"
             )
     placed = overlay(dataset, tables) if tables else []
-    folder = _folder(out, [ours, [table.attrs["identity"] for table in tables]], str(ours["objective"]))
+    folder = _folder(out, [ours, [stored_identity(table) for table in tables]], str(ours["objective"]))
     from .landscapes.draw.surface import save_surface
 
     with console.status("drawing"):

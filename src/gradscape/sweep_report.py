@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import shlex
-import shutil
 import sys
 import time
 from collections.abc import Sequence
@@ -19,9 +18,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from .cluster import recipe, workers
-from .console import duration, identity_of, provenance_of, read_extent, read_settings, size
+from .console import duration, provenance_of, read_extent, read_settings, size
 from .envs.registry import make
-from .landscapes.files import visible, write_json
+from .landscapes.files import discard, visible, write_json
+from .landscapes.slice_paths import filling, is_slice
 from .swept import FRAMES, HORIZON, ONLY, SMOOTHING, Moved, moved
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ class Job:
         provenance = provenance_of(env, command)
         stores = tuple(
             SliceStore.open_or_create(
-                folder / name, plane, env.space, grad=grad, identity=identity_of(moved.env_at(i)), provenance=provenance
+                folder / name, plane, env.space, grad=grad, identity=moved.env_at(i).identity(), provenance=provenance
             )
             for i, (name, plane) in enumerate(zip(moved.stores, moved.planes, strict=True))
         )
@@ -235,7 +235,7 @@ class Job:
 def sweep_folder(env: Environment, moved: Moved, over: str, *, grad: bool = True) -> Path:
     """Return a folder of its own for every different sweep, the same for the same one."""
     planes = [plane.record() for plane in moved.planes]
-    settings = json.dumps([identity_of(env), planes, moved.values, grad], sort_keys=True)
+    settings = json.dumps([env.identity(), planes, moved.values, grad], sort_keys=True)
     axes = [str(int(row.nonzero()[0])) for row in moved.planes[0].basis]
     what = over if over in (SMOOTHING, HORIZON) else str(env.space.index(over))
     points = "x".join(map(str, (*planes[0]["resolution"], len(moved.values))))
@@ -245,19 +245,17 @@ def sweep_folder(env: Environment, moved: Moved, over: str, *, grad: bool = True
 
 def _check(folder: Path) -> None:
     """Refuse a folder that holds anything but a sweep."""
-    ours = {FRAMES, ONLY, FILM, GIF, STREAM, SUMMARY}
+    slices = {FRAMES, ONLY, filling(Path(ONLY)).name}
     present = {file.name for file in visible(folder)}
-    if present - ours or (present and not present & {FRAMES, ONLY}):
+    if present - slices - {FILM, GIF, STREAM, SUMMARY} or (present and not present & slices):
         raise ValueError(f"{folder} holds other files and no sweep; give --out a new or an empty folder")
 
 
 def _clear(folder: Path) -> None:
     """Remove the slices of a sweep, and what was made of them."""
-    from .landscapes.store import is_slice
-
-    for store in [*folder.glob(f"{FRAMES}/*.zarr"), folder / ONLY]:
+    for store in [*folder.glob(f"{FRAMES}/*.zarr"), folder / ONLY, filling(folder / ONLY)]:
         if is_slice(store):
-            shutil.rmtree(store)
+            discard(store)
     for name in (FILM, GIF, STREAM, SUMMARY):
         (folder / name).unlink(missing_ok=True)
 

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .landscapes.slice_paths import SLICE
+
 if TYPE_CHECKING:
     import xarray as xr
     from torch import Tensor
@@ -17,7 +19,7 @@ if TYPE_CHECKING:
 
 SMOOTHING, WIDEST = "smoothing", 0.25  # the widest Gaussian's standard deviation, as a fraction of the box's sides
 HORIZON = "horizon"  # a scene option: the episode's duration as a multiple of the scene's own
-FRAMES, ONLY = "frames", "slice.zarr"  # the folder of a sweep's slices, and the slice where there is one
+FRAMES, ONLY = "frames", SLICE  # the folder of a sweep's slices, and the slice where there is one
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from .console import duration, identity_of, provenance_of, read_settings, size
+from .console import duration, provenance_of, read_settings, size
 from .envs.registry import environment_class, make
 from .tolerance import keep
 
@@ -98,7 +98,7 @@ class Study:
 
         chosen = [part for text in ladders for part in text.split(",") if part] or list(LADDERS)
         found = rungs(env, chosen)
-        identity = {**identity_of(env), "points": points, "seed": seed}
+        identity = {**env.identity(), "points": points, "seed": seed}
         digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:6]
         folder = Path(out) if out else Path("out") / f"tradeoff-{env.name}-{points}-{digest}"
         pieces = Pieces.open(folder, identity, what="tradeoff", force=force)
@@ -231,7 +231,7 @@ class Study:
             "rungs": rows,
             "refused": [{"name": name, "why": why} for name, why in self.refused.items()],
             "orders": _orders(rows),
-            "identity": identity_of(self.env),
+            "identity": self.env.identity(),
             "provenance": provenance_of(self.env, self.command),
             "command": self.command,
         }

@@ -12,6 +12,7 @@ import pytest
 from gradscape.gallery.build import build_site
 from gradscape.gallery.figures import HERE
 from gradscape.gallery.runs import open_run
+from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.store import open_slice
 
 from .conftest import FIGURES, MEASURES, SWEEP
@@ -129,8 +130,8 @@ def test_a_search_of_other_options_is_not_laid_over_a_slice(data: Path) -> None:
     tables, dataset = read_runs(data / "runs"), open_slice(data / "full/slice.zarr")
     assert len(tables) == 4
     assert len(trajectories(dataset, tables)) == 2
-    dataset.attrs["identity"]["options"] = {"goal": "high"}
-    tables[-1].attrs["identity"]["options"] = {"goal": "low"}
+    for one, goal in ((dataset, "high"), (tables[-1], "low")):
+        one.attrs["identity"] = json.dumps({**stored_identity(one), "options": {"goal": goal}})
     assert [run["method"] for run in trajectories(dataset, tables)] == ["descents"]
 
 

@@ -18,7 +18,7 @@ def table(loss: list[float], kind: list[int] | None = None, *, budget: int = 20,
             "status": ("evaluation", status),
             "episodes": ("evaluation", np.arange(1, len(loss) + 1)),
         },
-        attrs=about | {"identity": {"gradscape": "0"}, "provenance": {}},
+        attrs=about | {"identity": '{"gradscape": "0"}', "provenance": "{}"},
     )
 
 

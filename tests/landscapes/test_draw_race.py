@@ -1,3 +1,5 @@
+import json
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -34,8 +36,8 @@ def race(methods=("cma-es", "bo-leap"), **attributes) -> xr.Dataset:
             "loss_unit": "m",
             "spacing": "log",
             "targets": (2, 1.0, 100.0),
-            "identity": {"gradscape": "0.1.0", "device": "cpu"},
-            "provenance": {"created": "2026-11-21", "command": "landscape race fluid"},
+            "identity": json.dumps({"gradscape": "0.1.0", "device": "cpu"}),
+            "provenance": json.dumps({"created": "2026-11-21", "command": "landscape race fluid"}),
         }
         | attributes,
     )
@@ -120,7 +122,7 @@ def test_a_logarithmic_axis_has_numbers_however_many_decades_it_spans(scale):
 @pytest.mark.parametrize("failed", [0, 2])
 def test_nothing_overlaps_or_leaves_the_page_with_every_method(failed):
     command = f"landscape race triple-move --methods {','.join(METHODS)} --fidelity reference --workers 2 --report"
-    dataset = race(tuple(METHODS), provenance={"created": "2026-11-21", "command": command})
+    dataset = race(tuple(METHODS), provenance=json.dumps({"created": "2026-11-21", "command": command}))
     dataset["unsuccessful"][:] = failed
     figure = race_figure(dataset)
     figure.canvas.draw()

@@ -17,8 +17,9 @@ from gradscape.landscapes.identity import StoreError
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling import sample
+from gradscape.landscapes.slice_paths import filling
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.landscapes.store import SliceStore, pack
+from gradscape.landscapes.store import SliceStore
 
 SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
 PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 16))
@@ -58,6 +59,12 @@ def same(one, other) -> bool:
     return all(
         one[name].to_numpy().tobytes() == other[name].to_numpy().tobytes() for name in ("loss", "grad", "status")
     )
+
+
+@pytest.fixture
+def kept(monkeypatch):
+    """Leave the tiles of a slice that is complete: as it is just before it is finished."""
+    monkeypatch.setattr(SliceStore, "finish", lambda *_: None)
 
 
 @pytest.fixture(scope="module")
@@ -113,10 +120,11 @@ def test_memory_for_no_point_at_all_ends_it_and_other_errors_pass():
 
 @pytest.mark.parametrize("damage", ["truncated", "altered", "empty"])
 @pytest.mark.parametrize("array", ["loss", "grad", "status"])
-def test_a_damaged_tile_is_named_and_computed_again(tmp_path, whole, array, damage):
+def test_a_damaged_tile_is_named_and_computed_again(tmp_path, kept, whole, array, damage):
     path = tmp_path / "s.zarr"
     sample(from_torch(wave, SPACE), PLANE, store_at(path))
-    (file,) = (path / array / "c" / "2" / "3").rglob("*") if array == "grad" else [path / array / "c" / "2" / "3"]
+    place = filling(path) / array / "c" / "2" / "3"
+    (file,) = place.rglob("*") if array == "grad" else [place]
     sound = file.read_bytes()
     torn = {"truncated": sound[: len(sound) // 2], "altered": bytes([*sound[:-1], sound[-1] ^ 1]), "empty": b""}
     file.write_bytes(torn[damage])
@@ -128,19 +136,18 @@ def test_a_damaged_tile_is_named_and_computed_again(tmp_path, whole, array, dama
     assert file.read_bytes() == sound
 
 
-def test_a_tile_that_was_never_finished_is_no_damage(tmp_path, whole):
+def test_a_tile_that_was_never_finished_is_no_damage(tmp_path, kept, whole):
     path = tmp_path / "s.zarr"
     sample(from_torch(wave, SPACE), PLANE, store_at(path))
-    (path / "status" / "c" / "2" / "3").unlink()
+    (filling(path) / "status" / "c" / "2" / "3").unlink()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert same(sample(from_torch(wave, SPACE), PLANE, store_at(path)), whole)
 
 
-def test_a_damaged_packed_slice_is_named_and_computed_again(tmp_path, whole):
+def test_a_damaged_finished_slice_is_named_and_computed_again(tmp_path, whole):
     path = tmp_path / "s.zarr"
     sample(from_torch(wave, SPACE), PLANE, store_at(path))
-    pack(path)
     file = path / "loss" / "c" / "0" / "0"
     file.write_bytes(file.read_bytes()[:-3])
     with pytest.warns(RuntimeWarning, match=r"tile \(0, 0\) is damaged and computed again"):
@@ -150,9 +157,9 @@ def test_a_damaged_packed_slice_is_named_and_computed_again(tmp_path, whole):
 def test_a_damaged_axis_is_said_with_what_to_do(tmp_path):
     path = tmp_path / "s.zarr"
     store_at(path)
-    (file,) = (path / "u" / "c").iterdir()
+    (file,) = (filling(path) / "u" / "c").iterdir()
     file.write_bytes(b"")
-    with pytest.raises(StoreError, match=r"s\.zarr is damaged .*begin anew with --force"):
+    with pytest.raises(StoreError, match=r"s\.filling\.zarr is damaged .*begin anew with --force"):
         store_at(path)
 
 

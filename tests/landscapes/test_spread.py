@@ -194,7 +194,7 @@ def test_a_worker_of_another_store_or_without_the_file_system_says_so(tmp_path):
         Halving(from_torch(wave, SPACE)), store, functools.partial(from_torch, wave, SPACE)
     ).__reduce__()
     remote = make(*arguments)
-    (tmp_path / "s.zarr").rename(tmp_path / "elsewhere.zarr")
+    (tmp_path / "s.filling.zarr").rename(tmp_path / "elsewhere.zarr")
     with pytest.raises(StoreError, match=r"a worker finds no .*file system that they share"):
         list(remote.fill(store.tiles()))
     SliceStore.create(tmp_path / "s.zarr", PLANE, SPACE, identity={"objective": "hill"})
@@ -252,7 +252,7 @@ def test_a_worker_keeps_a_store_open_until_another_lies_there(tmp_path):
     tiles = site.store.tiles()
     assert list(remote.fill(tiles[:1]))
     assert remote.here().store is remote.here().store
-    shutil.rmtree(site.store.path)
+    shutil.rmtree(site.store.place)
     again = store_at(site.store.path)
     assert list(remote.fill(tiles[:1]))
     assert again.statuses(tiles[0])

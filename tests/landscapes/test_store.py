@@ -1,9 +1,12 @@
 import json
 import os
+import shutil
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
@@ -12,8 +15,9 @@ import xarray as xr
 from gradscape.landscapes.identity import StoreError, StoreMismatchError
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.plane import Plane
+from gradscape.landscapes.slice_paths import filling
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.landscapes.store import SliceStore, open_slice, pack, plane_of
+from gradscape.landscapes.store import SliceStore, open_slice, plane_of
 
 SPACE = ParameterSpace(
     ("x", "y", "z"), -torch.ones(3).double(), torch.tensor([1.0, 2.0, 3.0]).double(), ("m", "m/s", "")
@@ -37,16 +41,25 @@ def fill(store: SliceStore, tiles=None) -> SliceStore:
     return store
 
 
-def chunks(path: Path) -> list[Path]:
+def finished(path: Path, **changes) -> SliceStore:
+    store = fill(make(path, **changes))
+    store.finish(store.dataset())
+    return store
+
+
+def chunks(place: Path) -> list[Path]:
     return sorted(
-        file for name in ("loss", "grad", "status") for file in (path / name / "c").rglob("*") if file.is_file()
+        file for name in ("loss", "grad", "status") for file in (place / name / "c").rglob("*") if file.is_file()
     )
 
 
 def test_every_value_comes_back_at_its_own_coordinates(tmp_path):
     path = tmp_path / "deep" / "slice.zarr"
     fill(make(path))
+    tiles = open_slice(path)
+    finished(path)
     dataset = open_slice(path)
+    assert dataset.identical(tiles)
     assert dataset["loss"].dims == ("v", "u")
     assert dataset["grad"].dims == ("v", "u", "dim")
     assert dataset["grad"].dtype == dataset["loss"].dtype == np.float64
@@ -60,15 +73,130 @@ def test_every_value_comes_back_at_its_own_coordinates(tmp_path):
 
 
 def test_the_file_says_what_it_holds_to_anyone_who_opens_it(tmp_path):
-    fill(make(tmp_path / "s.zarr"))
+    finished(tmp_path / "s.zarr")
     with xr.open_zarr(tmp_path / "s.zarr", chunks=None) as raw:
-        assert raw.attrs["identity"]["options"] == {"steps": 3, "tilt": [0.1, 0.2]}
-        assert raw.attrs["provenance"]["command"] == "x"
+        assert json.loads(raw.attrs["identity"])["options"] == {"steps": 3, "tilt": [0.1, 0.2]}
+        assert json.loads(raw.attrs["provenance"])["command"] == "x"
+        assert raw.attrs["title"] == "wave over x and y"
+        assert raw.attrs["Conventions"].startswith("CF-")
         assert raw["u"].attrs == {"label": "x [m]", "long_name": "x", "units": "m"}
         assert raw["loss"].attrs["units"] == "J"
         assert list(raw["dim"].values) == ["x", "y", "z"]
-        xr.testing.assert_equal(raw["loss"].sortby(["u", "v"]), open_slice(tmp_path / "s.zarr")["loss"])
+        assert list(raw["unit"].values) == ["m", "m/s", ""]
     assert plane_of(open_slice(tmp_path / "s.zarr")).record() == PLANE.record()
+
+
+def test_plain_xarray_reads_a_finished_slice_as_we_do(tmp_path):
+    """Ascending axes: values, nearest samples and pictures are right for whoever knows nothing of us."""
+    finished(tmp_path / "s.zarr")
+    ours = open_slice(tmp_path / "s.zarr")
+    with xr.open_zarr(tmp_path / "s.zarr", chunks=None) as raw:
+        assert (np.diff(raw["u"]) > 0).all()
+        assert (np.diff(raw["v"]) > 0).all()
+        for name in ours.variables:
+            np.testing.assert_array_equal(raw[name], ours[name])
+        assert raw.attrs == ours.attrs
+        near = raw["loss"].sel(u=-0.5, v=0.1, method="nearest")
+        assert float(near) == float(ours["loss"].sel(u=near["u"], v=near["v"]))
+        raw["loss"].plot()
+    plt.close("all")
+
+
+def attribute_values(dataset: xr.Dataset) -> list[object]:
+    about = [dataset.attrs, *(one.attrs for one in dataset.variables.values())]
+    values = [value for attrs in about for value in attrs.values()]
+    return [one for value in values for one in (value if isinstance(value, list) else [value])]
+
+
+def test_a_slice_goes_to_netcdf_and_back(tmp_path):
+    finished(tmp_path / "s.zarr")
+    ours = open_slice(tmp_path / "s.zarr")
+    assert {type(value) for value in attribute_values(ours)} == {str, int}
+    ours.to_netcdf(tmp_path / "s.nc")
+    with xr.open_dataset(tmp_path / "s.nc") as back:
+        np.testing.assert_array_equal(back["grad"], ours["grad"])
+        assert plane_of(back).record() == PLANE.record()
+        assert list(back["dim"].values) == ["x", "y", "z"]
+
+
+def test_what_xarray_writes_of_a_slice_is_a_slice(tmp_path):
+    store = fill(SliceStore.in_memory(PLANE, SPACE, identity=IDENTITY, provenance={"loss_unit": "J"}))
+    ours = store.dataset()
+    for name, indexed in (("plain", False), ("indexed", True)):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of zarr, whose specification knows no index yet
+            ours.to_zarr(tmp_path / f"{name}.zarr", consolidated=indexed)
+        back = open_slice(tmp_path / f"{name}.zarr")
+        xr.testing.assert_equal(back, ours)
+        assert back.attrs == ours.attrs
+    ours.isel(u=slice(1, None)).to_zarr(tmp_path / "cut.zarr", consolidated=False)
+    with pytest.raises(StoreError, match="u is damaged: it is not what the store's identity says"):
+        open_slice(tmp_path / "cut.zarr")
+
+
+def test_a_finished_slice_has_large_chunks_in_few_files_and_nothing_beside_it(tmp_path):
+    path = tmp_path / "slice.zarr"
+    fill(make(path))
+    assert [file.name for file in tmp_path.iterdir()] == ["slice.filling.zarr"]
+    tiles = len(chunks(filling(path)))
+    finished(path)
+    assert len(chunks(path)) == 3 < tiles
+    assert [file.name for file in tmp_path.iterdir()] == ["slice.zarr"]
+    assert make(path).pending() == []
+    assert make(path).coarse().identical(open_slice(path))
+
+
+def test_a_slice_is_found_by_its_folder_too(tmp_path):
+    fill(make(tmp_path / "slice.zarr"))
+    assert open_slice(tmp_path).identical(open_slice(tmp_path / "slice.zarr"))
+    assert open_slice(tmp_path).identical(open_slice(tmp_path / "slice.filling.zarr"))
+    finished(tmp_path / "slice.zarr")
+    assert open_slice(tmp_path).identical(open_slice(tmp_path / "slice.zarr"))
+
+
+def test_a_slice_that_is_not_complete_is_not_finished(tmp_path):
+    store = make(tmp_path / "slice.zarr")
+    fill(store, store.tiles()[:2])
+    with pytest.raises(StoreError, match="not complete"):
+        store.finish(store.dataset())
+    assert len(make(tmp_path / "slice.zarr").pending()) == len(store.tiles()) - 2
+
+
+def test_tiles_that_a_kill_left_beside_a_finished_slice_go(tmp_path):
+    path = tmp_path / "slice.zarr"
+    fill(make(path))
+    shutil.copytree(filling(path), tmp_path / "kept")
+    finished(path)
+    (tmp_path / "kept").rename(filling(path))  # as if the process had been killed before they were removed
+    whole = open_slice(path)
+    assert make(path).pending() == []
+    assert [file.name for file in tmp_path.iterdir()] == ["slice.zarr"]
+    assert open_slice(path).identical(whole)
+
+
+def test_another_process_that_finishes_first_is_followed(tmp_path):
+    path = tmp_path / "slice.zarr"
+    slow, tile = make(path), make(path).tiles()[0]
+    whole = open_slice(finished(path).path)
+    slow.write(tile, evaluated(slow.points(tile)))  # too late, and not needed
+    assert slow.dataset().identical(whole)
+    assert slow.pending() == []
+    assert open_slice(path).identical(whole)
+
+
+def test_a_damaged_chunk_of_a_finished_slice_is_computed_again(tmp_path):
+    path = tmp_path / "slice.zarr"
+    finished(path)
+    whole = open_slice(path)
+    for file in chunks(path):
+        content = bytearray(file.read_bytes())
+        content[len(content) // 2] ^= 1
+        file.write_bytes(bytes(content))
+        assert (SliceStore.open(path).status() == Status.MISSING).all()
+        assert make(path).coarse() is None
+        finished(path)
+        assert SliceStore.open(path).pending() == []
+        assert open_slice(path).identical(whole)
 
 
 def test_a_nan_result_is_finished_and_not_missing(tmp_path):
@@ -89,11 +217,11 @@ def test_a_damaged_chunk_costs_exactly_its_tile(tmp_path, damage):
     small = {"plane": Plane.through(SPACE, SPACE.center, ["x", "y"], resolution=(7, 5))}
     store = fill(make(path, **small))
     whole = open_slice(path)
-    for file in chunks(path):
+    for file in chunks(filling(path)):
         sound = file.read_bytes()
         torn = {"truncated": sound[: len(sound) // 2], "altered": sound[:-1] + bytes([sound[-1] ^ 1])}
         file.unlink() if damage == "removed" else file.write_bytes(torn[damage])
-        index = tuple(map(int, file.relative_to(path).parts[2:4]))
+        index = tuple(map(int, file.relative_to(filling(path)).parts[2:4]))
         pending = make(path, **small).pending()
         assert [tile.index for tile in pending] == [index]
         seen = open_slice(path)["status"].to_numpy()
@@ -106,7 +234,7 @@ def test_a_damaged_chunk_costs_exactly_its_tile(tmp_path, damage):
 def test_a_tile_without_its_status_is_not_there_yet(tmp_path):
     path = tmp_path / "s.zarr"
     store = fill(make(path))
-    (path / "status" / "c" / "0" / "0").unlink()
+    (filling(path) / "status" / "c" / "0" / "0").unlink()
     assert [tile.index for tile in store.pending()] == [(0, 0)]
     dataset = store.dataset()
     assert np.isnan(dataset["loss"].values[dataset["status"].values == Status.MISSING]).all()
@@ -126,12 +254,12 @@ def test_a_tile_without_its_status_is_not_there_yet(tmp_path):
 def test_other_settings_are_refused_by_name_and_harm_nothing(tmp_path, changes, said):
     path = tmp_path / "s.zarr"
     fill(make(path))
-    before = {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
     with pytest.raises(StoreMismatchError, match=said) as error:
         make(path, **changes)
     assert "--out" in str(error.value)
     assert "--force" in str(error.value)
-    assert {file: file.read_bytes() for file in path.rglob("*") if file.is_file()} == before
+    assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
 
 
 def test_what_is_no_slice_store_is_never_touched(tmp_path):
@@ -151,15 +279,16 @@ def test_what_is_no_slice_store_is_never_touched(tmp_path):
 
 def test_overwriting_is_asked_for_and_leaves_only_the_new_store(tmp_path):
     path = tmp_path / "s.zarr"
-    old = fill(make(path))
-    with pytest.raises(StoreError, match="exists already"):
-        SliceStore.create(path, PLANE, SPACE, identity=IDENTITY)
-    new = SliceStore.create(path, PLANE, SPACE, identity={"objective": "hill"}, overwrite=True)
-    assert new.pending() == new.tiles()
-    assert os.listdir(tmp_path) == ["s.zarr"]
-    with pytest.raises(StoreError, match="was replaced"):
-        fill(old)
-    assert new.pending() == new.tiles()
+    for prepare in (lambda: fill(make(path)), lambda: finished(path, identity={"objective": "hill"})):
+        old = prepare()
+        with pytest.raises(StoreError, match="exists already"):
+            SliceStore.create(path, PLANE, SPACE, identity=IDENTITY)
+        new = SliceStore.create(path, PLANE, SPACE, identity={"objective": "hill"}, overwrite=True)
+        assert new.pending() == new.tiles()
+        assert os.listdir(tmp_path) == ["s.filling.zarr"]
+        with pytest.raises(StoreError, match="was replaced"):
+            fill(old)
+        assert new.pending() == new.tiles()
 
 
 def test_plain_json_is_asked_for():
@@ -172,7 +301,7 @@ def test_plain_json_is_asked_for():
 KILLED_WHILE_CREATING = """
 import os, signal, sys, time
 from pathlib import Path
-from test_store import make
+from test_store import filling, make
 path = Path(sys.argv[1])
 for delay in (1, 10, 20, 40, 60, 90):  # ms
     if not (child := os.fork()):
@@ -181,8 +310,8 @@ for delay in (1, 10, 20, 40, 60, 90):  # ms
     time.sleep(delay / 1000)
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
-    print(delay, path.exists(), len(list(path.parent.iterdir())))
-    if path.exists():
+    print(delay, filling(path).exists(), len(list(path.parent.iterdir())))
+    if filling(path).exists():
         break
 store = make(path)
 assert store.pending() == store.tiles()
@@ -200,14 +329,16 @@ def test_a_creation_that_is_killed_leaves_nothing_in_the_way(tmp_path):
 
 
 def test_hidden_leftovers_are_ignored_and_cleared_away_when_old(tmp_path):
-    fresh, stale = (tmp_path / f".s.zarr.{name}.making" for name in ("fresh", "stale"))
-    for folder in (fresh, stale):
-        folder.mkdir()
-        (folder / "zarr.json").write_text("{")
-    os.utime(stale, (0, 0))
-    make(tmp_path / "s.zarr")
-    assert fresh.exists()
-    assert not stale.exists()
+    for name in ("s", "s.filling"):
+        fresh, stale = (tmp_path / f".{name}.zarr.{age}.making" for age in ("fresh", "stale"))
+        for folder in (fresh, stale):
+            folder.mkdir()
+            (folder / "zarr.json").write_text("{")
+        os.utime(stale, (0, 0))
+        make(tmp_path / "s.zarr")
+        assert fresh.exists()
+        assert not stale.exists()
+        finished(tmp_path / "s.zarr")
 
 
 def test_tiles_come_in_squares_and_the_coarse_picture_grows_with_them():
@@ -249,41 +380,8 @@ def test_a_half_evaluated_tile_is_refused():
 def test_a_store_of_another_format_is_refused(tmp_path):
     path = tmp_path / "s.zarr"
     make(path)
-    about = json.loads((path / "zarr.json").read_text())
+    about = json.loads((filling(path) / "zarr.json").read_text())
     about["attributes"]["gradscape_slice"] = 99
-    (path / "zarr.json").write_text(json.dumps(about))
-    with pytest.raises(StoreError, match="format 1"):
+    (filling(path) / "zarr.json").write_text(json.dumps(about))
+    with pytest.raises(StoreError, match="format 2"):
         make(path)
-
-
-def test_a_packed_slice_is_the_same_in_few_files_and_still_finished(tmp_path):
-    path = tmp_path / "slice.zarr"
-    fill(make(path))
-    before, files = open_slice(path), len(chunks(path))
-    pack(path)
-    assert open_slice(path).identical(before)
-    assert len(chunks(path)) == 3 < files
-    assert make(path).pending() == []
-    xr.testing.assert_equal(xr.open_zarr(path)["loss"].sortby(["u", "v"]), before["loss"])
-    assert [file.name for file in tmp_path.iterdir()] == ["slice.zarr"]
-
-
-def test_a_slice_that_is_not_finished_is_not_packed(tmp_path):
-    store = make(tmp_path / "slice.zarr")
-    fill(store, store.tiles()[:2])
-    with pytest.raises(StoreError, match="not finished, so it is not packed"):
-        pack(tmp_path / "slice.zarr")
-    assert len(make(tmp_path / "slice.zarr").pending()) == len(store.tiles()) - 2
-
-
-def test_a_damaged_packed_slice_is_as_if_never_sampled(tmp_path):
-    path = tmp_path / "slice.zarr"
-    fill(make(path))
-    pack(path)
-    torn = path / "loss" / "c" / "0" / "0"
-    content = bytearray(torn.read_bytes())
-    content[len(content) // 2] ^= 1
-    torn.write_bytes(bytes(content))
-    assert (SliceStore.open(path).status() == Status.MISSING).all()
-    fill(make(path))
-    assert SliceStore.open(path).pending() == []

@@ -1,0 +1,39 @@
+"""Where a slice lies: in its own place once it is finished, beside it while it is being filled."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+SLICE, FILLING = "slice.zarr", ".filling.zarr"
+
+
+def filling(path: Path) -> Path:
+    """Return where the tiles of a slice are while it is being filled: slice.filling.zarr beside slice.zarr."""
+    return path.with_name(path.name.removesuffix(".zarr") + FILLING)
+
+
+def finished(path: Path) -> Path:
+    """Return where a slice will be once it is finished, given that place or the one of its tiles."""
+    return path.with_name(path.name.removesuffix(FILLING) + ".zarr") if path.name.endswith(FILLING) else path
+
+
+def place_of(path: Path) -> Path:
+    """Return where a slice is now."""
+    return path if path.exists() else filling(path)
+
+
+def there(path: Path) -> bool:
+    """Say whether anything is in the place of a slice or of its tiles."""
+    return place_of(path).exists()
+
+
+def is_slice(path: Path) -> bool:
+    """Say whether a slice of this format, finished or not, is at `path`."""
+    import zarr
+
+    from .slice_arrays import FORMAT
+
+    try:
+        return zarr.open_group(place_of(path), mode="r", use_consolidated=False).attrs.get("gradscape_slice") == FORMAT
+    except Exception:  # whatever else is there is none
+        return False
