@@ -21,6 +21,7 @@ from ..landscapes.episode import Episode as Episode
 from ..landscapes.halving import collect
 from ..landscapes.objective import Evaluation
 from ..landscapes.space import ParameterSpace
+from .code import code_digest
 from .options import NoOptions, read_options
 
 if TYPE_CHECKING:
@@ -100,8 +101,6 @@ class Environment(abc.ABC):
     @final
     def identity(self) -> dict[str, Any]:
         """Return what decides the numbers, as plain JSON: scene, options, fidelity, device, engine and code."""
-        from .registry import code_digest
-
         return {
             "objective": self.name,
             "options": asdict(self.options),
@@ -110,7 +109,7 @@ class Environment(abc.ABC):
             "device": self.device,
             "engine": self.engine,
             "deterministic": self.deterministic,
-            "code": code_digest(type(self)),
+            "code": self.code,
         }
 
     @final
@@ -135,6 +134,11 @@ class Environment(abc.ABC):
         """Return losses that torch can differentiate."""
         losses: Tensor = _Bridge.apply(x, self)  # type: ignore[no-untyped-call]
         return losses
+
+    @property
+    def code(self) -> str:
+        """Digest of the code that the numbers come from."""
+        return code_digest(type(self), self.engine)
 
     @classmethod
     def about(cls) -> str:

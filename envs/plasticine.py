@@ -15,6 +15,7 @@ from torch import Tensor
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
 from .base import Environment, Episode, Fidelity, Work
+from .code import code_digest
 from .controls import hold, lasting, roll, travel
 from .engines.manipulators import Kind
 from .engines.model import Model
@@ -25,7 +26,6 @@ from .observation import followed, motion
 from .options import EpisodeOptions
 from .plasticine_look import parts, view
 from .plasticine_model import SPAN, STEPS, Scene, model, target
-from .registry import code_digest
 from .targets import Target, cached, contact
 
 SEGMENTS = 5  # of the controls

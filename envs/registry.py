@@ -8,14 +8,11 @@ Another package registers its own by an entry point of the group `gradscape.envi
 
 from __future__ import annotations
 
-import hashlib
-import inspect
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -160,14 +157,6 @@ def environment_class(name: str) -> type[Environment]:
     except (ImportError, AttributeError) as error:
         raise ValueError(f"{name} is registered as {known[name].target}, which cannot be imported: {error}") from error
     return found
-
-
-def code_digest(kind: type[Environment]) -> str:
-    """Return a digest of the code an environment's numbers come from: all of ours, or the other package's module."""
-    file = Path(inspect.getfile(kind)).resolve()
-    ours = Path(__file__).resolve().parent
-    files = sorted(ours.rglob("*.py")) if file.is_relative_to(ours) else [file]
-    return hashlib.sha256(b"".join(source.read_bytes() for source in files)).hexdigest()[:12]
 
 
 def make(

@@ -118,7 +118,7 @@ def test_build_refuses_an_empty_folder_of_data_and_foreign_files(listed: None, d
 def test_a_figure_of_which_nothing_is_sampled_begins_anew_by_other_code(
     listed: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gradscape.envs.registry.code_digest", lambda kind: "other")
+    monkeypatch.setattr("gradscape.envs.base.code_digest", lambda *_: "other")
     monkeypatch.setattr(gallery_parts, "follow", stop)
     assert compute(tmp_path, "--only", "branin") == 1
     assert stored_identity(open_slice(tmp_path / "branin/slice.zarr"))["code"] == "other"

@@ -170,7 +170,7 @@ def test_a_stopped_report_says_what_is_kept(
 def test_a_slice_of_other_code_is_reported_with_a_warning(
     run: Run, cut: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gradscape.envs.registry.code_digest", lambda kind: "changed")
+    monkeypatch.setattr("gradscape.envs.base.code_digest", lambda *_: "changed")
     done = run("report", "cut", "--points", "2", "--out", "told", cwd=tmp_path)
     assert "warning: cut was sampled otherwise (code" in done.stderr
 

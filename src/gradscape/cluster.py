@@ -16,7 +16,7 @@ from dataclasses import asdict
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from .envs.registry import code_digest, make
+from .envs.registry import make
 
 if TYPE_CHECKING:
     from .envs.base import Environment
@@ -67,12 +67,12 @@ def workers(scheduler: str | None, device: str) -> Iterator[Executor | None]:
 def recipe(env: Environment) -> partial[Environment]:
     """Return what makes an environment in another process, and refuses to make one of other code."""
     how = {"fidelity": env.fidelity, "device": env.device, "engine": env.engine, "deterministic": env.deterministic}
-    return partial(_made, env.name, code_digest(type(env)), how | asdict(env.options))
+    return partial(_made, env.name, env.code, how | asdict(env.options))
 
 
 def _made(name: str, code: str, settings: dict[str, Any]) -> Environment:
     env = make(name, **settings)
-    if code_digest(type(env)) != code:
+    if env.code != code:
         raise ValueError(f"worker {platform.node()} has other code of {name}; install the same version of it there")
     return env
 

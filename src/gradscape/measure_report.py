@@ -19,7 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from .console import duration, fill, size
-from .envs.registry import code_digest, entries, make
+from .envs.registry import entries, make
 from .gallery.figures import DATA, read_figures
 from .landscapes.files import replacing, visible, write_json
 from .landscapes.identity import stored_identity
@@ -166,7 +166,7 @@ def measured(
     if "grad" not in dataset or min(dataset["loss"].shape) < 3:
         raise ValueError(f"{subject.name}: report needs a slice with gradients and three samples per axis; got another")
     env = environment_of(dataset, device)
-    key = {**settings, "slice": digest(dataset), "code": code_digest(type(env))}
+    key = {**settings, "slice": digest(dataset), "code": env.code}
     _fetch(console, subject.store.parent, folder, key)
     if (folder / REPORT).exists():
         return _kept(console, folder, key, env.device)
