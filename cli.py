@@ -13,7 +13,6 @@ from .verbs import gallery, look, measure, search
 app = typer.Typer(
     name="landscape",
     help="See, measure and search the loss landscapes of differentiable simulators.",
-    no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -32,13 +31,24 @@ for _verb in _VERBS:
 _gallery = typer.Typer(help="Sample the paper's figures and ours, and build a site that shows them offline.")
 for _verb in (gallery.compute, gallery.list_, gallery.build, gallery.serve):
     _gallery.command(_verb.__name__.rstrip("_"))(_verb)
-app.add_typer(_gallery, name="gallery", no_args_is_help=True)
+app.add_typer(_gallery, name="gallery")
 
 
 @app.callback(invoke_without_command=True)
-def _root(version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False) -> None:
+def _root(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False,
+) -> None:
     if version:
         typer.echo(f"gradscape {__version__}")
+        raise typer.Exit()
+    _help_without_verb(context)
+
+
+@_gallery.callback(invoke_without_command=True)
+def _help_without_verb(context: typer.Context) -> None:
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
         raise typer.Exit()
 
 
@@ -47,11 +57,11 @@ def main(arguments: list[str] | None = None) -> Any:
     from typer.exceptions import TyperException
 
     try:
-        code = app(args=arguments, standalone_mode=False)
+        code = app(args=arguments, prog_name="landscape", standalone_mode=False)
         if code == 130:  # what typer makes of Ctrl-C where a verb has not said what is kept
             raise KeyboardInterrupt
     except TyperException as error:
-        code = _fail(error.format_message(), 2)
+        code = _fail(_usage(error), 2)
     except ValueError as error:
         code = _fail(str(error), 2)
     except OSError as error:
@@ -59,6 +69,13 @@ def main(arguments: list[str] | None = None) -> Any:
     except (KeyboardInterrupt, typer.Abort):
         code = _fail("stopped before anything was computed; the same command begins again", 130)
     sys.exit(code)
+
+
+def _usage(error: Any) -> str:
+    """Return what is wrong with a command's words, and where it is said what the command takes."""
+    context = getattr(error, "ctx", None)
+    said = error.format_message().rstrip(".")
+    return f"{said} (`{context.command_path} --help` says what it takes)" if context else said
 
 
 def _fail(message: str, code: int) -> int:

@@ -1,7 +1,7 @@
 """Which code an environment's numbers come from, as a digest that changes when they may.
 
 It is taken of the scene's own file and of every file of this folder that it imports, directly or not, without their
-comments and docstrings. Other scenes, drawing and the other engine do not count.
+comments, docstrings and import lines. Other scenes, the other engine, and what no loss depends on do not count.
 """
 
 from __future__ import annotations
@@ -20,8 +20,12 @@ if TYPE_CHECKING:
     from .base import Environment
 
 HERE = Path(__file__).resolve().parent
-# What scenes import that computes no loss: the contract, devices and threads, what is observed, what is drawn.
-NO_NUMBERS = ("base.py", "code.py", "engines/runtime.py", "observation.py", "outlines.py", "plasticine_look.py")
+# What scenes import that computes no loss: the contract, their list, devices and threads, what is observed and drawn.
+NO_LOSS = frozenset({"about", "episode", "events", "memory", "work", "_energy", "_observe"})  # hooks of a scene
+NO_NUMBERS = (
+    *("base.py", "code.py", "registry.py", "engines/runtime.py"),
+    *("observation.py", "outlines.py", "plasticine_look.py"),
+)
 
 
 @cache
@@ -49,8 +53,9 @@ def reached(start: Iterable[Path], folder: Path, engine: str) -> list[Path]:
     return sorted(found)
 
 
+@cache
 def bare(file: Path) -> str:
-    """Return a file's code without comments, docstrings and blank lines."""
+    """Return the code of a file that a loss may depend on, line by line, without comments and docstrings."""
     text = file.read_text()
     lines = text.splitlines()
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
@@ -58,11 +63,17 @@ def bare(file: Path) -> str:
             row, column = token.start
             lines[row - 1] = lines[row - 1][:column]
     for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
-            said = node.body[0]
-            for row in range(said.lineno - 1, said.end_lineno or said.lineno):
-                lines[row] = ""
+        for silent in _silent(node):
+            lines[silent.lineno - 1 : silent.end_lineno] = [""] * ((silent.end_lineno or 0) - silent.lineno + 1)
     return "\n".join(line.rstrip() for line in lines if line.strip())
+
+
+def _silent(node: ast.AST) -> Iterator[ast.stmt]:
+    """Yield what no loss depends on in a node of a file: imports, docstrings, hooks that compute none."""
+    if isinstance(node, ast.Import | ast.ImportFrom) or (isinstance(node, ast.FunctionDef) and node.name in NO_LOSS):
+        yield node
+    if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
+        yield node.body[0]
 
 
 def _file(kind: type) -> Path | None:

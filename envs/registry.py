@@ -149,7 +149,7 @@ def environment_class(name: str) -> type[Environment]:
     known = entries()
     if name not in known:
         close = get_close_matches(name, known, n=1)
-        hint = f"; did you mean {close[0]}?" if close else ""
+        hint = f"; did you mean {close[0]}?" if close else ";"
         raise ValueError(f"no environment is called {name!r}{hint} `landscape envs` lists all {len(known)}")
     module, _, attribute = known[name].target.partition(":")
     try:

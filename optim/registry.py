@@ -41,8 +41,8 @@ def optimizer_class(name: str) -> type[Optimizer]:
     """Import and return the class of a method."""
     if name not in METHODS:
         close = get_close_matches(name, METHODS, n=1)
-        hint = f"; did you mean {close[0]}?" if close else ""
-        raise ValueError(f"no method is called {name!r}{hint} There are {', '.join(METHODS)}")
+        hint = f"; did you mean {close[0]}?" if close else ";"
+        raise ValueError(f"no method is called {name!r}{hint} there are {', '.join(METHODS)}")
     method = METHODS[name]
     module, _, attribute = method.target.partition(":")
     try:

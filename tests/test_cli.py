@@ -33,6 +33,21 @@ def test_help_and_table_import_nothing_heavy(arguments: list[str]) -> None:
     assert not heavy & loaded(arguments)
 
 
+@pytest.mark.parametrize("arguments", [[], ["gallery"]])
+def test_a_command_alone_is_its_help(run: Callable[..., Said], tmp_path: Path, arguments: list[str]) -> None:
+    alone = run(*arguments, cwd=tmp_path)
+    assert (alone.returncode, alone.stderr) == (0, "")
+    assert alone.stdout == run(*arguments, "--help", cwd=tmp_path).stdout
+    assert alone.stdout.startswith(" ".join(["Usage: landscape", *arguments, "[OPTIONS] COMMAND"]))
+    assert len(alone.stdout.splitlines()) > 8
+
+
+def test_a_word_too_few_or_too_many_says_where_to_read_on(run: Callable[..., Said], tmp_path: Path) -> None:
+    for arguments in (["slice"], ["slice", "fluid", "--dimz", "0"], ["slice", "fluid", "--resolution", "x"]):
+        assert "(`landscape slice --help` says what it takes)" in run(*arguments, cwd=tmp_path).stderr
+    assert "(`landscape --help` says what it takes)" in run("plot", cwd=tmp_path).stderr
+
+
 def test_envs_lists_every_environment_with_units(
     run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -255,7 +255,7 @@ def test_a_tolerance_that_nothing_meets_names_the_best(run: Command, tmp_path: P
     assert "the best is standard-dt-x0.5" in none.stderr
     some = run(*how, "50%", cwd=tmp_path)
     assert some.returncode == 0
-    assert "warning: measured with another version of the code, older" in some.stderr
+    assert "warning: measured with another version of the code of converging, older" in some.stderr
 
 
 def test_the_gallerys_rungs_of_the_same_problem_are_found_where_nothing_of_the_users_own_is(
@@ -310,3 +310,47 @@ def test_pairs_needs_two_parameters(run: Command, tmp_path: Path) -> None:
 def test_a_tolerance_is_a_share_or_a_number() -> None:
     assert read_tolerance("5%") == (0.05, True)
     assert read_tolerance("0.2") == (0.2, False)
+
+
+def elsewhere(report: dict[str, Any]) -> dict[str, Any]:
+    """Return a report as it would be of a GPU, on which the finest rungs are the quickest."""
+    finest = {"reference": 1e-9, "standard": 1e-6}
+    rungs = [
+        {**row, "device": "cuda", "seconds": dict.fromkeys(row["seconds"], finest.get(row["name"], 1.0))}
+        for row in report["rungs"]
+    ]
+    return {**report, "rungs": rungs, "identity": {**report["identity"], "device": "cuda"}}
+
+
+def test_seconds_are_those_of_the_device_that_will_run(
+    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Errors measured on a GPU count here; its seconds do not: what may be quickest is timed, once, and kept."""
+    from gradscape import tolerance
+
+    report = json.loads(run(*TRADE, "--json", cwd=tmp_path).stdout)
+    for kept in (tmp_path / "data").rglob("*.json"):
+        kept.write_text(json.dumps(elsewhere(report)))
+    timed: list[str] = []
+
+    def slow(env: gradscape.Environment) -> float:
+        timed.append(env.fidelity.name)
+        return float(env.work().count)
+
+    monkeypatch.setattr(tolerance, "_seconds", slow)
+    how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--json"]
+    errors = {row["name"]: row["loss_error"]["p95_relative"]["value"] for row in report["rungs"]}
+    within = [name for name, off in errors.items() if off is not None and off <= 0.02]
+    work = {
+        row["name"]: gradscape.make("converging", fidelity=gradscape.Fidelity(**row["fidelity"])).work().count
+        for row in report["rungs"]
+    }
+    done = run(*how, "--tolerance", "2%", cwd=tmp_path)
+    chosen = json.loads(done.stdout)["fidelity"]
+    assert work[chosen] == min(work[name] for name in within)
+    assert chosen not in ("reference", "standard")
+    assert "timed on cpu here" in done.stderr
+    assert 1 <= len(timed) < len(within)  # what is dearer from the outset is not tried
+    timed.clear()
+    assert json.loads(run(*how, "--tolerance", "2%", cwd=tmp_path).stdout)["episodes"] == 0
+    assert timed == []

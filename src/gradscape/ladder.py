@@ -12,6 +12,7 @@ from .envs.registry import make
 
 LADDERS = ("dt", "resolution", "particles", "precision", "stiffness", "engine", "device")
 STEPS, CELLS, PARTICLES, STIFFNESSES = (0.5, 2.0, 4.0), (2 / 3, 1.5), (0.5, 2.0), (0.25, 0.5, 2.0, 4.0)
+SLOWER = 1.5  # times what float32 takes, float64 is expected to take
 STIFFNESS = "ke"  # what scenes with penalty contact call its stiffness
 
 
@@ -86,6 +87,11 @@ def refuse_single(env: Environment) -> None:
     """Refuse a scene that has one fidelity only: nothing of it can be traded."""
     if len(env.fidelities) < 2:
         raise ValueError(f"{env.name} has fidelity {', '.join(env.fidelities)} only; there is nothing to trade")
+
+
+def expected_work(env: Environment) -> float:
+    """Return what an episode is expected to cost, beside other rungs of its scene."""
+    return env.work().count * (SLOWER if env.fidelity.precision == "float64" else 1.0)
 
 
 def _length(env: Environment) -> float:

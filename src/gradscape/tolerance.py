@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shlex
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from importlib import resources
@@ -13,12 +14,16 @@ from typing import TYPE_CHECKING, Any
 
 from platformdirs import user_data_path
 
-from .envs.registry import code_digest, environment_class, make
+from .envs.registry import make
+from .ladder import expected_work
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from .envs.base import Environment, Fidelity
+
+Row = Mapping[str, Any]
+FARTHER = 2.0  # times the expected work of the quickest so far, from where on a rung is not timed any more
 
 
 def keep(report: Mapping[str, Any]) -> Path:
@@ -41,10 +46,10 @@ def chosen(
     engine: str,
     options: Mapping[str, Any],
 ) -> Fidelity:
-    """Return the cheapest measured fidelity whose 95th-percentile loss error is within a tolerance, and say why.
+    """Return the quickest measured fidelity whose 95th-percentile loss error is within a tolerance, and say why.
 
-    Looks among the user's own reports, then in the gallery's; options of the scene must be those that were measured.
-    Rungs of the same engine and device count, and of the other device where there are none.
+    Looks among the user's own reports, then in the gallery's; options of the scene must be those that were measured,
+    and so must the engine. Errors may be of the other device; seconds are of this one, and measured now if need be.
     """
     if fidelity is not None:
         raise ValueError(f"--tolerance chooses the fidelity; got --fidelity {fidelity} too, leave out one of them")
@@ -52,24 +57,78 @@ def chosen(
     env = make(name, device=device, engine=engine, **options)
     report, source, rows = _measured(env, options)
     from .envs.base import Fidelity
-    from .landscapes.tradeoff import cheapest, p95
+    from .landscapes.tradeoff import p95
 
-    row = cheapest(rows, limit, relative=relative)
-    if row is None:
-        best = min((off, row["name"]) for row in rows if (off := p95(row, relative=relative)) is not None)
+    errors = {row["name"]: off for row in rows if (off := p95(row, relative=relative)) is not None}
+    within = [row for row in rows if errors.get(row["name"], float("inf")) <= limit]
+    if not within:
+        best = min(errors, key=lambda rung: errors[rung])
         raise ValueError(
-            f"no measured fidelity of {name} is within {tolerance}; the best is {best[1]}, "
-            f"{_amount(best[0], relative, report)} off at the 95th percentile"
+            f"no measured fidelity of {name} is within {tolerance}; the best is {best}, "
+            f"{_amount(errors[best], relative, report)} off at the 95th percentile"
         )
-    for warning in _warnings(report, row, code_digest(environment_class(name)), env.device):
-        console.print(f"warning: {warning}", markup=False)
+    row, seconds, where = _quickest(console, env, within)
+    if (ours := _code(env, report)) != (theirs := report["identity"]["code"]):
+        said = f"measured with another version of the code of {name}, {theirs}, this is {ours}"
+        console.print(f"warning: {said}", markup=False)
     console.print(
-        f"{row['name']}: the quickest of {len(rows)} measured that is within {tolerance}; its losses are "
-        f"{_amount(p95(row, relative=relative) or 0.0, relative, report)} off or less in 95 % of {row['compared']} "
-        f"points, {row['seconds']['with_gradient']:.3g} s an episode with gradient ({source})",
+        f"{row['name']}: the quickest of {len(within)} of {len(rows)} measured that are within {tolerance}; its losses "
+        f"are {_amount(errors[row['name']], relative, report)} off or less in 95 % of {row['compared']} "
+        f"points ({source}), {seconds:.3g} s an episode with gradient ({where})",
         markup=False,
     )
     return Fidelity(**row["fidelity"])
+
+
+def _quickest(console: Console, env: Environment, rows: Sequence[Row]) -> tuple[Row, float, str]:
+    """Return the rung that takes least time on the environment's device, that time [s], and where it was measured."""
+    if rows[0]["device"] == env.device:
+        best = min(rows, key=lambda row: float(row["seconds"]["with_gradient"]))
+        return best, float(best["seconds"]["with_gradient"]), f"measured on {env.device} by `landscape tradeoff`"
+    with console.status(f"{env.name}: timing {len(rows)} fidelities on {env.device}, where none was measured"):
+        seconds = _timed(env, rows)
+    best = min((row for row in rows if row["name"] in seconds), key=lambda row: seconds[row["name"]])
+    return best, seconds[best["name"]], f"{len(seconds)} of them timed on {env.device} here, one episode alone"
+
+
+def _timed(env: Environment, rows: Sequence[Row]) -> dict[str, float]:
+    """Time an episode with gradient of each rung that may be the quickest [s]; what was timed before is kept.
+
+    It is kept so that the same command chooses the same rung, and goes on with what it began.
+    """
+    from .envs.base import Fidelity
+    from .landscapes.files import write_json
+
+    path = _kept(env.name, asdict(env.options), env.device).with_suffix(f".{env.engine}-{env.code}.seconds.json")
+    known: dict[str, float] = json.loads(path.read_text()) if path.is_file() else {}
+    how = {"device": env.device, "engine": env.engine, **asdict(env.options)}
+    made = {row["name"]: make(env.name, fidelity=Fidelity(**row["fidelity"]), **how) for row in rows}
+    work = {name: expected_work(one) for name, one in made.items()}
+    found: dict[str, float] = {}
+    for name in sorted(work, key=lambda name: work[name]):
+        if found and work[name] > FARTHER * work[min(found, key=lambda other: found[other])]:
+            break
+        if name not in known:
+            known[name] = _seconds(made[name])
+            write_json(path, known)
+        found[name] = known[name]
+    return found
+
+
+def _seconds(env: Environment) -> float:
+    """Time an episode with gradient at the middle of the box, a second one since the first may compile."""
+    env.prepare()
+    x = env.space.center[None]
+    env.evaluate(x)
+    began = time.perf_counter()
+    env.evaluate(x)
+    return time.perf_counter() - began
+
+
+def _code(env: Environment, report: Mapping[str, Any]) -> str:
+    from .envs.code import code_digest
+
+    return code_digest(type(env), report["identity"]["engine"])
 
 
 def kept_rung(env: Environment, device: str) -> tuple[Mapping[str, Any], Path]:
@@ -136,12 +195,3 @@ def _rows(report: Mapping[str, Any], engine: str, device: str) -> Sequence[Mappi
 
 def _amount(value: float, relative: bool, report: Mapping[str, Any]) -> str:
     return f"{value:.2%} of the losses' spread" if relative else f"{value:.3g} {report['loss_unit']}".rstrip()
-
-
-def _warnings(report: Mapping[str, Any], row: Mapping[str, Any], code: str, device: str) -> list[str]:
-    found = []
-    if report["identity"]["code"] != code:
-        found.append(f"measured with another version of the code, {report['identity']['code']}, this is {code}")
-    if row["device"] != device:
-        found.append(f"measured on {row['device']}; on {device} another fidelity may be the quickest")
-    return found

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 RECORD, PICTURE = "tradeoff.json", "tradeoff.png"
 WIDTH = 126  # least characters of the table, for narrower terminals to wrap
-SLOWER = 1.5  # what float64 is expected to cost, in an estimate
 
 
 def tradeoff(
@@ -130,6 +129,7 @@ class Study:
 
     def estimate(self) -> dict[str, float]:
         """Return the seconds that each rung that is left should take; one that is refused takes none."""
+        from .ladder import expected_work
         from .landscapes.tradeoff import TIMING
 
         left = self.left()
@@ -142,7 +142,7 @@ class Study:
         rate = (time.perf_counter() - began) / len(batch) / base.work().count
         seconds = {rung.name: 0.0 for rung in left}
         for rung, env in self._made(left):
-            each = rate * env.work().count * (SLOWER if env.fidelity.precision == "float64" else 1)
+            each = rate * expected_work(env)
             seconds[rung.name] = len(self.x) * each + 2 * max(TIMING, min(len(self.x), env.preferred_batch) * each / 3)
         return seconds
 
