@@ -22,7 +22,7 @@ app = typer.Typer(
 _VERBS = (
     look.envs, look.info, look.slice_, look.sweep,
     search.methods, search.optimize, search.race, search.overlay,
-    look.surface, look.replay, look.view, look.bounce,
+    look.surface, look.replay, look.export, look.view, look.bounce,
     measure.plan, measure.bench, measure.check, measure.tradeoff, measure.pairs, measure.report_,
 )  # fmt: skip
 

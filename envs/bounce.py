@@ -57,6 +57,7 @@ class Bounce(Environment):
 
     name: ClassVar[str] = "bounce"
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
+    beyond_box: ClassVar[bool] = True
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=1 / 240),
         "standard": Fidelity("standard", dt=1 / 480),

@@ -67,6 +67,7 @@ class Cartpole(Environment):
 
     name: ClassVar[str] = "cartpole"
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
+    beyond_box: ClassVar[bool] = True
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=SPAN),
         "standard": Fidelity("standard", dt=SPAN / 2),

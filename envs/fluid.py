@@ -74,6 +74,7 @@ class Fluid(Environment):
 
     name: ClassVar[str] = "fluid"
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
+    beyond_box: ClassVar[bool] = True
     engines: ClassVar[tuple[str, ...]] = ("warp", "taichi")
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=SPAN / 3, resolution=12, sampling=1.4),

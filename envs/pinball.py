@@ -66,6 +66,7 @@ class Pinball(Environment):
     """
 
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
+    beyond_box: ClassVar[bool] = True
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=1 / 60),
         "standard": Fidelity("standard", dt=1 / 240),

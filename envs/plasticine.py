@@ -76,6 +76,7 @@ class Plasticine(Environment):
     """
 
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
+    beyond_box: ClassVar[bool] = True
     engines: ClassVar[tuple[str, ...]] = ("warp", "taichi")
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=SPAN / 9, resolution=32, particles=800),

@@ -47,6 +47,7 @@ class SheetScene(Environment):
     """
 
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
+    beyond_box: ClassVar[bool] = True
     engines: ClassVar[tuple[str, ...]] = ("warp", "taichi")
     loss_unit: ClassVar[str] = "m"
     Options: ClassVar[type[Any]] = EpisodeOptions

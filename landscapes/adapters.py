@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .objective import Evaluation, Objective, Status
+from .objective import Evaluation, Objective, evaluated_inside, name_of
 from .space import ParameterSpace
 
 TorchFunction = Callable[[Tensor], Tensor]
@@ -34,7 +34,8 @@ def from_numpy(
     """Make an objective of a numpy function from points, shape (batch, dim), to losses, shape (batch,).
 
     The function may return (losses, gradients) instead, gradients of shape (batch, dim). If it returns losses only,
-    `differences` makes gradients by central differences with that step, a fraction of each parameter's range.
+    `differences` makes gradients by central differences with that step, a fraction of each parameter's range; at the
+    bounds they are one-sided, since the function is not asked beyond them.
     """
     if differences is not None and not differences > 0:
         raise ValueError(f"from_numpy takes differences as a positive fraction of the bounds; got {differences}")
@@ -42,7 +43,7 @@ def from_numpy(
 
 
 def within_box(objective: Objective) -> Objective:
-    """Evaluate an objective inside its box only; points beyond it have left the domain (status ESCAPED)."""
+    """Evaluate an objective inside its box only, though it may invite points beyond: these have status ESCAPED."""
     return _BoxedObjective(objective)
 
 
@@ -104,19 +105,21 @@ class _NumpyObjective:
                 f"{self.name} returned losses without gradients; return (losses, gradients), pass differences=1e-4 "
                 "to from_numpy, or sample with grad=False (--no-gradients)"
             )
-        step = self.differences * (self.space.upper - self.space.lower)
+        lower, upper = self.space.lower, self.space.upper
         slopes = []
         for axis in range(self.space.dim):
-            shift = torch.zeros_like(step)
-            shift[axis] = step[axis]
-            slopes.append((self._call(x + shift)[0] - self._call(x - shift)[0]) / (2 * step[axis]))
+            step = torch.zeros_like(lower)
+            step[axis] = self.differences * (upper - lower)[axis]
+            ahead, behind = torch.minimum(x + step, upper), torch.maximum(x - step, lower)
+            apart = (ahead - behind)[:, axis]
+            slopes.append((self._call(ahead)[0] - self._call(behind)[0]) / apart)
         return torch.stack(slopes, dim=1)
 
 
 class _BoxedObjective:
     """What the objective knows of itself beside, such as its preferred batch, is passed on."""
 
-    ROUNDING = 1e-9  # of the box; points that far beyond it are moved back
+    beyond_box = False
 
     def __init__(self, objective: Objective) -> None:
         self.objective, self.space = objective, objective.space
@@ -127,17 +130,7 @@ class _BoxedObjective:
         return getattr(self.objective, name)
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
-        x = _points(x, self.space, getattr(self.objective, "name", type(self.objective).__name__))
-        unit = self.space.to_unit(x)
-        inside = ((unit >= -self.ROUNDING) & (unit <= 1 + self.ROUNDING)).all(dim=1)
-        found = self.objective.evaluate(torch.clamp(x[inside], self.space.lower, self.space.upper), grad=grad)
-        loss = x.new_full((len(x),), torch.nan)
-        slope = torch.full_like(x, torch.nan) if grad else None
-        status = torch.full((len(x),), Status.ESCAPED, dtype=torch.int8)
-        loss[inside], status[inside] = found.loss.to(loss), found.status.to(status)
-        if slope is not None and found.grad is not None:
-            slope[inside] = found.grad.to(slope)
-        return Evaluation(loss, slope, status)
+        return evaluated_inside(self.objective, _points(x, self.space, name_of(self.objective)), grad=grad)
 
 
 def _name(fn: Callable[..., object]) -> str:

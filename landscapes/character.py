@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 import torch
 import xarray as xr
+from jaxtyping import Float
+from torch import Tensor
 
 from . import gradients, verdict
 from .estimate import plain
 from .jumps import Count, Jumps, find_jumps
 from .noise import Noise, noise
-from .objective import Objective
+from .objective import Evaluation, Objective, evaluated, in_box, name_of
 from .ruggedness import Ruggedness, ruggedness
 from .store import plane_of
 from .verdict import Verdict, judge
@@ -27,7 +29,8 @@ PAIRS_PER_POINT = 8  # steep pairs of samples that are looked into, for each poi
 class Character:
     """Hold the measures of a slice: of its losses, of its noise, of its jumps and of its gradients at several scales.
 
-    `steps`, `samples` and `smooth` are what `gradients.ladder`, `of_samples` and `smoothed_slopes` return.
+    `steps`, `samples` and `smooth` are what `gradients.ladder`, `of_samples` and `smoothed_slopes` return. `cut` of
+    `asked` evaluations would have been beyond the box of an objective that does not invite that, and were left out.
     """
 
     losses: Ruggedness
@@ -37,6 +40,8 @@ class Character:
     samples: xr.Dataset
     smooth: xr.Dataset
     verdict: Verdict
+    asked: int
+    cut: int
 
     def record(self) -> dict[str, Any]:
         """Return it as plain JSON."""
@@ -49,6 +54,7 @@ class Character:
             "smoothing": gradients.width_table(self.smooth),
             "verdict": {"words": list(self.verdict.words), "reasons": self.verdict.reasons},
             "thresholds": verdict.thresholds(),
+            "beyond_the_box": {"asked": self.asked, "cut": self.cut},
         }
 
 
@@ -74,7 +80,7 @@ def characterise(
     `rounding` is the engine's relative precision, 1.2e-7 of float32 and 2.2e-16 of float64. Jumps are looked for from
     half the step on, from sample to sample, of a ramp through the range of the losses.
     """
-    plane = plane_of(dataset)
+    plane, objective = plane_of(dataset), _Within(objective)
     generator = torch.Generator().manual_seed(seed)
     places = gradients.subgrid(plane, points if plane.rank == 2 else points**2)
     shares = torch.rand(NOISE_POINTS, plane.rank, generator=generator, dtype=torch.float64)
@@ -89,7 +95,24 @@ def characterise(
     smooth = gradients.smoothed_slopes(objective, plane, places, pairs=PAIRS, seed=seed)
     samples = gradients.of_samples(dataset, deviation=deviation)
     cosine = samples["cosine"].isel(scale=0).to_numpy()
-    return Character(found, fuzz, jumps, steps, samples, smooth, judge(found, jumps, cosine))
+    words = judge(found, jumps, cosine)
+    return Character(found, fuzz, jumps, steps, samples, smooth, words, objective.asked, objective.cut)
+
+
+class _Within:
+    """Evaluate an objective where it may be asked, and count the points where it may not."""
+
+    beyond_box = True  # those are left out here
+
+    def __init__(self, objective: Objective) -> None:
+        self.objective, self.space, self.name = objective, objective.space, name_of(objective)
+        self.asked = self.cut = 0
+
+    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
+        self.asked += len(x)
+        if not getattr(self.objective, "beyond_box", False):
+            self.cut += int((~in_box(self.space, x)).sum())
+        return evaluated(self.objective, x, grad=grad)
 
 
 def named_measures(record: Mapping[str, Any]) -> dict[str, str]:
@@ -114,6 +137,8 @@ def named_measures(record: Mapping[str, Any]) -> dict[str, str]:
         f"Cosine of gradient and difference over {near['scale']:.1%} of the box": _number(near["cosine"]),
         f"Gradients uphill over {near['scale']:.1%} of the box": _shares(near["uphill"]),
     }
+    if cut := record.get("beyond_the_box", {}).get("cut"):
+        named["Probes beyond the bounds, left out"] = f"{cut} of {record['beyond_the_box']['asked']}"
     for row in smooth:
         named[f"First order biased, smoothed over {row['width']:.0%} of the box"] = _shares(row["biased"])
     return {name: text for name, text in named.items() if text}

@@ -49,7 +49,7 @@ def checks(
     yield "centre", lambda: _at("centre", objective, space.center[None])
     for share in BEYOND:
         name, beyond = f"{share:.0%} outside the box", space.from_unit(ends + share * (2 * ends - 1))
-        yield name, partial(_at, name, objective, beyond, may_refuse=True)
+        yield name, partial(_beyond, name, objective, beyond)
     yield "float32 against float64", lambda: _precisions(subject, "float32 against float64", other)
     for variant in variants:
         yield variant.name, partial(_variant, subject, variant)
@@ -105,6 +105,12 @@ def _at(
             raise
         return verdict(name, True, f"refused: {' '.join(str(refusal).split())}")
     return _judged(name, found, what)
+
+
+def _beyond(name: str, objective: Objective, x: Float[Tensor, "batch dim"]) -> Finding:
+    if not getattr(objective, "beyond_box", False):
+        return Finding(name, SKIP, "not asked", "it does not invite points beyond its box (beyond_box = True does)")
+    return _at(name, objective, x, may_refuse=True)
 
 
 def _judged(name: str, found: Evaluation, what: str = "") -> Finding:

@@ -7,10 +7,12 @@ from enum import IntEnum
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .space import ParameterSpace
+
+ROUNDING = 1e-9  # of the box; points that are no farther beyond it are moved back
 
 
 class Status(IntEnum):
@@ -66,7 +68,10 @@ class Evaluation:
 
 @runtime_checkable
 class Objective(Protocol):
-    """Anything with a parameter space that can be evaluated at a batch of points."""
+    """Anything with a parameter space that can be evaluated at a batch of points.
+
+    It is never asked beyond its bounds unless it invites that by an attribute `beyond_box` that is true.
+    """
 
     @property
     def space(self) -> ParameterSpace:
@@ -77,8 +82,12 @@ class Objective(Protocol):
 
 
 def evaluated(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
-    """Evaluate an objective, hold the result against the protocol, and blank every failure."""
-    raw = objective.evaluate(x, grad=grad)
+    """Evaluate an objective, hold the result against the protocol, and blank every failure.
+
+    Points beyond its bounds have left the domain (status ESCAPED), unless the objective invites them.
+    """
+    invited = getattr(objective, "beyond_box", False)
+    raw = objective.evaluate(x, grad=grad) if invited else evaluated_inside(objective, x, grad=grad)
     who, count = name_of(objective), len(x)
     wanted: dict[str, tuple[Tensor, tuple[int, ...]]] = {"loss": (raw.loss, (count,)), "status": (raw.status, (count,))}
     if grad:
@@ -93,6 +102,36 @@ def evaluated(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool
     loss, status = (tensor.detach().cpu() for tensor in (raw.loss, raw.status))
     gradient = wanted["grad"][0].detach().cpu().double() if grad else None
     return Evaluation.judged(loss.double(), gradient, status)
+
+
+def evaluated_inside(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+    """Evaluate an objective at those of the points that lie in its box; the others have left the domain.
+
+    What is no point at all, of a wrong shape or not a number, is for the objective to refuse.
+    """
+    if x.ndim != 2 or x.shape[1] != objective.space.dim:
+        return objective.evaluate(x, grad=grad)
+    inside = in_box(objective.space, x)
+    if bool(inside.all()):
+        return objective.evaluate(_moved_back(objective.space, x), grad=grad)
+    loss, slope = x.new_full((len(x),), torch.nan), torch.full_like(x, torch.nan) if grad else None
+    status = torch.full((len(x),), Status.ESCAPED, dtype=torch.int8)
+    if bool(inside.any()):
+        found = objective.evaluate(_moved_back(objective.space, x[inside]), grad=grad)
+        loss[inside], status[inside] = found.loss.detach().to(loss), found.status.to(status)
+        if slope is not None:
+            slope[inside] = _present(found.grad, name_of(objective)).detach().to(slope)
+    return Evaluation(loss, slope, status)
+
+
+def in_box(space: ParameterSpace, x: Float[Tensor, "batch dim"]) -> Bool[Tensor, " batch"]:
+    """Say which points lie nowhere beyond the bounds, to rounding."""
+    unit = space.to_unit(x)
+    return ~((unit < -ROUNDING) | (unit > 1 + ROUNDING)).any(dim=1)
+
+
+def _moved_back(space: ParameterSpace, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch dim"]:
+    return torch.clamp(x, space.lower, space.upper)
 
 
 def name_of(objective: Objective) -> str:

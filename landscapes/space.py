@@ -15,7 +15,7 @@ class ParameterSpace:
     """Name the parameters of an objective, their units and their bounds.
 
     `lower` and `upper` become float64, shape (dim,), in the parameters' own units. The bounds say where a landscape is
-    looked at by default; an objective may be evaluated outside them.
+    looked at, and an objective is not asked beyond them unless it invites that (`Objective`).
     """
 
     names: tuple[str, ...]

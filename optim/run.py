@@ -40,7 +40,7 @@ FORMAT = 1
 CHUNK = 64  # rows
 PAUSE = 1.0  # least seconds between two writes, so that quick episodes are not held up
 SHARE = 0.05  # most of the time that may go into writing, so that a large state is not written too often
-STATE = "state"
+RUN, STATE = "run.zarr", "state"
 DEEP = ("x", "grad")
 COLUMNS: dict[str, tuple[str, dict[str, Any]]] = {  # status last: a row that has one is whole
     "x": ("float64", {"long_name": "parameters, each in its own unit"}),
@@ -330,6 +330,15 @@ class Run:
             if self.path is None or self.path.stat().st_ino == self._inode:
                 return
         raise StoreError(f"{self.path} was replaced or removed while it was being filled; run the command again")
+
+
+def open_run(path: str | Path) -> xr.Dataset:
+    """Read a run from disk as its `table`: a row for each episode that was evaluated so far.
+
+    `path` is the run, or the folder that `landscape optimize` left it in.
+    """
+    path = Path(path)
+    return Run.open(path / RUN if (path / RUN).exists() else path).table()
 
 
 def is_run(path: str | Path) -> bool:

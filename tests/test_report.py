@@ -210,3 +210,17 @@ def test_the_paper_is_quoted_on_every_environment_it_shows() -> None:
     said = paper_words()
     assert set(said) <= set(entries())
     assert {figure.env for figure in read_figures()} <= set(said)
+
+
+@pytest.mark.parametrize("cut", [["rastrigin", "--set", "dim=5"], ["branin"]])
+def test_a_function_that_refuses_what_is_beyond_its_bounds_is_reported(
+    run: Callable[..., Said], tmp_path: Path, cut: list[str]
+) -> None:
+    done = run("slice", *cut, "--dims", "0", "1", "--resolution", "12", "--out", "cut", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = run("report", "cut", "--out", "told", "--json", cwd=tmp_path)
+    assert report.returncode == 0, report.stderr
+    beyond = json.loads(report.stdout)["beyond_the_box"]
+    assert 0 < beyond["cut"] < beyond["asked"] / 10
+    measures = json.loads((tmp_path / "told/measures.json").read_text())
+    assert measures["Probes beyond the bounds, left out"] == f"{beyond['cut']} of {beyond['asked']}"

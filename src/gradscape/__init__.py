@@ -15,6 +15,7 @@ _HOMES = {
     "from_numpy": "landscapes.adapters",
     "from_torch": "landscapes.adapters",
     "open_slice": "landscapes.store",
+    "open_run": "optim.run",
     "sample": "landscapes.sampling",
     "Environment": "envs.base",
     "Episode": "envs.base",

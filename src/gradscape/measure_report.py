@@ -248,6 +248,7 @@ class _Counted:
 
     def __init__(self, objective: Objective, batch: int, advance: Any) -> None:
         self.objective, self.space, self.batch, self.advance = objective, objective.space, batch, advance
+        self.beyond_box = getattr(objective, "beyond_box", False)
         self.name = getattr(objective, "name", type(objective).__name__)
 
     def evaluate(self, x: Tensor, *, grad: bool = True) -> Evaluation:

@@ -178,6 +178,21 @@ def replay(
     report(env, params=params, fidelity=fidelity, device=device, engine=engine, settings=set_ or [], out=out, film=film)
 
 
+def export(
+    what: Annotated[str, typer.Argument(metavar="SLICE|RUN", help="The folder of a slice or of a run.")],
+    to: Annotated[str, typer.Option(help="csv, parquet or netcdf.")] = "csv",
+    out: Annotated[str | None, typer.Option(help="The file to write; by default one beside the slice or run.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace the file where it exists already.")] = False,
+) -> None:
+    """Write a slice or a run as a table for other programs: a row for each sample or episode, columns with units.
+
+    netCDF holds the arrays themselves, with their names, units and how they were made.
+    """
+    from ..export_report import export as report
+
+    report(what, to=to, out=out, force=force)
+
+
 def view(
     file: Annotated[str, typer.Argument(help="A picture, a film, a page, a recording (.rrd), or a results folder.")],
     serve: Annotated[bool, typer.Option("--serve", help="Serve a recording to a browser, until Ctrl-C.")] = False,

@@ -1,0 +1,83 @@
+"""A slice or a run as a table or a file that other programs read: CSV, Parquet, netCDF."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+
+from .files import replacing
+from .slice_arrays import parameters_of, plane_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SUFFIXES = {"csv": ".csv", "parquet": ".parquet", "netcdf": ".nc"}
+
+
+def save_as(dataset: xr.Dataset, path: Path, kind: str) -> None:
+    """Write a slice or a run as csv, parquet or netcdf, whole or not at all.
+
+    The first two hold `frame`; the last holds the dataset itself, with all of its attributes.
+    """
+    if kind not in SUFFIXES:
+        raise ValueError(f"a slice or a run is exported to {', '.join(SUFFIXES)}; got {kind!r}")
+    with replacing(path) as partial:
+        if kind == "netcdf":
+            dataset.to_netcdf(partial)
+        elif kind == "csv":
+            frame(dataset).to_csv(partial, index=False)
+        else:
+            frame(dataset).to_parquet(partial, index=False)
+
+
+def frame(dataset: xr.Dataset) -> pd.DataFrame:
+    """Return a slice, a row for each sample, or a run, a row for each episode, columns named with their units.
+
+    A slice's rows begin with the plane's coordinates, a run's with the parameters; then come the loss, in words how the
+    evaluation ended and, where they were asked for, the gradient's components.
+    """
+    import pandas as pd
+
+    columns = _places(dataset) if "x" not in dataset else _points(dataset)
+    unit = str(dataset["loss"].attrs.get("units", ""))
+    columns[_labelled("loss", unit)] = dataset["loss"].to_numpy().ravel()
+    for name in ("status", "kind"):
+        if name in dataset:
+            columns[name] = _worded(dataset[name])
+    for name in ("forwards", "seconds"):
+        if name in dataset:
+            columns[_labelled(name, str(dataset[name].attrs.get("units", "")))] = dataset[name].to_numpy()
+    if "grad" in dataset:
+        grad = dataset["grad"].to_numpy().reshape(-1, dataset.sizes["dim"])
+        for (name, by), slope in zip(parameters_of(dataset), grad.T, strict=True):
+            per = f"{unit or '1'}/({by})" if by else unit
+            columns[_labelled(f"gradient by {name}", per)] = slope
+    return pd.DataFrame(columns)
+
+
+def _places(dataset: xr.Dataset) -> dict[str, np.ndarray]:
+    """Return the plane's coordinates of every sample, u varying fastest."""
+    axes = [dataset[name].to_numpy() for name in dataset["loss"].dims]
+    grid = np.meshgrid(*axes, indexing="ij")[::-1]
+    return {label: axis.ravel() for label, axis in zip(plane_of(dataset).labels, grid, strict=True)}
+
+
+def _points(run: xr.Dataset) -> dict[str, np.ndarray]:
+    """Return number and parameters of every episode."""
+    values = run["x"].to_numpy().T
+    named = {_labelled(*one): column for one, column in zip(parameters_of(run), values, strict=True)}
+    return {"episode": run["episodes"].to_numpy(), **named}
+
+
+def _worded(codes: xr.DataArray) -> np.ndarray:
+    """Return the words that codes stand for."""
+    words = str(codes.attrs["flag_meanings"]).split()
+    by_code = dict(zip(codes.attrs["flag_values"], words, strict=True))
+    return np.array([by_code[code] for code in codes.to_numpy().ravel().tolist()])
+
+
+def _labelled(name: str, unit: str) -> str:
+    return f"{name} [{unit}]" if unit else name
