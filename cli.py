@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+from inspect import signature
 from typing import Annotated, Any
 
 import typer
 
 from . import __version__
 from .verbs import gallery, look, measure, search
+from .verbs.dims import TakesDims
 
 app = typer.Typer(
     name="landscape",
@@ -27,7 +29,8 @@ _VERBS = (
 )  # fmt: skip
 
 for _verb in _VERBS:
-    app.command(_verb.__name__.rstrip("_"))(_verb)
+    _cls = TakesDims if "dims" in signature(_verb).parameters else None
+    app.command(_verb.__name__.rstrip("_"), cls=_cls)(_verb)
 _gallery = typer.Typer(help="Sample the paper's figures and ours, and build a site that shows them offline.")
 for _verb in (gallery.compute, gallery.list_, gallery.build, gallery.serve):
     _gallery.command(_verb.__name__.rstrip("_"))(_verb)

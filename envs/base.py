@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import inspect
+import re
 import threading
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -20,7 +21,7 @@ from torch import Tensor
 from ..landscapes.episode import Episode as Episode
 from ..landscapes.halving import collect
 from ..landscapes.objective import Evaluation
-from ..landscapes.space import ParameterSpace
+from ..landscapes.space import ParameterSpace, as_tensor
 from .code import code_digest
 from .options import NoOptions, read_options
 
@@ -56,15 +57,16 @@ class Work:
 class Environment(abc.ABC):
     """A differentiable scene: a batch of parameter vectors in, losses and gradients out.
 
-    A scene is written by deriving from this class: the class attributes say what it is, `_evaluate` simulates. An
-    environment is an `Objective`, and a torch function: `env(x)` returns losses, shape (batch,), that can be
-    differentiated. `fidelity` is a name from `fidelities`, the first unless said otherwise, or a record of one's own;
-    `device` is auto, cpu or cuda; `engine` is one of `engines`; options are those of the class's `Options`. On a GPU
-    two runs may differ by round-off, because atomic adds come in any order, unless `deterministic` says otherwise.
+    A scene is written by deriving from this class: the class attributes say what it is, `_evaluate` simulates; needed
+    are `space` and `_evaluate`. An environment is an `Objective`, and a torch function: `env(x)` returns losses, shape
+    (batch,), that can be differentiated. `fidelity` is a name from `fidelities`, the first unless said otherwise, or a
+    record of one's own; `device` is auto, cpu or cuda; `engine` is one of `engines`; options are those of the class's
+    `Options`. On a GPU two runs may differ by round-off, because atomic adds come in any order, unless `deterministic`
+    says otherwise.
     """
 
-    name: ClassVar[str]
-    fidelities: ClassVar[Mapping[str, Fidelity]]
+    name: ClassVar[str]  # of a class that says none, its own in lower case
+    fidelities: ClassVar[Mapping[str, Fidelity]] = {"default": Fidelity("default", dt=0.0, precision="float64")}
     examples: ClassVar[Mapping[str, tuple[float, ...]]] = {}
     Options: ClassVar[type[Any]] = NoOptions
     devices: ClassVar[tuple[str, ...]] = ("cpu",)
@@ -75,9 +77,17 @@ class Environment(abc.ABC):
     control_step: ClassVar[float] = 0.0  # how long a control is held [s], in whole time steps; 0 where any step does
 
     space: ParameterSpace
+    _named: ClassVar[bool] = False
     _solvers: Pool[Any] | None = None  # a scene on an engine sets both in `_setup`: what simulates,
     _capacity = 1 << 20  # and how many rows it takes at once,
     _most_rows = 1 << 20  # at most
+
+    def __init_subclass__(cls, **how: Any) -> None:
+        super().__init_subclass__(**how)
+        if "name" in vars(cls):
+            cls._named = True
+        elif not cls._named:
+            cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", cls.__name__).lower()
 
     def __init__(
         self,
@@ -98,6 +108,10 @@ class Environment(abc.ABC):
         self.options = read_options(self.name, self.Options, options)
         self._stop = threading.Event()
         self._setup()
+        if not isinstance(getattr(self, "space", None), ParameterSpace):
+            raise ValueError(
+                f"{self.name} needs its parameters: give the class a ParameterSpace as `space`, or set one in `_setup`"
+            )
 
     @final
     def identity(self) -> dict[str, Any]:
@@ -133,6 +147,9 @@ class Environment(abc.ABC):
     @final
     def __call__(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"]:
         """Return losses that torch can differentiate."""
+        if not isinstance(x, Tensor) or not x.is_floating_point():
+            kind = f"a tensor of {x.dtype}" if isinstance(x, Tensor) else type(x).__name__
+            raise ValueError(f"{self.name}(x) takes a floating-point tensor, and evaluate(x) any numbers; got {kind}")
         losses: Tensor = _Bridge.apply(x, self)  # type: ignore[no-untyped-call]
         return losses
 
@@ -259,7 +276,15 @@ class Environment(abc.ABC):
 
     def _simulate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         with torch.set_grad_enabled(grad):  # torch switches it off around `_Bridge.forward`; threads have their own
-            return self._evaluate(x, grad=grad)
+            found = self._evaluate(x, grad=grad)
+        if not isinstance(found, Evaluation):
+            raise ValueError(
+                f"{self.name}._evaluate must return an Evaluation; got {type(found).__name__}. "
+                "Evaluation.judged(losses, gradients) makes one"
+            )
+        if grad and found.grad is None:
+            raise ValueError(f"{self.name}._evaluate was asked for gradients (grad=True) and returned none")
+        return found
 
     def _setup(self) -> None:  # noqa: B027 -- a scene that shares nothing needs none
         """Prepare what all evaluations share; sets `space` unless the class does."""
@@ -307,8 +332,7 @@ class Environment(abc.ABC):
                 raise
 
     def _checked(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch dim"]:
-        if not isinstance(x, Tensor) or not x.is_floating_point():
-            raise ValueError(f"{self.name} takes a floating-point tensor; got {_kind(x)}")
+        x = as_tensor(x, self.name)
         if x.ndim != 2 or x.shape[1] != self.space.dim:
             raise ValueError(
                 f"{self.name} takes {self.space.dim} parameters, x of shape (batch, {self.space.dim}); "
@@ -317,7 +341,11 @@ class Environment(abc.ABC):
         if not bool(x.isfinite().all()):
             row = int((~x.isfinite().all(dim=1)).nonzero()[0])
             raise ValueError(f"{self.name} takes finite parameters; row {row} of x holds {x[row].tolist()}")
-        return x.detach().to("cpu", torch.float64)
+        return x
+
+    def _row(self, x: Float[Tensor, " dim"]) -> Float[Tensor, "one dim"]:
+        """Return a single point, as `episode` takes it, as a batch of one row."""
+        return self._checked(as_tensor(x, self.name)[None])
 
     def _named_fidelity(self, fidelity: str | Fidelity | None) -> Fidelity:
         if isinstance(fidelity, Fidelity):
@@ -353,10 +381,6 @@ class _Bridge(torch.autograd.Function):
     def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor, None]:
         (grad,) = ctx.saved_tensors
         return grad_loss[:, None] * grad, None
-
-
-def _kind(x: object) -> str:
-    return f"a tensor of {x.dtype}" if isinstance(x, Tensor) else type(x).__name__
 
 
 def _cuda() -> bool:

@@ -26,7 +26,10 @@ VIEW = View((-0.8, 0.0, -0.7), (2.6, 5.1, 0.7), eye=(0.1, 0.25, 1.0))
 
 @dataclass(frozen=True)
 class BounceOptions(EpisodeOptions):
-    """Contact: stiffness `ke` [N/m], damping `kd` and viscous friction `kf` [N s/m], Coulomb's `mu`; target [m]."""
+    """Contact: stiffness `ke` [N/m], damping `kd` and viscous friction `kf` [N s/m], Coulomb's `mu`.
+
+    The target is at (`target_x`, `target_y`, `target_z`) [m].
+    """
 
     ke: float = 1e4
     kd: float = 10.0
@@ -109,7 +112,7 @@ class Bounce(Environment):
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return the ball's flight."""
-        (row,) = self._checked(x[None])
+        (row,) = self._row(x)
         with self._solvers.lend() as solver:
             flight = solver.run(torch.tensor(START), row[None]).double().cpu()
         time = self.fidelity.dt * torch.arange(self.steps + 1, dtype=torch.float64)

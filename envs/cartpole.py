@@ -38,7 +38,7 @@ UPRIGHT = (
 
 @dataclass(frozen=True)
 class CartpoleOptions(EpisodeOptions):
-    """Where the tip is wanted [m]; the cart starts at (0, 0), its chain hanging down to (0, -3)."""
+    """The tip is wanted at (`target_x`, `target_y`) [m]; the cart starts at (0, 0), its chain hangs down to (0, -3)."""
 
     target_x: float = 0.0
     target_y: float = 3.0
@@ -110,7 +110,7 @@ class Cartpole(Environment):
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return the cart, and the joints of the chain with its tip."""
-        controls = self._controls(self._checked(x[None]))
+        controls = self._controls(self._row(x))
         with self._solvers.lend() as solver:
             phi = _swing(solver, controls)[:, 0].cpu().double()
         joints = _joints(self._cart(controls)[0], phi)

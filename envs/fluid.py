@@ -43,7 +43,7 @@ VIEW = View((-0.2, 0.0, -0.2), (0.2, 0.42, 0.2), eye=(0.4, 0.55, 1.0))
 class FluidOptions(EpisodeOptions):
     """`goal`: high rewards a cube lifted above the tank's edge; printed is the sign the paper prints, for a low one.
 
-    `viscosity` of the syrup [Pa s], density of the cube [kg/m^3], `friction` of the ladle (Coulomb).
+    `viscosity` of the syrup [Pa s], `cube_density` [kg/m^3], `friction` of the ladle (Coulomb).
     """
 
     goal: Literal["high", "printed"] = "high"
@@ -122,7 +122,7 @@ class Fluid(Environment):
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return syrup, cube and ladle at the ends of control steps."""
-        tools = self.ladle(self._checked(x[None]))
+        tools = self.ladle(self._row(x))
         with self._solvers.lend() as solver:
             solver.run(tools)
             frames = solver.positions(0)

@@ -48,10 +48,19 @@ def describe(declared: type[Any]) -> str:
     return ", ".join(f"{o.name}={o.wanted} (default {o.default})" for o in _declared(declared).values())
 
 
-def explain(declared: type[Any]) -> str:
-    """Return what the options mean, in the words of the classes that declare them."""
-    kinds = [kind for kind in declared.__mro__ if dataclasses.is_dataclass(kind)]
-    return "\n\n".join(inspect.cleandoc(kind.__doc__) for kind in kinds if kind.__doc__)
+def in_full(declared: type[Any]) -> str:
+    """Return every option on a line of its own, then what they mean, in the words of all classes that declare them."""
+    known = _declared(declared).values()
+    if not known:
+        return "options: none"
+    lines = "\n".join(f"  {option.name}={option.wanted} (default {option.default})" for option in known)
+    return f"options:\n{lines}\n\n{_explained(declared)}".rstrip()
+
+
+def _explained(declared: type[Any]) -> str:
+    """Return the docstrings of a class and of those it is derived from, but for those that dataclasses make up."""
+    docs = [(kind.__name__, kind.__doc__ or "") for kind in declared.__mro__ if dataclasses.is_dataclass(kind)]
+    return "\n\n".join(inspect.cleandoc(doc) for name, doc in docs if doc and not doc.startswith(f"{name}("))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -32,7 +32,7 @@ VIEW = View((0.0, -0.8, -0.5), (WIDTH, HEIGHT, 0.5), eye=(0.08, 0.1, 1.0), groun
 class PinballOptions(EpisodeOptions):
     """`contacts`: impact follows the ball to the time of impact, step reflects it in fixed steps, whose gradients err.
 
-    `restitution` and Coulomb's `friction` of walls and bars; where the ball is wanted [m].
+    `restitution` and Coulomb's `friction` of walls and bars; the ball is wanted at (`goal_x`, `goal_y`) [m].
     """
 
     contacts: Literal["impact", "step"] = "impact"
@@ -109,7 +109,7 @@ class Pinball(Environment):
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return the ball at the ends of steps, and both ends of every bar."""
-        (row,) = self._checked(x[None])
+        (row,) = self._row(x)
         with self._solvers.lend() as solver:
             solver.run(row[None], self._start)
             flight = _in_space(solver.at_steps("x", 0).double().cpu())

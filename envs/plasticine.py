@@ -36,7 +36,11 @@ REACH = 0.1  # what a policy measures lengths by [m]
 
 @dataclass(frozen=True)
 class PlasticineOptions(EpisodeOptions):
-    """`loss` of the final frame, or summed over all control steps; and what each of its terms weighs."""
+    """`loss` is of the final frame, or summed over all control steps.
+
+    `density`, `sdf` and `contact` are the weights of its terms: the body's density against the target's, its distance
+    from the target, and the distance of the tools from it.
+    """
 
     loss: Literal["final", "sum"] = "final"
     density: float = 10.0
@@ -126,12 +130,12 @@ class Plasticine(Environment):
     def end(self, x: Float[Tensor, " dim"]) -> Float[Tensor, "particle 3"]:
         """Return where particles are at the end of the episode at one point [m]."""
         with self._solvers.lend() as stage:
-            end: Tensor = stage.solver.run(self.tools(self._checked(x[None])))[0].double().cpu()
+            end: Tensor = stage.solver.run(self.tools(self._row(x)))[0].double().cpu()
         return end
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return plasticine and tools at the ends of control steps."""
-        tools = self.tools(self._checked(x[None]))
+        tools = self.tools(self._row(x))
         with self._solvers.lend() as stage:
             stage.solver.run(tools)
             frames = stage.solver.positions(0)

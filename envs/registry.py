@@ -4,33 +4,42 @@ Another package registers its own by an entry point of the group `gradscape.envi
 
     [project.entry-points."gradscape.environments"]
     my-arm = "my_package.arm:Arm"
+
+A program or a notebook registers a class by `register`, and the command takes a class from a file as `FILE.py:Class`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import cache
-from importlib import import_module
 from importlib.metadata import entry_points
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from .importing import IN_FILE, module_of
 
 if TYPE_CHECKING:
     from .base import Environment, Fidelity
 
+Kind = TypeVar("Kind", bound="Environment")
 GROUP = "gradscape.environments"
 SCENE = ("draft", "standard", "reference")
 
 
 @dataclass(frozen=True)
 class Entry:
-    """Say what an environment is without importing it; `target` is "module:Class"."""
+    """Say what an environment is without importing it.
+
+    `target` is "module:Class", "FILE.py:Class" or the class itself. What another package's entry point cannot say is
+    empty; `completed` asks the class.
+    """
 
     name: str
-    target: str
-    dim: str = "?"
-    parameters: str = "?"
-    model: str = "?"
+    target: str | type[Environment]
+    dim: str = ""
+    parameters: str = ""
+    model: str = ""
     fidelities: tuple[str, ...] = ()
 
 
@@ -144,23 +153,101 @@ def entries() -> dict[str, Entry]:
     return found
 
 
+def register(kind: type[Kind]) -> type[Kind]:
+    """Let an environment's class be found by its `name` in this process, and return it (so it can be a decorator).
+
+    Raises ValueError where another environment has that name. A class that is run again, as in a notebook, takes the
+    place of the earlier one.
+    """
+    from .base import Environment
+
+    if not (isinstance(kind, type) and issubclass(kind, Environment)):
+        raise ValueError(f"register takes a class derived from Environment; got {kind!r}")
+    taken = entries().get(kind.name)
+    if taken and not (isinstance(taken.target, type) and taken.target.__qualname__ == kind.__qualname__):
+        raise ValueError(
+            f"an environment called {kind.name!r} exists already ({taken.model}); give the class another name"
+        )
+    entries()[kind.name] = Entry(kind.name, kind, model="registered by this program")
+    return kind
+
+
+def completed(entry: Entry) -> Entry:
+    """Return an entry with what its class says of itself, which is imported for that."""
+    if entry.dim:
+        return entry
+    try:
+        env = make(entry.name, device="cpu")
+    except Exception as error:  # another package's: whatever it raises, the others are to be listed
+        return replace(entry, model=f"{entry.model}; it cannot be made: {error}")
+    labels = ", ".join(env.space.labels[:3]) + (", ..." if env.space.dim > 3 else "")
+    about = " ".join(env.about().partition("\n\n")[0].split()) or "says nothing of itself"
+    return replace(
+        entry,
+        dim=str(env.space.dim),
+        parameters=labels,
+        model=f"{about} ({entry.model})",
+        fidelities=tuple(env.fidelities),
+    )
+
+
 def environment_class(name: str) -> type[Environment]:
-    """Import and return the class of a registered environment."""
+    """Import and return the class of a registered environment, or of `FILE.py:Class`, which is registered by that."""
+    if IN_FILE.fullmatch(name):
+        return _of_file(name)
     known = entries()
     if name not in known:
         close = get_close_matches(name, known, n=1)
         hint = f"; did you mean {close[0]}?" if close else ";"
         raise ValueError(f"no environment is called {name!r}{hint} `landscape envs` lists all {len(known)}")
-    module, _, attribute = known[name].target.partition(":")
+    target = known[name].target
+    if isinstance(target, type):
+        return target
+    module, _, attribute = target.rpartition(":")
     try:
-        found: type[Environment] = getattr(import_module(module), attribute)
+        found: type[Environment] = getattr(module_of(module), attribute)
     except (ImportError, AttributeError) as error:
-        raise ValueError(f"{name} is registered as {known[name].target}, which cannot be imported: {error}") from error
+        raise ValueError(f"{name} is registered as {target}, which cannot be imported: {error}") from error
     return found
 
 
+def source_of(env: Environment) -> str | type[Environment]:
+    """Return what makes such an environment in another process, where not all that is registered here may be."""
+    entry = entries().get(env.name)
+    if entry is None or isinstance(entry.target, type):
+        return type(env)
+    return entry.target if IN_FILE.fullmatch(entry.target) else env.name
+
+
+def _of_file(text: str) -> type[Environment]:
+    """Import a class from a file and register it under its name."""
+    from .base import Environment
+
+    path, _, attribute = text.rpartition(":")
+    file = Path(path).resolve()
+    if not file.is_file():
+        raise ValueError(f"there is no file {path} to take {attribute} from")
+    module = module_of(str(file))
+    kind = getattr(module, attribute, None)
+    if not (isinstance(kind, type) and issubclass(kind, Environment)):
+        there = [one.__name__ for one in vars(module).values() if _own(one, module.__name__)]
+        raise ValueError(f"{path} holds no environment {attribute}; it has {', '.join(there) or 'none'}")
+    taken = entries().get(kind.name)
+    target = f"{file}:{attribute}"
+    if taken and taken.target != target:
+        raise ValueError(f"{text} is called {kind.name!r}, and so is {taken.target}; give the class another name")
+    entries()[kind.name] = Entry(kind.name, target, model=f"of {path}")
+    return kind
+
+
+def _own(value: object, module: str) -> bool:
+    from .base import Environment
+
+    return isinstance(value, type) and issubclass(value, Environment) and value.__module__ == module
+
+
 def make(
-    name: str,
+    name: str | type[Environment],
     *,
     fidelity: str | Fidelity | None = None,
     device: str = "auto",
@@ -168,6 +255,10 @@ def make(
     deterministic: bool = False,
     **options: Any,
 ) -> Environment:
-    """Make a registered environment; `fidelity` defaults to its cheapest, `device` is auto, cpu or cuda."""
+    """Make an environment by its registered name, by FILE.py:Class, or of a class.
+
+    `fidelity` defaults to its cheapest, `device` is auto, cpu or cuda.
+    """
+    kind = name if isinstance(name, type) else environment_class(name)
     settings: dict[str, Any] = {"fidelity": fidelity, "device": device, "engine": engine}
-    return environment_class(name)(**settings, deterministic=deterministic, **options)
+    return kind(**settings, deterministic=deterministic, **options)

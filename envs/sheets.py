@@ -79,7 +79,7 @@ class SheetScene(Environment):
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return the sheet and its surroundings every hundredth of a second, and at the end."""
-        drive = self._drive(self._checked(x[None]))
+        drive = self._drive(self._row(x))
         shown = torch.arange(0, self.steps + 1, max(1, round(FRAME / self.fidelity.dt)))
         if shown[-1] != self.steps:
             shown = torch.cat([shown, shown.new_tensor([self.steps])])
@@ -92,7 +92,7 @@ class SheetScene(Environment):
     def end(self, x: Float[Tensor, " dim"]) -> Float[Tensor, "vertex 3"]:
         """Return where vertices are at the end of the episode at one point [m]."""
         with self._solvers.lend() as solver:
-            end: Tensor = solver.run(*self._drive(self._checked(x[None])).detached())[-1, 0].double().cpu()
+            end: Tensor = solver.run(*self._drive(self._row(x)).detached())[-1, 0].double().cpu()
         return end
 
     @abc.abstractmethod

@@ -38,7 +38,7 @@ class Figure:
 
     def command(self, device: str) -> str:
         """Return the command that makes this slice alone."""
-        if len(self.dims) == 1:
+        if len(self.dims) == 1 and self.env == "bounce":
             axis = ["bounce", "--axis", "xyz"[self.dims[0]]]
         else:
             axis = ["slice", self.env, "--dims", *map(str, self.dims)]
@@ -92,6 +92,6 @@ def _figure(path: Path, table: dict[str, Any]) -> Figure:
     for name, kind in KINDS.items():
         if not isinstance(value := table.get(name, kind()), kind):
             raise ValueError(f"{path}: figure {table['id']} has {name} {value!r}, which is no {kind.__name__}")
-    if len(table["dims"]) not in (1, 2) or (len(table["dims"]) == 1 and table["env"] != "bounce"):
-        raise ValueError(f"{path}: figure {table['id']} needs two dims, or one of bounce; got {table['dims']}")
+    if len(table["dims"]) not in (1, 2):
+        raise ValueError(f"{path}: figure {table['id']} needs one dimension or two; got {table['dims']}")
     return Figure(**(table | {"dims": tuple(table["dims"])}))

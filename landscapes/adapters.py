@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,33 +13,49 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .objective import Evaluation, Objective, evaluated_inside, name_of
-from .space import ParameterSpace
+from .space import ParameterSpace, as_tensor
 
 TorchFunction = Callable[[Tensor], Tensor]
-Losses = NDArray[np.floating]
-NumpyFunction = Callable[[NDArray[np.float64]], Losses | tuple[Losses, Losses]]
+NumpyFunction = Callable[[NDArray[np.float64]], Any]
 
 
-def from_torch(fn: TorchFunction, space: ParameterSpace, *, name: str | None = None) -> Objective:
+def from_torch(
+    fn: TorchFunction,
+    space: ParameterSpace,
+    *,
+    name: str | None = None,
+    loss_unit: str = "",
+    vectorized: bool = True,
+) -> Objective:
     """Make an objective of a torch function from points, shape (batch, dim), to losses, shape (batch,).
 
-    Gradients come by autograd. Each loss may depend on its own row only.
+    Gradients come by autograd. Each loss may depend on its own row only. With `vectorized=False` the function takes a
+    single point, shape (dim,), and returns one loss.
     """
-    return _TorchObjective(fn, space, name or _name(fn))
+    return _TorchObjective(fn if vectorized else _Pointwise(fn, _stacked), space, name or _name(fn), loss_unit)
 
 
 def from_numpy(
-    fn: NumpyFunction, space: ParameterSpace, *, name: str | None = None, differences: float | None = None
+    fn: NumpyFunction,
+    space: ParameterSpace,
+    *,
+    name: str | None = None,
+    loss_unit: str = "",
+    differences: float | None = None,
+    vectorized: bool = True,
 ) -> Objective:
     """Make an objective of a numpy function from points, shape (batch, dim), to losses, shape (batch,).
 
     The function may return (losses, gradients) instead, gradients of shape (batch, dim). If it returns losses only,
     `differences` makes gradients by central differences with that step, a fraction of each parameter's range; at the
-    bounds they are one-sided, since the function is not asked beyond them.
+    bounds they are one-sided, since the function is not asked beyond them. With `vectorized=False` the function takes a
+    single point, shape (dim,), and returns one loss, or that and its gradient.
     """
     if differences is not None and not differences > 0:
         raise ValueError(f"from_numpy takes differences as a positive fraction of the bounds; got {differences}")
-    return _NumpyObjective(fn, space, name or _name(fn), differences)
+    return _NumpyObjective(
+        fn if vectorized else _Pointwise(fn, np.array), space, name or _name(fn), loss_unit, differences
+    )
 
 
 def within_box(objective: Objective) -> Objective:
@@ -48,10 +64,32 @@ def within_box(objective: Objective) -> Objective:
 
 
 @dataclass(frozen=True)
+class _Pointwise:
+    """Call a function of one point at each of a batch; what it raises says at which."""
+
+    fn: Callable[[Any], Any]
+    join: Callable[[Sequence[Any]], Any]
+
+    def __call__(self, x: Any) -> Any:
+        found = [self._at(point) for point in x]
+        if found and isinstance(found[0], tuple):
+            return tuple(self.join(column) for column in zip(*found, strict=True))
+        return self.join(found)
+
+    def _at(self, point: Any) -> Any:
+        try:
+            return self.fn(point)
+        except Exception as error:
+            error.add_note(f"at x = {point.tolist()}")
+            raise
+
+
+@dataclass(frozen=True)
 class _TorchObjective:
     fn: TorchFunction
     space: ParameterSpace
     name: str
+    loss_unit: str
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
         """Return losses, and gradients if asked, at points `x` in the parameters' own units."""
@@ -79,6 +117,7 @@ class _NumpyObjective:
     fn: NumpyFunction
     space: ParameterSpace
     name: str
+    loss_unit: str
     differences: float | None
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
@@ -97,7 +136,8 @@ class _NumpyObjective:
         _check_shape(np.shape(loss), (len(x),), "losses", self.name)
         if gradient is not None:
             _check_shape(np.shape(gradient), tuple(x.shape), "gradients", self.name)
-        return _tensor(loss), None if gradient is None else _tensor(gradient)
+        slope = None if gradient is None else as_tensor(gradient, f"the gradient of {self.name}")
+        return as_tensor(loss, f"the loss of {self.name}"), slope
 
     def _differences(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch dim"]:
         if self.differences is None:
@@ -133,20 +173,24 @@ class _BoxedObjective:
         return evaluated_inside(self.objective, _points(x, self.space, name_of(self.objective)), grad=grad)
 
 
+def _stacked(found: Sequence[Any]) -> Any:
+    """Return losses of single points as one tensor; what is none is returned for the objective to refuse."""
+    return torch.stack(list(found)) if all(isinstance(one, Tensor) for one in found) else found[0]
+
+
 def _name(fn: Callable[..., object]) -> str:
     return str(getattr(fn, "__name__", type(fn).__name__))
 
 
-def _tensor(values: Losses) -> Tensor:
-    return torch.tensor(np.asarray(values), dtype=torch.float64)
-
-
-def _points(x: Tensor, space: ParameterSpace, name: str) -> Float[Tensor, "batch dim"]:
-    if x.ndim != 2 or x.shape[1] != space.dim:
-        raise ValueError(f"{name} takes {space.dim} parameters; got x of shape {tuple(x.shape)}")
-    return x.detach().to("cpu", torch.float64)
+def _points(x: object, space: ParameterSpace, name: str) -> Float[Tensor, "batch dim"]:
+    points = as_tensor(x, name)
+    if points.ndim != 2 or points.shape[1] != space.dim:
+        raise ValueError(f"{name} takes {space.dim} parameters; got x of shape {tuple(points.shape)}")
+    return points
 
 
 def _check_shape(got: tuple[int, ...], wanted: tuple[int, ...], what: str, name: str) -> None:
     if got != wanted:
-        raise ValueError(f"{name} must return {what} of shape {wanted}; got shape {got}")
+        raise ValueError(
+            f"{name} must return {what} of shape {wanted}; got shape {got} (a function of one point: vectorized=False)"
+        )

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .space import ParameterSpace
+from .space import ParameterSpace, as_tensor
 
 Bound = float | Sequence[float]
 
@@ -75,7 +75,7 @@ class Plane:
             raise ValueError(
                 f"a slice varies one or two different parameters; got {', '.join(map(str, dims)) or 'none'}"
             )
-        origin = origin.detach().to("cpu", torch.float64)
+        origin = as_tensor(origin, "a slice's point")
         if origin.shape != (space.dim,):
             raise ValueError(f"a slice goes through a point of shape ({space.dim},); got shape {tuple(origin.shape)}")
         lower, upper = _window(space.lower[numbers], space.upper[numbers], origin[numbers], extent)
@@ -96,7 +96,7 @@ class Plane:
         labels: Sequence[str] | None = None,
     ) -> Plane:
         """Span a plane by any directions, kept as given: coordinate 1 is one whole `directions[i]` from `origin`."""
-        origin, directions = (t.detach().to("cpu", torch.float64) for t in (origin, directions))
+        origin, directions = (as_tensor(t, "a slice's point and directions") for t in (origin, directions))
         rank = len(directions)
         lower, upper = (_bound(bound, rank) for bound in extent)
         named = labels or [f"along direction {axis + 1}" for axis in range(rank)]
@@ -117,7 +117,7 @@ class Plane:
         the projected points and a `margin`, as a fraction of their range. Parameters count in their own units: where
         these differ wildly, run it on a space of comparable ones.
         """
-        points = points.detach().to("cpu", torch.float64)
+        points = as_tensor(points, "a principal plane")
         if points.ndim != 2 or len(points) <= rank:
             raise ValueError(
                 f"{rank} principal directions need more than {rank} points; got shape {tuple(points.shape)}"

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class ParameterSpace:
     """Name the parameters of an objective, their units and their bounds.
 
-    `lower` and `upper` become float64, shape (dim,), in the parameters' own units. The bounds say where a landscape is
-    looked at, and an objective is not asked beyond them unless it invites that (`Objective`).
+        ParameterSpace({"kp": (0, 2, "N/m"), "kd": (0, 0.5)})
+        ParameterSpace(["kp", "kd"], lower=[0, 0], upper=[2, 0.5], units=["N/m", ""])
+
+    `lower` and `upper`, numbers of any kind, become float64, shape (dim,), in the parameters' own units, which are none
+    where they are not given. The bounds say where a landscape is looked at, and an objective is not asked beyond them
+    unless it invites that (`Objective`). Raises ValueError where names, bounds or units do not belong together.
     """
 
     names: tuple[str, ...]
@@ -23,17 +29,38 @@ class ParameterSpace:
     upper: Float[Tensor, " dim"]
     units: tuple[str, ...]
 
-    def __post_init__(self) -> None:
-        dim = len(self.names)
-        object.__setattr__(self, "lower", self.lower.detach().to("cpu", torch.float64))
-        object.__setattr__(self, "upper", self.upper.detach().to("cpu", torch.float64))
-        for field, size in (("units", len(self.units)), ("lower", self.lower.numel()), ("upper", self.upper.numel())):
-            if size != dim:
-                raise ValueError(f"ParameterSpace has {dim} names; {field} must have as many, got {size}")
-        if len(set(self.names)) != dim:
-            raise ValueError(f"ParameterSpace needs distinct names; got {', '.join(self.names)}")
-        if not bool((self.lower < self.upper).all()):
-            raise ValueError("ParameterSpace needs lower < upper in every dimension")
+    def __init__(
+        self,
+        names: Sequence[str] | Mapping[str, Sequence[Any]],
+        lower: Sequence[float] | Float[Tensor, " dim"] | None = None,
+        upper: Sequence[float] | Float[Tensor, " dim"] | None = None,
+        units: Sequence[str] | None = None,
+    ) -> None:
+        if isinstance(names, Mapping):
+            if not (lower is None and upper is None and units is None):
+                raise ValueError("ParameterSpace takes names with their bounds and units, or each of them; got both")
+            lower, upper, units = _columns(names)
+        if isinstance(names, str) or lower is None or upper is None:
+            raise ValueError(f"ParameterSpace takes names, lower and upper bounds; got {names!r}, {lower}, {upper}")
+        names = tuple(map(str, names))
+        units = ("",) * len(names) if units is None else units
+        for field, value in (("names", names), ("units", tuple(map(str, units)))):
+            object.__setattr__(self, field, value)
+        for field, bound in (("lower", lower), ("upper", upper)):
+            object.__setattr__(self, field, as_tensor(bound, f"ParameterSpace's {field}"))
+        self._check()
+
+    def _check(self) -> None:
+        for field, shape in (("units", (len(self.units),)), ("lower", self.lower.shape), ("upper", self.upper.shape)):
+            if tuple(shape) != (self.dim,):
+                raise ValueError(
+                    f"ParameterSpace has {self.dim} names; {field} must have as many, got shape {tuple(shape)}"
+                )
+        if len(set(self.names)) != self.dim or not self.dim:
+            raise ValueError(f"ParameterSpace needs distinct names; got {', '.join(self.names) or 'none'}")
+        for name, low, high in zip(self.names, self.lower.tolist(), self.upper.tolist(), strict=True):
+            if not (low < high and np.isfinite(high - low)):
+                raise ValueError(f"ParameterSpace needs finite lower < upper for {name}; got {low:g} to {high:g}")
 
     @classmethod
     def box(cls, names: Sequence[str], lower: float, upper: float, unit: str = "") -> ParameterSpace:
@@ -81,3 +108,31 @@ class ParameterSpace:
         if not 0 <= number < self.dim:
             raise ValueError(f"parameters are numbered 0 to {self.dim - 1}; got {number}")
         return number
+
+
+def as_tensor(x: object, who: str) -> Float[Tensor, "*shape"]:
+    """Return numbers, whole or floating, of a tensor, an array or lists as a float64 tensor on the CPU.
+
+    Raises ValueError, which says `who` takes them, for what is no number.
+    """
+    if isinstance(x, Tensor):
+        if x.is_complex() or x.dtype == torch.bool:
+            raise ValueError(f"{who} takes numbers; got a tensor of {x.dtype}")
+        return x.detach().to("cpu", torch.float64)
+    try:
+        values = np.asarray(x)
+        if values.dtype.kind not in "iuf":
+            raise TypeError(f"an array of {values.dtype}" if values.ndim else type(x).__name__)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{who} takes numbers, as a tensor, an array or lists; got {error}") from None
+    return torch.tensor(np.ascontiguousarray(values, dtype=np.float64))
+
+
+def _columns(named: Mapping[str, Sequence[Any]]) -> tuple[list[float], list[float], list[str]]:
+    """Return lower bounds, upper bounds and units of parameters given as name: (lower, upper) or (..., unit)."""
+    for name, bounds in named.items():
+        if isinstance(bounds, str) or not hasattr(bounds, "__len__") or len(bounds) not in (2, 3):
+            raise ValueError(f"parameter {name!r} needs (lower, upper) or (lower, upper, unit); got {bounds!r}")
+    rows = [(*bounds, "")[:3] for bounds in named.values()]
+    lower, upper, units = (list(column) for column in zip(*rows, strict=True)) if rows else ([], [], [])
+    return lower, upper, units

@@ -34,7 +34,7 @@ class BO(Optimizer):
 
 @dataclass(frozen=True)
 class BODescentsOptions(SurrogateOptions, DescentOptions):
-    """Those of the process and of each descent."""
+    """The options of the process and of each descent."""
 
 
 class BODescents(Optimizer):

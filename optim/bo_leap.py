@@ -17,7 +17,7 @@ from .surrogate import Surrogate, SurrogateOptions
 
 @dataclass(frozen=True)
 class BOLeapOptions(SurrogateOptions, DescentOptions):
-    """Those of the process and of each descent, and how the semi-local search goes.
+    """How the semi-local search goes.
 
     Populations of `population` points (K) are drawn with step size `sigma` at first, in the box scaled to [-1, 1]; the
     `best` of them with the least losses make the mean that descends. No new population is drawn once a semi-local

@@ -82,7 +82,7 @@ class Descent:
 
 @dataclass(frozen=True)
 class DescentsOptions(DescentOptions):
-    """Those of each descent; `together` descents are evaluated as one batch, 1 for one after the other."""
+    """`together` descents are evaluated as one batch, 1 for one after the other."""
 
     together: int = 4
 

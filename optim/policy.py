@@ -42,7 +42,9 @@ Numbers = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class PPOOptions:
-    """`episodes` of a rollout, shared by so many `minibatches`; `epochs` over them; `learning_rate`; `discount`.
+    """`episodes` of a rollout, shared by so many `minibatches`; `epochs` over them.
+
+    `learning_rate` of policy and value, `discount` of later rewards.
 
     SB3's rollout of 2048 steps would outlast 1000 episodes with one decision and make three updates of 1000 with five.
     Its learning rate is 3e-4, with which 600 episodes in a bowl (2-D) came to a mean loss of 2.4; they come to 1.5.
@@ -59,8 +61,9 @@ class PPOOptions:
 class SACOptions:
     """`warmup`: random episodes before the policy plays; then a gradient step on a `batch` for every transition.
 
-    `memory`: transitions that are kept; the default is all of 1000 episodes with 100 decisions. SB3's learning rate is
-    3e-4, with which 600 episodes of five decisions came to a mean loss of 1.3; they come to 0.3.
+    `learning_rate` of policy and critics, `discount` of later rewards. `memory`: transitions that are kept; the default
+    is all of 1000 episodes with 100 decisions. SB3's learning rate is 3e-4, with which 600 episodes of five decisions
+    came to a mean loss of 1.3; they come to 0.3.
     """
 
     warmup: int = 20

@@ -21,6 +21,7 @@ _HOMES = {
     "Episode": "envs.base",
     "Fidelity": "envs.base",
     "make": "envs.registry",
+    "register": "envs.registry",
 }
 
 __all__ = sorted([*_HOMES, "__version__"])

@@ -14,6 +14,7 @@ from rich.table import Table
 
 from .console import duration, read_settings, size
 from .envs.registry import environment_class, make
+from .tables import table
 
 if TYPE_CHECKING:
     from .envs.base import Environment
@@ -88,28 +89,28 @@ def _subject(report: dict[str, Any]) -> str:
 
 
 def _rates(report: dict[str, Any]) -> Table:
-    table = Table("batch", "engine", "episodes/s", "with gradient", "work/s", "with gradient", "gradient / forward")
+    found = table("batch", "engine", "episodes/s", "with gradient", "work/s", "with gradient", "gradient / forward")
     for row in report["rates"]:
         rates = [row[way] for way in WAYS]
         cells = [str(row["batch"]), row["engine"]]
         cells += [f"{rate['episodes_per_second']:.3g}" for rate in rates]
         cells += [f"{rate['work_per_second']:.3g}" for rate in rates]
-        table.add_row(*cells, f"{row['gradient_costs']:.2f}")
-    return table
+        found.add_row(*cells, f"{row['gradient_costs']:.2f}")
+    return found
 
 
 def _kernels(kernels: dict[str, Any]) -> Table:
     """Return the kernels as a table, slowest with gradient first, and what is spent outside them."""
-    table = Table(f"kernel, batch {kernels['forward']['batch']}", "forward", "", "with gradient", "")
+    shown = table(f"kernel, batch {kernels['forward']['batch']}", "forward", "", "with gradient", "")
     found = [{row["name"]: row for row in kernels[way]["kernels"]} for way in WAYS]
     for name in dict.fromkeys([*found[1], *found[0]]):
         cells = [_spent(rows[name]["seconds"], rows[name]["share"]) if name in rows else ("", "") for rows in found]
-        table.add_row(escape(name), *cells[0], *cells[1])
-    table.add_section()
+        shown.add_row(escape(name), *cells[0], *cells[1])
+    shown.add_section()
     rest = [kernels[way]["seconds"] - sum(row["seconds"] for row in kernels[way]["kernels"]) for way in WAYS]
     cells = [_spent(seconds, seconds / kernels[way]["seconds"]) for way, seconds in zip(WAYS, rest, strict=True)]
-    table.add_row("outside kernels", *cells[0], *cells[1])
-    return table
+    shown.add_row("outside kernels", *cells[0], *cells[1])
+    return shown
 
 
 def _spent(seconds: float, share: float) -> tuple[str, str]:

@@ -20,6 +20,7 @@ from rich.text import Text
 
 from .console import duration, read_settings
 from .envs.registry import make
+from .tables import table
 
 if TYPE_CHECKING:
     from .envs.base import Environment
@@ -211,14 +212,15 @@ def _show(finding: Finding, console: Console) -> None:
 
 
 def _table(finding: Finding) -> Table:
-    table = Table("step [of the box]", box=SIMPLE)
-    for heading in ("compared", "failed", "cosine", "sign right", "relative error, median"):
-        table.add_column(heading, justify="right")
+    headings = ("compared", "failed", "cosine", "sign right", "relative error, median")
+    found = table("step [of the box]", *headings, box=SIMPLE)
+    for column in found.columns[1:]:
+        column.justify = "right"
     formats = {"compared": ".0f", "failed": ".0f", "cosine": ".4f", "sign": ".0%", "error": ".1e"}
     for row in finding.table:
         cells = ("-" if row[key] is None else format(row[key], form) for key, form in formats.items())
-        table.add_row(f"{row['step']:.0e}", *cells)
-    return table
+        found.add_row(f"{row['step']:.0e}", *cells)
+    return found
 
 
 def _conclude(found: Sequence[Finding], passed: bool, console: Console) -> None:

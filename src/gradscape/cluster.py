@@ -16,7 +16,7 @@ from dataclasses import asdict
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from .envs.registry import make
+from .envs.registry import make, source_of
 
 if TYPE_CHECKING:
     from .envs.base import Environment
@@ -67,13 +67,13 @@ def workers(scheduler: str | None, device: str) -> Iterator[Executor | None]:
 def recipe(env: Environment) -> partial[Environment]:
     """Return what makes an environment in another process, and refuses to make one of other code."""
     how = {"fidelity": env.fidelity, "device": env.device, "engine": env.engine, "deterministic": env.deterministic}
-    return partial(_made, env.name, env.code, how | asdict(env.options))
+    return partial(_made, source_of(env), env.code, how | asdict(env.options))
 
 
-def _made(name: str, code: str, settings: dict[str, Any]) -> Environment:
-    env = make(name, **settings)
+def _made(source: str | type[Environment], code: str, settings: dict[str, Any]) -> Environment:
+    env = make(source, **settings)
     if env.code != code:
-        raise ValueError(f"worker {platform.node()} has other code of {name}; install the same version of it there")
+        raise ValueError(f"worker {platform.node()} has other code of {env.name}; install the same version of it there")
     return env
 
 

@@ -25,9 +25,10 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table
 
-from .envs.registry import entries, make
+from . import __version__
+from .envs.registry import completed, entries, make
+from .tables import table
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -47,34 +48,33 @@ PACKAGES = (
 
 
 def list_environments() -> None:
-    """Print every registered environment as a table, without importing any."""
-    table = Table(title="environments", title_justify="left")
-    for heading in ("name", "dim", "parameters", "model", "fidelities"):
-        table.add_column(heading, overflow="fold")
-    for entry in entries().values():
-        row = (entry.name, entry.dim, entry.parameters, entry.model, ", ".join(entry.fidelities) or "?")
-        table.add_row(*map(escape, row))
+    """Print every registered environment as a table; of ours none is imported for that."""
+    found = table("name", "dim", "parameters", "model", "fidelities", title="environments")
+    for entry in map(completed, entries().values()):
+        row = (entry.name, entry.dim, entry.parameters, entry.model, ", ".join(entry.fidelities))
+        found.add_row(*map(escape, row))
     console = Console()
-    console.print(table)
+    console.print(found)
     console.print("`landscape envs NAME` shows one in full: bounds, options, examples, fidelities, what it models.")
 
 
 def describe_environment(name: str) -> None:
     """Print all there is to know about one environment."""
-    from .envs.options import describe, explain
+    from .envs.options import in_full
 
     env, console = make(name, device="cpu"), Console(soft_wrap=True, highlight=False)
-    said = f"{name}: {env.space.dim} parameters\n\n{env.about()}\n"
+    about = env.about() or "It says nothing of itself: its class has no docstring."
+    said = f"{env.name}: {env.space.dim} parameter{'s' if env.space.dim > 1 else ''}\n\n{about}\n"
     console.print(said, markup=False)
-    table = Table("no.", "parameter", "lower", "upper", "unit")
+    bounded = table("no.", "parameter", "lower", "upper", "unit")
     bounds = zip(env.space.lower.tolist(), env.space.upper.tolist(), strict=True)
     for number, (label, unit, (lower, upper)) in enumerate(zip(env.space.names, env.space.units, bounds, strict=True)):
-        table.add_row(str(number), escape(label), f"{lower:g}", f"{upper:g}", escape(unit))
-    console.print(table)
+        bounded.add_row(str(number), escape(label), f"{lower:g}", f"{upper:g}", escape(unit))
+    console.print(bounded)
     for fidelity in env.fidelities.values():
         console.print(f"fidelity {asdict(fidelity)}", markup=False)
     console.print(f"engines: {', '.join(env.engines)}", markup=False)
-    console.print(f"options: {describe(env.Options) or 'none'}\n{explain(env.Options)}", markup=False)
+    console.print(in_full(env.Options), markup=False)
     console.print(f"examples: {', '.join(env.examples) or 'none'}", markup=False)
 
 
@@ -82,14 +82,14 @@ def show_info() -> None:
     """Print versions and devices."""
     from .envs.engines.runtime import cores, device_names
 
-    table = Table("what", "version or name", title="gradscape " + version("gradscape"), title_justify="left")
-    table.add_row("python", sys.version.split()[0])
+    found = table("what", "version or name", title=f"gradscape {__version__}")
+    found.add_row("python", sys.version.split()[0])
     for package in PACKAGES:
-        table.add_row(package, _installed(package))
-    table.add_row("cpu", f"{cores()} cores for this process")
+        found.add_row(package, _installed(package))
+    found.add_row("cpu", f"{cores()} cores for this process")
     for name in device_names() or ["none found"]:
-        table.add_row("cuda", name)
-    Console().print(table)
+        found.add_row("cuda", escape(name))
+    Console().print(found)
 
 
 def cut(

@@ -17,7 +17,6 @@ from typing import Any, TypeVar
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from .cluster import workers
 from .console import duration, size
@@ -25,6 +24,7 @@ from .gallery.figures import DATA, Figure, chosen, read_figures
 from .gallery_episodes import Episodes
 from .gallery_measures import Reports, Tradeoffs
 from .gallery_parts import Part, Searches, Slice, State, Sweep
+from .tables import table
 
 T = TypeVar("T")
 PARTS: dict[str, type[Part]] = {
@@ -119,14 +119,12 @@ def list_figures(*, data: str | None, as_json: bool) -> None:
     if as_json:
         print(json.dumps([{"id": figure.id, "points": of.points, "done": of.done} for figure, of in found]))
         return
-    table = Table(title=f"figures in {root}", title_justify="left")
-    for heading in ("figure", "paper", "environment", "dims", "through", "data"):
-        table.add_column(heading, overflow="fold")
+    listed = table("figure", "paper", "environment", "dims", "through", "data", title=f"figures in {root}")
     for figure, of in found:
         dims = " ".join(map(str, figure.dims))
         row = (figure.id, str(figure.number or "ours"), figure.env, dims, figure.through, _said(of))
-        table.add_row(*map(escape, row))
-    Console().print(table)
+        listed.add_row(*map(escape, row))
+    Console().print(listed)
     missing = sum(not of.finished for _, of in found)
     Console(soft_wrap=True).print(
         f"{len(found) - missing} there, {missing} missing; `landscape gallery compute` samples what is missing"

@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
 
 from .console import duration, fill, size
-from .envs.registry import entries, make
+from .envs.registry import environment_class, make
 from .gallery.figures import DATA, read_figures
 from .landscapes.files import replacing, visible, write_json
 from .landscapes.identity import stored_identity
 from .measure_tables import by_environment, slices_markdown, slices_table
 from .results import SLICE, environment_of, inside
+from .tables import table
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -52,6 +52,7 @@ class Subject:
 def report(
     what: str | None,
     *,
+    source: str | None,
     everything: bool,
     fidelity: str | None,
     device: str,
@@ -63,6 +64,8 @@ def report(
 ) -> None:
     """Measure slices, say what it costs, print the numbers and leave them in files."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
+    if source:
+        environment_class(source)  # which registers it
     if (what is None) != everything:
         raise ValueError("report takes a slice's folder, an environment, or --all for every figure of the gallery")
     root = Path(data) if data else DATA
@@ -104,8 +107,7 @@ def _subjects(console: Console, what: str, root: Path, fidelity: str | None, dev
     path = Path(what)
     if path.exists():
         return [Subject(path.parent.name if path.name == SLICE else path.name, inside(path, SLICE))]
-    if what not in entries():
-        make(what)  # refuses it, with the names that come close
+    environment_class(what)  # refuses a name that does not exist, with those that come close
     figures = [figure for figure in read_figures() if figure.env == what and fidelity in (None, figure.fidelity)]
     there = [Subject(figure.id, root / figure.id / SLICE) for figure in figures]
     if found := [subject for subject in there if _finished(subject.store)]:
@@ -349,10 +351,10 @@ def _show(record: dict[str, Any], as_json: bool, folder: Path) -> None:
     from .landscapes.character import named_measures
 
     console = Console(highlight=False)
-    table = Table("measure", "value, 95 % interval", title=f"{record['name']} ({record['env']})", title_justify="left")
+    found = table("measure", "value, 95 % interval", title=f"{record['name']} ({record['env']})")
     for name, text in named_measures(record).items():
-        table.add_row(escape(name), escape(text))
-    console.print(table)
+        found.add_row(escape(name), escape(text))
+    console.print(found)
     for word in record["verdict"]["words"]:
         console.print(f"{word}: {record['verdict']['reasons'][word]}", markup=False)
     if record["paper"]:

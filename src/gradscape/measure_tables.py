@@ -9,6 +9,8 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
+from .tables import table
+
 Record = dict[str, Any]
 HEADINGS = ("slice", "minima", "flat", "jumps", "cosine", "measured", "the paper's words", "measured too")
 ENVIRONMENTS = (
@@ -33,10 +35,10 @@ def by_environment(records: Sequence[Record]) -> dict[str, Record]:
 
 def slices_table(records: Sequence[Record]) -> Table:
     """Return a row for each slice, for a terminal."""
-    table = Table(*HEADINGS, title="what landscapes are like", title_justify="left")
+    found = table(*HEADINGS, title="what landscapes are like")
     for record in records:
-        table.add_row(*map(escape, _row(record)))
-    return table
+        found.add_row(*map(escape, _row(record)))
+    return found
 
 
 def slices_markdown(records: Sequence[Record]) -> str:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from .console import fill
+from .envs.registry import environment_class
 from .landscapes.files import visible
 from .landscapes.identity import stored_identity
 from .landscapes.slice_paths import there
@@ -39,6 +40,7 @@ def overlay(
     slice_: str,
     runs: Sequence[str],
     *,
+    source: str | None,
     out: str | None,
     through: str | None,
     plane: str | None,
@@ -48,6 +50,8 @@ def overlay(
     serve: bool,
 ) -> None:
     """Draw runs over a slice, or over one cut anew for them, and say what came out."""
+    if source:
+        environment_class(source)  # which registers it
     if plane not in (None, "pca"):
         raise ValueError(f"--plane takes pca, the runs' principal plane; got {plane!r}")
     if resolution and not (through or plane):

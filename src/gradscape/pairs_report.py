@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 from rich.box import SIMPLE
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from .console import duration, provenance_of, read_settings
 from .envs.registry import make
 from .search_report import search_progress
+from .tables import table
 
 if TYPE_CHECKING:
     from .envs.base import Environment
@@ -114,15 +114,15 @@ def _announce(console: Console, env: Environment, design: Design, folder: Path) 
 def show(report: dict[str, Any], console: Console, top: int) -> None:
     """Print the highest pairs, who leads in each measure, and the command that slices the first."""
     rows, names = report["pairs"], report["parameters"]
-    table = Table("no.", "pair", *COLUMNS, box=SIMPLE)
-    table.columns[0].no_wrap = True
+    found = table("no.", "pair", *COLUMNS, box=SIMPLE)
+    found.columns[0].no_wrap = True
     for row in rows[:top]:
         cells = ["" if row[name] is None else f"{row[name]:.3f}" for name in COLUMNS]
-        table.add_row(" ".join(map(str, row["dims"])), escape(_said(row, names)), *cells)
+        found.add_row(" ".join(map(str, row["dims"])), escape(_said(row, names)), *cells)
     failed = f", {report['failed']} failed" if report["failed"] else ""
     said = f"{report['env']} · {report['fidelity']}: {report['episodes']} episodes{failed}; {len(rows)} pairs"
     console.print(said, markup=False, highlight=False)
-    console.print(table)
+    console.print(found)
     console.print(
         "sensitivity: share of the loss's variance that a slice shows on average; interaction: what both do only "
         "together; ruggedness: ups and downs along a tenth of the box, in standard deviations; disagreement of "

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from .console import duration, read_extent, read_settings, size
 from .envs.registry import environment_class, make
 from .gallery.figures import Figure, read_figures
 from .planned import Plan, of_slice, of_sweep
+from .tables import table
 from .tolerance import kept_rung
 
 if TYPE_CHECKING:
@@ -165,10 +165,10 @@ def _print(record: dict[str, Any]) -> None:
     console.print(
         f"{record['env']} · {record['fidelity']} · {record['device']} · {points} points of {what}{moving}", markup=False
     )
-    table = Table("what", "how much", "", show_header=False)
+    found = table("what", "how much", "", show_header=False)
     for name, amount, note in _rows(record):
-        table.add_row(name, amount, escape(note))
-    console.print(table)
+        found.add_row(name, amount, escape(note))
+    console.print(found)
     each = record["seconds"]["simulating"] / record["episodes"]
     console.print(f"{each:.3g} s an episode, {record['rate']}", markup=False)
 
@@ -200,14 +200,13 @@ def _print_figures(records: Sequence[dict[str, Any]], as_json: bool) -> None:
         command = shlex.join(["landscape", *sys.argv[1:]])
         print(json.dumps({"total": total, "figures": records, "command": command}))
         return
-    table = Table("figure", "episodes", "device hours", "time", "memory", "disk", "rate", title_justify="left")
+    found = table("figure", "episodes", "device hours", "time", "memory", "disk", "rate")
     for record in records:
         hours, memory = f"{record['device_hours']:.3g}", size(record["memory"]["host"])
         room = size(record["disk"]["bytes"])
         row = (str(record["episodes"]), hours, duration(record["wall"]), memory, room, record["rate"])
-        table.add_row(escape(record["figure"]), *map(escape, row))
-    console = Console()
-    console.print(table)
+        found.add_row(escape(record["figure"]), *map(escape, row))
+    Console().print(found)
     Console(soft_wrap=True, highlight=False).print(
         f"{total['slices']} slices: {total['episodes']} episodes, {total['device_hours']:.3g} device hours, "
         f"{duration(total['wall'])}, {size(total['disk']['bytes'])} on disk"

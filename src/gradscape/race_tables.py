@@ -9,6 +9,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from .tables import table
+
 ENOUGH = 10  # seeds, as the paper has
 
 
@@ -26,12 +28,11 @@ def show(figures: Mapping[str, Any], console: Console, *, claims: bool) -> None:
 def _ranks(figures: Mapping[str, Any]) -> Table:
     unit = f" [{figures['loss_unit']}]" if figures["loss_unit"] else ""
     title = f"{figures['env']} · {figures['fidelity']} · {figures['budget']} episodes · {seeds_said(figures['seeds'])}"
-    table = Table(title=title, title_justify="left")
-    for heading in ("method", "mean rank", "wins", f"best loss{unit}", "failed", "forwards", "seconds"):
-        table.add_column(escape(heading))
+    headings = ("method", "mean rank", "wins", f"best loss{unit}", "failed", "forwards", "seconds")
+    found = table(*headings, title=title)
     for rank in figures["ranks"]:
         none = f"; none with {seeds_said(rank['unsuccessful'])}" if rank["unsuccessful"] else ""
-        table.add_row(
+        found.add_row(
             rank["method"],
             escape(_ranged(rank["rank"], rank["rank_low"], rank["rank_high"], 2)),
             str(rank["wins"]),
@@ -40,7 +41,7 @@ def _ranks(figures: Mapping[str, Any]) -> Table:
             f"{rank['forwards']:.0f}",
             f"{rank['seconds']:.3g}",
         )
-    return table
+    return found
 
 
 def _beaten(figures: Mapping[str, Any]) -> dict[str, list[str]]:
@@ -65,14 +66,13 @@ def _doubt(seeds: int) -> str:
 
 def _claims(figures: Mapping[str, Any]) -> Table:
     unit = f" [{figures['loss_unit']}]" if figures["loss_unit"] else ""
-    table = Table(title="what the paper claims, and this race", title_justify="left")
-    for heading in ("claim", "this race", f"difference of mean losses{unit}", "where the paper says so"):
-        table.add_column(escape(heading), overflow="fold")
+    headings = ("claim", "this race", f"difference of mean losses{unit}", "where the paper says so")
+    shown = table(*headings, title="what the paper claims, and this race")
     for claim in figures["claims"]:
         found = claim["difference"]
         numbers = _ranged(found["mean"], found["low"], found["high"], 3) if found else ""
-        table.add_row(claim["claim"], claim["verdict"], escape(numbers), escape(claim["source"]))
-    return table
+        shown.add_row(claim["claim"], claim["verdict"], escape(numbers), escape(claim["source"]))
+    return shown
 
 
 def _ranged(value: float | None, low: float | None, high: float | None, digits: int) -> str:

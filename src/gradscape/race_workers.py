@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
+
+import cloudpickle
 
 from .cluster import recipe
 from .search_report import give_torch_one_thread, made
@@ -23,7 +24,7 @@ def search_all(
     """Let workers fill runs, and yield each with how far it came as it ends."""
     from .landscapes.spread import results
 
-    there = pickle.dumps(recipe(env))
+    there = cloudpickle.dumps(recipe(env))
     tasks = [(number, there, *_told(entry), budget, ratio) for number, entry in enumerate(entries)]
     for number, now in results(executor, _search, tasks):
         yield entries[number], now
@@ -33,7 +34,7 @@ def cost(executor: Executor, env: Environment, *, grad: bool) -> Cost:
     """Return what an episode takes a worker."""
     from .landscapes.spread import results
 
-    (found,) = results(executor, _cost, [(pickle.dumps(recipe(env)), grad)])
+    (found,) = results(executor, _cost, [(cloudpickle.dumps(recipe(env)), grad)])
     return found
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .envs.registry import make
+from .envs.registry import environment_class, make
 from .landscapes.slice_paths import SLICE as SLICE
 from .landscapes.slice_paths import there
 
@@ -35,7 +35,11 @@ def environment_of(dataset: xr.Dataset, device: str) -> Environment:
             "`landscape slice ENV` samples one"
         )
     how = {"engine": identity["engine"], "deterministic": identity["deterministic"], **identity["options"]}
-    return make(identity["objective"], fidelity=Fidelity(**identity["settings"]), device=device, **how)
+    try:
+        kind = environment_class(identity["objective"])
+    except ValueError as error:
+        raise ValueError(f"{error}; of a class in a file, say where it is: --env FILE.py:Class") from None
+    return make(kind, fidelity=Fidelity(**identity["settings"]), device=device, **how)
 
 
 def run_tables(paths: Sequence[str]) -> list[xr.Dataset]:

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
 
 from .console import chosen_fidelity, duration, provenance_of, read_settings
 from .envs.registry import make
 from .landscapes.files import visible, write_json
 from .optim.registry import METHODS, code_digest, optimizer_class
+from .tables import table
 
 if TYPE_CHECKING:
     from .envs.base import Environment
@@ -32,11 +32,11 @@ STORE, PICTURE, SUMMARY = "run.zarr", "progress.png", "summary.json"
 
 def list_methods() -> None:
     """Print every method as a table, without importing any."""
-    table = Table("name", "what it does", "needs", title="methods", title_justify="left")
+    found = table("name", "what it does", "needs", title="methods")
     for method in METHODS.values():
-        table.add_row(method.name, method.summary, f"gradscape\\[{method.extra}]" if method.extra else "")
+        found.add_row(method.name, method.summary, f"gradscape\\[{method.extra}]" if method.extra else "")
     console = Console()
-    console.print(table)
+    console.print(found)
     console.print("`landscape methods NAME` shows one in full: what it does, its options and their defaults.")
 
 
@@ -44,12 +44,11 @@ def describe_method(name: str) -> None:
     """Print all there is to know about one method."""
     import inspect
 
-    from .envs.options import describe
+    from .envs.options import in_full
 
     kind, console = optimizer_class(name), Console(soft_wrap=True, highlight=False)
     said = [METHODS[name].summary, inspect.getdoc(kind) or "", f"gradients: {'yes' if kind.needs_grad else 'no'}"]
-    said += [f"options: {describe(kind.Options) or 'none'}"]
-    said += [about] if (about := inspect.cleandoc(kind.Options.__doc__ or "")) and describe(kind.Options) else []
+    said += [in_full(kind.Options)]
     console.print(f"{name}: " + "\n\n".join(said), markup=False)
 
 

@@ -18,10 +18,10 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 from .console import duration, provenance_of, read_settings, size
 from .envs.registry import environment_class, make
+from .tables import table
 from .tolerance import keep
 
 if TYPE_CHECKING:
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from .landscapes.tradeoff import Sample
 
 RECORD, PICTURE = "tradeoff.json", "tradeoff.png"
-WIDTH = 126  # least characters of the table, for narrower terminals to wrap
 
 
 def tradeoff(
@@ -282,16 +281,14 @@ def show(report: dict[str, Any], console: Console) -> None:
     others = rows[: [row["name"] for row in rows].index(report["reference"])]  # a slower one is beaten by it
     errors = [math.inf if (off := p95(row, relative=False)) is None else off for row in others]
     best = {others[k]["name"] for k in front([row["seconds"]["with_gradient"] for row in others], errors)}
-    console = Console(file=console.file, width=max(console.width, WIDTH), highlight=False)
+    console = Console(file=console.file, width=console.width, highlight=False)
     console.print(_subject(report), markup=False)
     accuracy = ("rung", "median", "95 % of points", "rank", "cosine", "slope", "failed")
-    table = Table(*accuracy, "ms", "with grad", "memory", box=SIMPLE, padding=(0, 1), collapse_padding=True)
-    for column in table.columns:
-        column.no_wrap = True
+    found = table(*accuracy, "ms", "with grad", "memory", box=SIMPLE, padding=(0, 1), collapse_padding=True)
     for row in rows:
         mark = " *" if row["name"] in best else ""
-        table.add_row(escape(row["name"]) + mark, *_cells(row, reference=row["name"] == report["reference"]))
-    console.print(table)
+        found.add_row(escape(row["name"]) + mark, *_cells(row, reference=row["name"] == report["reference"]))
+    console.print(found)
     console.print(
         "median, 95 %: loss error as a share of the spread (95 % interval); rank: Spearman's correlation of losses; "
         "cosine, slope: of gradients, median cosine and relative error; ms an episode; * none is quicker and nearer",

@@ -159,9 +159,18 @@ def test_points_of_another_shape_or_type_are_refused(env, points):
             message = refusal(lambda call=call, x=x: call(x))
             assert message.startswith(f"{env.name} takes {dim} parameters")
             assert message.endswith(f"got x of shape {shape}")
-    whole = refusal(lambda: env.evaluate(points.long()))
-    assert whole == f"{env.name} takes a floating-point tensor; got a tensor of torch.int64"
-    assert refusal(lambda: env.evaluate(points.numpy())).endswith("got ndarray")
+    wrong = {"a tensor of torch.bool": points > 0, "a tensor of torch.complex128": points + 1j, "str": "0.5"}
+    for kind, x in wrong.items():
+        message = refusal(lambda x=x: env.evaluate(x))
+        assert message.startswith(f"{env.name} takes numbers")
+        assert message.endswith(f"got {kind}")
+    assert refusal(lambda: env(points.long())).endswith("got a tensor of torch.int64")
+
+
+def test_arrays_and_lists_are_points_too(env, points, result):
+    reversed_, swapped = points.numpy()[::-1][::-1], points.numpy().astype(">f8")
+    for x in (points.numpy(), points.tolist(), reversed_, swapped):
+        assert_same_bits(env.evaluate(x), result)
 
 
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf])

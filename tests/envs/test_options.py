@@ -1,11 +1,14 @@
 """Scene options: read from values and from text, refused with what was wanted."""
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
 import pytest
 
-from gradscape.envs.options import EpisodeOptions, NoOptions, describe, explain, read_options
+from gradscape.envs.options import EpisodeOptions, NoOptions, describe, in_full, read_options
+from gradscape.envs.registry import entries, environment_class
+from gradscape.optim.registry import METHODS, optimizer_class
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,30 @@ def test_an_episodes_horizon_stands_last_and_is_explained():
 
     assert Scene(0.1).mu == 0.1
     assert describe(Scene) == "mu=a number (default 0.5), horizon=a number above 0, at most 8 (default 1.0)"
-    assert explain(Scene).startswith("`mu`: friction.\n\n`horizon`: how long an episode lasts")
+    said = in_full(Scene)
+    assert "\n\n`mu`: friction.\n\n`horizon`: how long an episode lasts" in said
+    assert in_full(NoOptions) == "options: none"
     assert read_options("scene", Scene, {"horizon": "0.5"}).lasting(5) == 2
     assert Scene(horizon=1e-3).lasting(5) == 1
+
+
+OPTIONS = {name: environment_class(name).Options for name in entries()} | {
+    name: optimizer_class(name).Options for name in METHODS
+}
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_every_option_of_every_scene_and_method_is_listed_and_explained(name: str) -> None:
+    said = in_full(OPTIONS[name])
+    for option in dataclasses.fields(OPTIONS[name]):
+        assert f"\n  {option.name}=" in said
+        assert f"`{option.name}`" in said, f"{name} explains no `{option.name}`"
+
+
+def test_what_dataclasses_make_up_is_no_explanation() -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Bare(EpisodeOptions):
+        wind: float = 0.0
+
+    assert "Bare(" not in in_full(Bare)
+    assert "wind=a number (default 0.0)" in in_full(Bare)

@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -108,3 +110,47 @@ def test_a_wrong_answer_says_who_what_and_what_to_do(objective, said):
 def test_a_wrong_dimension_says_who_wanted_what(objective):
     with pytest.raises(ValueError, match=r"takes 2 parameters; got x of shape \(3, 12\)"):
         objective.evaluate(torch.zeros(3, 12))
+
+
+def test_functions_of_one_point_are_called_at_each():
+    def at(x):
+        return math.sin(x[0]) * x[1] ** 2
+
+    def at_with_gradient(x):
+        return at(x), [math.cos(x[0]) * x[1] ** 2, 2 * math.sin(x[0]) * x[1]]
+
+    exact = from_torch(lambda x: x[0].sin() * x[1] ** 2, SPACE, vectorized=False).evaluate(X)
+    torch.testing.assert_close(exact.loss, wave(X))
+    torch.testing.assert_close(exact.grad, EXACT)
+    given = from_numpy(at_with_gradient, SPACE, vectorized=False).evaluate(X)
+    torch.testing.assert_close(given.grad, EXACT)
+    differed = from_numpy(at, SPACE, differences=1e-5, vectorized=False).evaluate(X)
+    torch.testing.assert_close(differed.loss, wave(X))
+    torch.testing.assert_close(differed.grad, EXACT, rtol=1e-4, atol=1e-4)
+
+
+def test_a_function_of_one_point_says_at_which_it_failed():
+    def fails(x):
+        raise ZeroDivisionError("the arm is singular")
+
+    with pytest.raises(ZeroDivisionError) as raised:
+        from_numpy(fails, SPACE, vectorized=False).evaluate(X[:1], grad=False)
+    assert raised.value.__notes__ == [f"at x = {X[0].tolist()}"]
+
+
+def test_a_function_of_one_point_taken_for_one_of_a_batch_is_told_how_to_say_so():
+    with pytest.raises(ValueError, match=r"losses of shape \(7,\); got shape \(2,\) .*vectorized=False"):
+        from_numpy(lambda x: x[0] * 2, SPACE).evaluate(X, grad=False)
+    with pytest.raises(ValueError, match="must return a tensor; got float"):
+        from_torch(lambda x: 1.0, SPACE, vectorized=False).evaluate(X)
+
+
+def test_lists_and_arrays_are_points_too_and_what_is_no_number_is_refused():
+    objective = from_torch(wave, SPACE)
+    for x in (X.tolist(), X.numpy(), X.numpy()[::-1][::-1]):
+        torch.testing.assert_close(objective.evaluate(x).loss, wave(X))
+    for wrong in ("0.5", [["a", "b"]], X + 1j, [[1, 2], [3]]):
+        with pytest.raises(ValueError, match="wave takes numbers"):
+            objective.evaluate(wrong)
+    with pytest.raises(ValueError, match="the loss of wave takes numbers"):
+        from_numpy(lambda x: 1j * x[:, 0], SPACE, name="wave").evaluate(X, grad=False)

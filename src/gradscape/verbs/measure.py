@@ -17,6 +17,7 @@ from .options import (
     ForceStudy,
     Json,
     NoGradients,
+    Of,
     OutOfStudy,
     Set,
     Through,
@@ -25,7 +26,7 @@ from .options import (
 
 def plan(
     what: Annotated[str, typer.Argument(metavar="ENV|FIGURES.toml", help="An environment, or a list of figures.")],
-    dims: Dims = ("0", "1"),
+    dims: Dims = ["0", "1"],  # noqa: B006 -- typer reads it, nobody changes it
     over: Annotated[
         str | None, typer.Option(help="Plan a sweep: what moves from frame to frame, as for `landscape sweep`.")
     ] = None,
@@ -104,7 +105,7 @@ def bench(
 
 
 def check(
-    env: Annotated[str, typer.Argument(help="The environment, ours or one that another package registers.")],
+    env: Env,
     fidelity: Fidelity = None,
     device: Device = "auto",
     engine: Engine = "warp",
@@ -217,6 +218,7 @@ def report_(
         str | None,
         typer.Argument(metavar="[SLICE|ENV]", help="A slice's folder, or an environment: its figures, else one slice."),
     ] = None,
+    env: Of = None,
     everything: Annotated[bool, typer.Option("--all", help="Every figure of the gallery that is sampled.")] = False,
     fidelity: Fidelity = None,
     device: Device = "auto",
@@ -241,6 +243,7 @@ def report_(
 
     report(
         what,
+        source=env,
         everything=everything,
         fidelity=fidelity,
         device=device,

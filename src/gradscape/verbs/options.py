@@ -6,8 +6,20 @@ from typing import Annotated
 
 import typer
 
-Env = Annotated[str, typer.Argument(help="The environment; `landscape envs` lists them.")]
-Dims = Annotated[tuple[str, str], typer.Option(help="The two parameters to vary, by number or by name.")]
+Env = Annotated[
+    str,
+    typer.Argument(
+        metavar="ENV", help="The environment: one that `landscape envs` lists, or a class in a file, FILE.py:Class."
+    ),
+]
+Of = Annotated[
+    str | None,
+    typer.Option("--env", help="Where the slice's environment is, if it is a class in a file: FILE.py:Class."),
+]
+Dims = Annotated[
+    list[str],
+    typer.Option("--dims", metavar="DIM [DIM]", help="The one or two parameters to vary, by number or by name."),
+]
 Resolution = Annotated[int, typer.Option(min=2, help="Points along each axis.")]
 Fidelity = Annotated[str | None, typer.Option(help="How accurately to simulate: draft, standard or reference.")]
 Tolerance = Annotated[

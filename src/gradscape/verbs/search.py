@@ -15,6 +15,7 @@ from .options import (
     Fidelity,
     ForceRun,
     Json,
+    Of,
     OutOfRun,
     Scheduler,
     Set,
@@ -127,6 +128,7 @@ def race(
 def overlay(
     slice_: Annotated[str, typer.Argument(metavar="SLICE", help="A slice's folder.")],
     runs: Annotated[list[str], typer.Argument(metavar="RUN", help="Folders of runs; a race's for all of it.")],
+    env: Of = None,
     out: Annotated[
         str | None, typer.Option(help="Folder for the results; by default one under out/ named after the overlay.")
     ] = None,
@@ -150,6 +152,7 @@ def overlay(
     report(
         slice_,
         runs,
+        source=env,
         out=out,
         through=through,
         plane=plane,

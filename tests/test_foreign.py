@@ -1,0 +1,200 @@
+"""Somebody else's simulator: a class in a file, registered by a program, short of what a scene of ours has."""
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import gradscape as gs
+from gradscape.envs import registry
+from gradscape.landscapes.identity import stored_identity
+
+from .command import Said
+
+# It has neither name nor fidelities nor docstring, imports a neighbour, and refuses what lies beyond its bounds.
+ARM = '''
+from dataclasses import dataclass
+import torch
+import gradscape as gs
+
+@dataclass(frozen=True)
+class Stiffness:
+    stiffness: float = 1.0
+
+class TwoLinkArm(gs.Environment):
+    Options = Stiffness
+    space = gs.ParameterSpace({"shoulder": (-1, 1, "rad"), "elbow": (0, 2, "rad"), "load": (0.1, 0.9, "kg")})
+    loss_unit = "J"
+
+    def _evaluate(self, x, *, grad):
+        if not bool(((x >= self.space.lower) & (x <= self.space.upper)).all()):
+            raise RuntimeError("the arm's joints do not go there")
+        loss = self.options.stiffness * (x[:, 0] ** 2 + (x[:, 1] - 1) ** 2) + x[:, 2]
+        slope = torch.stack([2 * x[:, 0], 2 * (x[:, 1] - 1), torch.ones(len(x))], dim=1)
+        slope[:, :2] *= self.options.stiffness
+        return gs.Evaluation.judged(loss, slope if grad else None)
+
+class Arm(TwoLinkArm):
+    """An arm.
+
+    With words.
+    """
+
+NOTHING = 3
+'''
+
+
+@pytest.fixture(autouse=True)
+def forgotten() -> Iterator[None]:
+    """Forget what a test registers."""
+    known = dict(registry.entries())
+    yield
+    registry.entries().clear()
+    registry.entries().update(known)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "arm.py").write_text(ARM)
+    return tmp_path
+
+
+def test_a_class_in_a_file_is_sliced_measured_searched_and_shown(run: Callable[..., Said], folder: Path) -> None:
+    cut = run("slice", "arm.py:TwoLinkArm", "--dims", "elbow", "0", "--resolution", "9", "--out", "cut", cwd=folder)
+    assert cut.returncode == 0, cut.stderr
+    dataset = gs.open_slice(folder / "cut")
+    assert stored_identity(dataset)["objective"] == "two-link-arm"
+    assert dataset["loss"].attrs["units"] == "J"
+    found = run("optimize", "arm.py:TwoLinkArm", "--method", "descents", "--budget", "9", "--out", "run", cwd=folder)
+    assert found.returncode == 0, found.stderr
+    for command in (
+        ["report", "cut", "--env", "arm.py:TwoLinkArm", "--points", "6", "--out", "told"],
+        ["overlay", "cut", "run", "--env", "arm.py:TwoLinkArm", "--through", "best", "--out", "over"],
+        ["check", "arm.py:TwoLinkArm", "--points", "2"],
+        ["plan", "arm.py:TwoLinkArm", "--resolution", "4"],
+        ["race", "arm.py:TwoLinkArm", "--methods", "random", "--seeds", "1", "--budget", "3", "--out", "raced"],
+        ["pairs", "arm.py:TwoLinkArm", "--samples", "2", "--out", "paired"],
+    ):
+        registry.entries().pop("two-link-arm", None)  # as in another process
+        done = run(*command, cwd=folder)
+        assert done.returncode == 0, (command, done.stderr)
+    registry.entries().pop("two-link-arm")
+    unknown = run("report", "cut", "--out", "elsewhere", cwd=folder)
+    assert unknown.returncode == 2
+    assert "of a class in a file, say where it is: --env FILE.py:Class" in unknown.stderr
+
+
+def test_a_class_in_a_file_says_what_there_is_to_say(run: Callable[..., Said], folder: Path) -> None:
+    bare, worded = (run("envs", f"arm.py:{name}", cwd=folder).stdout for name in ("TwoLinkArm", "Arm"))
+    for said in (bare, worded):
+        for part in ("3 parameters", "elbow", "rad", "fidelity", "stiffness=a number (default 1.0)"):
+            assert part in said
+        assert "Stiffness(" not in said
+        assert "differentiable scene" not in said  # what the base class says of all
+    assert "It says nothing of itself" in bare
+    assert "An arm.\n\nWith words." in worded
+    listed = run("envs", cwd=folder).stdout
+    assert "?" not in listed
+    row = next(line for line in listed.splitlines() if line.startswith("│ arm "))
+    assert [cell.strip() for cell in row.split("│")[1:3]] == ["arm", "3"]
+    assert "An arm." in row
+
+
+@pytest.mark.parametrize("words", [["--dims", "1"], ["--dims", "elbow"]])
+@pytest.mark.parametrize("last", [True, False])
+def test_a_line_has_one_dimension(run: Callable[..., Said], folder: Path, words: list[str], last: bool) -> None:
+    env = ["arm.py:TwoLinkArm"]
+    command = ["slice", *words, *env] if last else ["slice", *env, *words]
+    done = run(*command, "--resolution", "5", "--out", "line", "--json", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["dims"] == ["elbow"]
+    line = gs.open_slice(folder / "line")
+    np.testing.assert_allclose(line["loss"], (line["u"] - 1) ** 2 + 0.5)
+    assert (folder / "line/landscape.png").exists()
+    again = run(*command, "--resolution", "5", "--out", "line", cwd=folder)
+    assert "all 5 episodes with gradients are there already" in again.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("arm.py:Leg", "arm.py holds no environment Leg; it has TwoLinkArm, Arm"),
+        ("arm.py:NOTHING", "arm.py holds no environment NOTHING"),
+        ("leg.py:Leg", "there is no file leg.py"),
+        ("broken.py:Arm", "broken.py cannot be imported: ZeroDivisionError"),
+        ("fluid.py:Mine", "fluid.py:Mine is called 'fluid', and so is gradscape.envs.fluid:Fluid"),
+    ],
+)
+def test_a_file_without_the_class_is_refused_by_name(
+    run: Callable[..., Said], folder: Path, name: str, said: str
+) -> None:
+    (folder / "broken.py").write_text("1 / 0")
+    (folder / "fluid.py").write_text(
+        ARM.replace("TwoLinkArm", "Mine").replace("loss_unit", 'name = "fluid"\n    loss_unit')
+    )
+    done = run("slice", name, "--dims", "0", cwd=folder)
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert said in done.stderr
+
+
+class Spring(gs.Environment):
+    """A spring."""
+
+    space = gs.ParameterSpace({"pull": (0, 1, "m")})
+
+    def _evaluate(self, x, *, grad):  # type: ignore[no-untyped-def]
+        return gs.Evaluation.judged(x[:, 0] ** 2, 2 * x if grad else None)
+
+
+def test_a_program_registers_a_class_and_the_command_finds_it(run: Callable[..., Said], tmp_path: Path) -> None:
+    assert gs.register(Spring) is Spring
+    assert isinstance(gs.make("spring"), Spring)
+    done = run("slice", "spring", "--dims", "0", "--resolution", "4", "--out", "cut", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = run("report", "cut", "--points", "2", "--out", "told", cwd=tmp_path)
+    assert report.returncode == 0, report.stderr
+    gs.register(Spring)  # again, as a cell of a notebook does
+    with pytest.raises(ValueError, match="an environment called 'fluid' exists already"):
+        gs.register(type("Fluid", (Spring,), {"name": "fluid"}))
+    with pytest.raises(ValueError, match="takes a class derived from Environment"):
+        gs.register("spring")  # type: ignore[type-var]
+
+
+def short_of(**what: object) -> gs.Environment:
+    made: type[gs.Environment] = type("Short", (Spring,), what)
+    return made()
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ({"_evaluate": lambda self, x, *, grad: x[:, 0]}, "must return an Evaluation; got Tensor. Evaluation.judged"),
+        ({"_evaluate": lambda self, x, *, grad: None}, "must return an Evaluation; got NoneType"),
+        (
+            {"_evaluate": lambda self, x, *, grad: gs.Evaluation.judged(x[:, 0], None)},
+            r"was asked for gradients \(grad=True\) and returned none",
+        ),
+        ({"space": None}, "needs its parameters: give the class a ParameterSpace as `space`"),
+    ],
+)
+def test_what_a_class_lacks_is_said(what: dict[str, object], said: str) -> None:
+    with pytest.raises(ValueError, match=f"^short.*{said}"):
+        short_of(**what).evaluate(torch.zeros(2, 1))
+
+
+def test_what_is_sampled_of_an_environment_keeps_its_unit_fidelity_and_options(tmp_path: Path) -> None:
+    env = gs.make("bounce", fidelity="draft", device="cpu", ke=2e4)
+    dataset = gs.sample(env, gs.Plane.through(env.space, env.space.center, [0, 1], resolution=3))
+    identity = stored_identity(dataset)
+    assert (identity["objective"], identity["fidelity"], identity["options"]["ke"]) == ("bounce", "draft", 2e4)
+    assert dataset["loss"].attrs["units"] == "m²"
+    dataset.to_zarr(tmp_path / "mine.zarr", consolidated=False)
+    again = gs.open_slice(tmp_path / "mine.zarr")
+    assert again.attrs == dataset.attrs
+    np.testing.assert_array_equal(again["grad"], dataset["grad"])
+    function = gs.from_torch(lambda x: x[:, 0], env.space, name="first", loss_unit="m")
+    named = gs.sample(function, gs.Plane.through(env.space, env.space.center, [0], resolution=3))
+    assert (named.attrs["title"], named["loss"].attrs["units"]) == ("first over velocity x", "m")
