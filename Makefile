@@ -4,7 +4,7 @@ PYTHON ?= $(firstword $(foreach p,python3.11 python3.12 python3,$(if $(shell $(p
 BIN := .venv/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test setup setup-test check clean
+.PHONY: demo test wheel setup setup-test check clean
 
 demo: setup
 	$(BIN)/landscape slice fluid --dims 6 8 --resolution 24
@@ -12,6 +12,10 @@ demo: setup
 # Two workers have two cores: a second thread of each would only wait for the other worker's.
 test: setup-test
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+
+# Builds the wheel, installs it with all it needs into an empty environment, and tries it there; tests borrow the rest.
+wheel: setup-test
+	INSTALL_DEPENDENCIES=1 $(BIN)/python -m pytest tests/test_wheel.py
 
 check: setup-test
 	$(BIN)/ruff check .

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parent
-DATA = HERE / "data"
+DATA = HERE / "data"  # of a checkout; what is installed from a wheel has trade-offs there and no figures
+ELSEWHERE = Path("out") / "gallery-data"
 KINDS: dict[str, type] = {  # of a figure's fields in TOML
     **dict.fromkeys(("id", "env", "says", "through", "fidelity", "over"), str),
     **{"dims": list, "number": int, "resolution": int, "options": dict},
@@ -59,6 +60,13 @@ class Figure:
     @property
     def _set(self) -> list[str]:
         return [word for name, value in self.options.items() for word in ("--set", f"{name}={value}")]
+
+
+def data_folder(named: str | None) -> Path:
+    """Return where the figures' data is: as named, else a checkout's own, else under the folder where one stands."""
+    if named:
+        return Path(named)
+    return DATA if any(DATA.glob("*/slice.zarr")) else ELSEWHERE
 
 
 def read_figures(path: Path = HERE / "figures.toml") -> list[Figure]:

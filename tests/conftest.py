@@ -21,12 +21,12 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Said]:
-    """Run the command in this process, in a folder of its own, on a wide screen."""
+    """Run the command in this process, in a folder of its own, on a wide screen unless another width is given."""
 
-    def command(*arguments: str, cwd: Path) -> Said:
+    def command(*arguments: str, cwd: Path, width: int = 160) -> Said:
         monkeypatch.chdir(cwd)
         monkeypatch.setattr(sys, "argv", ["landscape", *arguments])
-        monkeypatch.setenv("COLUMNS", "160")
+        monkeypatch.setenv("COLUMNS", str(width))
         capsys.readouterr()
         with pytest.raises(SystemExit) as left:
             main(list(arguments))

@@ -1,4 +1,4 @@
-"""The package holds every folder, and the constraints every dependency."""
+"""The package's links, and constraints and reasons of its dependencies; what is sent is tried by test_wheel.py."""
 
 import re
 import tomllib
@@ -6,13 +6,6 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-
-
-def test_packages_are_the_folders_that_hold_code() -> None:
-    tops = ("landscapes", "envs", "optim", "gallery")
-    found = {file.parent.relative_to(ROOT) for top in tops for file in (ROOT / top).rglob("*.py")}
-    names = {"gradscape", *("gradscape." + ".".join(folder.parts) for folder in found)}
-    assert set(PROJECT["tool"]["setuptools"]["packages"]) == names
 
 
 def test_every_linked_folder_is_the_one_at_the_root() -> None:
@@ -34,3 +27,8 @@ def test_every_dependency_states_its_reason() -> None:
     lines = [line for line in text.splitlines() if re.match(r'\s+"[a-z-]+>=', line)]
     assert len(lines) >= 15
     assert all("#" in line for line in lines)
+
+
+def test_the_version_is_said_in_one_place() -> None:
+    assert "version" in PROJECT["project"]["dynamic"]
+    assert PROJECT["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "gradscape.__version__"}

@@ -20,7 +20,7 @@ from rich.markup import escape
 
 from .cluster import workers
 from .console import duration, size
-from .gallery.figures import DATA, Figure, chosen, read_figures
+from .gallery.figures import Figure, chosen, data_folder, read_figures
 from .gallery_episodes import Episodes
 from .gallery_measures import Reports, Tradeoffs
 from .gallery_parts import Part, Searches, Slice, State, Sweep
@@ -50,7 +50,8 @@ def compute(
     """Make what is missing of the figures, say first what it should cost, and leave with 1 where something failed."""
     if unknown := set(parts) - set(PARTS):
         raise ValueError(f"--part takes {', '.join(PARTS)}; got {', '.join(sorted(unknown))}")
-    console, root = Console(stderr=True, soft_wrap=True, highlight=False), Path(data) if data else DATA
+    _refuse_missing(device)
+    console, root = Console(stderr=True, soft_wrap=True, highlight=False), data_folder(data)
     figures = [_changed(figure, fidelity, resolution) for figure in chosen(read_figures(), only)]
     failed: set[str] = set()
     with workers(scheduler, device) as executor:
@@ -65,6 +66,13 @@ def compute(
             markup=False,
         )
         sys.exit(1)
+
+
+def _refuse_missing(device: str) -> None:
+    from .envs.engines.runtime import cuda_available
+
+    if device == "cuda" and not cuda_available():
+        raise ValueError("no CUDA device was found here, so nothing is computed on one; use --device cpu or auto")
 
 
 def _make(console: Console, name: str, parts: Sequence[Part], failed: set[str]) -> None:
@@ -92,8 +100,9 @@ def _estimate(console: Console, name: str, parts: Sequence[Part], failed: set[st
                 continue
             rates[kind] = rate
         total += rates[kind] * part.left()
-    if parts:
-        console.print(f"{name}: {len(parts)} to make, about {duration(total)} in all", markup=False)
+    left = [part for part in parts if part.figure.id not in failed]
+    if left:
+        console.print(f"{name}: {len(left)} to make, about {duration(total)} in all", markup=False)
 
 
 def _try(console: Console, part: Part, work: Callable[[], T], failed: set[str]) -> T | None:
@@ -114,7 +123,7 @@ def _try(console: Console, part: Part, work: Callable[[], T], failed: set[str]) 
 
 def list_figures(*, data: str | None, as_json: bool) -> None:
     """Print every figure with how much of it is there."""
-    root = Path(data) if data else DATA
+    root = data_folder(data)
     found = [(figure, Slice(figure, root, "cpu").state()) for figure in read_figures()]
     if as_json:
         print(json.dumps([{"id": figure.id, "points": of.points, "done": of.done} for figure, of in found]))
@@ -147,7 +156,7 @@ def build(*, data: str | None, out: str) -> None:
     """Build the site and say what it holds."""
     from .gallery.build import build_site
 
-    root, start = Path(data) if data else DATA, time.perf_counter()
+    root, start = data_folder(data), time.perf_counter()
     manifest = build_site(read_figures(), root, Path(out))
     weight = sum(file.stat().st_size for file in Path(out).rglob("*") if file.is_file())
     missing = f", {len(manifest['missing'])} not sampled yet" if manifest["missing"] else ""

@@ -19,7 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from .console import duration, fill, size
 from .envs.registry import environment_class, make
-from .gallery.figures import DATA, read_figures
+from .gallery.figures import data_folder, read_figures
 from .landscapes.files import replacing, visible, write_json
 from .landscapes.identity import stored_identity
 from .measure_tables import by_environment, slices_markdown, slices_table
@@ -68,7 +68,7 @@ def report(
         environment_class(source)  # which registers it
     if (what is None) != everything:
         raise ValueError("report takes a slice's folder, an environment, or --all for every figure of the gallery")
-    root = Path(data) if data else DATA
+    root = data_folder(data)
     subjects = _all(root) if what is None else _subjects(console, what, root, fidelity, device)
     settings = {"points": points, "seed": seed}
     folder = Path(out) if out else Path("out") / _folder_name(what or "all", subjects, settings)

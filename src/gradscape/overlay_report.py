@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shlex
 import sys
 import time
 from collections.abc import Sequence
@@ -28,8 +29,9 @@ if TYPE_CHECKING:
     from .landscapes.plane import Plane
 
 PICTURE, STREAM = "overlay.png", "overlay.rrd"
+SITE = "index.html"
 SHOWN = (  # of a folder, the first that is there
-    *("overlay.rrd", "race.png", "landscape.png", "progress.png", "sweep.mp4"),
+    *(SITE, "overlay.rrd", "race.png", "landscape.png", "progress.png", "sweep.mp4"),
     *("surface.png", "episode.mp4", "episode.png", "sweep.rrd", "episode.rrd"),
 )
 PICTURES = (".png", ".html", ".mp4", ".gif")
@@ -82,12 +84,15 @@ def view(file: str, *, serve: bool) -> None:
     """Open a file that one of the verbs left, or the picture of a folder."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     path = _shown(Path(file), serve=serve)
+    if path.name == SITE and serve:
+        raise ValueError(f"a site is served by: landscape gallery serve --out {shlex.quote(str(path.parent))}")
     if path.suffix != ".rrd" and serve:
         raise ValueError(f"--serve shows recordings (.rrd) in a browser; {path} is none")
     if path.suffix == ".rrd":
         _show(console, path, serve=serve)
         return
-    _need_display(path, "copy it to where one is")
+    serving = f"landscape gallery serve --out {shlex.quote(str(path.parent))}"
+    _need_display(path, f"serve it to a browser: {serving}" if path.name == SITE else "copy it to where one is")
     import typer
 
     console.print(f"opening {path}", markup=False)
@@ -183,7 +188,8 @@ def _shown(path: Path, *, serve: bool) -> Path:
             if (folder / name).exists():
                 return folder / name
         raise ValueError(
-            f"{path} holds none of {', '.join(SHOWN)}; `landscape slice`, sweep, optimize, race, overlay and replay do"
+            f"{path} holds none of {', '.join(SHOWN)}; what `landscape slice`, sweep, optimize, race, overlay, replay "
+            "and gallery build leave does"
         )
     if not path.exists():
         raise ValueError(f"there is no file {path}")

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from .options import (
+    Data,
     Deterministic,
     Device,
     Dims,
@@ -226,9 +227,7 @@ def report_(
         int, typer.Option(min=2, help="Points along each axis where gradients are tested by new evaluations.")
     ] = 6,
     seed: Annotated[int, typer.Option(min=0, help="What random numbers begin with.")] = 0,
-    data: Annotated[
-        str | None, typer.Option(help="Folder of the figures' slices; by default the gallery's own.")
-    ] = None,
+    data: Data = None,
     out: Annotated[
         str | None, typer.Option(help="Folder for the results; by default one under out/ named after the report.")
     ] = None,

@@ -64,4 +64,7 @@ Scheduler = Annotated[
     ),
 ]
 NoGradients = Annotated[bool, typer.Option("--no-gradients", help="Sample losses only.")]
-Data = Annotated[str | None, typer.Option(help="Folder of the figures' slices; by default the gallery's own.")]
+Data = Annotated[
+    str | None,
+    typer.Option(help="Folder of the figures' data; by default a checkout's own, or else out/gallery-data."),
+]
