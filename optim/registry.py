@@ -51,7 +51,7 @@ def optimizer_class(name: str) -> type[Optimizer]:
         if not method.extra:
             raise
         raise ValueError(
-            f"{name} needs the extra {method.extra}: pip install 'gradscape[{method.extra}]' ({error})"
+            f"{name} needs the extra {method.extra}: pip install '.[{method.extra}]' in gradscape's sources ({error})"
         ) from error
     return found
 

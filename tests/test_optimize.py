@@ -125,7 +125,7 @@ def test_methods_lists_them_all_and_shows_one_in_full(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     listed = run("methods", cwd=tmp_path).stdout
-    for name in ("random", "cma-es", "descents", "bo", "bo-descents", "bo-leap", "ppo", "sac", "gradscape[rl]"):
+    for name in ("random", "cma-es", "descents", "bo", "bo-descents", "bo-leap", "ppo", "sac", "extra rl"):
         assert f" {name} " in listed
     shown = run("methods", "cma-es", cwd=tmp_path).stdout
     for said in ("restarted when it has converged", "gradients: no", "sigma=a number (default 0.5)", "BoundTransform"):

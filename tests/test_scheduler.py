@@ -188,4 +188,4 @@ def test_an_address_where_nothing_answers_and_a_missing_dask_are_said(tmp_path, 
     monkeypatch.setitem(sys.modules, "distributed", None)
     said = run(*how, cwd=tmp_path)
     assert said.returncode == 2
-    assert "pip install 'gradscape[distributed]'" in said.stderr
+    assert "pip install '.[distributed]'" in said.stderr

@@ -117,11 +117,11 @@ def cut(
     options = read_settings(settings)
     accuracy = chosen_fidelity(console, name, tolerance, fidelity=fidelity, **how, options=options)
     env = make(name, fidelity=accuracy, deterministic=deterministic, **how, **options)
-    from .envs.points import point  # after make: a name that does not exist is refused before torch is loaded
-    from .landscapes.plane import Plane
+    from .landscapes.plane import Plane  # after make: a name that does not exist is refused before torch is loaded
+    from .results import point_of
 
     window = read_extent(extent)
-    plane = Plane.through(env.space, point(env, through), dims, resolution=resolution, extent=window)
+    plane = Plane.through(env.space, point_of(env, through), dims, resolution=resolution, extent=window)
     from .cluster import workers
 
     with workers(scheduler, env.device) as executor:

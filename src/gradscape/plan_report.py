@@ -60,11 +60,11 @@ def plan(
         return
     environment_class(what)  # a name that does not exist is refused before what measures is loaded
     env, where = _made(what, device, options)
-    from .envs.points import point
     from .landscapes.plane import Plane
+    from .results import point_of
 
     window, side = read_extent(extent), resolution or RESOLUTION
-    plane = Plane.through(env.space, point(env, through), dims, resolution=side, extent=window)
+    plane = Plane.through(env.space, point_of(env, through), dims, resolution=side, extent=window)
     with _rehearsing(console, env), tempfile.TemporaryDirectory() as folder:
         if over is None:
             found = of_slice(env, plane, Path(folder), grad=grad, began=began)

@@ -15,7 +15,7 @@ from rich.console import Console
 from .console import provenance_of, read_settings
 from .envs.registry import make
 from .landscapes.files import visible, write_json
-from .results import run_tables
+from .results import point_of
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -40,7 +40,7 @@ def replay(
     """Simulate one episode, draw it, and say what it cost."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     env = make(name, fidelity=fidelity, device=device, engine=engine, **read_settings(settings))
-    x = _point(env, params)
+    x = point_of(env, params)
     folder = _folder(out, env, x)
     with console.status(f"{env.name}: simulating (kernels are compiled once, then kept)"):
         episode = env.episode(x)
@@ -63,22 +63,6 @@ def replay(
         f"{folder}: {', '.join([*files, RECORD])}",
         markup=False,
     )
-
-
-def _point(env: Environment, text: str) -> Tensor:
-    """Return the parameters that `text` names: a point, or the best one that a run found."""
-    kind, _, run = text.partition(":")
-    if kind != "best":
-        from .envs.points import point
-
-        return point(env, text)
-    from .landscapes.identity import stored_identity
-    from .landscapes.overlay import best_point
-
-    tables = run_tables([run])
-    if {stored_identity(table).get("objective") for table in tables} != {env.name}:
-        raise ValueError(f"{run} holds no runs of {env.name} alone; replay the environment that was searched")
-    return best_point(tables)[0]
 
 
 def _folder(out: str | None, env: Environment, x: Tensor) -> Path:

@@ -12,6 +12,7 @@ from .landscapes.slice_paths import there
 
 if TYPE_CHECKING:
     import xarray as xr
+    from torch import Tensor
 
     from .envs.base import Environment
 
@@ -55,3 +56,22 @@ def run_tables(paths: Sequence[str]) -> list[xr.Dataset]:
     if not any(table.sizes["evaluation"] for table in tables):
         raise ValueError(f"{', '.join(paths)}: there are no episodes yet; `landscape optimize` evaluates them")
     return [table for table in tables if table.sizes["evaluation"]]
+
+
+def point_of(env: Environment, text: str) -> Tensor:
+    """Return the parameters that `text` names: a point, as `envs.points` has it, or the best that a run found."""
+    kind, _, run = text.partition(":")
+    if kind != "best":
+        from .envs.points import point
+
+        return point(env, text)
+    from .landscapes.identity import stored_identity
+    from .landscapes.overlay import best_point
+
+    tables = run_tables([run])
+    searched = {str(stored_identity(table).get("objective")) for table in tables}
+    if searched != {env.name}:
+        raise ValueError(
+            f"{run} holds runs of {', '.join(sorted(searched))}; {env.name} goes through points of its own"
+        )
+    return best_point(tables)[0]

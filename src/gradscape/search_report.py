@@ -34,7 +34,7 @@ def list_methods() -> None:
     """Print every method as a table, without importing any."""
     found = table("name", "what it does", "needs", title="methods")
     for method in METHODS.values():
-        found.add_row(method.name, method.summary, f"gradscape\\[{method.extra}]" if method.extra else "")
+        found.add_row(method.name, method.summary, f"extra {method.extra}" if method.extra else "")
     console = Console()
     console.print(found)
     console.print("`landscape methods NAME` shows one in full: what it does, its options and their defaults.")

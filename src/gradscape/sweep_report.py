@@ -64,10 +64,10 @@ def sweep(
     how: dict[str, Any] = {"fidelity": fidelity, "device": device, "engine": engine, "deterministic": deterministic}
     made = partial(make, name, **how, **read_settings(settings))
     env = made()
-    from .envs.points import point
     from .landscapes.plane import Plane
+    from .results import point_of
 
-    plane = Plane.through(env.space, point(env, through), dims, resolution=resolution, extent=read_extent(extent))
+    plane = Plane.through(env.space, point_of(env, through), dims, resolution=resolution, extent=read_extent(extent))
     if plane.rank != 2 or frames < 2:
         raise ValueError(f"a sweep has two dims and two frames or more; got {', '.join(dims)} and {frames} frames")
     swept = moved(over, env, plane, frames, made)

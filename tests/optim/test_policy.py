@@ -229,4 +229,4 @@ except ValueError as error:
 
 def test_without_the_extra_it_says_what_to_install():
     done = subprocess.run([sys.executable, "-c", MISSING], capture_output=True, text=True, check=True)
-    assert "sac needs the extra rl: pip install 'gradscape[rl]'" in done.stdout
+    assert "sac needs the extra rl: pip install '.[rl]'" in done.stdout

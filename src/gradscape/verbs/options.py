@@ -54,7 +54,8 @@ Extent = Annotated[
     typer.Option(help="What to cover: a fraction of the box around the point, or LOW:HIGH; the whole box by default."),
 ]
 Through = Annotated[
-    str, typer.Option(help="The point it goes through: center, random:SEED, example:NAME or a file of parameters.")
+    str,
+    typer.Option(help="The point it goes through: center, random:SEED, example:NAME, best:RUN or a file of numbers."),
 ]
 Scheduler = Annotated[
     str | None,
