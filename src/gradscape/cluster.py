@@ -41,9 +41,8 @@ def workers(scheduler: str | None, device: str) -> Iterator[Executor | None]:
     try:
         from distributed import Client, KilledWorker
     except ImportError as error:
-        raise ValueError(
-            f"--scheduler needs Dask: pip install '.[distributed]' where gradscape's sources are ({error})"
-        ) from None
+        said = f"--scheduler needs Dask: pip install '.[distributed]' in gradscape's sources ({error})"
+        raise ValueError(said) from None
     for name in ("distributed", "distributed.client"):  # what matters of what they say is raised
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with ExitStack() as stack:

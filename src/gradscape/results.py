@@ -71,7 +71,5 @@ def point_of(env: Environment, text: str) -> Tensor:
     tables = run_tables([run])
     searched = {str(stored_identity(table).get("objective")) for table in tables}
     if searched != {env.name}:
-        raise ValueError(
-            f"{run} holds runs of {', '.join(sorted(searched))}; {env.name} goes through points of its own"
-        )
+        raise ValueError(f"{run} holds no runs of {env.name} alone; it holds those of {', '.join(sorted(searched))}")
     return best_point(tables)[0]
