@@ -234,7 +234,7 @@ def _of_file(text: str) -> type[Environment]:
         raise ValueError(f"{path} holds no environment {attribute}; it has {', '.join(there) or 'none'}")
     taken = entries().get(kind.name)
     target = f"{file}:{attribute}"
-    if taken and taken.target != target:
+    if taken and taken.target not in (target, kind):  # a file may register its class itself
         raise ValueError(f"{text} is called {kind.name!r}, and so is {taken.target}; give the class another name")
     entries()[kind.name] = Entry(kind.name, target, model=f"of {path}")
     return kind

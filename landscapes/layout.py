@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import warnings
 from collections.abc import Sequence
 from enum import IntEnum
@@ -15,6 +16,7 @@ from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
 FILL = {"float64": float("nan"), "int8": 0, "int64": 0, "string": ""}
 CODECS = [ZstdCodec(level=3, checksum=True)]
 SMALL = [BloscCodec(cname="zstd", clevel=9, shuffle="shuffle"), Crc32cCodec()]
+_QUIET = threading.Lock()  # threads share what warnings are shown
 SIDE, VALUES = 256, 1 << 20  # of a chunk of a finished slice: samples along an axis and values in all, at most
 
 
@@ -58,6 +60,6 @@ def flags(kind: type[IntEnum]) -> dict[str, Any]:
 
 def consolidate(path: Path) -> None:
     """Gather a store's layout in one file, so that plain xarray.open_zarr reads it."""
-    with warnings.catch_warnings():  # not in zarr's specification yet
+    with _QUIET, warnings.catch_warnings():  # not in zarr's specification yet
         warnings.simplefilter("ignore")
         zarr.consolidate_metadata(str(path))

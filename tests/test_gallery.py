@@ -142,3 +142,57 @@ def test_serve_serves_what_build_built(data: Path, tmp_path: Path) -> None:
         with urlopen(found[0] + "branin/index.html") as answer:
             assert b"Three minima &lt;b&gt;" in answer.read()
         process.terminate()
+
+
+def test_a_device_that_is_not_here_is_refused_at_once(
+    listed: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("gradscape.envs.engines.runtime.cuda_available", lambda: False)
+    capsys.readouterr()
+    assert gallery("compute", "--device", "cuda", "--data", str(tmp_path / "data")) == 2
+    said = capsys.readouterr().err
+    assert said == (
+        "landscape: no CUDA device was found here, so nothing is computed on one; use --device cpu or auto\n"
+    )
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_a_checkout_s_data_results_go_to_the_folder_where_one_stands(
+    listed: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed = tmp_path / "site-packages" / "data"
+    (installed / "tradeoff").mkdir(parents=True)
+    monkeypatch.setattr("gradscape.gallery.figures.DATA", installed)
+    monkeypatch.chdir(tmp_path)
+    how = ["--part", "slices", "--device", "cpu", "--only", "branin", "--resolution", "4"]
+    assert gallery("compute", *how) == 0
+    assert (tmp_path / "out/gallery-data/branin/slice.zarr").exists()
+    assert gallery("build") == 0
+    assert (tmp_path / "out/gallery/branin/index.html").exists()
+    assert sorted(path.name for path in installed.rglob("*")) == ["tradeoff"]
+
+
+def test_view_opens_the_site(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert gallery("build", "--data", str(data), "--out", str(tmp_path / "my site")) == 0
+    opened: list[str] = []
+    monkeypatch.setattr("typer.launch", lambda path: opened.append(path) or 0)
+    monkeypatch.setenv("DISPLAY", ":0")
+    with pytest.raises(SystemExit) as left:
+        main(["view", str(tmp_path / "my site")])
+    assert not left.value.code
+    assert opened == [str(tmp_path / "my site" / "index.html")]
+
+
+@pytest.mark.parametrize("serve", [[], ["--serve"]])
+def test_view_says_how_a_site_is_served(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], serve: list[str]
+) -> None:
+    (tmp_path / "my site").mkdir()
+    (tmp_path / "my site" / "index.html").touch()
+    for display in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(display, raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    with pytest.raises(SystemExit) as left:
+        main(["view", str(tmp_path / "my site"), *serve])
+    assert left.value.code == 2
+    assert f"landscape gallery serve --out '{tmp_path / 'my site'}'" in capsys.readouterr().err

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from .envs.base import Environment, Fidelity
 
 Row = Mapping[str, Any]
-FARTHER = 2.0  # times the expected work of the quickest so far, from where on a rung is not timed any more
+FARTHER = 2.0  # times the least expected work, beyond which a rung is no candidate
+ENOUGH, SHORTEST = 1e6, 0.05  # work of an episode that is timed, if it can be shortened so far; least share of it
 
 
 def keep(report: Mapping[str, Any]) -> Path:
@@ -67,62 +68,78 @@ def chosen(
             f"no measured fidelity of {name} is within {tolerance}; the best is {best}, "
             f"{_amount(errors[best], relative, report)} off at the 95th percentile"
         )
-    row, seconds, where = _quickest(console, env, within)
+    row, known = _quickest(console, env, within)
     if (ours := _code(env, report)) != (theirs := report["identity"]["code"]):
         said = f"measured with another version of the code of {name}, {theirs}, this is {ours}"
         console.print(f"warning: {said}", markup=False)
+    amount = _amount(errors[row["name"]], relative, report)
+    accuracy = f"its losses are {amount} off or less in 95 % of {row['compared']} points"
+    if row["name"] == report["reference"]:
+        accuracy = "it is what the others are held against, so that its own error is not known"
     console.print(
-        f"{row['name']}: the quickest of {len(within)} of {len(rows)} measured that are within {tolerance}; its losses "
-        f"are {_amount(errors[row['name']], relative, report)} off or less in 95 % of {row['compared']} "
-        f"points ({source}), {seconds:.3g} s an episode with gradient ({where})",
+        f"{row['name']}: the quickest of {len(within)} of {len(rows)} measured that are within {tolerance}; {accuracy} "
+        f"({source}); {known}",
         markup=False,
     )
     return Fidelity(**row["fidelity"])
 
 
-def _quickest(console: Console, env: Environment, rows: Sequence[Row]) -> tuple[Row, float, str]:
-    """Return the rung that takes least time on the environment's device, that time [s], and where it was measured."""
+def _quickest(console: Console, env: Environment, rows: Sequence[Row]) -> tuple[Row, str]:
+    """Return the rung that takes least time on the environment's device, and what is known of that time."""
     if rows[0]["device"] == env.device:
         best = min(rows, key=lambda row: float(row["seconds"]["with_gradient"]))
-        return best, float(best["seconds"]["with_gradient"]), f"measured on {env.device} by `landscape tradeoff`"
-    with console.status(f"{env.name}: timing {len(rows)} fidelities on {env.device}, where none was measured"):
-        seconds = _timed(env, rows)
-    best = min((row for row in rows if row["name"] in seconds), key=lambda row: seconds[row["name"]])
-    return best, seconds[best["name"]], f"{len(seconds)} of them timed on {env.device} here, one episode alone"
+        seconds = float(best["seconds"]["with_gradient"])
+        return best, f"{seconds:.3g} s an episode with gradient on {env.device}, by `landscape tradeoff`"
+    made = {row["name"]: _made(env, row) for row in rows}
+    work = {name: expected_work(one) for name, one in made.items()}
+    likely = [row for row in rows if work[row["name"]] <= FARTHER * min(work.values())]
+    if len(likely) == 1:
+        return likely[0], f"the others have {FARTHER:g} times its work and more; none was timed on {env.device}"
+    with console.status(f"{env.name}: timing {len(likely)} fidelities on {env.device}, where none was measured"):
+        timed = _timed(env, [made[row["name"]] for row in likely])
+    best = min(likely, key=lambda row: timed[row["name"]])
+    return best, f"{timed[best['name']]:.3g} s an episode with gradient, one alone on {env.device}, timed here"
 
 
-def _timed(env: Environment, rows: Sequence[Row]) -> dict[str, float]:
-    """Time an episode with gradient of each rung that may be the quickest [s]; what was timed before is kept.
+def _made(env: Environment, row: Row) -> Environment:
+    """Make the environment of a rung on the device of another."""
+    from .envs.base import Fidelity
+
+    fidelity = Fidelity(**row["fidelity"])
+    return make(env.name, fidelity=fidelity, device=env.device, engine=env.engine, **asdict(env.options))
+
+
+def _timed(env: Environment, rungs: Sequence[Environment]) -> dict[str, float]:
+    """Time an episode with gradient of each rung [s], by its name; what was timed before is kept.
 
     It is kept so that the same command chooses the same rung, and goes on with what it began.
     """
-    from .envs.base import Fidelity
     from .landscapes.files import write_json
 
     path = _kept(env.name, asdict(env.options), env.device).with_suffix(f".{env.engine}-{env.code}.seconds.json")
     known: dict[str, float] = json.loads(path.read_text()) if path.is_file() else {}
-    how = {"device": env.device, "engine": env.engine, **asdict(env.options)}
-    made = {row["name"]: make(env.name, fidelity=Fidelity(**row["fidelity"]), **how) for row in rows}
-    work = {name: expected_work(one) for name, one in made.items()}
-    found: dict[str, float] = {}
-    for name in sorted(work, key=lambda name: work[name]):
-        if found and work[name] > FARTHER * work[min(found, key=lambda other: found[other])]:
-            break
-        if name not in known:
-            known[name] = _seconds(made[name])
+    for rung in rungs:
+        if rung.fidelity.name not in known:
+            known[rung.fidelity.name] = _seconds(rung)
             write_json(path, known)
-        found[name] = known[name]
-    return found
+    return known
 
 
 def _seconds(env: Environment) -> float:
-    """Time an episode with gradient at the middle of the box, a second one since the first may compile."""
+    """Time an episode with gradient at the middle of the box, of a long one the beginning [s].
+
+    It is run twice, since the first may compile.
+    """
+    whole, horizon = env.work().count, getattr(env.options, "horizon", None)
+    if horizon and whole > ENOUGH:
+        how = {**asdict(env.options), "horizon": horizon * max(SHORTEST, ENOUGH / whole)}
+        env = make(env.name, fidelity=env.fidelity, device=env.device, engine=env.engine, **how)
     env.prepare()
     x = env.space.center[None]
     env.evaluate(x)
     began = time.perf_counter()
     env.evaluate(x)
-    return time.perf_counter() - began
+    return (time.perf_counter() - began) * whole / env.work().count
 
 
 def _code(env: Environment, report: Mapping[str, Any]) -> str:

@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import sys
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -13,6 +14,7 @@ import torch
 import xarray as xr
 
 from gradscape.landscapes.identity import StoreError, StoreMismatchError
+from gradscape.landscapes.layout import consolidate
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.slice_paths import filling
@@ -300,6 +302,7 @@ def test_plain_json_is_asked_for():
 
 KILLED_WHILE_CREATING = """
 import os, signal, sys, time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from test_store import filling, make
 path = Path(sys.argv[1])
@@ -385,3 +388,11 @@ def test_a_store_of_another_format_is_refused(tmp_path):
     (filling(path) / "zarr.json").write_text(json.dumps(about))
     with pytest.raises(StoreError, match="format 2"):
         make(path)
+
+
+def test_threads_that_gather_layouts_warn_of_nothing(tmp_path):
+    """Which warnings are shown is shared by threads: each that changes it for a while has to be alone."""
+    stores = [make(tmp_path / f"{number}.zarr") for number in range(2)]
+    with ThreadPoolExecutor(2) as threads:
+        for _ in threads.map(lambda number: consolidate(stores[number % 2].place), range(40)):
+            pass
