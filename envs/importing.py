@@ -7,13 +7,17 @@ import re
 import sys
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
 from types import ModuleType
 
 IN_FILE = re.compile(r".+\.py:\w+", re.DOTALL)  # FILE.py:Class
 
 
 def module_of(name: str) -> ModuleType:
-    """Import a module by its name, or a file by its path, once; what a file raises is said with its name."""
+    """Import a module by its name, or a file by its path, once; what a file raises is said with its name.
+
+    A file finds modules beside it, as a program does.
+    """
     if not name.endswith(".py"):
         return import_module(name)
     known = f"gradscape_file_{hashlib.sha256(name.encode()).hexdigest()[:12]}"
@@ -30,6 +34,8 @@ def _loaded(known: str, path: str) -> ModuleType:
     assert spec is not None  # of a path that ends in .py there is one,
     assert spec.loader is not None  # which is loaded
     module = module_from_spec(spec)
+    if (beside := str(Path(path).parent)) not in sys.path:
+        sys.path.append(beside)
     sys.modules[known] = module  # dataclasses look there for their own module
     try:
         spec.loader.exec_module(module)

@@ -1,6 +1,7 @@
 """Somebody else's simulator: a class in a file, registered by a program, short of what a scene of ours has."""
 
 import json
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -19,10 +20,11 @@ ARM = '''
 from dataclasses import dataclass
 import torch
 import gradscape as gs
+from joints_of_the_arm import STIFFNESS
 
 @dataclass(frozen=True)
 class Stiffness:
-    stiffness: float = 1.0
+    stiffness: float = STIFFNESS
 
 class TwoLinkArm(gs.Environment):
     Options = Stiffness
@@ -49,16 +51,19 @@ NOTHING = 3
 
 @pytest.fixture(autouse=True)
 def forgotten() -> Iterator[None]:
-    """Forget what a test registers."""
-    known = dict(registry.entries())
+    """Forget what a test registers and imports."""
+    known, path = dict(registry.entries()), list(sys.path)
     yield
     registry.entries().clear()
     registry.entries().update(known)
+    sys.path[:] = path
+    sys.modules.pop("joints_of_the_arm", None)
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     (tmp_path / "arm.py").write_text(ARM)
+    (tmp_path / "joints_of_the_arm.py").write_text("STIFFNESS = 1.0")
     return tmp_path
 
 
