@@ -1,6 +1,7 @@
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import warnings
@@ -396,3 +397,44 @@ def test_threads_that_gather_layouts_warn_of_nothing(tmp_path):
     with ThreadPoolExecutor(2) as threads:
         for _ in threads.map(lambda number: consolidate(stores[number % 2].place), range(40)):
             pass
+
+
+KILLED_WHILE_FINISHING = """
+import os, signal, sys
+from pathlib import Path
+from gradscape.landscapes import files, store
+from test_store import fill, make
+path, instant = Path(sys.argv[1]), sys.argv[2]
+
+def die(*given, **options):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+found = fill(make(path))
+dataset = found.dataset()
+if instant == "written":  # whole, but not in its place
+    store.consolidate = die
+elif instant == "placed":  # before its tiles are removed
+    store.discard = die
+else:  # in the middle of their removal
+    def torn(folder, **how):
+        for chunks in Path(folder).rglob("c"):
+            os.rename(chunks, path.parent.with_name("torn"))
+            die()
+    files.shutil.rmtree = torn
+found.finish(dataset)
+"""
+
+
+@pytest.mark.parametrize("instant", ["written", "placed", "removed"])
+def test_a_kill_while_a_slice_is_finished_leaves_it_whole(tmp_path, instant):
+    path = tmp_path / "desk" / "slice.zarr"
+    command = [sys.executable, "-c", KILLED_WHILE_FINISHING, str(path), instant]
+    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    left = make(path)
+    assert left.pending() == []
+    left.finish(left.dataset())
+    whole = fill(SliceStore.in_memory(PLANE, SPACE, identity=IDENTITY)).dataset()
+    for name in ("loss", "grad", "status"):
+        np.testing.assert_array_equal(open_slice(path)[name], whole[name])
+    assert [file.name for file in path.parent.iterdir() if not file.name.startswith(".")] == ["slice.zarr"]
