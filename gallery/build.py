@@ -73,7 +73,7 @@ def _templates() -> Environment:
 
 def _number(value: Any, digits: int = 4) -> str:
     """Write a number with a minus sign, and anything else as it is."""
-    return f"{value:.{digits}g}".replace("-", "\N{MINUS SIGN}") if isinstance(value, int | float) else str(value)
+    return f"{value:z.{digits}g}".replace("-", "\N{MINUS SIGN}") if isinstance(value, int | float) else str(value)
 
 
 def _sampled(store: Path) -> bool:

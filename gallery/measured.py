@@ -69,7 +69,7 @@ def _small(rows: list[Record]) -> Record | None:
 
 
 def _signed(value: float) -> str:
-    return f"{value:.2f}".replace("-", "\N{MINUS SIGN}")
+    return f"{value:z.2f}".replace("-", "\N{MINUS SIGN}")
 
 
 def place_tradeoffs(data: Path, out: Path, envs: list[str]) -> dict[str, list[dict[str, Any]]]:

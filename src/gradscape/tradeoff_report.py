@@ -299,7 +299,7 @@ def show(report: dict[str, Any], console: Console) -> None:
     )
     for fit in report["orders"]:
         console.print(
-            f"error ~ dt^{fit['order']:.2f} ± {fit['standard_error']:.2f}: {', '.join(fit['rungs'])}", markup=False
+            f"error ~ dt^{fit['order']:z.2f} ± {fit['standard_error']:.2f}: {', '.join(fit['rungs'])}", markup=False
         )
     for why in dict.fromkeys(refused["why"] for refused in report["refused"]):
         names = [refused["name"] for refused in report["refused"] if refused["why"] == why]
@@ -345,4 +345,4 @@ def _percent(value: float | None) -> str:
 
 
 def _number(found: dict[str, float | None]) -> str:
-    return "" if found["value"] is None else f"{found['value']:.3f}"
+    return "" if found["value"] is None else f"{found['value']:z.3f}"
