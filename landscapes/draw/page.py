@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import re
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Patch
 from matplotlib.text import Text
 
-from ..files import replacing, visible
+from ..files import print_width, replacing, visible
 from ..objective import Status
 from . import style
 from .typesetting import MARGIN, across, settle, wrapped
@@ -165,7 +164,7 @@ def save_prints(draw: Callable[[float], Figure], path: Path, widths: Sequence[fl
 
     Those that are there from before are drawn anew, so that none is of something else.
     """
-    before = [float(found[1]) for file in visible(path.parent) if (found := _print(path.stem, file.name))]
+    before = {width for file in visible(path.parent) if (width := print_width(file.name, path.name))}
     names = []
     for width in dict.fromkeys([*sorted(before), *widths]):
         figure = draw(width)
@@ -173,12 +172,3 @@ def save_prints(draw: Callable[[float], Figure], path: Path, widths: Sequence[fl
             names.append(f"{path.stem}-{width:g}mm.{kind}")
             save(figure, path.with_name(names[-1]))
     return names
-
-
-def is_print(name: str, picture: str) -> bool:
-    """Whether a file is a print of a picture, which has a name of its own."""
-    return _print(Path(picture).stem, name) is not None
-
-
-def _print(stem: str, name: str) -> re.Match[str] | None:
-    return re.fullmatch(rf"{re.escape(stem)}-([\d.]+)mm\.(?:pdf|svg)", name)

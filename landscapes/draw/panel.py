@@ -22,7 +22,10 @@ def grid(picture: Picture, panels: int, *, share: bool = False) -> list[Axes]:
     """Return so many panels, as many side by side as the sheet has columns; they may share their window."""
     columns = min(panels, picture.sheet.columns)
     rows = -(-panels // columns)
-    return list(picture.subplots(rows, columns, sharex=share, sharey=share, squeeze=False).flat)[:panels]
+    every = list(picture.subplots(rows, columns, sharex=share, sharey=share, squeeze=False).flat)
+    for empty in every[panels:]:
+        empty.remove()
+    return every[:panels]
 
 
 def dress(ax: Axes) -> None:

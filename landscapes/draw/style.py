@@ -140,7 +140,9 @@ class Sheet:
             return cls(columns * pitch, columns, 1.0)
         if not NARROWEST <= width <= WIDEST:
             raise ValueError(f"a picture for print is {NARROWEST:g} to {WIDEST:g} mm wide; got {width:g}")
-        fit = max(1, min(panels or columns, int(width / least)))
+        panels = panels or columns
+        fit = max(1, min(panels, int(width / least)))
+        fit = math.ceil(panels / math.ceil(panels / fit))  # as many in each row
         return cls(width / INCH, fit, width / INCH / fit / pitch, title=8.0, label=7.0, tick=6.5, small=6.0)
 
     @property

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ from rich.table import Table
 from .console import duration, fill, identity_of, size
 from .envs.registry import code_digest, entries, make
 from .gallery.figures import DATA, read_figures
-from .landscapes.files import replacing, visible, write_json
+from .landscapes.files import others, replacing, write_json
 from .measure_tables import by_environment, slices_markdown, slices_table
 from .results import SLICE, environment_of, inside
 
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from .landscapes.objective import Evaluation, Objective
 
 REPORT, TABLE, PICTURE, MEASURES = "report.json", "report.md", "gradient-quality.png", "measures.json"
+ARRAYS = "gradient-quality.npz"  # what the picture is drawn from, but for the slice
 PRECISION = {"float32": 2.0**-23, "float64": 2.0**-52}
 RESOLUTION = 24  # points per axis of a slice that is sampled for its report
 TRIAL = 32  # most episodes that are timed beforehand
@@ -59,6 +61,7 @@ def report(
     data: str | None,
     out: str | None,
     as_json: bool,
+    prints: Sequence[float] = (),
 ) -> None:
     """Measure slices, say what it costs, print the numbers and leave them in files."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
@@ -71,7 +74,7 @@ def report(
     single = len(subjects) == 1 and what is not None
     _check(folder, single)
     places = [folder if single else folder / subject.name for subject in subjects]
-    records, failed = _measured(console, subjects, places, settings, device)
+    records, failed = _measured(console, subjects, places, settings, device, prints)
     if single:
         _show(records[0], as_json, folder)
         return
@@ -124,7 +127,12 @@ def _finished(store: Path) -> bool:
 
 
 def _measured(
-    console: Console, subjects: Sequence[Subject], places: Sequence[Path], settings: dict[str, Any], device: str
+    console: Console,
+    subjects: Sequence[Subject],
+    places: Sequence[Path],
+    settings: dict[str, Any],
+    device: str,
+    prints: Sequence[float],
 ) -> tuple[list[dict[str, Any]], dict[str, str]]:
     """Return a record of each slice, in the order given: those on disk as they are, the others measured now.
 
@@ -139,6 +147,7 @@ def _measured(
             console.print(f"slice {number + 1} of {len(subjects)}: {subject.name}", markup=False)
         try:
             records.append(measured(console, subject, folder, settings, device, paper_words()))
+            _print(console, subject, folder, prints)
         except KeyboardInterrupt:
             again = shlex.join(["landscape", *sys.argv[1:]])
             console.print(
@@ -195,7 +204,7 @@ def _fetch(console: Console, source: Path, folder: Path, key: dict[str, Any]) ->
         return
     if _same(json.loads((source / REPORT).read_text()), key):
         folder.mkdir(parents=True, exist_ok=True)
-        for file in files:
+        for file in [*files, *source.glob(ARRAYS)]:
             shutil.copyfile(file, folder / file.name)
         console.print(f"{folder} is copied from {source}", markup=False)
 
@@ -309,14 +318,42 @@ def _beside(character: Character, said: Said | None) -> dict[str, Any] | None:
 
 
 def _leave(console: Console, dataset: xr.Dataset, character: Character, record: dict[str, Any], folder: Path) -> None:
+    import xarray as xr
+
+    from .landscapes.bundle import save_bundle
     from .landscapes.character import named_measures
     from .landscapes.draw.page import save
     from .landscapes.draw.quality import quality_figure
 
+    noise = xr.Dataset({"deviation": character.noise.deviation})
+    save_bundle(folder / ARRAYS, steps=character.steps, smooth=character.smooth, noise=noise)
     save(quality_figure(dataset, character.steps, character.samples, character.smooth), folder / PICTURE)
     write_json(folder / MEASURES, named_measures(record))
     write_json(folder / REPORT, record)
-    console.print(f"{folder}: {REPORT}, {MEASURES}, {PICTURE}", markup=False)
+    console.print(f"{folder}: {REPORT}, {MEASURES}, {PICTURE}, {ARRAYS}", markup=False)
+
+
+def _print(console: Console, subject: Subject, folder: Path, prints: Sequence[float]) -> None:
+    """Draw a report that is there for pages so wide [mm]."""
+    if not prints:
+        return
+    if not (folder / ARRAYS).exists():
+        raise ValueError(
+            f"{folder} is a report from before {ARRAYS} was kept to draw from; delete it to measure it anew"
+        )
+    import numpy as np
+
+    from .landscapes.bundle import open_bundle
+    from .landscapes.draw.page import save_prints
+    from .landscapes.draw.quality import quality_figure
+    from .landscapes.gradients import of_samples
+    from .landscapes.store import open_slice
+
+    dataset, kept = open_slice(subject.store), open_bundle(folder / ARRAYS)
+    samples = of_samples(dataset, deviation=float(np.nan_to_num(kept["noise"]["deviation"])))
+    draw = partial(quality_figure, dataset, kept["steps"], samples, kept["smooth"])
+    printed = save_prints(lambda width: draw(width=width), folder / PICTURE, prints)
+    console.print(f"{folder}: {', '.join(printed)}", markup=False)
 
 
 def digest(dataset: xr.Dataset) -> str:
@@ -333,9 +370,8 @@ def _folder_name(what: str, subjects: Sequence[Subject], settings: dict[str, Any
 
 def _check(folder: Path, single: bool) -> None:
     """Refuse a folder that holds anything but reports."""
-    ours = {REPORT, MEASURES, PICTURE} if single else {REPORT, TABLE}
-    others = [file for file in visible(folder) if file.name not in ours and (single or not (file / PICTURE).exists())]
-    if others:
+    ours = {REPORT, MEASURES, PICTURE, ARRAYS} if single else {REPORT, TABLE}
+    if any(single or not (file / PICTURE).exists() for file in others(folder, ours, PICTURE)):
         raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
 
 

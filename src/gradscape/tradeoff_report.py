@@ -49,6 +49,7 @@ def tradeoff(
     out: str | None,
     as_json: bool,
     force: bool,
+    prints: Sequence[float] = (),
 ) -> None:
     """Measure every rung against the reference, keep what was found for --tolerance, and show it."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
@@ -61,6 +62,7 @@ def tradeoff(
     try:
         study.announce(console)
         report = study.run(console)
+        printed = study.print(report, prints)
     except KeyboardInterrupt:
         console.print(
             f"stopped: {study.pieces.count()} of {len(study.rungs)} rungs are kept in {study.pieces.folder}; "
@@ -70,7 +72,8 @@ def tradeoff(
         sys.exit(130)
     kept = keep(report)
     show(report, Console(stderr=as_json))
-    console.print(f"{study.pieces.folder}: {PICTURE}, {RECORD}; kept for --tolerance: {kept}", markup=False)
+    files = ", ".join([PICTURE, *printed, RECORD])
+    console.print(f"{study.pieces.folder}: {files}; kept for --tolerance: {kept}", markup=False)
     if as_json:
         print(json.dumps({**report, "folder": str(study.pieces.folder)}))
 
@@ -169,6 +172,13 @@ class Study:
         save(tradeoff_figure(report), folder / PICTURE)
         write_json(folder / RECORD, report)
         return report
+
+    def print(self, report: dict[str, Any], prints: Sequence[float]) -> list[str]:
+        """Draw the report for pages so wide [mm], too; return the files' names."""
+        from .landscapes.draw.page import save_prints
+        from .landscapes.draw.tradeoff import tradeoff_figure
+
+        return save_prints(lambda width: tradeoff_figure(report, width=width), self.pieces.folder / PICTURE, prints)
 
     def _measure(self, console: Console) -> dict[str, Sample]:
         from .landscapes.tradeoff import Sample

@@ -9,11 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from matplotlib import rcParams
 from matplotlib.text import Text
 
 from gradscape.landscapes import draw, gradients
 from gradscape.landscapes.draw import page, typesetting
+from gradscape.landscapes.draw.contact import Caption, episode_figure
 from gradscape.landscapes.draw.contour import landscape_figure
 from gradscape.landscapes.draw.curve import run_figure
 from gradscape.landscapes.draw.overlay import overlay_figure
@@ -24,6 +26,8 @@ from gradscape.landscapes.draw.surface import surface_figure
 from gradscape.landscapes.draw.sweep import Scales, frame_figure
 from gradscape.landscapes.draw.thumbnail import thumbnail_figure
 from gradscape.landscapes.draw.tradeoff import tradeoff_figure
+from gradscape.landscapes.episode import Episode, Part, View
+from gradscape.landscapes.files import print_width
 from gradscape.landscapes.sampling import sample
 from gradscape.optim.registry import METHODS
 
@@ -53,6 +57,14 @@ def quality(dataset):
     return dataset, steps, gradients.of_samples(dataset), smooth
 
 
+EPISODE = Episode(
+    torch.arange(6) / 10, {}, {}, (Part("sphere", "rubber", torch.zeros(6, 1, 3), (0.3,)),),
+    View((-1.0,) * 3, (1.0,) * 3, ground=None),
+)  # fmt: skip
+CAPTION = Caption(
+    "plasticine · reference", "loss 1.2345 m", "best:out/race", {f"tool {n} x": "−0.25 m" for n in range(30)},
+    "episode.json", COMMAND,
+)  # fmt: skip
 FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
     "landscape_figure": [
         lambda width: landscape_figure(PLANE, width=width),
@@ -79,6 +91,7 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
     ],
     "tradeoff_figure": [lambda width: tradeoff_figure(REPORT, width=width)],
     "frame_figure": [lambda width: frame_figure(SWEEP, 1, Scales.of(SWEEP), width=width)],
+    "episode_figure": [lambda width: episode_figure(EPISODE, caption=CAPTION, width=width)],
     "thumbnail_figure": [lambda width: thumbnail_figure(DATASET, width=width)],
 }
 EACH = [pytest.param(make, id=f"{name}-{number}") for name, all_ in FIGURES.items() for number, make in enumerate(all_)]
@@ -184,8 +197,8 @@ def test_prints_are_named_by_their_width_and_those_there_are_drawn_anew(tmp_path
     names = page.save_prints(draw_, picture, [170.0])
     assert drawn == [85.0, 85.0, 170.0]
     assert sorted(names) == sorted(file.name for file in tmp_path.iterdir())
-    assert all(page.is_print(name, "landscape.png") for name in names)
-    assert not page.is_print("landscape-notes.pdf", "landscape.png")
+    assert [print_width(name, "landscape.png") for name in names] == [85.0, 85.0, 170.0, 170.0]
+    assert print_width("landscape-notes.pdf", "landscape.png") is None
 
 
 def test_a_text_is_wrapped_by_its_width() -> None:

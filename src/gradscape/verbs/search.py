@@ -16,6 +16,7 @@ from .options import (
     ForceRun,
     Json,
     OutOfRun,
+    Print,
     Scheduler,
     Set,
     Tolerance,
@@ -42,6 +43,7 @@ def optimize(
     set_: Set = None,
     option: Annotated[list[str] | None, typer.Option(help="A method's option, name=value; may be repeated.")] = None,
     out: OutOfRun = None,
+    print_: Print = None,
     json_: Json = False,
     force: ForceRun = False,
 ) -> None:
@@ -65,6 +67,7 @@ def optimize(
         settings=set_ or [],
         method_settings=option or [],
         out=out,
+        prints=print_ or [],
         as_json=json_,
         force=force,
     )
@@ -93,6 +96,7 @@ def race(
     out: Annotated[
         str | None, typer.Option(help="Folder for the results; by default one under out/ named after the race.")
     ] = None,
+    print_: Print = None,
     json_: Json = False,
     report: Annotated[bool, typer.Option("--report", help="Say which of the paper's orderings hold.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Begin anew where these runs exist already.")] = False,
@@ -117,6 +121,7 @@ def race(
         settings=set_ or [],
         method_settings=option or [],
         out=out,
+        prints=print_ or [],
         as_json=json_,
         report=report,
         force=force,
@@ -130,6 +135,7 @@ def overlay(
     out: Annotated[
         str | None, typer.Option(help="Folder for the results; by default one under out/ named after the overlay.")
     ] = None,
+    print_: Print = None,
     through: Annotated[
         str | None, typer.Option(help="Cut anew through the best point of all runs (best) or of one run's folder.")
     ] = None,
@@ -151,6 +157,7 @@ def overlay(
         slice_,
         runs,
         out=out,
+        prints=print_ or [],
         through=through,
         plane=plane,
         resolution=resolution,
