@@ -206,13 +206,13 @@ def _best_said(runs: Runs) -> str:
     loss, run = min(found, key=lambda pair: pair[0])
     row = int(run["loss"].argmin("evaluation"))
     away = float(run["distance"][row])
-    where = f", {_away(away)} off the plane" if away > 1e-9 else ""
+    where = f", {half_widths(away)} off the plane" if away > 1e-9 else ""
     beyond = ", outside the map" if bool(run["outside"][row]) else ""
     unit = run["loss"].attrs.get("units", "")
     return f"best {style.number(loss)}{f' {unit}' if unit else ''}{where}{beyond}"
 
 
-def _away(distance: float) -> str:
+def half_widths(distance: float) -> str:
     """Write a distance from the plane with its unit."""
     said = style.number(distance, ".2g") if distance >= 1e-3 else "less than 0.001"
     return f"{said} half-width{'' if said == '1' else 's'} of the box"
@@ -245,7 +245,7 @@ def _distance_entries(sheet: style.Sheet, runs: Runs, reach: float) -> list[Arti
     steps = np.array([0.0, reach / 2, reach])
     sizes = sheet.weight * np.sqrt(style.point_areas(steps, reach, _count(runs)))
     look: dict[str, Any] = {"linestyle": "none", "marker": "o", "markerfacecolor": style.QUIET, "markeredgewidth": 0.0}
-    said = ("on the plane", *(f"{_away(float(away))} off it" for away in steps[1:]))
+    said = ("on the plane", *(f"{half_widths(float(away))} off it" for away in steps[1:]))
     return [Line2D([], [], markersize=size, **look, label=text) for size, text in zip(sizes, said, strict=True)]
 
 

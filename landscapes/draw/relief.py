@@ -14,8 +14,11 @@ from . import contour, style
 Grid = NDArray[np.float64]
 
 SIDE, HEIGHT = 2.0, 0.9  # of the surface: the slice's window, and the scale of the losses
-AWAY, UP = 4.83, 2.74  # of the eye from the middle of the surface, over the ground and above
+FOCUS = 0.26  # how high the eye looks
+AWAY, UP = 4.83, 2.74  # of the eye from the middle of the surface, over the ground and up
 AZIMUTHS = (236.0, 304.0, 124.0, 56.0, 214.0, 326.0, 146.0, 34.0)  # of the eye [degrees]; no edge is seen end on
+TRIANGLES = ((0, 1, 2), (0, 2, 3))  # of a cell's corners
+FOOT = 0.08  # share of the upright axis that has no ticks
 LOWEST = 0.1  # share of the samples that are the valley
 STEPS = 160  # of a line of sight across the surface
 
@@ -105,6 +108,48 @@ def _owners(
     at: tuple[NDArray[np.intp], NDArray[np.intp]], right: int, back: int, columns: int
 ) -> tuple[Grid, NDArray[np.intp]]:
     return np.tile([float(right), float(back), 0.0], (len(at[0]), 1)), at[0] * columns + at[1]
+
+
+@dataclass(frozen=True)
+class Stand:
+    """Say from where the surface is seen: the azimuth of the eye [degrees]."""
+
+    azimuth: float
+
+    def place(self, turn: float, away: float, up: float) -> tuple[float, float, float]:
+        """Return a place so far from the middle, at an angle from the eye [degrees]."""
+        angle = np.radians(self.azimuth + turn)
+        return (float(away * np.cos(angle)), float(away * np.sin(angle)), FOCUS + up)
+
+    @property
+    def front(self) -> tuple[float, float]:
+        """On which side of the surface the edges in front are, -1 or 1 along u and v."""
+        x, y, _ = self.place(0.0, 1.0, 0.0)
+        return float(np.sign(x)), float(np.sign(y))
+
+    def beside(self, axis: int, share: float, away: float) -> tuple[float, float, float]:
+        """Return a place beside an axis: u and v along the edges in front, the loss up the edge at the right."""
+        (right, back), half, along = self.front, SIDE / 2, SIDE * (share - 0.5)
+        if axis == 0:
+            return (along, back * (half + away), 0.0)
+        if axis == 1:
+            return (right * (half + away), along, 0.0)
+        x, y, _ = self.place(90.0, 1.0, 0.0)  # to the right of who looks
+        corner = (-right * half, back * half) if x * right < y * back else (right * half, -back * half)
+        return (corner[0] + x * away, corner[1] + y * away, HEIGHT * share)
+
+    def frame(self) -> list[Grid]:
+        """Return the edges of the ground and of the two walls behind, as lines of shape (point, 3)."""
+        a, top, (right, back) = SIDE / 2, HEIGHT, self.front
+        x, y = -right * a, -back * a  # where the walls are
+        floor = [(-a, -a, 0), (a, -a, 0), (a, a, 0), (-a, a, 0), (-a, -a, 0)]
+        walls = [(-x, y, 0), (-x, y, top), (x, y, top), (x, y, 0)], [(x, y, top), (x, -y, top), (x, -y, 0)]
+        return [np.array(line, dtype=np.float64) for line in (floor, *walls)]
+
+
+def stand(relief: Relief, dataset: xr.Dataset) -> Stand:
+    """Return where most of the valley is seen from."""
+    return Stand(azimuth(relief, dataset))
 
 
 def azimuth(relief: Relief, dataset: xr.Dataset) -> float:

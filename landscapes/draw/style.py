@@ -25,6 +25,9 @@ BAND = ("#dfe6ee", "#f6f8fa")  # alternating event counts
 LINE = "#31688e"  # the loss over a line: viridis' blue
 SLOPE_LINE = "#b5367a"  # the gradient along it: magma's pink
 
+BETWEEN = "#777777"  # as far from white as from black: lines and labels in a viewer, whose ground is light or dark
+BEYOND, LOST = "#9a7b00", "#c94f4f"  # points there that are outside the window, or failed
+
 LOSS_MAP: Colormap = colormaps["viridis"]
 SLOPE_MAP: Colormap = ListedColormap(colormaps["magma"](np.linspace(0.08, 0.77, 256)), "magma, legible on white")
 

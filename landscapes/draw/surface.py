@@ -23,7 +23,7 @@ from ..objective import Status
 from ..store import plane_of
 from . import page, panel, relief, style
 from .overlay import by_kind, joint_scale
-from .relief import HEIGHT, SIDE, Relief
+from .relief import FOCUS, HEIGHT, SIDE, Relief, Stand
 from .solids import off_screen
 
 Runs = Sequence[xr.Dataset]
@@ -31,43 +31,13 @@ Grid = NDArray[np.float64]
 
 PITCH = 8.6  # of the page on a screen [inch]
 PIXELS, FINE = (1500, 1100), 300  # of the picture; in print, so many per inch where that is more
-ANGLE, FOCUS = 28.0, 0.26  # of the camera: its angle [degrees], how high it looks
+ANGLE = 28.0  # of the camera [degrees]
 LIGHTS = (((-100.0, 2.0, 4.0), 0.85), ((60.0, 3.2, 1.2), 0.35))  # from the eye's azimuth, away and up; strength
 MATTER: dict[str, Any] = {"ambient": 0.3, "diffuse": 0.78, "specular": 0.0}
 POINT, TRAIL, BEST, LIFT = 0.016, 0.006, 0.03, 0.004  # radii of points, descents and bests; how far they lie above
 FRAME = 0.003  # radius of its lines
 AWAY, OUT = (0.09, 0.09, 0.04), (0.31, 0.31, 0.28)  # of ticks and of names from the frame, for each axis
-FOOT = 0.08  # share of the upright axis that has no ticks
 ROOM = 0.02  # about the frame, in the picture
-
-
-@dataclass(frozen=True)
-class Stand:
-    """Say from where the surface is seen: the azimuth of the eye [degrees]."""
-
-    azimuth: float
-
-    def place(self, turn: float, away: float, up: float) -> tuple[float, float, float]:
-        """Return a place so far from the middle, at an angle from the eye [degrees]."""
-        angle = np.radians(self.azimuth + turn)
-        return (float(away * np.cos(angle)), float(away * np.sin(angle)), FOCUS + up)
-
-    @property
-    def front(self) -> tuple[float, float]:
-        """On which side of the surface the edges in front are, -1 or 1 along u and v."""
-        x, y, _ = self.place(0.0, 1.0, 0.0)
-        return float(np.sign(x)), float(np.sign(y))
-
-    def beside(self, axis: int, share: float, away: float) -> tuple[float, float, float]:
-        """Return a place beside an axis: u and v along the edges in front, the loss up the edge at the right."""
-        (right, back), half, along = self.front, SIDE / 2, SIDE * (share - 0.5)
-        if axis == 0:
-            return (along, back * (half + away), 0.0)
-        if axis == 1:
-            return (right * (half + away), along, 0.0)
-        x, y, _ = self.place(90.0, 1.0, 0.0)  # to the right of who looks
-        corner = (-right * half, back * half) if x * right < y * back else (right * half, -back * half)
-        return (corner[0] + x * away, corner[1] + y * away, HEIGHT * share)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +103,7 @@ def scene(dataset: xr.Dataset, runs: Runs, *, pixels: tuple[int, int] = PIXELS) 
     if plane.rank != 2:
         raise ValueError(f"a surface shows a plane; got a slice of rank {plane.rank}, so vary two parameters")
     body = Relief(plane, joint_scale(dataset, runs))
-    stand = Stand(relief.azimuth(body, dataset))
+    stand = relief.stand(body, dataset)
     with off_screen(pixels) as plotter:
         focus = (0.0, 0.0, FOCUS)
         for (turn, away, up), strength in LIGHTS:
@@ -159,7 +129,7 @@ def _add_surface(plotter: pv.Plotter, body: Relief, dataset: xr.Dataset) -> None
     if not len(made.corners):
         return
     first = 4 * np.arange(len(made.corners))[:, None]
-    faces = np.concatenate([first + np.array(corners) for corners in ((0, 1, 2), (0, 2, 3))])
+    faces = np.concatenate([first + np.array(corners) for corners in relief.TRIANGLES])
     surface = pv.PolyData.from_regular_faces(made.corners.reshape(-1, 3), faces)
     colours = style.LOSS_MAP(body.shade(dataset["loss"].transpose("v", "u").to_numpy()).ravel(), bytes=True)[:, :3]
     surface["color"] = np.repeat(colours[made.sample], 4, axis=0)
@@ -169,13 +139,8 @@ def _add_surface(plotter: pv.Plotter, body: Relief, dataset: xr.Dataset) -> None
 
 
 def _add_frame(plotter: pv.Plotter, stand: Stand) -> None:
-    """Draw the edges of the ground and of the two walls behind."""
-    a, top, (right, back) = SIDE / 2, HEIGHT, stand.front
-    x, y = -right * a, -back * a  # where the walls are
-    floor = [(-a, -a, 0), (a, -a, 0), (a, a, 0), (-a, a, 0), (-a, -a, 0)]
-    walls = [(-x, y, 0), (-x, y, top), (x, y, top), (x, y, 0)], [(x, y, top), (x, -y, top), (x, -y, 0)]
-    for number, line in enumerate((floor, *walls)):
-        lines = pv.lines_from_points(np.array(line, dtype=np.float64)).tube(radius=FRAME)
+    for number, line in enumerate(stand.frame()):
+        lines = pv.lines_from_points(line).tube(radius=FRAME)
         plotter.add_mesh(lines, color=style.FAINT, lighting=False, name=f"frame {number}", reset_camera=False)
 
 
@@ -226,7 +191,7 @@ def _label(ax: Axes, dataset: xr.Dataset, shown: Shown) -> None:
         ticks = ticks[(ticks >= low) & (ticks <= high)]
         share = (ticks - low) / (high - low) if axis < 2 else body.shade(ticks)
         if axis == 2:  # at its foot another axis begins
-            ticks, share = ticks[share > FOOT], share[share > FOOT]
+            ticks, share = ticks[share > relief.FOOT], share[share > relief.FOOT]
         spots = shown.on_picture(np.array([shown.stand.beside(axis, part, room * AWAY[axis]) for part in share]))
         look: dict[str, Any] = {"size": sheet.tick, "color": style.INK, "va": "center"}
         look["ha"] = "left" if axis == 2 else "center"
