@@ -25,11 +25,13 @@ BAND = ("#dfe6ee", "#f6f8fa")  # alternating event counts
 LINE = "#31688e"  # the loss over a line: viridis' blue
 SLOPE_LINE = "#b5367a"  # the gradient along it: magma's pink
 
+NIGHT, NIGHT_INK = "#16181b", "#ececec"  # ground and ink of the gallery's pages where they are dark
 BETWEEN = "#777777"  # as far from white as from black: lines and labels in a viewer, whose ground is light or dark
 BEYOND, LOST = "#9a7b00", "#c94f4f"  # points there that are outside the window, or failed
 
 LOSS_MAP: Colormap = colormaps["viridis"]
 SLOPE_MAP: Colormap = ListedColormap(colormaps["magma"](np.linspace(0.08, 0.77, 256)), "magma, legible on white")
+SLOPE_MAP_DARK: Colormap = ListedColormap(colormaps["magma"](np.linspace(0.42, 1.0, 256)), "magma, legible on black")
 
 FAILURES = {Status.NONFINITE: "not finite", Status.ESCAPED: "left the domain", Status.ERROR: "error"}
 _FAILED: dict[str, Any] = {"facecolor": "white", "edgecolor": QUIET, "linewidth": 0.0}
@@ -97,7 +99,7 @@ LADDERS: dict[str, dict[str, Any]] = {  # what was turned to make a rung of a tr
     "particles": {"color": "#e69f00", "marker": "^"},
     "precision": {"color": "#cc79a7", "marker": "D"},
     "stiffness": {"color": "#d55e00", "marker": "v"},
-    "engine": {"color": "#5b2a86", "marker": "P"},
+    "engine": {"color": "#8455c9", "marker": "P"},
     "device": {"color": "#7f7f7f", "marker": "X"},
     "named": {"color": INK, "marker": "*", "markersize": 13.0},
 }
