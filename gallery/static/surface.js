@@ -13,10 +13,10 @@ function project([right, back, high]) {
   const [cos, sin] = [Math.cos(view.turn), Math.sin(view.turn)];
   const [a, b, c] = [right - 0.5, back - 0.5, high - HEIGHT / 2];
   const [across_, away] = [a * cos - b * sin, a * sin + b * cos];
-  const scale = Math.min(0.68 * stage.clientHeight, 0.5 * stage.clientWidth) * view.zoom;
+  const scale = Math.min(0.62 * stage.clientHeight, 0.5 * stage.clientWidth) * view.zoom;
   const lifted = c * Math.cos(view.tilt) + away * Math.sin(view.tilt);
   const near = c * Math.sin(view.tilt) - away * Math.cos(view.tilt);
-  return [stage.clientWidth / 2 + across_ * scale, stage.clientHeight / 2 - lifted * scale, near];
+  return [stage.clientWidth / 2 + across_ * scale, 0.46 * stage.clientHeight - lifted * scale, near];
 }
 const flat = (point) => project(point).slice(0, 2);
 
@@ -83,25 +83,31 @@ function draped(run, row) {
   return flat([right, back, rise(column, line) + 0.015]);
 }
 
-// Beside the edge that is nearer to the viewer; below the other axis' label, where both would be in one place.
-function beside(brush, axis, put, other) {
+// Name and ends of an axis beside its edge that is nearer to the viewer. A name that has no room there comes below the
+// floor, and below one of those that are `under` it already if it would run into that.
+function beside(brush, axis, put, under) {
   const edge = (side, share, off) => put(share, side ? 1 + off : -off);
   const side = project(edge(1, 0.5, 0))[2] > project(edge(0, 0.5, 0))[2] ? 1 : 0;
-  brush.textAlign = "center";
-  const [middle, under] = flat(edge(side, 0.5, 0.2));
-  const room = brush.measureText(axis.label).width / 2 + 6;
-  const label = { middle: clamp(middle, room, stage.clientWidth - room), under, room };
-  if (other && Math.abs(label.middle - other.middle) < room + other.room && Math.abs(under - other.under) < 16) {
-    label.under = other.under + 16;
-  }
-  brush.fillText(axis.label, label.middle, label.under);
   brush.font = "12px system-ui, sans-serif";
+  brush.textAlign = "center";
   for (const value of [axis.ticks[0], axis.ticks[axis.ticks.length - 1]]) {
     const [right, down] = flat(edge(side, along(value, axis), 0.07));
     brush.fillText(number(value), right, down + 4);
   }
   brush.font = "13px system-ui, sans-serif";
-  return label;
+  const [[right, down], wide, long] = [flat(edge(side, 0.5, 0.09)), stage.clientWidth, brush.measureText(axis.label).width];
+  const onLeft = right < wide / 2;
+  if (onLeft ? right - long > 4 : right + long < wide - 4) {
+    brush.textAlign = onLeft ? "right" : "left";
+    brush.fillText(axis.label, right, down + 8);
+    return;
+  }
+  const middle = clamp(right, long / 2 + 4, wide - long / 2 - 4);
+  const line = under.filter((other) => Math.abs(middle - other.middle) < (long + other.long) / 2 + 12).length;
+  under.push({ middle, long });
+  const lowest = Math.max(...FLOOR.map((corner) => flat(corner)[1]));
+  brush.textAlign = "center";
+  brush.fillText(axis.label, middle, lowest + 36 + 17 * line);
 }
 
 // The height's scale at the corner that is farthest to the left.
@@ -146,8 +152,9 @@ const repaint = fit(stage, (brush, width, height) => {
   brush.fillStyle = ink("ink");
   brush.lineWidth = 1;
   brush.font = "13px system-ui, sans-serif";
-  const first = beside(brush, across, (share, off) => [share, off, 0]);
-  beside(brush, up, (share, off) => [off, share, 0], first);
+  const under = [];
+  beside(brush, across, (share, off) => [share, off, 0], under);
+  beside(brush, up, (share, off) => [off, share, 0], under);
   heights(brush);
 });
 
