@@ -97,6 +97,11 @@ def test_a_report_is_printed_from_what_it_kept(run: Run, tmp_path: Path, monkeyp
     again = run(*command, "--print", "85", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     assert (tmp_path / "told" / name).read_bytes() == before
+    for file in (tmp_path / "told").iterdir():
+        (tmp_path / "cut" / file.name).write_bytes(file.read_bytes())
+    beside = run("report", "cut", "--points", "2", "--out", "copied", "--print", "85", cwd=tmp_path)
+    assert "copied is copied from cut" in beside.stderr
+    assert (tmp_path / "copied" / name).read_bytes() == before
     (tmp_path / "told/gradient-quality.npz").unlink()
     older = run(*command, "--print", "85", cwd=tmp_path)
     assert older.returncode == 2

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pyvista as pv
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
 from ..episode import Episode, Part, View
-from . import materials, style
+from . import materials, style, typesetting
+from .film import picture as picture_of
 from .film import save_film
 from .solids import Grid, mesh, off_screen
 
 Picture = NDArray[np.uint8]
 
 HEIGHT = 600  # of a frame [pixel]
+STRIP, STRIP_DPI = 0.4, 100  # height of what is over a film [inch], and how fine it is
 BAR = 0.25  # most of a frame's width that its scale takes
 LIKELY = (0.5, 1.6)  # narrowest and widest frame, its width per height
 APART = 2.0  # from where on a target's surface is away from a body's particles, in their distances
@@ -30,11 +34,32 @@ SAMPLES = 40_000  # of the surfaces that throw it
 
 
 def save_replay(episode: Episode, mp4: str | Path, gif: str | Path, *, title: str = "", longest: int = LONGEST) -> int:
-    """Write evenly spaced frames, first and last among them, as MP4 and GIF; return how many."""
+    """Write evenly spaced frames, first and last among them, under a title as MP4 and GIF; return how many."""
     count = min(longest, len(episode.time))
-    chosen = evenly(episode, count)
-    save_film(frames(episode, chosen, title=title), Path(mp4), Path(gif), count=count, rate=RATE)
+    pictures = headed(frames(episode, evenly(episode, count)), title)
+    save_film(pictures, Path(mp4), Path(gif), count=count, rate=RATE)
     return count
+
+
+def headed(pictures: Iterable[Picture], title: str) -> Iterator[Picture]:
+    """Put a title over pictures, in a strip of its own; none is put where there is no title."""
+    strip = None
+    for picture in pictures:
+        if title and strip is None:
+            strip = _strip(title, picture.shape[1])
+        yield picture if strip is None else np.concatenate([strip, picture])
+
+
+def _strip(title: str, width: int) -> Picture:
+    """Return a title on the background of a picture so wide [pixel]."""
+    figure = Figure(figsize=(width / STRIP_DPI, STRIP), facecolor=materials.BACKGROUND)
+    FigureCanvasAgg(figure)
+    room = width / STRIP_DPI - 2 * typesetting.MARGIN
+    fits = typesetting.text_width(title, style.Sheet.label) < room
+    size = style.Sheet.label if fits else style.Sheet.small  # of which there is room for two lines
+    said, left = typesetting.wrapped(title, room, size), typesetting.MARGIN * STRIP_DPI / width
+    figure.text(left, 0.5, said, size=size, color=style.INK, va="center", parse_math=False)
+    return picture_of(figure, dpi=STRIP_DPI)
 
 
 def evenly(episode: Episode, count: int) -> list[int]:
@@ -43,9 +68,7 @@ def evenly(episode: Episode, count: int) -> list[int]:
     return found
 
 
-def frames(
-    episode: Episode, chosen: Sequence[int], *, height: int = HEIGHT, title: str = "", marked: bool = True
-) -> Iterator[Picture]:
+def frames(episode: Episode, chosen: Sequence[int], *, height: int = HEIGHT, marked: bool = True) -> Iterator[Picture]:
     """Yield pictures of the chosen frames, shape (height, width, 3); each has its time and a scale unless not `marked`.
 
     The scale is right at the middle of the view: what is nearer is larger.
@@ -62,7 +85,7 @@ def frames(
         goals = [mesh(part, 0) for part in sought(episode)]
         _place(plotter, still, [mesh(part, 0) for part in still], "still")
         if marked:
-            _write_scale(plotter, shot, title)
+            _write_scale(plotter, shot)
         for frame in chosen:
             _place(plotter, moving, [mesh(part, frame) for part in moving], "moving")
             _place(plotter, sought(episode), [missing(goal, bodies, frame) for goal in goals], "sought")
@@ -70,7 +93,7 @@ def frames(
                 _lay_ground(plotter, view, [mesh(part, frame) for part in episode.parts if materials.solid(part)])
             if marked:
                 said = f"{style.number(float(episode.time[frame]), '.3g')} s"
-                plotter.add_text(said, name="time", position=materials.INSET, **materials.STAMP)
+                _stamp(plotter, said, "time", materials.INSET)
             plotter.render()
             picture = np.array(plotter.screenshot(return_img=True))
             if marked:
@@ -131,12 +154,17 @@ def _stage(view: View, shot: Shot) -> Iterator[pv.Plotter]:
         yield plotter
 
 
-def _write_scale(plotter: pv.Plotter, shot: Shot, title: str) -> None:
-    """Write how long the scale's bar is, over its place at the lower right, and a title at the upper left."""
-    (right, lift), (width, height) = materials.INSET, shot.size
-    over = (width - right - round(shot.bar * shot.metre), lift + 2 * materials.THICK)
-    plotter.add_text(f"{style.number(shot.bar)} m", name="scale", position=over, **materials.STAMP)
-    plotter.add_text(title, name="title", position=(right, height - 3 * lift), **materials.STAMP)
+def _write_scale(plotter: pv.Plotter, shot: Shot) -> None:
+    """Write how long the scale's bar is, over its place at the lower right."""
+    right, lift = materials.INSET
+    over = (shot.size[0] - right - round(shot.bar * shot.metre), lift + 2 * materials.THICK)
+    _stamp(plotter, f"{style.number(shot.bar)} m", "scale", over)
+
+
+def _stamp(plotter: pv.Plotter, said: str, name: str, position: tuple[int, int]) -> None:
+    """Write on a picture, on a ground that lets little through."""
+    actor = plotter.add_text(said, name=name, position=position, **materials.STAMP)
+    actor.prop.background_color, actor.prop.background_opacity = materials.BACKGROUND, materials.VEIL
 
 
 def _draw_bar(picture: Picture, shot: Shot) -> None:

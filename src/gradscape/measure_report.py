@@ -146,7 +146,7 @@ def _measured(
         if len(subjects) > 1:
             console.print(f"slice {number + 1} of {len(subjects)}: {subject.name}", markup=False)
         try:
-            records.append(measured(console, subject, folder, settings, device, paper_words()))
+            records.append(measured(console, subject, folder, settings, device, paper_words(), drawn=bool(prints)))
             _print(console, subject, folder, prints)
         except KeyboardInterrupt:
             again = shlex.join(["landscape", *sys.argv[1:]])
@@ -165,9 +165,19 @@ def _measured(
 
 
 def measured(
-    console: Console, subject: Subject, folder: Path, settings: dict[str, Any], device: str, said: dict[str, Said]
+    console: Console,
+    subject: Subject,
+    folder: Path,
+    settings: dict[str, Any],
+    device: str,
+    said: dict[str, Said],
+    *,
+    drawn: bool = False,
 ) -> dict[str, Any]:
-    """Return the record of a slice that is in `folder`, or else is measured now and left there."""
+    """Return the record of a slice that is in `folder`, or else is measured now and left there.
+
+    One that is to be `drawn` is not taken from beside the slice without what it is drawn from.
+    """
     from .landscapes.store import open_slice
 
     dataset = open_slice(subject.store)
@@ -175,7 +185,8 @@ def measured(
         raise ValueError(f"{subject.name}: report needs a slice with gradients and three samples per axis; got another")
     env = environment_of(dataset, device)
     key = {**settings, "slice": digest(dataset), "code": code_digest(type(env))}
-    _fetch(console, subject.store.parent, folder, key)
+    if not drawn or (subject.store.parent / ARRAYS).exists():
+        _fetch(console, subject.store.parent, folder, key)
     if (folder / REPORT).exists():
         return _kept(console, folder, key, env.device)
     _warn(console, subject, dataset, env)
