@@ -17,6 +17,9 @@ SIDE, HEIGHT = 2.0, 0.9  # of the surface: the slice's window, and the scale of 
 FOCUS = 0.26  # how high the eye looks
 AWAY, UP = 4.83, 2.74  # of the eye from the middle of the surface, over the ground and up
 AZIMUTHS = (236.0, 304.0, 124.0, 56.0, 214.0, 326.0, 146.0, 34.0)  # of the eye [degrees]; no edge is seen end on
+TOP = ((0, 0), (1, 0), (1, 1), (0, 1))  # corners of a cell to the right and back, counterclockwise from above
+# from the way a wall looks to its two edges, counterclockwise from there
+WALLS = {(1, 0): ((1, 0), (1, 1)), (-1, 0): ((0, 1), (0, 0)), (0, 1): ((1, 1), (0, 1)), (0, -1): ((0, 0), (1, 0))}
 TRIANGLES = ((0, 1, 2), (0, 2, 3))  # of a cell's corners
 FOOT = 0.08  # share of the upright axis that has no ticks
 LOWEST = 0.1  # share of the samples that are the valley
@@ -64,50 +67,25 @@ def cells(relief: Relief, dataset: xr.Dataset) -> Cells:
     Nothing is drawn between samples that was not sampled: a wall has the colour of the sample it belongs to, the higher
     one. A sample that failed has no top, and like the border of the slice is walled down to the ground.
     """
-    loss = dataset["loss"].transpose("v", "u").to_numpy()
-    height = relief.height(loss)
-    edges = contour.cell_edges(dataset)
-    u, v = (SIDE * ((at - at[0]) / (at[-1] - at[0]) - 0.5) for at in edges)
-    whole = np.isfinite(height)
-    rows, columns = np.nonzero(whole)
-    tops = np.stack(
-        [
-            np.stack([u[columns + right], v[rows + back], height[rows, columns]], axis=-1)
-            for right, back in ((0, 0), (1, 0), (1, 1), (0, 1))
-        ],
-        axis=1,
-    )
-    parts = [(tops, np.tile([0.0, 0.0, 1.0], (len(rows), 1)), rows * loss.shape[1] + columns)]
-    padded = np.pad(np.nan_to_num(height, nan=0.0), 1)  # the ground, where there is nothing
-    for right, back in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        beside = padded[rows + 1 + back, columns + 1 + right]
-        lower = beside < height[rows, columns]
-        at = rows[lower], columns[lower]
-        parts.append(
-            (_walls(u, v, at, height[at], beside[lower], right, back), *_owners(at, right, back, loss.shape[1]))
-        )
-    return Cells(*(np.concatenate([part[number] for part in parts]) for number in range(3)))
+    height = relief.height(dataset["loss"].transpose("v", "u").to_numpy())
+    rows, columns = np.nonzero(np.isfinite(height))
+    high = height[rows, columns]
+    u, v = (SIDE * ((at - at[0]) / (at[-1] - at[0]) - 0.5) for at in contour.cell_edges(dataset))
+    ground = np.pad(np.nan_to_num(height, nan=0.0), 1)  # also where there is nothing
 
+    def at(corner: tuple[int, int], z: Grid) -> Grid:
+        return np.stack([u[columns + corner[0]], v[rows + corner[1]], z], axis=-1)
 
-def _walls(
-    u: Grid, v: Grid, at: tuple[NDArray[np.intp], NDArray[np.intp]], top: Grid, foot: Grid, right: int, back: int
-) -> Grid:
-    """Return the walls at one side of cells, counterclockwise from outside."""
-    rows, columns = at
-    if right:
-        x = np.stack([u[columns + (right > 0)]] * 2)
-        y = np.stack([v[rows], v[rows + 1]])[::right]
-    else:
-        y = np.stack([v[rows + (back > 0)]] * 2)
-        x = np.stack([u[columns + 1], u[columns]])[::back]
-    ends = [(0, foot), (1, foot), (1, top), (0, top)]
-    return np.stack([np.stack([x[end], y[end], z], axis=-1) for end, z in ends], axis=1)
-
-
-def _owners(
-    at: tuple[NDArray[np.intp], NDArray[np.intp]], right: int, back: int, columns: int
-) -> tuple[Grid, NDArray[np.intp]]:
-    return np.tile([float(right), float(back), 0.0], (len(at[0]), 1)), at[0] * columns + at[1]
+    corners = [np.stack([at(corner, high) for corner in TOP], axis=1)]
+    normals = [np.tile([0.0, 0.0, 1.0], (len(rows), 1))]
+    sample = [rows * height.shape[1] + columns]
+    for (right, back), (first, second) in WALLS.items():
+        low = ground[rows + 1 + back, columns + 1 + right]
+        wall = np.stack([at(first, low), at(second, low), at(second, high), at(first, high)], axis=1)
+        corners.append(wall[low < high])
+        normals.append(np.tile([float(right), float(back), 0.0], (int((low < high).sum()), 1)))
+        sample.append(sample[0][low < high])
+    return Cells(np.concatenate(corners), np.concatenate(normals), np.concatenate(sample))
 
 
 @dataclass(frozen=True)
