@@ -32,7 +32,7 @@ from ..landscapes.slice_arrays import parameters_of, plane_of
 from ..landscapes.slice_paths import is_slice
 from ..landscapes.store import SliceStore, open_slice
 from .figures import HERE, Figure
-from .measured import MEASURES, QUALITY, REPORT, place_tradeoffs, read_report
+from .measured import MEASURES, QUALITY, REPORT, dark_name, place_tradeoffs, read_report
 from .page_data import nodes, numbers, read_episodes, read_json
 from .runs import FOLDER
 from .trajectories import read_runs, trajectories
@@ -70,13 +70,14 @@ def _templates() -> Environment:
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     pages.filters["number"] = _number
+    pages.filters["dark"] = dark_name
     pages.filters["times"] = lambda text: re.sub(r"(?<=\d) x (?=[\d(])", " \N{MULTIPLICATION SIGN} ", text)
     return pages
 
 
 def _number(value: Any, digits: int = 4) -> str:
     """Write a number with a minus sign, and anything else as it is."""
-    return f"{value:.{digits}g}".replace("-", "\N{MINUS SIGN}") if isinstance(value, int | float) else str(value)
+    return f"{value:z.{digits}g}".replace("-", "\N{MINUS SIGN}") if isinstance(value, int | float) else str(value)
 
 
 def _sampled(store: Path) -> bool:
@@ -92,6 +93,8 @@ def _page(
     traded: Mapping[str, list[dict[str, Any]]],
 ) -> dict[str, Any]:
     """Write a slice's page and all it shows into `folder`, and return its entry in the manifest."""
+    from ..landscapes.draw.dark import save_dark
+
     folder.mkdir()
     dataset = open_slice(source / STORE)
     _draw(dataset, source, folder)
@@ -101,11 +104,16 @@ def _page(
     surfaces = [name for name in SURFACES if (source / name).exists()]
     films = [episode[kind] for episode in shown for kind in ("mp4", "webp") if kind in episode]
     reported = [name for name in (REPORT, MEASURES, QUALITY) if (source / name).exists()]
-    copied = [*surfaces, *([] if sweep is None else [SWEEP]), *films, *reported]
-    for name in copied:
+    given = [*surfaces, *([] if sweep is None else [SWEEP]), *films, *reported]
+    for name in given:
         shutil.copyfile(source / name, folder / name)
+    pictures = [PICTURE, THUMBNAIL, *(name for name in given if name.endswith(".png"))]
+    for name in pictures:
+        if not (folder / dark_name(name)).exists():
+            save_dark(folder / name, folder / dark_name(name))
+    copied = [name for name in given if name not in pictures]
     entry = _entry(figure, dataset) | {
-        "files": [NODES, PICTURE, THUMBNAIL, "index.html", *copied],
+        "files": [NODES, "index.html", *copied, *(name for one in pictures for name in (one, dark_name(one)))],
         "episodes": shown,
         "sweep": sweep,
         "runs": [{name: value for name, value in run.items() if name not in POINTS} for run in runs],
@@ -139,19 +147,22 @@ def _entry(figure: Figure, dataset: xr.Dataset) -> dict[str, Any]:
 
 
 def _draw(dataset: xr.Dataset, source: Path, folder: Path) -> None:
-    """Draw a slice; a line's picture is the one made with it, since its events need episodes."""
+    """Draw a slice for light and for dark; a line's picture is the one made with it, since its events need episodes."""
     from ..landscapes.draw.contour import landscape_figure
+    from ..landscapes.draw.dark import darken
     from ..landscapes.draw.page import save
     from ..landscapes.draw.profile import profile_figure
     from ..landscapes.draw.thumbnail import thumbnail_figure
 
-    save(thumbnail_figure(dataset), folder / THUMBNAIL)
-    if len(dataset["loss"].dims) == 2:
-        save(landscape_figure(dataset), folder / PICTURE)
-    elif (source / PICTURE).exists():
+    drawn = {THUMBNAIL: thumbnail_figure(dataset)}
+    if len(dataset["loss"].dims) == 1 and (source / PICTURE).exists():
         shutil.copyfile(source / PICTURE, folder / PICTURE)
     else:
-        save(profile_figure(dataset), folder / PICTURE)
+        drawn[PICTURE] = (landscape_figure if len(dataset["loss"].dims) == 2 else profile_figure)(dataset)
+    for name, picture in drawn.items():
+        save(picture, folder / name)
+        darken(picture)
+        save(picture, folder / dark_name(name))
 
 
 def _held(dataset: xr.Dataset) -> list[tuple[str, float, str]]:

@@ -69,11 +69,18 @@ def _small(rows: list[Record]) -> Record | None:
 
 
 def _signed(value: float) -> str:
-    return f"{value:.2f}".replace("-", "\N{MINUS SIGN}")
+    return f"{value:z.2f}".replace("-", "\N{MINUS SIGN}")
+
+
+def dark_name(picture: str) -> str:
+    """Return the name of a picture for pages that are dark."""
+    return picture.removesuffix(".png") + "-dark.png"
 
 
 def place_tradeoffs(data: Path, out: Path, envs: list[str]) -> dict[str, list[dict[str, Any]]]:
     """Copy what was measured of these environments' accuracy into the site, and return it by environment."""
+    from ..landscapes.draw.dark import save_dark
+
     found: dict[str, list[dict[str, Any]]] = {}
     for env in dict.fromkeys(envs):
         for file in (data / TRADEOFF / f"{env}-{device}.json" for device in DEVICES):
@@ -83,6 +90,7 @@ def place_tradeoffs(data: Path, out: Path, envs: list[str]) -> dict[str, list[di
             (out / TRADEOFF).mkdir(exist_ok=True)
             for one in (file, picture):
                 shutil.copyfile(one, out / TRADEOFF / one.name)
+            save_dark(picture, out / TRADEOFF / dark_name(picture.name))
             found.setdefault(env, []).append(_tradeoff(record, file.stem))
     return found
 

@@ -34,9 +34,11 @@ def numbers(dataset: xr.Dataset) -> dict[str, Any]:
 def nodes(dataset: xr.Dataset, episodes: Sequence[dict[str, Any]], runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return a slice as plain lists, row by row from the lowest v: what the map draws and says of a node.
 
-    `slope` is the gradient along the axes, `gradient` its length in all dimensions.
+    `slope` is the gradient along the axes, `gradient` its length in all dimensions; `azimuth` is where the surface is
+    seen from at first [degrees].
     """
-    from ..landscapes.draw.style import LOSS_MAP, round_values
+    from ..landscapes.draw.relief import Relief, azimuth
+    from ..landscapes.draw.style import LOSS_MAP, Scale, round_values
 
     plane, loss = plane_of(dataset), dataset["loss"].to_numpy()
     labelled = zip(plane.labels, (axis.tolist() for axis in plane.axes()), strict=True)
@@ -53,6 +55,8 @@ def nodes(dataset: xr.Dataset, episodes: Sequence[dict[str, Any]], runs: Sequenc
         "episodes": list(episodes),
         "runs": list(runs),
     }
+    if plane.rank == 2:
+        found["azimuth"] = azimuth(Relief(plane, Scale.of_loss(loss)), dataset)
     if "grad" in dataset:
         grad = dataset["grad"].to_numpy().reshape(loss.size, -1)
         found["slope"] = [rounded(column) for column in plane.slope(torch.from_numpy(grad)).numpy().T]

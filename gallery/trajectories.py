@@ -11,7 +11,7 @@ import xarray as xr
 
 from ..landscapes.identity import stored_identity, stored_provenance
 from ..landscapes.objective import Status
-from ..landscapes.overlay import lay
+from ..landscapes.overlay import improvements, lay
 from .page_data import rounded
 from .runs import SUFFIX, open_run
 
@@ -54,8 +54,6 @@ def _trajectory(run: xr.Dataset, reach: float, points: int, top: float) -> dict[
     loss, distance = run["loss"].to_numpy(), run["distance"].to_numpy()
     outside = run["outside"].to_numpy() | (loss > top)
     failed = run["status"].to_numpy() != Status.OK
-    best, before = run["best"].to_numpy(), np.append(np.inf, run["best"].to_numpy()[:-1])
-    improved = np.isfinite(best) & ~(best >= before)
     radius = np.sqrt(point_areas(distance, reach, points) / np.pi) * 4 / 3  # a point is 4/3 of a pixel
     return {
         "method": run.attrs["method"],
@@ -72,6 +70,6 @@ def _trajectory(run: xr.Dataset, reach: float, points: int, top: float) -> dict[
         "command": stored_provenance(run).get("command", ""),
         **{name: rounded(run[name].to_numpy()) for name in ("u", "v", "loss") if name in run},
         "radius": [round(float(size), 1) for size in radius],
-        "path": np.flatnonzero(improved).tolist(),
+        "path": improvements(run).tolist(),
         "hidden": np.flatnonzero(outside).tolist(),
     }

@@ -149,7 +149,7 @@ def _shares(estimate: Mapping[str, float | None] | None) -> str:
 
 
 def _number(estimate: Mapping[str, float | None] | None) -> str:
-    return _with_interval(estimate, lambda value: f"{value:.2f}".replace("-", "\N{MINUS SIGN}"))
+    return _with_interval(estimate, lambda value: f"{value:z.2f}".replace("-", "\N{MINUS SIGN}"))
 
 
 def _with_interval(estimate: Mapping[str, float | None] | None, write: Any) -> str:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import shutil
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -30,6 +31,17 @@ def replacing(path: Path) -> Iterator[Path]:
 def visible(folder: Path) -> list[Path]:
     """Return what a folder holds, but for hidden files: a process that was killed may have left what it was making."""
     return [path for path in folder.iterdir() if not path.name.startswith(".")] if folder.exists() else []
+
+
+def print_width(name: str, picture: str) -> float | None:
+    """Return for how wide a page [mm] a file of this name is a print of a picture, None where it is none."""
+    found = re.fullmatch(rf"{re.escape(Path(picture).stem)}-([\d.]+)mm\.(?:pdf|svg)", name)
+    return float(found[1]) if found else None
+
+
+def others(folder: Path, ours: Collection[str], picture: str) -> list[Path]:
+    """Return what a folder holds beside files of our names and prints of a picture."""
+    return [file for file in visible(folder) if file.name not in ours and print_width(file.name, picture) is None]
 
 
 def write_json(path: Path, record: object) -> None:

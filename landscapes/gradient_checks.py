@@ -50,7 +50,7 @@ def ladder(subject: Subject, name: str) -> Finding:
         return Finding(name, SKIP, "no slope to compare", "all are flat, lost in noise, or failed", table=tuple(table))
     figure = (
         f"in {subject.precision}, best at {best['step']:.0e} of the box: median relative error {best['error']:.1e}, "
-        f"sign right {best['sign']:.0%}, cosine {best['cosine']:.4f}"
+        f"sign right {best['sign']:.0%}, cosine {best['cosine']:z.4f}"
     )
     found = verdict(name, agrees, figure, f"wanted: error {limit:.0e}, sign right {SIGNS:.0%}")
     return replace(found, numbers={**best, "limit": limit}, table=tuple(table))

@@ -18,7 +18,7 @@ import xarray as xr
 from jaxtyping import Float
 from torch import Tensor
 
-from .files import visible, write_json
+from .files import print_width, visible, write_json
 from .halving import Halving
 from .objective import Objective, Status
 from .plane import Plane
@@ -47,15 +47,19 @@ class Cost:
 
 @dataclass(frozen=True)
 class Job:
-    """A slice to sample into `folder`, and how to draw it; `executor` and `made` are those of `sample`."""
+    """A slice to sample into `folder`, and how to draw it; `executor` and `made` are those of `sample`.
+
+    `prints` are widths of pages [mm] that it is also drawn for.
+    """
 
     objective: Objective
     plane: Plane
     folder: Path
     store: SliceStore
-    draw: Callable[[xr.Dataset], Figure]
+    draw: Callable[..., Figure]
     executor: Executor | None = None
     made: Callable[[], Objective] | None = None
+    prints: Sequence[float] = ()
 
     @classmethod
     def open(
@@ -63,7 +67,7 @@ class Job:
         objective: Objective,
         plane: Plane,
         folder: Path,
-        draw: Callable[[xr.Dataset], Figure],
+        draw: Callable[..., Figure],
         *,
         identity: Mapping[str, Any],
         provenance: Mapping[str, Any],
@@ -71,6 +75,7 @@ class Job:
         force: bool = False,
         executor: Executor | None = None,
         made: Callable[[], Objective] | None = None,
+        prints: Sequence[float] = (),
     ) -> Job:
         """Go on with the slice in `folder`, or begin it there; `force` begins anew where another slice is."""
         path = folder / STORE
@@ -79,11 +84,12 @@ class Job:
         settings: dict[str, Any] = {"identity": identity, "provenance": provenance, "grad": grad}
         if force and is_slice(path):
             store = SliceStore.create(path, plane, objective.space, overwrite=True, **settings)
-            (folder / PICTURE).unlink(missing_ok=True)
-            (folder / SUMMARY).unlink(missing_ok=True)
+            for leftover in visible(folder):
+                if leftover.name in (PICTURE, SUMMARY) or print_width(leftover.name, PICTURE):
+                    leftover.unlink()
         else:
             store = SliceStore.open_or_create(path, plane, objective.space, **settings)
-        return cls(objective, plane, folder, store, draw, executor, made)
+        return cls(objective, plane, folder, store, draw, executor, made, prints)
 
     def cost(self) -> Cost:
         """Estimate what is left; workers that compute it do, which warms them, and leaves a GPU of theirs alone."""
@@ -110,8 +116,10 @@ class Job:
         how: dict[str, Any] = {"grad": self.store.grad, "executor": self.executor, "made": self.made}
         dataset = sample(self.objective, self.plane, self.store, progress=follow, **how)
         self._save(dataset)
+        printed = self._print(dataset)
         computed = last.done - last.resumed if last else 0
         summary = self._summary(dataset, computed, time.monotonic() - start, command)
+        summary["files"] = [STORE, PICTURE, *printed, SUMMARY]
         write_json(self.folder / SUMMARY, summary)
         return summary
 
@@ -124,6 +132,11 @@ class Job:
         from .draw.page import save
 
         save(self.draw(dataset), self.folder / PICTURE)
+
+    def _print(self, dataset: xr.Dataset) -> list[str]:
+        from .draw.page import save_prints
+
+        return save_prints(lambda width: self.draw(dataset, width=width), self.folder / PICTURE, self.prints)
 
     def _summary(self, dataset: xr.Dataset, computed: int, seconds: float, command: str) -> dict[str, Any]:
         identity, status = self.store.identity, dataset["status"].to_numpy()
@@ -144,7 +157,6 @@ class Job:
             "loss": {"lowest": ends[0], "highest": ends[1]},
             "flat": flat_points(dataset),
             "command": command,
-            "files": [STORE, PICTURE, SUMMARY],
         }
 
 

@@ -62,6 +62,13 @@ def lay(dataset: xr.Dataset, table: xr.Dataset, label: str) -> xr.Dataset:
     return table.assign(added).assign_attrs(label=label)
 
 
+def improvements(run: xr.Dataset) -> NDArray[np.intp]:
+    """Return the rows of a run laid over a slice that lowered its least loss so far, in the order of evaluation."""
+    best = run["best"].to_numpy()
+    before = np.append(np.inf, best[:-1])
+    return np.flatnonzero(np.isfinite(best) & ~(best >= before))
+
+
 def best_point(tables: Sequence[xr.Dataset]) -> tuple[Float[Tensor, " dim"], float]:
     """Return the point of least loss among all the runs, and its loss."""
     losses = np.concatenate([table["loss"].to_numpy() for table in tables])

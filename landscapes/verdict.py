@@ -80,7 +80,7 @@ def _gradients(found: Ruggedness, cosine: Values) -> dict[str, str]:
     if not len(known):
         return reasons
     average, uphill = float(known.mean()), float((known < 0).mean())
-    said = f"mean cosine {average:.2f} with the slope over two samples"
+    said = f"mean cosine {average:z.2f} with the slope over two samples"
     reasons[GOOD if average >= AGREE else NOISY] = said
     if uphill >= OFTEN:
         reasons[OPPOSITE] = f"{uphill:.0%} of the gradients point up that slope"

@@ -93,6 +93,18 @@ def test_errors_and_order_of_convergence_are_those_of_the_scene(run: Command, tm
     assert fit["order"] == pytest.approx(2, abs=0.01)
 
 
+def test_a_tradeoff_is_printed_without_being_measured_again(
+    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert run(*TRADE, "--ladder", "precision", cwd=tmp_path).returncode == 0
+    monkeypatch.setattr(Converging, "_evaluate", None)
+    done = run(*TRADE, "--ladder", "precision", "--print", "85", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "tradeoff-85mm.pdf, tradeoff-85mm.svg" in done.stderr
+    assert (tmp_path / "trade/tradeoff-85mm.pdf").read_bytes().startswith(b"%PDF")
+    assert run(*TRADE, "--ladder", "precision", cwd=tmp_path).returncode == 0
+
+
 def test_rungs_that_are_refused_are_listed_and_those_that_diverge_are_counted(run: Command, tmp_path: Path) -> None:
     done = run(*TRADE, "--json", cwd=tmp_path)
     report = json.loads(done.stdout)

@@ -2,9 +2,10 @@
 "use strict";
 
 const stage = document.getElementById("surface");
-const view = { turn: -0.7, tilt: 0.6, zoom: 1 };
+const azimuth = (SLICE.azimuth * Math.PI) / 180; // of the viewer: where most of the valley is seen from
+const view = { turn: Math.atan2(-Math.cos(azimuth), -Math.sin(azimuth)), tilt: 0.6, zoom: 1 };
 const HEIGHT = 0.55; // of the surface, where its sides are 1
-const LIGHT = [0.36, 0.48, 0.8];
+const WALLS = [0.78, 0.6]; // how light the walls across and along the first axis are; what is flat has its own colour
 const FLOOR = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]];
 
 // A corner of the unit box as [x, y on the canvas, depth towards the viewer].
@@ -12,35 +13,57 @@ function project([right, back, high]) {
   const [cos, sin] = [Math.cos(view.turn), Math.sin(view.turn)];
   const [a, b, c] = [right - 0.5, back - 0.5, high - HEIGHT / 2];
   const [across_, away] = [a * cos - b * sin, a * sin + b * cos];
-  const scale = Math.min(0.68 * stage.clientHeight, 0.5 * stage.clientWidth) * view.zoom;
+  const scale = Math.min(0.62 * stage.clientHeight, 0.5 * stage.clientWidth) * view.zoom;
   const lifted = c * Math.cos(view.tilt) + away * Math.sin(view.tilt);
   const near = c * Math.sin(view.tilt) - away * Math.cos(view.tilt);
-  return [stage.clientWidth / 2 + across_ * scale, stage.clientHeight / 2 - lifted * scale, near];
+  return [stage.clientWidth / 2 + across_ * scale, 0.46 * stage.clientHeight - lifted * scale, near];
 }
 const flat = (point) => project(point).slice(0, 2);
 
-const corner = (column, row) => {
-  const loss = SLICE.loss[row * columns + column];
-  return loss === null ? null : [column / (columns - 1), row / (rows - 1), HEIGHT * clamp(level(loss), 0, 1)];
-};
+// The window reaches half a cell beyond the outermost nodes, as the map's does.
+const spread = (share, count) => (share * (count - 1) + 0.5) / count;
+const along = (value, axis) => spread((value - ends(axis)[0]) / (ends(axis)[1] - ends(axis)[0]), axis.values.length);
 
-function lit(colour, [p, q, , s]) {
-  const [u, v] = [q, s].map((end) => end.map((part, axis) => part - p[axis]));
-  const normal = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
-  const facing = normal.reduce((sum, part, axis) => sum + part * LIGHT[axis], 0) / Math.hypot(...normal);
-  const light = 0.55 + 0.5 * Math.max(0, facing);
-  const part = (start) => Math.min(255, Math.round(light * parseInt(colour.slice(start, start + 2), 16)));
+// How high the cell of a node is: the ground where nothing is.
+function rise(column, row) {
+  const inside = column >= 0 && column < columns && row >= 0 && row < rows;
+  const loss = inside ? SLICE.loss[row * columns + column] : null;
+  return loss === null ? 0 : HEIGHT * clamp(level(loss), 0, 1);
+}
+
+function dimmed(colour, light) {
+  const part = (start) => Math.round(light * parseInt(colour.slice(start, start + 2), 16));
   return `rgb(${[1, 3, 5].map(part).join(" ")})`;
 }
 
-// Every cell whose four nodes have a loss; the others stay open.
-const cells = [];
-for (let row = 0; row + 1 < rows; row++) {
-  for (let column = 0; column + 1 < columns; column++) {
-    const corners = [[0, 0], [1, 0], [1, 1], [0, 1]].map(([right, back]) => corner(column + right, row + back));
-    if (corners.includes(null)) continue;
-    const mean = corners.reduce((sum, one) => sum + one[2], 0) / 4 / HEIGHT;
-    cells.push({ corners, colour: lit(shade(mean), corners) });
+// A node is a flat cell, with walls down to what is lower beside it, in its own colour: nothing is drawn between nodes.
+// `side` is where the viewer is, -1 or 1 along both axes: of the four walls the other two are hidden.
+function faces(column, row, side) {
+  const high = rise(column, row);
+  const colour = shade(high / HEIGHT);
+  const [left, front] = [column / columns, row / rows];
+  const [right, back] = [(column + 1) / columns, (row + 1) / rows];
+  const found = [];
+  const [x, y] = [side[0] > 0 ? right : left, side[1] > 0 ? back : front];
+  for (const [low, light, [from, to]] of [
+    [rise(column + side[0], row), WALLS[0], [[x, front], [x, back]]],
+    [rise(column, row + side[1]), WALLS[1], [[left, y], [right, y]]],
+  ]) {
+    if (low >= high) continue;
+    const corners = [[...from, low], [...to, low], [...to, high], [...from, high]];
+    found.push({ corners, colour: dimmed(colour, light) });
+  }
+  found.push({ corners: [[left, front], [right, front], [right, back], [left, back]].map((at) => [...at, high]), colour });
+  return found;
+}
+
+// Cells from the farthest to the nearest: none is covered by one that is drawn before it.
+function* inOrder(side) {
+  const turned = (count, towards) => [...Array(count).keys()].sort((one, other) => towards * (one - other));
+  for (const row of turned(rows, side[1])) {
+    for (const column of turned(columns, side[0])) {
+      if (SLICE.loss[row * columns + column] !== null) yield* faces(column, row, side);
+    }
   }
 }
 
@@ -54,32 +77,37 @@ function outline(brush, points, colour) {
 
 // Where a search's point lies on the surface: over its place on the slice, however far off it is.
 function draped(run, row) {
-  const share = (value, axis) => (value - ends(axis)[0]) / (ends(axis)[1] - ends(axis)[0]);
-  const [right, back] = [share(run.u[row], across), share(run.v[row], up)].map((part) => clamp(part, 0, 1));
-  const under = corner(Math.round(right * (columns - 1)), Math.round(back * (rows - 1)));
-  return under && flat([right, back, under[2] + 0.015]);
+  const [right, back] = [along(run.u[row], across), along(run.v[row], up)].map((part) => clamp(part, 0, 1 - 1e-9));
+  const [column, line] = [Math.floor(right * columns), Math.floor(back * rows)];
+  if (SLICE.loss[line * columns + column] === null) return null;
+  return flat([right, back, rise(column, line) + 0.015]);
 }
 
-// Beside the edge that is nearer to the viewer; below the other axis' label, where both would be in one place.
-function beside(brush, axis, along, other) {
-  const edge = (side, share, off) => along(share, side ? 1 + off : -off);
+// Name and ends of an axis beside its edge that is nearer to the viewer. A name that has no room there comes below the
+// floor, and below one of those that are `under` it already if it would run into that.
+function beside(brush, axis, put, under) {
+  const edge = (side, share, off) => put(share, side ? 1 + off : -off);
   const side = project(edge(1, 0.5, 0))[2] > project(edge(0, 0.5, 0))[2] ? 1 : 0;
-  brush.textAlign = "center";
-  const [middle, under] = flat(edge(side, 0.5, 0.2));
-  const room = brush.measureText(axis.label).width / 2 + 6;
-  const label = { middle: clamp(middle, room, stage.clientWidth - room), under, room };
-  if (other && Math.abs(label.middle - other.middle) < room + other.room && Math.abs(under - other.under) < 16) {
-    label.under = other.under + 16;
-  }
-  brush.fillText(axis.label, label.middle, label.under);
-  const share = (value) => (value - ends(axis)[0]) / (ends(axis)[1] - ends(axis)[0]);
   brush.font = "12px system-ui, sans-serif";
+  brush.textAlign = "center";
   for (const value of [axis.ticks[0], axis.ticks[axis.ticks.length - 1]]) {
-    const [right, down] = flat(edge(side, share(value), 0.07));
+    const [right, down] = flat(edge(side, along(value, axis), 0.07));
     brush.fillText(number(value), right, down + 4);
   }
   brush.font = "13px system-ui, sans-serif";
-  return label;
+  const [[right, down], wide, long] = [flat(edge(side, 0.5, 0.09)), stage.clientWidth, brush.measureText(axis.label).width];
+  const onLeft = right < wide / 2;
+  if (onLeft ? right - long > 4 : right + long < wide - 4) {
+    brush.textAlign = onLeft ? "right" : "left";
+    brush.fillText(axis.label, right, down + 8);
+    return;
+  }
+  const middle = clamp(right, long / 2 + 4, wide - long / 2 - 4);
+  const line = under.filter((other) => Math.abs(middle - other.middle) < (long + other.long) / 2 + 12).length;
+  under.push({ middle, long });
+  const lowest = Math.max(...FLOOR.map((corner) => flat(corner)[1]));
+  brush.textAlign = "center";
+  brush.fillText(axis.label, middle, lowest + 36 + 17 * line);
 }
 
 // The height's scale at the corner that is farthest to the left.
@@ -114,11 +142,9 @@ const repaint = fit(stage, (brush, width, height) => {
   brush.fillRect(0, 0, width, height);
   brush.lineWidth = 1;
   outline(brush, FLOOR.map(project), ink("line"));
-  const placed = cells.map(({ corners, colour }) => ({ points: corners.map(project), colour }));
-  const depth = ({ points }) => points.reduce((sum, point) => sum + point[2], 0);
-  placed.sort((one, other) => depth(one) - depth(other));
-  for (const { points, colour } of placed) {
-    outline(brush, points, colour); // closes the seams between cells
+  const side = [-Math.sign(Math.sin(view.turn)) || 1, -Math.sign(Math.cos(view.turn)) || 1];
+  for (const { corners, colour } of inOrder(side)) {
+    outline(brush, corners.map(project), colour); // closes the seams between cells
     brush.fillStyle = colour;
     brush.fill();
   }
@@ -126,8 +152,9 @@ const repaint = fit(stage, (brush, width, height) => {
   brush.fillStyle = ink("ink");
   brush.lineWidth = 1;
   brush.font = "13px system-ui, sans-serif";
-  const first = beside(brush, across, (share, off) => [share, off, 0]);
-  beside(brush, up, (share, off) => [off, share, 0], first);
+  const under = [];
+  beside(brush, across, (share, off) => [share, off, 0], under);
+  beside(brush, up, (share, off) => [off, share, 0], under);
   heights(brush);
 });
 

@@ -9,7 +9,6 @@ import torch
 import xarray as xr
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
@@ -17,43 +16,47 @@ from numpy.typing import NDArray
 
 from ..plane import Plane
 from ..store import plane_of
-from . import page, style
+from . import page, panel, style
 
 Grid = NDArray[np.float64]
 
+PITCH = 6.0  # room of a map with its colour bar on a screen [inch]
 
-def landscape_figure(dataset: xr.Dataset) -> Figure:
-    """Draw a slice of rank 2: the loss as colours above, its negated gradients as arrows below.
+
+def landscape_figure(dataset: xr.Dataset, *, width: float | None = None) -> page.Picture:
+    """Draw a slice of rank 2: the loss as colours above, its negated gradients as arrows below, or beside it.
 
     Each cell is one sample, or for a coarse slice the part of the box nearest to it; nothing is interpolated. All
     arrows are equally long and point down the steepest slope of the picture as it is seen, its axes scaled to the same
-    length; their colour is the magnitude of the gradient along the plane. Failures are hatched and counted.
+    length; their colour is the magnitude of the gradient along the plane. Failures are hatched and counted. `width` is
+    that of a page for print [mm]; as for every picture, without it the picture is as large as suits a screen.
     """
     plane = plane_of(dataset)
     if plane.rank != 2:
         raise ValueError(f"landscape_figure draws planes; got a slice of rank {plane.rank}, so use profile_figure")
     panels = 2 if "grad" in dataset else 1
-    figure = page.blank_page(style.PANEL + 2.0, panels * style.PANEL + 1.4)
-    axes: list[Axes] = list(figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0])
+    sheet = style.Sheet.of(width, pitch=PITCH, panels=panels)
+    picture = page.Picture(sheet, panels / sheet.columns * sheet.pitch)
+    axes = panel.grid(picture, panels, share=True)
     entries = loss_panel(axes[0], dataset)
     entries += arrow_panel(axes[1], dataset) if panels == 2 else []
     for ax in axes:
         frame(ax, dataset, plane)
-    axes[-1].set_xlabel(plane.labels[0], size=style.LABEL, parse_math=False)
-    page.head(figure, axes[0], dataset)
-    page.key(figure, [*entries, *page.failure_key(dataset)])
-    return figure
+        panel.name_outer(ax, *plane.labels)
+    page.head(picture, axes[0], dataset)
+    page.finish(picture, [*entries, *page.failure_key(dataset)])
+    return picture
 
 
 def frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
     """Give a panel over a slice its limits, its ticks and its failures."""
-    style.dress(ax)
+    panel.dress(ax)
     ax.set_box_aspect(1)
     ax.set_xlim(*_limits(plane, 0))
     ax.set_ylim(*_limits(plane, 1))
-    ax.set_ylabel(plane.labels[1], size=style.LABEL, parse_math=False)
+    panel.name_axes(ax, y=plane.labels[1])
     status = dataset["status"].to_numpy()
-    edges = _edges(dataset["u"].to_numpy(), plane, 0), _edges(dataset["v"].to_numpy(), plane, 1)
+    edges = cell_edges(dataset)
     for kind, look in style.LOOKS.items():
         if (where := status == kind).any():
             patch = PathPatch(_cells(*edges, where), **look, zorder=1.5, antialiased=False, gid=kind.name)
@@ -79,18 +82,19 @@ def loss_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) 
     if np.nanmin(loss) == np.nanmax(loss):
         return [Line2D([], [], linestyle="none", label=f"every sample: {style.number(np.nanmin(loss))}")]
     row, column = np.unravel_index(np.nanargmin(loss), loss.shape)
-    (lowest,) = ax.plot(u[column], v[row], **style.LOWEST, label=f"lowest sample: {style.number(loss[row, column])}")
+    look = page.sheet_of(ax).look(style.LOWEST)
+    (lowest,) = ax.plot(u[column], v[row], **look, label=f"lowest sample: {style.number(loss[row, column])}")
     return [lowest]
 
 
 def loss_map(ax: Axes, dataset: xr.Dataset, scale: style.Scale) -> None:
     """Draw every sample's loss as the colour of its cell, with the colour bar."""
-    plane, loss = plane_of(dataset), dataset["loss"].to_numpy()
-    edges = _edges(dataset["u"].to_numpy(), plane, 0), _edges(dataset["v"].to_numpy(), plane, 1)
-    mesh = ax.pcolormesh(*edges, np.ma.masked_invalid(loss), cmap=style.LOSS_MAP, norm=scale.norm, rasterized=True)
+    loss = dataset["loss"].to_numpy()
+    mesh = ax.pcolormesh(
+        *cell_edges(dataset), np.ma.masked_invalid(loss), cmap=style.LOSS_MAP, norm=scale.norm, rasterized=True
+    )
     unit = dataset["loss"].attrs.get("units", "")
-    bar = ax.figure.colorbar(mesh, ax=ax, extend=scale.extend, fraction=0.05, pad=0.02)
-    style.dress_bar(bar, f"loss [{unit}]" if unit else "loss")
+    panel.colour_bar(ax, mesh, f"loss [{unit}]" if unit else "loss", scale)
 
 
 def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> list[Artist]:
@@ -113,13 +117,13 @@ def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None)
         u[seen], v[seen], steps[seen, 0], steps[seen, 1], logarithm[at][seen],
         cmap=style.SLOPE_MAP, norm=scale.norm, pivot="mid", angles="xy", scale_units="xy", scale=1.0, **style.ARROW,
     )  # fmt: skip
-    bar = ax.figure.colorbar(quiver, ax=ax, extend=scale.extend, fraction=0.05, pad=0.02)
-    style.dress_bar(bar, label)
+    bar = panel.colour_bar(ax, quiver, label, scale)
     bar.ax.set_visible(bool(seen.any()))  # hidden rather than left out, so that both panels keep their width
     if not flat.any():
         return []
-    ax.plot(u[flat[at]], v[flat[at]], **style.FLAT, zorder=2.5)
-    return [Line2D([], [], **style.FLAT, label=f"gradient exactly zero: {int(flat.sum())} of {flat.size}")]
+    look = page.sheet_of(ax).look(style.FLAT)
+    ax.plot(u[flat[at]], v[flat[at]], **look, zorder=2.5)
+    return [Line2D([], [], **look, label=f"gradient exactly zero: {int(flat.sum())} of {flat.size}")]
 
 
 def log_magnitude(dataset: xr.Dataset) -> Grid:
@@ -172,8 +176,14 @@ def _length(*positions: Grid) -> float:
     return min(style.LONGEST_ARROW, max(0.86 * closest, 0.45 / densest))
 
 
-def _edges(centers: Grid, plane: Plane, axis: int) -> Grid:
-    low, high = _limits(plane, axis)
+def cell_edges(dataset: xr.Dataset) -> tuple[Grid, Grid]:
+    """Return where the cells of a plane's samples end along u and v, from border to border of the picture."""
+    plane = plane_of(dataset)
+    u, v = (_edges(dataset[name].to_numpy(), *_limits(plane, axis)) for axis, name in enumerate("uv"))
+    return u, v
+
+
+def _edges(centers: Grid, low: float, high: float) -> Grid:
     return np.concatenate([[low], (centers[1:] + centers[:-1]) / 2, [high]])
 
 

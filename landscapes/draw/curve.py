@@ -6,32 +6,32 @@ import numpy as np
 import xarray as xr
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ..objective import Status
-from . import page, style
+from . import page, panel, style
 
-WIDTH, HEIGHT = 7.2, 4.4  # of the page [inch]
+PITCH, SHAPE = 7.2, 0.5  # room of the panel on a screen [inch]; its height, against its width
 WIDE = 30.0  # ratio of losses from which the axis is logarithmic
 
 
-def run_figure(table: xr.Dataset) -> Figure:
+def run_figure(table: xr.Dataset, *, width: float | None = None) -> page.Picture:
     """Draw a run's losses, by what each point was evaluated for, and the best so far; failures are marked below."""
-    figure = page.blank_page(WIDTH, HEIGHT)
-    ax = figure.subplots()
-    style.dress(ax)
+    sheet = style.Sheet.of(width, pitch=PITCH)
+    picture = page.Picture(sheet, sheet.width)
+    ax = picture.subplots()
+    panel.dress(ax)
+    ax.set_box_aspect(SHAPE)
     loss = table["loss"].to_numpy()
     best = np.fmin.accumulate(loss)
     _scale(ax, loss)
     entries = [*_draw_points(ax, table), _draw_best(ax, table, best), *_draw_failures(ax, table)]
     unit = table["loss"].attrs.get("units", "")
-    ax.set_xlabel("episodes", size=style.LABEL)
-    ax.set_ylabel(f"loss [{unit}]" if unit else "loss", size=style.LABEL, parse_math=False)
+    panel.name_axes(ax, "episodes", f"loss [{unit}]" if unit else "loss")
     ax.set_xlim(0, len(loss) + 1)
-    page.head(figure, ax, table, _title(table))
-    page.key(figure, entries)
-    return figure
+    page.head(picture, ax, table, _title(table))
+    page.finish(picture, entries)
+    return picture
 
 
 def _title(table: xr.Dataset) -> str:
@@ -70,15 +70,14 @@ def _draw_points(ax: Axes, table: xr.Dataset) -> list[Artist]:
         above = int((loss[here] > top).sum())
         label = f"{name} points" + (f" ({above} above the picture)" if above else "")
         look = style.KINDS[name] | {"markersize": 3.0, "markeredgewidth": 0.0, "alpha": 0.55, "linestyle": "none"}
-        entries += ax.plot(episodes[here], loss[here], **look, label=label, gid=name)
+        entries += ax.plot(episodes[here], loss[here], **page.sheet_of(ax).look(look), label=label, gid=name)
     return entries
 
 
 def _draw_best(ax: Axes, table: xr.Dataset, best: NDArray[np.float64]) -> Artist:
     label = f"best so far: {style.number(best[-1])}" if np.isfinite(best[-1]) else "no episode has succeeded"
-    (line,) = ax.step(
-        table["episodes"], best, where="post", color=style.INK, linewidth=1.4, label=label, gid="best", zorder=3
-    )
+    look = page.sheet_of(ax).look({"color": style.INK, "linewidth": 1.4, "zorder": 3})
+    (line,) = ax.step(table["episodes"], best, where="post", label=label, gid="best", **look)
     return line
 
 
@@ -88,9 +87,6 @@ def _draw_failures(ax: Axes, table: xr.Dataset) -> list[Artist]:
     if not failed.any():
         return []
     label = f"failed: {int(failed.sum())} of {len(failed)}"
-    return list(
-        ax.plot(
-            episodes[failed], np.full(failed.sum(), 0.02), transform=ax.get_xaxis_transform(), color=style.QUIET,
-            marker="|", markersize=7, linestyle="none", label=label, gid="failed",
-        )
-    )  # fmt: skip
+    look = page.sheet_of(ax).look({"color": style.QUIET, "marker": "|", "markersize": 7, "linestyle": "none"})
+    at = np.full(failed.sum(), 0.02)
+    return list(ax.plot(episodes[failed], at, transform=ax.get_xaxis_transform(), label=label, gid="failed", **look))

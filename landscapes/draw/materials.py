@@ -7,7 +7,9 @@ from typing import Any
 from ..episode import Part
 
 BACKGROUND, GROUND, SHADOW = "#ffffff", "#f1efec", 0.34  # share of the light a full shadow takes
-STAMP: dict[str, Any] = {"color": "#3c3c3c", "font_size": 11, "font": "arial", "position": (18, 14)}
+STAMP: dict[str, Any] = {"color": "#3c3c3c", "font_size": 11, "font": "arial"}
+VEIL = 0.75  # how much the ground of what is written on a frame covers
+INSET, THICK = (18, 14), 4  # of what is written on a frame, from its edges; of its scale's bar [pixel]
 KEY = (-0.55, 1.0, 0.65)  # where the light that throws shadows comes from
 LIGHTS = ((KEY, 0.70), ((0.7, 0.3, 1.0), 0.48), ((0.1, 0.3, -1.0), 0.18))  # direction, strength
 ANGLE = 24.0  # the camera's, from side to side [degrees]

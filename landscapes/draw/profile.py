@@ -10,17 +10,20 @@ import torch
 import xarray as xr
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from ..plane import Plane
 from ..store import plane_of
-from . import page, style
+from . import page, panel, style, typesetting
 
-WIDTH = 8.0  # of the page [inch]
+WIDTH, LOSS, SLOPE, ROOM = 8.0, 2.6, 2.2, 1.2  # of the page, height of the panels, room beside them [inch]
+STRIP = 2.7  # height of a strip of event counts, in that of its type
+FLATTEST = 0.55  # of the panels, against those on a screen: narrow ones are drawn higher than they would be
 
 
-def profile_figure(dataset: xr.Dataset, *, events: Mapping[str, ArrayLike] | None = None) -> Figure:
+def profile_figure(
+    dataset: xr.Dataset, *, events: Mapping[str, ArrayLike] | None = None, width: float | None = None
+) -> page.Picture:
     """Draw a slice of rank 1: the loss above, its derivative along the line below with central differences behind it.
 
     `events` maps a name to a whole number per point (how many bounces, say): each is a strip on top, labelled where
@@ -30,21 +33,25 @@ def profile_figure(dataset: xr.Dataset, *, events: Mapping[str, ArrayLike] | Non
     if plane.rank != 1:
         raise ValueError(f"profile_figure draws lines; got a slice of rank {plane.rank}, so use landscape_figure")
     counted = {name: _counts(name, values, dataset.sizes["u"]) for name, values in (events or {}).items()}
-    heights = [style.STRIP] * len(counted) + [2.6] + [2.2] * ("grad" in dataset)
-    figure = page.blank_page(WIDTH, sum(heights) + 1.6)
-    grid = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)
-    strips, panels = list(grid[: len(counted), 0]), list(grid[len(counted) :, 0])
+    sheet = style.Sheet.of(width, pitch=WIDTH)
+    heights = [STRIP * sheet.small / 72] * len(counted)
+    heights += [max(FLATTEST, sheet.zoom) * height for height in (LOSS, SLOPE)[: 1 + ("grad" in dataset)]]
+    picture = page.Picture(sheet, sum(heights) + 1.6)
+    grid = picture.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    for ax, height in zip(grid, heights, strict=True):
+        ax.set_box_aspect(height / (sheet.width - ROOM * sheet.type))
+    strips, panels = list(grid[: len(counted)]), list(grid[len(counted) :])
     entries = _draw_loss(panels[0], dataset)
     entries += _draw_slope(panels[1], dataset, plane) if "grad" in dataset else []
     for ax in panels:
         _frame(ax, dataset, plane)
     for strip, (name, counts) in zip(strips, counted.items(), strict=True):
         _draw_strip(strip, panels, dataset["u"].to_numpy(), name, counts)
-    panels[-1].set_xlabel(plane.labels[0], size=style.LABEL, parse_math=False)
-    figure.align_ylabels(panels)
-    page.head(figure, [*strips, *panels][0], dataset)
-    page.key(figure, [*entries, *page.failure_key(dataset)])
-    return figure
+    panel.name_axes(panels[-1], plane.labels[0])
+    picture.align_ylabels(panels)
+    page.head(picture, [*strips, *panels][0], dataset)
+    page.finish(picture, [*entries, *page.failure_key(dataset)])
+    return picture
 
 
 def _counts(name: str, values: ArrayLike, points: int) -> NDArray[np.int64]:
@@ -59,14 +66,16 @@ def _counts(name: str, values: ArrayLike, points: int) -> NDArray[np.int64]:
 def _draw_loss(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
     u, loss = dataset["u"].to_numpy(), dataset["loss"].to_numpy()
     unit = dataset["loss"].attrs.get("units", "")
-    ax.plot(u, loss, color=style.LINE, **style.stroke(len(u)))
-    ax.set_ylabel(f"loss [{unit}]" if unit else "loss", size=style.LABEL, parse_math=False)
+    sheet = page.sheet_of(ax)
+    ax.plot(u, loss, color=style.LINE, **sheet.look(style.stroke(len(u))))
+    panel.name_axes(ax, y=f"loss [{unit}]" if unit else "loss")
     if not np.isfinite(loss).any():
         return []
     lowest = int(np.nanargmin(loss))
     (star,) = ax.plot(
-        u[lowest], loss[lowest], **style.LOWEST, zorder=4, label=f"lowest sample: {style.number(loss[lowest])}"
-    )
+        u[lowest], loss[lowest], **sheet.look(style.LOWEST), zorder=4,
+        label=f"lowest sample: {style.number(loss[lowest])}",
+    )  # fmt: skip
     return [star]
 
 
@@ -76,11 +85,12 @@ def _draw_slope(ax: Axes, dataset: xr.Dataset, plane: Plane) -> list[Artist]:
     differences = np.full_like(u, np.nan)
     differences[1:-1] = (loss[2:] - loss[:-2]) / (u[2:] - u[:-2])
     ax.axhline(0, color=style.FAINT, linewidth=0.8, zorder=0.5)
-    (behind,) = ax.plot(u, differences, color=style.QUIET, linewidth=0.7, label="central difference of the loss")
-    (line,) = ax.plot(u, slope, color=style.SLOPE_LINE, **style.stroke(len(u)), label="gradient")
+    sheet, thin = page.sheet_of(ax), {"color": style.QUIET, "linewidth": 0.7}
+    (behind,) = ax.plot(u, differences, **sheet.look(thin), label="central difference of the loss")
+    (line,) = ax.plot(u, slope, color=style.SLOPE_LINE, **sheet.look(style.stroke(len(u))), label="gradient")
     low, high = style.span_of_line(slope, differences)
     ax.set_ylim(low, high)
-    ax.set_ylabel(_slope_label(plane, dataset["loss"].attrs.get("units", "")), size=style.LABEL, parse_math=False)
+    panel.name_axes(ax, y=_slope_label(plane, dataset["loss"].attrs.get("units", "")))
     for drawn, values in ((line, slope), (behind, differences)):
         if off := int(((values < low) | (values > high)).sum()):
             drawn.set_label(f"{drawn.get_label()} ({off} off scale)")
@@ -94,7 +104,7 @@ def _slope_label(plane: Plane, loss_unit: str) -> str:
 
 
 def _frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
-    style.dress(ax)
+    panel.dress(ax)
     ax.set_xlim(float(plane.lower[0]), float(plane.upper[0]))
     u, status = dataset["u"].to_numpy(), dataset["status"].to_numpy()
     edges = np.concatenate([u[:1], (u[1:] + u[:-1]) / 2, u[-1:]])
@@ -110,18 +120,20 @@ def _runs(where: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 def _draw_strip(strip: Axes, panels: list[Axes], u: NDArray[np.float64], name: str, counts: NDArray[np.int64]) -> None:
     """Shade the stretches of equal count, label those that have room, and mark where they meet."""
+    sheet = page.sheet_of(strip)
     meets = np.flatnonzero(np.diff(counts)) + 1
     edges = [u[0], *((u[meets] + u[meets - 1]) / 2).tolist(), u[-1]]
     labels = counts[[0, *meets.tolist()]].tolist()
     for number, ((low, high), label) in enumerate(zip(pairwise(edges), labels, strict=True)):
         strip.axvspan(low, high, color=style.BAND[number % 2], linewidth=0)
-        if (high - low) / (u[-1] - u[0]) * (WIDTH - 1.2) > style.text_width(str(label)):
-            strip.text((low + high) / 2, 0.5, str(label), size=style.SMALL, color=style.INK, ha="center", va="center")
+        room = (high - low) / (u[-1] - u[0]) * (sheet.width - ROOM * sheet.type)
+        if room > typesetting.text_width(str(label), sheet.small) + sheet.small / 72:
+            strip.text((low + high) / 2, 0.5, str(label), size=sheet.small, color=style.INK, ha="center", va="center")
     for edge in edges[1:-1]:
         for ax in panels:
-            ax.axvline(edge, color=style.FAINT, linewidth=style.thin(len(meets)), zorder=0.7)
+            ax.axvline(edge, color=style.FAINT, linewidth=sheet.weight * style.thin(len(meets)), zorder=0.7)
     strip.set_ylim(0, 1)
     strip.set_yticks([])
     strip.tick_params(bottom=False, labelbottom=False)
     strip.spines[:].set_visible(False)
-    strip.set_ylabel(name, size=style.SMALL, rotation=0, ha="right", va="center", parse_math=False)
+    strip.set_ylabel(name, size=sheet.small, rotation=0, ha="right", va="center", parse_math=False)

@@ -20,19 +20,19 @@ from ..files import replacing
 from ..objective import Status
 from ..plane import Plane
 from ..store import plane_of
-from . import contour, page, style
-from .overlay import by_kind, farthest, joint_scale
+from . import contour, page, relief, style
+from .overlay import by_kind, farthest, half_widths, joint_scale
+from .relief import HEIGHT, SIDE
 
 Runs = Sequence[xr.Dataset]
 Grid = NDArray[np.float64]
 
 TIMELINE = "evaluation"
 SURFACE, ARROWS = "landscape/surface", "landscape/descent_directions"
-SIDE, HEIGHT = 2.0, 1.0  # of the scene: the slice's window, and the scale of the losses
 LIFT = 0.004  # of arrows above the surface
-OUTSIDE, FAILED = "#f0e442", "#ffffff"  # on the viewer's dark ground
-EYE = rrb.EyeControls3D(position=(-1.5, -2.3, 2.1), look_target=(0.0, -0.1, 0.25), eye_up=(0.0, 0.0, 1.0))
-RADIUS, LINE = 0.015, 0.003  # of points on the plane, of lines
+AWAY, UP = 2.75, 1.85  # of the eye: nearer than the picture's, whose angle is smaller
+TICKS, NAMES, OVER = 0.06, 0.28, 1.12  # how far labels are from the frame; where along it the loss has its name
+RADIUS, LINE, DOT = 0.015, 0.003, 0.002  # of points on the plane, of lines, of what only carries a label
 
 
 def save_stream(dataset: xr.Dataset, runs: Runs, path: str | Path) -> None:
@@ -55,7 +55,7 @@ def save_stream(dataset: xr.Dataset, runs: Runs, path: str | Path) -> None:
         for run in runs:
             _log_run(stream, scene, run)
             _log_best(stream, scene, run)
-        _log_key(stream, runs)
+        _log_key(stream, scene, runs)
         _log(stream, "about", rr.TextDocument(_about(dataset, runs, scene), media_type=rr.MediaType.MARKDOWN))
         stream.disconnect()
 
@@ -67,11 +67,19 @@ class Scene:
     plane: Plane
     scale: style.Scale
     reach: float
+    stand: relief.Stand
 
     @classmethod
-    def of(cls, dataset: xr.Dataset, runs: Runs) -> Scene:
-        """Return the scene of a slice and of runs laid over it."""
-        return cls(plane_of(dataset), joint_scale(dataset, runs), farthest(runs))
+    def of(cls, dataset: xr.Dataset, runs: Runs, scale: style.Scale | None = None) -> Scene:
+        """Return the scene of a slice and of runs laid over it, on the scale of their losses unless given."""
+        plane, scale = plane_of(dataset), scale or joint_scale(dataset, runs)
+        return cls(plane, scale, farthest(runs), relief.stand(relief.Relief(plane, scale), dataset))
+
+    @property
+    def eye(self) -> rrb.EyeControls3D:
+        """From where it is seen at first."""
+        place, focus = self.stand.place(0.0, AWAY, UP), (0.0, 0.0, relief.FOCUS)
+        return rrb.EyeControls3D(position=place, look_target=focus, eye_up=(0.0, 0.0, 1.0))
 
     def at(self, u: Grid, v: Grid, loss: Grid) -> Grid:
         """Return positions, shape (..., 3); places beyond the window are moved to its border."""
@@ -100,32 +108,20 @@ def _log(stream: rr.RecordingStream, path: str, archetype: rr.AsComponents) -> N
 
 
 def surface(scene: Scene, dataset: xr.Dataset) -> rr.Mesh3D:
-    """Return a slice as a surface whose height and colour are the loss."""
-    loss = dataset["loss"].transpose("v", "u").to_numpy()
-    u, v = np.meshgrid(dataset["u"].to_numpy(), dataset["v"].to_numpy())
-    positions = scene.at(u, v, loss)
-    number = np.arange(loss.size).reshape(loss.shape)
-    a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
-    triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-    triangles = triangles[np.isfinite(loss).ravel()[triangles].all(axis=1)]
+    """Return a slice as flat cells whose height and colour are the loss."""
+    made = relief.cells(relief.Relief(scene.plane, scene.scale), dataset)
+    first = 4 * np.arange(len(made.corners))[:, None]
+    loss = dataset["loss"].transpose("v", "u").to_numpy().ravel()
     return rr.Mesh3D(
-        vertex_positions=np.nan_to_num(positions).reshape(-1, 3),
-        triangle_indices=triangles,
-        vertex_normals=_normals(positions).reshape(-1, 3),
-        vertex_colors=scene.tint(loss).reshape(-1, 4),
+        vertex_positions=made.corners.reshape(-1, 3),
+        triangle_indices=np.concatenate([first + np.array(corners) for corners in relief.TRIANGLES]),
+        vertex_normals=np.repeat(made.normals, 4, axis=0),
+        vertex_colors=np.repeat(scene.tint(loss[made.sample]), 4, axis=0),
     )
 
 
-def _normals(positions: Grid) -> Grid:
-    """Return the surface's unit normals, straight up beside a hole."""
-    along, across = np.gradient(positions, axis=1), np.gradient(positions, axis=0)
-    normals: Grid = np.cross(along, across)
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    return np.where(np.isfinite(normals), normals, [0.0, 0.0, 1.0])
-
-
 def descent_arrows(scene: Scene, dataset: xr.Dataset, scale: style.Scale | None = None) -> rr.Arrows3D:
-    """Lay the directions of steepest descent on the surface, coloured by the gradient's magnitude."""
+    """Lay the directions of steepest descent on the cells, coloured by the gradient's magnitude."""
     rows, columns = (contour.thinned(dataset.sizes[name]) for name in ("v", "u"))
     at = np.ix_(rows, columns)
     slope = scene.plane.slope(torch.from_numpy(dataset["grad"].transpose("v", "u", "dim").to_numpy())).numpy()
@@ -133,11 +129,9 @@ def descent_arrows(scene: Scene, dataset: xr.Dataset, scale: style.Scale | None 
     norm = (scale or style.Scale.of_magnitude(logarithm)).norm
     u, v = np.meshgrid(dataset["u"].to_numpy(), dataset["v"].to_numpy())
     places = scene.at(u, v, dataset["loss"].transpose("v", "u").to_numpy())
-    normals, origins = _normals(places)[at], places[at]
+    origins = places[at]
     flat = contour.descent(slope, scene.plane)[at] * 0.8 * SIDE / max(len(rows), len(columns))
-    rise = -(normals[..., :2] * flat).sum(axis=-1) / normals[..., 2]
-    vectors = np.concatenate([flat, rise[..., None]], axis=-1)
-    vectors *= np.linalg.norm(flat, axis=-1, keepdims=True) / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    vectors = np.concatenate([flat, np.zeros_like(flat[..., :1])], axis=-1)
     seen = np.isfinite(vectors).all(axis=-1) & np.isfinite(origins).all(axis=-1)
     return rr.Arrows3D(
         vectors=vectors[seen],
@@ -149,27 +143,23 @@ def descent_arrows(scene: Scene, dataset: xr.Dataset, scale: style.Scale | None 
 
 def log_axes(stream: rr.RecordingStream, scene: Scene, dataset: xr.Dataset) -> None:
     """Frame the scene, with the ticks of both parameters and of the loss."""
-    low, high = -SIDE / 2, SIDE / 2
-    frame = [[low, high, HEIGHT], [low, high, 0], [low, low, 0], [high, low, 0], [high, high, 0], [low, high, 0]]
-    _log(stream, "landscape/axes/frame", rr.LineStrips3D([frame], colors=_rgba(style.FAINT), radii=LINE / 2))
+    frame = rr.LineStrips3D(scene.stand.frame(), colors=rgba(style.BETWEEN), radii=LINE / 2)
+    _log(stream, "landscape/axes/frame", frame)
     window = [side.numpy() for side in scene.plane.window()]
     unit = dataset["loss"].attrs.get("units", "")
     names = [*scene.plane.labels, f"loss [{unit}]" if unit else "loss"]
     ends = [(window[0][0], window[1][0]), (window[0][1], window[1][1])]
-    ends.append((float(scene.scale.norm.vmin or 0.0), float(scene.scale.norm.vmax or 0.0)))
+    ends.append(scene.scale.ends)
     for axis, (name, (least, most)) in enumerate(zip(names, ends, strict=True)):
         ticks = _ticks(least, most, logarithmic=axis == 2 and scene.scale.logarithmic)
         share = (ticks - least) / (most - least) if axis < 2 else scene.height(ticks) / HEIGHT
-        places = [_on_axis(axis, part) for part in share]
-        places.append(_on_axis(axis, 0.5, away=0.28) if axis < 2 else _on_axis(axis, 1.12))
+        if axis == 2:  # at its foot another axis ends
+            ticks, share = ticks[share > relief.FOOT], share[share > relief.FOOT]
+        places = [scene.stand.beside(axis, part, TICKS) for part in share]
+        places.append(scene.stand.beside(axis, 0.5, NAMES) if axis < 2 else scene.stand.beside(axis, OVER, TICKS))
         labels = [*map(style.number, ticks.tolist()), name]
-        points = rr.Points3D(places, labels=labels, show_labels=True, colors=_rgba(style.FAINT), radii=0.002)
+        points = rr.Points3D(places, labels=labels, show_labels=True, colors=rgba(style.BETWEEN), radii=DOT)
         _log(stream, f"landscape/axes/{'uvz'[axis]}", points)
-
-
-def _on_axis(axis: int, share: float, away: float = 0.06) -> tuple[float, float, float]:
-    low, along = -SIDE / 2, SIDE * (share - 0.5)
-    return ((along, low - away, 0.0), (low - away, along, 0.0), (low - away, -low + away, HEIGHT * share))[axis]
 
 
 def _ticks(low: float, high: float, *, logarithmic: bool) -> Grid:
@@ -178,17 +168,20 @@ def _ticks(low: float, high: float, *, logarithmic: bool) -> Grid:
     return ticks[(ticks >= low) & (ticks <= high)]
 
 
-def _log_key(stream: rr.RecordingStream, runs: Runs) -> None:
-    """Label the colours of points, behind the scene."""
+def _log_key(stream: rr.RecordingStream, scene: Scene, runs: Runs) -> None:
+    """Label the colours of points, behind the scene: the labels themselves in one that is read on every ground."""
     shown = {name: style.KINDS[name]["color"] for run in runs for name, _ in by_kind(run)}
     if any(run["outside"].any() for run in runs):
-        shown["outside"] = OUTSIDE
+        shown["outside"] = style.BEYOND
     if any((run["status"] != Status.OK).any() for run in runs):
-        shown["failed"] = FAILED
-    places = [(SIDE / 2, SIDE / 2 - 0.45 * number, HEIGHT * 1.25) for number in range(len(shown))]
-    colors = [_rgba(color) for color in shown.values()]
-    points = rr.Points3D(places, labels=list(shown), show_labels=True, colors=colors, radii=RADIUS)
-    _log(stream, "landscape/key", points)
+        shown["failed"] = style.LOST
+    behind, left = (np.array(scene.stand.place(turn, 1.0, -relief.FOCUS)) for turn in (180.0, -90.0))
+    high = np.array([0.0, 0.0, 1.25 * HEIGHT])
+    places = [SIDE / 2 * behind + 0.45 * (number - 0.5) * left + high for number in range(len(shown))]
+    colors = [rgba(color) for color in shown.values()]
+    _log(stream, "landscape/key", rr.Points3D(places, colors=colors, radii=RADIUS))
+    names = rr.Points3D(places, labels=list(shown), show_labels=True, colors=rgba(style.BETWEEN), radii=DOT)
+    _log(stream, "landscape/key/names", names)
 
 
 def _log_run(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None:
@@ -197,7 +190,7 @@ def _log_run(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None:
     radii = RADIUS * np.sqrt(style.point_areas(run["distance"].to_numpy(), scene.reach, 1) / style.NEAR[1])
     failed = run["status"].to_numpy() != Status.OK
     groups = [(name, here & ~outside & ~failed, style.KINDS[name]["color"]) for name, here in by_kind(run)]
-    groups += [("outside", outside & ~failed, OUTSIDE), ("failed", failed, FAILED)]
+    groups += [("outside", outside & ~failed, style.BEYOND), ("failed", failed, style.LOST)]
     for name, here, color in groups:
         _log_points(stream, f"{path}/{name}", np.flatnonzero(here), places, radii, color)
     rows = np.flatnonzero(run["previous"].to_numpy() >= 0)
@@ -212,7 +205,7 @@ def _log_gaps(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset, path: s
     feet[:, 2] = scene.height(run["beneath"].to_numpy())
     apart = np.isfinite(run["loss"].to_numpy()) & (np.abs(feet[:, 2] - places[:, 2]) > RADIUS)
     rows = np.flatnonzero(apart)
-    _log_lines(stream, path, rows, np.stack([feet[rows], places[rows]], axis=1), style.FAINT)
+    _log_lines(stream, path, rows, np.stack([feet[rows], places[rows]], axis=1), style.BETWEEN)
 
 
 def _log_best(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None:
@@ -222,7 +215,7 @@ def _log_best(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None
     if not len(known):
         return
     curve = np.log10(best[known]) if scene.scale.logarithmic else best[known]
-    _log(stream, f"best/{label}", rr.SeriesLines(colors=_rgba(color), names=label, widths=1.5))
+    _log(stream, f"best/{label}", rr.SeriesLines(colors=rgba(color), names=label, widths=1.5))
     stream.send_columns(f"best/{label}", _times(known), rr.Scalars.columns(scalars=curve), strict=True)
     lowered = known[np.diff(best[known], prepend=np.inf) < 0]
     places = scene.at(*(run[name].to_numpy()[lowered] for name in ("u", "v", "loss")))
@@ -235,14 +228,14 @@ def _log_points(
     stream: rr.RecordingStream, path: str, rows: NDArray[np.intp], places: Grid, radii: Grid, color: str
 ) -> None:
     if len(rows):
-        colors = np.tile(_rgba(color), (len(rows), 1))
+        colors = np.tile(rgba(color), (len(rows), 1))
         columns = rr.Points3D.columns(positions=places[rows], radii=radii[rows], colors=colors)
         stream.send_columns(path, _times(rows), columns, strict=True)
 
 
 def _log_lines(stream: rr.RecordingStream, path: str, rows: NDArray[np.intp], strips: Grid, color: str) -> None:
     if len(rows):
-        colors, radii = np.tile(_rgba(color), (len(rows), 1)), np.full(len(rows), LINE / 2)
+        colors, radii = np.tile(rgba(color), (len(rows), 1)), np.full(len(rows), LINE / 2)
         columns = rr.LineStrips3D.columns(strips=strips.astype(np.float32), colors=colors, radii=radii)
         stream.send_columns(path, _times(rows), columns, strict=True)
 
@@ -252,7 +245,8 @@ def _times(rows: NDArray[np.intp]) -> list[rr.TimeColumn]:
     return [rr.TimeColumn(TIMELINE, sequence=rows + 1)]
 
 
-def _rgba(color: str) -> NDArray[np.uint8]:
+def rgba(color: str) -> NDArray[np.uint8]:
+    """Return a colour as rerun takes it."""
     found: NDArray[np.uint8] = np.rint(255 * np.array(to_rgba(color))).astype(np.uint8)
     return found
 
@@ -262,7 +256,7 @@ def _blueprint(dataset: xr.Dataset, scene: Scene) -> rrb.Blueprint:
         TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
     )
     space = rrb.Spatial3DView(
-        name=page.title(dataset), origin="landscape", time_ranges=so_far, eye_controls=EYE, line_grid=False
+        name=page.title(dataset), origin="landscape", time_ranges=so_far, eye_controls=scene.eye, line_grid=False
     )
     what = "best loss so far, log10" if scene.scale.logarithmic else "best loss so far"
     curves = rrb.TimeSeriesView(name=what, origin="best", plot_legend=rrb.Corner2D.RightTop)
@@ -280,7 +274,7 @@ def _about(dataset: xr.Dataset, runs: Runs, scene: Scene) -> str:
     kind = "logarithmic" if scene.scale.logarithmic else "linear"
     unit = dataset["loss"].attrs.get("units", "")
     distance = (
-        f"A point on the plane is largest; one {scene.reach:.2g} half-widths of the box off it has "
+        f"A point on the plane is largest; one {half_widths(scene.reach)} off it has "
         f"{style.FAR**0.5:.0%} of that radius."
         if scene.reach
         else "Every point lies on the plane."

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib import colormaps
-from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.colorbar import Colorbar
 from matplotlib.colors import Colormap, ListedColormap, LogNorm, Normalize
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
@@ -18,19 +18,20 @@ from numpy.typing import NDArray
 
 from ..objective import Status
 
-DPI = 150
-PANEL = 4.3  # side of a map [inch]
-STRIP = 0.26  # height of a strip of event counts [inch]
-
-TITLE, LABEL, TICK, SMALL = 12.0, 10.0, 9.0, 7.0  # type sizes [pt]
+DPI, PRINT_DPI = 150, 600  # of a picture for a screen, and of what is pixels in one for print
 INK, QUIET, FAINT = "#1a1a1a", "#5f5f5f", "#c9c9c9"
 UNSAMPLED = "#ececec"  # MISSING: nothing there yet
 BAND = ("#dfe6ee", "#f6f8fa")  # alternating event counts
 LINE = "#31688e"  # the loss over a line: viridis' blue
 SLOPE_LINE = "#b5367a"  # the gradient along it: magma's pink
 
+NIGHT, NIGHT_INK = "#16181b", "#ececec"  # ground and ink of the gallery's pages where they are dark
+BETWEEN = "#777777"  # as far from white as from black: lines and labels in a viewer, whose ground is light or dark
+BEYOND, LOST = "#9a7b00", "#c94f4f"  # points there that are outside the window, or failed
+
 LOSS_MAP: Colormap = colormaps["viridis"]
 SLOPE_MAP: Colormap = ListedColormap(colormaps["magma"](np.linspace(0.08, 0.77, 256)), "magma, legible on white")
+SLOPE_MAP_DARK: Colormap = ListedColormap(colormaps["magma"](np.linspace(0.42, 1.0, 256)), "magma, legible on black")
 
 FAILURES = {Status.NONFINITE: "not finite", Status.ESCAPED: "left the domain", Status.ERROR: "error"}
 _FAILED: dict[str, Any] = {"facecolor": "white", "edgecolor": QUIET, "linewidth": 0.0}
@@ -45,7 +46,8 @@ ARROWS = 32  # most arrows per axis
 LONGEST_ARROW = 0.055  # as a fraction of a side
 ARROW: dict[str, Any] = {"width": 0.0032, "headwidth": 4.0, "headlength": 4.5, "headaxislength": 4.0, "minlength": 0.0}
 LOWEST: dict[str, Any] = {
-    "marker": "*", "markersize": 12, "markerfacecolor": "white", "markeredgecolor": INK, "linestyle": "none"
+    "marker": "*", "markersize": 12, "markeredgewidth": 1.0, "markerfacecolor": "white", "markeredgecolor": INK,
+    "linestyle": "none",
 }  # fmt: skip
 FLAT: dict[str, Any] = {"marker": "o", "markersize": 2.6, "color": QUIET, "linestyle": "none"}
 
@@ -74,6 +76,10 @@ OVERLAID: dict[str, Any] = {"linewidths": 0.6, "zorder": 3, "rasterized": True} 
 HALO: dict[str, Any] = OVERLAID | {"linewidths": 1.5, "zorder": 2.9, "facecolors": "none", "edgecolors": "white"}
 NEAR, FAR = (4.0, 34.0), 0.2  # area of a point on the plane [pt^2], fewest of many; share of it left at the farthest
 TRAIL: dict[str, Any] = {"linewidths": 1.1, "zorder": 2.6, "capstyle": "round"}  # a descent
+ORDER: tuple[dict[str, Any], ...] = (  # what was the best so far, joined: white with a dark edge, for any ground
+    {"color": INK, "alpha": 0.6, "linewidth": 2.2, "zorder": 2.75},
+    {"color": "white", "linewidth": 1.0, "zorder": 2.8},
+)
 FAINTEST = 0.25  # opacity of a descent at the farthest
 BEST: dict[str, Any] = {"marker": "*", "s": 190.0, "linewidths": 1.1, "zorder": 5}
 BROKEN: dict[str, Any] = {"marker": "x", "s": 18.0, "linewidths": 0.9, "color": INK, "zorder": 3.5}  # a failed episode
@@ -93,7 +99,7 @@ LADDERS: dict[str, dict[str, Any]] = {  # what was turned to make a rung of a tr
     "particles": {"color": "#e69f00", "marker": "^"},
     "precision": {"color": "#cc79a7", "marker": "D"},
     "stiffness": {"color": "#d55e00", "marker": "v"},
-    "engine": {"color": "#5b2a86", "marker": "P"},
+    "engine": {"color": "#8455c9", "marker": "P"},
     "device": {"color": "#7f7f7f", "marker": "X"},
     "named": {"color": INK, "marker": "*", "markersize": 13.0},
 }
@@ -103,15 +109,67 @@ RUNG: dict[str, Any] = {
 WHISKER: dict[str, Any] = {"color": FAINT, "linewidth": 1.0, "zorder": 1.5, "solid_capstyle": "butt"}
 FRONT: dict[str, Any] = {"color": QUIET, "linewidth": 1.2, "zorder": 2}
 AGAINST: dict[str, Any] = {"color": INK, "linewidth": 0.9, "linestyle": (0, (4, 2)), "zorder": 1}
-NAME: dict[str, Any] = {
-    "fontsize": LABEL, "color": INK, "zorder": 4, "path_effects": [withStroke(linewidth=2.5, foreground="white")]
-}  # fmt: skip
-BESIDE: tuple[tuple[str, tuple[float, float], dict[str, Any]], ...] = (  # where a name may stand [pt]
-    ("above", (0.0, 9.0), {"ha": "center", "va": "bottom"}),
-    ("below", (0.0, -9.0), {"ha": "center", "va": "top"}),
-    ("right", (9.0, 0.0), {"ha": "left", "va": "center"}),
-    ("left", (-9.0, 0.0), {"ha": "right", "va": "center"}),
-)
+NAME: dict[str, Any] = {"color": INK, "zorder": 6, "path_effects": [withStroke(linewidth=2.0, foreground="white")]}
+LEADER: dict[str, Any] = {"arrowstyle": "-", "color": QUIET, "linewidth": 0.5, "shrinkA": 0.0, "shrinkB": 2.0}
+
+EXTEND = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
+SUBS = ((6.0, (1, 1.5, 2, 3, 4, 5, 7)), (2e3, (1, 2, 5)))  # ticks of a decade, by the axis' span
+INCH = 25.4  # [mm]
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+NARROWEST, WIDEST = 80.0, 400.0  # of a picture for print [mm]
+LIGHTEST = 0.5  # of lines and marks, against those on a screen: a tenth of a millimetre
+WEIGHTS = {"linewidth": 1, "linewidths": 1, "markersize": 1, "markeredgewidth": 1, "capsize": 1, "s": 2}
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What a picture's place decides: a screen, as wide as its panels, or a printed page that is so wide."""
+
+    width: float  # [inch]
+    columns: int  # panels side by side
+    zoom: float  # of a panel, against its size on a screen
+    title: float = 12.0  # type sizes [pt]
+    label: float = 10.0
+    tick: float = 9.0
+    small: float = 7.0
+
+    @classmethod
+    def of(
+        cls, width: float | None, *, pitch: float, columns: int = 1, panels: int | None = None, least: float = NARROWEST
+    ) -> Sheet:
+        """Return a screen's, `columns` panels of a `pitch` [inch], or that of a page `width` millimetres wide.
+
+        There, as many of the `panels` stand side by side as have `least` millimetres each; type has a journal's sizes.
+        """
+        if width is None:
+            return cls(columns * pitch, columns, 1.0)
+        if not NARROWEST <= width <= WIDEST:
+            raise ValueError(f"a picture for print is {NARROWEST:g} to {WIDEST:g} mm wide; got {width:g}")
+        panels = panels or columns
+        fit = max(1, min(panels, int(width / least)))
+        fit = math.ceil(panels / math.ceil(panels / fit))  # as many in each row
+        return cls(width / INCH, fit, width / INCH / fit / pitch, title=8.0, label=7.0, tick=6.5, small=6.0)
+
+    @property
+    def pitch(self) -> float:
+        """How much room a panel has with all that belongs to it [inch]."""
+        return self.width / self.columns
+
+    @property
+    def type(self) -> float:
+        """How large type is, against a screen's."""
+        return self.label / Sheet.label
+
+    @property
+    def weight(self) -> float:
+        """How heavy lines and marks are, against a screen's: they go with the panels, down to what can be printed."""
+        return min(1.0, max(LIGHTEST, self.zoom))
+
+    def look(self, look: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the look of lines or marks in the sheet's weight."""
+        return {
+            name: value * self.weight ** WEIGHTS[name] if name in WEIGHTS else value for name, value in look.items()
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,13 +199,24 @@ class Scale:
         return cls(Normalize(low, high), extend)
 
     @property
+    def ends(self) -> tuple[float, float]:
+        """The least and the largest value that have a colour of their own."""
+        return float(self.norm.vmin or 0.0), float(self.norm.vmax or 0.0)
+
+    def over(self, values: NDArray[np.float64]) -> Scale:
+        """Return the same scale, with the ends open beyond which some of the values are."""
+        low, high = self.ends
+        finite = values[np.isfinite(values)]
+        return Scale(self.norm, EXTEND[bool((finite < low).any()), bool((finite > high).any())])
+
+    @property
     def logarithmic(self) -> bool:
         """Whether equal ratios, not differences, are equally far apart."""
         return isinstance(self.norm, LogNorm)
 
     def ticks(self) -> list[float]:
         """Return round values along the scale."""
-        low, high = float(self.norm.vmin or 0.0), float(self.norm.vmax or 0.0)
+        low, high = self.ends
         if self.logarithmic:
             values = LogLocator(subs=(1, 2, 5) if high < 2e3 * low else (1,), numticks=9).tick_values(low, high)
             return [float(value) for value in values if low <= value <= high]
@@ -174,16 +243,7 @@ def _span(values: NDArray[np.float64]) -> tuple[float, float, str]:
     if not high > low:  # one value all over: a scale around it
         pad = 0.5 * abs(low) or 0.5
         low, high = low - pad, high + pad
-    extend = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
-    return low, high, extend[below, above]
-
-
-def dress(ax: Axes) -> None:
-    """Give a panel its ticks and frame."""
-    ax.tick_params(labelsize=TICK, color=QUIET, labelcolor=INK, length=3)
-    ax.spines[:].set(color=QUIET, linewidth=0.6)
-    ax.xaxis.set_major_locator(MaxNLocator(5))
-    ax.yaxis.set_major_locator(MaxNLocator(5))
+    return low, high, EXTEND[below, above]
 
 
 def log_axis(axis: Axis) -> None:
@@ -191,16 +251,10 @@ def log_axis(axis: Axis) -> None:
     scale = axis.axes.set_xscale if axis is axis.axes.xaxis else axis.axes.set_yscale
     scale("log")
     low, high = sorted(axis.get_view_interval())
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 2e3 * low else (1,), numticks=9))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
+    subs = next((subs for span, subs in SUBS if high < span * low), (1,))
+    axis.set_major_locator(LogLocator(subs=subs, numticks=9))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: power(value)))
     axis.set_minor_formatter(NullFormatter())
-
-
-def dress_bar(bar: Colorbar, label: str) -> None:
-    """Give a colour bar its label and ticks."""
-    bar.set_label(label, size=LABEL, color=INK, parse_math=False)
-    bar.ax.tick_params(labelsize=TICK, color=QUIET, labelcolor=INK, length=3)
-    bar.outline.set(edgecolor=QUIET, linewidth=0.6)
 
 
 def stroke(points: int) -> dict[str, Any]:
@@ -222,19 +276,24 @@ def point_areas(distance: NDArray[np.float64], reach: float, points: int) -> NDA
     return areas
 
 
-def number(value: float) -> str:
-    """Write a number with four digits and the minus sign that the ticks have."""
-    return f"{value:.4g}".replace("-", "\N{MINUS SIGN}")
+def number(value: float, form: str = ".4g") -> str:
+    """Write a number, with four digits unless `form` says otherwise, the ticks' minus sign, and no negative zero."""
+    return f"{value:z{form}}".replace("-", "\N{MINUS SIGN}")
+
+
+def power(value: float, plain: int = 4) -> str:
+    """Write a round number of a logarithmic axis, beyond so many `plain` digits as a multiple of a power of ten."""
+    exponent = math.floor(math.log10(value) + 1e-9)
+    if -plain <= exponent < plain:
+        return number(value)
+    factor = round(value / 10.0**exponent)
+    ten = "10" + str(exponent).translate(RAISED)
+    return ten if factor == 1 else f"{factor}\N{MULTIPLICATION SIGN}{ten}"
 
 
 def thin(lines: int) -> float:
     """Return the width of so many vertical lines [pt]: hairlines where there are many."""
     return max(0.25, min(0.8, 40 / max(lines, 1)))
-
-
-def text_width(text: str) -> float:
-    """Return about how much room small type takes [inch], with a margin."""
-    return (0.65 * SMALL * len(text) + 4) / 72
 
 
 def span_of_line(values: NDArray[np.float64], beside: NDArray[np.float64]) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""A slice as a lit surface, with runs draped on it (pyvista, off-screen; labels by matplotlib)."""
+"""A slice as a lit surface of flat cells, with runs draped on it (pyvista, off-screen; labels by matplotlib)."""
 
 from __future__ import annotations
 
@@ -14,129 +14,139 @@ import xarray as xr
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator
 from numpy.typing import NDArray
 
 from ..files import replacing
 from ..objective import Status
-from ..plane import Plane
 from ..store import plane_of
-from . import page, style
+from . import page, panel, relief, style
 from .overlay import by_kind, joint_scale
+from .relief import FOCUS, HEIGHT, SIDE, Relief, Stand
 from .solids import off_screen
 
 Runs = Sequence[xr.Dataset]
 Grid = NDArray[np.float64]
 
-SIDE, HEIGHT = 2.0, 0.9  # of the surface: the slice's window, and the scale of the losses
-EYE, FOCUS, ANGLE = (-2.7, -4.0, 3.0), (0.0, 0.0, 0.26), 28.0  # of the camera; its angle [degrees]
-PIXELS = (1500, 1100)
-LIGHTS = (((-2.0, -1.0, 2.5), 0.75), ((2.5, -2.0, 1.5), 0.35), ((0.0, 3.0, 1.0), 0.2))  # position, strength
-MATTER: dict[str, Any] = {"ambient": 0.25, "diffuse": 0.8, "specular": 0.12, "specular_power": 20}
+PITCH = 8.6  # of the page on a screen [inch]
+PIXELS, FINE = (1500, 1100), 300  # of the picture; in print, so many per inch where that is more
+ANGLE = 28.0  # of the camera [degrees]
+LIGHTS = (((-100.0, 2.0, 4.0), 0.85), ((60.0, 3.2, 1.2), 0.35))  # from the eye's azimuth, away and up; strength
+MATTER: dict[str, Any] = {"ambient": 0.3, "diffuse": 0.78, "specular": 0.0}
 POINT, TRAIL, BEST, LIFT = 0.016, 0.006, 0.03, 0.004  # radii of points, descents and bests; how far they lie above
-FRAME, AWAY = 0.003, 0.09  # radius of the frame's lines; of labels from it
+FRAME = 0.003  # radius of its lines
+AWAY, OUT = (0.09, 0.09, 0.04), (0.31, 0.31, 0.28)  # of ticks and of names from the frame, for each axis
+ROOM = 0.02  # about the frame, in the picture
 
 
 @dataclass(frozen=True, eq=False)
-class Relief:
-    """Say where plane coordinates and losses are: the slice's window is centred, its longer side SIDE."""
+class Shown:
+    """Hold a scene that is ready to be drawn in so many pixels, and how it is seen."""
 
-    plane: Plane
-    scale: style.Scale
+    plotter: pv.Plotter
+    relief: Relief
+    stand: Stand
+    pixels: tuple[int, int]
+    projection: Grid  # the matrix that takes positions to the picture
 
-    def at(self, u: Grid, v: Grid, loss: Grid) -> Grid:
-        """Return positions, shape (..., 3)."""
-        low, high = (side.numpy() for side in self.plane.window())
-        flat = SIDE * ((np.stack([u, v], axis=-1) - low) / (high - low) - 0.5)
-        return np.concatenate([flat, self.height(loss)[..., None]], axis=-1)
-
-    def height(self, loss: Grid) -> Grid:
-        """Return the height of a loss, cut at both ends of the scale; NaN for none."""
-        return HEIGHT * self.shade(loss)
-
-    def shade(self, loss: Grid) -> Grid:
-        """Return where a loss is on the scale, 0 to 1; NaN for none."""
-        least = float(self.scale.norm.vmin or 0.0) if self.scale.logarithmic else -np.inf
-        return np.clip(np.asarray(self.scale.norm(np.maximum(loss, least)), dtype=np.float64), 0.0, 1.0)
+    def on_picture(self, places: Grid) -> Grid:
+        """Return where positions, shape (point, 3), are in the picture [pixel], from its upper left corner."""
+        clip = np.concatenate([places, np.ones((len(places), 1))], axis=1) @ self.projection.T
+        flat = clip[:, :2] / clip[:, 3:]
+        return np.stack([flat[:, 0] + 1, 1 - flat[:, 1]], axis=1) / 2 * self.pixels
 
 
 def save_surface(dataset: xr.Dataset, runs: Runs, png: str | Path, gltf: str | Path) -> None:
-    """Write a slice, and runs laid over it as `overlay` does, as a picture and as a model to turn around."""
+    """Write a slice, and runs laid over it as `overlay` does, as a picture and as a model to turn around.
+
+    The model is turned so that who opens it looks at it from where the picture does: in glTF y points up and z to who
+    looks.
+    """
     page.save(surface_figure(dataset, runs), png)
-    with _scene(dataset, runs) as (plotter, _), replacing(Path(gltf)) as partial:
-        plotter.export_gltf(str(partial), inline_data=True, rotate_scene=True, save_normals=True)
+    with scene(dataset, runs) as shown, replacing(Path(gltf)) as partial:
+        for actor in shown.plotter.actors.values():
+            actor.rotate_x(-90.0)  # after what follows
+            actor.rotate_z(-90.0 - shown.stand.azimuth)
+        camera = shown.plotter.camera
+        camera.position, camera.focal_point = (0.0, FOCUS + relief.UP, relief.AWAY), (0.0, FOCUS, 0.0)
+        camera.up = (0.0, 1.0, 0.0)
+        shown.plotter.export_gltf(str(partial), inline_data=True, rotate_scene=False, save_normals=True)
 
 
-def surface_figure(dataset: xr.Dataset, runs: Runs = ()) -> Figure:
-    """Draw a slice as a surface whose height and colour are the loss; samples that failed are holes."""
-    with _scene(dataset, runs) as (plotter, relief):
-        pixels = np.asarray(plotter.screenshot(return_img=True))
-        seen = _projection(plotter)
-    figure = page.blank_page(8.6, 6.6)
-    ax = figure.add_subplot()
-    ax.imshow(pixels, interpolation="antialiased")
-    ax.set_axis_off()
-    page.head(figure, ax, dataset)
-    _label(ax, dataset, relief, seen)
-    bar = figure.colorbar(
-        ScalarMappable(relief.scale.norm, style.LOSS_MAP), ax=ax, extend=relief.scale.extend, fraction=0.03, pad=0.0,
-        shrink=0.7,
-    )  # fmt: skip
-    style.dress_bar(bar, _loss_name(dataset))
-    page.key(figure, [*_entries(runs), *_holes(dataset)], columns=3)
-    return figure
+def surface_figure(dataset: xr.Dataset, runs: Runs = (), *, width: float | None = None) -> page.Picture:
+    """Draw a slice as a body whose height and colour are the loss: every sample is flat, those that failed are holes.
+
+    It is seen from the side, of eight, from which most of the valley is, its lowest tenth.
+    """
+    sheet = style.Sheet.of(width, pitch=PITCH)
+    fine = max(1.0, FINE * sheet.width / PIXELS[0]) if width else 1.0
+    picture = page.Picture(sheet, sheet.width)
+    ax = picture.add_subplot()
+    with scene(dataset, runs, pixels=(round(fine * PIXELS[0]), round(fine * PIXELS[1]))) as shown:
+        ax.imshow(np.asarray(shown.plotter.screenshot(return_img=True)), interpolation="antialiased", aspect="auto")
+        _crop(ax, shown)
+        _label(ax, dataset, shown)
+    page.head(picture, ax, dataset)
+    scale = shown.relief.scale
+    panel.colour_bar(
+        ax, ScalarMappable(scale.norm, style.LOSS_MAP), _loss_name(dataset), scale, fraction=0.03, pad=0.02, shrink=0.8
+    )
+    page.finish(picture, [*_entries(sheet, runs), *_holes(dataset)], columns=3)
+    return picture
 
 
 @contextmanager
-def _scene(dataset: xr.Dataset, runs: Runs) -> Iterator[tuple[pv.Plotter, Relief]]:
+def scene(dataset: xr.Dataset, runs: Runs, *, pixels: tuple[int, int] = PIXELS) -> Iterator[Shown]:
+    """Give the scene of a slice and of runs laid over it."""
     plane = plane_of(dataset)
     if plane.rank != 2:
         raise ValueError(f"a surface shows a plane; got a slice of rank {plane.rank}, so vary two parameters")
-    relief = Relief(plane, joint_scale(dataset, runs))
-    with off_screen(PIXELS) as plotter:
-        for position, strength in LIGHTS:
-            plotter.add_light(pv.Light(position=position, focal_point=FOCUS, intensity=strength))
-        plotter.camera.position, plotter.camera.focal_point, plotter.camera.up = EYE, FOCUS, (0.0, 0.0, 1.0)
-        plotter.camera.view_angle = ANGLE
-        _add_surface(plotter, relief, dataset)
-        _add_frame(plotter)
+    body = Relief(plane, joint_scale(dataset, runs))
+    stand = relief.stand(body, dataset)
+    with off_screen(pixels) as plotter:
+        focus = (0.0, 0.0, FOCUS)
+        for (turn, away, up), strength in LIGHTS:
+            plotter.add_light(pv.Light(position=stand.place(turn, away, up), focal_point=focus, intensity=strength))
+        plotter.camera.position, plotter.camera.focal_point = stand.place(0.0, relief.AWAY, relief.UP), focus
+        plotter.camera.up, plotter.camera.view_angle = (0.0, 0.0, 1.0), ANGLE
+        _add_surface(plotter, body, dataset)
+        _add_frame(plotter, stand)
         for run in runs:
-            _add_run(plotter, relief, run)
+            _add_run(plotter, body, run)
         plotter.camera.clipping_range = (0.5, 30.0)
         plotter.enable_anti_aliasing("ssaa")
-        yield plotter, relief
+        yield Shown(plotter, body, stand, pixels, _projection(plotter, pixels))
 
 
-def _add_surface(plotter: pv.Plotter, relief: Relief, dataset: xr.Dataset) -> None:
-    loss = dataset["loss"].transpose("v", "u").to_numpy()
-    u, v = np.meshgrid(dataset["u"].to_numpy(), dataset["v"].to_numpy())
-    number = np.arange(loss.size).reshape(loss.shape)
-    a, b, c, d = (p.ravel() for p in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
-    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-    faces = faces[np.isfinite(loss).ravel()[faces].all(axis=1)]
-    if not len(faces):
+def _projection(plotter: pv.Plotter, pixels: tuple[int, int]) -> Grid:
+    matrix = plotter.camera.GetCompositeProjectionTransformMatrix(pixels[0] / pixels[1], -1.0, 1.0)
+    return np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])
+
+
+def _add_surface(plotter: pv.Plotter, body: Relief, dataset: xr.Dataset) -> None:
+    made = relief.cells(body, dataset)
+    if not len(made.corners):
         return
-    surface = pv.PolyData.from_regular_faces(np.nan_to_num(relief.at(u, v, loss)).reshape(-1, 3), faces)
-    surface["color"] = style.LOSS_MAP(relief.shade(loss).ravel(), bytes=True)[:, :3]
-    surface = surface.clean(point_merging=False).compute_normals(cell_normals=False, split_vertices=False)
+    first = 4 * np.arange(len(made.corners))[:, None]
+    faces = np.concatenate([first + np.array(corners) for corners in relief.TRIANGLES])
+    surface = pv.PolyData.from_regular_faces(made.corners.reshape(-1, 3), faces)
+    colours = style.LOSS_MAP(body.shade(dataset["loss"].transpose("v", "u").to_numpy()).ravel(), bytes=True)[:, :3]
+    surface["color"] = np.repeat(colours[made.sample], 4, axis=0)
+    surface.point_data.active_normals = np.repeat(made.normals, 4, axis=0)
     look = {"color": "white", "scalars": "color", "rgb": True, "smooth_shading": True, **MATTER}
     plotter.add_mesh(surface, name="surface", reset_camera=False, **look)
 
 
-def _add_frame(plotter: pv.Plotter) -> None:
-    a, top = SIDE / 2, HEIGHT
-    floor = [(-a, -a, 0), (a, -a, 0), (a, a, 0), (-a, a, 0), (-a, -a, 0)]
-    walls = [(-a, a, 0), (-a, a, top), (a, a, top), (a, a, 0)], [(a, a, top), (a, -a, top), (a, -a, 0)]
-    for number, line in enumerate((floor, *walls)):
-        lines = pv.lines_from_points(np.array(line, dtype=np.float64)).tube(radius=FRAME)
+def _add_frame(plotter: pv.Plotter, stand: Stand) -> None:
+    for number, line in enumerate(stand.frame()):
+        lines = pv.lines_from_points(line).tube(radius=FRAME)
         plotter.add_mesh(lines, color=style.FAINT, lighting=False, name=f"frame {number}", reset_camera=False)
 
 
-def _add_run(plotter: pv.Plotter, relief: Relief, run: xr.Dataset) -> None:
+def _add_run(plotter: pv.Plotter, body: Relief, run: xr.Dataset) -> None:
     """Drape a run's points on the surface, where its loss differs above or below it, and join its descents."""
-    places = relief.at(*(run[name].to_numpy() for name in ("u", "v", "loss"))) + np.array([0.0, 0.0, LIFT])
+    places = body.at(*(run[name].to_numpy() for name in ("u", "v", "loss"))) + np.array([0.0, 0.0, LIFT])
     shown = ~run["outside"].to_numpy() & np.isfinite(run["loss"].to_numpy())
     label, color = run.attrs["label"], style.method(run)["color"]
     for name, here in by_kind(run):
@@ -156,61 +166,58 @@ def _add_run(plotter: pv.Plotter, relief: Relief, run: xr.Dataset) -> None:
         plotter.add_mesh(pv.Sphere(radius=BEST, center=best), color=color, name=f"{label} best", reset_camera=False)
 
 
-def _projection(plotter: pv.Plotter) -> Grid:
-    """Return the matrix that takes positions to the picture."""
-    matrix = plotter.camera.GetCompositeProjectionTransformMatrix(PIXELS[0] / PIXELS[1], -1.0, 1.0)
-    return np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])
+def _crop(ax: Axes, shown: Shown) -> None:
+    """Show what the frame takes up of the picture, and a little about it."""
+    a = SIDE / 2
+    box = np.array([(x, y, z) for x in (-a, a) for y in (-a, a) for z in (0.0, HEIGHT)])
+    spots = shown.on_picture(box)
+    low, high = spots.min(axis=0), spots.max(axis=0)
+    room = ROOM * (high - low)[0]
+    (left, upper), (right, lower) = low - room, high + room
+    ax.set(xlim=(left, right), ylim=(lower, upper))
+    ax.set_box_aspect((lower - upper) / (right - left))
+    ax.set_axis_off()
 
 
-def on_picture(seen: Grid, places: Grid) -> Grid:
-    """Return where positions, shape (point, 3), are in the picture [pixel], from its upper left corner."""
-    clip = np.concatenate([places, np.ones((len(places), 1))], axis=1) @ seen.T
-    flat = clip[:, :2] / clip[:, 3:]
-    return np.stack([(flat[:, 0] + 1) / 2 * PIXELS[0], (1 - flat[:, 1]) / 2 * PIXELS[1]], axis=1)
-
-
-def _label(ax: Axes, dataset: xr.Dataset, relief: Relief, seen: Grid) -> None:
+def _label(ax: Axes, dataset: xr.Dataset, shown: Shown) -> None:
     """Write ticks and names beside the frame's two lower edges in front and the one at the right."""
-    window = [side.numpy() for side in relief.plane.window()]
-    norm = relief.scale.norm
-    ends = [*zip(*window, strict=True), (float(norm.vmin or 0.0), float(norm.vmax or 0.0))]
-    for axis, name in enumerate((*relief.plane.labels, _loss_name(dataset))):
+    sheet, body = page.sheet_of(ax), shown.relief
+    room = sheet.type / sheet.zoom  # that type takes up of the scene
+    ends = [*zip(*(side.tolist() for side in body.plane.window()), strict=True), body.scale.ends]
+    for axis, name in enumerate((*body.plane.labels, _loss_name(dataset))):
         low, high = ends[axis]
-        logarithmic = axis == 2 and relief.scale.logarithmic
+        logarithmic = axis == 2 and body.scale.logarithmic
         ticks = np.asarray((LogLocator(numticks=6) if logarithmic else MaxNLocator(5)).tick_values(low, high))
         ticks = ticks[(ticks >= low) & (ticks <= high)]
-        share = (ticks - low) / (high - low) if axis < 2 else relief.shade(ticks)
-        spots = on_picture(seen, np.array([_beside(axis, part, AWAY) for part in share]))
+        share = (ticks - low) / (high - low) if axis < 2 else body.shade(ticks)
+        if axis == 2:  # at its foot another axis begins
+            ticks, share = ticks[share > relief.FOOT], share[share > relief.FOOT]
+        spots = shown.on_picture(np.array([shown.stand.beside(axis, part, room * AWAY[axis]) for part in share]))
+        look: dict[str, Any] = {"size": sheet.tick, "color": style.INK, "va": "center"}
+        look["ha"] = "left" if axis == 2 else "center"
         for tick, (x, y) in zip(ticks.tolist(), spots, strict=True):
-            ax.text(
-                x,
-                y,
-                style.number(tick),
-                size=style.TICK,
-                color=style.INK,
-                ha="left" if axis == 2 else "center",
-                va="center",
-            )
-        away = (3.2, 3.2, 8.0)[axis] * AWAY
-        start, end, (x, y) = on_picture(seen, np.array([_beside(axis, part, away) for part in (0.0, 1.0, 0.5)]))
-        slope = np.degrees(np.arctan2(start[1] - end[1], end[0] - start[0]))
-        slope -= 180.0 * round(slope / 180.0) if abs(slope) > 90.0 + 1e-6 else 0.0
-        look: dict[str, Any] = {"size": style.LABEL, "color": style.INK, "parse_math": False}
-        ax.text(x, y, name, rotation=slope, rotation_mode="anchor", ha="center", va="center", **look)
+            ax.text(x, y, style.power(tick) if logarithmic else style.number(tick), **look)
+        _name(ax, shown, axis, name, room * OUT[axis])
 
 
-def _beside(axis: int, share: float, away: float) -> tuple[float, float, float]:
-    low, along = -SIDE / 2, SIDE * (share - 0.5)
-    return ((along, low - away, 0.0), (low - away, along, 0.0), (-low + 0.5 * away, low, HEIGHT * share))[axis]
+def _name(ax: Axes, shown: Shown, axis: int, name: str, away: float) -> None:
+    """Write an axis' name along it, farther out than its ticks."""
+    spots = shown.on_picture(np.array([shown.stand.beside(axis, part, away) for part in (0.0, 1.0, 0.5)]))
+    start, end, (x, y) = spots
+    slope = np.degrees(np.arctan2(start[1] - end[1], end[0] - start[0]))
+    slope -= 180.0 * round(slope / 180.0) if abs(slope) > 90.0 + 1e-6 else 0.0
+    look: dict[str, Any] = {"size": page.sheet_of(ax).label, "color": style.INK, "parse_math": False}
+    ax.text(x, y, name, rotation=slope, rotation_mode="anchor", ha="center", va="center", **look)
 
 
-def _entries(runs: Runs) -> list[Artist]:
+def _entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
     """Return legend entries of methods and of kinds of points."""
-    dot: dict[str, Any] = {"linestyle": "none", "marker": "o"}
+    dot = sheet.look({"linestyle": "none", "marker": "o", "markersize": 6.0})
     kinds = dict.fromkeys(name for run in runs for name, _ in by_kind(run))
     found: list[Artist] = [Line2D([], [], color=style.KINDS[name]["color"], **dot, label=name) for name in kinds]
     methods = {str(run.attrs["method"]): style.method(run)["color"] for run in runs}
-    bests = [Line2D([], [], color=color, **dot, markersize=10, label=f"{m}: best") for m, color in methods.items()]
+    large = dot | {"markersize": 10.0 * sheet.weight}
+    bests = [Line2D([], [], color=color, **large, label=f"{m}: best") for m, color in methods.items()]
     outside = sum(int(run["outside"].sum()) for run in runs)
     beyond = [Line2D([], [], linestyle="none", label=f"beyond the slice: {outside} points")] if outside else []
     return [*found, *bests, *beyond]

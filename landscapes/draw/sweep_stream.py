@@ -12,19 +12,19 @@ from numpy.typing import NDArray
 
 from ..files import replacing
 from ..objective import Status
-from ..store import plane_of
 from . import page, stream, style
+from .relief import HEIGHT, SIDE
 from .sweep import RATES, Scales, Sweep
 
 
 def save_stream(sweep: Sweep, path: Path) -> None:
     """Write the slices as surfaces on a rerun timeline named after what moves, numbered like the frames from 0."""
     scales, first = Scales.of(sweep), sweep.slices[0]
-    scene = stream.Scene(plane_of(first), scales.loss, 0.0)
+    scene = stream.Scene.of(first, [], scales.loss)
     with replacing(path) as partial:
         name = _digest(sweep)
         recording = rr.RecordingStream(f"gradscape-{name}", recording_id=name, send_properties=False)
-        recording.save(partial, default_blueprint=_blueprint(sweep))
+        recording.save(partial, default_blueprint=_blueprint(sweep, scene))
         recording.set_log_time_enabled(False)
         stream.log_axes(recording, scene, first)
         about = rr.TextDocument(_about(sweep, scales), media_type=rr.MediaType.MARKDOWN)
@@ -34,21 +34,21 @@ def save_stream(sweep: Sweep, path: Path) -> None:
             recording.log(stream.SURFACE, stream.surface(scene, dataset), strict=True)
             if scales.slope:
                 recording.log(stream.ARROWS, stream.descent_arrows(scene, dataset, scales.slope), strict=True)
-            recording.log("landscape/value", _label(sweep, number), strict=True)
+            recording.log("landscape/value", _label(sweep, scene, number), strict=True)
             if np.isfinite(dataset["loss"]).any():
                 recording.log("lowest", rr.Scalars(float(dataset["loss"].min())), strict=True)
         recording.disconnect()
 
 
-def _label(sweep: Sweep, number: int) -> rr.Points3D:
-    place = (0.0, stream.SIDE / 2, 1.3 * stream.HEIGHT)
+def _label(sweep: Sweep, scene: stream.Scene, number: int) -> rr.Points3D:
+    place = scene.stand.place(180.0, SIDE / 2, HEIGHT)
     said = f"{sweep.name} = {sweep.said(sweep.values[number])}"
-    return rr.Points3D([place], labels=[said], show_labels=True, radii=0.002)
+    return rr.Points3D([place], labels=[said], show_labels=True, colors=stream.rgba(style.BETWEEN), radii=stream.DOT)
 
 
-def _blueprint(sweep: Sweep) -> rrb.Blueprint:
+def _blueprint(sweep: Sweep, scene: stream.Scene) -> rrb.Blueprint:
     space = rrb.Spatial3DView(
-        name=page.title(sweep.slices[0]), origin="landscape", eye_controls=stream.EYE, line_grid=False
+        name=page.title(sweep.slices[0]), origin="landscape", eye_controls=scene.eye, line_grid=False
     )
     curve = rrb.TimeSeriesView(
         name="lowest loss of each frame", origin="lowest", plot_legend=rrb.PlotLegend(visible=False)

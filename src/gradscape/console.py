@@ -110,6 +110,7 @@ def cut(
     as_json: bool,
     force: bool,
     scheduler: str | None = None,
+    prints: Sequence[float] = (),
 ) -> None:
     """Sample a slice into its folder and say what it costs, how far it is and what came out."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
@@ -126,7 +127,8 @@ def cut(
 
     with workers(scheduler, env.device) as executor:
         into = Path(out) if out else None
-        folder, summary = fill(console, env, plane, out=into, grad=grad, force=force, executor=executor)
+        how = {"out": into, "grad": grad, "force": force, "executor": executor, "prints": prints}
+        folder, summary = fill(console, env, plane, **how)
     if as_json:
         print(json.dumps({**summary, "folder": str(folder)}))
 
@@ -142,6 +144,7 @@ def fill(
     force: bool = False,
     boxed: bool = False,
     executor: Executor | None = None,
+    prints: Sequence[float] = (),
 ) -> tuple[Path, dict[str, Any]]:
     """Sample a slice into `out`, by default a folder named after it under `root`; stopping it ends the process.
 
@@ -156,7 +159,7 @@ def fill(
     job = Job.open(
         within_box(env) if boxed else env, plane, out or root / _folder(identity, plane, grad), picture_of(env, plane),
         identity=identity, provenance=provenance, grad=grad, force=force, executor=executor,
-        made=None if boxed else recipe(env),
+        made=None if boxed else recipe(env), prints=prints,
     )  # fmt: skip
     try:
         _announce(console, job, env)
@@ -202,18 +205,18 @@ def _folder(identity: dict[str, Any], plane: Plane, grad: bool) -> str:
 def picture_of(env: Environment, plane: Plane) -> Any:
     """Return how a slice of an environment is drawn: a map, or a profile over a line."""
 
-    def surface(dataset: xr.Dataset) -> Figure:
+    def surface(dataset: xr.Dataset, width: float | None = None) -> Figure:
         from .landscapes.draw.contour import landscape_figure
 
-        return landscape_figure(dataset)
+        return landscape_figure(dataset, width=width)
 
-    def profile(dataset: xr.Dataset) -> Figure:
+    def profile(dataset: xr.Dataset, width: float | None = None) -> Figure:
         import torch
 
         from .landscapes.draw.profile import profile_figure
 
         u = torch.tensor(dataset["u"].to_numpy())
-        return profile_figure(dataset, events=env.events(plane.lift(u[:, None])))
+        return profile_figure(dataset, events=env.events(plane.lift(u[:, None])), width=width)
 
     return surface if plane.rank == 2 else profile
 

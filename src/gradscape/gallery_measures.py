@@ -51,7 +51,7 @@ class Reports(Part):
         from .gallery.words import paper_words
         from .landscapes.draw.film import lighten
 
-        files = [self.folder / name for name in (REPORT, MEASURES, measure_report.PICTURE)]
+        files = [self.folder / name for name in (REPORT, MEASURES, measure_report.PICTURE, measure_report.ARRAYS)]
         for file in files:
             file.unlink(missing_ok=True)
         settings = {"points": REPORT_POINTS, "seed": SEED}

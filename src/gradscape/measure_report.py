@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from .console import duration, fill, size
 from .envs.registry import environment_class, make
 from .gallery.figures import data_folder, read_figures
-from .landscapes.files import replacing, visible, write_json
+from .landscapes.files import others, replacing, write_json
 from .landscapes.identity import stored_identity
 from .measure_tables import by_environment, slices_markdown, slices_table
 from .results import SLICE, environment_of, inside
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from .landscapes.objective import Evaluation, Objective
 
 REPORT, TABLE, PICTURE, MEASURES = "report.json", "report.md", "gradient-quality.png", "measures.json"
+ARRAYS = "gradient-quality.npz"  # what the picture is drawn from, but for the slice
 PRECISION = {"float32": 2.0**-23, "float64": 2.0**-52}
 RESOLUTION = 24  # points per axis of a slice that is sampled for its report
 TRIAL = 32  # most episodes that are timed beforehand
@@ -61,6 +63,7 @@ def report(
     data: str | None,
     out: str | None,
     as_json: bool,
+    prints: Sequence[float] = (),
 ) -> None:
     """Measure slices, say what it costs, print the numbers and leave them in files."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
@@ -75,7 +78,7 @@ def report(
     single = len(subjects) == 1 and what is not None
     _check(folder, single)
     places = [folder if single else folder / subject.name for subject in subjects]
-    records, failed = _measured(console, subjects, places, settings, device)
+    records, failed = _measured(console, subjects, places, settings, device, prints)
     if single:
         _show(records[0], as_json, folder)
         return
@@ -127,7 +130,12 @@ def _finished(store: Path) -> bool:
 
 
 def _measured(
-    console: Console, subjects: Sequence[Subject], places: Sequence[Path], settings: dict[str, Any], device: str
+    console: Console,
+    subjects: Sequence[Subject],
+    places: Sequence[Path],
+    settings: dict[str, Any],
+    device: str,
+    prints: Sequence[float],
 ) -> tuple[list[dict[str, Any]], dict[str, str]]:
     """Return a record of each slice, in the order given: those on disk as they are, the others measured now.
 
@@ -141,7 +149,8 @@ def _measured(
         if len(subjects) > 1:
             console.print(f"slice {number + 1} of {len(subjects)}: {subject.name}", markup=False)
         try:
-            records.append(measured(console, subject, folder, settings, device, paper_words()))
+            records.append(measured(console, subject, folder, settings, device, paper_words(), drawn=bool(prints)))
+            _print(console, subject, folder, prints)
         except KeyboardInterrupt:
             again = shlex.join(["landscape", *sys.argv[1:]])
             console.print(
@@ -159,9 +168,19 @@ def _measured(
 
 
 def measured(
-    console: Console, subject: Subject, folder: Path, settings: dict[str, Any], device: str, said: dict[str, Said]
+    console: Console,
+    subject: Subject,
+    folder: Path,
+    settings: dict[str, Any],
+    device: str,
+    said: dict[str, Said],
+    *,
+    drawn: bool = False,
 ) -> dict[str, Any]:
-    """Return the record of a slice that is in `folder`, or else is measured now and left there."""
+    """Return the record of a slice that is in `folder`, or else is measured now and left there.
+
+    One that is to be `drawn` is not taken from beside the slice without what it is drawn from.
+    """
     from .landscapes.store import open_slice
 
     dataset = open_slice(subject.store)
@@ -169,7 +188,8 @@ def measured(
         raise ValueError(f"{subject.name}: report needs a slice with gradients and three samples per axis; got another")
     env = environment_of(dataset, device)
     key = {**settings, "slice": digest(dataset), "code": env.code}
-    _fetch(console, subject.store.parent, folder, key)
+    if not drawn or (subject.store.parent / ARRAYS).exists():
+        _fetch(console, subject.store.parent, folder, key)
     if (folder / REPORT).exists():
         return _kept(console, folder, key, env.device)
     _warn(console, subject, dataset, env)
@@ -198,7 +218,7 @@ def _fetch(console: Console, source: Path, folder: Path, key: dict[str, Any]) ->
         return
     if _same(json.loads((source / REPORT).read_text()), key):
         folder.mkdir(parents=True, exist_ok=True)
-        for file in files:
+        for file in [*files, *source.glob(ARRAYS)]:
             shutil.copyfile(file, folder / file.name)
         console.print(f"{folder} is copied from {source}", markup=False)
 
@@ -313,14 +333,42 @@ def _beside(character: Character, said: Said | None) -> dict[str, Any] | None:
 
 
 def _leave(console: Console, dataset: xr.Dataset, character: Character, record: dict[str, Any], folder: Path) -> None:
+    import xarray as xr
+
+    from .landscapes.bundle import save_bundle
     from .landscapes.character import named_measures
     from .landscapes.draw.page import save
     from .landscapes.draw.quality import quality_figure
 
+    noise = xr.Dataset({"deviation": character.noise.deviation})
+    save_bundle(folder / ARRAYS, steps=character.steps, smooth=character.smooth, noise=noise)
     save(quality_figure(dataset, character.steps, character.samples, character.smooth), folder / PICTURE)
     write_json(folder / MEASURES, named_measures(record))
     write_json(folder / REPORT, record)
-    console.print(f"{folder}: {REPORT}, {MEASURES}, {PICTURE}", markup=False)
+    console.print(f"{folder}: {REPORT}, {MEASURES}, {PICTURE}, {ARRAYS}", markup=False)
+
+
+def _print(console: Console, subject: Subject, folder: Path, prints: Sequence[float]) -> None:
+    """Draw a report that is there for pages so wide [mm]."""
+    if not prints:
+        return
+    if not (folder / ARRAYS).exists():
+        raise ValueError(
+            f"{folder} is a report from before {ARRAYS} was kept to draw from; delete it to measure it anew"
+        )
+    import numpy as np
+
+    from .landscapes.bundle import open_bundle
+    from .landscapes.draw.page import save_prints
+    from .landscapes.draw.quality import quality_figure
+    from .landscapes.gradients import of_samples
+    from .landscapes.store import open_slice
+
+    dataset, kept = open_slice(subject.store), open_bundle(folder / ARRAYS)
+    samples = of_samples(dataset, deviation=float(np.nan_to_num(kept["noise"]["deviation"])))
+    draw = partial(quality_figure, dataset, kept["steps"], samples, kept["smooth"])
+    printed = save_prints(lambda width: draw(width=width), folder / PICTURE, prints)
+    console.print(f"{folder}: {', '.join(printed)}", markup=False)
 
 
 def digest(dataset: xr.Dataset) -> str:
@@ -337,9 +385,8 @@ def _folder_name(what: str, subjects: Sequence[Subject], settings: dict[str, Any
 
 def _check(folder: Path, single: bool) -> None:
     """Refuse a folder that holds anything but reports."""
-    ours = {REPORT, MEASURES, PICTURE} if single else {REPORT, TABLE}
-    others = [file for file in visible(folder) if file.name not in ours and (single or not (file / PICTURE).exists())]
-    if others:
+    ours = {REPORT, MEASURES, PICTURE, ARRAYS} if single else {REPORT, TABLE}
+    if any(single or not (file / PICTURE).exists() for file in others(folder, ours, PICTURE)):
         raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
 
 

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from .console import fill
 from .envs.registry import environment_class
-from .landscapes.files import visible
+from .landscapes.files import others
 from .landscapes.identity import stored_identity
 from .landscapes.slice_paths import there
 from .results import RUN, SLICE, environment_of, inside, run_tables
@@ -50,6 +50,7 @@ def overlay(
     device: str,
     spawn: bool,
     serve: bool,
+    prints: Sequence[float] = (),
 ) -> None:
     """Draw runs over a slice, or over one cut anew for them, and say what came out."""
     if source:
@@ -74,8 +75,8 @@ def overlay(
         sampled, _ = fill(console, env, cut, root=folder, grad=gradients, boxed=plane is not None)
         dataset = open_slice(sampled / SLICE)
     placed = laid(dataset, tables)
-    _write(dataset, placed, folder)
-    console.print(f"{_outcome(placed)}\n{folder}: {PICTURE}, {STREAM}", markup=False)
+    files = _write(dataset, placed, folder, prints)
+    console.print(f"{_outcome(placed)}\n{folder}: {', '.join(files)}", markup=False)
     if spawn or serve:
         _show(console, folder / STREAM, serve=serve)
 
@@ -127,7 +128,7 @@ def _folder(out: str | None, dataset: xr.Dataset, tables: Sequence[xr.Dataset], 
         digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:6]
         return Path("out") / f"overlay-{ours['objective']}-{digest}"
     folder = Path(out)
-    if any(file.name not in (PICTURE, STREAM) and not there(file / SLICE) for file in visible(folder)):
+    if any(not there(file / SLICE) for file in others(folder, (PICTURE, STREAM), PICTURE)):
         raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
     return folder
 
@@ -158,13 +159,15 @@ def _plane(
     return replace(present.moved(point), resolution=shape)
 
 
-def _write(dataset: xr.Dataset, placed: Sequence[xr.Dataset], folder: Path) -> None:
+def _write(dataset: xr.Dataset, placed: Sequence[xr.Dataset], folder: Path, prints: Sequence[float]) -> list[str]:
     from .landscapes.draw.overlay import overlay_figure
-    from .landscapes.draw.page import save
+    from .landscapes.draw.page import save, save_prints
     from .landscapes.draw.stream import save_stream
 
     save(overlay_figure(dataset, placed), folder / PICTURE)
     save_stream(dataset, placed, folder / STREAM)
+    printed = save_prints(lambda width: overlay_figure(dataset, placed, width=width), folder / PICTURE, prints)
+    return [PICTURE, STREAM, *printed]
 
 
 def _outcome(placed: Sequence[xr.Dataset]) -> str:

@@ -18,7 +18,7 @@ from rich.console import Console
 from . import cluster, race_workers
 from .console import duration, provenance_of, read_settings
 from .envs.registry import make
-from .landscapes.files import visible, write_json
+from .landscapes.files import print_width, visible, write_json
 from .optim.registry import METHODS
 from .race_tables import seeds_said, show
 from .search_report import STORE, give_torch_one_thread, made, run_identity, search_progress
@@ -51,6 +51,7 @@ def race(
     report: bool,
     force: bool,
     scheduler: str | None = None,
+    prints: Sequence[float] = (),
 ) -> None:
     """Let methods compete on an environment; say what it costs, how far it is and what came out."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
@@ -70,7 +71,7 @@ def race(
         with cluster.workers(scheduler, env.device) as executor:
             job.run(console, executor)
         with console.status("resampling seeds"):
-            figures = job.save()
+            figures = job.save(prints)
     except KeyboardInterrupt:
         job.farewell(console)
         sys.exit(130)
@@ -152,8 +153,9 @@ class Job:
         }
         entries = [_entry(env, maker, folder, budget=budget, command=command, force=force) for maker in makers.values()]
         if force:
-            for leftover in (PICTURE, FIGURES):
-                (folder / leftover).unlink(missing_ok=True)
+            for leftover in visible(folder):
+                if leftover.name in (PICTURE, FIGURES) or print_width(leftover.name, PICTURE):
+                    leftover.unlink()
         return cls(env, entries, folder, budget, workers, command)
 
     @property
@@ -204,9 +206,9 @@ class Job:
             with entry.run.filling():  # reads it
                 follow(entry, now)
 
-    def save(self) -> dict[str, Any]:
-        """Draw the race, write its figures and return them."""
-        from .landscapes.draw.page import save
+    def save(self, prints: Sequence[float] = ()) -> dict[str, Any]:
+        """Draw the race, also for pages so wide [mm], write its figures and return them."""
+        from .landscapes.draw.page import save, save_prints
         from .landscapes.draw.race import race_figure
         from .optim.race import judged, picture, tables
         from .optim.standings import targets
@@ -227,7 +229,6 @@ class Job:
                 "seeds": self.seeds,
                 **judged(self.env.name, runs, goals),
                 "command": self.command,
-                "files": [FIGURES, PICTURE],
             }
         )
         dataset = picture(runs, goals).assign_attrs(
@@ -241,6 +242,8 @@ class Job:
             provenance=json.dumps(provenance_of(self.env, self.command)),
         )
         save(race_figure(dataset), self.folder / PICTURE)
+        printed = save_prints(lambda width: race_figure(dataset, width=width), self.folder / PICTURE, prints)
+        figures["files"] = [FIGURES, PICTURE, *printed]
         write_json(self.folder / FIGURES, figures)
         return figures
 

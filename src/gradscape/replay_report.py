@@ -7,20 +7,23 @@ import json
 import shlex
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
+from . import __version__
 from .console import provenance_of, read_settings
 from .envs.registry import make
-from .landscapes.files import visible, write_json
+from .landscapes.files import others, write_json
 from .results import point_of
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from .envs.base import Environment
+    from .landscapes.draw.contact import Caption
 
 SHEET, FILM, LOOP, RECORD = "episode.png", "episode.mp4", "episode.gif", "episode.json"
 STREAM = "episode.rrd"
@@ -36,6 +39,7 @@ def replay(
     settings: Sequence[str],
     out: str | None,
     film: bool,
+    prints: Sequence[float] = (),
 ) -> None:
     """Simulate one episode, draw it, and say what it cost."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
@@ -46,23 +50,47 @@ def replay(
         episode = env.episode(x)
         result = env.evaluate(x[None], grad=False)
     loss, status = float(result.loss[0]), int(result.status[0])
+    from .landscapes.draw.contact import episode_figure, save_sheet
     from .landscapes.draw.episode_stream import save_episode
-    from .landscapes.draw.replay import save_replay, save_sheet
+    from .landscapes.draw.page import save_prints
+    from .landscapes.draw.replay import save_replay
 
+    caption = _caption(env, params, x, loss, status)
     with console.status(f"{env.name}: drawing"):
-        save_sheet(episode, folder / SHEET)
-        said = f"{env.name}, {env.fidelity.name}: loss {loss:.4g} {env.loss_unit}".strip()
+        save_sheet(episode, folder / SHEET, caption=caption)
+        said = f"{caption.title} · {caption.outcome}"
         save_episode(episode, folder / STREAM, title=said)
         files = [SHEET, STREAM]
         if film:
-            save_replay(episode, folder / FILM, folder / LOOP)
+            save_replay(episode, folder / FILM, folder / LOOP, title=said)
             files += [FILM, LOOP]
+        draw = partial(episode_figure, episode, caption=caption)
+        files += save_prints(lambda width: draw(width=width), folder / SHEET, prints)
     _write_record(env, x, loss, status, folder / RECORD)
     console.print(
-        f"{env.name} · {env.fidelity.name} · {env.device}: loss {loss:.4g} {env.loss_unit}\n"
-        f"{folder}: {', '.join([*files, RECORD])}",
-        markup=False,
+        f"{caption.title} · {env.device} · {caption.outcome}\n{folder}: {', '.join([*files, RECORD])}", markup=False
     )
+
+
+def _caption(env: Environment, params: str, x: Tensor, loss: float, status: int) -> Caption:
+    """Say what an episode is."""
+    from .landscapes.draw.contact import Caption
+    from .landscapes.draw.style import FAILURES, number
+    from .landscapes.objective import Status
+
+    failed = Status(status) != Status.OK
+    outcome = f"no loss: {FAILURES[Status(status)]}" if failed else f"loss {number(loss)} {env.loss_unit}".rstrip()
+    values = {
+        name: f"{number(value)} {unit}".rstrip()
+        for name, value, unit in zip(env.space.names, x.tolist(), env.space.units, strict=True)
+    }
+    about = provenance_of(env, _command())
+    said = [f"gradscape {__version__}", env.device, str(about["created"]), str(about["command"])]
+    return Caption(f"{env.name} · {env.fidelity.name}", outcome, params, values, RECORD, " · ".join(said))
+
+
+def _command() -> str:
+    return shlex.join(["landscape", *sys.argv[1:]])
 
 
 def _folder(out: str | None, env: Environment, x: Tensor) -> Path:
@@ -70,8 +98,7 @@ def _folder(out: str | None, env: Environment, x: Tensor) -> Path:
         settings = json.dumps([env.identity(), x.tolist()], sort_keys=True)
         return Path("out") / f"replay-{env.name}-{hashlib.sha256(settings.encode()).hexdigest()[:6]}"
     folder = Path(out)
-    known = {SHEET, STREAM, FILM, LOOP, RECORD}
-    if any(file.name not in known for file in visible(folder)):
+    if others(folder, (SHEET, STREAM, FILM, LOOP, RECORD), SHEET):
         raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
     return folder
 
@@ -80,10 +107,9 @@ def _write_record(env: Environment, x: Tensor, loss: float, status: int, path: P
     """Keep what was drawn, and how it came about."""
     from .landscapes.objective import Status
 
-    command = shlex.join(["landscape", *sys.argv[1:]])
     record: dict[str, Any] = {
         "identity": env.identity(),
-        "provenance": provenance_of(env, command),
+        "provenance": provenance_of(env, _command()),
         "parameters": dict(zip(env.space.names, x.tolist(), strict=True)),
         "loss": loss if status == Status.OK else None,
         "status": Status(status).name,

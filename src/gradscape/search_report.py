@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from .console import chosen_fidelity, duration, provenance_of, read_settings
 from .envs.registry import make
-from .landscapes.files import visible, write_json
+from .landscapes.files import print_width, visible, write_json
 from .optim.registry import METHODS, code_digest, optimizer_class
 from .tables import table
 
@@ -97,6 +97,7 @@ def optimize(
     out: str | None,
     as_json: bool,
     force: bool,
+    prints: Sequence[float] = (),
 ) -> None:
     """Run a method into its folder and say what it costs, how far it is and what came out."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
@@ -107,7 +108,7 @@ def optimize(
     env = make(name, fidelity=accuracy, deterministic=deterministic, **how, **scene)
     give_torch_one_thread()
     optimizer, command = made(method, env, seed=seed, options=options), shlex.join(["landscape", *sys.argv[1:]])
-    job = Job.open(env, optimizer, budget=budget, command=command, out=out, force=force)
+    job = Job.open(env, optimizer, budget=budget, command=command, out=out, force=force, prints=prints)
     try:
         summary = job.run(console)
     except KeyboardInterrupt:
@@ -120,7 +121,7 @@ def optimize(
 
 @dataclass(frozen=True)
 class Job:
-    """A run to fill in `folder`."""
+    """A run to fill in `folder`, and to draw for pages of the widths of `prints` [mm], too."""
 
     env: Environment
     optimizer: Optimizer
@@ -128,6 +129,7 @@ class Job:
     filled: Run
     budget: int
     command: str
+    prints: Sequence[float] = ()
 
     @classmethod
     def open(
@@ -139,6 +141,7 @@ class Job:
         command: str,
         out: str | None = None,
         force: bool = False,
+        prints: Sequence[float] = (),
     ) -> Job:
         """Go on with the run in its folder, or begin it there; `force` begins anew where another run is."""
         from .optim.run import Run, is_run
@@ -151,11 +154,12 @@ class Job:
         wanted: dict[str, Any] = {"identity": identity, "provenance": provenance_of(env, command), "budget": budget}
         if force and is_run(path):
             run = Run.create(path, env.space, overwrite=True, **wanted)
-            for leftover in (PICTURE, SUMMARY):
-                (folder / leftover).unlink(missing_ok=True)
+            for leftover in visible(folder):
+                if leftover.name in (PICTURE, SUMMARY) or print_width(leftover.name, PICTURE):
+                    leftover.unlink()
         else:
             run = Run.open_or_create(path, env.space, **wanted)
-        return cls(env, optimizer, folder, run, budget, command)
+        return cls(env, optimizer, folder, run, budget, command, prints)
 
     def run(self, console: Console) -> dict[str, Any]:
         """Compute what is missing, draw it, write and return the summary."""
@@ -165,7 +169,7 @@ class Job:
         else:
             console.print(f"{self._where()}\nall {self.budget} episodes are there already", markup=False)
         self.picture()
-        return self._summarise(resumed, time.monotonic() - start)
+        return self._summarise(resumed, time.monotonic() - start, self._print())
 
     def _fill(self, console: Console) -> int:
         """Search, following it on a progress bar, and return how many episodes were there before."""
@@ -191,6 +195,13 @@ class Job:
 
         if self.filled.count:
             save(run_figure(self.filled.table()), self.folder / PICTURE)
+
+    def _print(self) -> list[str]:
+        from .landscapes.draw.curve import run_figure
+        from .landscapes.draw.page import save_prints
+
+        table = self.filled.table()
+        return save_prints(lambda width: run_figure(table, width=width), self.folder / PICTURE, self.prints)
 
     def farewell(self, console: Console) -> None:
         """Say what is kept of a run that was stopped, and how to go on."""
@@ -224,8 +235,9 @@ class Job:
     def _where(self) -> str:
         return f"{self.env.name} · {self.env.fidelity.name} · {self.env.device} · {self.optimizer.name} · {self.folder}"
 
-    def _summarise(self, resumed: int, seconds: float) -> dict[str, Any]:
-        summary = _summary(self.filled, resumed, seconds, self.command)
+    def _summarise(self, resumed: int, seconds: float, printed: Sequence[str]) -> dict[str, Any]:
+        files = [STORE, PICTURE, *printed, SUMMARY]
+        summary = {**_summary(self.filled, resumed, seconds, self.command), "files": files}
         write_json(self.folder / SUMMARY, summary)
         return summary
 
@@ -270,7 +282,6 @@ def _summary(run: Run, resumed: int, seconds: float, command: str) -> dict[str, 
         "kinds": {kind.name.lower(): int((table["kind"] == kind).sum()) for kind in Kind},
         "best": best,
         "command": command,
-        "files": [STORE, PICTURE, SUMMARY],
     }
 
 

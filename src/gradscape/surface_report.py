@@ -9,13 +9,13 @@ from pathlib import Path
 
 from rich.console import Console
 
-from .landscapes.files import visible
+from .landscapes.files import others
 from .results import SLICE, inside, run_tables
 
 PICTURE, MODEL = "surface.png", "surface.gltf"
 
 
-def surface(slice_: str, runs: Sequence[str], *, out: str | None) -> None:
+def surface(slice_: str, runs: Sequence[str], *, out: str | None, prints: Sequence[float] = ()) -> None:
     """Draw a slice as a surface, with runs on it."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     from .landscapes.identity import stored_identity
@@ -34,11 +34,13 @@ def surface(slice_: str, runs: Sequence[str], *, out: str | None) -> None:
             )
     placed = overlay(dataset, tables) if tables else []
     folder = _folder(out, [ours, [stored_identity(table) for table in tables]], str(ours["objective"]))
-    from .landscapes.draw.surface import save_surface
+    from .landscapes.draw.page import save_prints
+    from .landscapes.draw.surface import save_surface, surface_figure
 
     with console.status("drawing"):
         save_surface(dataset, placed, folder / PICTURE, folder / MODEL)
-    console.print(f"{folder}: {PICTURE}, {MODEL}", markup=False)
+        printed = save_prints(lambda width: surface_figure(dataset, placed, width=width), folder / PICTURE, prints)
+    console.print(f"{folder}: {', '.join([PICTURE, MODEL, *printed])}", markup=False)
 
 
 def _folder(out: str | None, content: list[object], objective: str) -> Path:
@@ -46,6 +48,6 @@ def _folder(out: str | None, content: list[object], objective: str) -> Path:
         digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:6]
         return Path("out") / f"surface-{objective}-{digest}"
     folder = Path(out)
-    if any(file.name not in (PICTURE, MODEL) for file in visible(folder)):
+    if others(folder, (PICTURE, MODEL), PICTURE):
         raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
     return folder

@@ -47,6 +47,7 @@ def tradeoff(
     out: str | None,
     as_json: bool,
     force: bool,
+    prints: Sequence[float] = (),
 ) -> None:
     """Measure every rung against the reference, keep what was found for --tolerance, and show it."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
@@ -59,6 +60,7 @@ def tradeoff(
     try:
         study.announce(console)
         report = study.run(console)
+        printed = study.print(report, prints)
     except KeyboardInterrupt:
         console.print(
             f"stopped: {study.pieces.count()} of {len(study.rungs)} rungs are kept in {study.pieces.folder}; "
@@ -68,7 +70,8 @@ def tradeoff(
         sys.exit(130)
     kept = keep(report)
     show(report, Console(stderr=as_json))
-    console.print(f"{study.pieces.folder}: {PICTURE}, {RECORD}; kept for --tolerance: {kept}", markup=False)
+    files = ", ".join([PICTURE, *printed, RECORD])
+    console.print(f"{study.pieces.folder}: {files}; kept for --tolerance: {kept}", markup=False)
     if as_json:
         print(json.dumps({**report, "folder": str(study.pieces.folder)}))
 
@@ -168,6 +171,13 @@ class Study:
         save(tradeoff_figure(report), folder / PICTURE)
         write_json(folder / RECORD, report)
         return report
+
+    def print(self, report: dict[str, Any], prints: Sequence[float]) -> list[str]:
+        """Draw the report for pages so wide [mm], too; return the files' names."""
+        from .landscapes.draw.page import save_prints
+        from .landscapes.draw.tradeoff import tradeoff_figure
+
+        return save_prints(lambda width: tradeoff_figure(report, width=width), self.pieces.folder / PICTURE, prints)
 
     def _measure(self, console: Console) -> dict[str, Sample]:
         from .landscapes.tradeoff import Sample
@@ -296,7 +306,7 @@ def show(report: dict[str, Any], console: Console) -> None:
     )
     for fit in report["orders"]:
         console.print(
-            f"error ~ dt^{fit['order']:.2f} ± {fit['standard_error']:.2f}: {', '.join(fit['rungs'])}", markup=False
+            f"error ~ dt^{fit['order']:z.2f} ± {fit['standard_error']:.2f}: {', '.join(fit['rungs'])}", markup=False
         )
     for why in dict.fromkeys(refused["why"] for refused in report["refused"]):
         names = [refused["name"] for refused in report["refused"] if refused["why"] == why]
@@ -342,4 +352,4 @@ def _percent(value: float | None) -> str:
 
 
 def _number(found: dict[str, float | None]) -> str:
-    return "" if found["value"] is None else f"{found['value']:.3f}"
+    return "" if found["value"] is None else f"{found['value']:z.3f}"

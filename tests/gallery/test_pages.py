@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gradscape.landscapes.draw.relief import Relief, azimuth
 from gradscape.landscapes.draw.style import LOSS_MAP, Scale
-from gradscape.landscapes.store import open_slice
+from gradscape.landscapes.store import open_slice, plane_of
 
 from .conftest import FIGURES
 
@@ -220,6 +221,61 @@ def test_the_surface_is_there_and_turns(filed: str, visit: Visit) -> None:
     before = pixels(page, "surface")
     page.keyboard.press("+")
     assert (pixels(page, "surface") != before).any()
+
+
+def test_the_surface_is_flat_where_a_node_is_and_opens_where_its_valley_is_seen(
+    filed: str, data: Path, visit: Visit
+) -> None:
+    page = visit(filed, "bare/index.html")
+    loss = open_slice(data / "bare/slice.zarr")["loss"].to_numpy()
+    row, column = np.unravel_index(int(np.nanargmax(loss)), loss.shape)  # nothing is before it
+    places = page.evaluate(
+        """([row, column]) => [[0.5, 0.5], [0.2, 0.3], [0.8, 0.7], [0.7, 0.2]].map(([right, back]) =>
+            flat([(column + right) / columns, (row + back) / rows, rise(column, row)]))""",
+        [int(row), int(column)],
+    )  # fmt: skip
+    seen = pixels(page, "surface")
+    found = np.array([seen[round(down), round(right), :3] for right, down in places], dtype=int)
+    assert np.ptp(found, axis=0).max() == 0  # one colour over all of it, and the map's own
+    np.testing.assert_allclose(
+        found[0], 255 * np.array(LOSS_MAP(Scale.of_loss(loss).norm(np.nanmax(loss)))[:3]), atol=2
+    )
+    dataset = open_slice(data / "bare/slice.zarr")
+    eye = np.radians(azimuth(Relief(plane_of(dataset), Scale.of_loss(loss)), dataset))
+    nearest = page.evaluate("FLOOR.map(project).map((corner) => corner[2])")
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    assert np.argmax(nearest) == np.argmax(corners @ [np.cos(eye), np.sin(eye)])
+
+
+def test_dark_screens_have_the_dark_pictures_and_print_the_light_ones(filed: str, visit: Visit) -> None:
+    sources = "() => Array.from(document.querySelectorAll('picture img')).map((one) => one.currentSrc.split('/').pop())"
+    for scheme, dark in (("dark", True), ("light", False)):
+        page = visit(filed, "full/index.html", color_scheme=scheme)
+        page.evaluate("document.querySelectorAll('img').forEach((one) => { one.loading = 'eager'; })")
+        page.wait_for_function("Array.from(document.querySelectorAll('picture img')).every((one) => one.currentSrc)")
+        found = page.evaluate(sources)
+        assert len(found) >= 3
+        assert {name.endswith("-dark.png") for name in found} == {dark}
+        page.emulate_media(media="print")
+        page.wait_for_function("!Array.from(document.images).some((one) => one.currentSrc.endsWith('-dark.png'))")
+
+
+def test_every_table_shows_all_of_its_columns_on_a_phone(filed: str, visit: Visit) -> None:
+    page = visit(filed, "full/index.html", width=360)
+    page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+    boxes = page.evaluate(
+        """() => Array.from(document.querySelectorAll('tbody th, tbody td')).filter((one) => one.textContent.trim())
+            .map((one) => { const box = one.getBoundingClientRect();
+                            return [box.left, box.right, box.width, one.scrollWidth - one.clientWidth]; })"""
+    )  # fmt: skip
+    assert len(boxes) > 50
+    for left, right, width, hidden in boxes:
+        assert 0 <= left < right <= 360
+        assert width > 20
+        assert hidden <= 0
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    for table in page.locator(".across").all():
+        assert table.evaluate("(one) => one.scrollWidth <= one.clientWidth")
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

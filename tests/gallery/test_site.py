@@ -26,12 +26,14 @@ class Page(HTMLParser):
         self.references: list[str] = []
         self.ids: list[str] = []
         self.pictures: list[dict[str, str | None]] = []
+        self.sources: list[dict[str, str | None]] = []
         self.named: list[str] = []
         self.feed(path.read_text())
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         found = dict(attrs)
-        self.references += [value for name in ("href", "src", "poster") if (value := found.get(name))]
+        self.references += [value for name in ("href", "src", "srcset", "poster") if (value := found.get(name))]
+        self.sources += [found] if tag == "source" else []
         self.ids += [value for value in [found.get("id")] if value]
         self.pictures += [found] if tag == "img" else []
         for name in ("aria-labelledby", "aria-describedby", "for", "data-copy"):
@@ -98,7 +100,7 @@ def test_words_are_beside_the_papers_and_a_trade_off_is_ranked(site: Path) -> No
     trade, another = full["tradeoffs"]
     assert (trade["device"], another["device"]) == ("cuda", "cpu")
     files = {path.name for path in (site / "tradeoff").iterdir()}
-    assert files == {f"fluid-{device}.{kind}" for device in ("cuda", "cpu") for kind in ("json", "png")}
+    assert files == {f"fluid-{device}{kind}" for device in ("cuda", "cpu") for kind in (".json", ".png", "-dark.png")}
     assert [(row["name"], row["front"]) for row in trade["rungs"]] == [
         ("coarse", False), ("draft", True), ("standard", True), ("slow", False), ("reference", False)
     ]  # fmt: skip
@@ -149,19 +151,46 @@ def test_a_page_says_what_it_has_and_nothing_of_what_it_has_not(site: Path) -> N
     sections = ("sweep-title", "episodes-title", "measures-title", "tradeoff-title", 'id="surface"')
     assert [section in full for section in sections] == [True, True, True, True, True]
     assert [section in bare for section in sections] == [False, False, False, False, True]
-    words = re.findall(r'<th scope="row">([\w ]+)</th><td>(.*?)</td>\s*<td>(.*?)</td></tr>', full)
+    words = re.findall(r'<th scope="row">([\w ]+)</th>\s*<td>([^<]*)</td>\s*<td>([^<]*)</td></tr>', bare_cells(full))
     assert words[:3] == [
         ("rugged", "yes: minima: 12", "agrees"), ("gradients good", "no", "disagrees: it says so"),
         ("gradients noisy", "yes: 0.5", "says nothing of it"),
     ]  # fmt: skip
     assert '<th scope="row">local minima</th><td>7</td>' in full
-    assert re.sub(r"\s+", " ", full).count("<td>9 (4.5 to 18)</td> <td>0.987</td> <td>0.654</td> <td>25 %</td>") == 2
+    assert bare_cells(full).count("<td>9 (4.5 to 18)</td> <td>0.987</td> <td>0.654</td> <td>25 %</td>") == 2
     assert re.findall(r"<h3>(On .*?)</h3>", full) == ["On cuda", "On cpu"]
     assert "2 J from the 5th to the 95th percentile" in full.replace("\n", " ")
     assert "Mass from −10 to 10: 12 slices" in full.replace("\n", " ")
     assert SWEEP["command"] in full
-    assert '<th scope="row">mass</th><td>0</td><td>none</td>' in full
-    assert '<th scope="row">force</th><td>10</td><td>N</td>' in (site / "line/index.html").read_text()
+    assert '<th scope="row">mass</th><td>0</td> <td>none</td>' in bare_cells(full)
+    line = bare_cells((site / "line/index.html").read_text())
+    assert '<th scope="row">force</th><td>10</td> <td>N</td>' in line
+
+
+def bare_cells(page: str) -> str:
+    """Return a page without line breaks and what its cells say of their columns."""
+    return re.sub(r' data-label="[^"]*"', "", re.sub(r"\s+", " ", page))
+
+
+def test_every_picture_has_a_dark_variant_for_screens_and_print_has_the_light_one(site: Path) -> None:
+    for path in site.rglob("*.html"):
+        page = Page(path)
+        light = [str(picture["src"]) for picture in page.pictures if str(picture.get("src")).endswith(".png")]
+        assert light
+        assert [source["srcset"] for source in page.sources] == [src.replace(".png", "-dark.png") for src in light]
+        assert {source["media"] for source in page.sources} == {"screen and (prefers-color-scheme: dark)"}
+
+
+def test_cells_say_which_column_they_are_of_where_there_is_a_heading(site: Path) -> None:
+    """On a phone they stand one below the other."""
+    full = (site / "full/index.html").read_text()
+    for table in re.findall(r"<table.*?</table>", full, re.DOTALL):
+        heading = re.search(r'<thead(?: class="(.*?)")?>(.*?)</thead>', table, re.DOTALL)
+        if heading and heading[1] is None:
+            names = [re.sub(r"\s+", " ", name) for name in re.findall(r'"col">(.*?)</th>', heading[2], re.DOTALL)][1:]
+            labels = re.findall(r'data-label="([^"]*)"', table)
+            assert labels
+            assert all(any(name.startswith(label) for name in names) for label in labels)
 
 
 def test_a_folder_of_other_files_is_left_alone(data: Path, tmp_path: Path) -> None:

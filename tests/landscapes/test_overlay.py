@@ -8,7 +8,7 @@ from matplotlib.colors import to_rgba
 from gradscape.landscapes.draw import style
 from gradscape.landscapes.draw.overlay import joint_scale, overlay_figure
 from gradscape.landscapes.objective import Evaluation
-from gradscape.landscapes.overlay import best_point, overlay, principal_plane
+from gradscape.landscapes.overlay import best_point, improvements, overlay, principal_plane
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling import sample
 from gradscape.landscapes.space import ParameterSpace
@@ -229,3 +229,53 @@ def test_a_run_that_converged_leaves_the_map_its_colours():
     assert laid[0]["loss"].min() < 1e-20
     assert scale.norm.vmin == pytest.approx(0.1)
     assert scale.extend == "min"
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.04, 0.24), (-3.0, 2.0), (1e-3, 10.0)])
+def test_the_map_rules_its_scale_whatever_runs_found(low, high):
+    """A map from 0.04 to 0.24 was drawn to 0.98, nearly black: runs that got worse took its colours away."""
+    shape = SLICE["loss"].shape
+    dataset = SLICE.assign(loss=(("v", "u"), np.geomspace(1, 2, shape[0] * shape[1]).reshape(shape)))
+    loss = dataset["loss"].to_numpy()
+    loss[:] = low + (high - low) * (loss - 1)
+    (laid,) = overlay(dataset, [run(SPREAD, [0] * 30)])
+    laid["loss"].values[:] = np.linspace(low, 10 * high, 30)
+    scale = joint_scale(dataset, [laid])
+    assert (scale.ends, scale.extend) == ((low, high), "max")
+    laid["loss"].values[0] = low - 100 * (high - low)
+    below = joint_scale(dataset, [laid])
+    assert below.ends[1] == high
+    assert below.ends[0] == pytest.approx(low / 10 if low > 0 else 2 * low - high)
+    assert below.extend == "both"
+
+
+def test_distances_have_their_unit_wherever_they_are_written():
+    said = [text for text in legend() if "off" in text]
+    assert any(text.startswith("bo-leap, seed 0: best") for text in said)
+    assert all("half-width" in text and "of the box off" in text for text in said)
+
+
+@pytest.mark.parametrize("count", [1, 12])
+def test_what_was_the_best_so_far_is_joined_in_its_order_and_numbered_where_there_is_room(count):
+    tables = [
+        run(np.random.default_rng(seed).uniform(-0.7, 0.7, (30, 3)), [1] * 30, seed=seed) for seed in range(count)
+    ]
+    laid = overlay(SLICE, tables)
+    figure = overlay_figure(SLICE, laid)
+    ax = figure.axes[0]
+    lines = [line for line in ax.lines if line.get_gid() == "order"]
+    for own in laid:
+        best = np.minimum.accumulate(own["loss"].values)
+        rows = np.flatnonzero(np.diff(best, prepend=np.inf) < 0)
+        np.testing.assert_array_equal(improvements(own), rows)
+        path = np.stack([own["u"], own["v"]], axis=1)[rows]
+        assert sum(np.array_equal(line.get_xydata(), path) for line in lines) == 2  # white, with a dark edge
+    numbers = [text for text in ax.texts if text.get_gid() == "episode"]
+    assert len(numbers) >= min(count, 4)
+    for text in numbers:
+        row = int(text.get_text()) - 1
+        at = [(float(own["u"][row]), float(own["v"][row])) for own in laid if row in improvements(own)]
+        assert any(np.allclose(text.xy, place) for place in at)
+    boxes = [text.get_window_extent() for text in numbers]
+    assert not any(one.overlaps(other) for number, one in enumerate(boxes) for other in boxes[:number])
+    assert any("numbers are episodes" in text.get_text() for text in figure.legends[0].get_texts())

@@ -16,7 +16,8 @@ from gradscape.envs.fluid import TANK_HEIGHT, TANK_WIDTH
 from gradscape.envs.outlines import about, skin, triangles
 from gradscape.envs.registry import BUILTIN, make
 from gradscape.landscapes.draw import materials
-from gradscape.landscapes.draw.replay import axes, frames, missing, save_replay, save_sheet
+from gradscape.landscapes.draw.contact import Caption, episode_figure, save_sheet
+from gradscape.landscapes.draw.replay import Shot, axes, frames, headed, missing, save_replay
 from gradscape.landscapes.draw.solids import lump, mesh
 from gradscape.landscapes.episode import Episode, Part, View
 
@@ -113,10 +114,17 @@ def test_a_target_of_particles_is_drawn_where_the_body_is_not_yet_and_alone_at_t
     assert not green(there).any()
     left = [missing(mesh(parts[1], 0), parts[:1], frame).n_cells for frame in (0, 1)]
     assert left == [mesh(parts[1], 0).n_cells, 0]
+    shown = episode_figure(episode, keys=2).axes
+    assert [ax.get_xlabel() for ax in shown] == ["0 s", "0.1 s", "target"]
+    assert green(pixels(shown[-1])).mean() > 0.1
     save_sheet(episode, tmp_path / "a.png", keys=2)
-    sheet = (255 * imread(tmp_path / "a.png")[..., :3]).astype(np.uint8)
-    assert green(sheet[:, -600:]).mean() > 0.1
-    assert sheet.shape[1] == 3 * 600 + 2 * 12
+    assert green((255 * imread(tmp_path / "a.png")[..., :3]).astype(np.uint8)).any()
+
+
+def pixels(ax) -> np.ndarray:
+    """Return what a panel of a contact sheet shows."""
+    (image,) = ax.images
+    return np.asarray(image.get_array())
 
 
 def green(picture: np.ndarray) -> np.ndarray:
@@ -138,11 +146,57 @@ def test_a_film_has_every_frame_and_a_sheet_every_key(tmp_path: Path) -> None:
         [imageio_ffmpeg.get_ffmpeg_exe(), "-i", tmp_path / "a.mp4", "-f", "null", "-"], capture_output=True, check=True
     ).stderr.decode()
     assert "frame=    5" in said
-    save_sheet(episode, tmp_path / "a.png", keys=2)
-    left, right = np.split(imread(tmp_path / "a.png")[:, :1200, :3], 2, axis=1)
+    left, right = (pixels(ax) for ax in episode_figure(episode, keys=2).axes)
     middles = [np.nonzero(half[..., 0] > 1.5 * half[..., 1])[1].mean() for half in (left, right)]
     assert middles[0] < 250 < 350 < middles[1]
     assert not list(tmp_path.glob(".*"))
+
+
+def test_a_scale_is_as_long_as_it_says_at_the_middle_of_the_view() -> None:
+    """A rod of that length, across the middle of the view, is as long as the bar."""
+    view = View((-1.0,) * 3, (1.0,) * 3, eye=(0.35, 0.5, 1.0), ground=None)
+    shot, right = Shot.of(view, 300), axes(view)[0]
+    half = torch.from_numpy(shot.bar / 2 * right)
+    rod = Part("path", "rubber", torch.stack([-half, half])[None], (0.01,))
+    episode = replace(still(rod), view=view)
+    (plain,) = frames(episode, [0], height=300, marked=False)
+    red, green_, _ = plain.astype(float).transpose(2, 0, 1)
+    columns = np.flatnonzero((red > 1.8 * green_).any(axis=0))
+    assert columns.max() - columns.min() + 1 == pytest.approx(shot.bar * shot.metre, abs=5)
+    (marked,) = frames(episode, [0], height=300)
+    changed = np.nonzero((marked != plain).any(axis=2))
+    bar = changed[1][changed[0] == 300 - materials.INSET[1] - 1]  # its lowest row
+    assert np.ptp(bar) + 1 == round(shot.bar * shot.metre)
+    (titled,) = headed([marked], "a title that is longer than its picture is wide: loss 1 m")
+    strip, below = np.split(titled, [len(titled) - 300])
+    np.testing.assert_array_equal(below, marked)
+    inked = np.flatnonzero((strip.min(axis=2) < 100).any(axis=0))
+    assert 0 < inked.min() < inked.max() < strip.shape[1] - 1
+    assert (changed[1] < 60).any(), "no time"
+    ax = episode_figure(episode).axes[0]
+    (line,) = (line for line in ax.lines if line.get_gid() == "scale")
+    sheet = Shot.of(view, 600)
+    assert np.ptp(line.get_xdata()) == pytest.approx(sheet.bar * sheet.metre)
+    assert [text.get_text() for text in ax.texts] == [f"{sheet.bar:g} m"]
+
+
+def test_a_sheet_says_what_was_simulated_what_came_out_and_how() -> None:
+    episode = still(Part("sphere", "rubber", torch.zeros(1, 1, 3), (0.3,)))
+    few = Caption(
+        "hill · draft", "loss 0.5 m", "example:scoop", {"a": "1 m/s", "b": "−2"}, "episode.json", "gradscape 0"
+    )
+    figure = episode_figure(episode, caption=few, width=170)
+    assert figure.get_suptitle() == "hill · draft · loss 0.5 m"
+    lines = figure.get_supxlabel().split("\n")
+    assert lines[0] == "2 parameters of example:scoop: a = 1 m/s, b = −2"
+    assert lines[1].startswith("Scale: ")
+    assert lines[-1] == "gradscape 0"
+    many = replace(few, outcome="no loss: not finite", values={f"speed {number}": "1.25 m/s" for number in range(90)})
+    figure = episode_figure(episode, caption=many, width=170)
+    said = figure.get_supxlabel().replace("\n", " ")
+    assert said.startswith("90 parameters of example:scoop: speed 0 = 1.25 m/s, ")
+    assert "…; see episode.json Scale" in said
+    assert figure.get_suptitle().endswith("no loss: not finite")
 
 
 def test_an_episode_without_parts_is_refused() -> None:

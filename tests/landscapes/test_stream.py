@@ -106,12 +106,18 @@ def test_points_shrink_with_their_distance_from_the_plane(held) -> None:
 
 
 def test_samples_that_failed_are_holes_in_the_surface(held) -> None:
-    (triangles,), (vertices,) = (held["/landscape/surface"][name] for name in ("triangle_indices", "vertex_positions"))
-    failed = np.flatnonzero(np.isnan(SLICE["loss"].values))
-    assert len(failed) == 4
-    assert len(vertices) == 81
-    assert not np.isin(triangles, failed).any()
-    assert len(triangles) == 2 * (8 * 8 - 4)
+    names = ("triangle_indices", "vertex_positions", "vertex_normals")
+    triangles, vertices, normals = (np.array(held["/landscape/surface"][name][0]) for name in names)
+    failed = np.isnan(SLICE["loss"].values)
+    assert failed.sum() == 4
+    tops = normals[triangles][:, :, 2] == 1  # flat, each over its sample
+    assert (tops.all(axis=1) == tops.any(axis=1)).all()
+    places = vertices[triangles[tops.all(axis=1)]]
+    assert len(places) == 2 * (81 - 4)
+    assert np.ptp(places[..., 2], axis=1).max() < 1e-6
+    side = SIDE / 9
+    cells = np.floor((places.mean(axis=1)[:, :2] + SIDE / 2) / side).astype(int)
+    assert not failed[cells[:, 1], cells[:, 0]].any()
 
 
 def test_arrows_point_down_the_slope_and_lie_on_the_surface(held) -> None:
@@ -168,3 +174,22 @@ def test_a_recording_is_served_to_this_machine_alone_and_its_page_may_call_nobod
         urllib.request.urlopen(f"{root}/other.rrd")
     refused.value.close()
     assert not list(tmp_path.rglob("analytics*"))  # rerun keeps what it would send there
+
+
+def luminance(color: int) -> float:
+    """WCAG's relative luminance of a packed RGBA."""
+    parts = np.array([color >> 24 & 255, color >> 16 & 255, color >> 8 & 255]) / 255
+    linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+@pytest.mark.parametrize("ground", [0xECECECFF, 0x1C1C1EFF], ids=["light", "dark"])
+def test_every_label_is_legible_on_what_the_viewer_lays_under_it(held, ground: int) -> None:
+    """A label has the colour of its point. WCAG asks for 3:1 of large type; no one colour has more than 3.8 on both."""
+    seen = 0
+    for components in held.values():
+        for label, color in zip(components.get("labels", []), components.get("colors", []), strict=False):
+            low, high = sorted((luminance(ground), luminance(color[0])))
+            assert (high + 0.05) / (low + 0.05) > 3.5, label
+            seen += len(label)
+    assert seen > 15

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from scipy.stats import spearmanr
 from torch import Tensor
 
 from gradscape.landscapes import tradeoff
 from gradscape.landscapes.adapters import from_torch
 from gradscape.landscapes.draw.page import save
-from gradscape.landscapes.draw.tradeoff import tradeoff_figure
+from gradscape.landscapes.draw.tradeoff import short, tradeoff_figure
 from gradscape.landscapes.objective import Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.tradeoff import Estimate, Sample, cheapest, compare, front, gradient_error, order
@@ -195,9 +196,41 @@ def test_names_of_fidelities_cover_nothing(figure: Figure) -> None:
     (ax,) = figure.axes
     names = [text for text in ax.texts if text.get_text() in ("draft", "standard")]
     assert len(names) == 2
-    boxes = [text.get_window_extent() for text in names]
+    figure.canvas.draw()
+    boxes = [Text.get_window_extent(text) for text in names]
     assert not boxes[0].overlaps(boxes[1])
     for line in ax.lines:
-        if line.get_gid() and line.get_gid() != "front":
+        if line.get_gid() and line.get_gid() not in ("front", "interval"):
             for point in ax.transData.transform(line.get_xydata()):
                 assert not any(box.contains(*point) for box in boxes)
+
+
+@pytest.mark.parametrize("width", [None, 85.0])
+@pytest.mark.parametrize("crowd", [0, 8])
+def test_every_rung_is_named_beside_its_mark_or_by_number_in_the_legend(width: float | None, crowd: int) -> None:
+    crowded = [rung(f"standard-resolution-{n}", 1.0 + 0.02 * n, 0.021 + 0.002 * n, "resolution") for n in range(crowd)]
+    report = {**REPORT, "rungs": [*REPORT["rungs"], *crowded]}
+    drawn = tradeoff_figure(report, width=width)
+    (ax,), (legend,) = drawn.axes, drawn.legends
+    entries = [text.get_text().split(": ", 1) for text in legend.get_texts()]
+    keyed = {entry[0]: entry[1] for entry in entries if entry[0].isdigit()}
+    said = sorted(keyed.get(text.get_text(), text.get_text()) for text in ax.texts)
+    others = [row for row in report["rungs"] if row["name"] != "reference"]
+    assert said == sorted(short(row) for row in others)
+    drawn.canvas.draw()
+    boxes = [Text.get_window_extent(text) for text in ax.texts]
+    assert not any(one.overlaps(other) for number, one in enumerate(boxes) for other in boxes[:number])
+
+
+@pytest.mark.parametrize(
+    ("name", "ladder", "said"),
+    [
+        ("standard", "named", "standard"),
+        ("draft-dt-x0.5", "dt", "draft ×0.5"),
+        ("standard-resolution-96", "resolution", "standard 96"),
+        ("draft-float64", "precision", "draft float64"),
+        ("draft on taichi", "engine", "draft taichi"),
+    ],
+)
+def test_a_short_name_leaves_out_what_the_mark_says(name: str, ladder: str, said: str) -> None:
+    assert short({"name": name, "ladder": ladder}) == said

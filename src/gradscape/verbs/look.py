@@ -18,6 +18,7 @@ from .options import (
     Json,
     NoGradients,
     Out,
+    Print,
     Resolution,
     Scheduler,
     Set,
@@ -55,6 +56,7 @@ def slice_(
     no_gradients: NoGradients = False,
     scheduler: Scheduler = None,
     out: Out = None,
+    print_: Print = None,
     json_: Json = False,
     force: Force = False,
 ) -> None:
@@ -78,6 +80,7 @@ def slice_(
         settings=set_ or [],
         grad=not no_gradients,
         out=out,
+        prints=print_ or [],
         as_json=json_,
         force=force,
         scheduler=scheduler,
@@ -144,6 +147,7 @@ def surface(
     out: Annotated[
         str | None, typer.Option(help="Folder for the results; by default one under out/ named after the surface.")
     ] = None,
+    print_: Print = None,
 ) -> None:
     """Draw a slice as a lit surface, its height and colour the loss, with runs draped on it.
 
@@ -151,7 +155,7 @@ def surface(
     """
     from ..surface_report import surface as report
 
-    report(slice_, runs or [], out=out)
+    report(slice_, runs or [], out=out, prints=print_ or [])
 
 
 def replay(
@@ -167,6 +171,7 @@ def replay(
     out: Annotated[
         str | None, typer.Option(help="Folder for the results; by default one under out/ named after the episode.")
     ] = None,
+    print_: Print = None,
     film: Annotated[bool, typer.Option(help="Film it, too; that takes about a minute.")] = True,
 ) -> None:
     """Draw an episode: key frames side by side in episode.png, all of it in episode.mp4, episode.gif and episode.rrd.
@@ -175,7 +180,17 @@ def replay(
     """
     from ..replay_report import replay as report
 
-    report(env, params=params, fidelity=fidelity, device=device, engine=engine, settings=set_ or [], out=out, film=film)
+    report(
+        env,
+        params=params,
+        fidelity=fidelity,
+        device=device,
+        engine=engine,
+        settings=set_ or [],
+        out=out,
+        film=film,
+        prints=print_ or [],
+    )
 
 
 def export(
@@ -212,6 +227,7 @@ def bounce(
     extent: Extent = None,
     set_: Set = None,
     out: Out = None,
+    print_: Print = None,
     json_: Json = False,
     force: Force = False,
 ) -> None:
@@ -233,6 +249,7 @@ def bounce(
         settings=set_ or [],
         grad=True,
         out=out,
+        prints=print_ or [],
         as_json=json_,
         force=force,
     )

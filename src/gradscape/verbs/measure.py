@@ -20,6 +20,7 @@ from .options import (
     NoGradients,
     Of,
     OutOfStudy,
+    Print,
     Set,
     Through,
 )
@@ -149,6 +150,7 @@ def tradeoff(
     engine: Engine = "warp",
     set_: Set = None,
     out: OutOfStudy = None,
+    print_: Print = None,
     json_: Json = False,
     force: ForceStudy = False,
 ) -> None:
@@ -168,6 +170,7 @@ def tradeoff(
         ladders=ladder or [],
         settings=set_ or [],
         out=out,
+        prints=print_ or [],
         as_json=json_,
         force=force,
     )
@@ -231,6 +234,7 @@ def report_(
     out: Annotated[
         str | None, typer.Option(help="Folder for the results; by default one under out/ named after the report.")
     ] = None,
+    print_: Print = None,
     json_: Json = False,
 ) -> None:
     """Say what a landscape is like: minima, flatness, jumps, correlation, gradient quality, and the verdict.
@@ -250,5 +254,6 @@ def report_(
         seed=seed,
         data=data,
         out=out,
+        prints=print_ or [],
         as_json=json_,
     )

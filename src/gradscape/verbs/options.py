@@ -65,6 +65,17 @@ Scheduler = Annotated[
     ),
 ]
 NoGradients = Annotated[bool, typer.Option("--no-gradients", help="Sample losses only.")]
+Print = Annotated[
+    list[float] | None,
+    typer.Option(
+        "--print",
+        metavar="MM",
+        min=80,
+        max=400,
+        help="Also write the picture for print, as PDF and SVG, this wide [mm]: 85 for a column, 170 for a page; may "
+        "be repeated.",
+    ),
+]
 Data = Annotated[
     str | None,
     typer.Option(help="Folder of the figures' data; by default a checkout's own, or else out/gallery-data."),

@@ -17,6 +17,7 @@ from .options import (
     Json,
     Of,
     OutOfRun,
+    Print,
     Scheduler,
     Set,
     Tolerance,
@@ -43,6 +44,7 @@ def optimize(
     set_: Set = None,
     option: Annotated[list[str] | None, typer.Option(help="A method's option, name=value; may be repeated.")] = None,
     out: OutOfRun = None,
+    print_: Print = None,
     json_: Json = False,
     force: ForceRun = False,
 ) -> None:
@@ -66,6 +68,7 @@ def optimize(
         settings=set_ or [],
         method_settings=option or [],
         out=out,
+        prints=print_ or [],
         as_json=json_,
         force=force,
     )
@@ -94,6 +97,7 @@ def race(
     out: Annotated[
         str | None, typer.Option(help="Folder for the results; by default one under out/ named after the race.")
     ] = None,
+    print_: Print = None,
     json_: Json = False,
     report: Annotated[bool, typer.Option("--report", help="Say which of the paper's orderings hold.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Begin anew where these runs exist already.")] = False,
@@ -118,6 +122,7 @@ def race(
         settings=set_ or [],
         method_settings=option or [],
         out=out,
+        prints=print_ or [],
         as_json=json_,
         report=report,
         force=force,
@@ -132,6 +137,7 @@ def overlay(
     out: Annotated[
         str | None, typer.Option(help="Folder for the results; by default one under out/ named after the overlay.")
     ] = None,
+    print_: Print = None,
     through: Annotated[
         str | None, typer.Option(help="Cut anew through the best point of all runs (best) or of one run's folder.")
     ] = None,
@@ -154,6 +160,7 @@ def overlay(
         runs,
         source=env,
         out=out,
+        prints=print_ or [],
         through=through,
         plane=plane,
         resolution=resolution,

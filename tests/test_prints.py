@@ -1,0 +1,125 @@
+"""`--print`: pictures for print beside those for a screen, drawn again without computing anything."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gradscape.landscapes.bundle import open_bundle, save_bundle
+
+from .command import Said
+
+Run = Callable[..., Said]
+SLICE = ("slice", "branin", "--dims", "0", "1", "--resolution", "5", "--out", "cut")
+
+
+def prints(picture: str, *widths: int) -> list[str]:
+    return [f"{picture}-{width}mm.{kind}" for width in widths for kind in ("pdf", "svg")]
+
+
+def whole(folder: Path, names: list[str]) -> bool:
+    begins = {"pdf": b"%PDF", "svg": b"<?xml"}
+    return all((folder / name).read_bytes().startswith(begins[name[-3:]]) for name in names)
+
+
+@pytest.mark.parametrize(
+    ("command", "picture", "resumed"),
+    [
+        (SLICE, "landscape", "all 25 episodes with gradients are there already"),
+        (
+            ("bounce", "--axis", "x", "--resolution", "8", "--fidelity", "draft", "--device", "cpu"),
+            "landscape",
+            "all 8",
+        ),
+        (("optimize", "ackley", "--method", "random", "--budget", "6"), "progress", "all 6 episodes are there already"),
+        (("race", "ackley", "--methods", "random,cma-es", "--budget", "6", "--seeds", "1"), "race", "all 12 episodes"),
+    ],
+    ids=["slice", "bounce", "optimize", "race"],
+)
+def test_a_command_repeated_with_print_draws_and_computes_nothing(
+    run: Run, tmp_path: Path, command: tuple[str, ...], picture: str, resumed: str
+) -> None:
+    command = (*command, "--json", *(() if "--out" in command else ("--out", "cut")))
+    first = run(*command, cwd=tmp_path)
+    assert first.returncode == 0, first.stderr
+    assert not {name for name in json.loads(first.stdout)["files"] if name.endswith((".pdf", ".svg"))}
+    again = run(*command, "--print", "85", "--print", "170", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert resumed in again.stderr
+    wanted = prints(picture, 85, 170)
+    assert set(wanted) < set(json.loads(again.stdout)["files"])
+    assert whole(tmp_path / "cut", wanted)
+    assert wanted[0] in again.stderr
+    third = run(*command, cwd=tmp_path)  # a folder with prints is still its own
+    assert set(wanted) < set(json.loads(third.stdout)["files"])
+
+
+def test_what_begins_anew_leaves_no_print_of_what_was(run: Run, tmp_path: Path) -> None:
+    run(*SLICE, "--print", "85", cwd=tmp_path)
+    done = run(*SLICE, "--force", "--resolution", "4", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert not list((tmp_path / "cut").glob("*.pdf"))
+
+
+def test_overlays_surfaces_and_replays_are_printed_too(run: Run, tmp_path: Path) -> None:
+    cut = ("slice", "bounce", "--dims", "0", "1", "--resolution", "5", "--device", "cpu", "--out", "cut")
+    search = ("optimize", "bounce", "--method", "random", "--budget", "6", "--device", "cpu", "--out", "run")
+    for command in (cut, search):
+        assert run(*command, cwd=tmp_path).returncode == 0
+    for name, command in (
+        ("overlay", ("overlay", "cut", "run", "--out", "overlay")),
+        ("surface", ("surface", "cut", "run", "--out", "surface")),
+        ("episode", ("replay", "bounce", "--no-film", "--device", "cpu", "--out", "episode")),
+    ):
+        for _ in range(2):  # the second time into a folder that has prints
+            done = run(*command, "--print", "85", cwd=tmp_path)
+            assert done.returncode == 0, done.stderr
+            assert whole(tmp_path / name, prints(name, 85))
+            assert prints(name, 85)[-1] in done.stderr
+
+
+def test_a_report_is_printed_from_what_it_kept(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(*SLICE, cwd=tmp_path)
+    command = ("report", "cut", "--points", "2", "--out", "told")
+    first = run(*command, "--print", "85", cwd=tmp_path)
+    assert first.returncode == 0, first.stderr
+    name = prints("gradient-quality", 85)[0]
+    before = (tmp_path / "told" / name).read_bytes()
+    (tmp_path / "told" / name).unlink()
+
+    def compute(*_: object) -> None:
+        raise AssertionError("it is measured again")
+
+    monkeypatch.setattr("gradscape.measure_report._character", compute)
+    again = run(*command, "--print", "85", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert (tmp_path / "told" / name).read_bytes() == before
+    for file in (tmp_path / "told").iterdir():
+        (tmp_path / "cut" / file.name).write_bytes(file.read_bytes())
+    beside = run("report", "cut", "--points", "2", "--out", "copied", "--print", "85", cwd=tmp_path)
+    assert "copied is copied from cut" in beside.stderr
+    assert (tmp_path / "copied" / name).read_bytes() == before
+    (tmp_path / "told/gradient-quality.npz").unlink()
+    older = run(*command, "--print", "85", cwd=tmp_path)
+    assert older.returncode == 2
+    assert older.stderr.splitlines()[-1].endswith("delete it to measure it anew")
+
+
+@pytest.mark.parametrize("width", ["40", "wide"])
+def test_no_page_is_so_wide(run: Run, tmp_path: Path, width: str) -> None:
+    done = run(*SLICE, "--print", width, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "--print" in done.stderr
+    assert not (tmp_path / "cut").exists()
+
+
+def test_datasets_in_a_file_are_read_as_they_were(tmp_path: Path) -> None:
+    one = xr.Dataset({"cosine": (("scale", "point"), np.random.default_rng(0).random((2, 3)))}, {"scale": [0.1, 0.2]})
+    other = xr.Dataset({"deviation": np.nan})
+    save_bundle(tmp_path / "a.npz", one=one, other=other)
+    found = open_bundle(tmp_path / "a.npz")
+    assert found["one"].identical(one)
+    assert found["other"].identical(other)
