@@ -1,3 +1,6 @@
+import math
+import subprocess
+import sys
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -148,6 +151,7 @@ def test_equal_runs_give_equal_recordings_and_others_do_not(
 @pytest.fixture
 def address(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setattr(viewer, "PATIENCE", math.inf)
     with viewer.served(path) as address:
         yield address
 
@@ -168,3 +172,10 @@ def test_a_recording_is_served_to_this_machine_alone_and_its_page_may_call_nobod
         urllib.request.urlopen(f"{root}/other.rrd")
     refused.value.close()
     assert not list(tmp_path.rglob("analytics*"))  # rerun keeps what it would send there
+
+
+def test_a_server_that_ends_before_it_answers_is_not_waited_for(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(viewer, "PATIENCE", math.inf)
+    monkeypatch.setattr(viewer, "_rerun", lambda *_, log: subprocess.Popen([sys.executable, "-c", ""], stderr=log))
+    with pytest.raises(OSError, match="rerun's web viewer does not answer"), viewer.served(path):
+        pass
