@@ -79,8 +79,8 @@ def run(command: str, folder: Path, patience: float | None = None) -> bool:
     return process.exitcode == 0
 
 
-def bits(folder: Path, answer: Connection) -> None:
-    """Send how many points the stores in a folder hold, and a digest of all their values."""
+def bits(folder: Path) -> tuple[int, str]:
+    """Return how many points the stores in a folder hold, and a digest of all their values."""
     from gradscape.landscapes.store import SliceStore, is_slice
     from gradscape.optim.run import Run, is_run
 
@@ -98,17 +98,21 @@ def bits(folder: Path, answer: Connection) -> None:
         done += int((dataset["status"] > 0).sum())
         for name in sorted(dataset.data_vars):
             digest.update(str(name).encode() + dataset[name].to_numpy().tobytes())
-    answer.send((done, digest.hexdigest()))
+    return done, digest.hexdigest()
 
 
 def held(folder: Path) -> tuple[int, str]:
-    """Return what `bits` finds, from a process of its own: none that has read a store is forked."""
+    """Return the `bits` of a folder, read in a process of its own: none that has read a store is forked."""
     here, there = FORK.Pipe()
-    process = FORK.Process(target=bits, args=(folder, there))
+    process = FORK.Process(target=_send_bits, args=(folder, there))
     process.start()
     found: tuple[int, str] = here.recv()
     process.join()
     return found
+
+
+def _send_bits(folder: Path, answer: Connection) -> None:
+    answer.send(bits(folder))
 
 
 def disturbed(command: str, folder: Path, kills: int, moment: Callable[[], float], whole: int, tally: Tally) -> int:

@@ -1,27 +1,61 @@
 """What tests of the command share."""
 
+import gc
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from gradscape.cli import main
 
-from .command import Said
+from .command import NO_BROWSER, Said, leave_blank
 
 # A shell that is not interactive starts what it sends to the background deaf to Ctrl-C; commands that tests interrupt
 # would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# Hypothesis gives an example 200 ms, and complains of those that take long to make.
+settings.register_profile("timeless", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("timeless")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def freeze() -> None:
+    """Spare what was loaded before a module to every collection of garbage in it: studies ask for one at each step."""
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_sessionfinish(session: pytest.Session) -> Generator[None]:
+    """Say last of all what was left out for want of a browser."""
+    yield
+    if reporter := session.config.pluginmanager.get_plugin("terminalreporter"):
+        skipped = sum(NO_BROWSER in str(report.longrepr) for report in reporter.stats.get("skipped", []))
+        if skipped:
+            reporter.write_line(f"{skipped} browser tests were skipped; {NO_BROWSER}")
+
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Said]:
-    """Run the command in this process, in a folder of its own, on a wide screen unless another width is given."""
+def blank(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave pictures blank, but in tests marked `drawn`."""
+    if request.node.get_closest_marker("drawn") is None:
+        leave_blank(monkeypatch)
+
+
+@pytest.fixture
+def run(blank: None, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Said]:
+    """Run the command in this process, in a folder of its own, on a wide screen unless another width is given.
+
+    It times two episodes and no more.
+    """
+    monkeypatch.setattr("gradscape.optim.search.MOMENT", 0.0)
 
     def command(*arguments: str, cwd: Path, width: int = 160) -> Said:
         monkeypatch.chdir(cwd)
@@ -45,7 +79,7 @@ def rerun() -> Callable[..., int]:
     program = Path(next(iter(spec.submodule_search_locations or ()))) / "rerun"
 
     def command(*arguments: str) -> int:
-        done = subprocess.run([program, *arguments], env=os.environ | viewer.SILENT, capture_output=True, timeout=60)
+        done = subprocess.run([program, *arguments], env=os.environ | viewer.SILENT, capture_output=True)
         return done.returncode
 
     return command

@@ -2,10 +2,8 @@
 
 import json
 import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,24 +11,14 @@ import pytest
 
 import gradscape
 
-from .command import Said
-
-COMMAND = [sys.executable, "-m", "gradscape"]
-
-
-def loaded(arguments: list[str]) -> set[str]:
-    code = (
-        "import sys\nfrom gradscape.cli import main\n"
-        f"try: main({arguments})\nexcept SystemExit: pass\nprint('MODULES', *sys.modules, file=sys.stderr)"
-    )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
-    return set(said.stderr.split("MODULES")[1].split())
+from .command import Said, modules
+from .processes import Instant, alone, landscape
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["slice", "--help"], ["envs"]])
 def test_help_and_table_import_nothing_heavy(arguments: list[str]) -> None:
     heavy = {"torch", "warp", "taichi", "numpy", "matplotlib", "xarray", "zarr", "botorch", "pyvista", "rerun"}
-    assert not heavy & loaded(arguments)
+    assert not heavy & modules(arguments)
 
 
 @pytest.mark.parametrize("arguments", [[], ["gallery"]])
@@ -63,6 +51,7 @@ def test_envs_shows_one_in_full(run: Callable[..., Said], tmp_path: Path) -> Non
         assert shown in said
 
 
+@pytest.mark.drawn
 def test_slice_leaves_store_picture_and_summary(run: Callable[..., Said], tmp_path: Path) -> None:
     done = run("slice", "branin", "--dims", "x0", "1", "--resolution", "9", "--json", "--out", "cut", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -171,6 +160,7 @@ def test_a_slice_goes_through_the_point_in_a_file(
     assert (float(dataset["u"][1]), float(dataset["v"][1])) == (1.5, 2.5)
 
 
+@pytest.mark.drawn
 def test_bounce_counts_the_bounces_it_marks(run: Callable[..., Said], tmp_path: Path) -> None:
     done = run("bounce", "--axis", "y", "--resolution", "64", "--json", "--out", "b", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -220,36 +210,20 @@ def test_a_slice_of_one_engine_is_not_continued_by_another(run: Callable[..., Sa
     assert "engine: wanted 'taichi', found 'warp'" in refused.stderr
 
 
-# So many flights of a ball take seconds, in many tiles: time enough to be stopped in the middle.
-SIDE = 64
+SIDE = 16
 LONG = ["slice", "bounce", "--dims", "0", "1", "--resolution", str(SIDE), "--fidelity", "standard"]
 LONG += ["--json", "--out", "cut"]
-
-
-def written(folder: Path) -> list[Path]:
-    """Return the files of finished tiles, neither their folders nor what is about to be renamed to one."""
-    found = folder.glob("cut/slice.zarr/status/c/**/[0-9]*")
-    return [path for path in found if path.name.isdecimal() and path.is_file()]
-
-
-def begun(folder: Path) -> subprocess.Popen[str]:
-    """Start the long slice and return once it has written a tile."""
-    process = subprocess.Popen([*COMMAND, *LONG], cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 120
-    while not written(folder) and time.monotonic() < deadline:
-        time.sleep(0.02)
-    assert process.poll() is None, "the slice ended before it could be stopped"
-    return process
+cut = partial(landscape, *LONG)
 
 
 def test_sigkill_costs_nothing_but_the_tiles_under_way(run: Callable[..., Said], tmp_path: Path) -> None:
-    (tmp_path / "whole").mkdir()
-    (tmp_path / "killed").mkdir()
+    for name in ("whole", "killed"):
+        (tmp_path / name).mkdir()
     whole = run(*LONG, cwd=tmp_path / "whole")
     assert whole.returncode == 0, whole.stderr
-    process = begun(tmp_path / "killed")
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
+    for instant in (Instant(1), Instant(5, "status/c"), Instant(7, "grad/c")):
+        killed = alone(cut, tmp_path / "killed", instant)
+        assert killed.returncode == -signal.SIGKILL
     resumed = json.loads(run(*LONG, cwd=tmp_path / "killed").stdout)
     assert 0 < resumed["resumed"] < SIDE**2
     assert resumed["episodes"] + resumed["resumed"] == SIDE**2
@@ -259,11 +233,9 @@ def test_sigkill_costs_nothing_but_the_tiles_under_way(run: Callable[..., Said],
 
 
 def test_interrupt_ends_cleanly_and_says_how_to_go_on(run: Callable[..., Said], tmp_path: Path) -> None:
-    process = begun(tmp_path)
-    process.send_signal(signal.SIGINT)
-    out, said = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert out == ""
-    assert "Traceback" not in said
-    assert "the same command goes on from there: landscape slice bounce" in said
-    assert json.loads(run(*LONG, cwd=tmp_path).stdout)["resumed"] > 0
+    done = alone(cut, tmp_path, Instant(9, "status/c", signal.SIGINT))
+    assert done.returncode == 130
+    assert done.stdout == ""
+    assert "Traceback" not in done.stderr
+    assert "the same command goes on from there: landscape slice bounce" in done.stderr
+    assert 0 < json.loads(run(*LONG, cwd=tmp_path).stdout)["resumed"] < SIDE**2

@@ -23,7 +23,7 @@ from gradscape.landscapes.store import SliceStore
 from .command import Said
 
 # The same examples every time: a test that fails now and then helps nobody.
-QUIET = settings(deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None)
+QUIET = settings(derandomize=True, suppress_health_check=list(HealthCheck), database=None)
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 VALID = """
 envs branin

@@ -19,6 +19,8 @@ from gradscape.gallery.figures import Figure
 from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.store import open_slice
 
+from .command import leave_blank
+
 FIGURES = [
     Figure("bounce-y", "bounce", (1,), "It jumps.", number=8, through="example:aim", resolution=12, fidelity="draft"),
     Figure("bounce-x-y", "bounce", (0, 1), "A plane of it.", through="example:aim", resolution=12, fidelity="draft"),
@@ -40,6 +42,7 @@ def compute(data: Path, *arguments: str) -> int:
 def listed() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gallery_report, "read_figures", lambda: list(FIGURES))
+        leave_blank(patch)
         yield
 
 
@@ -136,12 +139,14 @@ def test_serve_serves_what_build_built(data: Path, tmp_path: Path) -> None:
     assert gallery("build", "--data", str(data), "--out", str(tmp_path / "site")) == 0
     command = [sys.executable, "-m", "gradscape", "gallery", "serve", "--out", str(tmp_path / "site"), "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        found = re.search(r"http://127\.0\.0\.1:\d+/", process.stdout.readline())
-        assert found
-        with urlopen(found[0] + "branin/index.html") as answer:
-            assert b"Three minima &lt;b&gt;" in answer.read()
-        process.terminate()
+        try:
+            assert process.stdout is not None
+            found = re.search(r"http://127\.0\.0\.1:\d+/", process.stdout.readline())
+            assert found
+            with urlopen(found[0] + "branin/index.html") as answer:
+                assert b"Three minima &lt;b&gt;" in answer.read()
+        finally:
+            process.terminate()
 
 
 def test_a_device_that_is_not_here_is_refused_at_once(

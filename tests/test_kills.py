@@ -1,29 +1,43 @@
-"""Jobs of all kinds that are killed at random moments end in the bits of undisturbed ones."""
+"""Jobs of all kinds that are killed end in the bits of undisturbed ones, and what a kill leaves is in nobody's way."""
 
-import json
-import subprocess
-import sys
+from functools import partial
 from pathlib import Path
+from signal import SIGKILL
 
 import pytest
+from benchmarks.kills import bits
 
 from gradscape.cli import main
 
+from .processes import Instant, alone, landscape
+
 BOUNCE = ["bounce", "--dims", "0", "1", "--resolution", "4", "--fidelity", "draft"]
 SEARCH = ["--budget", "4", "--fidelity", "draft"]
-SCRIPT = Path(__file__).parent.parent / "benchmarks" / "kills.py"
+JOBS = {
+    "slice": ("slice bounce --dims 0 1 --resolution 12 --fidelity draft --out made", "landscape.png"),
+    "sweep": ("sweep bounce --dims 0 1 --over 2 --frames 2 --resolution 8 --fidelity draft --out made", "sweep.gif"),
+    "race": ("race bounce --methods random,descents --seeds 2 --budget 12 --fidelity draft --out made", "race.png"),
+    "gallery": (
+        "gallery compute --only bounce --part slices --resolution 24 --fidelity draft --device cpu --data made",
+        "bounce-y",
+    ),
+}
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="jobs are forked")
-def test_five_kills_change_no_bit(tmp_path: Path) -> None:
-    command = [sys.executable, str(SCRIPT), "--count", "5", "--seed", "1", "--json"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False)
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert sum(sum(one["kills"].values()) for one in found.values()) == 5
-    assert all(one["jobs"] and not one["other_bits"] for one in found.values())
-    assert len(found) >= 3
-    assert not list(tmp_path.iterdir())
+@pytest.mark.parametrize("job", JOBS)
+def test_four_kills_change_no_bit(job: str, tmp_path: Path) -> None:
+    """One before anything is there, one before a tile's losses, one before a status, one when all values are there."""
+    command, last = JOBS[job]
+    work, killed, whole = partial(landscape, *command.split()), tmp_path / "killed", tmp_path / "whole"
+    for folder in (killed, whole):
+        folder.mkdir()
+    for instant in (Instant(1), Instant(4, "loss/c"), Instant(5, "status/c"), Instant(1, last)):
+        assert alone(work, killed, instant).returncode == -SIGKILL
+    for folder in (killed, whole):
+        done = alone(work, folder)
+        assert done.returncode == 0, done.stderr
+    assert bits(killed) == bits(whole)
+    assert bits(whole)[0] > 0
 
 
 @pytest.mark.parametrize(

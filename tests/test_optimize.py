@@ -2,22 +2,26 @@
 
 import json
 import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 import xarray as xr
+from torch import Tensor
 
-from gradscape.optim.run import STATE, Run
+from gradscape.envs.base import Environment
+from gradscape.landscapes.objective import Evaluation
+from gradscape.optim.run import Run
 
-from .command import Said
+from .clock import Clock
+from .command import Said, modules
+from .processes import Instant, alone, landscape
 
 QUICK = ["optimize", "branin", "--method", "cma-es", "--budget", "50"]
 
 
+@pytest.mark.drawn
 def test_optimize_leaves_run_picture_and_summary(run: Callable[..., Said], tmp_path: Path) -> None:
     done = run(*QUICK, "--option", "population=7", "--json", "--out", "run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -35,15 +39,24 @@ def test_optimize_leaves_run_picture_and_summary(run: Callable[..., Said], tmp_p
     assert f"best loss {summary['best']['loss']:.6g} at episode {row + 1}" in done.stderr
 
 
-def test_a_method_with_gradients_says_what_they_cost(run: Callable[..., Said], tmp_path: Path) -> None:
+def test_a_method_with_gradients_says_what_they_cost(
+    run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, evaluate = Clock(), Environment.evaluate
+
+    def slow(env: Environment, x: Tensor, *, grad: bool = True) -> Evaluation:
+        clock.sleep(3.0 if grad else 1.0)
+        return evaluate(env, x, grad=grad)
+
+    monkeypatch.setattr("gradscape.optim.search.time", clock)
+    monkeypatch.setattr(Environment, "evaluate", slow)
     command = ["optimize", "bounce", "--method", "descents", "--budget", "8", "--out", "run", "--json"]
     done = run(*command, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout)
     assert summary["kinds"]["descent"] == 8
-    assert summary["forwards"] == pytest.approx(8 * summary["gradient_cost"])
-    assert summary["gradient_cost"] > 1
-    assert "without gradients, " in done.stderr
+    assert (summary["gradient_cost"], summary["forwards"]) == (3.0, 24.0)
+    assert "8 episodes to compute: one by one 8.0 s without gradients, 24 s with" in done.stderr
 
 
 def test_same_command_computes_nothing_twice_a_larger_budget_goes_on_and_force_begins_anew(
@@ -134,59 +147,37 @@ def test_methods_lists_them_all_and_shows_one_in_full(
 
 @pytest.mark.parametrize("arguments", [["optimize", "--help"], ["methods"]])
 def test_help_and_list_import_nothing_heavy(arguments: list[str]) -> None:
-    code = (
-        "import sys\nfrom gradscape.cli import main\n"
-        f"try: main({arguments})\nexcept SystemExit: pass\nprint('MODULES', *sys.modules, file=sys.stderr)"
-    )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
     heavy = {"torch", "warp", "numpy", "matplotlib", "xarray", "zarr", "botorch", "cma", "stable_baselines3"}
-    assert not heavy & set(said.stderr.split("MODULES")[1].split())
+    assert not heavy & modules(arguments)
 
 
-# So many episodes take seconds: time enough to be stopped in the middle.
-BUDGET = 7000
-LONG = ["optimize", "rastrigin", "--set", "dim=5", "--method", "cma-es", "--json", "--out", "run", "--budget"]
-
-
-def begun(folder: Path, rows: int, budget: int = BUDGET) -> subprocess.Popen[str]:
-    """Start the long run and return once so many rows are written."""
-    command = [sys.executable, "-m", "gradscape", *LONG, str(budget)]
-    process = subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    deadline, state = time.monotonic() + 60, folder / "run/run.zarr" / STATE
-    while process.poll() is None:
-        if state.exists() and json.loads(state.read_bytes().split(b"\n")[0])["rows"] > rows:
-            return process
-        if time.monotonic() > deadline:
-            process.kill()
-        time.sleep(0.01)
-    pytest.fail(f"the run could not be stopped in the middle: {process.communicate()}")
+BUDGET = 70
+LONG = ["optimize", "rastrigin", "--set", "dim=5", "--method", "cma-es", "--budget", str(BUDGET)]
+LONG += ["--json", "--out", "run"]
+search = partial(landscape, *LONG)
 
 
 def test_sigkill_at_several_moments_changes_no_bit(run: Callable[..., Said], tmp_path: Path) -> None:
-    (tmp_path / "whole").mkdir()
-    (tmp_path / "killed").mkdir()
-    assert run(*LONG, str(BUDGET), cwd=tmp_path / "whole").returncode == 0
-    for rows in (-1, 0):  # before its first rows, and after
-        process = begun(tmp_path / "killed", rows)
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
-    resumed = json.loads(run(*LONG, str(BUDGET), cwd=tmp_path / "killed").stdout)
-    assert 0 < resumed["resumed"] < BUDGET
+    for name in ("whole", "killed"):
+        (tmp_path / name).mkdir()
+    assert run(*LONG, cwd=tmp_path / "whole").returncode == 0
+    for instant in (Instant(1), Instant(1, "loss/c"), Instant(4, ".state"), Instant(5, "loss/c")):
+        assert alone(search, tmp_path / "killed", instant).returncode == -signal.SIGKILL
+    kept = Run.open(tmp_path / "killed/run/run.zarr").count
+    resumed = json.loads(run(*LONG, cwd=tmp_path / "killed").stdout)
+    assert 0 < resumed["resumed"] == kept < BUDGET
     assert resumed["episodes"] + resumed["resumed"] == BUDGET
     one, two = (Run.open(tmp_path / name / "run/run.zarr").table() for name in ("whole", "killed"))
     xr.testing.assert_equal(one.drop_vars("seconds"), two.drop_vars("seconds"))
 
 
 def test_interrupt_ends_cleanly_and_says_how_to_go_on(tmp_path: Path) -> None:
-    budget = 100 * BUDGET
-    process = begun(tmp_path, 0, budget)
-    process.send_signal(signal.SIGINT)
-    out, said = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert out == ""
-    assert "Traceback" not in said
+    done = alone(search, tmp_path, Instant(9, "status/c", signal.SIGINT))
+    assert done.returncode == 130
+    assert done.stdout == ""
+    assert "Traceback" not in done.stderr
     kept = Run.open(tmp_path / "run/run.zarr").count
-    assert f"stopped: {kept} of {budget} episodes are kept in run" in said
-    assert "the same command goes on from there: landscape optimize rastrigin" in said
-    assert 0 < kept < budget
+    assert f"stopped: {kept} of {BUDGET} episodes are kept in run" in done.stderr
+    assert "the same command goes on from there: landscape optimize rastrigin" in done.stderr
+    assert 0 < kept < BUDGET
     assert (tmp_path / "run/progress.png").exists()

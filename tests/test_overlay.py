@@ -18,6 +18,8 @@ from gradscape.landscapes.overlay import best_point, overlay
 from gradscape.landscapes.store import plane_of
 from gradscape.optim.run import Run
 
+from .command import leave_blank
+
 
 @dataclass(frozen=True)
 class Said:
@@ -38,6 +40,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
+        leave_blank(patch)
         for command in commands:
             patch.setattr(sys, "argv", ["landscape", *command.split()])
             with pytest.raises(SystemExit) as left:
@@ -48,7 +51,11 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(
-    results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    blank: None,
+    results: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> Callable[..., Said]:
     shutil.copytree(results, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
@@ -64,6 +71,7 @@ def run(
     return command
 
 
+@pytest.mark.drawn
 def test_a_race_is_laid_over_a_slice(run: Callable[..., Said], tmp_path: Path) -> None:
     done = run("overlay cut race --out over")
     assert done.returncode == 0, done.stderr

@@ -1,30 +1,53 @@
-"""The verb `plan`: what it predicts against what jobs then take."""
+"""The verb `plan`: its parts add up to what a job takes, on a clock by which everything has its price."""
 
 import json
-import os
-import subprocess
-import sys
-import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from statistics import median
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 import gradscape
-from gradscape.landscapes.rehearsal import Alike
+from gradscape.envs.base import Environment
+from gradscape.landscapes.draw import page, sweep
+from gradscape.landscapes.rehearsal import Alike, drawn, pictures
 from gradscape.landscapes.store import SliceStore
 
+from .clock import Clock
 from .command import Said
 
 JOBS = {
-    "bounce": ["bounce", "--dims", "0", "1", "--resolution", "64", "--fidelity", "standard"],
+    "bounce": ["bounce", "--dims", "0", "1", "--resolution", "32", "--fidelity", "draft"],
     "flip": ["flip", "--dims", "0", "1", "--resolution", "14", "--fidelity", "draft"],
-    "sweep": ["bounce", "--dims", "0", "1", "--over", "2", "--frames", "6", "--resolution", "16"],
+    "sweep": ["bounce", "--dims", "0", "1", "--over", "2", "--frames", "4", "--resolution", "16"],
 }
-TRIES = 6
+EPISODE, TILE, PICTURE = 0.05, 0.035, 0.5  # seconds that it takes to simulate, write and draw one
+
+
+@pytest.fixture(autouse=True)
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """Let what jobs are made of take its time on a clock of its own."""
+    clock = Clock()
+    for module in ("landscapes.job", "landscapes.rehearsal", "planned", "plan_report", "sweep_report"):
+        monkeypatch.setattr(f"gradscape.{module}.time", clock)
+
+    def slow(owner: Any, name: str, price: Callable[..., float]) -> None:
+        plain = getattr(owner, name)
+
+        def slowed(*given: Any, **named: Any) -> Any:
+            clock.sleep(price(*given))
+            return plain(*given, **named)
+
+        monkeypatch.setattr(owner, name, slowed)
+
+    monkeypatch.setattr(page, "save", lambda figure, path: path.write_bytes(bytes(60_000)))
+    slow(Environment, "evaluate", lambda env, x: EPISODE * len(x))
+    slow(SliceStore, "write", lambda *_: TILE)
+    slow(page, "save", lambda *_: PICTURE)
+    slow(sweep, "frame_figure", lambda *_: PICTURE)
+    return clock
 
 
 def plan(run: Callable[..., Said], cwd: Path, *arguments: str) -> dict[str, Any]:
@@ -34,67 +57,59 @@ def plan(run: Callable[..., Said], cwd: Path, *arguments: str) -> dict[str, Any]
     return found
 
 
-def size(folder: Path) -> int:
-    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-
-
 @pytest.mark.parametrize("name", JOBS)
-def test_a_job_takes_what_was_planned_within_a_quarter(
-    run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+def test_the_parts_of_a_plan_add_up_to_what_the_job_takes(run: Callable[..., Said], tmp_path: Path, name: str) -> None:
+    planned, verb = plan(run, tmp_path, *JOBS[name]), "sweep" if name == "sweep" else "slice"
+    done = json.loads(run(verb, *JOBS[name], "--out", "made", "--json", cwd=tmp_path).stdout)
+    there = list((tmp_path / "made").rglob("*"))
+    room = sum(one.stat().st_size for one in there if one.is_file())
+    tiles = sum(len(SliceStore.open(path).tiles()) for path in there if path.suffix == ".zarr")
+    seconds, guess = planned["seconds"], 1e-3 if verb == "sweep" else PICTURE  # when a picture is due
+    assert planned["episodes"] == done["episodes"]
+    assert seconds["simulating"] == pytest.approx(EPISODE * done["episodes"])
+    assert seconds["writing"] == pytest.approx(TILE * tiles)
+    parts = seconds["simulating"] + seconds["writing"] + seconds["drawing"]
+    assert parts == pytest.approx(done["seconds"], abs=guess)
+    assert planned["disk"]["bytes"] == pytest.approx(room, rel=0.25)
+    assert planned["disk"]["files"] == pytest.approx(len(there), rel=0.02)
+
+
+def test_a_plan_needs_the_memory_that_is_held_and_that_of_the_slice_to_come(
+    run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Seconds are those of all cores that the process has used: what else the machine does falls on those of the clock.
-
-    Medians of a few tries count, since caches are shared, too; all but `start`, which in this process is over.
-    """
-    verb = "sweep" if name == "sweep" else "slice"
-    small = [*JOBS[name], "--resolution", "2"] + (["--frames", "2"] if verb == "sweep" else [])
-    assert run(verb, *small, "--out", "loads", cwd=tmp_path).returncode == 0
-    for clock in ("perf_counter", "monotonic"):
-        monkeypatch.setattr(time, clock, time.process_time)
-    expected, took = [], []
-    for number in range(TRIES):
-        planned = plan(run, tmp_path, *JOBS[name])
-        done = json.loads(run(verb, *JOBS[name], "--out", str(number), "--json", cwd=tmp_path).stdout)
-        assert planned["episodes"] == done["episodes"]
-        expected.append(sum(planned["seconds"][part] for part in ("simulating", "writing", "drawing")))
-        took.append(done["seconds"])
-        if (off := abs(median(expected) / median(took) - 1)) < 0.25:
-            break
-    assert off < 0.25, (expected, took)
-    there = tmp_path / str(number)
-    assert planned["disk"]["bytes"] == pytest.approx(size(there), rel=0.25)
-    assert planned["disk"]["files"] == pytest.approx(len(list(there.rglob("*"))), rel=0.02)
+    monkeypatch.setattr("gradscape.landscapes.job.peak_memory", lambda: 10**9)
+    planned = plan(run, tmp_path, "cartpole", "--dims", "0", "1", "--resolution", "16")
+    assert planned["memory"] == {"host": 10**9 + 8 * 16**2 * (2 + 400), "device": 0}  # loss, status, gradient
 
 
-def test_a_job_needs_the_memory_that_was_planned_within_a_quarter(tmp_path: Path) -> None:
-    # a third of what it holds is gradients of 400 components
-    job = ["cartpole", "--dims", "0", "1", "--resolution", "128", "--json"]
-    planned, _ = alone("plan", *job, cwd=tmp_path)
-    _, peak = alone("slice", *job, cwd=tmp_path)
-    assert planned["memory"]["host"] == pytest.approx(peak, rel=0.25)
+def test_what_a_first_drawing_loads_is_paid_once_and_what_is_made_up_to_draw_never(clock: Clock) -> None:
+    alike, took = SimpleNamespace(seconds=7.0), iter((5.0, 2.0))
+
+    def draw() -> None:
+        clock.sleep(next(took) + 1.0)
+        alike.seconds += 1.0
+
+    assert drawn(draw, alike) == (3.0, 2.0)  # type: ignore[arg-type]
 
 
-def alone(*arguments: str, cwd: Path) -> tuple[dict[str, Any], int]:
-    """Run the command in a process of its own; return what it printed and the most memory it held [bytes]."""
-    said = cwd / "said.json"
-    with (
-        said.open("w") as out,
-        subprocess.Popen([sys.executable, "-m", "gradscape", *arguments], stdout=out, cwd=cwd) as process,
-    ):
-        _, code, used = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(code)
-    assert process.returncode == 0
-    return json.loads(said.read_text()), used.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+def test_pictures_come_with_finer_levels_batches_and_a_pause_between_them() -> None:
+    space = gradscape.ParameterSpace.box(["a", "b"], -1.0, 1.0)
+    store = SliceStore.in_memory(gradscape.Plane.through(space, space.center, ("a", "b"), resolution=64), space)
+    most = 1 + store.tiles()[-1].level
+    assert [pictures(store, *now) for now in ((99, 1e6, 1.0), (99, 0.0, 1.0), (99, 44.0, 1.0), (3, 44.0, 1.0))] == [
+        most, 2, 6, 4
+    ]  # fmt: skip
 
 
 def test_a_plan_leaves_nothing_behind_and_workers_share_what_can_be_shared(
     run: Callable[..., Said], tmp_path: Path
 ) -> None:
-    one, four = (plan(run, tmp_path, *JOBS["bounce"], "--workers", count) for count in ("1", "4"))
+    job = [*JOBS["bounce"], "--resolution", "48"]
+    one, four = (plan(run, tmp_path, *job, "--workers", count) for count in ("1", "4"))
     assert not list(tmp_path.iterdir())
     assert one["rate"] == "measured here, now"
     assert one["device_hours"] == one["seconds"]["simulating"] / 3600
-    for planned, share in ((one, 1.0), (four, 2 / 8)):  # 4096 points in 8 batches
+    for planned, share in ((one, 1.0), (four, 2 / 5)):  # 2304 points in 5 batches
         seconds = planned["seconds"]
         shared = share * (seconds["simulating"] + seconds["writing"])
         assert planned["wall"] == pytest.approx(seconds["start"] + shared + seconds["drawing"])

@@ -2,10 +2,8 @@
 
 import json
 import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +12,12 @@ import pytest
 from gradscape.optim.run import Run
 
 from .command import Said
+from .processes import Instant, alone, landscape
 
 RACE = ["race", "branin", "--methods", "random,cma-es", "--methods", "descents", "--budget", "40", "--seeds", "3"]
 
 
+@pytest.mark.drawn
 def test_race_leaves_runs_picture_and_figures(run: Callable[..., Said], tmp_path: Path) -> None:
     done = run(*RACE, "--json", "--out", "r", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -118,29 +118,23 @@ def test_a_folder_with_other_files_is_refused(run: Callable[..., Said], tmp_path
     assert "holds other files and no race" in done.stderr
 
 
-LONG = ["race", "bounce", "--methods", "random,descents", "--fidelity", "draft", "--budget", "70", "--seeds", "2"]
-LONG += ["--workers", "2", "--json", "--out", "r"]
+LONG = ["race", "bounce", "--methods", "random,descents", "--fidelity", "draft", "--budget", "40", "--seeds", "2"]
+LONG += ["--json", "--out", "r"]
 
 
 def test_interrupt_says_how_to_go_on_and_the_result_is_the_same(run: Callable[..., Said], tmp_path: Path) -> None:
     for name in ("whole", "stopped"):
         (tmp_path / name).mkdir()
-    command = [sys.executable, "-m", "gradscape", *LONG]
-    process = subprocess.Popen(
-        command, cwd=tmp_path / "stopped", stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    deadline = time.monotonic() + 120
-    while not any(Run.open(path).count for path in tmp_path.glob("stopped/r/*/run.zarr")):
-        assert time.monotonic() < deadline, "nothing was kept"
-        time.sleep(0.02)
-    process.send_signal(signal.SIGINT)
-    out, said = process.communicate(timeout=60)
-    assert (process.returncode, out) == (130, "")
-    assert "Traceback" not in said
-    assert "the same command goes on from there: landscape race bounce" in said
+    race = partial(landscape, *LONG, "--workers", "2")
+    whole = alone(race, tmp_path / "whole")
+    assert whole.returncode == 0, whole.stderr
+    stopped = alone(race, tmp_path / "stopped", Instant(9, of="status/c", by=signal.SIGINT))
+    assert (stopped.returncode, stopped.stdout) == (130, "")
+    assert "Traceback" not in stopped.stderr
+    assert "the same command goes on from there: landscape race bounce" in stopped.stderr
     resumed = run(*LONG, cwd=tmp_path / "stopped")
     assert "are there already" in resumed.stderr
-    whole = run(*LONG[: LONG.index("--workers")], "--json", "--out", "r", cwd=tmp_path / "whole")
+    assert "all 160 episodes" not in resumed.stderr
     one, two = (json.loads(done.stdout) for done in (whole, resumed))
     finals = [{rank["method"]: rank["final"] for rank in figures["ranks"]} for figures in (one, two)]
     assert finals[0] == finals[1]

@@ -12,7 +12,7 @@ from gradscape.cli import main
 
 @pytest.fixture
 def run(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    blank: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> Callable[[str], tuple[int, str]]:
     monkeypatch.chdir(tmp_path)
 
@@ -48,6 +48,7 @@ def test_what_cannot_be_replayed_is_refused(run: Callable[[str], tuple[int, str]
     assert (code, "full holds other files" in said) == (2, True)
 
 
+@pytest.mark.drawn
 def test_a_slice_with_a_run_becomes_a_surface(run: Callable[[str], tuple[int, str]]) -> None:
     assert run("slice bounce --dims 0 1 --resolution 5 --out cut --device cpu")[0] == 0
     assert run("optimize bounce --method random --budget 4 --out r --device cpu")[0] == 0

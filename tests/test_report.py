@@ -25,6 +25,7 @@ def cut(run: Run, tmp_path: Path) -> Path:
     return tmp_path / "cut"
 
 
+@pytest.mark.drawn
 def test_a_slice_is_reported_in_numbers_and_words(run: Run, cut: Path, tmp_path: Path) -> None:
     done = run("report", "cut", "--points", "2", "--out", "told", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -3,11 +3,9 @@
 import json
 import shutil
 import signal
-import subprocess
 import sys
-import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,22 +20,16 @@ from gradscape.landscapes.sampling import sample
 from gradscape.landscapes.smoothing import smoothed
 from gradscape.landscapes.store import plane_of
 
+from .command import Said
+from .processes import Instant, alone, landscape
+
 SWEEP = "sweep bounce --dims 0 1 --over 2 --frames 3 --resolution 5 --through example:aim --device cpu --out moved"
 FILES = ["frames", "summary.json", "sweep.gif", "sweep.mp4", "sweep.rrd"]
-
-
-@dataclass(frozen=True)
-class Said:
-    returncode: int
-    stdout: str
-    stderr: str
-
-
 Command = Callable[[str], Said]
 
 
 @pytest.fixture
-def run(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+def run(blank: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
     """Run the command in this process, in a folder of its own."""
     monkeypatch.chdir(tmp_path)
 
@@ -106,6 +98,7 @@ def test_force_begins_anew_and_another_sweep_is_not_overwritten(run: Command) ->
     assert names(Path("moved/frames")) == ["000.zarr", "001.zarr"]
 
 
+@pytest.mark.drawn
 def test_smoothing_averages_one_slice(run: Command) -> None:
     done = run("sweep branin --dims 0 1 --over smoothing --frames 3 --resolution 9 --out soft --json")
     assert done.returncode == 0, done.stderr
@@ -174,20 +167,15 @@ def test_bad_input_is_one_line_and_writes_nothing(run: Command, over: str, said:
 
 
 def test_a_sweep_that_is_stopped_goes_on_to_the_same_bits(run: Command, tmp_path: Path) -> None:
-    text = "sweep bounce --dims 0 1 --over 2 --frames 4 --resolution 24 --device cpu --out"
-    command = [sys.executable, "-m", "gradscape", *text.split(), "stopped"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path) as process:
-        while not list(tmp_path.glob("stopped/frames/000.zarr/status/c/*/*")):
-            assert process.poll() is None
-            time.sleep(0.02)
-        process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert f"the same command goes on from there: landscape {text} stopped" in said
-    kept = int(said.split("stopped: ")[1].split(" of 2304 points")[0])
-    assert 0 < kept < 2304
-    again = json.loads(run(f"{text} stopped --json").stdout)
-    assert (again["resumed"], again["episodes"]) == (kept, 2304 - kept)
+    text = "sweep bounce --dims 0 1 --over 2 --frames 4 --resolution 8 --device cpu --out stopped"
+    sweep = partial(landscape, *text.split())
+    done = alone(sweep, tmp_path, Instant(20, of="status/c", by=signal.SIGINT))
+    assert done.returncode == 130
+    assert f"the same command goes on from there: landscape {text}" in done.stderr
+    kept = int(done.stderr.split("stopped: ")[1].split(" of 256 points")[0])
+    assert 0 < kept < 256
+    again = json.loads(run(f"{text} --json").stdout)
+    assert (again["resumed"], again["episodes"]) == (kept, 256 - kept)
     env = gradscape.make("bounce", device="cpu")
     for number in range(4):
         stopped = gradscape.open_slice(f"stopped/frames/{number:03d}.zarr")

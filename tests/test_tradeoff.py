@@ -1,7 +1,6 @@
 """`landscape tradeoff`, `--tolerance` and `landscape pairs`: what they leave, say, go on from and refuse."""
 
 import json
-import time
 import weakref
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +11,7 @@ import torch
 from torch import Tensor
 
 import gradscape
-from gradscape import ladder
+from gradscape import ladder, tradeoff_report
 from gradscape.envs import registry
 from gradscape.envs.base import Environment, Fidelity, Work
 from gradscape.landscapes import tradeoff
@@ -21,14 +20,16 @@ from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.tolerance import read_tolerance
 
+from .clock import Clock
 from .command import Said
 
 Command = Callable[..., Said]
+CLOCK = Clock()
 TRADE = ["tradeoff", "converging", "--points", "16", "--device", "cpu", "--out", "trade"]
 
 
 class Converging(Environment):
-    """A bowl whose loss is off by (1 + x0) dt^2, in float32 by 1e-7 more.
+    """A bowl whose loss is off by (1 + x0) dt^2, in float32 by 1e-7 more, in 1e-3 / dt seconds a point.
 
     Refuses dt of 0.4 or more, diverges at 0.2 where x0 is large.
     """
@@ -50,7 +51,7 @@ class Converging(Environment):
 
     def _evaluate(self, x: Tensor, *, grad: bool) -> Evaluation:
         dt = self.fidelity.dt
-        time.sleep(1e-6 / dt)
+        CLOCK.sleep(len(x) * 1e-3 / dt)
         rounding = 1e-7 if self.fidelity.precision == "float32" else 0.0
         loss = x.square().sum(dim=1) + (1 + x[:, 0]) * dt**2 + rounding
         loss[(x[:, 0] > 0.5) & (dt >= 0.2)] = torch.nan
@@ -59,9 +60,10 @@ class Converging(Environment):
 
 @pytest.fixture(autouse=True)
 def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Keep measurements in a folder of the test's own, and take little time for timing."""
+    """Keep measurements in a folder of the test's own, and time by the clock of the scene."""
     monkeypatch.setattr("gradscape.tolerance.user_data_path", lambda name: tmp_path / "data" / name)
-    monkeypatch.setattr(tradeoff, "TIMING", 0.002)
+    for module in (tradeoff, tradeoff_report):
+        monkeypatch.setattr(module, "time", CLOCK)
     monkeypatch.setattr(tradeoff, "RESAMPLES", 99)
     monkeypatch.setitem(registry.entries(), "converging", registry.Entry("converging", f"{__name__}:Converging"))
     return tmp_path / "data"
@@ -71,11 +73,16 @@ def by_name(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
     return {row["name"]: row for row in report["rungs"]}
 
 
-def without_seconds(report: dict[str, Any]) -> dict[str, Any]:
-    rungs = [{key: value for key, value in row.items() if key != "seconds"} for row in report["rungs"]]
-    return {**report, "rungs": rungs, "command": None, "folder": None, "provenance": None}
+def study(report: dict[str, Any]) -> dict[str, Any]:
+    """Return what two studies have in common, however far the clock was when they began."""
+
+    def rounded(rung: dict[str, Any]) -> dict[str, Any]:
+        return {**rung, "seconds": {way: round(value, 9) for way, value in rung["seconds"].items()}}
+
+    return {**report, "rungs": list(map(rounded, report["rungs"])), "command": None, "folder": None, "provenance": None}
 
 
+@pytest.mark.drawn
 def test_errors_and_order_of_convergence_are_those_of_the_scene(run: Command, tmp_path: Path) -> None:
     done = run(*TRADE, "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -88,6 +95,7 @@ def test_errors_and_order_of_convergence_are_those_of_the_scene(run: Command, tm
         off = (1 + x[:, 0]) * (dt**2 - 1e-8) + 1e-7
         assert rungs[name]["loss_error"]["median"]["value"] == pytest.approx(float(off.quantile(0.5)))
         assert rungs[name]["loss_error"]["p95"]["value"] == pytest.approx(float(off.sort().values[-1]))
+        assert rungs[name]["seconds"] == pytest.approx(dict.fromkeys(("forward", "with_gradient"), 1e-3 / dt))
     (fit,) = report["orders"]  # of rungs in float32, without the reference's own
     assert fit["rungs"] == ["draft", "standard", "standard-dt-x0.5"]
     assert fit["order"] == pytest.approx(2, abs=0.01)
@@ -200,7 +208,7 @@ def test_a_stopped_study_goes_on_with_the_next_rung(
     kept = {path.name: path.read_bytes() for path in (tmp_path / "trade/pieces").iterdir()}
     monkeypatch.setattr(tradeoff, "measure", measure)
     resumed = json.loads(run(*TRADE, "--json", cwd=tmp_path).stdout)
-    assert without_seconds(resumed) == without_seconds(whole)
+    assert study(resumed) == study(whole)
     assert kept == {name: (tmp_path / "trade/pieces" / name).read_bytes() for name in kept}
 
 

@@ -83,13 +83,14 @@ def _assets() -> dict[str, bytes]:
     port, other = _free_port(), _free_port()
     server = _rerun("--serve-web", "--web-viewer-port", str(port), "--port", str(other), log=subprocess.DEVNULL)
     try:
-        return {name: _fetched(f"http://{LOOPBACK}:{port}{name}") for name in ASSETS}
+        return {name: _fetched(f"http://{LOOPBACK}:{port}{name}", server) for name in ASSETS}
     finally:
         server.terminate()
         server.wait()
 
 
-def _fetched(address: str) -> bytes:
+def _fetched(address: str, server: subprocess.Popen[bytes]) -> bytes:
+    """Return what a server answers, which may be about to come up."""
     deadline = time.monotonic() + PATIENCE
     while True:
         try:
@@ -97,7 +98,7 @@ def _fetched(address: str) -> bytes:
                 found: bytes = answer.read()
                 return found
         except URLError:
-            if time.monotonic() > deadline:
+            if server.poll() is not None or time.monotonic() > deadline:
                 raise OSError(f"rerun's web viewer does not answer at {address}; try --spawn") from None
             time.sleep(0.05)
 

@@ -69,7 +69,7 @@ def test_the_loss_is_height_missing_plus_distances_to_ladle_and_axis(tiny):
     torch.testing.assert_close(tiny.evaluate(x, grad=False).loss, wanted, rtol=0, atol=1e-14)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(st.lists(st.floats(-1e3, 1e3), min_size=2 * SEGMENTS, max_size=2 * SEGMENTS))
 def test_the_ladle_stays_in_the_tank(tiny, speeds):
     path = tiny.ladle(torch.tensor([speeds], dtype=torch.float64))

@@ -22,6 +22,8 @@ from gradscape.landscapes.store import SliceStore
 from gradscape.optim.run import Run
 from gradscape.optim.search import search
 
+from ..command import NO_BROWSER
+
 SPACE = ParameterSpace(
     ("speed", "force", "mass"), torch.tensor([-1.0, 0, -10]).double(), torch.tensor([1.0, 20, 10]).double(),
     ("m/s", "N", ""),
@@ -40,6 +42,7 @@ SWEEP = {
     "over": "2", "label": "mass", "low": -10.0, "high": 10.0, "fidelity": "draft", "frames": 12,
     "resolution": [24, 24], "command": "landscape sweep fluid --dims 0 1 --over 2",
 }  # fmt: skip
+PATIENCE = 600_000  # milliseconds until the browser is given up, and no measure of anything
 MEASURES = {"local minima": 7, "noise floor": "none"}
 
 
@@ -162,11 +165,12 @@ def site(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def browser():  # type: ignore[no-untyped-def]
     program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if not program:
-        pytest.skip("no Chromium here: `apt-get install -y chromium` (or your system's) lets this test run")
-    from playwright.sync_api import sync_playwright
+        pytest.skip(NO_BROWSER)
+    from playwright.sync_api import expect, sync_playwright
 
+    expect.set_options(timeout=PATIENCE)
     with sync_playwright() as driver:
-        opened = driver.chromium.launch(executable_path=program, args=["--disable-gpu"])
+        opened = driver.chromium.launch(executable_path=program, args=["--disable-gpu"], timeout=PATIENCE)
         yield opened
         opened.close()
 
@@ -181,6 +185,7 @@ def visit(browser) -> Iterator[Callable]:  # type: ignore[no-untyped-def, type-a
 
     def go(root: str, path: str, *, width: int = 1100, **options):  # type: ignore[no-untyped-def]
         context = browser.new_context(viewport={"width": width, "height": 900}, **options)
+        context.set_default_timeout(PATIENCE)
         contexts.append(context)
         page = context.new_page()
         page.on("console", lambda message: complaints.append(message.text))

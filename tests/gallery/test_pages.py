@@ -110,15 +110,18 @@ def test_the_map_says_what_is_under_the_pointer_and_the_keys(filed: str, data: P
     assert told(page, "force") == pytest.approx(float(dataset["v"][4]), rel=1e-3)
     assert told(page, "Gradient along the slice") == pytest.approx(slope[4, 2, 0], rel=1e-3)
     assert told(page, "Gradient’s length") == pytest.approx(np.linalg.norm(slope[4, 2]), rel=1e-3)
+    page.clock.install()
     page.mouse.move(*point_at(page, 11, 11))
     assert "Loss: not finite" in page.inner_text("#readout")
+    page.clock.run_for(10_000)
     assert page.inner_text("#spoken") == ""
     page.mouse.move(*point_at(page, 4, 2))
     page.focus("#map")
     for key in ("ArrowRight", "ArrowUp", "ArrowUp"):
         page.keyboard.press(key)
     assert told(page, "Loss") == pytest.approx(loss[6, 3], rel=1e-3)
-    page.wait_for_function("document.getElementById('spoken').textContent.includes('Loss: ')")
+    page.clock.run_for(10_000)
+    assert "Loss: " in page.inner_text("#spoken")
     page.keyboard.press("Shift+ArrowLeft")
     assert told(page, "speed") == -1
     page.keyboard.press("Home")
@@ -160,12 +163,17 @@ def test_a_click_on_a_ringed_node_plays_its_episode(filed: str, visit: Visit) ->
     assert page.eval_on_selector("#player video", "(one) => one.paused")
 
 
-def test_nothing_moves_by_itself_where_motion_is_not_wanted(filed: str, visit: Visit) -> None:
-    page = visit(filed, "full/index.html", reduced_motion="reduce")
+@pytest.mark.parametrize(("motion", "played"), [("reduce", 0), ("no-preference", 1)])
+def test_nothing_moves_by_itself_where_motion_is_not_wanted(motion: str, played: int, filed: str, visit: Visit) -> None:
+    page = visit(filed, "full/index.html", reduced_motion=motion)
+    page.evaluate("""() => {
+        window.played = 0;
+        HTMLMediaElement.prototype.play = async () => { played += 1; };
+    }""")
     page.mouse.click(*point_at(page, 6, 5))
     assert page.is_visible("#player video")
-    page.wait_for_timeout(200)
-    assert page.evaluate("document.querySelector('#player video').currentTime") == 0
+    assert page.evaluate("played") == played
+    assert page.evaluate("Array.from(document.querySelectorAll('video')).every((one) => one.paused && !one.autoplay)")
 
 
 @pytest.mark.parametrize("name", ["full", "line"])
@@ -319,9 +327,11 @@ def test_a_browser_that_never_lets_it_copy_has_the_command_selected(filed: str, 
 
     page = visit(filed, "full/index.html")
     page.evaluate("() => { if (window.Clipboard) Clipboard.prototype.writeText = () => new Promise(() => {}) }")
+    page.clock.install()
     button = page.locator("[data-copy=command]")
     button.click()
-    expect(button).to_have_text("Selected", timeout=30_000)
+    page.clock.run_for(10_000)
+    expect(button).to_have_text("Selected")
     assert "landscape slice" in page.evaluate("getSelection().toString()")
 
 

@@ -1,6 +1,7 @@
 """What `landscape gallery compute` makes beside slices: films, episodes at nodes, searches."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import xarray as xr
 
 from gradscape import gallery_episodes, gallery_measures, gallery_parts, gallery_report
 from gradscape.cli import main
+from gradscape.envs.bounce import Bounce
 from gradscape.gallery.figures import Figure
 from gradscape.gallery.runs import open_run, save_run
 from gradscape.gallery_episodes import Node, nodes_shown
@@ -69,8 +71,8 @@ def test_a_run_is_one_file_and_comes_back(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """Let all there is to make be little."""
+def small(blank: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Let all there is to make be little, and steps of time long."""
     monkeypatch.setattr(gallery_report, "read_figures", lambda: list(FIGURES))
     for name, value in (("FRAMES", 2), ("COARSE", 4), ("DPI", 40), ("METHODS", ("random", "cma-es")), ("BUDGET", 9)):
         monkeypatch.setattr(gallery_parts, name, value)
@@ -80,6 +82,8 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         monkeypatch.setattr(gallery_measures, name, value)
     for name in ("TIMING", "PATIENCE"):
         monkeypatch.setattr(f"gradscape.landscapes.tradeoff.{name}", 0.01)
+    longer = {name: replace(one, dt=4 * one.dt) for name, one in Bounce.fidelities.items()}
+    monkeypatch.setattr(Bounce, "fidelities", longer)
     monkeypatch.chdir(tmp_path)
     return tmp_path / "data"
 

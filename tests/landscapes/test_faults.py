@@ -1,7 +1,6 @@
 """What goes wrong while a slice is filled: memory, disk, damaged files, another process."""
 
 import errno
-import multiprocessing
 import os
 import warnings
 from pathlib import Path
@@ -20,6 +19,8 @@ from gradscape.landscapes.sampling import sample
 from gradscape.landscapes.slice_paths import filling
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.store import SliceStore
+
+from ..processes import PROCESSES
 
 SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
 PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 16))
@@ -192,9 +193,8 @@ def _fill(path: Path, barrier) -> None:
 
 
 def test_two_processes_fill_the_same_store_and_harm_nothing(tmp_path, whole):
-    fork = multiprocessing.get_context("fork")
-    barrier = fork.Barrier(2)
-    both = [fork.Process(target=_fill, args=(tmp_path / "s.zarr", barrier)) for _ in range(2)]
+    barrier = PROCESSES.Barrier(2)
+    both = [PROCESSES.Process(target=_fill, args=(tmp_path / "s.zarr", barrier)) for _ in range(2)]
     for process in both:
         process.start()
     for process in both:

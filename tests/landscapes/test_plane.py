@@ -13,7 +13,7 @@ SPACE = ParameterSpace(
     ("m", "m/s", "", "kg [dry]"),
 )
 COORDINATES = st.lists(st.floats(-10, 10), min_size=2, max_size=2)
-FEW = settings(max_examples=40, deadline=None)
+FEW = settings(max_examples=40)
 
 
 def tilted(seed: int, rank: int = 2, dim: int = 6) -> Plane:

@@ -26,8 +26,8 @@ SMALL = 120  # height of a test's pictures [pixel]
 
 
 @cache
-def scene(name: str) -> tuple[Environment, Episode]:
-    env = make(name, fidelity="draft", device="cpu")
+def scene(name: str, *, horizon: float = 1.0) -> tuple[Environment, Episode]:
+    env = make(name, fidelity="draft", device="cpu", horizon=horizon)
     x = env.example(next(iter(env.examples))) if env.examples else env.space.center
     return env, env.episode(x)
 
@@ -44,7 +44,7 @@ def tinted(picture: np.ndarray, color: str) -> np.ndarray:
 
 @pytest.mark.parametrize("name", SCENES)
 def test_every_scene_says_what_it_looks_like_and_is_drawn(name: str) -> None:
-    _, episode = scene(name)
+    _, episode = scene(name, horizon=0.2)
     assert episode.view is not None
     assert all(len(part.at) == len(episode.time) for part in episode.parts)
     (picture,) = frames(episode, [len(episode.time) - 1], height=SMALL)

@@ -1,7 +1,6 @@
 import contextlib
-import subprocess
-import sys
-import time
+import signal
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,8 @@ from gradscape.landscapes.sampling import sample
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.store import SliceStore
 
+from ..processes import Instant, alone
+
 SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
 PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 16))
 
@@ -27,15 +28,14 @@ class Wave:
 
     space = SPACE
 
-    def __init__(self, *, stop_after: int | None = None, pause: float = 0.0):
+    def __init__(self, *, stop_after: int | None = None):
         self.asked: list[tuple[float, ...]] = []
         self.batches: list[int] = []
-        self.stop_after, self.pause = stop_after, pause
+        self.stop_after = stop_after
 
     def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
         if self.stop_after is not None and len(self.asked) >= self.stop_after:
             raise KeyboardInterrupt
-        time.sleep(self.pause)
         self.asked += map(tuple, x.tolist())
         self.batches.append(len(x))
         loss = (3 * x).sin().prod(dim=1) + x.exp().sum(dim=1)
@@ -59,7 +59,7 @@ def test_a_slice_holds_the_objective_at_its_own_points():
     assert {int(s) for s in np.unique(dataset["status"])} == {Status.OK, Status.ESCAPED}
 
 
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=4)
 @given(stops=st.lists(st.integers(0, 120), max_size=4), batch=st.integers(1, 100))
 def test_interruptions_change_no_bit_and_cost_no_finished_tile(tmp_path_factory, stops, batch):
     path = tmp_path_factory.mktemp("slice") / "s.zarr"
@@ -93,38 +93,30 @@ def test_an_interruption_between_two_tiles_of_a_batch_keeps_the_first(tmp_path):
     assert len(objective.asked) == 18 * 16 - len(first)
 
 
-KILLED_WHILE_SAMPLING = """
-import os, signal, sys, time
-from pathlib import Path
-from test_sampling import PLANE, Wave, sample, store_at
-path = Path(sys.argv[1])
-for delay in (0.4, 0.6, 0.5):  # together too short for 20 tiles, however fast the machine
-    if not (child := os.fork()):
-        sample(Wave(pause=0.1), PLANE, store_at(path))
-        os._exit(0)
-    time.sleep(delay)
-    os.kill(child, signal.SIGKILL)
-    _, status = os.waitpid(child, 0)
-    assert os.WIFSIGNALED(status), "finished before it was killed"
-"""
+def sampling(path: Path) -> None:
+    sample(Wave(), PLANE, store_at(path))
 
 
 def test_sigkill_at_any_instant_changes_no_bit(tmp_path):
-    path = tmp_path / "s.zarr"
-    command = [sys.executable, "-c", KILLED_WHILE_SAMPLING, str(path)]
-    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    tiles, left = len(store_at(path).tiles()), len(store_at(path).pending())
-    assert 0 < left < tiles
-    objective = Wave()
-    resumed = sample(objective, PLANE, store_at(path))
-    assert len(objective.batches) == left
-    xr.testing.assert_equal(resumed, sample(Wave(), PLANE))
-    whole = sample(Wave(), PLANE, store_at(path.with_name("whole.zarr")))
-    for name in ("loss", "grad", "status"):
-        assert resumed[name].values.tobytes() == whole[name].values.tobytes()
-    for file in (file for file in path.with_name("whole.zarr").rglob("*") if file.is_file()):
-        assert (path / file.relative_to(path.with_name("whole.zarr"))).read_bytes() == file.read_bytes()
+    undisturbed, found = tmp_path / "undisturbed.zarr", []
+    instants, whole = alone(partial(sampling, undisturbed), tmp_path).changes, sample(Wave(), PLANE)
+    files = {file.relative_to(undisturbed): file for file in undisturbed.rglob("*") if file.is_file()}
+    for instant in range(1, instants + 1, 23):
+        path = tmp_path / f"{instant}.zarr"
+        assert alone(partial(sampling, path), tmp_path, Instant(instant)).returncode == -signal.SIGKILL
+        tiles, pending = len(store_at(path).tiles()), len(store_at(path).pending())
+        found.append(tiles - pending)
+        objective = Wave()
+        resumed = sample(objective, PLANE, store_at(path))
+        assert len(objective.batches) == pending
+        xr.testing.assert_equal(resumed, whole)
+        for name in ("loss", "grad", "status"):
+            assert resumed[name].values.tobytes() == whole[name].values.tobytes()
+        for name, file in files.items():
+            assert (path / name).read_bytes() == file.read_bytes()
+    assert found[0] == 0
+    assert found == sorted(found)
+    assert len(set(found)) > 3
 
 
 def test_progress_counts_up_by_status_and_announces_each_finer_picture(tmp_path):

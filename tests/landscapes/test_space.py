@@ -10,7 +10,7 @@ from gradscape.landscapes.space import ParameterSpace
 SPACE = ParameterSpace(
     ("speed", "angle"), torch.tensor([-2.0, 0.0]).double(), torch.tensor([4.0, 0.5]).double(), ("m/s", "")
 )
-FEW = settings(max_examples=40, deadline=None)
+FEW = settings(max_examples=40)
 
 
 @FEW

@@ -4,11 +4,9 @@ import pickle
 import shutil
 import sys
 import threading
-import time
 import uuid
 from collections import defaultdict
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 
 import cloudpickle
@@ -28,6 +26,9 @@ from gradscape.landscapes.sampling import sample
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.spread import Site, WorkersLostError, equal_batches
 from gradscape.landscapes.store import SliceStore
+
+from ..clock import Clock
+from ..processes import PROCESSES
 
 cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers need not find the tests
 SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
@@ -49,7 +50,7 @@ def same(one: SliceStore, other: SliceStore) -> bool:
 
 @pytest.fixture(scope="module")
 def processes():
-    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(2, mp_context=PROCESSES) as pool:
         yield pool
 
 
@@ -69,11 +70,11 @@ def test_processes_write_the_bits_of_one_and_progress_counts_every_tile(tmp_path
 
 
 def test_threads_share_the_objective_and_a_slice_in_memory(alone):
-    asked = []
+    asked, both = [], threading.Barrier(2)
 
     def counted(x: torch.Tensor) -> torch.Tensor:
         asked.append(threading.get_ident())
-        time.sleep(0.02)
+        both.wait()
         return wave(x)
 
     with ThreadPoolExecutor(2) as threads:
@@ -180,12 +181,23 @@ class Deserted(Executor):
         return Future()
 
 
-def test_workers_that_never_come_back_are_given_up(tmp_path, monkeypatch):
-    monkeypatch.setattr("gradscape.landscapes.spread.POLL", 0.02)
-    monkeypatch.setattr("gradscape.landscapes.spread.PATIENCE", 0.1)
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(spread, "time", clock)
+    return clock
+
+
+def test_workers_that_never_come_back_are_given_up(tmp_path, clock, monkeypatch):
+    def wait(pending, timeout, return_when):
+        clock.sleep(timeout)
+        return set(), pending
+
+    monkeypatch.setattr(spread, "wait", wait)
     store = store_at(tmp_path / "s.zarr")
-    with pytest.raises(WorkersLostError, match=r"none was there for 0\.1 s.*0 of .* the same command goes on"):
+    with pytest.raises(WorkersLostError, match=r"none was there for 60 s.*0 of .* the same command goes on"):
         sample(from_torch(wave, SPACE), PLANE, store, executor=Deserted())
+    assert spread.PATIENCE < clock.now <= spread.PATIENCE + spread.POLL
 
 
 def test_a_worker_of_another_store_or_without_the_file_system_says_so(tmp_path):
@@ -223,20 +235,19 @@ def hidden(monkeypatch):
         return None if times[tile] >= 0 else finished(store, tile)
 
     monkeypatch.setattr(SliceStore, "finished", late)
-    monkeypatch.setattr(spread, "POLL", 0.01)
     return times
 
 
-def test_what_workers_wrote_is_waited_for(tmp_path, alone, hidden):
+def test_what_workers_wrote_is_waited_for(tmp_path, alone, hidden, clock):
     store = store_at(tmp_path / "s.zarr")
     with ThreadPoolExecutor(2) as threads:
         dataset = sample(from_torch(wave, SPACE), PLANE, store, batch=40, executor=threads)
     assert dataset["loss"].equals(alone.dataset()["loss"])
     assert set(hidden.values()) == {-1}  # and read once
+    assert clock.slept == [spread.POLL]
 
 
-def test_what_workers_wrote_and_never_appears_is_an_error(tmp_path, hidden, monkeypatch):
-    monkeypatch.setattr(spread, "LATE", 0.05)
+def test_what_workers_wrote_and_never_appears_is_an_error(tmp_path, hidden, clock):
     store = store_at(tmp_path / "s.zarr")
     hidden[store.tiles()[3]] = math.inf
     with (
@@ -244,6 +255,7 @@ def test_what_workers_wrote_and_never_appears_is_an_error(tmp_path, hidden, monk
         pytest.raises(StoreError, match=r"s\.zarr: 1 tiles that workers finished have not appeared here"),
     ):
         sample(from_torch(wave, SPACE), PLANE, store, batch=40, executor=threads)
+    assert spread.LATE < clock.now <= spread.LATE + spread.POLL
 
 
 def test_a_worker_keeps_a_store_open_until_another_lies_there(tmp_path):

@@ -2,10 +2,9 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import warnings
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -21,6 +20,8 @@ from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.slice_paths import filling
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.store import SliceStore, open_slice, plane_of
+
+from ..processes import Instant, alone
 
 SPACE = ParameterSpace(
     ("x", "y", "z"), -torch.ones(3).double(), torch.tensor([1.0, 2.0, 3.0]).double(), ("m", "m/s", "")
@@ -301,35 +302,18 @@ def test_plain_json_is_asked_for():
         SliceStore.in_memory(PLANE, SPACE, identity={"plane": "mine"})
 
 
-KILLED_WHILE_CREATING = """
-import os, signal, sys, time
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from test_store import filling, make
-path = Path(sys.argv[1])
-for delay in (1, 10, 20, 40, 60, 90):  # ms
-    if not (child := os.fork()):
-        make(path)
-        os._exit(0)
-    time.sleep(delay / 1000)
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    print(delay, filling(path).exists(), len(list(path.parent.iterdir())))
-    if filling(path).exists():
-        break
-store = make(path)
-assert store.pending() == store.tiles()
-"""
-
-
 def test_a_creation_that_is_killed_leaves_nothing_in_the_way(tmp_path):
     """Kill the making of a store at ever later instants; whatever is left, the same call goes on from it."""
-    path = tmp_path / "s.zarr"
-    command = [sys.executable, "-c", KILLED_WHILE_CREATING, str(path)]
-    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert int(done.stdout.split()[-1]) > 1  # some were killed half way
-    assert make(path).pending() == make(path).tiles()
+    left = []
+    for instant in range(1, alone(partial(make, tmp_path / "whole.zarr"), tmp_path).changes + 1, 5):
+        path = tmp_path / str(instant) / "s.zarr"
+        assert alone(partial(make, path), tmp_path, Instant(instant)).returncode == -signal.SIGKILL
+        left.append(len(list(path.parent.glob(".*"))))
+        store = make(path)
+        assert store.pending() == store.tiles()
+        fill(store)
+        assert make(path).pending() == []
+    assert left.count(1) > 1  # some were killed half way
 
 
 def test_hidden_leftovers_are_ignored_and_cleared_away_when_old(tmp_path):
@@ -339,6 +323,7 @@ def test_hidden_leftovers_are_ignored_and_cleared_away_when_old(tmp_path):
             folder.mkdir()
             (folder / "zarr.json").write_text("{")
         os.utime(stale, (0, 0))
+        os.utime(fresh, (2**33, 2**33))  # to come, whenever this is read
         make(tmp_path / "s.zarr")
         assert fresh.exists()
         assert not stale.exists()
@@ -399,42 +384,26 @@ def test_threads_that_gather_layouts_warn_of_nothing(tmp_path):
             pass
 
 
-KILLED_WHILE_FINISHING = """
-import os, signal, sys
-from pathlib import Path
-from gradscape.landscapes import files, store
-from test_store import fill, make
-path, instant = Path(sys.argv[1]), sys.argv[2]
-
-def die(*given, **options):
-    os.kill(os.getpid(), signal.SIGKILL)
-
-found = fill(make(path))
-dataset = found.dataset()
-if instant == "written":  # whole, but not in its place
-    store.consolidate = die
-elif instant == "placed":  # before its tiles are removed
-    store.discard = die
-else:  # in the middle of their removal
-    def torn(folder, **how):
-        for chunks in Path(folder).rglob("c"):
-            os.rename(chunks, path.parent.with_name("torn"))
-            die()
-    files.shutil.rmtree = torn
-found.finish(dataset)
-"""
+def finishing(path):
+    store = make(path)
+    store.finish(store.dataset())
 
 
-@pytest.mark.parametrize("instant", ["written", "placed", "removed"])
-def test_a_kill_while_a_slice_is_finished_leaves_it_whole(tmp_path, instant):
-    path = tmp_path / "desk" / "slice.zarr"
-    command = [sys.executable, "-c", KILLED_WHILE_FINISHING, str(path), instant]
-    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
-    assert done.returncode == -signal.SIGKILL, done.stderr
-    left = make(path)
-    assert left.pending() == []
-    left.finish(left.dataset())
+def test_a_kill_at_any_instant_of_finishing_leaves_a_slice_whole(tmp_path):
+    """Kill as the tiles are copied, as the copy takes its place, and in the middle of the tiles' removal."""
     whole = fill(SliceStore.in_memory(PLANE, SPACE, identity=IDENTITY)).dataset()
-    for name in ("loss", "grad", "status"):
-        np.testing.assert_array_equal(open_slice(path)[name], whole[name])
-    assert [file.name for file in path.parent.iterdir() if not file.name.startswith(".")] == ["slice.zarr"]
+    fill(make(tmp_path / "0" / "slice.zarr"))
+    shutil.copytree(tmp_path / "0", tmp_path / "filled")
+    instants, places = alone(partial(finishing, tmp_path / "0" / "slice.zarr"), tmp_path).changes, set()
+    for instant in range(1, instants + 1, 7):
+        desk = shutil.copytree(tmp_path / "filled", tmp_path / str(instant))
+        path = desk / "slice.zarr"
+        assert alone(partial(finishing, path), tmp_path, Instant(instant)).returncode == -signal.SIGKILL
+        places.add(frozenset(file.name for file in desk.iterdir() if not file.name.startswith(".")))
+        left = make(path)
+        assert left.pending() == []
+        left.finish(left.dataset())
+        for name in ("loss", "grad", "status"):
+            np.testing.assert_array_equal(open_slice(path)[name], whole[name])
+        assert [file.name for file in desk.iterdir() if not file.name.startswith(".")] == ["slice.zarr"]
+    assert places >= {frozenset({"slice.filling.zarr"}), frozenset({"slice.zarr"})}

@@ -1,3 +1,6 @@
+import math
+import subprocess
+import sys
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -154,6 +157,7 @@ def test_equal_runs_give_equal_recordings_and_others_do_not(
 @pytest.fixture
 def address(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setattr(viewer, "PATIENCE", math.inf)
     with viewer.served(path) as address:
         yield address
 
@@ -193,3 +197,10 @@ def test_every_label_is_legible_on_what_the_viewer_lays_under_it(held, ground: i
             assert (high + 0.05) / (low + 0.05) > 3.5, label
             seen += len(label)
     assert seen > 15
+
+
+def test_a_server_that_ends_before_it_answers_is_not_waited_for(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(viewer, "PATIENCE", math.inf)
+    monkeypatch.setattr(viewer, "_rerun", lambda *_, log: subprocess.Popen([sys.executable, "-c", ""], stderr=log))
+    with pytest.raises(OSError, match="rerun's web viewer does not answer"), viewer.served(path):
+        pass

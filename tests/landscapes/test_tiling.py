@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from gradscape.landscapes.tiling import coarse_to_fine, tile_side
 
 POINTS = st.integers(2, 600)
-FEW = settings(max_examples=40, deadline=None)
+FEW = settings(max_examples=40)
 
 
 @FEW

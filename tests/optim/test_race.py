@@ -1,8 +1,8 @@
 import dataclasses
 import math
 import threading
-import time
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -270,16 +270,15 @@ def test_a_finished_race_computes_nothing_and_touches_no_file(tmp_path):
     assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*")} == before
 
 
-def test_a_run_that_breaks_ends_those_under_way():
-    broken = threading.Event()
+def test_a_run_that_breaks_ends_those_under_way(monkeypatch):
+    stop = threading.Event()
+    monkeypatch.setattr("gradscape.optim.race.threading", SimpleNamespace(Event=lambda: stop))
 
     class Broken(Bowl):
         def evaluate(self, x, *, grad=True):
             if grad:
-                broken.set()
                 raise ValueError("no gradients here")
-            broken.wait()
-            time.sleep(0.2)  # for the race to hear of it
+            stop.wait()  # until the race has heard of it
             return super().evaluate(x, grad=grad)
 
     objective = Broken()

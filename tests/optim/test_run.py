@@ -2,7 +2,6 @@ import fcntl
 import json
 import os
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +13,8 @@ from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
 from gradscape.optim.run import CHUNK, STATE, Run, is_run
+
+from ..clock import Clock
 
 SPACE = ParameterSpace(("speed", "angle"), torch.tensor([-1.0, 0.0]), torch.tensor([1.0, 3.0]), ("m/s", "rad"))
 IDENTITY = {"objective": "hill", "fidelity": "draft", "method": "walk", "seed": 4}
@@ -172,18 +173,17 @@ def test_one_process_at_a_time_fills_a_run(tmp_path: Path) -> None:
 
 
 def test_writing_takes_a_twentieth_of_the_time_at_most(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    now, saved = 0.0, []
-    monkeypatch.setattr("gradscape.optim.run.time", SimpleNamespace(monotonic=lambda: now))
+    clock, saved = Clock(), []
+    monkeypatch.setattr("gradscape.optim.run.time", clock)
     run = run_at(tmp_path / "run.zarr")
 
     def slow_state() -> bytes:
-        nonlocal now
-        now += 0.4
+        clock.sleep(0.4)
         saved.append(run.count)
         return b""
 
     for number in range(60):
-        now += 0.3
+        clock.sleep(0.3)
         run.append(*points(1, start=number), Kind.RANDOM, 0.3, slow_state)
     assert saved == [4, 31, 58]  # after the first second, then after 0.4 s / 5 % = 8 s each
     assert json.loads((tmp_path / "run.zarr" / STATE).read_bytes().splitlines()[0])["rows"] == 58

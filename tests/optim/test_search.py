@@ -1,6 +1,5 @@
-import subprocess
-import sys
-import time
+import signal
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,10 @@ from gradscape.optim.base import Kind, NoOptions, Optimizer, Points, Proposal
 from gradscape.optim.cmaes import CMAES
 from gradscape.optim.random import RandomSearch
 from gradscape.optim.run import Run
-from gradscape.optim.search import Progress, episode_cost, search
+from gradscape.optim.search import LONG, MOMENT, Progress, episode_cost, search
+
+from ..clock import Clock
+from ..processes import Instant, alone
 
 SPACE = ParameterSpace(("a", "b", "c"), torch.tensor([-2.0, 0, 5]), torch.tensor([2.0, 9, 6]), ("m", "s", ""))
 
@@ -25,15 +27,14 @@ class Pit:
 
     space, name = SPACE, "pit"
 
-    def __init__(self, *, stop_after: int | None = None, pause: float = 0.0):
+    def __init__(self, *, stop_after: int | None = None):
         self.batches: list[int] = []
         self.with_gradient = 0
-        self.stop_after, self.pause = stop_after, pause
+        self.stop_after = stop_after
 
     def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
         if self.stop_after is not None and len(self.batches) >= self.stop_after:
             raise KeyboardInterrupt
-        time.sleep(self.pause * len(x))
         self.batches.append(len(x))
         self.with_gradient += grad * len(x)
         u = SPACE.to_unit(x)
@@ -146,41 +147,23 @@ def test_a_run_in_memory_can_be_continued_too() -> None:
     )
 
 
-KILLED_WHILE_SEARCHING = """
-import os, signal, sys, time
-from pathlib import Path
-from gradscape.optim import run
-from test_search import CMAES, Pit, filled
-run.PAUSE = 0.02
-path = Path(sys.argv[1])
-
-def told():
-    return run.Run.open(path).count if path.exists() else 0
-
-for delay in (0.02, 0.05, 0.03, 0.01):  # together too short for the budget, however fast the machine
-    before = told()
-    if not (child := os.fork()):
-        filled(path, CMAES, budget=300, objective=Pit(pause=0.01))
-        os._exit(0)
-    while told() == before:  # however slow it is
-        time.sleep(0.002)
-    time.sleep(delay)
-    os.kill(child, signal.SIGKILL)
-    _, status = os.waitpid(child, 0)
-    assert os.WIFSIGNALED(status), "finished before it was killed"
-"""
+def searching(path: Path) -> None:
+    filled(path, CMAES, budget=45)
 
 
 def test_sigkill_at_any_instant_changes_no_bit(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", KILLED_WHILE_SEARCHING, str(tmp_path / "run.zarr")]
-    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    kept = run_at(tmp_path / "run.zarr", budget=300).count
-    assert 0 < kept < 300
-    objective = Pit()
-    resumed = filled(tmp_path / "run.zarr", CMAES, budget=300, objective=objective)
-    assert sum(objective.batches) == 300 - kept
-    xr.testing.assert_identical(resumed, filled(tmp_path / "whole.zarr", CMAES, budget=300))
+    instants = alone(partial(searching, tmp_path / "whole.zarr"), tmp_path).changes
+    whole, found = run_at(tmp_path / "whole.zarr", budget=45).table().drop_vars("seconds"), []
+    for instant in range(1, instants + 1, 17):
+        path = tmp_path / f"{instant}.zarr"
+        assert alone(partial(searching, path), tmp_path, Instant(instant)).returncode == -signal.SIGKILL
+        found.append(run_at(path, budget=45).count)
+        objective = Pit()
+        xr.testing.assert_identical(filled(path, CMAES, budget=45, objective=objective), whole)
+        assert sum(objective.batches) == 45 - found[-1]
+    assert found[0] == 0
+    assert found == sorted(found)
+    assert len(set(found)) > 3
 
 
 def test_forward_equivalents_count_a_gradient_for_what_it_costs(tmp_path: Path) -> None:
@@ -193,24 +176,43 @@ def test_forward_equivalents_count_a_gradient_for_what_it_costs(tmp_path: Path) 
     assert Run.open(tmp_path / "run.zarr").gradient_cost == 2.5
 
 
-def test_what_a_gradient_costs_is_measured() -> None:
-    class Slow(Pit):
-        def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
-            time.sleep(0.03 if grad else 0.01)
-            return super().evaluate(x, grad=grad)
+class Timed(Pit):
+    """A pit whose episodes take a hundredth of a second, three with their gradient, the first ones `late` more."""
 
-    cost = episode_cost(Slow())
-    assert cost.forward == pytest.approx(0.01, rel=0.3)
-    assert cost.ratio == pytest.approx(3.0, rel=0.3)
-    assert search(Slow(), Mixed(SPACE), budget=3).gradient_cost == pytest.approx(3.0, rel=0.3)
+    def __init__(self, clock: Clock, late: tuple[float, ...] = ()):
+        super().__init__()
+        self.clock, self.late = clock, iter(late)
+
+    def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
+        self.clock.sleep((0.03 if grad else 0.01) * len(x) + next(self.late, 0.0))
+        return super().evaluate(x, grad=grad)
 
 
-def test_seconds_add_up_to_the_time_it_took() -> None:
-    start = time.perf_counter()
-    seconds = search(Pit(pause=0.01), RandomSearch(SPACE), budget=40).table()["seconds"].values
-    assert 0.4 <= seconds[-1] <= time.perf_counter() - start
-    assert 0.16 <= seconds[15] <= seconds[-1] - 0.24
-    assert (np.diff(seconds) >= 0).all()
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr("gradscape.optim.search.time", clock)
+    return clock
+
+
+def test_what_a_gradient_costs_is_measured_at_its_best_within_a_moment(clock: Clock) -> None:
+    objective = Timed(clock, late=(0.2, 0.1, 0.004, 0.0, 0.0, 0.006))
+    cost = episode_cost(objective)
+    assert (cost.forward, cost.gradient) == (pytest.approx(0.01), pytest.approx(0.03))
+    assert cost.ratio == pytest.approx(3.0)
+    assert MOMENT <= clock.now < MOMENT + 0.04
+    assert search(Timed(clock), Mixed(SPACE), budget=3).gradient_cost == pytest.approx(3.0)
+
+
+def test_a_slow_first_episode_must_do(clock: Clock) -> None:
+    objective = Timed(clock, late=(LONG,))
+    assert episode_cost(objective).gradient == pytest.approx(0.03)
+    assert objective.batches == [1, 1]
+
+
+def test_seconds_add_up_to_the_time_it_took(clock: Clock) -> None:
+    table = search(Timed(clock), RandomSearch(SPACE), budget=40).table()
+    np.testing.assert_allclose(table["seconds"], np.minimum(np.arange(16, 64) // 16 * 0.16, 0.4)[:40])
 
 
 def test_progress_counts_up_and_knows_the_best(tmp_path: Path) -> None:

@@ -198,7 +198,7 @@ def flights(board, dt, seed, rows=16, duration=2.0, name="float64", contacts="im
     return thrown, angle, used
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     dt=st.floats(1 / 500, 1 / 6),
     restitution=st.sampled_from([0.0, 0.3, 0.6, 1.0]),

@@ -71,7 +71,7 @@ def test_update_advances_by_the_motion_before_it_returns():
     torch.testing.assert_close(new, after((IDENTITY + 0.1 * C) @ F), rtol=0, atol=1e-13)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.tuples(*[st.floats(-2.5, 2.5)] * 3), st.integers(0, 999))
 def test_shape_flows_and_volume_returns(logs, seed):
     """However it is strained, it bears no more than kappa, and keeps its volume and its principal directions."""

@@ -1,0 +1,102 @@
+"""Work in a process of its own, which may be stopped at an exact instant: as it changes its folder for the n-th time.
+
+What a stopped job leaves behind differs only by what it has made, renamed and removed, so instants are numbered by that
+and not by seconds: stopped at the same one, a process has done the same on any machine. What else a job does when a
+while has passed, it does always or never.
+"""
+
+import math
+import os
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import count
+from multiprocessing import get_context
+from pathlib import Path
+from signal import SIGKILL, Signals
+from typing import Any
+
+import pytest
+import zarr
+
+from gradscape.cli import main
+from gradscape.landscapes import job
+from gradscape.optim import run, search
+
+from .command import Said, leave_blank
+
+LOADED = (
+    *("search_report", "race_report", "sweep_report", "gallery_report", "envs.bounce", "envs.engines.rigid"),
+    *("envs.functions", "envs.points", "optim.race", "optim.random", "optim.cmaes", "optim.descent", "landscapes.job"),
+    *(f"landscapes.draw.{name}" for name in ("contour", "profile", "curve", "sweep", "sweep_stream", "race")),
+)
+CHANGES = {"os.mkdir", "os.rename", "os.remove", "os.rmdir"}  # events of PEP 578
+
+# Processes are forked from one that has loaded what they need, and has used nothing of it.
+PROCESSES = get_context("forkserver")
+OTHERS = ("pytest", "hypothesis", "dask.array", "jinja2", "imageio_ffmpeg")  # Dask's arrays are loaded by xarray
+PROCESSES.set_forkserver_preload([*OTHERS, *(f"gradscape.{name}" for name in LOADED)])
+
+
+@dataclass(frozen=True)
+class Instant:
+    """The moment before a process makes, renames or removes something whose path holds `of` for the `number`-th time.
+
+    It gets the signal `by` then; never if the number is 0.
+    """
+
+    number: int = 0
+    of: str = ""
+    by: Signals = SIGKILL
+
+
+@dataclass(frozen=True)
+class Ended(Said):
+    """What a process said, and how many changes of its folder it has made of those that its instant counts."""
+
+    changes: int
+
+
+def alone(work: Callable[[], object], folder: Path, stop: Instant | None = None) -> Ended:
+    """Do work in a process of its own and in a folder, and wait for its end."""
+    changes = PROCESSES.Value("i", 0, lock=False)
+    with tempfile.TemporaryDirectory() as said:
+        process = PROCESSES.Process(target=_work, args=(work, folder, Path(said), changes, stop or Instant()))
+        process.start()
+        process.join()
+        out, err = ((Path(said) / name).read_text() for name in ("out", "err"))
+    assert process.exitcode is not None
+    return Ended(process.exitcode, out, err, changes.value)
+
+
+def landscape(*arguments: str) -> None:
+    """Run the command."""
+    sys.argv = ["landscape", *arguments]
+    main(list(arguments))
+
+
+def _work(work: Callable[[], object], folder: Path, said: Path, changes: Any, stop: Instant) -> None:
+    os.chdir(folder)
+    for stream, name in ((1, "out"), (2, "err")):
+        os.dup2(os.open(said / name, os.O_WRONLY | os.O_CREAT), stream)
+    numbers, within = count(1), os.getcwd() + os.sep
+
+    def watch(event: str, arguments: tuple[Any, ...]) -> None:
+        if event in CHANGES or (event == "open" and _makes(*arguments)):
+            path = os.path.abspath(os.fsdecode(arguments[0]))
+            if path.startswith(within) and stop.of in path:
+                changes.value = number = next(numbers)
+                if number == stop.number:
+                    os.kill(os.getpid(), stop.by)
+
+    run.PAUSE, run.SHARE, search.MOMENT = 0.0, math.inf, 0.0  # writes after every proposal, times two episodes
+    job.PAUSE = math.inf  # draws no coarse picture
+    zarr.config.set({"threading.max_workers": 1})  # so that its threads never take turns
+    leave_blank(pytest.MonkeyPatch())
+    sys.addaudithook(watch)
+    work()
+
+
+def _makes(path: object, mode: str | None, flags: int) -> bool:
+    return not isinstance(path, int) and bool(flags & os.O_CREAT)
