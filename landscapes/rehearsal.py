@@ -16,17 +16,15 @@ from pathlib import Path
 import numpy as np
 import torch
 import xarray as xr
-import zarr
 from jaxtyping import Float
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
-from zarr.storage import MemoryStore
 
 from .job import PAUSE, first_points
-from .layout import SMALL, create_array
 from .objective import Evaluation, Objective
 from .sampling import Progress, sample
+from .slice_arrays import write_finished
 from .space import ParameterSpace
 from .store import SliceStore
 
@@ -34,7 +32,6 @@ PATIENCE = 2.0  # seconds that a rehearsal goes on writing tiles
 SEEN = 1.0  # seconds for the evaluations that are repeated
 JITTER = 1e-3  # by how much, relatively, a repeated value differs from the true one
 BLOCK = 1024  # points that are made up at a time
-MOST = 1 << 20  # numbers that are packed to see how well they compress
 
 
 class Alike:
@@ -104,13 +101,20 @@ class Alike:
 
 
 @dataclass(frozen=True)
+class Room:
+    """Room on a disk: bytes, and the number of files and folders."""
+
+    bytes: int
+    files: int
+
+
+@dataclass(frozen=True)
 class Stored:
-    """Say what writing a slice takes [s], and its room [bytes], its files and folders as it is filled, and packed."""
+    """Say what writing a slice takes [s], its room once it is finished, and that of its tiles until then."""
 
     seconds: float
-    bytes: int
-    inodes: int
-    packed: int
+    finished: Room
+    filling: Room
 
 
 class _Enough(Exception):  # noqa: N818 -- nothing went wrong
@@ -123,19 +127,25 @@ def stored(alike: Alike, store: SliceStore) -> Stored:
     if path is None:
         raise ValueError("a rehearsal needs a store on disk; got one in memory")
     tiles, began = len(store.tiles()), time.perf_counter() - alike.seconds
-    before, done, took = _room(path), 0, 0.0
+    before, done, took, total = room_of(store.place or path), 0, 0.0, math.prod(store.shape)
 
     def follow(now: Progress) -> None:
         nonlocal done, took
         done, took = now.done, time.perf_counter() - alike.seconds - began
-        if done and took > PATIENCE:
+        if done == total or (done and took > PATIENCE):
             raise _Enough
 
     with contextlib.suppress(_Enough):
         sample(alike, store.plane, store, grad=store.grad, progress=follow)
-    after, total = _room(path), math.prod(store.shape)
-    grown = [round(old + (new - old) * total / done) for old, new in zip(before, after, strict=True)]
-    return Stored(took * total / done, grown[0], min(grown[1], before[1] + 6 * tiles), _packed(alike, store))
+    after = room_of(store.place or path)
+    size, files = (
+        round(old + (new - old) * total / done)
+        for old, new in ((before.bytes, after.bytes), (before.files, after.files))
+    )
+    whole, began = alike.dataset(store), time.perf_counter()
+    write_finished(path, whole)
+    seconds = took * total / done + time.perf_counter() - began
+    return Stored(seconds, room_of(path), Room(size, min(files, before.files + 6 * tiles)))
 
 
 def drawn(draw: Callable[[], object], alike: Alike | None = None) -> tuple[float, float]:
@@ -157,24 +167,7 @@ def pictures(store: SliceStore, batches: int, seconds: float, once: float) -> in
     return 1 + min(levels, batches, 1 + int(seconds / (PAUSE + once)))
 
 
-def _room(path: Path) -> tuple[int, int]:
-    """Return the bytes, and the number of files and folders."""
-    there = list(path.rglob("*"))
-    return sum(one.stat().st_size for one in there if one.is_file()), len(there)
-
-
-def _packed(alike: Alike, store: SliceStore) -> int:
-    """Return the bytes of the values once packed."""
-    total = math.prod(store.shape)
-    count = min(total, MOST // (2 + alike.space.dim * store.grad))
-    said = alike.evaluate(first_points(store, store.tiles(), count), grad=store.grad)
-    group = zarr.create_group(MemoryStore(), zarr_format=3)
-    size = 0
-    for name, values in (("loss", said.loss), ("grad", said.grad), ("status", said.status)):
-        if values is not None:
-            kind = "int8" if name == "status" else "float64"
-            shape = tuple(values.shape)
-            array = create_array(group, name, shape, shape, (), kind, codecs=SMALL)
-            array[...] = values.numpy()
-            size += array.nbytes_stored()
-    return size * total // count
+def room_of(path: Path) -> Room:
+    """Return the room of what is in a folder, which itself counts as one of its folders."""
+    there = [path, *path.rglob("*")]
+    return Room(sum(one.stat().st_size for one in there if one.is_file()), len(there))

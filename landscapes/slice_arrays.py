@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import zarr
 from numpy.typing import NDArray
 
 from .identity import stored_identity
-from .layout import CODECS, SMALL, analysis_chunks, create_array, flags
+from .layout import CODECS, SMALL, analysis_chunks, consolidate, create_array, flags
 from .objective import Status
 from .plane import Plane
 from .space import ParameterSpace
@@ -61,8 +62,9 @@ def lay_out(
     _keep(group, "unit", axes["unit"], ("dim",), {"long_name": "unit of the parameter"})
 
 
-def write_finished(group: zarr.Group, dataset: xr.Dataset) -> None:
-    """Write a slice that is complete: ascending, in chunks as analysis wants them."""
+def write_finished(path: Path, dataset: xr.Dataset) -> None:
+    """Write a slice that is complete to a new folder: ascending, in chunks as analysis wants them."""
+    group = zarr.create_group(path, zarr_format=3)
     group.attrs.update({**dataset.attrs, **COORDINATES})
     samples = dataset["loss"].shape
     for name, values in dataset.variables.items():
@@ -75,6 +77,7 @@ def write_finished(group: zarr.Group, dataset: xr.Dataset) -> None:
             array[...] = values.to_numpy()
         else:
             _keep(group, str(name), values.to_numpy(), dims, values.attrs)
+    consolidate(path)
 
 
 def attributes_of(node: zarr.Group | zarr.Array[Any]) -> dict[str, Any]:

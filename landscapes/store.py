@@ -268,8 +268,7 @@ class SliceStore:
         if bool((dataset["status"] == Status.MISSING).any()):
             raise StoreError(f"{self.path} is not complete; run the command that samples it again")
         with contextlib.suppress(FileExistsError), placing(self.path, overwrite=False) as new:
-            write_finished(zarr.create_group(new, zarr_format=3), dataset)
-            consolidate(new)
+            write_finished(new, dataset)
         self._move_on(self.path)
 
     def coarse(self) -> xr.Dataset | None:

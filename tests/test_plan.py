@@ -8,11 +8,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import xarray as xr
 
 import gradscape
 from gradscape.envs.base import Environment
 from gradscape.landscapes.draw import page, sweep
-from gradscape.landscapes.rehearsal import Alike, drawn, pictures
+from gradscape.landscapes.rehearsal import Alike, drawn, pictures, room_of
 from gradscape.landscapes.store import SliceStore
 
 from .clock import Clock
@@ -58,20 +59,31 @@ def plan(run: Callable[..., Said], cwd: Path, *arguments: str) -> dict[str, Any]
 
 
 @pytest.mark.parametrize("name", JOBS)
-def test_the_parts_of_a_plan_add_up_to_what_the_job_takes(run: Callable[..., Said], tmp_path: Path, name: str) -> None:
+def test_the_parts_of_a_plan_add_up_to_what_the_job_takes(
+    run: Callable[..., Said], tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
     planned, verb = plan(run, tmp_path, *JOBS[name]), "sweep" if name == "sweep" else "slice"
+    finish, tiles, before = SliceStore.finish, [], clock.slept.count(TILE)
+
+    def finished(store: SliceStore, dataset: xr.Dataset) -> None:
+        assert store.place is not None
+        tiles.append(room_of(store.place))
+        finish(store, dataset)
+
+    monkeypatch.setattr(SliceStore, "finish", finished)
     done = json.loads(run(verb, *JOBS[name], "--out", "made", "--json", cwd=tmp_path).stdout)
-    there = list((tmp_path / "made").rglob("*"))
-    room = sum(one.stat().st_size for one in there if one.is_file())
-    tiles = sum(len(SliceStore.open(path).tiles()) for path in there if path.suffix == ".zarr")
+    room = room_of(tmp_path / "made")
     seconds, guess = planned["seconds"], 1e-3 if verb == "sweep" else PICTURE  # when a picture is due
     assert planned["episodes"] == done["episodes"]
     assert seconds["simulating"] == pytest.approx(EPISODE * done["episodes"])
-    assert seconds["writing"] == pytest.approx(TILE * tiles)
+    assert seconds["writing"] == pytest.approx(TILE * (clock.slept.count(TILE) - before))
     parts = seconds["simulating"] + seconds["writing"] + seconds["drawing"]
     assert parts == pytest.approx(done["seconds"], abs=guess)
-    assert planned["disk"]["bytes"] == pytest.approx(room, rel=0.25)
-    assert planned["disk"]["files"] == pytest.approx(len(there), rel=0.02)
+    assert planned["disk"]["bytes"] == pytest.approx(room.bytes, rel=0.25)
+    assert planned["disk"]["files"] == room.files - 1  # all that is in the folder
+    filling = planned["disk"]["filling"]
+    assert filling["bytes"] == pytest.approx(max(one.bytes for one in tiles), rel=0.25)
+    assert filling["files"] == pytest.approx(max(one.files for one in tiles), rel=0.02)
 
 
 def test_a_plan_needs_the_memory_that_is_held_and_that_of_the_slice_to_come(

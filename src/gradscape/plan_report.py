@@ -144,8 +144,7 @@ def _figure(console: Console, figure: Figure, device: str, *, grad: bool, began:
     plane = plane_of_figure(figure, env, figure.resolution)
     with _rehearsing(console, env), tempfile.TemporaryDirectory() as folder:
         found = of_slice(env, plane, Path(folder), grad=grad, began=began)
-    found = _there(found, env, where, grad=grad)
-    return replace(found, disk=found.packed), _subject(env, plane, where)  # the gallery packs what it has sampled
+    return _there(found, env, where, grad=grad), _subject(env, plane, where)
 
 
 def _kind(figure: Figure) -> str:
@@ -183,7 +182,16 @@ def _rows(record: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
     yield "devices", f"{record['device_hours']:.3g} h", "of simulating"
     gpu = f", {size(record['memory']['device'])} of the device" if record["memory"]["device"] else ""
     yield "memory", size(record["memory"]["host"]), f"of each worker{gpu}"
-    yield "disk", size(disk["bytes"]), f"{disk['files']} files and folders; {size(disk['packed'])} once packed"
+    yield "disk", size(disk["bytes"]), f"{disk['files']} files and folders"
+    tiles = disk["filling"]
+    yield "", size(tiles["bytes"]), f"more until a slice is finished, {tiles['files']} files and folders"
+
+
+def _rooms(disks: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Add up the room of slices that are sampled one after another."""
+    tiles = [disk["filling"] for disk in disks]
+    whole = {name: sum(disk[name] for disk in disks) for name in ("bytes", "files")}
+    return {**whole, "filling": {name: max((one[name] for one in tiles), default=0) for name in ("bytes", "files")}}
 
 
 def _print_figures(records: Sequence[dict[str, Any]], as_json: bool) -> None:
@@ -193,7 +201,7 @@ def _print_figures(records: Sequence[dict[str, Any]], as_json: bool) -> None:
         "episodes": sum(record["episodes"] for record in records),
         "device_hours": sum(record["device_hours"] for record in records),
         "wall": sum(record["wall"] for record in records),
-        "disk": {name: sum(record["disk"][name] for record in records) for name in ("bytes", "packed", "files")},
+        "disk": _rooms([record["disk"] for record in records]),
         "memory": {name: max((record["memory"][name] for record in records), default=0) for name in ("host", "device")},
     }
     if as_json:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ from .swept import SMOOTHING, moved
 if TYPE_CHECKING:
     from .envs.base import Environment
     from .landscapes.plane import Plane
+    from .landscapes.rehearsal import Room
 
 HERE = "measured here, now"
 FEW, MORE = 2, 8  # frames of which films are made, to see what each frame takes
@@ -27,8 +28,9 @@ SUMMARY = 1000  # bytes of a slice's summary, about
 class Plan:
     """Say what a job takes, in seconds, bytes, files and folders.
 
-    `start` is what passes until the first episode that counts. `memory` is of the host, `gpu` of the device. `rate`
-    says where the seconds of an episode are from.
+    `start` is what passes until the first episode that counts. `memory` is of the host, `gpu` of the device. `disk` is
+    what results take, `filling` what the tiles of a slice take until it is finished. `rate` says where the seconds of
+    an episode are from.
     """
 
     episodes: int
@@ -39,9 +41,8 @@ class Plan:
     drawing: float
     memory: int
     gpu: int
-    disk: int
-    packed: int
-    files: int
+    disk: Room
+    filling: Room
     rate: str = HERE
 
     def wall(self, workers: int) -> float:
@@ -56,14 +57,14 @@ class Plan:
             **{"episodes": self.episodes, "batches": self.batches, "workers": workers, "wall": self.wall(workers)},
             **{"seconds": seconds, "device_hours": self.simulating / 3600, "rate": self.rate},
             "memory": {"host": self.memory, "device": self.gpu},
-            "disk": {"bytes": self.disk, "packed": self.packed, "files": self.files},
+            "disk": {**asdict(self.disk), "filling": asdict(self.filling)},
         }
 
 
 def of_slice(env: Environment, plane: Plane, folder: Path, *, grad: bool, began: float) -> Plan:
     """Plan a slice whose command would have begun at `began` on `time.perf_counter`'s clock."""
     from .landscapes.job import Job, peak_memory
-    from .landscapes.rehearsal import Alike, drawn, pictures, stored
+    from .landscapes.rehearsal import Alike, Room, drawn, pictures, stored
 
     job = Job.open(
         env, plane, folder, picture_of(env, plane),
@@ -72,14 +73,14 @@ def of_slice(env: Environment, plane: Plane, folder: Path, *, grad: bool, began:
     cost = job.cost()
     start, memory = time.perf_counter() - began, cost.memory - peak_memory()
     alike = Alike.of(env, job.store, cost.seconds / cost.episodes)
-    room = stored(alike, job.store)
+    kept = stored(alike, job.store)
     loading, once = drawn(lambda: job._save(alike.dataset(job.store)), alike)
     batches = -(-cost.episodes // env.preferred_batch)
-    count = pictures(job.store, batches, cost.seconds + room.seconds, once)
+    count = pictures(job.store, batches, cost.seconds + kept.seconds, once)
     extra = SUMMARY + sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
     return Plan(
-        cost.episodes, batches, start, cost.seconds, room.seconds, loading + count * once,
-        memory + peak_memory(), _gpu(env), room.bytes + extra, room.packed + extra, room.inodes + 2,
+        cost.episodes, batches, start, cost.seconds, kept.seconds, loading + count * once, memory + peak_memory(),
+        _gpu(env), Room(kept.finished.bytes + extra, kept.finished.files + 2), kept.filling,
     )  # fmt: skip
 
 
@@ -100,17 +101,17 @@ def of_sweep(
     seconds, memory = job.cost()
     start, last = time.perf_counter() - began, len(job.stores) - 1
     from .landscapes.job import peak_memory
-    from .landscapes.rehearsal import Alike, stored
+    from .landscapes.rehearsal import Alike, Room, stored
 
     memory -= peak_memory()
     alike = Alike.of(swept.env_at(last), job.stores[last], seconds / job.total)
-    room = stored(alike, job.stores[last])
+    kept = stored(alike, job.stores[last])
     drawing, films = _filming(job, seconds / job.total, folder / "films", frames)
     count, batches = len(job.stores), sum(-(-math.prod(s.shape) // env.preferred_batch) for s in job.stores)
     extra = films + SUMMARY + 250 * frames
     return Plan(
-        job.total, batches, start, seconds, count * room.seconds, drawing, memory + peak_memory(), _gpu(env),
-        count * room.bytes + extra, count * room.packed + extra, count * (room.inodes + 1) + 5,
+        job.total, batches, start, seconds, count * kept.seconds, drawing, memory + peak_memory(), _gpu(env),
+        Room(count * kept.finished.bytes + extra, count * kept.finished.files + 5), kept.filling,
     )  # fmt: skip
 
 
