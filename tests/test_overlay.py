@@ -149,7 +149,7 @@ def test_another_fidelity_is_drawn_with_a_warning(run: Callable[..., Said]) -> N
         ("view cut/landscape.png", "there is no display here to open cut/landscape.png"),
         ("view cut/slice.zarr", "there is no display here to open cut/landscape.png"),
         ("view race/cma-es-0", "there is no display here to open race/cma-es-0/progress.png"),
-        ("view race", "race holds none of overlay.rrd, race.png"),
+        ("view race", "race holds none of index.html, overlay.rrd, race.png"),
         ("view cut --serve", "--serve shows recordings (.rrd)"),
     ],
 )

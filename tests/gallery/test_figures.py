@@ -40,7 +40,7 @@ def test_figures_are_chosen_by_id_and_by_environment() -> None:
         ("", "needs figures"),
         ('[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1]', "lacks .'says'"),
         ('[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1]\nsays = ""\ndim = 3', "unknown .'dim'"),
-        ('[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0]\nsays = ""', "needs two dims"),
+        ('[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1, 2]\nsays = ""', "needs one dimension or two"),
         (2 * '[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1]\nsays = ""\n', "repeated: a"),
     ],
 )

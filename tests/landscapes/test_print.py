@@ -1,6 +1,7 @@
 """Every figure function: shown in a notebook, drawn for print at a journal's widths, saved by its ending."""
 
 import itertools
+import json
 import pkgutil
 import re
 from collections.abc import Callable
@@ -44,7 +45,7 @@ COMMAND = "landscape slice bowl --dims speed lift --resolution 16 --fidelity sta
 
 def dated(dataset):
     """Give a slice the provenance that one from the command has."""
-    return dataset.assign_attrs(provenance={"created": "2026-11-21", "command": COMMAND})
+    return dataset.assign_attrs(provenance=json.dumps({"created": "2026-11-21", "command": COMMAND}))
 
 
 PLANE, LONG = dated(DATASET), dated(LINE)
@@ -73,7 +74,8 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
     "profile_figure": [lambda width: profile_figure(LONG, events={"bounces": BOUNCES}, width=width)],
     "run_figure": [
         lambda width: run_figure(
-            table([9.0, 3.0, np.nan, 0.01], [0, 1, 2, 3]).assign_attrs(provenance={"command": COMMAND}), width=width
+            table([9.0, 3.0, np.nan, 0.01], [0, 1, 2, 3]).assign_attrs(provenance=json.dumps({"command": COMMAND})),
+            width=width,
         )
     ],
     "quality_figure": [

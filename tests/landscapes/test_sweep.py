@@ -31,6 +31,7 @@ class Bowl:
 
     space = SPACE
     name = "bowl"
+    beyond_box = True  # where c is 1.25
 
     def evaluate(self, x, *, grad=True):
         away = torch.stack([x[:, 0] - x[:, 2], x[:, 1]], dim=1)
