@@ -49,7 +49,7 @@ def reached(start: Iterable[Path], folder: Path, engine: str) -> list[Path]:
         file = left.pop()
         if file not in found and file.relative_to(folder).as_posix() not in NO_NUMBERS:
             found.add(file)
-            left += _imported(file, folder, engine)
+            left += imported(file, folder, engine)
     return sorted(found)
 
 
@@ -84,8 +84,10 @@ def _file(kind: type) -> Path | None:
         return None
 
 
-def _imported(file: Path, folder: Path, engine: str) -> Iterator[Path]:
-    """Yield the files of a folder that one of them imports while it runs."""
+@cache
+def imported(file: Path, folder: Path, engine: str) -> tuple[Path, ...]:
+    """Return the files of a folder that one of them imports while it runs."""
+    found = []
     for node in _running(ast.parse(file.read_text())):
         if isinstance(node, ast.ImportFrom) and node.level:
             package = [file, *file.parents][node.level]
@@ -97,9 +99,10 @@ def _imported(file: Path, folder: Path, engine: str) -> Iterator[Path]:
         else:
             continue
         for place in places:
-            for found in (place.with_suffix(".py"), place / "__init__.py"):
-                if found.is_file() and found.is_relative_to(folder):
-                    yield found
+            for one in (place.with_suffix(".py"), place / "__init__.py"):
+                if one.is_file() and one.is_relative_to(folder):
+                    found.append(one)
+    return tuple(found)
 
 
 def _running(node: ast.AST) -> Iterator[ast.AST]:

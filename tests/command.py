@@ -30,7 +30,7 @@ def modules(arguments: list[str]) -> set[str]:
 
 
 def leave_blank(patch: pytest.MonkeyPatch) -> None:
-    """Let pictures and frames of films be blank: most of what a small job takes is drawing them."""
+    """Let pictures and frames of films be blank, and not laid out: most of what a small job takes is drawing them."""
     save = Figure.savefig
 
     def leave(figure: Figure, where: Any, **how: Any) -> None:
@@ -40,3 +40,4 @@ def leave_blank(patch: pytest.MonkeyPatch) -> None:
             save(Figure(figsize=(0.1, 0.1)), where, **how)
 
     patch.setattr(Figure, "savefig", leave)
+    patch.setattr("gradscape.landscapes.draw.page.settle", lambda picture: picture.set_layout_engine("none"))

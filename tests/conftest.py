@@ -53,9 +53,11 @@ def blank(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> No
 def run(blank: None, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Said]:
     """Run the command in this process, in a folder of its own, on a wide screen unless another width is given.
 
-    It times two episodes and no more.
+    What a job takes is foretold by one episode or two and no more.
     """
     monkeypatch.setattr("gradscape.optim.search.MOMENT", 0.0)
+    for name in ("PATIENCE", "FIRST_PATIENCE"):
+        monkeypatch.setattr(f"gradscape.landscapes.job.{name}", 0.0)
 
     def command(*arguments: str, cwd: Path, width: int = 160) -> Said:
         monkeypatch.chdir(cwd)

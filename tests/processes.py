@@ -91,7 +91,7 @@ def _work(work: Callable[[], object], folder: Path, said: Path, changes: Any, st
                     os.kill(os.getpid(), stop.by)
 
     run.PAUSE, run.SHARE, search.MOMENT = 0.0, math.inf, 0.0  # writes after every proposal, times two episodes
-    job.PAUSE = math.inf  # draws no coarse picture
+    job.PAUSE, job.PATIENCE, job.FIRST_PATIENCE = math.inf, 0.0, 0.0  # draws no coarse picture
     zarr.config.set({"threading.max_workers": 1})  # so that its threads never take turns
     leave_blank(pytest.MonkeyPatch())
     sys.addaudithook(watch)

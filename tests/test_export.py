@@ -1,5 +1,6 @@
 """`landscape export`: slices and runs as files that other programs read."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,25 +10,36 @@ import pytest
 import xarray as xr
 
 import gradscape
+from gradscape.cli import main
 from gradscape.landscapes.export import SUFFIXES
 
-from .command import Said
+from .command import Said, leave_blank
 
 READ = {"csv": pd.read_csv, "parquet": pd.read_parquet}
 
 
-@pytest.fixture
-def results(run: Callable[..., Said], tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Leave a slice, a line and a run of the bouncing ball."""
+    folder = tmp_path_factory.mktemp("made")
     how = ["--fidelity", "draft", "--device", "cpu"]
-    for verb, more, out in (
-        (["slice", "bounce", "--dims", "0", "2"], ["--resolution", "5"], "cut"),
-        (["bounce", "--axis", "y"], ["--resolution", "6"], "line"),
-        (["optimize", "bounce", "--method", "descents"], ["--budget", "7"], "searched"),
-    ):
-        done = run(*verb, *more, *how, "--out", out, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-    return tmp_path
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        leave_blank(patch)
+        for verb, more, out in (
+            (["slice", "bounce", "--dims", "0", "2"], ["--resolution", "5"], "cut"),
+            (["bounce", "--axis", "y"], ["--resolution", "6"], "line"),
+            (["optimize", "bounce", "--method", "descents"], ["--budget", "7"], "searched"),
+        ):
+            with pytest.raises(SystemExit) as left:
+                main([*verb, *more, *how, "--out", out])
+            assert not left.value.code
+    return folder
+
+
+@pytest.fixture
+def results(made: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(made, tmp_path, dirs_exist_ok=True)
 
 
 @pytest.mark.parametrize("kind", list(READ))

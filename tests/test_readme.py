@@ -3,6 +3,7 @@
 import json
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -40,7 +41,7 @@ ADDED = {
     "check": ["--points", "2"],
     "pairs": ["--samples", "2"],
     "gallery compute": ["--only", "bounce-y", "--part", "slices", "--fidelity", "draft", "--data", "made"],
-    "gallery build": ["--out", "site"],
+    "gallery build": ["--data", "few", "--out", "site"],
     "gallery serve": ["--out", "served", "--port", "0"],
 }
 SCENES = {verb: {"fluid": "bounce"} for verb in ("race", "optimize", "tradeoff")}
@@ -103,7 +104,7 @@ def test_forms_name_verbs_and_options_there_are(command: str) -> None:
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a slice, a run, somebody's own class, and a site to serve."""
+    """A folder with a slice, a run, somebody's own class, two figures of the gallery, and a site to serve."""
     folder = tmp_path_factory.mktemp("desk")
     (mine,) = (block for block in BLOCKS if block.startswith("# my.py"))
     (folder / "my.py").write_text(mine)
@@ -116,6 +117,8 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         with pytest.raises(SystemExit) as left:
             main(command)
         assert not left.value.code
+    for figure in ("bounce-y", "flip-0-1"):
+        shutil.copytree(DATA / figure, folder / "few" / figure)
     (folder / "served").mkdir()
     (folder / "served" / "index.html").write_text("<p>a site</p>")
     return folder
@@ -136,8 +139,6 @@ def test_every_command_runs(
     monkeypatch.setattr(overlay_report, "_show", lambda console, path, serve: opened.append(path))
     for name in ("TIMING", "PATIENCE"):
         monkeypatch.setattr(f"gradscape.landscapes.tradeoff.{name}", 0.01)
-    for name in ("PATIENCE", "FIRST_PATIENCE"):
-        monkeypatch.setattr(f"gradscape.landscapes.job.{name}", 0.0)
     done = run(*small(command), cwd=desk)
     assert done.returncode == 0, (small(command), done.stderr)
     assert bool(opened) == ("view" in command)

@@ -8,7 +8,7 @@ import pytest
 
 from gradscape.envs import code
 from gradscape.envs.base import Environment
-from gradscape.envs.code import bare, code_digest, reached
+from gradscape.envs.code import bare, code_digest, imported, reached
 from gradscape.envs.registry import BUILTIN, environment_class, make
 
 SCENES = [entry.name for entry in BUILTIN]
@@ -102,5 +102,6 @@ def test_a_change_is_told_to_the_scenes_it_may_matter_to(copy: Path, file: str, 
 
     before = {name: texts(name) for name in SCENES}
     (copy / file).write_text((copy / file).read_text() + added)
-    bare.cache_clear()
+    for remembered in (bare, imported):
+        remembered.cache_clear()
     assert {name for name in SCENES if texts(name) != before[name]} == changes
