@@ -9,9 +9,11 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 demo: setup
 	$(BIN)/landscape slice fluid --dims 6 8 --resolution 24
 
-# Two workers have two cores: a second thread of each would only wait for the other worker's.
+# Two workers have two cores: a second thread of each would only wait for the other worker's. Each takes tests that are
+# next to one another, which share what they make. The many processes that tests start compile the sources once.
+unexport PYTHONDONTWRITEBYTECODE
 test: setup-test
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
 
 # Builds the wheel, installs it with all it needs into an empty environment, and tries it there; tests borrow the rest.
 wheel: setup-test

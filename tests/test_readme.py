@@ -46,6 +46,8 @@ ADDED = {
 }
 SCENES = {verb: {"fluid": "bounce"} for verb in ("race", "optimize", "tradeoff")}
 SCENES["--tolerance"] = {"fluid": "bounce", "6": "0", "8": "1"}
+SHORT = {"slice": {"fluid", "assembly"}, "sweep": {"fluid"}, "replay": {"fluid"}, "plan": {"fluid"}}
+TENTH = ["--set", "horizon=0.1"]  # of an episode
 TAICHI = ["--no-gradients"]  # whose kernels take minutes to compile with gradients
 
 
@@ -77,7 +79,8 @@ def small(command: str) -> list[str]:
         found[at + 1] = VALUES.get(word, found[at + 1])
     added = ADDED.get(verb, []) + (TAICHI if "taichi" in found else [])
     pairs = [added[at : at + 2] for at in range(0, len(added), 2)] if verb != "replay" else [added]
-    return [*found, *(word for pair in pairs if pair[0] not in found for word in pair)]
+    short = TENTH if SHORT.get(verb, set()) & {*found} else []
+    return [*found, *(word for pair in pairs if pair[0] not in found for word in pair), *short]
 
 
 FORMS = [command for command in typed() if not complete(command)]
@@ -110,8 +113,8 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "my.py").write_text(mine)
     how = ["--fidelity", "draft", "--device", "cpu", "--out"]
     for command in (
-        ["slice", "fluid", "--dims", "0", "1", "--resolution", "2", *how, str(folder / "cut")],
-        ["optimize", "fluid", "--method", "random", "--budget", "2", *how, str(folder / "run")],
+        ["slice", "fluid", *TENTH, "--dims", "0", "1", "--resolution", "2", *how, str(folder / "cut")],
+        ["optimize", "fluid", *TENTH, "--method", "random", "--budget", "2", *how, str(folder / "run")],
         ["overlay", str(folder / "cut"), str(folder / "run"), "--out", str(folder / "over")],
     ):
         with pytest.raises(SystemExit) as left:
@@ -137,8 +140,8 @@ def test_every_command_runs(
     monkeypatch.setenv("XDG_DATA_HOME", str(desk / "data"))
     monkeypatch.setattr("http.server.ThreadingHTTPServer.serve_forever", stop)
     monkeypatch.setattr(overlay_report, "_show", lambda console, path, serve: opened.append(path))
-    for name in ("TIMING", "PATIENCE"):
-        monkeypatch.setattr(f"gradscape.landscapes.tradeoff.{name}", 0.01)
+    for name, value in (("TIMING", 0.01), ("PATIENCE", 0.01), ("RESAMPLES", 9)):
+        monkeypatch.setattr(f"gradscape.landscapes.tradeoff.{name}", value)
     done = run(*small(command), cwd=desk)
     assert done.returncode == 0, (small(command), done.stderr)
     assert bool(opened) == ("view" in command)

@@ -33,7 +33,7 @@ SETTINGS |= {name: {"fidelity": SOFT_TINY} for name in SOFT}
 SHORT = {name: {"horizon": 0.4} for name in SOFT}
 # Where vertices strike a surface their losses jump, by little but often: differences need a step between the jumps.
 SMALL_STEPS = dict.fromkeys(("swing-velocity", "swing-stiffness", "flip"), 1e-8)
-ROWS = 7
+ROWS = 5
 
 
 def made(name):
@@ -101,7 +101,7 @@ def test_rows_do_not_depend_on_their_batch(env, points, result, size):
 
 
 def test_rows_do_not_depend_on_their_order(env, points, result):
-    order = torch.tensor([4, 2, 6, 0, 5, 1, 3])
+    order = torch.tensor([4, 2, 0, 1, 3])
     shuffled = env.evaluate(points[order])
     assert_same_bits(shuffled, replace(result, **{f: getattr(result, f)[order] for f in ("loss", "grad", "status")}))
 

@@ -149,6 +149,8 @@ def test_in_print_all_is_legible_on_the_page_and_apart(
     for (text, box), (other, another) in itertools.combinations(zip(texts, boxes, strict=True), 2):
         apart = box.x1 <= another.x0 or another.x1 <= box.x0 or box.y1 <= another.y0 or another.y1 <= box.y0
         assert apart or text.get_rotation() % 90 or other.get_rotation() % 90, (text, other)
+    if width > min(WIDTHS):
+        return  # fonts and width of the file are those of the picture, whichever it is
     page.save(picture, tmp_path / "picture.pdf")
     raw = (tmp_path / "picture.pdf").read_bytes()
     left, _, right, _ = map(float, re.search(rb"/MediaBox \[ ([\d.]+) ([\d.]+) ([\d.]+) ([\d.]+) \]", raw).groups())

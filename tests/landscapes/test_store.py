@@ -305,7 +305,7 @@ def test_plain_json_is_asked_for():
 def test_a_creation_that_is_killed_leaves_nothing_in_the_way(tmp_path):
     """Kill the making of a store at ever later instants; whatever is left, the same call goes on from it."""
     left = []
-    for instant in range(1, alone(partial(make, tmp_path / "whole.zarr"), tmp_path).changes + 1, 5):
+    for instant in range(1, alone(partial(make, tmp_path / "whole.zarr"), tmp_path).changes + 1, 9):
         path = tmp_path / str(instant) / "s.zarr"
         assert alone(partial(make, path), tmp_path, Instant(instant)).returncode == -signal.SIGKILL
         left.append(len(list(path.parent.glob(".*"))))
@@ -395,7 +395,7 @@ def test_a_kill_at_any_instant_of_finishing_leaves_a_slice_whole(tmp_path):
     fill(make(tmp_path / "0" / "slice.zarr"))
     shutil.copytree(tmp_path / "0", tmp_path / "filled")
     instants, places = alone(partial(finishing, tmp_path / "0" / "slice.zarr"), tmp_path).changes, set()
-    for instant in range(1, instants + 1, 7):
+    for instant in range(1, instants + 1, 17):
         desk = shutil.copytree(tmp_path / "filled", tmp_path / str(instant))
         path = desk / "slice.zarr"
         assert alone(partial(finishing, path), tmp_path, Instant(instant)).returncode == -signal.SIGKILL
