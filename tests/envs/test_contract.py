@@ -106,6 +106,11 @@ def test_rows_do_not_depend_on_their_order(env, points, result):
     assert_same_bits(shuffled, replace(result, **{f: getattr(result, f)[order] for f in ("loss", "grad", "status")}))
 
 
+def test_threads_share_a_batch_without_changing_a_bit(env, points, result, monkeypatch):
+    monkeypatch.setattr(type(env), "threads", 3)  # 2, 2 and 1 rows
+    assert_same_bits(env.evaluate(points), result)
+
+
 def test_an_empty_batch_gives_an_empty_evaluation(env, points):
     result = env.evaluate(points[:0])
     assert result.loss.shape == result.status.shape == (0,)

@@ -1,4 +1,4 @@
-"""The Fluid scene: the ladle's path, the loss, what floats and what is lifted, threads, precision and failures."""
+"""The Fluid scene: the ladle's path, the loss, what floats and what is lifted, precision and failures."""
 
 from dataclasses import replace
 
@@ -94,17 +94,6 @@ def test_single_precision_gives_the_same_landscape(draft):
     single, exact = draft.evaluate(x), double.evaluate(x)
     torch.testing.assert_close(single.loss, exact.loss, rtol=0, atol=1e-5)
     torch.testing.assert_close(single.grad, exact.grad, rtol=0, atol=1e-3 * float(exact.grad.abs().max()))
-
-
-def test_threads_share_a_batch_without_changing_a_bit(tiny, monkeypatch):
-    x = tiny.space.uniform(7, seed=3)
-    results = []
-    for threads in (1, 2, 3):
-        monkeypatch.setattr(Fluid, "threads", property(lambda self, threads=threads: threads))
-        results.append(tiny.evaluate(x))
-    for result in results[1:]:
-        assert torch.equal(result.loss, results[0].loss)
-        assert torch.equal(result.grad, results[0].grad)
 
 
 def test_syrup_thrown_out_of_the_grid_is_an_escape_and_spoils_no_other_row(monkeypatch):
