@@ -191,7 +191,7 @@ def _kernels(env: Environment) -> dict[str, Any]:
 
     They run on one thread: what several launch at a time adds up to more than the time that passes.
     """
-    points = _points(env, -(-env.preferred_batch // env.threads))
+    points = _points(env, env._share(env.preferred_batch))
     env._simulate(points, grad=True)
     found = {}
     for way, grad in WAYS.items():

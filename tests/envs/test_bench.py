@@ -134,6 +134,7 @@ def timed(request, monkeypatch):
         clock = Clock(tick=1.0)
         for module in ("bench", "engines.runtime"):
             monkeypatch.setattr(f"gradscape.envs.{module}.time", clock)
+        monkeypatch.setattr(Bounce, "threads", 1)  # a solver takes fewer rows than are worth evaluating at once
     return bench(lambda engine: Bounce(device=request.param, engine=engine), "warp", batches=[1], seconds=0.0)
 
 
