@@ -13,6 +13,7 @@ from pathlib import Path
 
 import cloudpickle
 import dask
+import distributed  # noqa: F401 -- whose settings are to be there before a test changes some for a while
 import numpy as np
 import pytest
 import torch
