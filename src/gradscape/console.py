@@ -126,9 +126,8 @@ def cut(
     from .cluster import workers
 
     with workers(scheduler, env.device) as executor:
-        into = Path(out) if out else None
-        how = {"out": into, "grad": grad, "force": force, "executor": executor, "prints": prints}
-        folder, summary = fill(console, env, plane, **how)
+        kept: dict[str, Any] = {"out": Path(out) if out else None, "force": force, "prints": prints}
+        folder, summary = fill(console, env, plane, grad=grad, executor=executor, **kept)
     if as_json:
         print(json.dumps({**summary, "folder": str(folder)}))
 
