@@ -5,11 +5,13 @@ The environment borrows the packages of the one that runs the tests; with INSTAL
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 import sysconfig
 import tarfile
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -52,9 +54,13 @@ print(json.dumps(said))
 WALK = """
 import importlib, json, pkgutil, gradscape
 names = [module.name for module in pkgutil.walk_packages(gradscape.__path__, "gradscape.")]
+missing = {}
 for name in names:
-    importlib.import_module(name)
-print(json.dumps([gradscape.__file__, names]))
+    try:
+        importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        missing[name] = error.name
+print(json.dumps([gradscape.__file__, names, missing]))
 """
 
 
@@ -137,11 +143,15 @@ def test_every_file_of_the_package_is_sent(built: dict[str, Path], kind: str) ->
 
 
 def test_every_module_imports_where_it_is_installed(built: dict[str, Path], python: Path, tmp_path: Path) -> None:
-    home, names = json.loads(ran(python, "-c", WALK, cwd=tmp_path))
+    """But for those that need a package of an extra, where the wheel is installed without."""
+    home, names, missing = json.loads(ran(python, "-c", WALK, cwd=tmp_path))
     assert Path(home).is_relative_to(python.parent.parent)
     files = {name for name in names_of(built["wheel"]) if name.endswith(".py")}
     modules = {"gradscape." + name.removesuffix(".py").replace("/", ".").removesuffix(".__init__") for name in files}
     assert {*names, "gradscape.__init__"} == modules
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    optional = {re.split("[^a-z0-9-]", one)[0].replace("-", "_") for one in extras["rl"] + extras["distributed"]}
+    assert set(missing.values()) <= optional
 
 
 def test_the_command_works_there_and_leaves_its_results_where_one_stands(python: Path, tmp_path: Path) -> None:
