@@ -55,13 +55,15 @@ def ratios(job: str, folder: Path) -> dict[str, float]:
     """Plan a job, do it, and return what was predicted by what it took."""
     _, _, what = job.partition(" ")
     planned, taken = run(f"plan {what}", folder).said, run(f"{job} --out made", folder)
-    there = list((folder / "made").rglob("*"))
+    from gradscape.landscapes.rehearsal import room_of
+
+    room = room_of(folder / "made")
     return {
         "wall": planned["wall"] / taken.wall,
         "work": sum(planned["seconds"][part] for part in WORK) / taken.said["seconds"],
         "memory": planned["memory"]["host"] / taken.memory,
-        "bytes": planned["disk"]["bytes"] / sum(one.stat().st_size for one in there if one.is_file()),
-        "files": planned["disk"]["files"] / len(there),
+        "bytes": planned["disk"]["bytes"] / room.bytes,
+        "files": planned["disk"]["files"] / (room.files - 1),  # all that is in the folder
     }
 
 

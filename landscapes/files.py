@@ -41,7 +41,18 @@ def print_width(name: str, picture: str) -> float | None:
 
 def others(folder: Path, ours: Collection[str], picture: str) -> list[Path]:
     """Return what a folder holds beside files of our names and prints of a picture."""
-    return [file for file in visible(folder) if file.name not in ours and print_width(file.name, picture) is None]
+    return [file for file in visible(folder) if not _is_ours(file, ours, picture)]
+
+
+def clear(folder: Path, ours: Collection[str], picture: str) -> None:
+    """Remove files of our names and prints of a picture from a folder."""
+    for file in visible(folder):
+        if _is_ours(file, ours, picture):
+            file.unlink()
+
+
+def _is_ours(file: Path, ours: Collection[str], picture: str) -> bool:
+    return file.name in ours or print_width(file.name, picture) is not None
 
 
 def write_json(path: Path, record: object) -> None:

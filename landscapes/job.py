@@ -18,7 +18,7 @@ import xarray as xr
 from jaxtyping import Float
 from torch import Tensor
 
-from .files import print_width, visible, write_json
+from .files import clear, visible, write_json
 from .halving import Halving
 from .objective import Objective, Status
 from .plane import Plane
@@ -84,9 +84,7 @@ class Job:
         settings: dict[str, Any] = {"identity": identity, "provenance": provenance, "grad": grad}
         if force and is_slice(path):
             store = SliceStore.create(path, plane, objective.space, overwrite=True, **settings)
-            for leftover in visible(folder):
-                if leftover.name in (PICTURE, SUMMARY) or print_width(leftover.name, PICTURE):
-                    leftover.unlink()
+            clear(folder, (PICTURE, SUMMARY), PICTURE)
         else:
             store = SliceStore.open_or_create(path, plane, objective.space, **settings)
         return cls(objective, plane, folder, store, draw, executor, made, prints)

@@ -18,7 +18,7 @@ from rich.console import Console
 from . import cluster, race_workers
 from .console import duration, provenance_of, read_settings
 from .envs.registry import make
-from .landscapes.files import print_width, visible, write_json
+from .landscapes.files import clear, visible, write_json
 from .optim.registry import METHODS
 from .race_tables import seeds_said, show
 from .search_report import STORE, give_torch_one_thread, made, run_identity, search_progress
@@ -153,9 +153,7 @@ class Job:
         }
         entries = [_entry(env, maker, folder, budget=budget, command=command, force=force) for maker in makers.values()]
         if force:
-            for leftover in visible(folder):
-                if leftover.name in (PICTURE, FIGURES) or print_width(leftover.name, PICTURE):
-                    leftover.unlink()
+            clear(folder, (PICTURE, FIGURES), PICTURE)
         return cls(env, entries, folder, budget, workers, command)
 
     @property

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from .console import chosen_fidelity, duration, provenance_of, read_settings
 from .envs.registry import make
-from .landscapes.files import print_width, visible, write_json
+from .landscapes.files import clear, visible, write_json
 from .optim.registry import METHODS, code_digest, optimizer_class
 from .tables import table
 
@@ -154,9 +154,7 @@ class Job:
         wanted: dict[str, Any] = {"identity": identity, "provenance": provenance_of(env, command), "budget": budget}
         if force and is_run(path):
             run = Run.create(path, env.space, overwrite=True, **wanted)
-            for leftover in visible(folder):
-                if leftover.name in (PICTURE, SUMMARY) or print_width(leftover.name, PICTURE):
-                    leftover.unlink()
+            clear(folder, (PICTURE, SUMMARY), PICTURE)
         else:
             run = Run.open_or_create(path, env.space, **wanted)
         return cls(env, optimizer, folder, run, budget, command, prints)
@@ -200,8 +198,8 @@ class Job:
         from .landscapes.draw.curve import run_figure
         from .landscapes.draw.page import save_prints
 
-        table = self.filled.table()
-        return save_prints(lambda width: run_figure(table, width=width), self.folder / PICTURE, self.prints)
+        path = self.folder / PICTURE  # the table is read only where it is printed
+        return save_prints(lambda width: run_figure(self.filled.table(), width=width), path, self.prints)
 
     def farewell(self, console: Console) -> None:
         """Say what is kept of a run that was stopped, and how to go on."""
