@@ -93,8 +93,7 @@ def loss_map(ax: Axes, dataset: xr.Dataset, scale: style.Scale) -> None:
     mesh = ax.pcolormesh(
         *cell_edges(dataset), np.ma.masked_invalid(loss), cmap=style.LOSS_MAP, norm=scale.norm, rasterized=True
     )
-    unit = dataset["loss"].attrs.get("units", "")
-    panel.colour_bar(ax, mesh, f"loss [{unit}]" if unit else "loss", scale)
+    panel.colour_bar(ax, mesh, page.loss_name(dataset), scale)
 
 
 def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> list[Artist]:

@@ -26,8 +26,7 @@ def run_figure(table: xr.Dataset, *, width: float | None = None) -> page.Picture
     best = np.fmin.accumulate(loss)
     _scale(ax, loss)
     entries = [*_draw_points(ax, table), _draw_best(ax, table, best), *_draw_failures(ax, table)]
-    unit = table["loss"].attrs.get("units", "")
-    panel.name_axes(ax, "episodes", f"loss [{unit}]" if unit else "loss")
+    panel.name_axes(ax, "episodes", page.loss_name(table))
     ax.set_xlim(0, len(loss) + 1)
     page.head(picture, ax, table, _title(table))
     page.finish(picture, entries)

@@ -31,9 +31,7 @@ PAPER, PALE, NEAR = 0.975, 0.6, 3  # lightness of the page, of colours that it s
 
 def darken(picture: Picture) -> None:
     """Recolour a picture, as it is drawn, for a dark page; arrows have the map that is seen there."""
-    for artist in picture.findobj(
-        lambda one: not isinstance(one, Figure | Axes)
-    ):  # they have the colours of their patches
+    for artist in picture.findobj(lambda one: not isinstance(one, Figure | Axes)):  # these have their patches' colours
         if isinstance(artist, ScalarMappable) and artist.get_array() is not None:
             if artist.get_cmap() == style.SLOPE_MAP:
                 artist.set_cmap(style.SLOPE_MAP_DARK)

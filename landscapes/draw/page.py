@@ -108,6 +108,12 @@ def provenance(dataset: xr.Dataset) -> str:
     return " · ".join(said)
 
 
+def loss_name(dataset: xr.Dataset) -> str:
+    """Return what stands along an axis of losses: the word, and their unit if they have one."""
+    unit = dataset["loss"].attrs.get("units", "")
+    return f"loss [{unit}]" if unit else "loss"
+
+
 def failure_key(dataset: xr.Dataset) -> list[Patch]:
     """Return one legend entry for each way of failing that occurs, with how often."""
     status = dataset["status"].to_numpy()

@@ -65,10 +65,9 @@ def _counts(name: str, values: ArrayLike, points: int) -> NDArray[np.int64]:
 
 def _draw_loss(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
     u, loss = dataset["u"].to_numpy(), dataset["loss"].to_numpy()
-    unit = dataset["loss"].attrs.get("units", "")
     sheet = page.sheet_of(ax)
     ax.plot(u, loss, color=style.LINE, **sheet.look(style.stroke(len(u))))
-    panel.name_axes(ax, y=f"loss [{unit}]" if unit else "loss")
+    panel.name_axes(ax, y=page.loss_name(dataset))
     if not np.isfinite(loss).any():
         return []
     lowest = int(np.nanargmin(loss))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
+from matplotlib.ticker import LogLocator, MaxNLocator
 from numpy.typing import NDArray
 
 from ..plane import Plane
@@ -46,7 +47,22 @@ class Relief:
     def shade(self, loss: Grid) -> Grid:
         """Return where a loss is on the scale, 0 to 1; NaN for none."""
         least = self.scale.ends[0] if self.scale.logarithmic else -np.inf
-        return np.clip(np.asarray(self.scale.norm(np.maximum(loss, least)), dtype=np.float64), 0.0, 1.0)
+        with np.errstate(invalid="ignore"):
+            return np.clip(np.asarray(self.scale.norm(np.maximum(loss, least)), dtype=np.float64), 0.0, 1.0)
+
+    def ticks(self, axis: int) -> tuple[Grid, Grid]:
+        """Return round values along u, v or the loss, and where they are along it, 0 to 1.
+
+        Of the loss none is at the foot, where another axis begins.
+        """
+        low, high = [*zip(*(side.tolist() for side in self.plane.window()), strict=True), self.scale.ends][axis]
+        logarithmic = axis == 2 and self.scale.logarithmic
+        ticks = np.asarray((LogLocator(numticks=6) if logarithmic else MaxNLocator(5)).tick_values(low, high))
+        ticks = ticks[(ticks >= low) & (ticks <= high)]
+        if axis < 2:
+            return ticks, (ticks - low) / (high - low)
+        share = self.shade(ticks)
+        return ticks[share > FOOT], share[share > FOOT]
 
 
 @dataclass(frozen=True)
@@ -59,6 +75,12 @@ class Cells:
     corners: Grid
     normals: Grid
     sample: NDArray[np.intp]
+
+    @property
+    def triangles(self) -> NDArray[np.intp]:
+        """Return two triangles for each cell, as numbers of the corners one after another."""
+        first = 4 * np.arange(len(self.corners))[:, None]
+        return np.concatenate([first + np.array(corners) for corners in TRIANGLES])
 
 
 def cells(relief: Relief, dataset: xr.Dataset) -> Cells:

@@ -13,11 +13,11 @@ import rerun.blueprint as rrb
 import torch
 import xarray as xr
 from matplotlib.colors import to_rgba
-from matplotlib.ticker import LogLocator, MaxNLocator
 from numpy.typing import NDArray
 
 from ..files import replacing
 from ..objective import Status
+from ..overlay import improvements
 from ..plane import Plane
 from ..store import plane_of
 from . import contour, page, relief, style
@@ -64,16 +64,25 @@ def save_stream(dataset: xr.Dataset, runs: Runs, path: str | Path) -> None:
 class Scene:
     """Say where plane coordinates and losses are in the scene, which is centred on the slice's window."""
 
-    plane: Plane
-    scale: style.Scale
+    body: relief.Relief
     reach: float
     stand: relief.Stand
 
     @classmethod
     def of(cls, dataset: xr.Dataset, runs: Runs, scale: style.Scale | None = None) -> Scene:
         """Return the scene of a slice and of runs laid over it, on the scale of their losses unless given."""
-        plane, scale = plane_of(dataset), scale or joint_scale(dataset, runs)
-        return cls(plane, scale, farthest(runs), relief.stand(relief.Relief(plane, scale), dataset))
+        body = relief.Relief(plane_of(dataset), scale or joint_scale(dataset, runs))
+        return cls(body, farthest(runs), relief.stand(body, dataset))
+
+    @property
+    def plane(self) -> Plane:
+        """The plane of the slice."""
+        return self.body.plane
+
+    @property
+    def scale(self) -> style.Scale:
+        """The scale of the losses."""
+        return self.body.scale
 
     @property
     def eye(self) -> rrb.EyeControls3D:
@@ -83,24 +92,12 @@ class Scene:
 
     def at(self, u: Grid, v: Grid, loss: Grid) -> Grid:
         """Return positions, shape (..., 3); places beyond the window are moved to its border."""
-        low, high = (side.numpy() for side in self.plane.window())
-        flat = (np.stack([u, v], axis=-1) - low) / (high - low)
-        flat = SIDE * (np.clip(flat, 0.0, 1.0) - 0.5)
-        return np.concatenate([flat, self.height(loss)[..., None]], axis=-1)
-
-    def height(self, loss: Grid) -> Grid:
-        """Return the height of a loss, cut at both ends of the scale; NaN for none."""
-        return HEIGHT * np.clip(self.shade(loss), 0.0, 1.0)
-
-    def shade(self, loss: Grid) -> Grid:
-        """Return where a loss is on the scale, 0 at its lower end and 1 at its upper."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            lowest = float(self.scale.norm.vmin or 0.0) if self.scale.logarithmic else -np.inf
-            return np.asarray(self.scale.norm(np.maximum(loss, lowest)), dtype=np.float64)
+        (left, front), (right, back) = (side.numpy() for side in self.plane.window())
+        return self.body.at(np.clip(u, left, right), np.clip(v, front, back), loss)
 
     def tint(self, loss: Grid) -> NDArray[np.uint8]:
         """Return the colour of a loss."""
-        return style.LOSS_MAP(self.shade(loss), bytes=True)
+        return style.LOSS_MAP(self.body.shade(loss), bytes=True)
 
 
 def _log(stream: rr.RecordingStream, path: str, archetype: rr.AsComponents) -> None:
@@ -109,12 +106,11 @@ def _log(stream: rr.RecordingStream, path: str, archetype: rr.AsComponents) -> N
 
 def surface(scene: Scene, dataset: xr.Dataset) -> rr.Mesh3D:
     """Return a slice as flat cells whose height and colour are the loss."""
-    made = relief.cells(relief.Relief(scene.plane, scene.scale), dataset)
-    first = 4 * np.arange(len(made.corners))[:, None]
+    made = relief.cells(scene.body, dataset)
     loss = dataset["loss"].transpose("v", "u").to_numpy().ravel()
     return rr.Mesh3D(
         vertex_positions=made.corners.reshape(-1, 3),
-        triangle_indices=np.concatenate([first + np.array(corners) for corners in relief.TRIANGLES]),
+        triangle_indices=made.triangles,
         vertex_normals=np.repeat(made.normals, 4, axis=0),
         vertex_colors=np.repeat(scene.tint(loss[made.sample]), 4, axis=0),
     )
@@ -145,27 +141,13 @@ def log_axes(stream: rr.RecordingStream, scene: Scene, dataset: xr.Dataset) -> N
     """Frame the scene, with the ticks of both parameters and of the loss."""
     frame = rr.LineStrips3D(scene.stand.frame(), colors=rgba(style.BETWEEN), radii=LINE / 2)
     _log(stream, "landscape/axes/frame", frame)
-    window = [side.numpy() for side in scene.plane.window()]
-    unit = dataset["loss"].attrs.get("units", "")
-    names = [*scene.plane.labels, f"loss [{unit}]" if unit else "loss"]
-    ends = [(window[0][0], window[1][0]), (window[0][1], window[1][1])]
-    ends.append(scene.scale.ends)
-    for axis, (name, (least, most)) in enumerate(zip(names, ends, strict=True)):
-        ticks = _ticks(least, most, logarithmic=axis == 2 and scene.scale.logarithmic)
-        share = (ticks - least) / (most - least) if axis < 2 else scene.height(ticks) / HEIGHT
-        if axis == 2:  # at its foot another axis ends
-            ticks, share = ticks[share > relief.FOOT], share[share > relief.FOOT]
+    for axis, name in enumerate((*scene.plane.labels, page.loss_name(dataset))):
+        ticks, share = scene.body.ticks(axis)
         places = [scene.stand.beside(axis, part, TICKS) for part in share]
         places.append(scene.stand.beside(axis, 0.5, NAMES) if axis < 2 else scene.stand.beside(axis, OVER, TICKS))
         labels = [*map(style.number, ticks.tolist()), name]
         points = rr.Points3D(places, labels=labels, show_labels=True, colors=rgba(style.BETWEEN), radii=DOT)
         _log(stream, f"landscape/axes/{'uvz'[axis]}", points)
-
-
-def _ticks(low: float, high: float, *, logarithmic: bool) -> Grid:
-    locator = LogLocator(numticks=6) if logarithmic else MaxNLocator(5)
-    ticks = np.asarray(locator.tick_values(low, high))
-    return ticks[(ticks >= low) & (ticks <= high)]
 
 
 def _log_key(stream: rr.RecordingStream, scene: Scene, runs: Runs) -> None:
@@ -202,7 +184,7 @@ def _log_run(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None:
 def _log_gaps(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset, path: str, places: Grid) -> None:
     """Join each point to the surface below or above it, where its loss is another."""
     feet = places.copy()
-    feet[:, 2] = scene.height(run["beneath"].to_numpy())
+    feet[:, 2] = scene.body.height(run["beneath"].to_numpy())
     apart = np.isfinite(run["loss"].to_numpy()) & (np.abs(feet[:, 2] - places[:, 2]) > RADIUS)
     rows = np.flatnonzero(apart)
     _log_lines(stream, path, rows, np.stack([feet[rows], places[rows]], axis=1), style.BETWEEN)
@@ -217,7 +199,7 @@ def _log_best(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None
     curve = np.log10(best[known]) if scene.scale.logarithmic else best[known]
     _log(stream, f"best/{label}", rr.SeriesLines(colors=rgba(color), names=label, widths=1.5))
     stream.send_columns(f"best/{label}", _times(known), rr.Scalars.columns(scalars=curve), strict=True)
-    lowered = known[np.diff(best[known], prepend=np.inf) < 0]
+    lowered = improvements(run)
     places = scene.at(*(run[name].to_numpy()[lowered] for name in ("u", "v", "loss")))
     spread = np.empty((run.sizes["evaluation"], 3))
     spread[lowered] = places
@@ -270,7 +252,7 @@ def _blueprint(dataset: xr.Dataset, scene: Scene) -> rrb.Blueprint:
 
 def _about(dataset: xr.Dataset, runs: Runs, scene: Scene) -> str:
     """Say in Markdown what is to be seen, and where it comes from."""
-    low, high = (style.number(float(end or 0.0)) for end in (scene.scale.norm.vmin, scene.scale.norm.vmax))
+    low, high = map(style.number, scene.scale.ends)
     kind = "logarithmic" if scene.scale.logarithmic else "linear"
     unit = dataset["loss"].attrs.get("units", "")
     distance = (

@@ -15,7 +15,6 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, MaxNLocator
 from numpy.typing import NDArray
 
 from ..files import replacing
@@ -90,7 +89,13 @@ def surface_figure(dataset: xr.Dataset, runs: Runs = (), *, width: float | None 
     page.head(picture, ax, dataset)
     scale = shown.relief.scale
     panel.colour_bar(
-        ax, ScalarMappable(scale.norm, style.LOSS_MAP), _loss_name(dataset), scale, fraction=0.03, pad=0.02, shrink=0.8
+        ax,
+        ScalarMappable(scale.norm, style.LOSS_MAP),
+        page.loss_name(dataset),
+        scale,
+        fraction=0.03,
+        pad=0.02,
+        shrink=0.8,
     )
     page.finish(picture, [*_entries(sheet, runs), *_holes(dataset)], columns=3)
     return picture
@@ -128,9 +133,7 @@ def _add_surface(plotter: pv.Plotter, body: Relief, dataset: xr.Dataset) -> None
     made = relief.cells(body, dataset)
     if not len(made.corners):
         return
-    first = 4 * np.arange(len(made.corners))[:, None]
-    faces = np.concatenate([first + np.array(corners) for corners in relief.TRIANGLES])
-    surface = pv.PolyData.from_regular_faces(made.corners.reshape(-1, 3), faces)
+    surface = pv.PolyData.from_regular_faces(made.corners.reshape(-1, 3), made.triangles)
     colours = style.LOSS_MAP(body.shade(dataset["loss"].transpose("v", "u").to_numpy()).ravel(), bytes=True)[:, :3]
     surface["color"] = np.repeat(colours[made.sample], 4, axis=0)
     surface.point_data.active_normals = np.repeat(made.normals, 4, axis=0)
@@ -183,15 +186,9 @@ def _label(ax: Axes, dataset: xr.Dataset, shown: Shown) -> None:
     """Write ticks and names beside the frame's two lower edges in front and the one at the right."""
     sheet, body = page.sheet_of(ax), shown.relief
     room = sheet.type / sheet.zoom  # that type takes up of the scene
-    ends = [*zip(*(side.tolist() for side in body.plane.window()), strict=True), body.scale.ends]
-    for axis, name in enumerate((*body.plane.labels, _loss_name(dataset))):
-        low, high = ends[axis]
+    for axis, name in enumerate((*body.plane.labels, page.loss_name(dataset))):
+        ticks, share = body.ticks(axis)
         logarithmic = axis == 2 and body.scale.logarithmic
-        ticks = np.asarray((LogLocator(numticks=6) if logarithmic else MaxNLocator(5)).tick_values(low, high))
-        ticks = ticks[(ticks >= low) & (ticks <= high)]
-        share = (ticks - low) / (high - low) if axis < 2 else body.shade(ticks)
-        if axis == 2:  # at its foot another axis begins
-            ticks, share = ticks[share > relief.FOOT], share[share > relief.FOOT]
         spots = shown.on_picture(np.array([shown.stand.beside(axis, part, room * AWAY[axis]) for part in share]))
         look: dict[str, Any] = {"size": sheet.tick, "color": style.INK, "va": "center"}
         look["ha"] = "left" if axis == 2 else "center"
@@ -227,8 +224,3 @@ def _holes(dataset: xr.Dataset) -> list[Artist]:
     status = dataset["status"].to_numpy()
     failed = int((status != Status.OK).sum())
     return [Line2D([], [], linestyle="none", label=f"holes: {failed} of {status.size} samples")] if failed else []
-
-
-def _loss_name(dataset: xr.Dataset) -> str:
-    unit = dataset["loss"].attrs.get("units", "")
-    return f"loss [{unit}]" if unit else "loss"

@@ -63,7 +63,7 @@ def _blueprint(sweep: Sweep, scene: stream.Scene) -> rrb.Blueprint:
 
 def _about(sweep: Sweep, scales: Scales) -> str:
     """Say in Markdown what is to be seen, and where it comes from."""
-    low, high = (style.number(float(end or 0.0)) for end in (scales.loss.norm.vmin, scales.loss.norm.vmax))
+    low, high = map(style.number, scales.loss.ends)
     kind = "logarithmic" if scales.loss.logarithmic else "linear"
     lines = [
         f"# {page.title(sweep.slices[0])}\n",
