@@ -26,5 +26,7 @@ def save_run(table: xr.Dataset, path: Path) -> None:
 def open_run(path: Path) -> xr.Dataset:
     """Read a run's table."""
     with ZipStore(path, mode="r") as store:
-        table: xr.Dataset = xr.open_zarr(store, consolidated=False, mask_and_scale=False, decode_times=False).load()
+        table: xr.Dataset = xr.open_zarr(
+            store, zarr_format=3, consolidated=False, mask_and_scale=False, decode_times=False
+        ).load()
     return table

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Sequence
 from enum import IntEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
@@ -18,6 +18,11 @@ CODECS = [ZstdCodec(level=3, checksum=True)]
 SMALL = [BloscCodec(cname="zstd", clevel=9, shuffle="shuffle"), Crc32cCodec()]
 _QUIET = threading.Lock()  # threads share what warnings are shown
 SIDE, VALUES = 256, 1 << 20  # of a chunk of a finished slice: samples along an axis and values in all, at most
+
+
+def open_group(path: Path, mode: Literal["r", "r+"] = "r") -> zarr.Group:
+    """Open a store of zarr's format 3 alone: format 2 has a codec (pickle) that runs what it reads."""
+    return zarr.open_group(path, mode=mode, zarr_format=3, use_consolidated=False)
 
 
 def create_array(

@@ -145,7 +145,7 @@ def stored(alike: Alike, store: SliceStore) -> Stored:
     whole, began = alike.dataset(store), time.perf_counter()
     write_finished(path, whole)
     seconds = took * total / done + time.perf_counter() - began
-    return Stored(seconds, room_of(path), Room(size, min(files, before.files + 6 * tiles)))
+    return Stored(seconds, room_of(path), Room(size, min(files, before.files + 8 * tiles)))
 
 
 def drawn(draw: Callable[[], object], alike: Alike | None = None) -> tuple[float, float]:

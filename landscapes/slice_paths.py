@@ -29,11 +29,10 @@ def there(path: Path) -> bool:
 
 def is_slice(path: Path) -> bool:
     """Say whether a slice of this format, finished or not, is at `path`."""
-    import zarr
-
+    from .layout import open_group
     from .slice_arrays import FORMAT
 
     try:
-        return zarr.open_group(place_of(path), mode="r", use_consolidated=False).attrs.get("gradscape_slice") == FORMAT
+        return open_group(place_of(path)).attrs.get("gradscape_slice") == FORMAT
     except Exception:  # whatever else is there is none
         return False

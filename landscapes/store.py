@@ -9,8 +9,9 @@ coordinates `u`, `v`, `dim`, `unit(dim)`; a line has no `v`. It lies in one of t
   (`layout.analysis_chunks`), so that anybody's xarray or zarr reads it right. It appears whole, and only then the
   tiles go: a process killed at any instant leaves one or the other.
 
-A tile, or a chunk of a finished slice, counts when it decodes, its status has no MISSING, and loss and gradient are
-finite exactly where the status is OK. Everything else, a torn file included, is as if it had never been written.
+A tile, or a chunk of a finished slice, counts when it decodes, its status has no MISSING, loss and gradient are finite
+exactly where the status is OK, and all of it together has the checksum that was written of it in its place. Everything
+else, a torn file included, is as if it had never been written.
 """
 
 from __future__ import annotations
@@ -34,11 +35,11 @@ from zarr.storage import MemoryStore
 
 from .files import discard, placing
 from .identity import StoreError, StoreExistsError, check_identity, full_identity, plain_json
-from .integrity import check_integrity
-from .layout import consolidate
+from .integrity import check_integrity, tile_sum
+from .layout import consolidate, open_group
 from .objective import Evaluation, Status
 from .plane import Plane
-from .slice_arrays import AXES, FORMAT, attributes_of, axes_of, lay_out, write_finished
+from .slice_arrays import AXES, FORMAT, SUMS, attributes_of, axes_of, lay_out, write_finished
 from .slice_arrays import plane_of as plane_of
 from .slice_paths import SLICE, filling, finished, place_of, there
 from .slice_paths import is_slice as is_slice
@@ -75,6 +76,8 @@ class SliceStore:
         self._parameters, self._units = ([str(one) for one in np.asarray(arrays[name][:])] for name in ("dim", "unit"))
         self._attributes = {name: attributes_of(array) for name, array in arrays.items()}
         self.side = self._values["status"].chunks[: self.plane.rank]
+        sums = arrays.get(SUMS)  # none in a copy that xarray wrote of `dataset`
+        self._sums = sums if place and sums is not None and sums.shape == self._tile_counts() else None
 
     @classmethod
     def create(
@@ -121,7 +124,7 @@ class SliceStore:
         if not is_slice(place):
             raise StoreError(f"{place} is no slice store of format {FORMAT}; move it away or write elsewhere")
         try:
-            group = zarr.open_group(place, mode="r+", use_consolidated=False)
+            group = open_group(place, "r+")
             store = cls(group, path, place)
             axes = axes_of(store.plane, store.identity["parameters"], store._units, ascending=store.ascending)
             check_integrity(place, group, axes, ["loss", "status", *(["grad"] if store.identity["gradients"] else [])])
@@ -186,8 +189,9 @@ class SliceStore:
 
     def tiles(self) -> list[Tile]:
         """Return every tile, coarse to fine."""
-        counts = [math.ceil(points / side) for points, side in zip(self.shape, self.side, strict=True)]
-        return sorted(map(Tile, np.ndindex(*counts)), key=lambda tile: (tile.level, sum(tile.index), tile.index))
+        return sorted(
+            map(Tile, np.ndindex(*self._tile_counts())), key=lambda tile: (tile.level, sum(tile.index), tile.index)
+        )
 
     def pending(self, status: NDArray[np.int8] | None = None) -> list[Tile]:
         """Return the tiles that are not finished, coarse to fine; `status` spares reading it again."""
@@ -212,7 +216,7 @@ class SliceStore:
             values = self._stored(self._place(tile))
         except Exception:  # as in `_read`
             return None
-        return None if (self._judged(values) == Status.MISSING).any() else values
+        return None if (self._judged(values) == Status.MISSING).any() or not self._in_place(tile, values) else values
 
     def statuses(self, tile: Tile) -> Counter[Status]:
         """Count how the points of a finished tile ended; nothing of one that is not finished."""
@@ -239,10 +243,15 @@ class SliceStore:
             raise ValueError("a tile is written whole; got an evaluation with status MISSING")
         if self._taken_over():
             return
+        arrays = {}
+        for name, stored in self._values.items():  # loss, grad, status
+            tensor: Tensor = getattr(evaluation, name)
+            arrays[name] = tensor.detach().cpu().numpy().reshape(shape + tensor.shape[1:]).astype(stored.dtype)
         try:
-            for name, values in self._values.items():  # loss, grad, status
-                tensor: Tensor = getattr(evaluation, name)
-                values[place] = tensor.detach().cpu().numpy().reshape(shape + tensor.shape[1:]).astype(values.dtype)
+            if self._sums is not None:
+                self._sums[tile.index] = tile_sum(tile.index, arrays)
+            for name, values in arrays.items():
+                self._values[name][place] = values
         except FileNotFoundError:
             if not self._taken_over():
                 raise
@@ -303,7 +312,7 @@ class SliceStore:
 
     def _move_on(self, path: Path) -> None:
         """Become the finished slice, and clear the tiles away."""
-        self._adopt(zarr.open_group(path, mode="r+", use_consolidated=False), path, path)
+        self._adopt(open_group(path, "r+"), path, path)
         discard(filling(path))
 
     def _whole(self) -> tuple[slice, ...]:
@@ -312,6 +321,18 @@ class SliceStore:
     def _place(self, tile: Tile) -> tuple[slice, ...]:
         sizes = zip(tile.index, self.side, self.shape, strict=True)
         return tuple(slice(at * side, min((at + 1) * side, points)) for at, side, points in sizes)
+
+    def _tile_counts(self) -> tuple[int, ...]:
+        return tuple(math.ceil(points / side) for points, side in zip(self.shape, self.side, strict=True))
+
+    def _in_place(self, tile: Tile, values: Mapping[str, NDArray[Any]]) -> bool:
+        """Say whether what was read of a tile is what was written of this tile."""
+        if self._sums is None:
+            return True
+        try:
+            return bool(self._sums[tile.index] == tile_sum(tile.index, values))
+        except Exception:  # as in `_read`
+            return False
 
     def _has_status(self, tile: Tile) -> bool:
         try:
@@ -340,9 +361,13 @@ class SliceStore:
         except Exception:  # a damaged chunk raises whatever its codec does
             values = self._by_tile(box, {})
         status = self._judged(values)
-        for tile in self.tiles() if (status == Status.MISSING).any() else ():  # finished whole or not at all
-            if (status[self._place(tile)] == Status.MISSING).any():
-                status[self._place(tile)] = Status.MISSING
+        for tile in self.tiles() if self._sums is not None or (status == Status.MISSING).any() else ():
+            place = self._place(tile)
+            part = {name: array[place] for name, array in values.items()}
+            if not part["status"].any():
+                continue
+            if (part["status"] == Status.MISSING).any() or not self._in_place(tile, part):
+                part["status"][...] = Status.MISSING  # finished whole or not at all
         values["loss"][status == Status.MISSING] = np.nan
         if self.grad:
             values["grad"][status == Status.MISSING] = np.nan

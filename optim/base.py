@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import abc
 import math
-import pickle
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from enum import IntEnum
-from typing import Any, ClassVar, final
+from typing import Any, ClassVar, Self, final
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from ..landscapes.objective import Evaluation, Objective, Status
 from ..landscapes.space import ParameterSpace
 
 Points = NDArray[np.float64]
+COMMON = {"space", "seed", "options", "random", "worst", "_told_any"}  # attributes of every optimiser
 
 
 class Kind(IntEnum):
@@ -51,8 +52,11 @@ class Optimizer(abc.ABC):
     A method is written by deriving from this class. Its hooks see the box scaled to [-1, 1] in every dimension, as
     numpy arrays: `_ask` proposes points there, `_tell` takes their losses (+inf where an episode failed) and, where it
     asked for them, gradients (zero where an episode failed) with respect to the scaled parameters. Randomness comes
-    from `self.random` alone, so that a seed decides everything, and an optimiser can be pickled between `tell` and
-    `ask`: what comes back goes on bit for bit.
+    from `self.random` alone, so that a seed decides everything.
+
+    Between `tell` and `ask` an optimiser is its `state`: what is `restored` from it goes on bit for bit. A method whose
+    attributes are numbers, strings, arrays, lists and mappings of them needs nothing for that; any other says in
+    `_state` and `_restore` what of it is data.
     """
 
     name: ClassVar[str]
@@ -68,7 +72,7 @@ class Optimizer(abc.ABC):
         self._setup()
 
     @classmethod
-    def on(cls, objective: Objective, *, seed: int = 0, options: Any = None) -> Optimizer:
+    def on(cls, objective: Objective, *, seed: int = 0, options: Any = None) -> Self:
         """Return the optimiser for an objective, of which most methods need no more than its box."""
         return cls(objective.space, seed=seed, options=options)
 
@@ -98,9 +102,31 @@ class Optimizer(abc.ABC):
         self._tell(z, loss, grad)
 
     @final
-    def state(self) -> bytes:
-        """Return all there is to go on from."""
-        return pickle.dumps(self)
+    def state(self) -> dict[str, Any]:
+        """Return all there is to go on from, as data that `optim.state.encoded` writes."""
+        return {
+            "method": self.name,
+            "seed": self.seed,
+            "options": asdict(self.options),
+            "random": self.random.bit_generator.state,
+            "worst": self.worst,
+            "told": self._told_any,
+            "own": self._state(),
+        }
+
+    @final
+    @classmethod
+    def restored(cls, objective: Objective, state: Mapping[str, Any]) -> Self:
+        """Return the optimiser that had this state, attached to the objective.
+
+        What does not fit raises whatever it is stumbled upon: KeyError, TypeError, ValueError and others.
+        """
+        made = cls.on(objective, seed=state["seed"], options=cls.Options(**state["options"]))
+        made.attach(objective)
+        made._restore(state["own"])
+        made.worst, made._told_any = float(state["worst"]), bool(state["told"])
+        made.random.bit_generator.state = state["random"]  # last, since it may have drawn meanwhile
+        return made
 
     def penalised(self, loss: Points) -> Points:
         """Return losses for models that take finite numbers only: a failure counts as the worst loss so far."""
@@ -109,6 +135,17 @@ class Optimizer(abc.ABC):
     def _setup(self) -> None:  # noqa: B027 -- nothing, for the simplest methods
         """Prepare the first `_ask`."""
 
+    def _state(self) -> dict[str, Any]:
+        """Return what the method itself goes on from; `self.random` stands where it did after the last draw."""
+        return {name: value for name, value in vars(self).items() if name not in COMMON}
+
+    def _restore(self, own: Mapping[str, Any]) -> None:
+        """Take back what `_state` returned, after `_setup` and `attach`; draws are put back afterwards."""
+        for name, value in own.items():
+            if hasattr(type(self), name):
+                raise ValueError(f"{name} is no attribute that {self.name} keeps")
+            setattr(self, name, value)
+
     @abc.abstractmethod
     def _ask(self) -> Proposal:
         """Propose points of the scaled box; those beyond it are moved to its border before they are evaluated."""
@@ -116,14 +153,3 @@ class Optimizer(abc.ABC):
     @abc.abstractmethod
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
         """Take in points as they were evaluated, with shapes (count, dim), (count,) and (count, dim)."""
-
-
-def restored(state: bytes) -> Optimizer:
-    """Return the optimiser whose `state` was kept; only of a run of one's own, since unpickling runs what it says."""
-    try:
-        found = pickle.loads(state)
-    except (AttributeError, EOFError, ImportError, pickle.UnpicklingError) as error:
-        raise ValueError(f"the kept state of the optimiser cannot be read ({error}); begin the run anew") from error
-    if not isinstance(found, Optimizer):
-        raise ValueError(f"the kept state is that of a {type(found).__name__}, not of an optimiser; begin the run anew")
-    return found

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -30,6 +32,12 @@ class BO(Optimizer):
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
         self.surrogate.add(z, loss)
+
+    def _state(self) -> dict[str, Any]:
+        return {"surrogate": self.surrogate.state()}
+
+    def _restore(self, own: Mapping[str, Any]) -> None:
+        self.surrogate.restore(own["surrogate"])
 
 
 @dataclass(frozen=True)
@@ -65,3 +73,10 @@ class BODescents(Optimizer):
         self.descent.tell(float(loss[0]), grad[0])
         if self.descent.done:
             self.descent = None
+
+    def _state(self) -> dict[str, Any]:
+        return {"surrogate": self.surrogate.state(), "descent": self.descent and self.descent.state()}
+
+    def _restore(self, own: Mapping[str, Any]) -> None:
+        self.surrogate.restore(own["surrogate"])
+        self.descent = own["descent"] and Descent.restored(own["descent"], self.options)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import cma
 import numpy as np
@@ -79,6 +81,20 @@ class BOLeap(Optimizer):
             self.local.leap(self.descent.at)
             self.descent = None
 
+    def _state(self) -> dict[str, Any]:
+        return {
+            "surrogate": self.surrogate.state(),
+            "local": self.local and self.local.state(),
+            "descent": self.descent and self.descent.state(),
+            "spent": self.spent,
+        }
+
+    def _restore(self, own: Mapping[str, Any]) -> None:
+        self.surrogate.restore(own["surrogate"])
+        self.local = own["local"] and SemiLocal.restored(own["local"], self.options, self.random)
+        self.descent = own["descent"] and Descent.restored(own["descent"], self.options)
+        self.spent = int(own["spent"])
+
 
 class SemiLocal:
     """Adapt sigma and C to populations by equations 14-17 of Hansen & Ostermeier 2001; their mean leaps.
@@ -90,6 +106,9 @@ class SemiLocal:
 
     def __init__(self, mu: Points, options: BOLeapOptions, random: np.random.Generator) -> None:
         self.count, self.best = options.population, options.best
+        self._began, self._start = random.bit_generator.state, mu
+        self._told: list[tuple[Points, Points]] = []  # populations as they were evaluated, and their losses
+        self._leaps: list[Points] = []
         dim = len(mu)
         self.es = cma.CMAEvolutionStrategy(
             mu,
@@ -119,12 +138,37 @@ class SemiLocal:
 
     def tell(self, x: Points, loss: Points) -> Points:
         """Adapt sigma and C to a population, and return the mean of its best points."""
+        self._told.append((x, loss))
         self.es.tell(list(x), list(np.nan_to_num(loss, posinf=np.finfo(float).max)), check_points=False)
         return np.array(self.es.mean)
 
     def leap(self, mu: Points) -> None:
         """Let the next population be drawn around `mu`."""
         self.es.mean = mu.copy()
+        self._leaps.append(mu)
+
+    def state(self) -> dict[str, Any]:
+        """Return what the library has been told, and where that began: its own state could only be pickled."""
+        points, losses = ([told[part] for told in self._told] for part in (0, 1))
+        return {
+            "began": self._began,
+            "start": self._start,
+            "points": np.array(points),
+            "losses": np.array(losses),
+            "leaps": np.array(self._leaps),
+        }
+
+    @classmethod
+    def restored(cls, state: Mapping[str, Any], options: BOLeapOptions, random: np.random.Generator) -> SemiLocal:
+        """Return the search that had this state, by telling it all again."""
+        random.bit_generator.state = state["began"]
+        made = cls(state["start"], options, random)
+        for number, (points, loss) in enumerate(zip(state["points"], state["losses"], strict=True)):
+            made.population()
+            made.tell(points, loss)
+            if number < len(state["leaps"]):
+                made.leap(state["leaps"][number])
+        return made
 
 
 class PathLength(CMAAdaptSigmaCSA):  # type: ignore[misc]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -11,6 +13,11 @@ import torch
 from cma.sigma_adaptation import CMAAdaptSigmaCSA
 
 from .base import Kind, Optimizer, Points, Proposal
+
+OTHERS = (
+    "cma-es goes on with the points and losses that the run holds; cma or its linear algebra draws others here than "
+    "where the run began, so that it ends in other points than it would have there"
+)
 
 
 @dataclass(frozen=True)
@@ -47,6 +54,8 @@ class CMAES(Optimizer):
         self._start()
 
     def _start(self) -> None:
+        self._began = self.random.bit_generator.state
+        self._told: list[tuple[Points, Points]] = []  # populations and their losses since then
         options: dict[str, Any] = {
             "bounds": [-1.0, 1.0],
             "AdaptSigma": CMAAdaptSigmaCSA,  # in every dimension, as published
@@ -65,9 +74,29 @@ class CMAES(Optimizer):
         return Proposal(torch.from_numpy(np.stack(self._asked)), Kind.POPULATION)
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
-        self.strategy.tell(self._asked, self.penalised(loss).tolist())  # the very points, which it knows again
+        self._take(self.penalised(loss))
         if self.strategy.stop():
             self._start()
+
+    def _take(self, loss: Points) -> None:
+        self.strategy.tell(self._asked, loss.tolist())  # the very points, which it knows again
+        self._told.append((np.stack(self._asked), loss))
+
+    def _state(self) -> dict[str, Any]:
+        """Return what the library has been told since it began last: its own state could only be pickled."""
+        points, losses = ([told[part] for told in self._told] for part in (0, 1))
+        return {"began": self._began, "points": np.array(points), "losses": np.array(losses)}
+
+    def _restore(self, own: Mapping[str, Any]) -> None:
+        self.random.bit_generator.state = own["began"]
+        self._start()
+        for points, loss in zip(own["points"], own["losses"], strict=True):
+            self._asked = self.strategy.ask()
+            if not np.array_equal(self._asked, points):
+                warnings.warn(OTHERS, RuntimeWarning, stacklevel=2)
+                self._asked = list(points)
+            self._take(loss)
+            self.strategy.stop()
 
 
 @dataclass(frozen=True)

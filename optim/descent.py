@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -73,6 +75,18 @@ class Descent:
         if not self.done:
             self._last, self._last_loss, self.at = self.at, loss, moved
 
+    def state(self) -> dict[str, Any]:
+        """Return where the descent stands, as data."""
+        return {name: value for name, value in vars(self).items() if name != "options"}
+
+    @classmethod
+    def restored(cls, state: Mapping[str, Any], options: DescentOptions) -> Self:
+        """Return the descent that had this state."""
+        made = cls(state["at"], options)
+        for name in made.state():
+            setattr(made, name, state[name])
+        return made
+
     def _moved(self, grad: Points) -> Points:
         """Return z - step * gradient, kept inside the box."""
         move = -self.options.step * grad
@@ -107,6 +121,12 @@ class Descents(Optimizer):
         for descent, one_loss, one_grad in zip(self.descents, loss, grad, strict=True):
             descent.tell(float(one_loss), one_grad)
         self.descents = [self._begun() if one.done else one for one in self.descents]
+
+    def _state(self) -> dict[str, Any]:
+        return {"descents": [one.state() for one in self.descents]}
+
+    def _restore(self, own: Mapping[str, Any]) -> None:
+        self.descents = [Descent.restored(one, self.options) for one in own["descents"]]
 
     def _begun(self) -> Descent:
         return Descent(self.random.uniform(-1.0, 1.0, self.space.dim), self.options)

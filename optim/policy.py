@@ -14,12 +14,12 @@ but neither values nor SAC's entropy. A failed episode is rewarded like the wors
 from __future__ import annotations
 
 import abc
-import io
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, ClassVar
 
 import gymnasium
@@ -147,7 +147,7 @@ class PolicySearch(Optimizer):
             self._scale = float(losses.mean()), float(losses.std()) or 1.0
         mean, deviation = self._scale
         with self._own_randomness():
-            self._model.set_logger(Logger(folder=None, output_formats=[]))  # which a model lacks that was loaded
+            self._model.set_logger(Logger(folder=None, output_formats=[]))  # which only SB3's own loop gives it
             self._learn(self._rollout, ((mean - losses) / deviation).astype(np.float32))
         del self._rollout
 
@@ -166,18 +166,20 @@ class PolicySearch(Optimizer):
             finally:
                 self._generators = _exchanged(others)
 
-    def __getstate__(self) -> dict[str, Any]:
-        kept = io.BytesIO()
-        if self._model is not None:
-            self._model.save(kept)
-        return self.__dict__ | {"_model": kept.getvalue(), "_objective": None}
+    def _state(self) -> dict[str, Any]:
+        torchs, numpys = self._generators
+        return {
+            "scale": self._scale,
+            "torch": torchs.numpy(),
+            "numpy": numpys,
+            "weights": None if self._model is None else _weights(self._model),
+        }
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        generators = self._generators
-        with self._own_randomness():
-            self._model = self.algorithm.load(io.BytesIO(state["_model"]), device="cpu") if state["_model"] else None
-        self._generators = generators  # loading draws, for weights that are then replaced
+    def _restore(self, own: Mapping[str, Any]) -> None:
+        self._scale = own["scale"] and tuple(own["scale"])
+        self._generators = torch.from_numpy(own["torch"]), dict(own["numpy"])
+        if own["weights"] is not None:
+            _put_weights(self._model, own["weights"])
 
 
 class PPO(PolicySearch):
@@ -278,10 +280,19 @@ class SAC(PolicySearch):
                 end = np.array([t == last])
                 self._model.replay_buffer.add(*what, reward * end, end, [{}])
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)
-        for rollout, rewards in self._remembered:
-            self._remember(rollout, rewards)
+    def _state(self) -> dict[str, Any]:
+        played = [rollout for rollout, _ in self._remembered]
+        return super()._state() | {
+            "seen": np.concatenate([one.seen for one in played], axis=1) if played else None,
+            "actions": np.concatenate([one.actions for one in played], axis=1) if played else None,
+            "rewards": np.concatenate([rewards for _, rewards in self._remembered]) if played else None,
+        }
+
+    def _restore(self, own: Mapping[str, Any]) -> None:
+        super()._restore(own)
+        if own["seen"] is not None:
+            self._remembered = [(Rollout(own["seen"], own["actions"]), own["rewards"])]
+            self._remember(*self._remembered[0])
 
 
 class _Spaces(gymnasium.Env[Any, Any]):
@@ -304,3 +315,43 @@ def _exchanged(states: tuple[Tensor, dict[str, Any]]) -> tuple[Tensor, dict[str,
     torch.set_rng_state(states[0])
     np.random.set_state(states[1])
     return before
+
+
+def _weights(model: Any) -> dict[str, Any]:
+    """Return the weights of a model's networks and what its optimisers have gathered about them, as arrays."""
+    return {name: _arrays(_inner(part)) for name, part in _parts(model).items()}
+
+
+def _put_weights(model: Any, weights: Mapping[str, Any]) -> None:
+    """Put what `_weights` returned into a model that was made by the same options."""
+    for name, part in _parts(model).items():
+        if isinstance(part, Tensor):
+            part.data.copy_(torch.from_numpy(weights[name]))
+        elif isinstance(part, torch.optim.Optimizer):
+            gathered = {int(number): _tensors(of) for number, of in weights[name].items()}
+            part.load_state_dict({**part.state_dict(), "state": gathered})
+        else:
+            part.load_state_dict(_tensors(weights[name]))
+
+
+def _parts(model: Any) -> dict[str, Any]:
+    """Return the networks, optimisers and single tensors of a model by SB3's names of them."""
+    names, tensors = model._get_torch_save_params()
+    return {name: attrgetter(name)(model) for name in (*names, *tensors)}
+
+
+def _inner(part: Any) -> Any:
+    if isinstance(part, Tensor):
+        return part
+    return part.state_dict()["state"] if isinstance(part, torch.optim.Optimizer) else part.state_dict()
+
+
+def _arrays(value: Any) -> Any:
+    """Return tensors, and mappings of them, as arrays under names."""
+    if isinstance(value, Mapping):
+        return {str(name): _arrays(inner) for name, inner in value.items()}
+    return value.detach().numpy()
+
+
+def _tensors(arrays: Mapping[str, Any]) -> dict[str, Tensor]:
+    return {name: torch.from_numpy(array) for name, array in arrays.items()}

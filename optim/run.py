@@ -1,9 +1,11 @@
 """A run on disk: every point an optimiser evaluated, and what it goes on from.
 
 A run is a zarr group of columns along `evaluation`, as long as the budget; a row without a status is not there yet.
-Beside the columns lies the file `state`: a line that counts the rows and those the optimiser has been told, then the
-optimiser itself, its random numbers included. Rows are written first, that file at once after them, so rows it does not
-count do not exist: whatever is lost by stopping a run at any instant is computed again, to the same bits.
+Beside the columns lies the file `state` (see `kept`): it counts the rows and those the optimiser has been told, has
+their checksums, and then the optimiser itself, its random numbers included, as data that is read and never run. Rows
+are written first, that file at once after them, so rows it does not count do not exist: whatever is lost by stopping a
+run at any instant is computed again, to the same bits. Rows that are not what the file says are damage, which is
+refused by name.
 
 Rows that are there and not told belong to a proposal that the budget cut short. The optimiser is told of none of its
 points, so that a run continued to a larger budget is the run that had it from the beginning.
@@ -13,7 +15,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import json
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -28,31 +29,19 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .. import __version__
-from ..landscapes.files import placing, replacing
-from ..landscapes.identity import StoreError, StoreExistsError, check_identity, plain_json
-from ..landscapes.layout import FILL, consolidate, create_array, flags
+from ..landscapes.files import placing
+from ..landscapes.identity import StoreError, StoreExistsError, check_identity
+from ..landscapes.layout import FILL, consolidate, open_group
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
 from .base import Kind
+from .kept import CHUNK, STATE, Kept, checksums, damaged, digest_of, first_wrong
+from .run_arrays import COLUMNS, FORMAT, Columns, attributes_of, dims_of, empty, lay_out, plain, read_rows
+from .state import decoded, encoded
 
-FORMAT = 1
-CHUNK = 64  # rows
 PAUSE = 1.0  # least seconds between two writes, so that quick episodes are not held up
 SHARE = 0.05  # most of the time that may go into writing, so that a large state is not written too often
-RUN, STATE = "run.zarr", "state"
-DEEP = ("x", "grad")
-COLUMNS: dict[str, tuple[str, dict[str, Any]]] = {  # status last: a row that has one is whole
-    "x": ("float64", {"long_name": "parameters, each in its own unit"}),
-    "loss": ("float64", {"long_name": "loss"}),
-    "grad": ("float64", {"long_name": "gradient of the loss by each parameter in its own unit"}),
-    "slope": ("float64", {"long_name": "length of the gradient"}),
-    "kind": ("int8", {"long_name": "what the point was evaluated for", **flags(Kind)}),
-    "episodes": ("int64", {"long_name": "episodes so far"}),
-    "forwards": ("float64", {"long_name": "episodes so far, in episodes without gradient"}),
-    "seconds": ("float64", {"long_name": "time so far", "units": "s"}),
-    "status": ("int8", {"long_name": "how the evaluation ended", **flags(Status)}),
-}
+RUN = "run.zarr"
 
 
 class Run:
@@ -66,13 +55,14 @@ class Run:
     def __init__(self, attributes: Mapping[str, Any], path: Path | None = None) -> None:
         self.path = path
         self.attributes = dict(attributes)
+        self._columns: Columns = {} if path else empty(CHUNK, self.dim)
         self.count = 0  # rows
         self.told = 0  # rows that the kept state has been told
         self._state: bytes | None = None
+        self._sums: list[int] = []  # checksums of the rows on disk
         self._written = 0  # rows known to be on disk
         self._saved_at = time.monotonic()
         self._next_save = PAUSE  # seconds after that
-        self._columns = self._empty(self.budget)
         if path:
             self._inode = path.stat().st_ino
             self._load(path)
@@ -90,15 +80,16 @@ class Run:
     ) -> Run:
         """Make an empty run at a path where there is none, all at once; `overwrite` replaces a run, nothing else."""
         path = Path(path).resolve()
-        attributes = _attributes(space, identity, provenance or {}, budget)
+        attributes = attributes_of(space, identity, provenance or {}, budget)
         if path.exists() and not overwrite:
             raise StoreExistsError(f"{path} exists already; write elsewhere with --out, or replace it with --force")
         if path.exists() and not is_run(path):
             raise StoreError(f"{path} is no run, so it is not replaced; move it away or write elsewhere")
         try:
             with placing(path, overwrite=overwrite) as new:
-                _lay_out(zarr.create_group(new, zarr_format=3), attributes)
+                lay_out(zarr.create_group(new, zarr_format=3), attributes)
                 consolidate(new)
+                Kept(about=digest_of(attributes)).write(new)
         except FileExistsError as error:
             raise StoreExistsError(str(error)) from None
         return cls.open(path)
@@ -111,7 +102,7 @@ class Run:
             raise StoreError(f"there is no run at {path}; make one with `landscape optimize`")
         if not is_run(path):
             raise StoreError(f"{path} is no run of format {FORMAT}; move it away or write elsewhere")
-        return cls(zarr.open_group(path, mode="r", use_consolidated=False).attrs.asdict(), path)
+        return cls(open_group(path).attrs.asdict(), path)
 
     @classmethod
     def open_or_create(
@@ -127,20 +118,25 @@ class Run:
         with contextlib.suppress(StoreExistsError):
             return cls.create(path, space, identity=identity, provenance=provenance, budget=budget)
         run = cls.open(path)
-        wanted = _attributes(space, identity, {}, budget)["identity"]
+        wanted = attributes_of(space, identity, {}, budget)["identity"]
         check_identity(run.path, wanted=wanted, found=run.identity, what="run")
         return run
 
     @classmethod
     def in_memory(cls, space: ParameterSpace, *, identity: Mapping[str, Any] | None = None, budget: int) -> Run:
         """Make a run that lives as long as the object."""
-        return cls(_attributes(space, identity or {}, {}, budget))
+        return cls(attributes_of(space, identity or {}, {}, budget))
 
     @property
     def identity(self) -> dict[str, Any]:
         """What decides the run's numbers."""
         found: dict[str, Any] = self.attributes["identity"]
         return found
+
+    @property
+    def dim(self) -> int:
+        """Number of parameters."""
+        return len(self.identity["parameters"])
 
     @property
     def budget(self) -> int:
@@ -164,9 +160,13 @@ class Run:
         """Number of episodes that failed."""
         return int((self._columns["status"][: self.count] != Status.OK).sum())
 
-    def state(self) -> bytes | None:
+    def state(self) -> dict[str, Any] | None:
         """Return the optimiser's state after `told` rows, None before the first."""
-        return self._state
+        try:
+            found: dict[str, Any] | None = decoded(self._state) if self._state else None
+        except Exception as error:  # whatever is read instead of arrays
+            raise damaged((self.path or Path()) / STATE, f"it holds no state ({error})") from None
+        return found
 
     def table(self) -> xr.Dataset:
         """Return every row as a long table: shapes (evaluation,) or (evaluation, dim).
@@ -175,11 +175,11 @@ class Run:
         """
         units = {"loss": {"units": self.attributes["loss_unit"]}}
         columns = {
-            name: (_dims(name), self._columns[name][: self.count].copy(), {**about, **units.get(name, {})})
+            name: (dims_of(name), self._columns[name][: self.count].copy(), {**about, **units.get(name, {})})
             for name, (_, about) in COLUMNS.items()
         }
         names = {"dim": ("dim", self.identity["parameters"]), "unit": ("dim", self.attributes["units"])}
-        return xr.Dataset(columns, names, _plain(self.attributes))
+        return xr.Dataset(columns, names, plain(self.attributes))
 
     @contextlib.contextmanager
     def filling(self) -> Iterator[None]:
@@ -201,16 +201,14 @@ class Run:
 
     def begin(self, *, gradient_cost: float) -> None:
         """Keep what an episode with gradient costs, in episodes without."""
+        self.attributes["gradient_cost"] = gradient_cost
+        self._keep()
         self._set(gradient_cost=gradient_cost)
 
     def extend(self, budget: int) -> None:
         """Make room for so many episodes, if there is less."""
         if budget <= self.budget:
             return
-        columns = self._empty(budget)
-        for name, values in self._columns.items():
-            columns[name][: len(values)] = values
-        self._columns = columns
         if self.path:
             for array in self._arrays().values():
                 array.resize((budget, *array.shape[1:]))
@@ -218,10 +216,13 @@ class Run:
 
     def rewind(self) -> None:
         """Drop the rows of a proposal that was cut short: it is evaluated again, whole."""
-        for name, values in self._columns.items():
-            values[self.told :] = FILL[COLUMNS[name][0]]
+        if self.count == self.told:
+            return
         self.count = self.told
-        self._written = min(self._written, self.told)
+        self._blank_rest()
+        if self._written > self.told:
+            self._written = self.told
+            self._keep()  # before other rows are in their place
 
     def append(
         self,
@@ -229,7 +230,7 @@ class Run:
         evaluation: Evaluation,
         kind: Kind,
         seconds: float,
-        state: Callable[[], bytes] | None = None,
+        state: Callable[[], dict[str, Any]] | None = None,
     ) -> None:
         """Add the points of a proposal, which took so many seconds, and write them if that is due.
 
@@ -238,19 +239,24 @@ class Run:
         rows = slice(self.count, self.count + len(x))
         if rows.stop > self.budget:
             raise ValueError(f"a run of {self.budget} episodes has {self.budget - self.count} left; got {len(x)} more")
+        self._make_room(rows.stop)
         for name, values in self._rows(x, evaluation, kind, seconds).items():
             self._columns[name][rows] = values
         self.count = rows.stop
         if state and self.path and time.monotonic() - self._saved_at >= self._next_save:
             self.save(state)
 
-    def save(self, state: Callable[[], bytes] | None) -> None:
-        """Write what is not written yet, rows first; without a state the one kept before stays."""
+    def hold(self, state: Callable[[], dict[str, Any]]) -> None:
+        """Take in the optimiser as it is once it has been told every row, to be written with the next `save`."""
+        self._state, self.told = encoded(state()), self.count
+
+    def save(self, state: Callable[[], dict[str, Any]] | None = None) -> None:
+        """Write what is not written yet, rows first; without a state the one held before stays."""
         began = time.monotonic()
         if state:
-            self._state, self.told = state(), self.count
+            self.hold(state)
         if self.path:
-            self._write(self.path)
+            self._write()
         self._saved_at = time.monotonic()
         self._next_save = max(PAUSE, (self._saved_at - began) / SHARE)
 
@@ -275,54 +281,65 @@ class Run:
     def _last(self, column: str) -> float:
         return float(self._columns[column][self.count - 1]) if self.count else 0.0
 
-    def _write(self, path: Path) -> None:
+    def _write(self) -> None:
         self._check_in_place()
         rows = slice(self._written // CHUNK * CHUNK, min(-(-self.count // CHUNK) * CHUNK, self.budget))  # whole chunks
         if rows.stop > rows.start:
             for name, array in self._arrays().items():
                 array[rows] = self._columns[name][rows]
+        self._keep()
         self._written = self.count
-        with replacing(path / STATE) as partial, partial.open("wb") as file:
-            file.write(json.dumps({"rows": self.count, "told": self.told}).encode() + b"\n")
-            file.write(self._state or b"")
+
+    def _keep(self) -> None:
+        """Write which rows count, and the optimiser."""
+        if self.path is None:
+            return
+        whole = self._sums[: min(self._written, self.count) // CHUNK]
+        self._sums = checksums(self._columns, self.count, whole)
+        about = digest_of(self.attributes)
+        Kept(self.count, self.told, self.gradient_cost, about, self._sums, self._state or b"").write(self.path)
 
     def _load(self, path: Path) -> None:
-        """Read the rows that the state counts."""
-        head, _, state = _kept(path).partition(b"\n")
-        counts = json.loads(head)
-        self.attributes = self._group("r").attrs.asdict()
-        self._columns = self._empty(self.budget)
-        for name, array in self._arrays().items():
-            rows = slice(min(counts["rows"], array.shape[0], self.budget))
-            self._columns[name][rows] = array[rows]
-        missing = np.append(self._columns["status"] == Status.MISSING, True)
-        self.count, self.told = int(missing.argmax()), counts["told"]
-        if self.count < self.told:
-            raise StoreError(f"{self.path} is damaged: row {self.count + 1} is missing; begin anew with --force")
-        self._state = state or None
-        self._written = self.count
+        """Read the rows that the state counts, and refuse what is not as it was written."""
+        kept, group = Kept.read(path), open_group(path)
+        attributes = group.attrs.asdict()
+        if digest_of(attributes) != kept.about or not isinstance(attributes.get("budget"), int):
+            raise damaged(path / "zarr.json", "what the run says of itself is not what was written")
+        self.attributes = attributes | {"gradient_cost": kept.gradient_cost}
+        self.count = self._written = 0
+        self._columns = empty(CHUNK, self.dim)
+        self._make_room(kept.rows)
+        for name, values in self._columns.items():
+            values[: kept.rows] = read_rows(path, group, name, kept.rows, self.dim)
+        self._sums = checksums(self._columns, kept.rows, [])
+        if wrong := first_wrong(self._sums, kept):
+            raise damaged(path, f"rows {wrong[0] + 1} to {wrong[-1] + 1} are not what was written")
+        self.count = self._written = kept.rows
+        self.told, self._state = kept.told, kept.state or None
+
+    def _make_room(self, rows: int) -> None:
+        """Let the columns in memory grow with the rows: a budget may be larger than what is ever used."""
+        if rows <= len(self._columns["status"]):
+            return
+        columns = empty(max(-(-rows // CHUNK) * CHUNK, 2 * len(self._columns["status"])), self.dim)
+        for name, values in self._columns.items():
+            columns[name][: self.count] = values[: self.count]
+        self._columns = columns
+
+    def _blank_rest(self) -> None:
         for name, values in self._columns.items():
             values[self.count :] = FILL[COLUMNS[name][0]]
 
     def _set(self, **attributes: Any) -> None:
         self.attributes.update(attributes)
         if self.path:
-            self._group().attrs.update(attributes)
+            open_group(self.path, "r+").attrs.update(attributes)
             consolidate(self.path)
 
-    def _group(self, mode: Any = "r+") -> zarr.Group:
-        return zarr.open_group(str(self.path), mode=mode, use_consolidated=False)
-
     def _arrays(self) -> dict[str, zarr.Array[Any]]:
-        group = self._group()
+        assert self.path is not None  # as its callers have seen
+        group = open_group(self.path, "r+")
         return {name: group[name] for name in COLUMNS}  # type: ignore[misc]
-
-    def _empty(self, budget: int) -> dict[str, NDArray[Any]]:
-        dim = len(self.identity["parameters"])
-        return {
-            name: np.full((budget, dim) if name in DEEP else budget, FILL[dtype], dtype)
-            for name, (dtype, _) in COLUMNS.items()
-        }
 
     def _check_in_place(self) -> None:
         """Refuse to write into a run that was replaced or removed since it was opened."""
@@ -344,60 +361,6 @@ def open_run(path: str | Path) -> xr.Dataset:
 def is_run(path: str | Path) -> bool:
     """Say whether a run of this format is at `path`."""
     try:
-        group = zarr.open_group(Path(path), mode="r", use_consolidated=False)
+        return open_group(Path(path)).attrs.get("gradscape_run") == FORMAT
     except Exception:  # whatever else is there is none
         return False
-    return group.attrs.get("gradscape_run") == FORMAT
-
-
-def _kept(path: Path) -> bytes:
-    try:
-        return (path / STATE).read_bytes()
-    except FileNotFoundError:
-        return b'{"rows": 0, "told": 0}\n'
-
-
-def _plain(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a run's attributes as any format of files has them; what is not known yet is left out."""
-    known = {name: value for name, value in attributes.items() if value is not None and name != "units"}
-    return {name: json.dumps(value) if isinstance(value, dict) else value for name, value in known.items()}
-
-
-def _dims(column: str) -> tuple[str, ...]:
-    return ("evaluation", "dim") if column in DEEP else ("evaluation",)
-
-
-def _attributes(
-    space: ParameterSpace, identity: Mapping[str, Any], provenance: Mapping[str, Any], budget: int
-) -> dict[str, Any]:
-    box = {"parameters": space.names, "lower": space.lower.tolist(), "upper": space.upper.tolist()}
-    whole = plain_json({**identity, **box, "gradscape": __version__}, "a run's identity")
-    return {
-        "gradscape_run": FORMAT,
-        "env": whole.get("objective", ""),
-        "method": whole.get("method", ""),
-        "seed": whole.get("seed", 0),
-        "budget": budget,
-        "fidelity": whole.get("fidelity", ""),
-        "loss_unit": str(provenance.get("loss_unit", "")),
-        "units": list(space.units),
-        "lower": whole["lower"],
-        "upper": whole["upper"],
-        "gradient_cost": None,
-        "identity": whole,
-        "provenance": plain_json(provenance, "a run's provenance"),
-    }
-
-
-def _lay_out(group: zarr.Group, attributes: dict[str, Any]) -> None:
-    group.attrs.update(attributes)
-    budget, parameters = attributes["budget"], attributes["identity"]["parameters"]
-    for name, (dtype, about) in COLUMNS.items():
-        unit = {"units": attributes["loss_unit"]} if name == "loss" else {}
-        deep = (len(parameters),) if name in DEEP else ()
-        create_array(group, name, (budget, *deep), (CHUNK, *deep), _dims(name), dtype, **{**about, **unit})
-    axis = create_array(
-        group, "dim", (len(parameters),), (len(parameters),), ("dim",), "string",
-        long_name="parameter", units=attributes["units"],
-    )  # fmt: skip
-    axis[:] = np.array(parameters, dtype=object)

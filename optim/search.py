@@ -5,9 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
+from ..landscapes.identity import StoreError
 from ..landscapes.objective import Objective, evaluated, name_of
-from .base import Optimizer, restored
+from .base import Optimizer
 from .registry import optimizer_class
 from .run import Run
 
@@ -67,10 +69,13 @@ def _in_memory(objective: Objective, method: Optimizer | str, budget: int) -> Ru
 
 def _fill(objective: Objective, optimizer: Optimizer, run: Run, budget: int, report: Callable[[], None]) -> None:
     mark = time.perf_counter()
-    whole = True
+    whole, largest = True, 0
     while run.count < budget:
+        if budget - run.count < largest:  # the next proposal may be cut short, and is proposed again by who goes on
+            run.hold(optimizer.state)
         proposal = optimizer.ask()
         _check(optimizer, len(proposal.x), grad=proposal.grad)
+        largest = max(largest, len(proposal.x))
         x = proposal.x[: budget - run.count]
         whole = len(x) == len(proposal.x)
         evaluation = evaluated(objective, x, grad=proposal.grad)
@@ -84,17 +89,13 @@ def _fill(objective: Objective, optimizer: Optimizer, run: Run, budget: int, rep
 
 def _begun(objective: Objective, method: Optimizer | str, run: Run, gradient_cost: float | None) -> Optimizer:
     """Return the optimiser that the run goes on with, the one it kept or a new one, and take the run back to it."""
-    name = method if isinstance(method, str) else method.name
     state = run.state()
     if state is not None:
-        optimizer = restored(state)
-    elif isinstance(method, Optimizer):
-        optimizer = method
+        optimizer = _restored(objective, method, run, state)
     else:
-        optimizer = optimizer_class(method).on(objective, seed=int(run.attributes["seed"]))
-    if optimizer.name != name:
-        raise ValueError(f"{run.path} holds a run of {optimizer.name}, not of {name}; give each a run of its own")
-    optimizer.attach(objective)
+        named = isinstance(method, str)
+        optimizer = optimizer_class(method).on(objective, seed=int(run.attributes["seed"])) if named else method
+        optimizer.attach(objective)
     run.rewind()
     if state is None:
         run.save(optimizer.state)  # what to go back to
@@ -102,6 +103,22 @@ def _begun(objective: Objective, method: Optimizer | str, run: Run, gradient_cos
     if optimizer.needs_grad and run.gradient_cost is None:
         run.begin(gradient_cost=gradient_cost or episode_cost(objective).ratio)
     return optimizer
+
+
+def _restored(objective: Objective, method: Optimizer | str, run: Run, state: dict[str, Any]) -> Optimizer:
+    """Return the optimiser that a run kept, of the class of `method`."""
+    kind = optimizer_class(method) if isinstance(method, str) else type(method)
+    if state.get("method") != kind.name:
+        raise ValueError(
+            f"{run.path} holds a run of {state.get('method')}, not of {kind.name}; give each a run of its own"
+        )
+    try:
+        return kind.restored(objective, state)
+    except Exception as error:  # whatever the method stumbles upon
+        raise StoreError(
+            f"{run.path} keeps no state of {kind.name} that can be gone on from ({type(error).__name__}: {error}); "
+            "begin the run anew with --force"
+        ) from error
 
 
 def _check(optimizer: Optimizer, count: int, *, grad: bool) -> None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -82,6 +82,15 @@ class Surrogate:
         """Take in points, shape (count, dim), and their losses, shape (count,), +inf where an episode failed."""
         self.z = np.concatenate([self.z, z])
         self.loss = np.concatenate([self.loss, loss])
+
+    def state(self) -> dict[str, Any]:
+        """Return what the process knows, as data."""
+        return {"z": self.z, "loss": self.loss, "fitted": self._fitted, "hyper": self._hyper}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Take back what `state` returned."""
+        self.z, self.loss = state["z"].reshape(-1, self.z.shape[1]), state["loss"]
+        self._fitted, self._hyper = int(state["fitted"]), dict(state["hyper"])
 
     def lowest(self, random: np.random.Generator) -> Points:
         """Return where mean - coefficient * standard deviation is least, shape (dim,); a random point before."""

@@ -5,6 +5,7 @@ import signal
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -52,9 +53,8 @@ def finished(path: Path, **changes) -> SliceStore:
 
 
 def chunks(place: Path) -> list[Path]:
-    return sorted(
-        file for name in ("loss", "grad", "status") for file in (place / name / "c").rglob("*") if file.is_file()
-    )
+    names = ("loss", "grad", "status", "checksum")
+    return sorted(file for name in names for file in (place / name / "c").rglob("*") if file.is_file())
 
 
 def test_every_value_comes_back_at_its_own_coordinates(tmp_path):
@@ -144,7 +144,7 @@ def test_a_finished_slice_has_large_chunks_in_few_files_and_nothing_beside_it(tm
     assert [file.name for file in tmp_path.iterdir()] == ["slice.filling.zarr"]
     tiles = len(chunks(filling(path)))
     finished(path)
-    assert len(chunks(path)) == 3 < tiles
+    assert len(chunks(path)) == 4 < tiles
     assert [file.name for file in tmp_path.iterdir()] == ["slice.zarr"]
     assert make(path).pending() == []
     assert make(path).coarse().identical(open_slice(path))
@@ -232,6 +232,31 @@ def test_a_damaged_chunk_costs_exactly_its_tile(tmp_path, damage):
         assert (seen == Status.MISSING).sum() == store.count(pending[0])
         fill(store, pending)
         assert file.read_bytes() == sound
+    xr.testing.assert_identical(open_slice(path), whole)
+
+
+@pytest.mark.parametrize("place", [filling, Path])
+def test_chunks_in_each_others_place_are_missing_and_not_taken_for_right(tmp_path, monkeypatch, place):
+    monkeypatch.setattr("gradscape.landscapes.layout.SIDE", 4)  # so that a finished slice has several, too
+    path = tmp_path / "s.zarr"
+    (fill(make(path)) if place is filling else finished(path))
+    whole, swapped = open_slice(path), 0
+    for one, other in combinations(chunks(place(path)), 2):
+        if one.relative_to(path.parent).parts[:2] == other.relative_to(path.parent).parts[:2]:
+            contents = one.read_bytes(), other.read_bytes()
+            if contents[0] == contents[1]:
+                continue
+            one.write_bytes(contents[1])
+            other.write_bytes(contents[0])
+            found = open_slice(path)
+            known = found["status"] != Status.MISSING
+            assert 0 < known.sum() < found["status"].size
+            for name in ("loss", "grad", "status"):
+                xr.testing.assert_equal(found[name].where(known), whole[name].where(known))
+            one.write_bytes(contents[0])
+            other.write_bytes(contents[1])
+            swapped += 1
+    assert swapped > 20
     xr.testing.assert_identical(open_slice(path), whole)
 
 

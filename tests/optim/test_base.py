@@ -1,12 +1,12 @@
-import pickle
-
 import numpy as np
 import pytest
 import torch
 
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.optim.base import Kind, NoOptions, Optimizer, Points, Proposal, restored
+from gradscape.optim.base import Kind, NoOptions, Optimizer, Points, Proposal
+
+from .states import restored
 
 SPACE = ParameterSpace(("a", "b"), torch.tensor([-3.0, 10.0]), torch.tensor([1.0, 10.5]), ("m", "s"))
 
@@ -24,6 +24,13 @@ class Recorder(Optimizer):
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
         self.z, self.loss, self.grad = z, loss, grad
+
+
+class Bowl:
+    space = SPACE
+
+    def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
+        return Evaluation.judged(x.square().sum(dim=1), 2 * x if grad else None)
 
 
 def told(status: list[int], loss: list[float], grad: list[list[float]] | None = None) -> Recorder:
@@ -60,12 +67,23 @@ def test_a_failed_episode_is_infinite_without_slope_and_counts_as_the_worst_so_f
     assert optimizer.penalised(optimizer.loss).tolist() == [-7.0, -7.0, -9.0]
 
 
-def test_a_state_of_something_else_is_refused() -> None:
-    optimizer = told([Status.OK], [2.0])
-    again = restored(optimizer.state())
-    assert isinstance(again, Recorder)
+def test_a_method_whose_attributes_are_data_is_restored_without_more() -> None:
+    optimizer = told([Status.OK, Status.OK], [2.0, np.nan], [[1.0, 2.0]] * 2)
+    again = restored(optimizer, Bowl())
     assert again.random.random() == optimizer.random.random()
-    with pytest.raises(ValueError, match="that of a dict, not of an optimiser"):
-        restored(pickle.dumps({}))
-    with pytest.raises(ValueError, match=r"cannot be read .*; begin the run anew"):
-        restored(optimizer.state()[:20])
+    assert again.worst == 2.0
+    for name in ("next", "z", "loss", "grad"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(optimizer, name))
+
+
+def test_what_is_no_data_is_named() -> None:
+    optimizer = told([Status.OK], [2.0])
+    optimizer.z = slice(3)  # type: ignore[assignment]
+    with pytest.raises(TypeError, match="a state holds numbers, strings and arrays; got a slice"):
+        restored(optimizer, Bowl())
+
+
+def test_a_state_puts_nothing_in_the_place_of_a_method() -> None:
+    state = told([Status.OK], [2.0]).state()
+    with pytest.raises(ValueError, match="_ask is no attribute that recorder keeps"):
+        Recorder.restored(Bowl(), state | {"own": {"_ask": 3}})

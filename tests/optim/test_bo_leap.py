@@ -8,9 +8,11 @@ from gradscape.envs.registry import make
 from gradscape.landscapes.adapters import from_torch
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.optim.base import Kind, restored
+from gradscape.optim.base import Kind
 from gradscape.optim.bo_leap import BOLeap, BOLeapOptions, SemiLocal
 from gradscape.optim.search import search
+
+from .states import restored
 
 SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 4.0, "m")
 RIPPLES = from_torch(lambda x: ((x - 0.5) ** 2).sum(dim=1) + (4 * x).cos().sum(dim=1), SPACE)
@@ -128,17 +130,17 @@ def test_points_lie_in_the_box():
     assert (table["status"] == Status.OK).all()
 
 
-def test_a_seed_decides_every_point_bit_for_bit_through_pickling_too():
+def test_a_seed_decides_every_point_bit_for_bit_through_its_state_too():
     options = BOLeapOptions(local_budget=30)
-    plain, pickled, other = (BOLeap(SPACE, seed=seed, options=options) for seed in (7, 7, 8))
+    plain, kept, other = (BOLeap(SPACE, seed=seed, options=options) for seed in (7, 7, 8))
     before = np.random.get_state()[1].copy()
     for _ in range(40):
-        asks = [one.ask() for one in (plain, pickled, other)]
+        asks = [one.ask() for one in (plain, kept, other)]
         assert torch.equal(asks[0].x, asks[1].x)
         assert asks[0].x.shape != asks[2].x.shape or not torch.equal(asks[0].x, asks[2].x)
-        for one, ask in zip((plain, pickled, other), asks, strict=True):
+        for one, ask in zip((plain, kept, other), asks, strict=True):
             one.tell(ask.x, RIPPLES.evaluate(ask.x, grad=ask.grad))
-        pickled = restored(pickled.state())
+        kept = restored(kept, RIPPLES)
     np.testing.assert_array_equal(before, np.random.get_state()[1])
 
 

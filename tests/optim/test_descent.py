@@ -1,5 +1,3 @@
-import pickle
-
 import numpy as np
 import pytest
 import torch
@@ -10,6 +8,8 @@ from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
 from gradscape.optim.descent import Descent, DescentOptions, Descents, DescentsOptions
 from gradscape.optim.search import search
+
+from .states import restored
 
 SPACE = ParameterSpace.box(("x", "y"), -2.0, 4.0, "m")
 BOWL = from_torch(lambda x: ((x - 1.0) ** 2 * torch.tensor([1.0, 3.0])).sum(dim=1), SPACE)
@@ -97,7 +97,7 @@ def test_a_zero_gradient_ends_a_descent_and_begins_another():
     assert len(np.unique(table["x"], axis=0)) == 40
 
 
-def test_descents_go_on_bit_for_bit_after_pickling():
+def test_descents_go_on_bit_for_bit_from_its_state():
     def fresh() -> Descents:
         return Descents(SPACE, seed=5)
 
@@ -107,7 +107,7 @@ def test_descents_go_on_bit_for_bit_after_pickling():
         assert torch.equal(ask.x, again.x)
         one.tell(ask.x, BOWL.evaluate(ask.x))
         other.tell(ask.x, BOWL.evaluate(ask.x))
-        other = pickle.loads(other.state())
+        other = restored(other, BOWL)
 
 
 def test_descents_go_on_past_failures():

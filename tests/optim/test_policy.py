@@ -10,10 +10,12 @@ pytest.importorskip("stable_baselines3", reason="the extra rl is not installed")
 
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.optim.base import Kind, restored
+from gradscape.optim.base import Kind
 from gradscape.optim.policy import PPO, SAC, PPOOptions, SACOptions
 from gradscape.optim.registry import optimizer_class
 from gradscape.optim.search import search
+
+from .states import restored
 
 
 class Bowl:
@@ -136,20 +138,14 @@ def test_stopping_after_every_proposal_changes_no_bit(small, objective):
     whole = played(small(objective), objective, 8)
     optimizer, parts = small(objective), []
     for _ in range(8):
-        optimizer = restored(optimizer.state())
-        optimizer.attach(objective)
+        optimizer = restored(optimizer, objective)
         parts.append(step(optimizer, objective))
     assert torch.equal(torch.cat(parts), whole)
 
 
-def test_the_objective_is_not_kept_with_the_optimiser(small):
-    class Unpicklable(Coin):
-        def __reduce__(self):
-            raise TypeError("an environment must not be pickled")
-
-    optimizer = restored(small(Unpicklable()).state())
+def test_before_it_is_attached_there_is_nothing_to_play_in():
     with pytest.raises(ValueError, match="attach it before the first ask"):
-        optimizer.ask()
+        SAC.on(Bowl()).ask()
 
 
 def test_seeds_do_not_disturb_each_other_nor_the_process(small):

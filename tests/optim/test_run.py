@@ -1,7 +1,15 @@
 import fcntl
+import io
 import json
 import os
+import pickle
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import reduce
+from operator import getitem
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +20,8 @@ from gradscape.landscapes.identity import StoreError
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
-from gradscape.optim.run import CHUNK, STATE, Run, is_run
+from gradscape.optim.kept import CHUNK, STATE, Kept
+from gradscape.optim.run import Run, is_run
 
 from ..clock import Clock
 
@@ -38,10 +47,10 @@ def test_a_run_reads_back_as_it_was_written(tmp_path: Path) -> None:
     run.begin(gradient_cost=2.5)
     run.append(*points(4), Kind.DESCENT, 1.5)
     run.append(*points(2, grad=False, start=4), Kind.POPULATION, 0.5)
-    run.save(lambda: b"what\ncomes\nnext")
+    run.save(lambda: {"at": "what\ncomes\nnext"})
     again = Run.open(tmp_path / "run.zarr")
     xr.testing.assert_identical(again.table(), run.table())
-    assert (again.count, again.told, again.state()) == (6, 6, b"what\ncomes\nnext")
+    assert (again.count, again.told, again.state()) == (6, 6, {"at": "what\ncomes\nnext"})
     table = again.table()
     np.testing.assert_array_equal(table["loss"], [0, 1, np.nan, 3, 4, 5])
     np.testing.assert_array_equal(table["slope"], [5, 5, np.nan, 5, np.nan, np.nan])
@@ -59,7 +68,7 @@ def test_a_run_reads_back_as_it_was_written(tmp_path: Path) -> None:
 def test_plain_xarray_reads_the_table_with_its_units(tmp_path: Path) -> None:
     run = run_at(tmp_path / "run.zarr")
     run.append(*points(5, grad=False), Kind.RANDOM, 1.0)
-    run.save(lambda: b"")
+    run.save(lambda: {})
     table = xr.open_zarr(tmp_path / "run.zarr").load()
     there = table.isel(evaluation=table["status"] != Status.MISSING)
     assert table.sizes == {"evaluation": 100, "dim": 2}
@@ -75,29 +84,29 @@ def test_plain_xarray_reads_the_table_with_its_units(tmp_path: Path) -> None:
 def test_rows_that_the_state_does_not_count_do_not_exist(tmp_path: Path) -> None:
     run = run_at(tmp_path / "run.zarr")
     run.append(*points(3), Kind.RANDOM, 1.0)
-    run.save(lambda: b"three")
+    run.save(lambda: {"at": "three"})
     state = (tmp_path / "run.zarr" / STATE).read_bytes()
     run.append(*points(3, start=3), Kind.RANDOM, 1.0)
-    run.save(lambda: b"six")
+    run.save(lambda: {"at": "six"})
     (tmp_path / "run.zarr" / STATE).write_bytes(state)  # as if killed between the rows and the state
     again = Run.open(tmp_path / "run.zarr")
-    assert (again.count, again.state()) == (3, b"three")
+    assert (again.count, again.state()) == (3, {"at": "three"})
     assert again.table().sizes["evaluation"] == 3
 
 
 def test_a_proposal_cut_short_is_in_the_table_and_dropped_before_the_run_goes_on(tmp_path: Path) -> None:
     run = run_at(tmp_path / "run.zarr", budget=5)
     run.append(*points(3), Kind.RANDOM, 1.0)
-    run.save(lambda: b"three")
+    run.save(lambda: {"at": "three"})
     run.append(*points(2, start=3), Kind.RANDOM, 1.0)
-    run.save(None)
+    run.save()
     again = Run.open(tmp_path / "run.zarr")
-    assert (again.count, again.told, again.state()) == (5, 3, b"three")
+    assert (again.count, again.told, again.state()) == (5, 3, {"at": "three"})
     again.rewind()
     assert (again.count, len(again.table()["loss"])) == (3, 3)
     again.extend(8)
     again.append(*points(5, start=3), Kind.RANDOM, 1.0)
-    again.save(lambda: b"eight")
+    again.save(lambda: {"at": "eight"})
     assert Run.open(tmp_path / "run.zarr").table()["loss"].values[-5:].tolist() == [3, 4, 5, 6, 7]
     assert xr.open_zarr(tmp_path / "run.zarr").sizes["evaluation"] == 8
 
@@ -105,25 +114,133 @@ def test_a_proposal_cut_short_is_in_the_table_and_dropped_before_the_run_goes_on
 def test_a_run_killed_while_it_writes_anew_what_was_cut_short_keeps_what_was_told(tmp_path: Path) -> None:
     run = run_at(tmp_path / "run.zarr", budget=9)
     run.append(*points(3), Kind.RANDOM, 1.0)
-    run.save(lambda: b"three")
+    run.save(lambda: {"at": "three"})
     run.append(*points(6, start=3), Kind.RANDOM, 1.0)
-    run.save(None)
-    state = (tmp_path / "run.zarr" / STATE).read_bytes()
+    run.save()
     run.rewind()
-    run.append(*points(2, start=3), Kind.RANDOM, 1.0)
-    run.save(lambda: b"five")
-    (tmp_path / "run.zarr" / STATE).write_bytes(state)  # nine rows, it says; five are there
+    state = (tmp_path / "run.zarr" / STATE).read_bytes()
+    run.append(*points(2, start=3), Kind.RANDOM, 2.0)
+    run.save(lambda: {"at": "five"})
+    (tmp_path / "run.zarr" / STATE).write_bytes(state)  # as if killed between the rows and the state
     again = Run.open(tmp_path / "run.zarr")
-    assert (again.count, again.told, again.state()) == (5, 3, b"three")
+    assert (again.count, again.told, again.state()) == (3, 3, {"at": "three"})
 
 
 def test_a_missing_row_is_damage_not_data(tmp_path: Path) -> None:
     run = run_at(tmp_path / "run.zarr", budget=3 * CHUNK)
     run.append(*points(2 * CHUNK), Kind.RANDOM, 1.0)
-    run.save(lambda: b"")
+    run.save(lambda: {})
     (tmp_path / "run.zarr/status/c/1").unlink()
-    with pytest.raises(StoreError, match=f"row {CHUNK + 1} is missing; begin anew with --force"):
+    with pytest.raises(
+        StoreError,
+        match=f"run.zarr is damaged: rows {CHUNK + 1} to {2 * CHUNK} are not what was written; .* begin the run anew",
+    ):
         Run.open(tmp_path / "run.zarr")
+
+
+def whole_run(path: Path) -> Run:
+    """A run of several chunks, whose optimiser has been told two thirds of it."""
+    run = run_at(path, budget=3 * CHUNK)
+    run.append(*points(2 * CHUNK), Kind.RANDOM, 1.0)
+    run.save(lambda: {"at": np.arange(3.0)})
+    run.append(*points(10, start=2 * CHUNK), Kind.RANDOM, 1.0)
+    run.save()
+    return run
+
+
+def told_of(path: Path, whole: xr.Dataset) -> str:
+    """Return why a run is refused; nothing where it is not, and then it has to be whole."""
+    try:
+        found = Run.open(path).table()
+    except StoreError as error:
+        return str(error)
+    xr.testing.assert_identical(found, whole)
+    return ""
+
+
+@pytest.mark.parametrize("damage", ["flipped", "cut", "removed", "empty", "swapped"])
+def test_whatever_file_of_a_run_is_damaged_it_is_refused_by_name_or_read_right(tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "run.zarr"
+    whole, refused = whole_run(path).table(), 0
+    files = sorted(file for file in path.rglob("*") if file.is_file())
+    for number, file in enumerate(files):
+        other = files[number - 1]
+        content, next_content = file.read_bytes(), other.read_bytes()
+        middle = len(content) // 2
+        if damage == "removed":
+            file.unlink()
+        elif damage == "swapped":
+            file.write_bytes(next_content)
+            other.write_bytes(content)
+        else:
+            flipped = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+            file.write_bytes({"flipped": flipped, "cut": content[:middle], "empty": b""}[damage])
+        said = told_of(path, whole)
+        assert not said or str(path) in said
+        refused += bool(said)
+        file.write_bytes(content)
+        other.write_bytes(next_content)
+    assert refused > len(files) / 2
+    xr.testing.assert_identical(Run.open(path).table(), whole)
+
+
+def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Return where the leaves of a JSON value are."""
+    if isinstance(value, (dict, list)) and value:
+        for key in value if isinstance(value, dict) else range(len(value)):
+            yield from leaves(value[key], (*path, key))
+    else:
+        yield path
+
+
+def test_what_a_run_says_of_itself_is_what_was_written(tmp_path: Path) -> None:
+    path = tmp_path / "run.zarr"
+    whole = whole_run(path).table()
+    about = json.loads((path / "zarr.json").read_text())
+    for place in leaves(about["attributes"]):
+        changed = json.loads(json.dumps(about))
+        *outer, last = place
+        inner = reduce(getitem, outer, changed["attributes"])
+        inner[last] = {"x": 1}
+        (path / "zarr.json").write_text(json.dumps(changed))
+        if place == ("gradient_cost",):  # the file `state` has it, too
+            xr.testing.assert_identical(Run.open(path).table(), whole)
+        else:
+            with pytest.raises(StoreError, match=re.escape(str(path))):
+                Run.open(path)
+
+
+def test_a_state_that_is_no_data_is_refused_and_not_run(tmp_path: Path) -> None:
+    class Trap:
+        def __reduce__(self) -> tuple[Any, ...]:
+            return Path.touch, (tmp_path / "sprung",)
+
+    path = tmp_path / "run.zarr"
+    run = whole_run(path)
+    traps = io.BytesIO()
+    trap = np.empty(1, dtype=object)
+    trap[0] = Trap()
+    np.savez(traps, outline=trap, **{"0": trap})
+    kept = Kept.read(path)
+    for planted in (pickle.dumps(Trap()), traps.getvalue()):
+        (path / STATE).write_bytes(planted)
+        with pytest.raises(StoreError, match="state is damaged"):
+            Run.open(path)
+        replace(kept, state=planted).write(path)  # by somebody who knows how
+        with pytest.raises(StoreError, match="state is damaged"):
+            Run.open(path).state()
+    assert not (tmp_path / "sprung").exists()
+    assert run.count == kept.rows
+
+
+def test_memory_grows_with_the_rows_and_not_with_the_budget(tmp_path: Path) -> None:
+    for run in (Run.in_memory(SPACE, budget=10**15), run_at(tmp_path / "run.zarr", budget=10**15)):
+        for start in range(0, 300, 3):
+            run.append(*points(3, start=start), Kind.RANDOM, 1.0)
+        run.save(lambda: {})
+        assert run.table().sizes["evaluation"] == 300
+        run.extend(10**16)
+    assert Run.open(tmp_path / "run.zarr").table().identical(run.table())
 
 
 def test_the_budget_is_the_end_of_the_table(tmp_path: Path) -> None:
@@ -148,16 +265,16 @@ def test_only_a_run_is_replaced(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="is no run, so it is not replaced"):
         Run.create(tmp_path / "mine", SPACE, identity={}, budget=3, overwrite=True)
     assert not is_run(tmp_path / "mine")
-    with pytest.raises(StoreError, match="is no run of format 1"):
+    with pytest.raises(StoreError, match="is no run of format 2"):
         Run.open(tmp_path / "mine")
     with pytest.raises(StoreError, match="make one with `landscape optimize`"):
         Run.open(tmp_path / "nothing")
     run = run_at(tmp_path / "run.zarr")
     run.append(*points(3), Kind.RANDOM, 1.0)
-    run.save(lambda: b"")
+    run.save(lambda: {})
     assert Run.create(tmp_path / "run.zarr", SPACE, identity={}, budget=3, overwrite=True).count == 0
     with pytest.raises(StoreError, match="was replaced or removed"):
-        run.save(lambda: b"")
+        run.save(lambda: {})
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine", "run.zarr"]
 
 
@@ -177,13 +294,13 @@ def test_writing_takes_a_twentieth_of_the_time_at_most(tmp_path: Path, monkeypat
     monkeypatch.setattr("gradscape.optim.run.time", clock)
     run = run_at(tmp_path / "run.zarr")
 
-    def slow_state() -> bytes:
+    def slow_state() -> dict[str, int]:
         clock.sleep(0.4)
         saved.append(run.count)
-        return b""
+        return {}
 
     for number in range(60):
         clock.sleep(0.3)
         run.append(*points(1, start=number), Kind.RANDOM, 0.3, slow_state)
     assert saved == [4, 31, 58]  # after the first second, then after 0.4 s / 5 % = 8 s each
-    assert json.loads((tmp_path / "run.zarr" / STATE).read_bytes().splitlines()[0])["rows"] == 58
+    assert Kept.read(tmp_path / "run.zarr").rows == 58
