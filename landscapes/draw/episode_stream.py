@@ -18,8 +18,8 @@ from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 
 from ..episode import Episode, Part, View
-from ..files import replacing
 from . import materials
+from .recording import recording
 from .replay import LONGEST, around, rests
 from .solids import mesh
 
@@ -40,17 +40,13 @@ def save_episode(episode: Episode, path: str | Path, *, title: str, longest: int
     """
     view = episode.view or around(episode)
     chosen = np.unique(np.linspace(0, len(episode.time) - 1, longest).round().astype(int)).tolist()
-    name = _digest(episode, title)  # of the application too: a viewer keeps one blueprint for each
-    with replacing(Path(path)) as partial:
-        stream = rr.RecordingStream(f"gradscape-{name}", recording_id=name, send_properties=False)
-        stream.save(partial, default_blueprint=_blueprint(view, title, float(episode.time[-1])))
-        stream.set_log_time_enabled(False)
+    blueprint = _blueprint(view, title, float(episode.time[-1]))
+    with recording(_digest(episode, title), Path(path), blueprint) as stream:
         stream.log(SCENE, rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True, strict=True)
         if view.ground is not None:
             stream.log(f"{SCENE}/ground", _ground(view), static=True, strict=True)
         for number, part in enumerate(episode.parts, start=1):
             _log_part(stream, f"{SCENE}/{number:02d}_{part.material}_{part.shape}", part, episode, chosen)
-        stream.disconnect()
 
 
 def _log_part(stream: rr.RecordingStream, path: str, part: Part, episode: Episode, chosen: Sequence[int]) -> None:

@@ -15,13 +15,13 @@ import xarray as xr
 from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 
-from ..files import replacing
 from ..objective import Status
 from ..overlay import improvements
 from ..plane import Plane
 from ..store import plane_of
 from . import contour, page, relief, style
 from .overlay import by_kind, farthest, half_widths, joint_scale
+from .recording import recording
 from .relief import HEIGHT, SIDE
 
 Runs = Sequence[xr.Dataset]
@@ -44,10 +44,7 @@ def save_stream(dataset: xr.Dataset, runs: Runs, path: str | Path) -> None:
     `evaluation` shows there; nothing else, no clock, is recorded, so that equal runs give equal recordings.
     """
     scene = Scene.of(dataset, runs)
-    with replacing(Path(path)) as partial:
-        name = _digest(dataset, runs)  # of the application too: a viewer keeps one blueprint for each
-        stream = rr.RecordingStream(f"gradscape-{name}", recording_id=name, send_properties=False)
-        stream.save(partial, default_blueprint=_blueprint(dataset, scene))
+    with recording(_digest(dataset, runs), Path(path), _blueprint(dataset, scene)) as stream:
         _log(stream, SURFACE, surface(scene, dataset))
         if "grad" in dataset:
             _log(stream, ARROWS, descent_arrows(scene, dataset))
@@ -57,7 +54,6 @@ def save_stream(dataset: xr.Dataset, runs: Runs, path: str | Path) -> None:
             _log_best(stream, scene, run)
         _log_key(stream, scene, runs)
         _log(stream, "about", rr.TextDocument(_about(dataset, runs, scene), media_type=rr.MediaType.MARKDOWN))
-        stream.disconnect()
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,9 +10,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from ..files import replacing
 from ..objective import Status
 from . import page, stream, style
+from .recording import recording
 from .relief import HEIGHT, SIDE
 from .sweep import RATES, Scales, Sweep
 
@@ -21,23 +21,18 @@ def save_stream(sweep: Sweep, path: Path) -> None:
     """Write the slices as surfaces on a rerun timeline named after what moves, numbered like the frames from 0."""
     scales, first = Scales.of(sweep), sweep.slices[0]
     scene = stream.Scene.of(first, [], scales.loss)
-    with replacing(path) as partial:
-        name = _digest(sweep)
-        recording = rr.RecordingStream(f"gradscape-{name}", recording_id=name, send_properties=False)
-        recording.save(partial, default_blueprint=_blueprint(sweep, scene))
-        recording.set_log_time_enabled(False)
-        stream.log_axes(recording, scene, first)
+    with recording(_digest(sweep), path, _blueprint(sweep, scene)) as kept:
+        stream.log_axes(kept, scene, first)
         about = rr.TextDocument(_about(sweep, scales), media_type=rr.MediaType.MARKDOWN)
-        recording.log("about", about, static=True, strict=True)
+        kept.log("about", about, static=True, strict=True)
         for number, dataset in enumerate(sweep.slices):
-            recording.set_time(sweep.name, sequence=number)
-            recording.log(stream.SURFACE, stream.surface(scene, dataset), strict=True)
+            kept.set_time(sweep.name, sequence=number)
+            kept.log(stream.SURFACE, stream.surface(scene, dataset), strict=True)
             if scales.slope:
-                recording.log(stream.ARROWS, stream.descent_arrows(scene, dataset, scales.slope), strict=True)
-            recording.log("landscape/value", _label(sweep, scene, number), strict=True)
+                kept.log(stream.ARROWS, stream.descent_arrows(scene, dataset, scales.slope), strict=True)
+            kept.log("landscape/value", _label(sweep, scene, number), strict=True)
             if np.isfinite(dataset["loss"]).any():
-                recording.log("lowest", rr.Scalars(float(dataset["loss"].min())), strict=True)
-        recording.disconnect()
+                kept.log("lowest", rr.Scalars(float(dataset["loss"].min())), strict=True)
 
 
 def _label(sweep: Sweep, scene: stream.Scene, number: int) -> rr.Points3D:

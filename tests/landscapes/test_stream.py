@@ -1,8 +1,10 @@
 import math
+import resource
 import subprocess
 import sys
 import urllib.request
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from urllib.error import HTTPError
 
@@ -19,6 +21,8 @@ from gradscape.landscapes.overlay import overlay
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling import sample
 from gradscape.landscapes.space import ParameterSpace
+
+from ..processes import alone
 
 SPACE = ParameterSpace.box(("a", "b", "c"), -1.0, 1.0, "m")
 
@@ -204,3 +208,17 @@ def test_a_server_that_ends_before_it_answers_is_not_waited_for(path: Path, monk
     monkeypatch.setattr(viewer, "_rerun", lambda *_, log: subprocess.Popen([sys.executable, "-c", ""], stderr=log))
     with pytest.raises(OSError, match="rerun's web viewer does not answer"), viewer.served(path):
         pass
+
+
+def written_in_little_room(folder: Path) -> None:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, resource.RLIM_INFINITY))  # of any file, as on a full disk
+    try:
+        save_stream(SLICE, LAID, folder / "overlay.rrd")
+    except OSError as error:
+        print(error.strerror, flush=True)
+
+
+def test_a_recording_that_finds_no_room_ends_with_an_error_and_leaves_nothing(tmp_path: Path) -> None:
+    said = alone(partial(written_in_little_room, tmp_path), tmp_path)
+    assert said.stdout.strip() == "File too large"
+    assert not list(tmp_path.iterdir())
