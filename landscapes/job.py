@@ -23,7 +23,7 @@ from .halving import Halving
 from .objective import Objective, Status
 from .plane import Plane
 from .sampling import Progress, sample
-from .slice_paths import SLICE, is_slice, there
+from .slice_paths import SLICE, there
 from .spread import RemoteSite, Site, results, workers_of
 from .store import SliceStore, plane_of
 from .tiling import Tile
@@ -82,7 +82,7 @@ class Job:
         if not there(path) and visible(folder):
             raise ValueError(f"{folder} holds other files and no slice; give --out a new or an empty folder")
         settings: dict[str, Any] = {"identity": identity, "provenance": provenance, "grad": grad}
-        if force and is_slice(path):
+        if force and there(path):
             store = SliceStore.create(path, plane, objective.space, overwrite=True, **settings)
             clear(folder, (PICTURE, SUMMARY), PICTURE)
         else:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from .identity import stored_identity
 from .layout import CODECS, SMALL, analysis_chunks, consolidate, create_array, flags
 from .objective import Status
+from .ownership import store_files
 from .plane import Plane
 from .space import ParameterSpace
 from .tiling import coarse_to_fine, tile_side
@@ -22,6 +23,7 @@ from .tiling import coarse_to_fine, tile_side
 FORMAT = 2
 AXES = ("u", "v")
 CF = "CF-1.11"
+FILES = store_files(("loss", "grad", "status", *AXES, "dim", "unit"))  # of a slice on disk
 COORDINATES = {"coordinates": "unit"}  # tells xarray that it is no variable
 
 
