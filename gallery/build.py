@@ -7,8 +7,8 @@ resolution, command); `episodes.json`, a list of nodes (row, column, why, loss, 
 `gradient-quality.png`, of `landscape report`. Runs in `runs/ENVIRONMENT-OPTIONS/` are laid over every slice of their
 environment and options; `tradeoff/ENVIRONMENT-DEVICE.json` and `.png` are shown with every slice of theirs.
 
-`manifest.json` lists all of it for programs; `schema` counts up whenever the meaning of a name in it changes. Its `files`
-are all that the site has: a folder is built anew only where it holds nothing else.
+`manifest.json` lists all of it for programs; `schema` counts up whenever the meaning of a name in it changes. Its
+`files` are all that the site has: a folder is built anew only where it holds nothing else.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from ..landscapes.slice_paths import is_slice
 from ..landscapes.store import SliceStore, open_slice
 from .figures import HERE, Figure
 from .measured import MEASURES, QUALITY, REPORT, dark_name, place_tradeoffs, read_report
-from .page_data import nodes, numbers, read_episodes, read_json
+from .page_data import nodes, numbers, read_episodes, read_measures, read_sweep
 from .runs import FOLDER
 from .trajectories import read_runs, trajectories
 
@@ -122,7 +122,7 @@ def _page(
     _draw(dataset, source, folder)
     shown, runs = read_episodes(source, dataset), trajectories(dataset, tables)
     (folder / NODES).write_text(f"const SLICE = {json.dumps(nodes(dataset, shown, runs), separators=(',', ':'))};\n")
-    sweep = (read_json(source / "sweep.json") or {}) if (source / SWEEP).exists() else None
+    sweep = read_sweep(source) if (source / SWEEP).exists() else None
     surfaces = [name for name in SURFACES if (source / name).exists()]
     films = [episode[kind] for episode in shown for kind in ("mp4", "webp") if kind in episode]
     reported = [name for name in (REPORT, MEASURES, QUALITY) if (source / name).exists()]
@@ -139,7 +139,7 @@ def _page(
         "episodes": shown,
         "sweep": sweep,
         "runs": [{name: value for name, value in run.items() if name not in POINTS} for run in runs],
-        "measures": read_json(source / MEASURES) or {},
+        "measures": read_measures(source / MEASURES),
         "report": read_report(source),
         "tradeoffs": traded.get(figure.env, []),
     }

@@ -6,10 +6,15 @@ import warnings
 from pathlib import Path
 
 import xarray as xr
+import zarr
 from zarr.storage import ZipStore
 
 from ..landscapes.files import replacing
+from ..landscapes.identity import stored_identity, stored_provenance
 from ..landscapes.layout import SMALL
+from ..landscapes.records import reading
+from ..optim.run import COLUMNS
+from .page_data import REMAKE
 
 FOLDER, SUFFIX = "runs", ".zarr.zip"
 
@@ -24,7 +29,12 @@ def save_run(table: xr.Dataset, path: Path) -> None:
 
 
 def open_run(path: Path) -> xr.Dataset:
-    """Read a run's table."""
-    with ZipStore(path, mode="r") as store:
+    """Read a run's table; raise ValueError, naming the file, where it is not what `save_run` wrote."""
+    with reading(path, REMAKE.format("searches")), ZipStore(path, mode="r") as store:
+        group = zarr.open_group(store, mode="r", use_consolidated=False)
+        lost = [name for name, array in group.arrays() if array.nchunks_initialized < array.nchunks]
+        if lost := [*lost, *(COLUMNS.keys() - set(group.array_keys()))]:
+            raise ValueError(f"it lacks some of {', '.join(sorted(lost))}")
         table: xr.Dataset = xr.open_zarr(store, consolidated=False, mask_and_scale=False, decode_times=False).load()
+        stored_identity(table), stored_provenance(table), table.attrs["method"], table.attrs["seed"]
     return table

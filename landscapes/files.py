@@ -1,7 +1,7 @@
 """Files and folders that appear whole or not at all.
 
-What is being made lies in a hidden folder beside its place, which its maker holds by a lock as long as it lives. So what
-a process that was killed has left is known at once, by anyone and on any clock: nobody holds it.
+What is being made lies in a hidden folder beside its place, which its maker holds by a lock as long as it lives. So
+what a process that was killed has left is known at once, by anyone and on any clock: nobody holds it.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def tidy(folder: Path) -> None:
 
 @contextmanager
 def _making(path: Path) -> Iterator[Path]:
-    """Give a hidden folder beside `path`, held for as long as something is made in it; clear away those nobody holds."""
+    """Give a hidden folder beside `path`, held while something is made in it; clear away those that nobody holds."""
     path.parent.mkdir(parents=True, exist_ok=True)
     _clear_left(path)
     folder, lock = _held(path)

@@ -18,7 +18,7 @@ import xarray as xr
 from jaxtyping import Float
 from torch import Tensor
 
-from .files import clear, visible, write_json
+from .files import clear, tidy, visible, write_json
 from .halving import Halving
 from .objective import Objective, Status
 from .plane import Plane
@@ -119,7 +119,13 @@ class Job:
         summary = self._summary(dataset, computed, time.monotonic() - start, command)
         summary["files"] = [STORE, PICTURE, *printed, SUMMARY]
         write_json(self.folder / SUMMARY, summary)
+        tidy(self.folder)
         return summary
+
+    def kept(self) -> str:
+        """Say how much of it is on disk."""
+        status = self.store.status()
+        return f"{int((status > 0).sum())} of {status.size} points are kept in {self.folder}"
 
     def picture(self) -> None:
         """Draw the finest complete picture of the whole so far, if there is one."""

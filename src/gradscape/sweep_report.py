@@ -21,7 +21,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from .cluster import recipe, workers
 from .console import duration, provenance_of, read_extent, read_settings, size
 from .envs.registry import make
-from .landscapes.files import discard, visible, write_json
+from .landscapes.disk import until_full
+from .landscapes.files import discard, tidy, visible, write_json
 from .landscapes.slice_paths import check_replaceable, filling
 from .swept import FRAMES, HORIZON, ONLY, SMOOTHING, Moved, moved
 
@@ -79,8 +80,9 @@ def sweep(
     with workers(scheduler, env.device) as executor:
         job = replace(job, executor=executor)
         try:
-            job.announce(console)
-            summary = job.run(console)
+            with until_full(job.kept):
+                job.announce(console)
+                summary = job.run(console)
         except KeyboardInterrupt:
             job.farewell(console)
             sys.exit(130)
@@ -162,13 +164,14 @@ class Job:
 
         return Sweep(self.moved.label, self.moved.values, self.moved.slices(slices))
 
+    def kept(self) -> str:
+        """Say how much of it is on disk."""
+        return f"{self.done()} of {self.total} points are kept in {self.folder}"
+
     def farewell(self, console: Console) -> None:
         """Say what is kept of a sweep that was stopped, and how to go on."""
-        console.print(
-            f"stopped: {self.done()} of {self.total} points are kept in {self.folder}; "
-            f"the same command goes on from there: {self.command}",
-            markup=False,
-        )
+        said = f"stopped: {self.kept()}; the same command goes on from there: {self.command}"
+        console.print(said, markup=False)
 
     @property
     def _grad(self) -> bool:
@@ -231,6 +234,7 @@ class Job:
             "files": [*sorted({name.split("/")[0] for name in self.moved.stores}), FILM, GIF, STREAM, SUMMARY],
         }
         write_json(self.folder / SUMMARY, summary)
+        tidy(self.folder)
         return summary
 
 
