@@ -129,12 +129,13 @@ def read_sweep(folder: Path) -> dict[str, Any]:
     return found
 
 
-def read_measures(path: Path) -> dict[str, str]:
+def read_measures(path: Path) -> dict[str, str | float]:
     """Return the numbers of a slice's report by their names, none where there is no report."""
     if not path.exists():
         return {}
     with reading(path, REMAKE.format("reports")):
-        return {name: text(value) for name, value in read_json(path).items()}
+        found = read_json(path)
+        return {name: value if isinstance(value, str) else number(value) for name, value in found.items()}
 
 
 def _counted(place: int) -> int:

@@ -78,8 +78,12 @@ def placing(path: Path, *, overwrite: bool, check: Callable[[], None] = lambda: 
         try:
             os.rename(new, path)
         except OSError as error:
-            taken = FileExistsError(f"{path} was made by another process meanwhile; run the command again")
-            raise (taken if path.exists() else error) from None
+            if path.exists():
+                said = f"{path} was made by another process meanwhile; run the command again"
+                raise FileExistsError(said) from None
+            if old.exists():
+                os.rename(old, path)
+            raise error from None
 
 
 def discard(folder: Path) -> None:

@@ -34,7 +34,7 @@ from zarr.storage import MemoryStore
 
 from .files import placing
 from .identity import StoreError, StoreExistsError, check_identity, full_identity, plain_json
-from .integrity import check_integrity
+from .integrity import check_integrity, check_layouts
 from .layout import consolidate
 from .objective import Evaluation, Status
 from .ownership import lost_root, remove
@@ -132,6 +132,7 @@ class SliceStore:
         except StoreError:
             raise
         except Exception as error:  # a damaged axis or layout raises whatever reads it; of tiles nothing is read here
+            check_layouts(place)
             raise StoreError(
                 f"{place} is damaged ({type(error).__name__}: {error}); begin anew with --force"
             ) from error
