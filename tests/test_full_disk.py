@@ -59,6 +59,7 @@ def test_a_full_disk_says_what_is_kept_and_the_same_command_goes_on(
     monkeypatch.setattr("gradscape.tolerance.user_data_path", lambda name: tmp_path / "data" / name)
     for name in ("TIMING", "PATIENCE"):
         monkeypatch.setattr(tradeoff, name, 0.002)
+    monkeypatch.setattr(tradeoff, "RESAMPLES", 9)
     command, last, kept = WRITING[verb]
     for needed, made in (("cut", SLICE), ("run", SEARCH)):
         if needed in command.split():
