@@ -68,7 +68,7 @@ def main(arguments: list[str] | None = None) -> Any:
     except ValueError as error:
         code = _fail(str(error), 2)
     except OSError as error:
-        code = _fail(str(error), 1)
+        code = _fail(_full(error) or str(error), 1)
     except (KeyboardInterrupt, typer.Abort):
         code = _fail("stopped before anything was computed; the same command begins again", 130)
     sys.exit(code)
@@ -79,6 +79,15 @@ def _usage(error: Any) -> str:
     context = getattr(error, "ctx", None)
     said = error.format_message().rstrip(".")
     return f"{said} (`{context.command_path} --help` says what it takes)" if context else said
+
+
+def _full(error: OSError) -> str:
+    """Return what to say of a full disk where the verb has not said what is kept, nothing of any other error."""
+    from .landscapes.disk import DiskFullError, is_full
+
+    if isinstance(error, DiskFullError) or not is_full(error):
+        return ""
+    return f"the disk is full ({error}); each file that is there is whole: make room, and give the same command again"
 
 
 def _fail(message: str, code: int) -> int:

@@ -26,8 +26,11 @@ class AnyDimension:
 class Function(Environment):
     """Evaluate one of BoTorch's synthetic functions and its exact gradient (float64 throughout).
 
-    Parameters: x0, x1, ..., without units, in the function's customary box. Loss: the function's value, no unit.
+    Parameters: x0, x1, ..., without units, in the function's customary box. Loss: the function's value, no unit. The
+    formula holds beyond the box too.
     """
+
+    beyond_box: ClassVar[bool] = True
 
     fidelities: ClassVar[dict[str, Fidelity]] = {"exact": Fidelity("exact", dt=0.0, precision="float64")}
     synthetic: ClassVar[Any]  # a class of botorch.test_functions.synthetic
@@ -55,7 +58,8 @@ class Function(Environment):
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         x = x.clone().requires_grad_(grad)
         with torch.set_grad_enabled(grad):
-            loss = torch.stack([self.function(row[None])[0] for row in x.unbind()])
+            formula = self.function._evaluate_true  # without the check that x lies in the box
+            loss = torch.stack([formula(row[None])[0] for row in x.unbind()])
         slope = torch.autograd.grad(loss.sum(), x)[0] if grad else None
         return Evaluation(loss.detach(), slope, torch.full((len(x),), Status.OK, dtype=torch.int8))
 

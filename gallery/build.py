@@ -7,7 +7,8 @@ resolution, command); `episodes.json`, a list of nodes (row, column, why, loss, 
 `gradient-quality.png`, of `landscape report`. Runs in `runs/ENVIRONMENT-OPTIONS/` are laid over every slice of their
 environment and options; `tradeoff/ENVIRONMENT-DEVICE.json` and `.png` are shown with every slice of theirs.
 
-`manifest.json` lists all of it for programs; `schema` counts up whenever the meaning of a name in it changes.
+`manifest.json` lists all of it for programs; `schema` counts up whenever the meaning of a name in it changes. Its
+`files` are all that the site has: a folder is built anew only where it holds nothing else.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import json
 import re
 import shutil
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -25,15 +27,16 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from .. import __version__
 from ..envs.registry import entries
-from ..landscapes.files import placing, visible
+from ..landscapes.files import placing
 from ..landscapes.identity import stored_identity, stored_provenance
 from ..landscapes.job import PICTURE, STORE
+from ..landscapes.ownership import check_ours
 from ..landscapes.slice_arrays import parameters_of, plane_of
 from ..landscapes.slice_paths import is_slice
 from ..landscapes.store import SliceStore, open_slice
 from .figures import HERE, Figure
 from .measured import MEASURES, QUALITY, REPORT, dark_name, place_tradeoffs, read_report
-from .page_data import nodes, numbers, read_episodes, read_json
+from .page_data import nodes, numbers, read_episodes, read_measures, read_sweep
 from .runs import FOLDER
 from .trajectories import read_runs, trajectories
 
@@ -44,24 +47,43 @@ POINTS = ("u", "v", "loss", "radius", "path", "hidden")  # of a trajectory, for 
 
 
 def build_site(figures: Sequence[Figure], data: Path, out: Path) -> dict[str, Any]:
-    """Build the site of the figures that `data` has into `out`, whole or not at all, and return its manifest."""
+    """Build the site of the figures that `data` has into `out`, whole or not at all, and return its manifest.
+
+    What is in `out` is replaced if a site built earlier is all that is there; anything else is refused.
+    """
+    out = out.resolve()
+    _check(out)
     there = [figure for figure in figures if _sampled(data / figure.id / STORE)]
     if not there:
         raise ValueError(f"{data} holds no slice of a figure; `landscape gallery compute` samples them")
-    if visible(out) and not (out / MANIFEST).exists():
-        raise ValueError(f"{out} holds other files and no gallery; give --out a new or an empty folder")
     pages, tables = _templates(), read_runs(data / FOLDER)
-    with placing(out.resolve(), overwrite=True) as new:
+    with placing(out, overwrite=True, check=partial(_check, out)) as new:
         shutil.copytree(HERE / "static", new / "static")
         traded = place_tradeoffs(data, new, [figure.env for figure in there])
         made = [_page(pages, figure, data / figure.id, new / figure.id, tables, traded) for figure in there]
         missing = [figure.id for figure in figures if figure not in there]
         manifest = {"schema": SCHEMA, "gradscape": __version__, "figures": made, "missing": missing}
-        (new / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n")
         groups = [(env, list(group)) for env, group in groupby(made, key=lambda entry: str(entry["env"]))]
         index = pages.get_template("index.html").render(groups=groups, manifest=manifest, scenes=entries())
         (new / "index.html").write_text(index)
+        files = [file.relative_to(new).as_posix() for file in new.rglob("*") if file.is_file()]
+        manifest["files"] = sorted([*files, MANIFEST])
+        (new / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n")
     return manifest
+
+
+def _check(out: Path) -> None:
+    """Refuse a folder that holds anything but a site whose manifest lists all of it."""
+    if not out.exists():
+        return
+    if not out.is_dir():
+        raise ValueError(f"{out} is a file; give --out a new or an empty folder")
+    try:
+        listed = json.loads((out / MANIFEST).read_text())
+        ours = frozenset(listed["files"] if {"schema", "gradscape"} <= listed.keys() else ())
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        ours = frozenset()  # none, or of an earlier version, which listed no files
+    check_ours(out, ours.__contains__, f"a gallery by its {MANIFEST}")
 
 
 def _templates() -> Environment:
@@ -100,7 +122,7 @@ def _page(
     _draw(dataset, source, folder)
     shown, runs = read_episodes(source, dataset), trajectories(dataset, tables)
     (folder / NODES).write_text(f"const SLICE = {json.dumps(nodes(dataset, shown, runs), separators=(',', ':'))};\n")
-    sweep = (read_json(source / "sweep.json") or {}) if (source / SWEEP).exists() else None
+    sweep = read_sweep(source) if (source / SWEEP).exists() else None
     surfaces = [name for name in SURFACES if (source / name).exists()]
     films = [episode[kind] for episode in shown for kind in ("mp4", "webp") if kind in episode]
     reported = [name for name in (REPORT, MEASURES, QUALITY) if (source / name).exists()]
@@ -117,7 +139,7 @@ def _page(
         "episodes": shown,
         "sweep": sweep,
         "runs": [{name: value for name, value in run.items() if name not in POINTS} for run in runs],
-        "measures": read_json(source / MEASURES) or {},
+        "measures": read_measures(source / MEASURES),
         "report": read_report(source),
         "tradeoffs": traded.get(figure.env, []),
     }

@@ -8,9 +8,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ..landscapes.records import maybe, number, read_json, reading, text
 from ..landscapes.tradeoff import cheapest, front, p95
 from ..landscapes.verdict import WORDS
-from .page_data import read_json
+from .page_data import REMAKE
 
 Record = Mapping[str, Any]
 REPORT, QUALITY, MEASURES = "report.json", "gradient-quality.png", "measures.json"
@@ -21,17 +22,19 @@ TOLERANCE = 0.05  # of the loss error that a picture's description names the qui
 
 def read_report(folder: Path) -> dict[str, Any] | None:
     """Return what `landscape report` found of a slice, None where there is no report."""
-    record = read_json(folder / REPORT)
-    if record is None:
+    path = folder / REPORT
+    if not path.exists():
         return None
-    return {
-        "words": _words(record),
-        "where": record["paper"]["where"] if record["paper"] else "",
-        "device": record["device"],
-        "fidelity": record["fidelity"],
-        "picture": _quality(record),
-        "file": REPORT,
-    }
+    with reading(path, REMAKE.format("reports")):
+        record = read_json(path)
+        return {
+            "words": _words(record),
+            "where": text(record["paper"]["where"]) if record["paper"] else "",
+            "device": text(record["device"]),
+            "fidelity": text(record["fidelity"]),
+            "picture": _quality(record),
+            "file": REPORT,
+        }
 
 
 def _words(record: Record) -> list[dict[str, Any]]:
@@ -42,7 +45,7 @@ def _words(record: Record) -> list[dict[str, Any]]:
         {
             "word": word,
             "measured": word in reasons,
-            "reason": reasons.get(word, ""),
+            "reason": text(reasons.get(word, "")),
             "agree": word in reasons if word in said else None,
         }
         for word in WORDS
@@ -84,14 +87,15 @@ def place_tradeoffs(data: Path, out: Path, envs: list[str]) -> dict[str, list[di
     found: dict[str, list[dict[str, Any]]] = {}
     for env in dict.fromkeys(envs):
         for file in (data / TRADEOFF / f"{env}-{device}.json" for device in DEVICES):
-            record, picture = read_json(file), file.with_suffix(".png")
-            if record is None or not picture.exists():
+            picture = file.with_suffix(".png")
+            if not (file.exists() and picture.exists()):
                 continue
+            with reading(file, REMAKE.format("tradeoffs")):
+                found.setdefault(env, []).append(_tradeoff(read_json(file), file.stem))
             (out / TRADEOFF).mkdir(exist_ok=True)
             for one in (file, picture):
                 shutil.copyfile(one, out / TRADEOFF / one.name)
             save_dark(picture, out / TRADEOFF / dark_name(picture.name))
-            found.setdefault(env, []).append(_tradeoff(record, file.stem))
     return found
 
 
@@ -102,9 +106,10 @@ def _tradeoff(record: Record, name: str) -> dict[str, Any]:
     errors = [math.inf if (off := _error(row, record)) is None else off for row in quicker]
     best = {quicker[number]["name"] for number in front([_time(row) for row in quicker], errors)}
     return {
-        **{name: record[name] for name in ("env", "reference", "points", "spread", "loss_unit", "refused", "command")},
-        "options": record["identity"]["options"],
-        "device": record["identity"]["device"],
+        **{name: text(record[name]) for name in ("env", "reference", "loss_unit", "command")},
+        **{"points": number(record["points"]), "spread": maybe(number, record["spread"]), "refused": record["refused"]},
+        "options": dict(record["identity"]["options"]),
+        "device": text(record["identity"]["device"]),
         "picture": f"{TRADEOFF}/{name}.png",
         "file": f"{TRADEOFF}/{name}.json",
         "alt": _accuracy(record, reference),
@@ -115,14 +120,14 @@ def _tradeoff(record: Record, name: str) -> dict[str, Any]:
 def _rung(row: Record, record: Record, best: set[str]) -> dict[str, Any]:
     error = row["loss_error"]["p95_relative" if record["spread"] else "p95"]
     return {
-        "name": row["name"],
+        "name": text(row["name"]),
         "front": row["name"] in best,
-        "error": error,
-        "spearman": row["spearman"]["value"],
-        "cosine": row["gradient"]["cosine"]["value"],
-        "diverged": row["diverged"],
-        "seconds": row["seconds"],
-        "memory": row["memory"],
+        "error": {end: maybe(number, error[end]) for end in ("value", "low", "high")},
+        "spearman": maybe(number, row["spearman"]["value"]),
+        "cosine": maybe(number, row["gradient"]["cosine"]["value"]),
+        "diverged": maybe(number, row["diverged"]),
+        "seconds": {way: number(row["seconds"][way]) for way in ("forward", "with_gradient")},
+        "memory": number(row["memory"]),
     }
 
 
@@ -142,7 +147,7 @@ def _accuracy(record: Record, reference: Record) -> str:
 
 
 def _time(row: Record) -> float:
-    return float(row["seconds"]["with_gradient"])
+    return number(row["seconds"]["with_gradient"])
 
 
 def _error(row: Record, record: Record) -> float | None:

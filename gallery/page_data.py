@@ -13,7 +13,11 @@ import xarray as xr
 
 from ..landscapes.job import flat_points
 from ..landscapes.objective import Status
+from ..landscapes.records import maybe, number, read_json, reading, text
 from ..landscapes.store import plane_of
+
+EPISODES = "episodes.json"
+REMAKE = "delete it, and `landscape gallery compute --part {}` makes it anew"
 
 
 def numbers(dataset: xr.Dataset) -> dict[str, Any]:
@@ -84,28 +88,60 @@ def _scale(loss: np.ndarray[Any, Any], below: Sequence[float]) -> dict[str, Any]
 
 def read_episodes(folder: Path, dataset: xr.Dataset) -> list[dict[str, Any]]:
     """Return the episodes that `episodes.json` lists, one a node, with their files and the parameters varied."""
-    listed = folder / "episodes.json"
-    plane = plane_of(dataset)
-    axes = [axis.tolist() for axis in plane.axes()]
-    found: dict[tuple[int, int], dict[str, Any]] = {}
-    for said in json.loads(listed.read_text()) if listed.exists() else []:
-        row, column = place = int(said["row"]), int(said["column"])
-        if place in found:
-            found[place]["why"] += ", " + str(said["why"])
-            continue
-        values = (axis[at] for axis, at in zip(axes, (column, row), strict=False))
-        files = {kind: f"episode-{row}-{column}.{kind}" for kind in ("mp4", "webp")}
-        found[place] = {
-            **{name: said[name] for name in ("row", "column", "why", "loss", "status")},
-            "at": dict(zip(plane.labels, values, strict=True)),
-            **{kind: name for kind, name in files.items() if (folder / name).exists()},
-        }
+    listed = folder / EPISODES
+    if not listed.exists():
+        return []
+    with reading(listed, REMAKE.format("episodes")):
+        plane = plane_of(dataset)
+        axes = [axis.tolist() for axis in plane.axes()]
+        found: dict[tuple[int, int], dict[str, Any]] = {}
+        for said in json.loads(listed.read_text()):
+            row, column = place = int(said["row"]), int(said["column"])
+            if place in found:
+                found[place]["why"] += ", " + text(said["why"])
+                continue
+            files = {kind: f"episode-{row}-{column}.{kind}" for kind in ("mp4", "webp")}
+            found[place] = {
+                **{"row": row, "column": column, "why": text(said["why"])},
+                **{"loss": maybe(number, said["loss"]), "status": Status[said["status"]].name},
+                "at": {
+                    label: axis[_counted(at)]
+                    for label, axis, at in zip(plane.labels, axes, (column, row), strict=False)
+                },
+                **{kind: name for kind, name in files.items() if (folder / name).exists()},
+            }
     return [episode for episode in found.values() if "mp4" in episode or "webp" in episode]
 
 
-def read_json(path: Path) -> Any:
-    """Return what a file says, None where there is none."""
-    return json.loads(path.read_text()) if path.exists() else None
+def read_sweep(folder: Path) -> dict[str, Any]:
+    """Return what `sweep.json` says of the film beside it, nothing where there is none."""
+    path = folder / "sweep.json"
+    if not path.exists():
+        return {}
+    with reading(path, REMAKE.format("sweeps")):
+        found = read_json(path)
+        for name in ("label", "fidelity", "command"):
+            text(found[name])
+        for value in (found["low"], found["high"], found["frames"], *found["resolution"]):
+            number(value)
+        if not found["label"]:
+            raise ValueError("its label is empty")
+    return found
+
+
+def read_measures(path: Path) -> dict[str, str | float]:
+    """Return the numbers of a slice's report by their names, none where there is no report."""
+    if not path.exists():
+        return {}
+    with reading(path, REMAKE.format("reports")):
+        found = read_json(path)
+        return {name: value if isinstance(value, str) else number(value) for name, value in found.items()}
+
+
+def _counted(place: int) -> int:
+    if place < 0:
+        raise ValueError(f"a place is counted from 0; got {place}")
+    return place
 
 
 def rounded(values: np.ndarray[Any, Any]) -> list[float | None]:

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
+from typing import Any
+from zipfile import ZipFile
 
 import xarray as xr
 from zarr.storage import ZipStore
 
 from ..landscapes.files import replacing
 from ..landscapes.layout import SMALL
+from ..landscapes.records import reading
+from ..optim.run_arrays import COLUMNS
+from .page_data import REMAKE
 
 FOLDER, SUFFIX = "runs", ".zarr.zip"
 
@@ -24,9 +29,14 @@ def save_run(table: xr.Dataset, path: Path) -> None:
 
 
 def open_run(path: Path) -> xr.Dataset:
-    """Read a run's table."""
-    with ZipStore(path, mode="r") as store:
-        table: xr.Dataset = xr.open_zarr(
-            store, zarr_format=3, consolidated=False, mask_and_scale=False, decode_times=False
-        ).load()
+    """Read a run's table; raise ValueError, naming the file, where it is not what `save_run` wrote."""
+    plain: Any = {"mask_and_scale": False, "decode_times": False}
+    with reading(path, REMAKE.format("searches")):
+        with ZipFile(path) as packed:
+            if torn := packed.testzip():  # a chunk that is not found would be one of nothing but its fill value
+                raise ValueError(f"{torn} in it is torn")
+        with ZipStore(path, mode="r") as store:
+            table = xr.open_zarr(store, zarr_format=3, consolidated=False, **plain).load()
+        if lost := COLUMNS.keys() - table.variables.keys():
+            raise ValueError(f"it lacks {', '.join(sorted(lost))}")
     return table

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from .files import replacing
+from .records import reading
 
 
 def save_bundle(path: Path, **datasets: xr.Dataset) -> None:
@@ -25,8 +26,8 @@ def save_bundle(path: Path, **datasets: xr.Dataset) -> None:
 def open_bundle(path: Path) -> dict[str, xr.Dataset]:
     """Read the datasets of a file by name."""
     found: dict[str, dict[str, Any]] = {}
-    with np.load(path, allow_pickle=False) as arrays:
+    with reading(path, "delete its folder to measure it anew"), np.load(path, allow_pickle=False) as arrays:
         for key, values in arrays.items():
             name, variable, dims = key.split("/")
             found.setdefault(name, {})[variable] = (dims.split(",") if dims else [], values)
-    return {name: xr.Dataset(variables) for name, variables in found.items()}
+        return {name: xr.Dataset(variables) for name, variables in found.items()}

@@ -1,31 +1,33 @@
-"""Files and folders that appear whole or not at all."""
+"""Files and folders that appear whole or not at all.
+
+What is being made lies in a hidden folder beside its place, which its maker holds by a lock as long as it lives. So
+what a process that was killed has left is known at once, by anyone and on any clock: nobody holds it.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import glob
 import json
 import os
 import re
 import shutil
-import time
 import uuid
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-STALE = 60.0  # seconds after which a hidden folder of a creation that was killed is cleared away
+MAKING = re.compile(r"\..+\.[0-9a-f]{32}\.making", re.DOTALL)  # the hidden folder of what is being made
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Give a path of its own to write to, and put what was written in the place of `path` at the end."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
-    try:
+    with _making(path) as folder:
+        partial = folder / f"{path.name}.partial"
         yield partial
         os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def visible(folder: Path) -> list[Path]:
@@ -35,7 +37,7 @@ def visible(folder: Path) -> list[Path]:
 
 def print_width(name: str, picture: str) -> float | None:
     """Return for how wide a page [mm] a file of this name is a print of a picture, None where it is none."""
-    found = re.fullmatch(rf"{re.escape(Path(picture).stem)}-([\d.]+)mm\.(?:pdf|svg)", name)
+    found = re.fullmatch(rf"{re.escape(Path(picture).stem)}-(\d+(?:\.\d+)?)mm\.(?:pdf|svg)", name)
     return float(found[1]) if found else None
 
 
@@ -62,40 +64,92 @@ def write_json(path: Path, record: object) -> None:
 
 
 @contextmanager
-def placing(path: Path, *, overwrite: bool) -> Iterator[Path]:
-    """Give a folder's path of its own to build at, and rename it to `path` at the end, unless that is taken by then."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _clear_stale(path)
-    new, old = _hidden(path), _hidden(path)
-    try:
+def placing(path: Path, *, overwrite: bool, check: Callable[[], None] = lambda: None) -> Iterator[Path]:
+    """Give a folder's path of its own to build at, and rename it to `path` at the end, unless that is taken by then.
+
+    `check` is called just before a folder that is there is replaced, to refuse that.
+    """
+    with _making(path) as folder:
+        new, old = folder / f"{path.name}.partial", folder / f"{path.name}.replaced"
         yield new
         if overwrite and path.exists():
+            check()
             os.rename(path, old)
         try:
             os.rename(new, path)
         except OSError as error:
-            taken = FileExistsError(f"{path} was made by another process meanwhile; run the command again")
-            raise (taken if path.exists() else error) from None
-    finally:
-        for left in (new, old):
-            shutil.rmtree(left, ignore_errors=True)
+            if path.exists():
+                said = f"{path} was made by another process meanwhile; run the command again"
+                raise FileExistsError(said) from None
+            if old.exists():
+                os.rename(old, path)
+            raise error from None
 
 
 def discard(folder: Path) -> None:
-    """Remove a folder at once: killed in the middle of it, nothing is left under its name."""
-    _clear_stale(folder)
-    gone = _hidden(folder)
-    with contextlib.suppress(FileNotFoundError):  # another process was quicker
-        os.rename(folder, gone)
-        shutil.rmtree(gone, ignore_errors=True)
+    """Remove a folder at once, if it is there: killed in the middle of it, nothing is left under its name."""
+    _clear_left(folder)
+    if folder.exists():
+        with _making(folder) as gone, contextlib.suppress(FileNotFoundError):  # another process was quicker
+            os.rename(folder, gone / folder.name)
 
 
-def _hidden(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{uuid.uuid4().hex}.making")
+def tidy(folder: Path) -> None:
+    """Remove what processes that were killed were making in a folder, at any depth; what a living one makes stays."""
+    for parent, names, _ in os.walk(folder):
+        for name in [name for name in names if MAKING.fullmatch(name)]:
+            names.remove(name)
+            _clear(Path(parent, name))
 
 
-def _clear_stale(path: Path) -> None:
-    for folder in path.parent.glob(f".{path.name}.*.making"):
-        with contextlib.suppress(OSError):
-            if time.time() - folder.stat().st_mtime > STALE:
+@contextmanager
+def _making(path: Path) -> Iterator[Path]:
+    """Give a hidden folder beside `path`, held while something is made in it; clear away those that nobody holds."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _clear_left(path)
+    folder, lock = _held(path)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(lock)
+
+
+def _held(path: Path) -> tuple[Path, int]:
+    """Make a hidden folder beside `path` and hold it; return it with the descriptor that does."""
+    while True:
+        folder = path.with_name(f".{path.name}.{uuid.uuid4().hex}.making")
+        folder.mkdir()
+        with contextlib.suppress(FileNotFoundError):  # somebody has cleared it away before it was held
+            lock = os.open(folder, os.O_RDONLY)
+            with contextlib.suppress(OSError):  # a file system without locks: nobody can hold it, so nobody clears it
+                fcntl.flock(lock, fcntl.LOCK_EX)
+            if _is(folder, lock):
+                return folder, lock
+            os.close(lock)
+
+
+def _clear_left(path: Path) -> None:
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*.making"):
+        if MAKING.fullmatch(left.name):
+            _clear(left)
+
+
+def _clear(folder: Path) -> None:
+    """Remove a hidden folder that nobody holds."""
+    with contextlib.suppress(OSError):
+        lock = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if _is(folder, lock):
                 shutil.rmtree(folder, ignore_errors=True)
+        finally:
+            os.close(lock)
+
+
+def _is(folder: Path, lock: int) -> bool:
+    """Whether a descriptor is of the folder that is at a path now."""
+    try:
+        return os.path.samestat(folder.stat(), os.fstat(lock))
+    except FileNotFoundError:
+        return False

@@ -47,6 +47,12 @@ def check_integrity(path: Path, group: zarr.Group, axes: Mapping[str, NDArray[An
             raise _damaged(path / name, "it is not what the store's identity says")
 
 
+def check_layouts(path: Path) -> None:
+    """Raise StoreError, naming the file, where what says how an array is stored cannot be read."""
+    for folder in sorted(one for one in path.iterdir() if one.is_dir()):
+        _read(folder)
+
+
 def _index(path: Path) -> dict[str, Any]:
     """Return the layout of every array as the store's index has it, nothing where it has no index."""
     root = _read(path)

@@ -18,12 +18,12 @@ import xarray as xr
 from jaxtyping import Float
 from torch import Tensor
 
-from .files import clear, visible, write_json
+from .files import clear, tidy, visible, write_json
 from .halving import Halving
 from .objective import Objective, Status
 from .plane import Plane
 from .sampling import Progress, sample
-from .slice_paths import SLICE, is_slice, there
+from .slice_paths import SLICE, there
 from .spread import RemoteSite, Site, results, workers_of
 from .store import SliceStore, plane_of
 from .tiling import Tile
@@ -82,7 +82,7 @@ class Job:
         if not there(path) and visible(folder):
             raise ValueError(f"{folder} holds other files and no slice; give --out a new or an empty folder")
         settings: dict[str, Any] = {"identity": identity, "provenance": provenance, "grad": grad}
-        if force and is_slice(path):
+        if force and there(path):
             store = SliceStore.create(path, plane, objective.space, overwrite=True, **settings)
             clear(folder, (PICTURE, SUMMARY), PICTURE)
         else:
@@ -119,7 +119,13 @@ class Job:
         summary = self._summary(dataset, computed, time.monotonic() - start, command)
         summary["files"] = [STORE, PICTURE, *printed, SUMMARY]
         write_json(self.folder / SUMMARY, summary)
+        tidy(self.folder)
         return summary
+
+    def kept(self) -> str:
+        """Say how much of it is on disk."""
+        status = self.store.status()
+        return f"{int((status > 0).sum())} of {status.size} points are kept in {self.folder}"
 
     def picture(self) -> None:
         """Draw the finest complete picture of the whole so far, if there is one."""

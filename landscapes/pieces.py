@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import shutil
+import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .files import replacing, visible, write_json
+from .files import discard, replacing, visible, write_json
 from .identity import check_identity, plain_json
+from .ownership import check_ours
+from .records import DamagedError, read_json, reading, text
 
 SETTINGS, PIECES = "settings.json", "pieces"
+PIECE = re.compile(r"[^/]+\.npz")  # the name of one
 
 
 @dataclass(frozen=True)
@@ -33,20 +36,29 @@ class Pieces:
         wanted, path = plain_json({"kind": what, **identity}, f"a {what}'s identity"), folder / SETTINGS
         if not path.exists() and visible(folder):
             raise ValueError(f"{folder} holds other files and no {what}; give --out a new or an empty folder")
-        if force:
-            shutil.rmtree(folder / PIECES, ignore_errors=True)
-        elif path.exists():
-            check_identity(folder, wanted=wanted, found=json.loads(path.read_text()), what="study")
+        if path.exists():
+            with reading(path, f"it is no study's or damaged: write elsewhere with --out, or delete {folder}"):
+                found = read_json(path)
+                text(found["kind"])
+            if force:
+                check_ours(folder / PIECES, PIECE.fullmatch, f"a {what}")
+                discard(folder / PIECES)
+            else:
+                check_identity(folder, wanted=wanted, found=found, what="study")
         write_json(path, wanted)
         return cls(folder)
 
     def load(self, name: str) -> dict[str, NDArray[Any]] | None:
-        """Return the arrays of a piece, None where it is not there."""
+        """Return the arrays of a piece, None where it is not there, or damaged, which is said."""
         path = self._path(name)
         if not path.exists():
             return None
-        with np.load(path, allow_pickle=False) as arrays:
-            return dict(arrays)
+        try:
+            with reading(path, "it is computed again"), np.load(path, allow_pickle=False) as arrays:
+                return dict(arrays)
+        except DamagedError as error:
+            warnings.warn(str(error), RuntimeWarning, stacklevel=2)
+            return None
 
     def save(self, name: str, **arrays: Any) -> None:
         """Write a piece, whole or not at all."""

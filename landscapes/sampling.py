@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import math
 import warnings
 from collections import Counter
@@ -14,6 +13,7 @@ from typing import Any
 
 import xarray as xr
 
+from .disk import full, is_full
 from .halving import Halving
 from .identity import check_identity
 from .objective import Objective, Status, name_of
@@ -126,9 +126,8 @@ def _resumable(store: SliceStore, counts: Counter[Status]) -> Iterator[None]:
         kept = f"{counts.total()} of {math.prod(store.shape)} points are kept in {store.path or 'memory'}"
         if isinstance(error, WorkersLostError):
             raise WorkersLostError(f"{error}; {kept}, and the same command goes on from there") from error
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            said = f"the disk is full; {kept}: make room, and the same command goes on from there"
-            raise OSError(error.errno, said) from error
+        if is_full(error):
+            raise full(error, kept) from error
         raise
 
 

@@ -17,6 +17,7 @@ from .identity import stored_identity
 from .integrity import tile_sum
 from .layout import CODECS, SMALL, analysis_chunks, consolidate, create_array, flags
 from .objective import Status
+from .ownership import store_files
 from .plane import Plane
 from .space import ParameterSpace
 from .tiling import coarse_to_fine, tile_side
@@ -25,6 +26,7 @@ FORMAT = 2
 AXES = ("u", "v")
 SUMS = "checksum"
 CF = "CF-1.11"
+FILES = store_files(("loss", "grad", "status", SUMS, *AXES, "dim", "unit"))  # of a slice on disk
 COORDINATES = {"coordinates": "unit"}  # tells xarray that it is no variable
 
 

@@ -36,3 +36,14 @@ def is_slice(path: Path) -> bool:
         return open_group(place_of(path)).attrs.get("gradscape_slice") == FORMAT
     except Exception:  # whatever else is there is none
         return False
+
+
+def check_replaceable(store: Path) -> None:
+    """Raise ValueError unless a folder is a slice's, its root damaged or not, and everything in it is of that."""
+    from .identity import StoreError
+    from .ownership import check_ours, lost_root
+    from .slice_arrays import FILES
+
+    if not is_slice(store) and not lost_root(store, FILES):
+        raise StoreError(f"{store} is no slice store, so it is not replaced; move it away or write elsewhere")
+    check_ours(store, FILES, "a slice")

@@ -33,15 +33,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 from zarr.storage import MemoryStore
 
-from .files import discard, placing
+from .files import placing
 from .identity import StoreError, StoreExistsError, check_identity, full_identity, plain_json
-from .integrity import check_integrity, tile_sum
+from .integrity import check_integrity, check_layouts, tile_sum
 from .layout import consolidate, open_group
 from .objective import Evaluation, Status
+from .ownership import lost_root, remove
 from .plane import Plane
-from .slice_arrays import AXES, FORMAT, SUMS, attributes_of, axes_of, lay_out, write_finished
+from .slice_arrays import AXES, FILES, FORMAT, SUMS, attributes_of, axes_of, lay_out, write_finished
 from .slice_arrays import plane_of as plane_of
-from .slice_paths import SLICE, filling, finished, place_of, there
+from .slice_paths import SLICE, check_replaceable, filling, finished, place_of, there
 from .slice_paths import is_slice as is_slice
 from .space import ParameterSpace
 from .tiling import Tile
@@ -95,15 +96,15 @@ class SliceStore:
 
         `identity` holds what decides the numbers (objective, options, fidelity, device); plane, parameters, gradients
         and version are added here. `provenance` is anything else worth keeping. Both must be plain JSON. `overwrite`
-        replaces a slice store, and refuses to replace anything else.
+        replaces a slice store with nothing else in it, and refuses to replace anything else.
         """
         path = Path(path).resolve()
         whole = full_identity(identity, plane, space, grad=grad)
         for taken in (path, filling(path)):
             if taken.exists() and not overwrite:
                 raise StoreExistsError(f"{path} exists already; write elsewhere with --out, or replace it with --force")
-            if taken.exists() and not is_slice(taken):
-                raise StoreError(f"{taken} is no slice store, so it is not replaced; move it away or write elsewhere")
+            if taken.exists():
+                check_replaceable(taken)
         try:
             with placing(filling(path), overwrite=overwrite) as new:
                 group = zarr.create_group(new, zarr_format=3)
@@ -111,7 +112,7 @@ class SliceStore:
                 consolidate(new)
         except FileExistsError as error:
             raise StoreExistsError(str(error)) from None
-        discard(path)
+        remove(path, FILES)
         return cls.open(path)
 
     @classmethod
@@ -122,6 +123,8 @@ class SliceStore:
         if not place.exists():
             raise StoreError(f"there is no slice store at {path}; make one with `landscape slice`")
         if not is_slice(place):
+            if lost_root(place, FILES):
+                raise StoreError(f"{place / 'zarr.json'} is damaged; restore it, or begin the slice anew with --force")
             raise StoreError(f"{place} is no slice store of format {FORMAT}; move it away or write elsewhere")
         try:
             group = open_group(place, "r+")
@@ -132,6 +135,7 @@ class SliceStore:
         except StoreError:
             raise
         except Exception as error:  # a damaged axis or layout raises whatever reads it; of tiles nothing is read here
+            check_layouts(place)
             raise StoreError(
                 f"{place} is damaged ({type(error).__name__}: {error}); begin anew with --force"
             ) from error
@@ -153,7 +157,7 @@ class SliceStore:
         store = cls.open(path)
         check_identity(store.path, wanted=full_identity(identity, plane, space, grad=grad), found=store.identity)
         if store.ascending and store.path:
-            discard(filling(store.path))  # left by a process that was killed when it had finished the slice
+            remove(filling(store.path), FILES)  # left by a process that was killed when it had finished the slice
         return store
 
     @classmethod
@@ -313,7 +317,7 @@ class SliceStore:
     def _move_on(self, path: Path) -> None:
         """Become the finished slice, and clear the tiles away."""
         self._adopt(open_group(path, "r+"), path, path)
-        discard(filling(path))
+        remove(filling(path), FILES)
 
     def _whole(self) -> tuple[slice, ...]:
         return tuple(slice(points) for points in self.shape)

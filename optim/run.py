@@ -18,6 +18,7 @@ import fcntl
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +34,11 @@ from ..landscapes.files import placing
 from ..landscapes.identity import StoreError, StoreExistsError, check_identity
 from ..landscapes.layout import FILL, consolidate, open_group
 from ..landscapes.objective import Evaluation, Status
+from ..landscapes.ownership import check_ours, lost_root
 from ..landscapes.space import ParameterSpace
 from .base import Kind
 from .kept import CHUNK, STATE, Kept, checksums, damaged, digest_of, first_wrong
-from .run_arrays import COLUMNS, FORMAT, Columns, attributes_of, dims_of, empty, lay_out, plain, read_rows
+from .run_arrays import COLUMNS, FILES, FORMAT, Columns, attributes_of, dims_of, empty, lay_out, plain, read_rows
 from .state import decoded, encoded
 
 PAUSE = 1.0  # least seconds between two writes, so that quick episodes are not held up
@@ -83,10 +85,10 @@ class Run:
         attributes = attributes_of(space, identity, provenance or {}, budget)
         if path.exists() and not overwrite:
             raise StoreExistsError(f"{path} exists already; write elsewhere with --out, or replace it with --force")
-        if path.exists() and not is_run(path):
-            raise StoreError(f"{path} is no run, so it is not replaced; move it away or write elsewhere")
+        if path.exists():
+            check_replaceable(path)
         try:
-            with placing(path, overwrite=overwrite) as new:
+            with placing(path, overwrite=overwrite, check=partial(check_replaceable, path)) as new:
                 lay_out(zarr.create_group(new, zarr_format=3), attributes)
                 consolidate(new)
                 Kept(about=digest_of(attributes)).write(new)
@@ -101,6 +103,8 @@ class Run:
         if not path.exists():
             raise StoreError(f"there is no run at {path}; make one with `landscape optimize`")
         if not is_run(path):
+            if lost_root(path, FILES):
+                raise damaged(path / "zarr.json", "it cannot be read")
             raise StoreError(f"{path} is no run of format {FORMAT}; move it away or write elsewhere")
         return cls(open_group(path).attrs.asdict(), path)
 
@@ -356,6 +360,13 @@ def open_run(path: str | Path) -> xr.Dataset:
     """
     path = Path(path)
     return Run.open(path / RUN if (path / RUN).exists() else path).table()
+
+
+def check_replaceable(path: Path) -> None:
+    """Raise ValueError unless a folder is a run's, its root damaged or not, and everything in it is of that."""
+    if not is_run(path) and not lost_root(path, FILES):
+        raise StoreError(f"{path} is no run, so it is not replaced; move it away or write elsewhere")
+    check_ours(path, FILES, "a run")
 
 
 def is_run(path: str | Path) -> bool:

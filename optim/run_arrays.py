@@ -15,9 +15,10 @@ from .. import __version__
 from ..landscapes.identity import plain_json
 from ..landscapes.layout import FILL, create_array, flags
 from ..landscapes.objective import Status
+from ..landscapes.ownership import store_files
 from ..landscapes.space import ParameterSpace
 from .base import Kind
-from .kept import CHUNK, damaged
+from .kept import CHUNK, STATE, damaged
 
 FORMAT = 2
 DEEP = ("x", "grad")
@@ -34,6 +35,7 @@ COLUMNS: dict[str, tuple[str, dict[str, Any]]] = {  # status last: a row that ha
 }
 
 Columns = dict[str, NDArray[Any]]
+FILES = store_files((*COLUMNS, "dim"), STATE)  # of a run on disk
 
 
 def empty(rows: int, dim: int) -> Columns:

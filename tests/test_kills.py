@@ -43,19 +43,22 @@ def test_four_kills_change_no_bit(job: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("command", "left"),
     [
-        (["slice", *BOUNCE], ".slice.zarr.0a.making"),
-        (["sweep", *BOUNCE, "--over", "2", "--frames", "2"], "frames/.0.zarr.0a.making"),
-        (["optimize", "bounce", "--method", "random", *SEARCH], ".run.zarr.0a.making"),
-        (["race", "bounce", "--methods", "random", "--seeds", "2", *SEARCH], "random-0/.run.zarr.0a.making"),
-        (["tradeoff", "bounce", "--points", "2", "--ladder", "engine"], ".settings.json.0a.partial"),
+        (["slice", *BOUNCE], ".landscape-85mm.pdf"),
+        (["sweep", *BOUNCE, "--over", "2", "--frames", "2"], "frames/.0.zarr"),
+        (["optimize", "bounce", "--method", "random", *SEARCH], ".run.zarr"),
+        (["race", "bounce", "--methods", "random", "--seeds", "2", *SEARCH], "random-0/.run.zarr"),
+        (["tradeoff", "bounce", "--points", "2", "--ladder", "engine"], ".settings.json"),
+        (["pairs", "bounce", "--samples", "2"], "pieces/.moved-7.npz"),
+        (["replay", "bounce", "--no-film"], ".episode.mp4"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else None,
 )
-def test_what_a_kill_left_in_a_folder_is_no_other_file(
+def test_what_a_kill_left_in_a_folder_is_no_other_file_and_goes(
     command: list[str], left: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "made" / left).mkdir(parents=True)
-    (tmp_path / "made" / left / "zarr.json").write_text("{}")
+    place = tmp_path / "made" / f"{left}.{'0a' * 16}.making"
+    place.mkdir(parents=True)
+    (place / "zarr.json").write_text("{}")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("gradscape.tolerance.user_data_path", lambda name: tmp_path / "data" / name)
     for name in ("TIMING", "PATIENCE"):
@@ -63,3 +66,4 @@ def test_what_a_kill_left_in_a_folder_is_no_other_file(
     with pytest.raises(SystemExit) as ended:
         main([*command, "--device", "cpu", "--out", "made"])
     assert not ended.value.code
+    assert not [path for path in (tmp_path / "made").rglob(".*") if path.name.startswith(".")]

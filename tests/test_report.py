@@ -214,7 +214,7 @@ def test_the_paper_is_quoted_on_every_environment_it_shows() -> None:
 
 
 @pytest.mark.parametrize("cut", [["rastrigin", "--set", "dim=5"], ["branin"]])
-def test_a_function_that_refuses_what_is_beyond_its_bounds_is_reported(
+def test_a_function_whose_box_is_its_own_is_asked_beyond_it(
     run: Callable[..., Said], tmp_path: Path, cut: list[str]
 ) -> None:
     done = run("slice", *cut, "--dims", "0", "1", "--resolution", "12", "--out", "cut", cwd=tmp_path)
@@ -222,6 +222,4 @@ def test_a_function_that_refuses_what_is_beyond_its_bounds_is_reported(
     report = run("report", "cut", "--out", "told", "--json", cwd=tmp_path)
     assert report.returncode == 0, report.stderr
     beyond = json.loads(report.stdout)["beyond_the_box"]
-    assert 0 < beyond["cut"] < beyond["asked"] / 10
-    measures = json.loads((tmp_path / "told/measures.json").read_text())
-    assert measures["Probes beyond the bounds, left out"] == f"{beyond['cut']} of {beyond['asked']}"
+    assert beyond["cut"] == 0 < beyond["asked"]

@@ -151,6 +151,7 @@ def fill(
     """
     from .cluster import recipe
     from .landscapes.adapters import within_box
+    from .landscapes.disk import until_full
     from .landscapes.job import Job
 
     command = shlex.join(["landscape", *sys.argv[1:]])
@@ -161,8 +162,9 @@ def fill(
         made=None if boxed else recipe(env), prints=prints,
     )  # fmt: skip
     try:
-        _announce(console, job, env)
-        summary = follow(console, job, command)
+        with until_full(job.kept):
+            _announce(console, job, env)
+            summary = follow(console, job, command)
     except KeyboardInterrupt:
         _farewell(console, job, command)
         sys.exit(130)
@@ -254,13 +256,9 @@ def follow(console: Console, job: Job, command: str) -> dict[str, Any]:
 
 
 def _farewell(console: Console, job: Job, command: str) -> None:
-    status = job.store.status()
+    kept = job.kept()
     job.picture()
-    console.print(
-        f"stopped: {int((status > 0).sum())} of {status.size} points are kept in {job.folder}; "
-        f"the same command goes on from there: {command}",
-        markup=False,
-    )
+    console.print(f"stopped: {kept}; the same command goes on from there: {command}", markup=False)
 
 
 def outcome(summary: dict[str, Any]) -> str:

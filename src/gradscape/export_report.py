@@ -37,9 +37,9 @@ def _read(path: Path) -> tuple[xr.Dataset, Path]:
     from .landscapes.store import open_slice
     from .optim.run import is_run, open_run
 
-    for store in (inside(path, SLICE), inside(path, RUN)):
-        if is_slice(store):
-            return open_slice(store), finished(store)
-        if is_run(store):
-            return open_run(store), store
+    slice_, run = inside(path, SLICE), inside(path, RUN)
+    if is_slice(slice_) or slice_ != path:  # one that is damaged is refused by what opens it
+        return open_slice(slice_), finished(slice_)
+    if is_run(run) or run != path:
+        return open_run(run), run
     raise ValueError(f"{path} is no slice and no run; give the folder that `landscape slice` or `optimize` left")

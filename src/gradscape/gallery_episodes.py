@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ import numpy as np
 from rich.console import Console
 
 from .envs.registry import environment_class, make
+from .gallery.page_data import EPISODES
 from .gallery_parts import LOSS, Part, read_record, seconds_of_one
 
 if TYPE_CHECKING:
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 
 HEIGHT, LONGEST = 480, 60  # of a film: pixels and most frames
 DRAWING = 0.15  # seconds per frame, about
+FILM = re.compile(r"episode-\d+-\d+\.(?:mp4|webp)")
 
 
 @dataclass(frozen=True)
@@ -69,12 +72,12 @@ class Episodes(Part):
             if node not in kept:
                 with console.status(f"{self.figure.id}: the episode of {node.why}"):
                     self._draw(env, plane, node)
-                write_json(self.folder / "episodes.json", [asdict(one) for one in [*kept, node]])
+                write_json(self.folder / EPISODES, [asdict(one) for one in [*kept, node]])
                 kept.append(node)
         for file in self.folder.glob("episode-*"):
-            if file.stem not in {node.name for node in self._nodes}:
+            if FILM.fullmatch(file.name) and file.stem not in {node.name for node in self._nodes}:
                 file.unlink()
-        write_json(self.folder / "episodes.json", [asdict(node) for node in self._nodes])
+        write_json(self.folder / EPISODES, [asdict(node) for node in self._nodes])
         return f"{len(self._nodes)} episodes"
 
     def _draw(self, env: Environment, plane: Plane, node: Node) -> None:
@@ -107,10 +110,11 @@ class Episodes(Part):
 
     def _kept(self) -> list[Node]:
         """Return the nodes whose films are there."""
-        kept = [Node(**one) for one in read_record(self.folder / "episodes.json") or []]
+        kept = read_record(self.folder / EPISODES)
         return [
-            node for node in kept
-            if node in self._nodes and all((self.folder / f"{node.name}.{kind}").exists() for kind in ("mp4", "webp"))
+            node for node in self._nodes
+            if isinstance(kept, list) and asdict(node) in kept
+            and all((self.folder / f"{node.name}.{kind}").exists() for kind in ("mp4", "webp"))
         ]  # fmt: skip
 
 

@@ -36,9 +36,10 @@ class Reports(Part):
         from .landscapes.store import is_slice, open_slice
 
         kept, store = read_record(self.folder / REPORT), self.folder / SLICE
-        if not isinstance(kept, dict) or not is_slice(store):
+        if not isinstance(kept, dict) or not (self.folder / MEASURES).exists() or not is_slice(store):
             return 1
-        return int(kept.get("key", {}).get("slice") != measure_report.digest(open_slice(store)))
+        key = kept.get("key")
+        return int(not isinstance(key, dict) or key.get("slice") != measure_report.digest(open_slice(store)))
 
     def seconds_each(self) -> float:
         """Estimate a report by the first episodes."""

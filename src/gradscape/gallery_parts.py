@@ -121,14 +121,16 @@ class Slice(Part):
         return said
 
     def _open(self) -> Job:
-        from .landscapes.job import Job
+        from .landscapes.job import STORE, Job
+        from .landscapes.store import is_slice
 
         env = self._env(self.figure.fidelity)
         plane = plane_of_figure(self.figure, env, self.figure.resolution)
+        empty = is_slice(self.folder / STORE) and self.state().done == 0
         return Job.open(
             env, plane, self.folder, picture_of(env, plane),
             identity=env.identity(), provenance=provenance_of(env, self.figure.command(self.device)),
-            force=self.state().done == 0,  # nothing is lost of a store made by other code or for another device
+            force=empty,  # nothing is lost of a store made by other code or for another device
             executor=self.executor, made=recipe(env),
         )  # fmt: skip
 

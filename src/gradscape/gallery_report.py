@@ -24,6 +24,8 @@ from .gallery.figures import Figure, chosen, data_folder, read_figures
 from .gallery_episodes import Episodes
 from .gallery_measures import Reports, Tradeoffs
 from .gallery_parts import Part, Searches, Slice, State, Sweep
+from .landscapes.disk import full, is_full, until_full
+from .landscapes.files import tidy
 from .tables import table
 
 T = TypeVar("T")
@@ -59,6 +61,7 @@ def compute(
             if name in parts or not parts:
                 sound = [figure for figure in figures if figure.id not in failed]
                 _make(console, name, [kind(figure, root, device, executor) for figure in sound], failed)
+    tidy(root)
     if failed:
         console.print(
             f"{len(failed)} of {len(figures)} figures failed: {', '.join(sorted(failed))}\n"
@@ -113,6 +116,8 @@ def _try(console: Console, part: Part, work: Callable[[], T], failed: set[str]) 
         console.print(f"stopped in {part.figure.id}; the same command goes on from there", markup=False)
         sys.exit(130)
     except Exception as error:  # one figure that fails, by whatever cause, leaves the others to be computed
+        if is_full(error):
+            raise full(error, f"all that is finished is kept in {part.root}") from error
         said = " ".join(str(error).split())
         console.print(f"{part.figure.id} failed: {type(error).__name__}: {said}", markup=False)
         failed.add(part.figure.id)
@@ -157,7 +162,8 @@ def build(*, data: str | None, out: str) -> None:
     from .gallery.build import build_site
 
     root, start = data_folder(data), time.perf_counter()
-    manifest = build_site(read_figures(), root, Path(out))
+    with until_full(lambda: f"{out} is as it was before"):
+        manifest = build_site(read_figures(), root, Path(out))
     weight = sum(file.stat().st_size for file in Path(out).rglob("*") if file.is_file())
     missing = f", {len(manifest['missing'])} not sampled yet" if manifest["missing"] else ""
     Console(stderr=True, soft_wrap=True, highlight=False).print(

@@ -21,7 +21,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from .console import duration, fill, size
 from .envs.registry import environment_class, make
 from .gallery.figures import data_folder, read_figures
-from .landscapes.files import others, replacing, write_json
+from .kept_reports import REPORT, TABLE, check_summary, read_report, verdict_lines
+from .landscapes.disk import full, is_full
+from .landscapes.files import others, replacing, tidy, write_json
 from .landscapes.identity import stored_identity
 from .measure_tables import by_environment, slices_markdown, slices_table
 from .results import SLICE, environment_of, inside
@@ -36,7 +38,7 @@ if TYPE_CHECKING:
     from .landscapes.character import Character
     from .landscapes.objective import Evaluation, Objective
 
-REPORT, TABLE, PICTURE, MEASURES = "report.json", "report.md", "gradient-quality.png", "measures.json"
+PICTURE, MEASURES = "gradient-quality.png", "measures.json"
 ARRAYS = "gradient-quality.npz"  # what the picture is drawn from, but for the slice
 PRECISION = {"float32": 2.0**-23, "float64": 2.0**-52}
 RESOLUTION = 24  # points per axis of a slice that is sampled for its report
@@ -145,21 +147,24 @@ def _measured(
 
     records: list[dict[str, Any]] = []
     failed: dict[str, str] = {}
+
+    def kept() -> str:
+        return f"{len(records)} of {len(subjects)} reports are kept in {places[0].parent}"
+
     for number, (subject, folder) in enumerate(zip(subjects, places, strict=True)):
         if len(subjects) > 1:
             console.print(f"slice {number + 1} of {len(subjects)}: {subject.name}", markup=False)
         try:
             records.append(measured(console, subject, folder, settings, device, paper_words(), drawn=bool(prints)))
             _print(console, subject, folder, prints)
+            tidy(folder)
         except KeyboardInterrupt:
             again = shlex.join(["landscape", *sys.argv[1:]])
-            console.print(
-                f"stopped: {len(records)} of {len(subjects)} reports are kept in {places[0].parent}; "
-                f"the same command goes on with the next: {again}",
-                markup=False,
-            )
+            console.print(f"stopped: {kept()}; the same command goes on with the next: {again}", markup=False)
             sys.exit(130)
         except Exception as error:  # whatever one slice meets, the others are not lost by it
+            if is_full(error):
+                raise full(error, kept()) from error
             if len(subjects) == 1:
                 raise
             failed[subject.name] = f"{type(error).__name__}: {' '.join(str(error).split())}"
@@ -216,24 +221,24 @@ def _fetch(console: Console, source: Path, folder: Path, key: dict[str, Any]) ->
     files = [source / name for name in (PICTURE, MEASURES, REPORT)]
     if (folder / REPORT).exists() or not all(file.exists() for file in files):
         return
-    if _same(json.loads((source / REPORT).read_text()), key):
+    if _same(read_report(source / REPORT), key):
         folder.mkdir(parents=True, exist_ok=True)
         for file in [*files, *source.glob(ARRAYS)]:
-            shutil.copyfile(file, folder / file.name)
+            with replacing(folder / file.name) as partial:
+                shutil.copyfile(file, partial)
         console.print(f"{folder} is copied from {source}", markup=False)
 
 
 def _same(record: dict[str, Any], key: dict[str, Any]) -> bool:
     """Say whether a report is of the slice and the settings; its code may be an older one, which is said."""
-    theirs = record.get("key", {})
-    return all(theirs.get(name) == key[name] for name in key if name != "code")
+    return all(record["key"].get(name) == key[name] for name in key if name != "code")
 
 
 def _kept(console: Console, folder: Path, key: dict[str, Any], device: str) -> dict[str, Any]:
     """Return the report that is there, on whatever device it was measured."""
-    kept: dict[str, Any] = json.loads((folder / REPORT).read_text())
+    kept = read_report(folder / REPORT)
     if not _same(kept, key):
-        theirs = kept.get("key", {})
+        theirs = kept["key"]
         said = ", ".join(
             f"{name} {theirs.get(name)} there, {key[name]} here" for name in key if theirs.get(name) != key[name]
         )
@@ -386,6 +391,8 @@ def _folder_name(what: str, subjects: Sequence[Subject], settings: dict[str, Any
 def _check(folder: Path, single: bool) -> None:
     """Refuse a folder that holds anything but reports."""
     ours = {REPORT, MEASURES, PICTURE, ARRAYS} if single else {REPORT, TABLE}
+    if not single:
+        check_summary(folder)
     if any(single or not (file / PICTURE).exists() for file in others(folder, ours, PICTURE)):
         raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
 
@@ -402,8 +409,5 @@ def _show(record: dict[str, Any], as_json: bool, folder: Path) -> None:
     for name, text in named_measures(record).items():
         found.add_row(escape(name), escape(text))
     console.print(found)
-    for word in record["verdict"]["words"]:
-        console.print(f"{word}: {record['verdict']['reasons'][word]}", markup=False)
-    if record["paper"]:
-        said = "; ".join(f"{one['word']}: {'yes' if one['measured'] else 'no'}" for one in record["paper"]["words"])
-        console.print(f"the paper's words ({record['paper']['where']}), measured too? {said}", markup=False)
+    for line in verdict_lines(record):
+        console.print(line, markup=False)

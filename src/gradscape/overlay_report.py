@@ -17,7 +17,7 @@ from rich.console import Console
 
 from .console import fill
 from .envs.registry import environment_class
-from .landscapes.files import others
+from .landscapes.files import others, tidy
 from .landscapes.identity import stored_identity
 from .landscapes.slice_paths import there
 from .results import RUN, SLICE, environment_of, inside, run_tables
@@ -76,6 +76,7 @@ def overlay(
         dataset = open_slice(sampled / SLICE)
     placed = laid(dataset, tables)
     files = _write(dataset, placed, folder, prints)
+    tidy(folder)
     console.print(f"{_outcome(placed)}\n{folder}: {', '.join(files)}", markup=False)
     if spawn or serve:
         _show(console, folder / STREAM, serve=serve)

@@ -48,7 +48,8 @@ def pairs(
     env = make(name, fidelity=fidelity, device=device, engine=engine, **read_settings(settings))
     if env.space.dim < 2:
         raise ValueError(f"{name} has one parameter; a pair takes two")
-    from .landscapes.files import write_json
+    from .landscapes.disk import until_full
+    from .landscapes.files import tidy, write_json
     from .landscapes.pairs import Design, default_samples, explore
     from .landscapes.pieces import Pieces
 
@@ -58,18 +59,24 @@ def pairs(
     folder = Path(out) if out else Path("out") / _folder(identity)
     pieces = Pieces.open(folder, identity, what="pairs", force=force)
     command = shlex.join(["landscape", *sys.argv[1:]])
+
+    def kept() -> str:
+        return f"{pieces.count()} batches are kept in {folder}"
+
     try:
-        _announce(console, env, design, folder)
-        with search_progress(console) as bar:
-            task = bar.add_task("episodes", total=design.episodes)
-            found = explore(env, design, pieces, follow=lambda done: bar.update(task, completed=done))
+        with until_full(kept):
+            _announce(console, env, design, folder)
+            with search_progress(console) as bar:
+                task = bar.add_task("episodes", total=design.episodes)
+                found = explore(env, design, pieces, follow=lambda done: bar.update(task, completed=done))
+            provenance = provenance_of(env, command)
+            record = _record(env, design, found)
+            report = {**identity, "set": read_settings(settings), **record, "provenance": provenance}
+            write_json(folder / RECORD, report)
     except KeyboardInterrupt:
-        said = f"stopped: {pieces.count()} batches are kept in {folder}; the same command goes on from there: {command}"
-        console.print(said, markup=False)
+        console.print(f"stopped: {kept()}; the same command goes on from there: {command}", markup=False)
         sys.exit(130)
-    provenance = provenance_of(env, command)
-    report = {**identity, "set": read_settings(settings), **_record(env, design, found), "provenance": provenance}
-    write_json(folder / RECORD, report)
+    tidy(folder)
     if as_json:
         print(json.dumps({**report, "pairs": report["pairs"][:top], "folder": str(folder)}))
     show(report, Console(stderr=as_json), top)

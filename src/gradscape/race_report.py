@@ -18,7 +18,8 @@ from rich.console import Console
 from . import cluster, race_workers
 from .console import duration, provenance_of, read_settings
 from .envs.registry import make
-from .landscapes.files import clear, visible, write_json
+from .landscapes.disk import until_full
+from .landscapes.files import clear, tidy, visible, write_json
 from .optim.registry import METHODS
 from .race_tables import seeds_said, show
 from .search_report import STORE, give_torch_one_thread, made, run_identity, search_progress
@@ -68,10 +69,11 @@ def race(
         chosen = _able(console, env, chosen)
     job = Job.open(env, chosen, options, seeds=seeds, budget=budget, workers=workers, out=out, force=force)
     try:
-        with cluster.workers(scheduler, env.device) as executor:
-            job.run(console, executor)
-        with console.status("resampling seeds"):
-            figures = job.save(prints)
+        with until_full(job.kept):
+            with cluster.workers(scheduler, env.device) as executor:
+                job.run(console, executor)
+            with console.status("resampling seeds"):
+                figures = job.save(prints)
     except KeyboardInterrupt:
         job.farewell(console)
         sys.exit(130)
@@ -243,18 +245,20 @@ class Job:
         printed = save_prints(lambda width: race_figure(dataset, width=width), self.folder / PICTURE, prints)
         figures["files"] = [FIGURES, PICTURE, *printed]
         write_json(self.folder / FIGURES, figures)
+        tidy(self.folder)
         return figures
 
     def farewell(self, console: Console) -> None:
         """Say what is kept of a race that was stopped, and how to go on."""
+        said = f"stopped: {self.kept()}; the same command goes on from there: {self.command}"
+        console.print(said, markup=False)
+
+    def kept(self) -> str:
+        """Say how much of it is on disk."""
         from .optim.run import Run
 
-        kept = sum(min(Run.open(entry.run.path).count, self.budget) for entry in self.entries if entry.run.path)
-        console.print(
-            f"stopped: {kept} of {self.budget * len(self.entries)} episodes are kept in {self.folder}; "
-            f"the same command goes on from there: {self.command}",
-            markup=False,
-        )
+        done = sum(min(Run.open(entry.run.path).count, self.budget) for entry in self.entries if entry.run.path)
+        return f"{done} of {self.budget * len(self.entries)} episodes are kept in {self.folder}"
 
     def _announce(self, console: Console, executor: Executor | None) -> float | None:
         """Say what is left to compute, and return what an episode with gradient costs if any method asks for it."""

@@ -16,7 +16,7 @@ from rich.console import Console
 from . import __version__
 from .console import provenance_of, read_settings
 from .envs.registry import make
-from .landscapes.files import others, write_json
+from .landscapes.files import others, tidy, write_json
 from .results import point_of
 
 if TYPE_CHECKING:
@@ -67,6 +67,7 @@ def replay(
         draw = partial(episode_figure, episode, caption=caption)
         files += save_prints(lambda width: draw(width=width), folder / SHEET, prints)
     _write_record(env, x, loss, status, folder / RECORD)
+    tidy(folder)
     console.print(
         f"{caption.title} · {env.device} · {caption.outcome}\n{folder}: {', '.join([*files, RECORD])}", markup=False
     )

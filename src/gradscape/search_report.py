@@ -8,7 +8,7 @@ import shlex
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from .console import chosen_fidelity, duration, provenance_of, read_settings
 from .envs.registry import make
-from .landscapes.files import clear, visible, write_json
+from .landscapes.disk import until_full
+from .landscapes.files import clear, tidy, visible, write_json
 from .optim.registry import METHODS, code_digest, optimizer_class
 from .tables import table
 
@@ -110,7 +111,8 @@ def optimize(
     optimizer, command = made(method, env, seed=seed, options=options), shlex.join(["landscape", *sys.argv[1:]])
     job = Job.open(env, optimizer, budget=budget, command=command, out=out, force=force, prints=prints)
     try:
-        summary = job.run(console)
+        with until_full(job.kept):
+            summary = job.run(console)
     except KeyboardInterrupt:
         job.farewell(console)
         sys.exit(130)
@@ -203,15 +205,19 @@ class Job:
 
     def farewell(self, console: Console) -> None:
         """Say what is kept of a run that was stopped, and how to go on."""
+        kept = self._on_disk()
+        kept.picture()
+        said = f"stopped: {kept.kept()}; the same command goes on from there: {self.command}"
+        console.print(said, markup=False)
+
+    def kept(self) -> str:
+        """Say how much of it is on disk."""
+        return f"{self._on_disk().filled.count} of {self.budget} episodes are kept in {self.folder}"
+
+    def _on_disk(self) -> Job:
         from .optim.run import Run
 
-        kept = Job(self.env, self.optimizer, self.folder, Run.open(self.folder / STORE), self.budget, self.command)
-        kept.picture()
-        console.print(
-            f"stopped: {kept.filled.count} of {self.budget} episodes are kept in {self.folder}; "
-            f"the same command goes on from there: {self.command}",
-            markup=False,
-        )
+        return replace(self, filled=Run.open(self.folder / STORE), prints=())
 
     def _announce(self, console: Console) -> float | None:
         """Say what is left to compute and return what a gradient costs, as far as the method asks for any."""
@@ -237,6 +243,7 @@ class Job:
         files = [STORE, PICTURE, *printed, SUMMARY]
         summary = {**_summary(self.filled, resumed, seconds, self.command), "files": files}
         write_json(self.folder / SUMMARY, summary)
+        tidy(self.folder)
         return summary
 
 

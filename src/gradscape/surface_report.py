@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from .landscapes.files import others
+from .landscapes.files import others, tidy
 from .results import SLICE, inside, run_tables
 
 PICTURE, MODEL = "surface.png", "surface.gltf"
@@ -40,6 +40,7 @@ def surface(slice_: str, runs: Sequence[str], *, out: str | None, prints: Sequen
     with console.status("drawing"):
         save_surface(dataset, placed, folder / PICTURE, folder / MODEL)
         printed = save_prints(lambda width: surface_figure(dataset, placed, width=width), folder / PICTURE, prints)
+    tidy(folder)
     console.print(f"{folder}: {', '.join([PICTURE, MODEL, *printed])}", markup=False)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shlex
 import sys
 import time
@@ -20,8 +21,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from .cluster import recipe, workers
 from .console import duration, provenance_of, read_extent, read_settings, size
 from .envs.registry import make
-from .landscapes.files import discard, visible, write_json
-from .landscapes.slice_paths import filling, is_slice
+from .landscapes.disk import until_full
+from .landscapes.files import discard, tidy, visible, write_json
+from .landscapes.slice_paths import check_replaceable, filling
 from .swept import FRAMES, HORIZON, ONLY, SMOOTHING, Moved, moved
 
 if TYPE_CHECKING:
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
 
 SUMMARY = "summary.json"
 FILM, GIF, STREAM = "sweep.mp4", "sweep.gif", "sweep.rrd"
+FRAME = re.compile(r"\d{3,}(?:\.filling)?\.zarr")  # what the folder of a sweep's slices holds
 
 
 def sweep(
@@ -77,8 +80,9 @@ def sweep(
     with workers(scheduler, env.device) as executor:
         job = replace(job, executor=executor)
         try:
-            job.announce(console)
-            summary = job.run(console)
+            with until_full(job.kept):
+                job.announce(console)
+                summary = job.run(console)
         except KeyboardInterrupt:
             job.farewell(console)
             sys.exit(130)
@@ -160,13 +164,14 @@ class Job:
 
         return Sweep(self.moved.label, self.moved.values, self.moved.slices(slices))
 
+    def kept(self) -> str:
+        """Say how much of it is on disk."""
+        return f"{self.done()} of {self.total} points are kept in {self.folder}"
+
     def farewell(self, console: Console) -> None:
         """Say what is kept of a sweep that was stopped, and how to go on."""
-        console.print(
-            f"stopped: {self.done()} of {self.total} points are kept in {self.folder}; "
-            f"the same command goes on from there: {self.command}",
-            markup=False,
-        )
+        said = f"stopped: {self.kept()}; the same command goes on from there: {self.command}"
+        console.print(said, markup=False)
 
     @property
     def _grad(self) -> bool:
@@ -229,6 +234,7 @@ class Job:
             "files": [*sorted({name.split("/")[0] for name in self.moved.stores}), FILM, GIF, STREAM, SUMMARY],
         }
         write_json(self.folder / SUMMARY, summary)
+        tidy(self.folder)
         return summary
 
 
@@ -247,15 +253,19 @@ def _check(folder: Path) -> None:
     """Refuse a folder that holds anything but a sweep."""
     slices = {FRAMES, ONLY, filling(Path(ONLY)).name}
     present = {file.name for file in visible(folder)}
-    if present - slices - {FILM, GIF, STREAM, SUMMARY} or (present and not present & slices):
+    strange = [file for file in visible(folder / FRAMES) if not FRAME.fullmatch(file.name)]
+    if strange or present - slices - {FILM, GIF, STREAM, SUMMARY} or (present and not present & slices):
         raise ValueError(f"{folder} holds other files and no sweep; give --out a new or an empty folder")
 
 
 def _clear(folder: Path) -> None:
     """Remove the slices of a sweep, and what was made of them."""
-    for store in [*folder.glob(f"{FRAMES}/*.zarr"), folder / ONLY, filling(folder / ONLY)]:
-        if is_slice(store):
-            discard(store)
+    places = [*visible(folder / FRAMES), folder / ONLY, filling(folder / ONLY)]
+    stores = [store for store in places if store.exists()]
+    for store in stores:
+        check_replaceable(store)
+    for store in stores:
+        discard(store)
     for name in (FILM, GIF, STREAM, SUMMARY):
         (folder / name).unlink(missing_ok=True)
 

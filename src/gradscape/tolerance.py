@@ -115,9 +115,13 @@ def _timed(env: Environment, rungs: Sequence[Environment]) -> dict[str, float]:
     It is kept so that the same command chooses the same rung, and goes on with what it began.
     """
     from .landscapes.files import write_json
+    from .landscapes.records import number, read_json, reading
 
     path = _kept(env.name, asdict(env.options), env.device).with_suffix(f".{env.engine}-{env.code}.seconds.json")
-    known: dict[str, float] = json.loads(path.read_text()) if path.is_file() else {}
+    known: dict[str, float] = {}
+    if path.is_file():
+        with reading(path, "delete it, and fidelities are timed anew"):
+            known = {name: number(seconds) for name, seconds in read_json(path).items()}
     for rung in rungs:
         if rung.fidelity.name not in known:
             known[rung.fidelity.name] = _seconds(rung)
@@ -197,10 +201,33 @@ def _found(name: str, options: dict[str, Any], device: str) -> tuple[dict[str, A
     kept = [_kept(name, options, where) for where in devices]
     for path in (*kept, *(gallery / f"{name}-{where}.json" for where in devices)):
         if path.is_file():
-            report: dict[str, Any] = json.loads(path.read_text())
+            report = _read(name, path)
             if report["identity"]["options"] == options:
                 return report, path
     return None
+
+
+def _read(name: str, path: Path) -> dict[str, Any]:
+    """Return what `landscape tradeoff` left in a file, all that is needed of it at hand."""
+    from .envs.base import Fidelity
+    from .landscapes.records import maybe, number, read_json, reading, text
+    from .landscapes.tradeoff import p95
+
+    with reading(path, f"delete it, and `landscape tradeoff {name}` measures it anew"):
+        report = read_json(path)
+        identity, rows = report["identity"], report["rungs"]
+        for said in (report["reference"], report["loss_unit"], identity["code"], identity["engine"]):
+            text(said)
+        for row in rows:
+            Fidelity(**row["fidelity"])
+            for said in (row["name"], row["engine"], row["device"]):
+                text(said)
+            for found in (p95(row, relative=True), p95(row, relative=False), row["compared"]):
+                maybe(number, found)
+            number(row["seconds"]["with_gradient"])
+            dict(row["options"])
+        dict(identity["options"])
+    return report
 
 
 def _rows(report: Mapping[str, Any], engine: str, device: str) -> Sequence[Mapping[str, Any]]:

@@ -54,21 +54,20 @@ def tradeoff(
     fidelities = environment_class(name).fidelities
     env = make(name, fidelity=list(fidelities)[-1], device=device, engine=engine, **read_settings(settings))
     from .ladder import refuse_single
+    from .landscapes.disk import until_full
 
     refuse_single(env)
     study = Study.open(env, points=points, seed=seed, ladders=ladders, out=out, force=force)
     try:
-        study.announce(console)
-        report = study.run(console)
-        printed = study.print(report, prints)
+        with until_full(study.kept):
+            study.announce(console)
+            report = study.run(console)
+            printed = study.print(report, prints)
+            kept = keep(report)
     except KeyboardInterrupt:
-        console.print(
-            f"stopped: {study.pieces.count()} of {len(study.rungs)} rungs are kept in {study.pieces.folder}; "
-            f"the same command goes on from there: {study.command}",
-            markup=False,
-        )
+        said = f"stopped: {study.kept()}; the same command goes on from there: {study.command}"
+        console.print(said, markup=False)
         sys.exit(130)
-    kept = keep(report)
     show(report, Console(stderr=as_json))
     files = ", ".join([PICTURE, *printed, RECORD])
     console.print(f"{study.pieces.folder}: {files}; kept for --tolerance: {kept}", markup=False)
@@ -165,12 +164,17 @@ class Study:
         report = self._report(samples)
         from .landscapes.draw.page import save
         from .landscapes.draw.tradeoff import tradeoff_figure
-        from .landscapes.files import write_json
+        from .landscapes.files import tidy, write_json
 
         folder = self.pieces.folder
         save(tradeoff_figure(report), folder / PICTURE)
         write_json(folder / RECORD, report)
+        tidy(folder)
         return report
+
+    def kept(self) -> str:
+        """Say how much of it is on disk."""
+        return f"{self.pieces.count()} of {len(self.rungs)} rungs are kept in {self.pieces.folder}"
 
     def print(self, report: dict[str, Any], prints: Sequence[float]) -> list[str]:
         """Draw the report for pages so wide [mm], too; return the files' names."""

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import urldefrag
@@ -195,9 +196,44 @@ def test_cells_say_which_column_they_are_of_where_there_is_a_heading(site: Path)
 
 def test_a_folder_of_other_files_is_left_alone(data: Path, tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("words")
-    with pytest.raises(ValueError, match="holds other files and no gallery"):
+    with pytest.raises(
+        ValueError, match=r"is not replaced, as it holds files that are not of a gallery.*: thesis\.txt; move"
+    ):
         build_site(FIGURES, data, tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+@pytest.mark.parametrize(
+    "said", ["{}", "[", '{"files": ["thesis.txt", "manifest.json"]}', '{"schema": 2, "figures": []}']
+)
+def test_a_manifest_of_something_else_gives_no_folder_away(data: Path, tmp_path: Path, said: str) -> None:
+    (tmp_path / "manifest.json").write_text(said)
+    (tmp_path / "thesis.txt").write_text("words")
+    with pytest.raises(ValueError, match=r"is not replaced, .*: manifest\.json, thesis\.txt; move"):
+        build_site(FIGURES, data, tmp_path)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["manifest.json", "thesis.txt"]
+
+
+def test_a_site_is_built_anew_where_its_manifest_lists_all_that_is_there(
+    site: Path, data: Path, tmp_path: Path
+) -> None:
+    out, link = shutil.copytree(site, tmp_path / "out"), tmp_path / "link"
+    link.symlink_to(out)
+    for mine in ("thesis.txt", "full/notes.txt", ".git/HEAD"):
+        (out / mine).parent.mkdir(exist_ok=True)
+        (out / mine).write_text("words")
+        for place in (out, link):
+            with pytest.raises(ValueError, match=rf"{out} is not replaced, .*: {mine}; move"):
+                build_site(FIGURES[:1], data, place)
+        assert (out / mine).read_text() == "words"
+        (out / mine).unlink()
+    (out / "elsewhere").symlink_to(tmp_path)
+    with pytest.raises(ValueError, match="elsewhere; move"):
+        build_site(FIGURES[:1], data, out)
+    (out / "elsewhere").unlink()
+    files = build_site(FIGURES[:1], data, link)["files"]
+    assert sorted(path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()) == files
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "out"]
 
 
 def colours(scheme: str) -> dict[str, str]:

@@ -1,3 +1,4 @@
+import fcntl
 import json
 import os
 import shutil
@@ -341,17 +342,18 @@ def test_a_creation_that_is_killed_leaves_nothing_in_the_way(tmp_path):
     assert left.count(1) > 1  # some were killed half way
 
 
-def test_hidden_leftovers_are_ignored_and_cleared_away_when_old(tmp_path):
+def test_hidden_leftovers_are_ignored_and_cleared_away_where_nobody_holds_them(tmp_path):
     for name in ("s", "s.filling"):
-        fresh, stale = (tmp_path / f".{name}.zarr.{age}.making" for age in ("fresh", "stale"))
-        for folder in (fresh, stale):
+        held, left = (tmp_path / f".{name}.zarr.{digit * 32}.making" for digit in "ab")
+        for folder in (held, left):
             folder.mkdir()
             (folder / "zarr.json").write_text("{")
-        os.utime(stale, (0, 0))
-        os.utime(fresh, (2**33, 2**33))  # to come, whenever this is read
+        lock = os.open(held, os.O_RDONLY)
+        fcntl.flock(lock, fcntl.LOCK_EX)
         make(tmp_path / "s.zarr")
-        assert fresh.exists()
-        assert not stale.exists()
+        assert held.exists()
+        assert not left.exists()
+        os.close(lock)
         finished(tmp_path / "s.zarr")
 
 

@@ -1,0 +1,39 @@
+"""A disk that is full ends a job by saying what is kept, and how to go on."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+CODES = (errno.ENOSPC, errno.EDQUOT)
+WORDS = "No space left on device"  # of a program that writes for us, such as ffmpeg
+
+
+class DiskFullError(OSError):
+    """Say what is kept of a job that a full disk ended."""
+
+    def __str__(self) -> str:
+        return str(self.strerror)
+
+
+def is_full(error: BaseException) -> bool:
+    """Whether an error comes of a disk or a quota that is full."""
+    return isinstance(error, OSError) and (error.errno in CODES or WORDS in str(error))
+
+
+def full(error: OSError, kept: str) -> DiskFullError:
+    """Return what to raise for a full disk, which keeps so much."""
+    said = f"the disk is full; {kept}: make room, and the same command goes on from there"
+    return DiskFullError(error.errno or errno.ENOSPC, said)
+
+
+@contextmanager
+def until_full(kept: Callable[[], str]) -> Iterator[None]:
+    """Say what is `kept` where the disk is full, unless that is said already."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, DiskFullError) or not is_full(error):
+            raise
+        raise full(error, kept()) from error

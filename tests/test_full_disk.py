@@ -1,0 +1,84 @@
+"""A disk that is full ends every verb that writes with what is kept, where, and how to go on."""
+
+import errno
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from gradscape.cli import app
+from gradscape.landscapes import tradeoff
+
+from .command import Said
+
+Command = Callable[..., Said]
+SLICE = "slice branin --dims 0 1 --resolution 4 --out"
+SEARCH = "optimize branin --method random --budget 4 --out"
+SWEEP = "sweep ackley --set dim=3 --dims 0 1 --over 2 --frames 2 --resolution 4 --no-gradients --out made"
+ANEW = "each file that is there is whole"
+WRITING = {  # the command, the file for which there is no room any more, what is kept
+    "slice": (f"{SLICE} made", "landscape.png", "16 of 16 points are kept in made"),
+    "bounce": (
+        "bounce --axis y --resolution 4 --fidelity draft --out made", "summary.json", "4 of 4 points are kept in made"
+    ),
+    "sweep": (SWEEP, "summary.json", "32 of 32 points are kept in made"),
+    "optimize": (f"{SEARCH} made", "progress.png", "4 of 4 episodes are kept in made"),
+    "race": (
+        "race branin --methods random --seeds 1 --budget 4 --out made", "race.json", "4 of 4 episodes are kept in made"
+    ),
+    "tradeoff": (
+        "tradeoff bounce --points 2 --ladder precision --device cpu --out made", "tradeoff.json",
+        "rungs are kept in made",
+    ),
+    "pairs": ("pairs branin --samples 2 --out made", "pairs.json", "2 batches are kept in made"),
+    "report": ("report cut --points 2 --out made", "report.json", "0 of 1 reports are kept in"),
+    "overlay": ("overlay cut run --out made", "overlay.png", ANEW),
+    "surface": ("surface cut --out made", "surface.png", ANEW),
+    "replay": ("replay bounce --no-film --out made", "episode.json", ANEW),
+    "export": ("export cut --out made.csv", "made.csv", ANEW),
+    "gallery": (
+        "gallery compute --only bounce-y --part slices --fidelity draft --resolution 4 --device cpu --data made",
+        "landscape.png", "all that is finished is kept in made",
+    ),
+}  # fmt: skip
+
+
+def test_every_verb_that_writes_is_tried() -> None:
+    commands: Any = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    writing = {name for name, one in commands.items() if any("--out" in param.opts for param in one.params)}
+    assert writing | {"gallery"} == set(WRITING)
+
+
+@pytest.mark.parametrize("verb", WRITING)
+def test_a_full_disk_says_what_is_kept_and_the_same_command_goes_on(
+    run: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, verb: str
+) -> None:
+    monkeypatch.setattr("gradscape.tolerance.user_data_path", lambda name: tmp_path / "data" / name)
+    for name in ("TIMING", "PATIENCE"):
+        monkeypatch.setattr(tradeoff, name, 0.002)
+    monkeypatch.setattr(tradeoff, "RESAMPLES", 9)
+    command, last, kept = WRITING[verb]
+    for needed, made in (("cut", SLICE), ("run", SEARCH)):
+        if needed in command.split():
+            assert run(*made.split(), needed, cwd=tmp_path).returncode == 0
+    replace, full = os.replace, [True]
+
+    def put(source: Any, target: Any) -> None:
+        if full and Path(target).name == last:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(target))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", put)
+    ended = run(*command.split(), cwd=tmp_path)
+    assert ended.returncode == 1, ended.stderr
+    assert "landscape: the disk is full" in ended.stderr
+    assert kept in ended.stderr
+    assert "same command" in ended.stderr
+    assert not list(tmp_path.rglob(last))
+    full.clear()
+    done = run(*command.split(), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert not [path for path in tmp_path.rglob(".*") if path.name.startswith(".")]
