@@ -329,7 +329,7 @@ def _least(losses: Sequence[float]) -> float:
 
 def _entry(env: Environment, maker: Any, folder: Path, *, budget: int, command: str, force: bool) -> racing.Entry:
     from .optim.race import Entry
-    from .optim.run import Run, is_run
+    from .optim.run import Run
 
     optimizer = maker()
     method, seed = optimizer.name, optimizer.seed
@@ -339,7 +339,7 @@ def _entry(env: Environment, maker: Any, folder: Path, *, budget: int, command: 
         "provenance": provenance_of(env, command),
         "budget": budget,
     }
-    if force and is_run(path):
+    if force and path.exists():
         run = Run.create(path, env.space, overwrite=True, **wanted)
     else:
         run = Run.open_or_create(path, env.space, **wanted)

@@ -146,7 +146,7 @@ class Job:
         prints: Sequence[float] = (),
     ) -> Job:
         """Go on with the run in its folder, or begin it there; `force` begins anew where another run is."""
-        from .optim.run import Run, is_run
+        from .optim.run import Run
 
         identity = run_identity(env, optimizer)
         folder = Path(out) if out else run_folder(identity)
@@ -154,7 +154,7 @@ class Job:
         if not path.exists() and visible(folder):
             raise ValueError(f"{folder} holds other files and no run; give --out a new or an empty folder")
         wanted: dict[str, Any] = {"identity": identity, "provenance": provenance_of(env, command), "budget": budget}
-        if force and is_run(path):
+        if force and path.exists():
             run = Run.create(path, env.space, overwrite=True, **wanted)
             clear(folder, (PICTURE, SUMMARY), PICTURE)
         else:

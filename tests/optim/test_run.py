@@ -278,6 +278,20 @@ def test_only_a_run_is_replaced(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine", "run.zarr"]
 
 
+def test_a_file_of_somebody_elses_in_a_run_is_not_lost_by_force(tmp_path: Path) -> None:
+    path = tmp_path / "run.zarr"
+    run_at(path)
+    (path / "x/thesis.txt").write_text("precious")
+    with pytest.raises(ValueError, match=r"holds files that are not of a run: x/thesis\.txt"):
+        Run.create(path, SPACE, identity={}, budget=3, overwrite=True)
+    assert (path / "x/thesis.txt").read_text() == "precious"
+    (path / "x/thesis.txt").unlink()
+    (path / "zarr.json").write_text("{")
+    with pytest.raises(StoreError, match=r"run\.zarr/zarr\.json is damaged: .*begin the run anew with --force"):
+        Run.open(path)
+    assert Run.create(path, SPACE, identity={}, budget=3, overwrite=True).budget == 3
+
+
 def test_one_process_at_a_time_fills_a_run(tmp_path: Path) -> None:
     run = run_at(tmp_path / "run.zarr")
     other = os.open(tmp_path / "run.zarr", os.O_RDONLY)
