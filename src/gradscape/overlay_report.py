@@ -205,7 +205,7 @@ def _show(console: Console, path: Path, *, serve: bool) -> None:
     from .landscapes.draw.viewer import open_viewer, served
 
     if not serve:
-        _need_display(path, f"look at it in a browser: landscape view {path} --serve")
+        _need_display(path, f"look at it in a browser: landscape view {shlex.quote(str(path))} --serve")
         console.print(f"opening {path} in rerun's viewer", markup=False)
         open_viewer(path)
         return
