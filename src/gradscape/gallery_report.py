@@ -173,12 +173,12 @@ def serve(*, out: str, port: int) -> None:
     """Serve the site to this machine only, until Ctrl-C."""
     if not (Path(out) / "index.html").exists():
         raise ValueError(f"{out} holds no gallery; build it with `landscape gallery build --out {shlex.quote(out)}`")
-    with LoopbackServer(port, partial(_Site, directory=out)) as server, contextlib.suppress(KeyboardInterrupt):
+    with LoopbackServer(port, partial(Site, directory=out)) as server, contextlib.suppress(KeyboardInterrupt):
         print(f"{out} is at {server.address}/ until Ctrl-C", flush=True)
         server.serve_forever()
 
 
-class _Site(LoopbackHandler, SimpleHTTPRequestHandler):
+class Site(LoopbackHandler, SimpleHTTPRequestHandler):
     """Serve the files that lie in a folder, and none to which a link leads out of it; folders are not listed."""
 
     def send_head(self) -> Any:

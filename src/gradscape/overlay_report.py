@@ -210,8 +210,8 @@ def _show(console: Console, path: Path, *, serve: bool) -> None:
         open_viewer(path)
         return
     with served(path) as address:
-        console.print(f"{path} is at {address} until Ctrl-C", markup=False)
         try:
+            console.print(f"{path} is at {address} until Ctrl-C", markup=False)
             while True:
                 time.sleep(3600)
         except KeyboardInterrupt:
