@@ -5,8 +5,11 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
+from http.client import HTTPConnection
 from pathlib import Path
+from signal import SIGINT
 from urllib.request import urlopen
 
 import numpy as np
@@ -135,18 +138,74 @@ def stop(*_: object) -> None:
     raise RuntimeError("stopped")
 
 
-def test_serve_serves_what_build_built(data: Path, tmp_path: Path) -> None:
-    assert gallery("build", "--data", str(data), "--out", str(tmp_path / "site")) == 0
-    command = [sys.executable, "-m", "gradscape", "gallery", "serve", "--out", str(tmp_path / "site"), "--port", "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+def asked(address: str, path: str, **headers: str) -> tuple[int, bytes]:
+    """Ask a server for a path as it stands, with no header but those given."""
+    connection = HTTPConnection(address.removeprefix("http://").rstrip("/"))
+    connection.putrequest("GET", path, skip_host=True, skip_accept_encoding=True)
+    for name, value in headers.items():
+        connection.putheader(name, value)
+    connection.endheaders()
+    with closing(connection), connection.getresponse() as answer:
+        return answer.status, answer.read()
+
+
+@pytest.fixture(scope="module")
+def site(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build a site, and plant links in it: of a file and of a page out of it, within it, in a loop."""
+    folder = tmp_path_factory.mktemp("served")
+    site, secret = folder / "site", folder / "secret"
+    assert gallery("build", "--data", str(data), "--out", str(site)) == 0
+    secret.mkdir()
+    (secret / "index.html").write_text("secret")
+    (site / "planted").mkdir()
+    (site / "planted/index.html").symlink_to(secret / "index.html")
+    (site / "file.html").symlink_to(secret / "index.html")
+    (site / "folder").symlink_to(secret)
+    (site / "inside.html").symlink_to("branin/index.html")
+    (site / "loop").symlink_to("loop")
+    return site
+
+
+@pytest.fixture(scope="module")
+def served(site: Path) -> Iterator[str]:
+    command = [sys.executable, "-m", "gradscape", "gallery", "serve", "--out", str(site), "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
             found = re.search(r"http://127\.0\.0\.1:\d+/", process.stdout.readline())
             assert found
-            with urlopen(found[0] + "branin/index.html") as answer:
-                assert b"Three minima &lt;b&gt;" in answer.read()
+            yield found[0]
+            process.send_signal(SIGINT)
+            assert process.communicate() == ("", "")
+            assert process.returncode == 0
         finally:
-            process.terminate()
+            process.kill()
+
+
+def test_serve_serves_what_build_built(served: str) -> None:
+    with urlopen(served + "branin/index.html") as answer:
+        assert b"Three minima &lt;b&gt;" in answer.read()
+    assert asked(served, "/inside.html", Host="localhost")[0] == 200
+
+
+def test_serve_answers_under_names_of_this_machine_alone(served: str) -> None:
+    """A page elsewhere whose name is made to mean 127.0.0.1 reads what is answered to that name."""
+    for name in ("127.0.0.1", "localhost:1", "LocalHost", "[::1]:80"):  # a tunnel's port is another
+        assert asked(served, "/", Host=name)[0] == 200
+    for name in ("evil.example", "127.0.0.1.evil.example", "localhost@evil.example", "evil.example:127", "0.0.0.0", ""):
+        assert asked(served, "/", Host=name)[0] == 421
+    assert asked(served, "/")[0] == 421
+
+
+def test_serve_serves_no_more_than_the_sites_files(served: str, site: Path) -> None:
+    folders = [f"/{one.relative_to(site)}/" for one in site.rglob("*") if one.is_dir() and not one.is_symlink()]
+    unlisted = [one for one in folders if not (site / one[1:] / "index.html").is_file()]
+    assert "/static/" in unlisted
+    outside = ["/file.html", "/planted/", "/planted/index.html", "/folder/", "/folder/index.html", "/../secret/index.html"]
+    none = ["/%00", "/static/%00", "/a%00b/", "/loop", "/loop/", f"/{'a' * 5000}", "/%ff", "/%ed%a0%80", "http://[/../.."]
+    for path in [*unlisted, *outside, *none]:
+        status, said = asked(served, path, Host="localhost")
+        assert (status, b"secret" in said) == (404, False), path
 
 
 def test_a_device_that_is_not_here_is_refused_at_once(

@@ -1,8 +1,10 @@
 """Dask distributed: a cluster of two here, workers that die, a scheduler that is gone, the command over an address."""
 
+import asyncio
 import os
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 import threading
@@ -10,6 +12,8 @@ import uuid
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from urllib.error import HTTPError
+from urllib.request import urlopen
 
 import cloudpickle
 import dask
@@ -17,6 +21,8 @@ import distributed  # noqa: F401 -- whose settings are to be there before a test
 import numpy as np
 import pytest
 import torch
+from distributed.comm import connect
+from distributed.security import Security
 
 from gradscape.cluster import recipe, workers
 from gradscape.envs.registry import make
@@ -29,10 +35,12 @@ from gradscape.landscapes.spread import WorkersLostError
 from gradscape.landscapes.store import SliceStore, open_slice
 from gradscape.optim.run import Run
 
+from .sockets import beyond_loopback, listening
+
 cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers need not find the tests
 SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
 PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 16))
-PATIENCE = "600s"  # for schedulers that do answer, on a machine that has other things to do
+PATIENCE = 600.0  # seconds, for schedulers that do answer, on a machine that has other things to do
 
 
 @pytest.fixture(scope="module")
@@ -52,13 +60,61 @@ def executor(machine):
         with suppress(OSError):  # another cluster has it indeed
             usual.bind(("127.0.0.1", 8787))
             usual.listen()
-        with dask.config.set({"distributed.comm.timeouts.connect": PATIENCE}), workers("local:2", "cpu") as found:
+        with dask.config.set({"distributed.comm.timeouts.connect": f"{PATIENCE}s"}), workers("local:2", "cpu") as found:
             yield found
 
 
 @pytest.fixture
 def address(executor):
-    return executor._client.scheduler.address
+    """Give the address of its scheduler, whose keys Dask's configuration has."""
+    keys = executor._client.security
+    named = {"ca-file": keys.tls_ca_file, "client.cert": keys.tls_client_cert, "client.key": keys.tls_client_key}
+    with dask.config.set({f"distributed.comm.tls.{name}": value for name, value in named.items()}):
+        yield executor._client.scheduler.address
+
+
+def addresses(executor) -> list[str]:
+    """Return where the scheduler listens, the workers and what watches over them."""
+    workers = executor._client.scheduler_info(n_workers=-1)["workers"]
+    return [executor._client.scheduler.address, *workers, *(one["nanny"] for one in workers.values())]
+
+
+def met(address: str, context: ssl.SSLContext | None) -> None:
+    async def greeted() -> None:
+        comm = await connect(address, ssl_context=context)
+        comm.abort()
+
+    asyncio.run(greeted())
+
+
+def context_of(keys: Security) -> ssl.SSLContext:
+    return keys.get_connection_args("client")["ssl_context"]
+
+
+def test_workers_here_listen_to_this_machine_and_to_holders_of_their_keys(executor):
+    assert len(listening()) >= len(addresses(executor)) == 5
+    assert beyond_loopback(listening()) == []
+    careless = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)  # which takes any server, and has no key
+    careless.check_hostname, careless.verify_mode = False, ssl.CERT_NONE
+    for address in addresses(executor):
+        met(address, context_of(executor._client.security))
+        with pytest.raises(OSError, match="certificate does not match"):
+            met(address, context_of(Security.temporary()))
+        with pytest.raises(OSError, match="closed|required"):
+            met(address, careless)
+        with pytest.raises(OSError, match="closed"):
+            met(address.replace("tls://", "tcp://"), None)
+
+
+def test_their_web_servers_have_no_pages(executor):
+    found = executor._client.scheduler_info(n_workers=-1)
+    ports = [one["services"]["dashboard"] for one in (found, *found["workers"].values())]
+    assert len(ports) == 3
+    for port in ports:
+        for page in ("health", "info/main/workers.html", "metrics"):
+            with pytest.raises(HTTPError, match="404") as refused:
+                urlopen(f"http://127.0.0.1:{port}/{page}")
+            refused.value.close()
 
 
 def store_at(path: Path, plane: Plane = PLANE, space: ParameterSpace = SPACE) -> SliceStore:
@@ -153,7 +209,7 @@ def once(x: torch.Tensor, mark: Path) -> torch.Tensor:
     return wave(x)
 
 
-def test_a_scheduler_that_is_gone_ends_it_with_a_slice_to_go_on_with(tmp_path, mortal, monkeypatch):
+def test_a_scheduler_that_is_gone_ends_it_with_a_slice_to_go_on_with(tmp_path, mortal, monkeypatch, capsys):
     monkeypatch.setattr("gradscape.cluster.ANSWER", PATIENCE)
     address, scheduler = mortal
     store = store_at(tmp_path / "s.zarr")
@@ -162,10 +218,12 @@ def test_a_scheduler_that_is_gone_ends_it_with_a_slice_to_go_on_with(tmp_path, m
         if now.done:
             scheduler.kill()
 
-    said = r"the workers are gone .*; 16 of 288 points are kept in .*s\.zarr.*the same command goes on"
+    gone = r"the workers are gone .*; 16 of 288 points are kept in .*s\.zarr.*the same command goes on"
     objective = from_torch(partial(once, mark=tmp_path / "mark"), SPACE)
-    with pytest.raises(WorkersLostError, match=said), workers(address, "cpu") as executor:
+    with pytest.raises(WorkersLostError, match=gone), workers(address, "cpu") as executor:
         sample(objective, PLANE, store, batch=1, executor=executor, progress=kill)
+    (warning,) = (line for line in capsys.readouterr().err.splitlines() if "warning" in line)
+    assert warning.startswith(f"warning: {address} is without TLS")
     assert len(store.pending()) == len(store.tiles()) - 1
     assert same(sample(from_torch(wave, SPACE), PLANE, store), sample(from_torch(wave, SPACE), PLANE))
 
@@ -177,6 +235,7 @@ def test_a_slice_and_a_sweep_go_over_an_address(tmp_path, run, address):
         alone = run(verb, "bounce", *how, *more, "--out", f"{verb}-alone", cwd=tmp_path)
         spread = run(verb, "bounce", *how, *more, "--out", f"{verb}-spread", "--scheduler", address, cwd=tmp_path)
         assert (alone.returncode, spread.returncode) == (0, 0), alone.stderr + spread.stderr
+        assert "warning" not in spread.stderr
         for store in stores:
             assert same(open_slice(tmp_path / f"{verb}-alone" / store), open_slice(tmp_path / f"{verb}-spread" / store))
 
@@ -207,8 +266,32 @@ def test_a_number_of_workers_that_is_none_is_refused(tmp_path, run, wrong):
     assert "local:N for N workers" in said.stderr
 
 
+def test_what_listens_at_an_address_and_is_no_scheduler_is_not_waited_for(tmp_path, run, monkeypatch):
+    monkeypatch.setattr("gradscape.cluster.ANSWER", 0.1)
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        address = f"tcp://127.0.0.1:{mute.getsockname()[1]}"
+        said = run("slice", "branin", "--dims", "0", "1", "--scheduler", address, cwd=tmp_path)
+    assert (said.returncode, said.stderr.count("\n")) == (1, 1)
+    assert f"no Dask scheduler answers at {address}: nothing is said there in 0.1 s" in said.stderr
+
+
+@pytest.mark.parametrize(
+    ("named", "said"),
+    [
+        ({}, "tls://127.0.0.1:9 takes certificates; docs/clusters.md says where they are named"),
+        ({"ca-file": "/none", "client.cert": "/none"}, "configuration names cannot be read"),
+    ],
+    ids=["none", "gone"],
+)
+def test_an_address_of_tls_takes_certificates(tmp_path, run, named, said):
+    with dask.config.set({f"distributed.comm.tls.{name}": value for name, value in named.items()}):
+        done = run("slice", "branin", "--dims", "0", "1", "--scheduler", "tls://127.0.0.1:9", cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert said in done.stderr
+
+
 def test_an_address_where_nothing_answers_and_a_missing_dask_are_said(tmp_path, run, monkeypatch):
-    monkeypatch.setattr("gradscape.cluster.ANSWER", "1s")
+    monkeypatch.setattr("gradscape.cluster.ANSWER", 1.0)
     how = ["slice", "bounce", "--dims", "0", "1", "--device", "cpu", "--scheduler", "tcp://127.0.0.1:9"]
     said = run(*how, cwd=tmp_path)
     assert said.returncode == 1

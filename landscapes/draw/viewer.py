@@ -9,15 +9,17 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from contextlib import contextmanager, suppress
+from http import HTTPStatus
 from importlib.util import find_spec
 from pathlib import Path
 from typing import IO
 from urllib.error import URLError
 from urllib.request import urlopen
 
-LOOPBACK = "127.0.0.1"
+from ..loopback import LOOPBACK, LoopbackHandler, LoopbackServer
+
+RECORDING = "/recording.rrd"  # whatever the file's name, which may be none for an address
 PATIENCE = 20.0  # seconds for rerun's server to come up
 SILENT = {
     "CI": "true",
@@ -47,33 +49,31 @@ def open_viewer(path: Path, *, wait: float = 2.0) -> None:
 
 
 @contextmanager
-def served(path: Path, *, port: int = 0) -> Iterator[str]:
+def served(path: Path) -> Iterator[str]:
     """Serve a recording with rerun's web viewer on the loopback interface, and give the address to open."""
     assets = _assets()
 
-    class Handler(BaseHTTPRequestHandler):
+    class Handler(LoopbackHandler):
         def do_GET(self) -> None:
             asked = self.path.partition("?")[0]
-            kind = "application/octet-stream" if asked == f"/{path.name}" else ASSETS.get(asked)
-            if kind is None:
-                self.send_error(404)
+            body = assets.get(asked)
+            if asked == RECORDING:
+                with suppress(OSError):  # it was there when the server started
+                    body = path.read_bytes()
+            if body is None:
+                self.send_error(HTTPStatus.NOT_FOUND)
                 return
-            body = assets.get(asked) or path.read_bytes()
             self.send_response(200)
-            self.send_header("Content-Type", kind)
+            self.send_header("Content-Type", ASSETS.get(asked, "application/octet-stream"))
             self.send_header("Content-Length", str(len(body)))
             self.send_header("Content-Security-Policy", POLICY)
             self.end_headers()
             self.wfile.write(body)
 
-        def log_message(self, *_: object) -> None:
-            """Say nothing."""
-
-    with ThreadingHTTPServer((LOOPBACK, port), Handler) as server:
+    with LoopbackServer(0, Handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        root = f"http://{LOOPBACK}:{server.server_port}"
         try:
-            yield f"{root}/?url={root}/{path.name}&hide_welcome_screen"
+            yield f"{server.address}/?url={server.address}{RECORDING}&hide_welcome_screen"
         finally:
             server.shutdown()
 

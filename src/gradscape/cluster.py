@@ -1,10 +1,13 @@
 """Workers on Dask distributed: a running cluster by its address, or one here with a worker per GPU or core.
 
-Workers of a GPU see that GPU only; those of a CPU are held to cores of their own.
+Workers of a GPU see that GPU only; those of a CPU are held to cores of their own. Whoever reaches a worker runs code on
+it. Those here listen on the loopback interface, where other users of the machine still reach them, and so they take TLS
+with keys made for this cluster, which lie in the memory of its processes only.
 """
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import platform
@@ -25,7 +28,9 @@ LOCAL = "local"
 DEAF = (
     "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"  # Ctrl-C is for the command, which ends its workers
 )
-ANSWER = "10s"  # that a scheduler is given to answer in
+ANSWER = 10.0  # seconds that a scheduler is given to answer in
+CLOSED = {"tls", "wss"}  # protocols that a scheduler cannot be reached by without a certificate
+INSTALL = "pip install '.[distributed]' in gradscape's sources"
 
 
 @contextmanager
@@ -41,14 +46,15 @@ def workers(scheduler: str | None, device: str) -> Iterator[Executor | None]:
     try:
         from distributed import Client, KilledWorker
     except ImportError as error:
-        said = f"--scheduler needs Dask: pip install '.[distributed]' in gradscape's sources ({error})"
-        raise ValueError(said) from None
+        raise ValueError(f"--scheduler needs Dask: {INSTALL} ({error})") from None
     for name in ("distributed", "distributed.client"):  # what matters of what they say is raised
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with ExitStack() as stack:
         address: Any = scheduler
         if scheduler.partition(":")[0] == LOCAL:
             address = stack.enter_context(_local(_count(scheduler), device))
+        else:
+            _greet(scheduler)
         try:
             client = stack.enter_context(Client(address, timeout=ANSWER))  # type: ignore[no-untyped-call]
         except (OSError, ValueError) as error:
@@ -63,6 +69,36 @@ def workers(scheduler: str | None, device: str) -> Iterator[Executor | None]:
 
             said = "what every worker died of that took it was given up; the rest is kept, and the same command goes on"
             raise WorkersLostError(f"{said}: {error}") from error
+
+
+def _greet(address: str) -> None:
+    """Refuse an address where no scheduler answers, which Dask's client would wait for; warn of one without TLS."""
+    from distributed.comm import connect, parse_address  # type: ignore[attr-defined]
+    from distributed.security import Security
+
+    closed = parse_address(address)[0] in CLOSED
+    try:
+        how = Security().get_connection_args("client")
+    except OSError as error:
+        raise ValueError(f"the certificates that Dask's configuration names cannot be read: {error}") from None
+    if closed and how["ssl_context"] is None:
+        raise ValueError(f"{address} takes certificates; docs/clusters.md says where they are named")
+
+    async def greeted() -> None:
+        comm = await asyncio.wait_for(connect(address, deserialize=False, **how), ANSWER)
+        comm.abort()
+
+    try:
+        asyncio.run(greeted())
+    except Exception as error:  # whatever it is that answers there, or does not
+        said = f"{error}" or f"nothing is said there in {ANSWER:g} s"
+        raise ConnectionError(f"no Dask scheduler answers at {address}: {said}") from error
+    if not closed:
+        print(
+            f"warning: {address} is without TLS, so whoever reaches it runs code on its workers and here; "
+            "docs/clusters.md says how a cluster is closed",
+            file=sys.stderr,
+        )
 
 
 def recipe(env: Environment) -> partial[Environment]:
@@ -88,14 +124,29 @@ def _count(scheduler: str) -> int | None:
 
 def _local(count: int | None, device: str) -> Any:
     """Start a cluster of processes here: workers by number, each with a GPU or with cores of its own."""
+    import dask
     from distributed import Nanny, Scheduler, SpecCluster
 
     places = _gpus(count) if device == "cuda" or (device == "auto" and _names()) else _cores(count)
-    common = {"nthreads": 1, "memory_limit": 0, "dashboard": False, "silence_logs": logging.CRITICAL}
+    security = _keys()
+    here = {"host": "127.0.0.1", "protocol": "tls", "security": security, "dashboard": False}
+    # without a dashboard, too, there are web servers: they get no pages, and no port that another cluster may have
+    web = {"scheduler": "distributed.scheduler.http.routes", "worker": "distributed.worker.http.routes"}
+    common = here | {"nthreads": 1, "memory_limit": 0, "silence_logs": logging.CRITICAL, "config": {web["worker"]: []}}
     specs = {number: {"cls": Nanny, "options": common | place} for number, place in enumerate(places)}
-    # without a dashboard, too, its web server wants a port, and warns where the usual one is taken
-    quiet = {"dashboard": False, "dashboard_address": "127.0.0.1:0", "host": "127.0.0.1", "port": 0}
-    return SpecCluster(workers=specs, scheduler={"cls": Scheduler, "options": quiet}, silence_logs=False)  # type: ignore[no-untyped-call]
+    leader = {"cls": Scheduler, "options": here | {"dashboard_address": "127.0.0.1:0", "port": 0}}
+    with dask.config.set({web["scheduler"]: []}):
+        return SpecCluster(workers=specs, scheduler=leader, security=security, silence_logs=False)  # type: ignore[no-untyped-call]
+
+
+def _keys() -> Any:
+    """Make a certificate that nobody but the processes of one cluster have."""
+    from distributed.security import Security
+
+    try:
+        return Security.temporary()  # type: ignore[no-untyped-call]
+    except ImportError as error:
+        raise ValueError(f"--scheduler local needs cryptography: {INSTALL} ({error})") from None
 
 
 def _gpus(count: int | None) -> list[dict[str, Any]]:

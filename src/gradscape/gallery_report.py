@@ -11,7 +11,8 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from http import HTTPStatus
+from http.server import SimpleHTTPRequestHandler
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,6 +27,7 @@ from .gallery_measures import Reports, Tradeoffs
 from .gallery_parts import Part, Searches, Slice, State, Sweep
 from .landscapes.disk import full, is_full, until_full
 from .landscapes.files import tidy
+from .landscapes.loopback import LoopbackHandler, LoopbackServer
 from .tables import table
 
 T = TypeVar("T")
@@ -176,16 +178,21 @@ def build(*, data: str | None, out: str) -> None:
 def serve(*, out: str, port: int) -> None:
     """Serve the site to this machine only, until Ctrl-C."""
     if not (Path(out) / "index.html").exists():
-        raise ValueError(f"{out} holds no gallery; build it with `landscape gallery build --out {out}`")
-    handler = partial(_Quiet, directory=out)
-    with ThreadingHTTPServer(("127.0.0.1", port), handler) as server:
-        print(f"{out} is at http://127.0.0.1:{server.server_address[1]}/ until Ctrl-C", flush=True)
-        with contextlib.suppress(KeyboardInterrupt):
-            server.serve_forever()
+        raise ValueError(f"{out} holds no gallery; build it with `landscape gallery build --out {shlex.quote(out)}`")
+    with LoopbackServer(port, partial(Site, directory=out)) as server, contextlib.suppress(KeyboardInterrupt):
+        print(f"{out} is at {server.address}/ until Ctrl-C", flush=True)
+        server.serve_forever()
 
 
-class _Quiet(SimpleHTTPRequestHandler):
-    """Serve files without a line per request."""
+class Site(LoopbackHandler, SimpleHTTPRequestHandler):
+    """Serve the files that lie in a folder, and none to which a link leads out of it; folders are not listed."""
 
-    def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing."""
+    def send_head(self) -> Any:
+        """Open what is asked for, where it is there."""
+        asked = Path(self.translate_path(self.path))
+        with contextlib.suppress(OSError, RuntimeError, ValueError):  # no name of a file, a loop of links
+            file = (asked / "index.html" if asked.is_dir() else asked).resolve(strict=True)
+            if file.is_file() and file.is_relative_to(Path(self.directory).resolve()):
+                return super().send_head()
+        self.send_error(HTTPStatus.NOT_FOUND)
+        return None

@@ -206,13 +206,13 @@ def _show(console: Console, path: Path, *, serve: bool) -> None:
     from .landscapes.draw.viewer import open_viewer, served
 
     if not serve:
-        _need_display(path, f"look at it in a browser: landscape view {path} --serve")
+        _need_display(path, f"look at it in a browser: landscape view {shlex.quote(str(path))} --serve")
         console.print(f"opening {path} in rerun's viewer", markup=False)
         open_viewer(path)
         return
     with served(path) as address:
-        console.print(f"{path} is at {address} until Ctrl-C", markup=False)
         try:
+            console.print(f"{path} is at {address} until Ctrl-C", markup=False)
             while True:
                 time.sleep(3600)
         except KeyboardInterrupt:

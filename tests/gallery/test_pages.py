@@ -7,7 +7,6 @@ import re
 import threading
 from collections.abc import Callable, Iterator
 from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gradscape.gallery_report import Site
 from gradscape.landscapes.draw.relief import Relief, azimuth
 from gradscape.landscapes.draw.style import LOSS_MAP, Scale
+from gradscape.landscapes.loopback import LoopbackServer
 from gradscape.landscapes.store import open_slice, plane_of
 
 from .conftest import FIGURES
@@ -24,18 +25,13 @@ from .conftest import FIGURES
 Visit = Callable[..., Any]
 
 
-class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing."""
-
-
 @pytest.fixture
 def served(site: Path) -> Iterator[str]:
     """Serve the folder above the site's: the site is in a subfolder of a server."""
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(site.parent))) as server:
+    with LoopbackServer(0, partial(Site, directory=str(site.parent))) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
-        yield f"http://127.0.0.1:{server.server_address[1]}/{site.name}/"
+        yield f"{server.address}/{site.name}/"
         server.shutdown()
         thread.join()
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from urllib.error import HTTPError
+from urllib.parse import parse_qs
 
 import numpy as np
 import pytest
@@ -162,7 +163,9 @@ def test_equal_runs_give_equal_recordings_and_others_do_not(
 def address(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setattr(viewer, "PATIENCE", math.inf)
-    with viewer.served(path) as address:
+    named = tmp_path / "über die Ebene, 100% #1?&+.rrd"
+    named.write_bytes(path.read_bytes())
+    with viewer.served(named) as address:
         yield address
 
 
@@ -171,16 +174,18 @@ def test_a_recording_is_served_to_this_machine_alone_and_its_page_may_call_nobod
 ) -> None:
     root, _, query = address.partition("/?")
     assert root.startswith("http://127.0.0.1:")
-    assert f"url={root}/overlay.rrd" in query
     with urllib.request.urlopen(root) as page:
         assert b"Rerun Viewer" in page.read()
         assert page.headers["Content-Security-Policy"].startswith("default-src 'self'")
         assert "http" not in page.headers["Content-Security-Policy"]
-    with urllib.request.urlopen(f"{root}/overlay.rrd") as recording:
+    (recorded,) = parse_qs(query)["url"]  # as the page reads it, which asks for it then
+    with urllib.request.urlopen(recorded) as recording:
         assert recording.read() == path.read_bytes()
-    with pytest.raises(HTTPError, match="404") as refused:
-        urllib.request.urlopen(f"{root}/other.rrd")
-    refused.value.close()
+    evil = {"Host": "evil.example"}
+    for asked, headers, code in ((f"{root}/other.rrd", {}, 404), (f"{root}/%00", {}, 404), (recorded, evil, 421)):
+        with pytest.raises(HTTPError, match=str(code)) as refused:
+            urllib.request.urlopen(urllib.request.Request(asked, headers=headers))
+        refused.value.close()
     assert not list(tmp_path.rglob("analytics*"))  # rerun keeps what it would send there
 
 
