@@ -94,6 +94,7 @@ class Environment(abc.ABC):
 
     def __init__(
         self,
+        /,
         *,
         fidelity: str | Fidelity | None = None,
         device: str = "auto",

@@ -248,6 +248,7 @@ def _own(value: object, module: str) -> bool:
 
 def make(
     name: str | type[Environment],
+    /,
     *,
     fidelity: str | Fidelity | None = None,
     device: str = "auto",

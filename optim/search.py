@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from ..landscapes.objective import Objective, evaluated, name_of
+from ..landscapes.space import whole
 from .base import Optimizer, restored
 from .registry import optimizer_class
 from .run import Run
@@ -42,6 +44,9 @@ def search(
     an objective whose rows do not depend on their batch. A proposal that does not fit into the budget is cut short.
     `gradient_cost` is what an episode with gradient costs in episodes without; it is measured if not given.
     """
+    budget = whole(budget, "a budget", least=1)
+    if gradient_cost is not None and not 0 < gradient_cost < math.inf:
+        raise ValueError(f"search takes a gradient_cost above 0 and finite; got {gradient_cost}")
     if run is None:
         run = _in_memory(objective, method, budget)
     with run.filling():

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
+from inspect import signature
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,6 +46,9 @@ PACKAGES = (
     *("numpy", "torch", "warp-lang", "taichi", "xarray", "zarr", "matplotlib"),
     *("pyvista", "rerun-sdk", "botorch", "gpytorch", "cma", "typer", "rich"),
 )
+
+
+TAKEN = {one.name for one in signature(make).parameters.values() if one.kind is one.KEYWORD_ONLY}  # not by options
 
 
 def list_environments() -> None:
@@ -275,11 +279,13 @@ def outcome(summary: dict[str, Any]) -> str:
 
 
 def read_settings(settings: Sequence[str], flag: str = "--set") -> dict[str, Any]:
-    """Return options given as name=value."""
+    """Return options given as name=value; of a scene, none may be called as something else that a scene is made of."""
     pairs = [setting.partition("=") for setting in settings]
     for setting, (name, equals, _) in zip(settings, pairs, strict=True):
         if not equals or not name:
             raise ValueError(f"{flag} takes name=value; got {setting!r}")
+        if flag == "--set" and name in TAKEN:
+            raise ValueError(f"--set takes a scene's own options; {name} is none of them, and chosen by --{name} if at all")
     return {name: value for name, _, value in pairs}
 
 
