@@ -53,9 +53,7 @@ def from_numpy(
     single point, shape (dim,), and returns one loss, or that and its gradient.
     """
     differences = None if differences is None else _step(differences, space)
-    return _NumpyObjective(
-        fn if vectorized else _Pointwise(fn, list), space, name or _name(fn), loss_unit, differences
-    )
+    return _NumpyObjective(fn if vectorized else _Pointwise(fn, list), space, name or _name(fn), loss_unit, differences)
 
 
 def within_box(objective: Objective) -> Objective:

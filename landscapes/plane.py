@@ -37,7 +37,9 @@ class Plane:
     def __post_init__(self) -> None:
         for field in ("origin", "basis", "lower", "upper"):
             object.__setattr__(self, field, as_tensor(getattr(self, field), f"Plane's {field}"))
-        object.__setattr__(self, "resolution", tuple(whole(n, "a slice's resolution", least=2) for n in self.resolution))
+        object.__setattr__(
+            self, "resolution", tuple(whole(n, "a slice's resolution", least=2) for n in self.resolution)
+        )
         self._check()
 
     def _check(self) -> None:

@@ -140,7 +140,9 @@ def as_tensor(x: object, who: str) -> Float[Tensor, "*shape"]:
             raise ValueError(f"{who} takes numbers; got a tensor of {x.dtype}")
         return x.detach().to("cpu", torch.float64)
     if any(map(np.ma.is_masked, x if isinstance(x, list | tuple) else [x])):
-        raise ValueError(f"{who} takes numbers; got an array that masks some (`.filled(numpy.nan)` makes them failures)")
+        raise ValueError(
+            f"{who} takes numbers; got an array that masks some (`.filled(numpy.nan)` makes them failures)"
+        )
     try:
         values = np.asarray(x)
         if values.dtype.kind not in "iuf":

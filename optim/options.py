@@ -28,4 +28,6 @@ class MethodOptions:  # noqa: D101 -- its words would stand among those that `la
         kind, words = (Integral, "whole numbers") if option.type == "int" else (Real, "numbers")
         value = getattr(self, option.name)
         if not isinstance(value, kind) or isinstance(value, bool) or not least <= value <= most:
-            raise ValueError(f"{self.method} option {option.name} takes {words} from {least:g} to {most:g}; got {value}")
+            raise ValueError(
+                f"{self.method} option {option.name} takes {words} from {least:g} to {most:g}; got {value}"
+            )

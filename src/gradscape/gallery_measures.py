@@ -6,8 +6,6 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-
 from . import measure_report, tradeoff_report
 from .envs.registry import environment_class, make
 from .gallery.measured import DEVICES, TRADEOFF
@@ -15,6 +13,7 @@ from .gallery_parts import Part, read_record
 from .ladder import LADDERS
 from .measure_report import MEASURES, REPORT, Subject
 from .results import SLICE
+from .terminal import Console
 
 if TYPE_CHECKING:
     from .tradeoff_report import Study

@@ -15,9 +15,6 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, TypeVar
 
-from rich.console import Console
-from rich.markup import escape
-
 from .cluster import workers
 from .console import duration, size
 from .gallery.figures import Figure, chosen, data_folder, read_figures
@@ -25,6 +22,7 @@ from .gallery_episodes import Episodes
 from .gallery_measures import Reports, Tradeoffs
 from .gallery_parts import Part, Searches, Slice, State, Sweep
 from .tables import table
+from .terminal import Console
 
 T = TypeVar("T")
 PARTS: dict[str, type[Part]] = {
@@ -132,7 +130,7 @@ def list_figures(*, data: str | None, as_json: bool) -> None:
     for figure, of in found:
         dims = " ".join(map(str, figure.dims))
         row = (figure.id, str(figure.number or "ours"), figure.env, dims, figure.through, _said(of))
-        listed.add_row(*map(escape, row))
+        listed.add_row(*row)
     Console().print(listed)
     missing = sum(not of.finished for _, of in found)
     Console(soft_wrap=True).print(

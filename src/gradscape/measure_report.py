@@ -14,8 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from .console import duration, fill, size
@@ -26,6 +24,7 @@ from .landscapes.identity import stored_identity
 from .measure_tables import by_environment, slices_markdown, slices_table
 from .results import SLICE, environment_of, inside
 from .tables import table
+from .terminal import Console, Described
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -253,7 +252,7 @@ def _character(console: Console, env: Environment, dataset: xr.Dataset, settings
 
     losses, gradients = effort(dataset["loss"].ndim, settings["points"])
     _announce(console, env, losses, gradients)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    columns = (Described(), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     objective = within_box(env) if stored_identity(dataset).get("boxed") else env
     with Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=console) as bar:
         task = bar.add_task("episodes", total=losses + gradients)
@@ -400,7 +399,7 @@ def _show(record: dict[str, Any], as_json: bool, folder: Path) -> None:
     console = Console(highlight=False)
     found = table("measure", "value, 95 % interval", title=f"{record['name']} ({record['env']})")
     for name, text in named_measures(record).items():
-        found.add_row(escape(name), escape(text))
+        found.add_row(name, text)
     console.print(found)
     for word in record["verdict"]["words"]:
         console.print(f"{word}: {record['verdict']['reasons'][word]}", markup=False)

@@ -13,14 +13,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-
 from .console import fill
 from .envs.registry import environment_class
 from .landscapes.files import others
 from .landscapes.identity import stored_identity
 from .landscapes.slice_paths import there
 from .results import RUN, SLICE, environment_of, inside, run_tables
+from .terminal import Console
 
 if TYPE_CHECKING:
     import xarray as xr

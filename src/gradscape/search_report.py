@@ -12,7 +12,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from .console import chosen_fidelity, duration, provenance_of, read_settings
@@ -20,6 +19,7 @@ from .envs.registry import make
 from .landscapes.files import clear, visible, write_json
 from .optim.registry import METHODS, code_digest, optimizer_class
 from .tables import table
+from .terminal import Console, Described
 
 if TYPE_CHECKING:
     from .envs.base import Environment
@@ -249,7 +249,7 @@ def run_folder(identity: dict[str, Any]) -> Path:
 
 def search_progress(console: Console) -> Progress:
     """Return a progress display for one run or several."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    columns = (Described(), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     return Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=console)
 
 

@@ -39,21 +39,23 @@ def searched(objective: Any, method: str, options: dict[str, Any], budget: int =
     return search(objective, kind.on(objective, seed=0, options=record), budget=budget, gradient_cost=1.0)
 
 
+def outcome(method: str, options: dict[str, Any]) -> tuple[str, Any]:
+    """Return how a search was refused, or the points it went to."""
+    try:
+        return "", searched(BOWL, method, options).table()["x"].to_numpy()
+    except ValueError as refusal:
+        return str(refusal), np.empty(0)
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(("method", "option"), [*options()])
 def test_a_hostile_value_is_refused_by_name_or_works(method: str, option: Any) -> None:
     """The ends of an option's range are values, too, but for those that count what takes its time."""
     least, most = option.metadata.get("range", (0, 0))
     for value in (*HOSTILE, least, *([most] if option.type == "float" else [])):
-        try:
-            run = searched(BOWL, method, SHORT.get(method, {}) | {option.name: value})
-        except ValueError as refusal:
-            assert method in str(refusal)
-            assert option.name in str(refusal)
-            assert "\n" not in str(refusal)
-        else:
-            assert run.count == 8
-            assert np.isfinite(run.table()["x"]).all()
+        said, points = outcome(method, SHORT.get(method, {}) | {option.name: value})
+        assert (len(points), said) == (8, "") or (method in said and option.name in said and "\n" not in said)
+        assert np.isfinite(points).all()
 
 
 @pytest.mark.parametrize(("method", "option"), [*options()])
