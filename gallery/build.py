@@ -25,7 +25,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from .. import __version__
 from ..envs.registry import entries
-from ..landscapes.files import placing, visible
+from ..landscapes.files import placing, resolved, visible
 from ..landscapes.identity import stored_identity, stored_provenance
 from ..landscapes.job import PICTURE, STORE
 from ..landscapes.slice_arrays import parameters_of, plane_of
@@ -51,7 +51,7 @@ def build_site(figures: Sequence[Figure], data: Path, out: Path) -> dict[str, An
     if visible(out) and not (out / MANIFEST).exists():
         raise ValueError(f"{out} holds other files and no gallery; give --out a new or an empty folder")
     pages, tables = _templates(), read_runs(data / FOLDER)
-    with placing(out.resolve(), overwrite=True) as new:
+    with placing(resolved(out), overwrite=True) as new:
         shutil.copytree(HERE / "static", new / "static")
         traded = place_tradeoffs(data, new, [figure.env for figure in there])
         made = [_page(pages, figure, data / figure.id, new / figure.id, tables, traded) for figure in there]

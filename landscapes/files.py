@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import re
@@ -16,10 +17,27 @@ from pathlib import Path
 STALE = 60.0  # seconds after which a hidden folder of a creation that was killed is cleared away
 
 
+def resolved(path: str | Path) -> Path:
+    """Return a path from the root, without links; raises ValueError for links that lead in a circle."""
+    try:
+        os.stat(path)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise ValueError(f"{path} leads in a circle, by symbolic links; give another path") from None
+    return Path(os.path.realpath(path))
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder and those it is in, where they are missing, however deep: `mkdir` calls itself for each."""
+    for one in (*reversed(folder.parents), folder):
+        if not one.is_dir():
+            one.mkdir(exist_ok=True)
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Give a path of its own to write to, and put what was written in the place of `path` at the end."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
     try:
         yield partial
@@ -64,7 +82,7 @@ def write_json(path: Path, record: object) -> None:
 @contextmanager
 def placing(path: Path, *, overwrite: bool) -> Iterator[Path]:
     """Give a folder's path of its own to build at, and rename it to `path` at the end, unless that is taken by then."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     _clear_stale(path)
     new, old = _hidden(path), _hidden(path)
     try:

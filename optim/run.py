@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .. import __version__
-from ..landscapes.files import placing, replacing
+from ..landscapes.files import placing, replacing, resolved
 from ..landscapes.identity import StoreError, StoreExistsError, check_identity, plain_json
 from ..landscapes.layout import FILL, consolidate, create_array, flags
 from ..landscapes.objective import Evaluation, Status
@@ -89,7 +89,7 @@ class Run:
         overwrite: bool = False,
     ) -> Run:
         """Make an empty run at a path where there is none, all at once; `overwrite` replaces a run, nothing else."""
-        path = Path(path).resolve()
+        path = resolved(path)
         attributes = _attributes(space, identity, provenance or {}, budget)
         if path.exists() and not overwrite:
             raise StoreExistsError(f"{path} exists already; write elsewhere with --out, or replace it with --force")
@@ -106,7 +106,7 @@ class Run:
     @classmethod
     def open(cls, path: str | Path) -> Run:
         """Open a run that exists."""
-        path = Path(path).resolve()
+        path = resolved(path)
         if not path.exists():
             raise StoreError(f"there is no run at {path}; make one with `landscape optimize`")
         if not is_run(path):

@@ -17,6 +17,8 @@ from typing import IO
 from urllib.error import URLError
 from urllib.request import urlopen
 
+from ..files import resolved
+
 LOOPBACK = "127.0.0.1"
 PATIENCE = 20.0  # seconds for rerun's server to come up
 SILENT = {
@@ -36,7 +38,7 @@ POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:"
 def open_viewer(path: Path, *, wait: float = 2.0) -> None:
     """Open a recording in rerun's own window, which stays when this process ends; it has to survive `wait` seconds."""
     with tempfile.TemporaryFile() as log:
-        viewer = _rerun(str(path.resolve()), "--port", "auto", log=log)
+        viewer = _rerun(str(resolved(path)), "--port", "auto", log=log)
         try:
             code = viewer.wait(wait)
         except subprocess.TimeoutExpired:

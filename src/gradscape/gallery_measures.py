@@ -80,12 +80,12 @@ class Tradeoffs(Part):
     def make(self, console: Console) -> str:
         """Measure every rung; those that are measured stay in the study's own folder under out/ until the last is."""
         from .landscapes.draw.film import lighten
-        from .landscapes.files import write_json
+        from .landscapes.files import make_folder, write_json
 
         study = self._study()
         report = study.run(console)
         record, picture = self._files(study.env.device)
-        record.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(record.parent)
         shutil.copyfile(study.pieces.folder / tradeoff_report.PICTURE, picture)
         lighten(picture)
         write_json(record, report)

@@ -19,7 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from .console import duration, fill, size
 from .envs.registry import environment_class, make
 from .gallery.figures import data_folder, read_figures
-from .landscapes.files import others, replacing, write_json
+from .landscapes.files import make_folder, others, replacing, write_json
 from .landscapes.identity import stored_identity
 from .measure_tables import by_environment, slices_markdown, slices_table
 from .results import SLICE, environment_of, inside
@@ -216,7 +216,7 @@ def _fetch(console: Console, source: Path, folder: Path, key: dict[str, Any]) ->
     if (folder / REPORT).exists() or not all(file.exists() for file in files):
         return
     if _same(json.loads((source / REPORT).read_text()), key):
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         for file in [*files, *source.glob(ARRAYS)]:
             shutil.copyfile(file, folder / file.name)
         console.print(f"{folder} is copied from {source}", markup=False)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from .console import fill
 from .envs.registry import environment_class
-from .landscapes.files import others
+from .landscapes.files import others, resolved
 from .landscapes.identity import stored_identity
 from .landscapes.slice_paths import there
 from .results import RUN, SLICE, environment_of, inside, run_tables
@@ -96,7 +96,7 @@ def view(file: str, *, serve: bool) -> None:
     import typer
 
     console.print(f"opening {path}", markup=False)
-    if typer.launch(str(path.resolve())):
+    if typer.launch(str(resolved(path))):
         raise OSError(f"no program of this system opens {path}; open it with one of your own")
 
 
