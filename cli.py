@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from inspect import signature
+from io import TextIOWrapper
 from typing import Annotated, Any
 
 import typer
@@ -59,6 +60,9 @@ def main(arguments: list[str] | None = None) -> Any:
     """Run the command; bad input ends with one line on standard error and exit code 2."""
     from typer.exceptions import TyperException
 
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a file's name need not be text
     try:
         code = app(args=arguments, prog_name="landscape", standalone_mode=False)
         if code == 130:  # what typer makes of Ctrl-C where a verb has not said what is kept

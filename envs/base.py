@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from .engines.runtime import Pool
 
 
+FLOAT32 = torch.finfo(torch.float32).max
+
+
 @dataclass(frozen=True)
 class Fidelity:
     """Say how accurately a scene is simulated.
@@ -91,6 +94,7 @@ class Environment(abc.ABC):
 
     def __init__(
         self,
+        /,
         *,
         fidelity: str | Fidelity | None = None,
         device: str = "auto",
@@ -341,6 +345,11 @@ class Environment(abc.ABC):
         if not bool(x.isfinite().all()):
             row = int((~x.isfinite().all(dim=1)).nonzero()[0])
             raise ValueError(f"{self.name} takes finite parameters; row {row} of x holds {x[row].tolist()}")
+        if self.fidelity.precision == "float32" and bool((large := x.abs() > FLOAT32).any()):
+            row = int(large.any(dim=1).nonzero()[0])
+            raise ValueError(
+                f"{self.name} computes in float32, whose numbers end at 3.4e38; row {row} of x holds {x[row].tolist()}"
+            )
         return x
 
     def _row(self, x: Float[Tensor, " dim"]) -> Float[Tensor, "one dim"]:

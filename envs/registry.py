@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import cache
 from importlib.metadata import entry_points
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from ..landscapes.files import resolved
 from .importing import IN_FILE, module_of
 
 if TYPE_CHECKING:
@@ -224,7 +224,7 @@ def _of_file(text: str) -> type[Environment]:
     from .base import Environment
 
     path, _, attribute = text.rpartition(":")
-    file = Path(path).resolve()
+    file = resolved(path)
     if not file.is_file():
         raise ValueError(f"there is no file {path} to take {attribute} from")
     module = module_of(str(file))
@@ -248,6 +248,7 @@ def _own(value: object, module: str) -> bool:
 
 def make(
     name: str | type[Environment],
+    /,
     *,
     fidelity: str | Fidelity | None = None,
     device: str = "auto",

@@ -27,7 +27,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from .. import __version__
 from ..envs.registry import entries
-from ..landscapes.files import placing
+from ..landscapes.files import placing, resolved
 from ..landscapes.identity import stored_identity, stored_provenance
 from ..landscapes.job import PICTURE, STORE
 from ..landscapes.ownership import check_ours
@@ -51,7 +51,7 @@ def build_site(figures: Sequence[Figure], data: Path, out: Path) -> dict[str, An
 
     What is in `out` is replaced if a site built earlier is all that is there; anything else is refused.
     """
-    out = out.resolve()
+    out = resolved(out)
     _check(out)
     there = [figure for figure in figures if _sampled(data / figure.id / STORE)]
     if not there:

@@ -100,6 +100,8 @@ def _figure(path: Path, table: dict[str, Any]) -> Figure:
     for name, kind in KINDS.items():
         if not isinstance(value := table.get(name, kind()), kind):
             raise ValueError(f"{path}: figure {table['id']} has {name} {value!r}, which is no {kind.__name__}")
+    if taken := {"fidelity", "device", "engine", "deterministic"} & set(table.get("options", {})):
+        raise ValueError(f"{path}: figure {table['id']} has options {', '.join(sorted(taken))}, which no scene has")
     if len(table["dims"]) not in (1, 2):
         raise ValueError(f"{path}: figure {table['id']} needs one dimension or two; got {table['dims']}")
     return Figure(**(table | {"dims": tuple(table["dims"])}))

@@ -17,6 +17,7 @@ from .space import ParameterSpace, as_tensor
 
 TorchFunction = Callable[[Tensor], Tensor]
 NumpyFunction = Callable[[NDArray[np.float64]], Any]
+LEAST_STEP = 1e-12  # of differences: losses are rounded to 1e-16 of themselves, and their difference is divided by it
 
 
 def from_torch(
@@ -51,11 +52,8 @@ def from_numpy(
     bounds they are one-sided, since the function is not asked beyond them. With `vectorized=False` the function takes a
     single point, shape (dim,), and returns one loss, or that and its gradient.
     """
-    if differences is not None and not differences > 0:
-        raise ValueError(f"from_numpy takes differences as a positive fraction of the bounds; got {differences}")
-    return _NumpyObjective(
-        fn if vectorized else _Pointwise(fn, np.array), space, name or _name(fn), loss_unit, differences
-    )
+    differences = None if differences is None else _step(differences, space)
+    return _NumpyObjective(fn if vectorized else _Pointwise(fn, list), space, name or _name(fn), loss_unit, differences)
 
 
 def within_box(objective: Objective) -> Objective:
@@ -101,15 +99,17 @@ class _TorchObjective:
         if not isinstance(loss, Tensor):
             raise ValueError(f"{self.name} must return a tensor; got {type(loss).__name__}")
         _check_shape(tuple(loss.shape), (len(x),), "losses", self.name)
-        if not grad:
-            return Evaluation.judged(loss.detach().cpu().double(), None)
-        if not loss.requires_grad:
+        losses = as_tensor(loss, f"the loss of {self.name}")
+        return Evaluation.judged(losses, self._gradient(loss, x) if grad else None)
+
+    def _gradient(self, loss: Float[Tensor, " batch"], x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch dim"]:
+        (gradient,) = torch.autograd.grad(loss.sum(), x, allow_unused=True) if loss.requires_grad else (None,)
+        if gradient is None:
             raise ValueError(
                 f"{self.name} returned losses that carry no gradient; compute them from x with torch operations, "
                 "or sample with grad=False (--no-gradients)"
             )
-        (gradient,) = torch.autograd.grad(loss.sum(), x)
-        return Evaluation.judged(loss.detach().cpu().double(), gradient)
+        return gradient
 
 
 @dataclass(frozen=True)
@@ -133,11 +133,12 @@ class _NumpyObjective:
     def _call(self, x: Float[Tensor, "batch dim"]) -> tuple[Tensor, Tensor | None]:
         result = self.fn(x.numpy().copy())
         loss, gradient = result if isinstance(result, tuple) else (result, None)
-        _check_shape(np.shape(loss), (len(x),), "losses", self.name)
-        if gradient is not None:
-            _check_shape(np.shape(gradient), tuple(x.shape), "gradients", self.name)
+        losses = as_tensor(loss, f"the loss of {self.name}")
+        _check_shape(tuple(losses.shape), (len(x),), "losses", self.name)
         slope = None if gradient is None else as_tensor(gradient, f"the gradient of {self.name}")
-        return as_tensor(loss, f"the loss of {self.name}"), slope
+        if slope is not None:
+            _check_shape(tuple(slope.shape), tuple(x.shape), "gradients", self.name)
+        return losses, slope
 
     def _differences(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch dim"]:
         if self.differences is None:
@@ -171,6 +172,21 @@ class _BoxedObjective:
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
         return evaluated_inside(self.objective, _points(x, self.space, name_of(self.objective)), grad=grad)
+
+
+def _step(differences: object, space: ParameterSpace) -> float:
+    """Return a step, a fraction of the bounds, that is no larger than they are and not lost in rounding."""
+    fraction = float(as_tensor(differences, "from_numpy's differences"))
+    if not LEAST_STEP <= fraction <= 1:
+        raise ValueError(
+            f"from_numpy takes differences from {LEAST_STEP:g} to 1, a fraction of the bounds; got {fraction}"
+        )
+    farthest = torch.maximum(space.lower.abs(), space.upper.abs())
+    lost = (farthest + fraction * (space.upper - space.lower) == farthest).tolist()
+    if any(lost):
+        name = space.names[lost.index(True)]
+        raise ValueError(f"from_numpy's differences of {fraction:g} are lost in rounding beside the bounds of {name}")
+    return fraction
 
 
 def _stacked(found: Sequence[Any]) -> Any:

@@ -7,6 +7,7 @@ what a process that was killed has left is known at once, by anyone and on any c
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import glob
 import json
@@ -19,6 +20,23 @@ from contextlib import contextmanager
 from pathlib import Path
 
 MAKING = re.compile(r"\..+\.[0-9a-f]{32}\.making", re.DOTALL)  # the hidden folder of what is being made
+
+
+def resolved(path: str | Path) -> Path:
+    """Return a path from the root, without links; raises ValueError for links that lead in a circle."""
+    try:
+        os.stat(path)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise ValueError(f"{path} leads in a circle, by symbolic links; give another path") from None
+    return Path(os.path.realpath(path))
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder and those it is in, where they are missing, however deep: `mkdir` calls itself for each."""
+    for one in (*reversed(folder.parents), folder):
+        if not one.is_dir():
+            one.mkdir(exist_ok=True)
 
 
 @contextmanager
@@ -105,7 +123,7 @@ def tidy(folder: Path) -> None:
 @contextmanager
 def _making(path: Path) -> Iterator[Path]:
     """Give a hidden folder beside `path`, held while something is made in it; clear away those that nobody holds."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     _clear_left(path)
     folder, lock = _held(path)
     try:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from .space import ParameterSpace
+from .space import ParameterSpace, as_tensor
 
 ROUNDING = 1e-9  # of the box; points that are no farther beyond it are moved back
 
@@ -31,12 +31,17 @@ class Evaluation:
 
     `loss` [objective's unit], float64, shape (batch,); `grad` [loss unit / parameter unit], float64, shape
     (batch, dim), or None where it was not asked for; `status`, int8, shape (batch,). Where the status is not OK, loss
-    and gradient are NaN.
+    and gradient are NaN. Arrays become tensors; raises ValueError for what is no real number, or no Status.
     """
 
     loss: Float[Tensor, " batch"]
     grad: Float[Tensor, "batch dim"] | None
     status: Int[Tensor, " batch"]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "loss", _real(self.loss, "a loss"))
+        object.__setattr__(self, "grad", None if self.grad is None else _real(self.grad, "a gradient"))
+        object.__setattr__(self, "status", _known(self.status))
 
     @classmethod
     def judged(
@@ -49,9 +54,10 @@ class Evaluation:
 
         `failed` holds a Status per row, OK where nothing is known to have gone wrong.
         """
-        status = (
-            torch.full(loss.shape, Status.OK, dtype=torch.int8) if failed is None else failed.to(torch.int8).clone()
-        )
+        loss, grad = _real(loss, "a loss"), None if grad is None else _real(grad, "a gradient")
+        status = torch.full(loss.shape, Status.OK, dtype=torch.int8)
+        if failed is not None:
+            status = _known(failed).to(torch.int8).clone()
         finite = loss.isfinite() if grad is None else loss.isfinite() & grad.isfinite().all(dim=1)
         status[(status == Status.OK) & ~finite] = Status.NONFINITE
         blank = status != Status.OK
@@ -87,20 +93,9 @@ def evaluated(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool
     Points beyond its bounds have left the domain (status ESCAPED), unless the objective invites them.
     """
     invited = getattr(objective, "beyond_box", False)
-    raw = objective.evaluate(x, grad=grad) if invited else evaluated_inside(objective, x, grad=grad)
-    who, count = name_of(objective), len(x)
-    wanted: dict[str, tuple[Tensor, tuple[int, ...]]] = {"loss": (raw.loss, (count,)), "status": (raw.status, (count,))}
-    if grad:
-        wanted["grad"] = (_present(raw.grad, who), tuple(x.shape))
-    for field, (tensor, shape) in wanted.items():
-        if tuple(tensor.shape) != shape:
-            raise ValueError(
-                f"{who} must return {field} of shape {shape} for x of shape {tuple(x.shape)}; got {tuple(tensor.shape)}"
-            )
-    if bool((raw.status == Status.MISSING).any()):
-        raise ValueError(f"{who} must say how every point ended; got status MISSING")
+    raw = _answer(objective, x, grad=grad) if invited else evaluated_inside(objective, x, grad=grad)
     loss, status = (tensor.detach().cpu() for tensor in (raw.loss, raw.status))
-    gradient = wanted["grad"][0].detach().cpu().double() if grad else None
+    gradient = raw.grad.detach().cpu().double() if grad and raw.grad is not None else None
     return Evaluation.judged(loss.double(), gradient, status)
 
 
@@ -113,15 +108,37 @@ def evaluated_inside(objective: Objective, x: Float[Tensor, "batch dim"], *, gra
         return objective.evaluate(x, grad=grad)
     inside = in_box(objective.space, x)
     if bool(inside.all()):
-        return objective.evaluate(_moved_back(objective.space, x), grad=grad)
+        return _answer(objective, _moved_back(objective.space, x), grad=grad)
     loss, slope = x.new_full((len(x),), torch.nan), torch.full_like(x, torch.nan) if grad else None
     status = torch.full((len(x),), Status.ESCAPED, dtype=torch.int8)
     if bool(inside.any()):
-        found = objective.evaluate(_moved_back(objective.space, x[inside]), grad=grad)
+        found = _answer(objective, _moved_back(objective.space, x[inside]), grad=grad)
         loss[inside], status[inside] = found.loss.detach().to(loss), found.status.to(status)
-        if slope is not None:
-            slope[inside] = _present(found.grad, name_of(objective)).detach().to(slope)
+        if slope is not None and found.grad is not None:
+            slope[inside] = found.grad.detach().to(slope)
     return Evaluation(loss, slope, status)
+
+
+def _answer(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+    """Return what an objective says of points, held against the protocol."""
+    found, who = objective.evaluate(x, grad=grad), name_of(objective)
+    if not isinstance(found, Evaluation):
+        raise ValueError(f"{who} must return an Evaluation; got {type(found).__name__}")
+    count = len(x)
+    wanted: dict[str, tuple[Tensor, tuple[int, ...]]] = {
+        "loss": (found.loss, (count,)),
+        "status": (found.status, (count,)),
+    }
+    if grad:
+        wanted["grad"] = (_present(found.grad, who), tuple(x.shape))
+    for field, (tensor, shape) in wanted.items():
+        if tuple(tensor.shape) != shape:
+            raise ValueError(
+                f"{who} must return {field} of shape {shape} for x of shape {tuple(x.shape)}; got {tuple(tensor.shape)}"
+            )
+    if bool((found.status == Status.MISSING).any()):
+        raise ValueError(f"{who} must say how every point ended; got status MISSING")
+    return found
 
 
 def in_box(space: ParameterSpace, x: Float[Tensor, "batch dim"]) -> Bool[Tensor, " batch"]:
@@ -137,6 +154,22 @@ def _moved_back(space: ParameterSpace, x: Float[Tensor, "batch dim"]) -> Float[T
 def name_of(objective: Objective) -> str:
     """Return what an objective is called."""
     return str(getattr(objective, "name", type(objective).__name__))
+
+
+def _real(values: Any, what: str) -> Tensor:
+    """Return a tensor of real numbers as it is, and one of what else holds some."""
+    real = isinstance(values, Tensor) and not values.is_complex() and values.dtype != torch.bool
+    return values if real else as_tensor(values, what)
+
+
+def _known(status: Any) -> Tensor:
+    """Return a tensor of statuses as it is, and refuse codes that mean none: as int8, 257 would be OK."""
+    status = _real(status, "a status")
+    sound = (status >= 0) & (status <= max(Status)) & (status % 1 == 0)
+    if not bool(sound.all()):
+        known = ", ".join(f"{kind.value} {kind.name}" for kind in Status)
+        raise ValueError(f"a status is one of {known}; got {status[~sound][0].item()}")
+    return status
 
 
 def _present(grad: Tensor | None, who: str) -> Tensor:

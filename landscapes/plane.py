@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeGuard
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.typing import NDArray
 from torch import Tensor
 
-from .space import ParameterSpace, as_tensor
+from .space import ParameterSpace, as_tensor, tensor_of, whole
 
-Bound = float | Sequence[float]
+Bound = float | Sequence[float] | NDArray[Any] | Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +35,14 @@ class Plane:
     labels: tuple[str, ...]
 
     def __post_init__(self) -> None:
+        for field in ("origin", "basis", "lower", "upper"):
+            object.__setattr__(self, field, as_tensor(getattr(self, field), f"Plane's {field}"))
+        object.__setattr__(
+            self, "resolution", tuple(whole(n, "a slice's resolution", least=2) for n in self.resolution)
+        )
+        self._check()
+
+    def _check(self) -> None:
         if self.basis.ndim != 2 or self.basis.shape[0] not in (1, 2):
             raise ValueError(f"Plane needs one or two directions; got a basis of shape {tuple(self.basis.shape)}")
         if self.origin.shape != self.basis.shape[1:]:
@@ -42,8 +52,6 @@ class Plane:
         for field, size in sizes.items():
             if size != self.rank:
                 raise ValueError(f"Plane of rank {self.rank} needs {self.rank} values of {field}; got {size}")
-        if min(self.resolution) < 2:
-            raise ValueError(f"Plane needs a resolution of at least 2 points per axis; got {self.resolution}")
         if not bool((self.lower < self.upper).all()) or not bool((self.upper - self.lower).isfinite().all()):
             raise ValueError(
                 f"Plane needs finite lower < upper on every axis; got {self.lower.tolist()} to {self.upper.tolist()}"
@@ -51,7 +59,7 @@ class Plane:
         if not bool(self.origin.isfinite().all()) or not bool(self.basis.isfinite().all()):
             raise ValueError("Plane needs a finite origin and finite directions; got NaN or infinity")
         unit = self.basis / self.basis.norm(dim=1, keepdim=True)
-        if int(torch.linalg.matrix_rank(unit)) < self.rank:
+        if not bool(unit.isfinite().all()) or int(torch.linalg.matrix_rank(unit)) < self.rank:
             raise ValueError("Plane needs directions that are not zero and not parallel; give two that differ")
 
     @classmethod
@@ -98,7 +106,7 @@ class Plane:
         """Span a plane by any directions, kept as given: coordinate 1 is one whole `directions[i]` from `origin`."""
         origin, directions = (as_tensor(t, "a slice's point and directions") for t in (origin, directions))
         rank = len(directions)
-        lower, upper = (_bound(bound, rank) for bound in extent)
+        lower, upper = _ends(extent, rank)
         named = labels or [f"along direction {axis + 1}" for axis in range(rank)]
         return cls(origin, directions, lower, upper, _per_axis(resolution, rank), tuple(named))
 
@@ -122,6 +130,8 @@ class Plane:
             raise ValueError(
                 f"{rank} principal directions need more than {rank} points; got shape {tuple(points.shape)}"
             )
+        if not bool(points.isfinite().all()):
+            raise ValueError("a principal plane takes finite points; got NaN or infinity")
         mean = points.mean(dim=0)
         _, scale, directions = torch.linalg.svd(points - mean, full_matrices=False)
         if len(scale) < rank or not bool(scale[rank - 1] > 1e-12 * scale[0]):
@@ -156,24 +166,26 @@ class Plane:
 
     def lift(self, u: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch dim"]:
         """Return the parameters at plane coordinates `u`; each row's bits are independent of the batch it is in."""
-        return self.origin + (u[..., :, None] * self.basis).sum(dim=-2)
+        return self.origin + (tensor_of(u, "lift")[..., :, None] * self.basis).sum(dim=-2)
 
     def project(self, x: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch rank"]:
         """Return the plane coordinates nearest to `x` (least squares in the parameters' own units)."""
-        u: Float[Tensor, "*batch rank"] = (x - self.origin) @ torch.linalg.pinv(self.basis)
+        u: Float[Tensor, "*batch rank"] = (tensor_of(x, "project") - self.origin) @ torch.linalg.pinv(self.basis)
         return u
 
     def distance(self, x: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch"]:
         """Return how far `x` is from the plane (Euclidean, in the parameters' own units)."""
+        x = tensor_of(x, "distance")
         off: Float[Tensor, "*batch dim"] = x - self.lift(self.project(x))
         return off.square().sum(dim=-1).sqrt()
 
     def slope(self, grad: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch rank"]:
         """Return the derivatives along the plane's axes [loss unit / plane unit] (chain rule, so any basis)."""
-        return (grad[..., None, :] * self.basis).sum(dim=-1)
+        return (tensor_of(grad, "slope")[..., None, :] * self.basis).sum(dim=-1)
 
     def moved(self, x: Float[Tensor, " dim"]) -> Plane:
         """Return the parallel plane through `x`, with the same coordinates and the same window."""
+        x = tensor_of(x, "moved")
         return replace(self, origin=x - self.project(x) @ self.basis)
 
     def window(self) -> tuple[Float[Tensor, " rank"], Float[Tensor, " rank"]]:
@@ -202,8 +214,8 @@ class Plane:
         return cls(origin, basis, lower, upper, tuple(record["resolution"]), tuple(record["labels"]))
 
 
-def _per_axis(resolution: int | Sequence[int], rank: int) -> tuple[int, ...]:
-    return (resolution,) * rank if isinstance(resolution, int) else tuple(resolution)
+def _per_axis(resolution: int | Sequence[int], rank: int) -> tuple[Any, ...]:
+    return tuple(resolution) if _several(resolution) else (resolution,) * rank
 
 
 def _split(label: str) -> tuple[str, str]:
@@ -212,10 +224,20 @@ def _split(label: str) -> tuple[str, str]:
 
 
 def _bound(bound: Bound, rank: int) -> Float[Tensor, " rank"]:
-    values = torch.as_tensor(bound, dtype=torch.float64)
+    values = as_tensor(bound, "extent")
     if values.ndim > 1 or (values.ndim == 1 and len(values) != rank):
         raise ValueError(f"extent needs one number per axis, {rank} in all; got {bound}")
     return values.expand(rank).clone()
+
+
+def _several(values: object) -> TypeGuard[Sequence[Any]]:
+    return isinstance(values, list | tuple) or getattr(values, "ndim", 0) > 0
+
+
+def _ends(extent: Sequence[Bound], rank: int) -> tuple[Float[Tensor, " rank"], Float[Tensor, " rank"]]:
+    if len(extent) != 2:
+        raise ValueError(f"extent takes a pair (lower, upper); got {len(extent)} values")
+    return _bound(extent[0], rank), _bound(extent[1], rank)
 
 
 def _window(
@@ -226,10 +248,11 @@ def _window(
 ) -> tuple[Float[Tensor, " rank"], Float[Tensor, " rank"]]:
     if extent is None:
         return lower.clone(), upper.clone()
-    if not isinstance(extent, int | float):
-        return _bound(extent[0], len(lower)), _bound(extent[1], len(lower))
-    if not extent > 0:
-        raise ValueError(f"extent as a fraction of the bounds must be positive; got {extent}")
-    width = extent * (upper - lower)
+    if _several(extent):
+        return _ends(extent, len(lower))
+    fraction = float(as_tensor(extent, "extent"))
+    if not 0 < fraction < np.inf:
+        raise ValueError(f"extent as a fraction of the bounds must be positive and finite; got {fraction}")
+    width = fraction * (upper - lower)
     start = (center - width / 2).clamp(torch.minimum(lower, upper - width), torch.maximum(lower, upper - width))
     return start, start + width

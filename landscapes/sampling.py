@@ -18,6 +18,7 @@ from .halving import Halving
 from .identity import check_identity
 from .objective import Objective, Status, name_of
 from .plane import Plane
+from .space import whole
 from .spread import Filled, ReadBack, Site, WorkersLostError, equal_batches, spread, workers_of
 from .store import SliceStore
 from .tiling import Tile
@@ -65,7 +66,7 @@ def sample(
     if store is None:
         store = SliceStore.in_memory(plane, objective.space, **_described(objective), grad=grad)
     _check_store(store, objective, plane, grad=grad)
-    batch = getattr(objective, "preferred_batch", 1) if batch is None else batch
+    batch = whole(getattr(objective, "preferred_batch", 1) if batch is None else batch, "sample's batch", least=1)
     status = store.status()
     counts: Counter[Status] = Counter({kind: int((status == kind).sum()) for kind in Status if kind != Status.MISSING})
     resumed, pending = counts.total(), store.pending(status)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -47,7 +48,8 @@ class ParameterSpace:
         for field, value in (("names", names), ("units", tuple(map(str, units)))):
             object.__setattr__(self, field, value)
         for field, bound in (("lower", lower), ("upper", upper)):
-            object.__setattr__(self, field, as_tensor(bound, f"ParameterSpace's {field}"))
+            values = torch.atleast_1d(as_tensor(bound, f"ParameterSpace's {field}"))
+            object.__setattr__(self, field, values.clone())  # what becomes of the caller's own is no bound
         self._check()
 
     def _check(self) -> None:
@@ -66,8 +68,7 @@ class ParameterSpace:
     def box(cls, names: Sequence[str], lower: float, upper: float, unit: str = "") -> ParameterSpace:
         """Return a space whose parameters share their bounds and their unit."""
         dim = len(names)
-        bound = torch.ones(dim, dtype=torch.float64)
-        return cls(tuple(names), lower * bound, upper * bound, (unit,) * dim)
+        return cls(tuple(names), [lower] * dim, [upper] * dim, (unit,) * dim)
 
     @property
     def dim(self) -> int:
@@ -86,15 +87,16 @@ class ParameterSpace:
 
     def from_unit(self, u: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
         """Map the unit cube onto the box."""
-        return self.lower + u * (self.upper - self.lower)
+        return self.lower + tensor_of(u, "from_unit") * (self.upper - self.lower)
 
     def to_unit(self, x: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
         """Map the box onto the unit cube."""
-        return (x - self.lower) / (self.upper - self.lower)
+        return (tensor_of(x, "to_unit") - self.lower) / (self.upper - self.lower)
 
     def uniform(self, count: int, *, seed: int) -> Float[Tensor, "count dim"]:
         """Draw points uniformly from the box; the same seed gives the same points."""
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(whole(seed, "a seed"))
+        count = whole(count, "a count of points")
         return self.from_unit(torch.rand(count, self.dim, generator=generator, dtype=torch.float64))
 
     def index(self, parameter: str | int) -> int:
@@ -102,30 +104,52 @@ class ParameterSpace:
         if isinstance(parameter, str) and parameter in self.names:
             return self.names.index(parameter)
         try:
-            number = int(parameter)
-        except ValueError:
+            number = int(parameter) if isinstance(parameter, str) else operator.index(parameter)
+        except (TypeError, ValueError):
             raise ValueError(f"no parameter is called {parameter!r}; there are {', '.join(self.names)}") from None
         if not 0 <= number < self.dim:
             raise ValueError(f"parameters are numbered 0 to {self.dim - 1}; got {number}")
         return number
 
 
+def whole(value: object, what: str, *, least: int = 0) -> int:
+    """Return a whole number of 64 bits that is not below `least`; raises ValueError, which says `what` it is, else."""
+    try:
+        number = least - 1 if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type] # as it tells
+    except TypeError:
+        number = least - 1
+    if number < least:
+        raise ValueError(f"{what} is a whole number of at least {least}; got {value!r}")
+    if number >= 1 << 63:
+        raise ValueError(f"{what} is a whole number below 2^63; got {value!r}")
+    return number
+
+
+def tensor_of(x: object, who: str) -> Float[Tensor, "*shape"]:
+    """Return a tensor as it is, and one of any other numbers."""
+    return x if isinstance(x, Tensor) else as_tensor(x, who)
+
+
 def as_tensor(x: object, who: str) -> Float[Tensor, "*shape"]:
     """Return numbers, whole or floating, of a tensor, an array or lists as a float64 tensor on the CPU.
 
-    Raises ValueError, which says `who` takes them, for what is no number.
+    Raises ValueError, which says `who` takes them, for what is no number, and for what an array masks.
     """
     if isinstance(x, Tensor):
         if x.is_complex() or x.dtype == torch.bool:
             raise ValueError(f"{who} takes numbers; got a tensor of {x.dtype}")
         return x.detach().to("cpu", torch.float64)
+    if any(map(np.ma.is_masked, x if isinstance(x, list | tuple) else [x])):
+        raise ValueError(
+            f"{who} takes numbers; got an array that masks some (`.filled(numpy.nan)` makes them failures)"
+        )
     try:
         values = np.asarray(x)
         if values.dtype.kind not in "iuf":
             raise TypeError(f"an array of {values.dtype}" if values.ndim else type(x).__name__)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{who} takes numbers, as a tensor, an array or lists; got {error}") from None
-    return torch.tensor(np.ascontiguousarray(values, dtype=np.float64))
+    return torch.from_numpy(np.array(values, dtype=np.float64, order="C"))
 
 
 def _columns(named: Mapping[str, Sequence[Any]]) -> tuple[list[float], list[float], list[str]]:

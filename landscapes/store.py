@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from zarr.storage import MemoryStore
 
-from .files import placing
+from .files import placing, resolved
 from .identity import StoreError, StoreExistsError, check_identity, full_identity, plain_json
 from .integrity import check_integrity, check_layouts, tile_sum
 from .layout import consolidate, open_group
@@ -98,7 +98,7 @@ class SliceStore:
         and version are added here. `provenance` is anything else worth keeping. Both must be plain JSON. `overwrite`
         replaces a slice store with nothing else in it, and refuses to replace anything else.
         """
-        path = Path(path).resolve()
+        path = resolved(path)
         whole = full_identity(identity, plane, space, grad=grad)
         for taken in (path, filling(path)):
             if taken.exists() and not overwrite:
@@ -118,7 +118,7 @@ class SliceStore:
     @classmethod
     def open(cls, path: str | Path) -> SliceStore:
         """Open a store that exists, the finished slice where there is one."""
-        path = finished(Path(path).resolve())
+        path = finished(resolved(path))
         place = place_of(path)
         if not place.exists():
             raise StoreError(f"there is no slice store at {path}; make one with `landscape slice`")

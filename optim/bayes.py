@@ -44,6 +44,8 @@ class BO(Optimizer):
 class BODescentsOptions(SurrogateOptions, DescentOptions):
     """The options of the process and of each descent."""
 
+    method = "bo-descents"
+
 
 class BODescents(Optimizer):
     """Descend from where the lower confidence bound is least; the process learns the loss of every iterate.

@@ -14,7 +14,10 @@ from cma.sigma_adaptation import CMAAdaptSigmaCSA
 from .base import Kind, Optimizer, Points, Proposal
 from .cmaes import Normal
 from .descent import Descent, DescentOptions
+from .options import MANY, number
 from .surrogate import Surrogate, SurrogateOptions
+
+MOST = np.finfo(float).max / 4  # what a failure counts as: pycma adds two of them
 
 
 @dataclass(frozen=True)
@@ -26,10 +29,20 @@ class BOLeapOptions(SurrogateOptions, DescentOptions):
     search has spent `local_budget` episodes, so that it may spend more by up to one population and one descent.
     """
 
-    population: int = 10
-    best: int = 5
-    sigma: float = 1.0
-    local_budget: int = 100
+    method = "bo-leap"
+
+    population: int = number(10, 2, 10_000)
+    best: int = number(5, 1, 9_999)
+    sigma: float = number(1.0, 1e-9, 1000)
+    local_budget: int = number(100, 1, MANY)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.best < self.population:
+            raise ValueError(
+                f"bo-leap option best takes 1 to {self.population - 1} of a population of {self.population}; "
+                f"got {self.best}"
+            )
 
 
 class BOLeap(Optimizer):
@@ -49,13 +62,6 @@ class BOLeap(Optimizer):
     def _setup(self) -> None:
         if self.space.dim < 2:
             raise ValueError(f"bo-leap searches two parameters or more; this space has {self.space.dim}")
-        if self.options.sigma <= 0 or self.options.local_budget < 1:
-            raise ValueError(f"bo-leap takes sigma and local_budget above zero; got {self.options}")
-        if not 0 < self.options.best < self.options.population:
-            raise ValueError(
-                f"bo-leap takes the best of a population of {self.options.population}: from 1 to "
-                f"{self.options.population - 1} of them; got best = {self.options.best}"
-            )
         self.surrogate = Surrogate(self.space.dim, self.options)
         self.local: SemiLocal | None = None
         self.descent: Descent | None = None
@@ -139,7 +145,7 @@ class SemiLocal:
     def tell(self, x: Points, loss: Points) -> Points:
         """Adapt sigma and C to a population, and return the mean of its best points."""
         self._told.append((x, loss))
-        self.es.tell(list(x), list(np.nan_to_num(loss, posinf=np.finfo(float).max)), check_points=False)
+        self.es.tell(list(x), list(loss.clip(-MOST, MOST)), check_points=False)
         return np.array(self.es.mean)
 
     def leap(self, mu: Points) -> None:
@@ -163,11 +169,11 @@ class SemiLocal:
         """Return the search that had this state, by telling it all again."""
         random.bit_generator.state = state["began"]
         made = cls(state["start"], options, random)
-        for number, (points, loss) in enumerate(zip(state["points"], state["losses"], strict=True)):
+        for turn, (points, loss) in enumerate(zip(state["points"], state["losses"], strict=True)):
             made.population()
             made.tell(points, loss)
-            if number < len(state["leaps"]):
-                made.leap(state["leaps"][number])
+            if turn < len(state["leaps"]):
+                made.leap(state["leaps"][turn])
         return made
 
 

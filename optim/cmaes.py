@@ -13,6 +13,7 @@ import torch
 from cma.sigma_adaptation import CMAAdaptSigmaCSA
 
 from .base import Kind, Optimizer, Points, Proposal
+from .options import MethodOptions, number
 
 OTHERS = (
     "cma-es goes on with the points and losses that the run holds; cma or its linear algebra draws others here than "
@@ -21,15 +22,22 @@ OTHERS = (
 
 
 @dataclass(frozen=True)
-class CMAESOptions:
+class CMAESOptions(MethodOptions):
     """`sigma` is the first step size in the box scaled to [-1, 1]; `population` 0 means 4 + 3 ln(dim) of them.
 
     A quarter of the box's width is what the library's author advises: the minimum is then expected within three
     standard deviations of wherever in the box the search starts.
     """
 
-    sigma: float = 0.5
-    population: int = 0
+    method = "cma-es"
+
+    sigma: float = number(0.5, 1e-9, 1000)
+    population: int = number(0, 0, 10_000)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if 0 < self.population < 3:
+            raise ValueError(f"cma-es option population takes 0 or at least 3; got {self.population}")
 
 
 class CMAES(Optimizer):
@@ -47,10 +55,6 @@ class CMAES(Optimizer):
     def _setup(self) -> None:
         if self.space.dim < 2:
             raise ValueError(f"cma-es searches two parameters or more; this space has {self.space.dim}")
-        if self.options.sigma <= 0:
-            raise ValueError(f"cma-es option sigma takes a number above zero; got {self.options.sigma}")
-        if self.options.population and self.options.population < 3:
-            raise ValueError(f"cma-es option population takes 0 or at least 3; got {self.options.population}")
         self._start()
 
     def _start(self) -> None:

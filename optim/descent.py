@@ -11,10 +11,11 @@ import numpy as np
 import torch
 
 from .base import Kind, Optimizer, Points, Proposal
+from .options import MANY, MethodOptions, number
 
 
 @dataclass(frozen=True)
-class DescentOptions:
+class DescentOptions(MethodOptions):
     """How a descent moves in the box scaled to [-1, 1], and when it ends.
 
     `step` [scaled parameter^2 / loss unit] is what gradients are multiplied by. A move whose largest component exceeds
@@ -24,20 +25,14 @@ class DescentOptions:
     the best so far by `tolerance`, a fraction of it.
     """
 
-    step: float = 1.0
-    longest: float = 0.2
-    shrink: float = 0.5
-    steps: int = 20
-    patience: int = 3
-    tolerance: float = 1e-4
+    method = "a descent"
 
-    def __post_init__(self) -> None:
-        if min(self.step, self.longest, self.steps) <= 0 or min(self.patience, self.tolerance) < 0:
-            raise ValueError(
-                f"a descent takes step, longest and steps above zero, patience and tolerance not below; got {self}"
-            )
-        if not 0 < self.shrink <= 1:
-            raise ValueError(f"a descent takes shrink above 0 and at most 1; got {self.shrink}")
+    step: float = number(1.0, 1e-300, 1e300)
+    longest: float = number(0.2, 1e-12, 1000)
+    shrink: float = number(0.5, 1e-12, 1)
+    steps: int = number(20, 1, MANY)
+    patience: int = number(3, 0, MANY)
+    tolerance: float = number(1e-4, 0, 1)
 
 
 class Descent:
@@ -89,8 +84,12 @@ class Descent:
 
     def _moved(self, grad: Points) -> Points:
         """Return z - step * gradient, kept inside the box."""
-        move = -self.options.step * grad
-        excess = float(np.abs(move).max()) / self.options.longest
+        with np.errstate(over="ignore"):
+            move = -self.options.step * grad
+            excess = float(np.abs(move).max()) / self.options.longest
+        if not math.isfinite(excess):  # too long to be counted: its direction is all that matters
+            finite = np.nan_to_num(grad)
+            move, excess = -self.options.longest * (finite / np.abs(finite).max()), 1.0
         return np.clip(self.at + self._scale * move / max(excess, 1.0), -1.0, 1.0)
 
 
@@ -98,7 +97,9 @@ class Descent:
 class DescentsOptions(DescentOptions):
     """`together` descents are evaluated as one batch, 1 for one after the other."""
 
-    together: int = 4
+    method = "descents"
+
+    together: int = number(4, 1, 10_000)
 
 
 class Descents(Optimizer):
@@ -109,8 +110,6 @@ class Descents(Optimizer):
     needs_grad = True
 
     def _setup(self) -> None:
-        if self.options.together < 1:
-            raise ValueError(f"descents takes together of at least 1; got {self.options.together}")
         self.descents = [self._begun() for _ in range(self.options.together)]
 
     def _ask(self) -> Proposal:

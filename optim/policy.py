@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import abc
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
@@ -33,15 +33,18 @@ from torch import Tensor
 
 from ..landscapes.objective import Objective
 from .base import Kind, Optimizer, Points, Proposal
+from .magnitude import LARGE
+from .options import MethodOptions, number
 
 LAYERS = (64, 64, 64)  # CoRL 2022, appendix C
 _GLOBAL = threading.Lock()  # held while the process's generators are an optimiser's own
 
+FAR = 1e18  # deviations: farther rewards are cut off, for their squares would be no float32
 Numbers = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class PPOOptions:
+class PPOOptions(MethodOptions):
     """`episodes` of a rollout, shared by so many `minibatches`; `epochs` over them.
 
     `learning_rate` of policy and value, `discount` of later rewards.
@@ -50,15 +53,25 @@ class PPOOptions:
     Its learning rate is 3e-4, with which 600 episodes in a bowl (2-D) came to a mean loss of 2.4; they come to 1.5.
     """
 
-    episodes: int = 20
-    minibatches: int = 4
-    epochs: int = 10
-    learning_rate: float = 1e-3
-    discount: float = 0.99
+    method = "ppo"
+
+    episodes: int = number(20, 2, 10_000)
+    minibatches: int = number(4, 1, 5_000)
+    epochs: int = number(10, 1, 10_000)
+    learning_rate: float = number(1e-3, 1e-12, 1)
+    discount: float = number(0.99, 0, 1)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.episodes % self.minibatches or self.episodes < 2 * self.minibatches:
+            raise ValueError(
+                f"ppo shares a rollout's episodes equally by its minibatches, two or more for each; "
+                f"got episodes={self.episodes}, minibatches={self.minibatches}"
+            )
 
 
 @dataclass(frozen=True)
-class SACOptions:
+class SACOptions(MethodOptions):
     """`warmup`: random episodes before the policy plays; then a gradient step on a `batch` for every transition.
 
     `learning_rate` of policy and critics, `discount` of later rewards. `memory`: transitions that are kept; the default
@@ -66,11 +79,13 @@ class SACOptions:
     came to a mean loss of 1.3; they come to 0.3.
     """
 
-    warmup: int = 20
-    batch: int = 256
-    learning_rate: float = 1e-3
-    discount: float = 0.99
-    memory: int = 100_000
+    method = "sac"
+
+    warmup: int = number(20, 1, 10_000)
+    batch: int = number(256, 1, 100_000)
+    learning_rate: float = number(1e-3, 1e-12, 1)
+    discount: float = number(0.99, 0, 1)
+    memory: int = number(100_000, 1, 1_000_000)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,23 +147,34 @@ class PolicySearch(Optimizer):
         """Play episodes side by side."""
         if self._objective is None:
             raise ValueError(f"{self.name} plays in the objective itself; attach it before the first ask")
+        self._refuse_diverged(self._model.policy.parameters())
         z = torch.zeros(episodes, self.decisions, self.space.dim // self.decisions, dtype=torch.float64)
         seen, actions = [], []
         for decision in range(self.decisions):
             seen.append(self._seen(self.space.from_unit((z.flatten(start_dim=1) + 1) / 2), decision))
             with self._own_randomness(), torch.no_grad():
                 actions.append(self._act(torch.from_numpy(seen[-1])).numpy())
+            self._refuse_diverged([torch.from_numpy(actions[-1])])
             z[:, decision] = torch.from_numpy(actions[-1]).double().clamp(-1, 1)
         return Rollout(np.stack(seen), np.stack(actions))
+
+    def _refuse_diverged(self, numbers: Iterable[Tensor]) -> None:
+        if not all(bool(part.isfinite().all()) for part in numbers):
+            raise ValueError(
+                f"the policy of {self.name} has diverged; give it a smaller learning_rate than "
+                f"{self.options.learning_rate:g}"
+            )
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
         losses = self.penalised(loss)
         if self._scale is None:
-            self._scale = float(losses.mean()), float(losses.std()) or 1.0
+            self._scale = _mean_and_deviation(losses)
         mean, deviation = self._scale
+        with np.errstate(over="ignore"):
+            rewards = np.clip((mean - losses) / deviation, -FAR, FAR)
         with self._own_randomness():
             self._model.set_logger(Logger(folder=None, output_formats=[]))  # which only SB3's own loop gives it
-            self._learn(self._rollout, ((mean - losses) / deviation).astype(np.float32))
+            self._learn(self._rollout, rewards.astype(np.float32))
         del self._rollout
 
     def _seen(self, x: Tensor, decision: int) -> Numbers:
@@ -191,11 +217,6 @@ class PPO(PolicySearch):
 
     def _untrained(self, spaces: gymnasium.Env[Any, Any]) -> sb3.PPO:
         o = self.options
-        if o.episodes % o.minibatches or o.episodes < 2 * o.minibatches:
-            raise ValueError(
-                f"ppo shares a rollout's episodes equally by its minibatches, two or more for each; "
-                f"got episodes={o.episodes}, minibatches={o.minibatches}"
-            )
         return sb3.PPO(
             "MlpPolicy",
             DummyVecEnv([lambda: spaces, *(lambda: copy(spaces) for _ in range(o.episodes - 1))]),
@@ -301,6 +322,12 @@ class _Spaces(gymnasium.Env[Any, Any]):
     def __init__(self, features: int, controls: int) -> None:
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (features,))
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (controls,))
+
+
+def _mean_and_deviation(losses: Points) -> tuple[float, float]:
+    """Return the mean of losses and their deviation, 1 where they are all the same."""
+    large = 2.0**600 if float(np.abs(losses).max()) > LARGE else 1.0  # their squares would be no numbers
+    return float((losses / large).mean() * large), float((losses / large).std() * large) or 1.0
 
 
 def _seeded(seed: int) -> tuple[Tensor, dict[str, Any]]:

@@ -30,7 +30,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..landscapes.files import placing
+from ..landscapes.files import placing, resolved
 from ..landscapes.identity import StoreError, StoreExistsError, check_identity
 from ..landscapes.layout import FILL, consolidate, open_group
 from ..landscapes.objective import Evaluation, Status
@@ -81,7 +81,7 @@ class Run:
         overwrite: bool = False,
     ) -> Run:
         """Make an empty run at a path where there is none, all at once; `overwrite` replaces a run, nothing else."""
-        path = Path(path).resolve()
+        path = resolved(path)
         attributes = attributes_of(space, identity, provenance or {}, budget)
         if path.exists() and not overwrite:
             raise StoreExistsError(f"{path} exists already; write elsewhere with --out, or replace it with --force")
@@ -99,7 +99,7 @@ class Run:
     @classmethod
     def open(cls, path: str | Path) -> Run:
         """Open a run that exists."""
-        path = Path(path).resolve()
+        path = resolved(path)
         if not path.exists():
             raise StoreError(f"there is no run at {path}; make one with `landscape optimize`")
         if not is_run(path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from typing import Any
 
 from ..landscapes.identity import StoreError
 from ..landscapes.objective import Objective, evaluated, name_of
+from ..landscapes.space import whole
 from .base import Optimizer
 from .registry import optimizer_class
 from .run import Run
@@ -44,6 +46,9 @@ def search(
     an objective whose rows do not depend on their batch. A proposal that does not fit into the budget is cut short.
     `gradient_cost` is what an episode with gradient costs in episodes without; it is measured if not given.
     """
+    budget = whole(budget, "a budget", least=1)
+    if gradient_cost is not None and not 0 < gradient_cost < math.inf:
+        raise ValueError(f"search takes a gradient_cost above 0 and finite; got {gradient_cost}")
     if run is None:
         run = _in_memory(objective, method, budget)
     with run.filling():
@@ -69,7 +74,7 @@ def _in_memory(objective: Objective, method: Optimizer | str, budget: int) -> Ru
 
 def _fill(objective: Objective, optimizer: Optimizer, run: Run, budget: int, report: Callable[[], None]) -> None:
     mark = time.perf_counter()
-    whole, largest = True, 0
+    complete, largest = True, 0
     while run.count < budget:
         if budget - run.count < largest:  # the next proposal may be cut short, and is proposed again by who goes on
             run.hold(optimizer.state)
@@ -77,14 +82,14 @@ def _fill(objective: Objective, optimizer: Optimizer, run: Run, budget: int, rep
         _check(optimizer, len(proposal.x), grad=proposal.grad)
         largest = max(largest, len(proposal.x))
         x = proposal.x[: budget - run.count]
-        whole = len(x) == len(proposal.x)
+        complete = len(x) == len(proposal.x)
         evaluation = evaluated(objective, x, grad=proposal.grad)
         seconds, mark = time.perf_counter() - mark, time.perf_counter()
-        if whole:
+        if complete:
             optimizer.tell(x, evaluation)
-        run.append(x, evaluation, proposal.kind, seconds, optimizer.state if whole else None)
+        run.append(x, evaluation, proposal.kind, seconds, optimizer.state if complete else None)
         report()
-    run.save(optimizer.state if whole else None)
+    run.save(optimizer.state if complete else None)
 
 
 def _begun(objective: Objective, method: Optimizer | str, run: Run, gradient_cost: float | None) -> Optimizer:

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal, cast
+from typing import Any, Literal, cast, get_args, get_type_hints
 
 import numpy as np
 import torch
@@ -27,6 +27,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .base import Points
+from .magnitude import tamed
+from .options import MANY, MethodOptions, number
 
 Rows = NDArray[np.intp]
 
@@ -39,7 +41,7 @@ ALONE = threading.RLock()  # GPyTorch's settings and Python's warning filters be
 
 
 @dataclass(frozen=True)
-class SurrogateOptions:
+class SurrogateOptions(MethodOptions):
     """How losses are modelled, and how much is ventured where little is known.
 
     `coefficient` is how many standard deviations the bound lies below the mean. `kernel` is squared-exponential or
@@ -48,10 +50,17 @@ class SurrogateOptions:
     more, the half with the least losses, and as many of the others, spread evenly over the run.
     """
 
-    coefficient: float = 1.0
+    method = "bo"
+
+    coefficient: float = number(1.0, 0, 1e6)
     kernel: Literal["rbf", "matern"] = "rbf"
-    initial: int = 10
-    most: int = 1000
+    initial: int = number(10, 1, MANY)
+    most: int = number(1000, 2, MANY)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.kernel not in (known := get_args(get_type_hints(SurrogateOptions)["kernel"])):
+            raise ValueError(f"{self.method} option kernel takes {' or '.join(known)}; got {self.kernel}")
 
 
 class Surrogate:
@@ -65,8 +74,6 @@ class Surrogate:
     """
 
     def __init__(self, dim: int, options: SurrogateOptions) -> None:
-        if options.coefficient < 0 or options.most < 2:
-            raise ValueError(f"a Gaussian process takes coefficient >= 0 and most >= 2; got {options}")
         self.options = options
         self.z: Points = np.empty((0, dim))
         self.loss: Points = np.empty(0)
@@ -129,7 +136,7 @@ class Surrogate:
     def _given(self, rows: Rows) -> SingleTaskGP:
         """Return the process given some of the points, with the hyper-parameters of the last fit."""
         finite = np.isfinite(self.loss)
-        loss = np.where(finite, self.loss, self.loss[finite].max())  # a failure counts as the worst loss so far
+        loss = tamed(np.where(finite, self.loss, self.loss[finite].max()))  # a failure counts as the worst so far
         dim = self.z.shape[1]
         model = SingleTaskGP(
             _unit(self.z[rows]),

@@ -115,7 +115,7 @@ def test_a_folder_of_other_files_is_left_alone(run: Callable[..., Said], tmp_pat
         (["optimize", "branin", "--method", "random", "--option", "sigma=1"], "random has no option 'sigma'"),
         (["optimize", "branin", "--method", "cma-es", "--option", "sigma=big"], "sigma takes a number; got 'big'"),
         (["optimize", "branin", "--method", "cma-es", "--option", "sigma"], "--option takes name=value; got 'sigma'"),
-        (["optimize", "branin", "--method", "cma-es", "--option", "sigma=0"], "above zero; got 0.0"),
+        (["optimize", "branin", "--method", "cma-es", "--option", "sigma=0"], "from 1e-09 to 1000; got 0.0"),
         (["optimize", "branin", "--method", "random", "--fidelity", "best"], "has fidelities exact; got 'best'"),
         (["optimize", "branin", "--method", "random", "--set", "dim=3"], "branin has no option 'dim'"),
         (["methods", "newton"], "no method is called 'newton'"),

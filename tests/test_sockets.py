@@ -47,7 +47,15 @@ gallery list --data data
 gallery build --data data --out site
 gallery serve --out site --port 0
 """.strip().splitlines()
-RESULTS = {"--json", "--force", "--no-gradients", "--deterministic", "--film", "--report", "--all"}  # not what is started
+RESULTS = {
+    "--json",
+    "--force",
+    "--no-gradients",
+    "--deterministic",
+    "--film",
+    "--report",
+    "--all",
+}  # not what is started
 NO_WINDOW = "rerun's viewer could not open a window"
 SERVED = "until Ctrl-C"  # what is said by all that serves
 
@@ -143,7 +151,7 @@ def walk(folder: Path) -> None:
                     look()
                     found[line] = (left.code, sorted(seen), said.getvalue())
     (folder / "found.json").write_text(json.dumps(found))
-    open("/tmp/closed/times","a").write(f"{os.times()}\n")
+    open("/tmp/closed/times", "a").write(f"{os.times()}\n")
 
 
 @pytest.fixture(scope="module")

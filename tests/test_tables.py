@@ -6,13 +6,13 @@ from io import StringIO
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 import gradscape
 from gradscape.envs.registry import entries
 from gradscape.gallery.figures import read_figures
 from gradscape.optim.registry import METHODS
 from gradscape.tables import table
+from gradscape.terminal import Console
 
 from .command import Said
 

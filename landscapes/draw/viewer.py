@@ -17,6 +17,7 @@ from typing import IO
 from urllib.error import URLError
 from urllib.request import urlopen
 
+from ..files import resolved
 from ..loopback import LOOPBACK, LoopbackHandler, LoopbackServer
 
 RECORDING = "/recording.rrd"  # whatever the file's name, which may be none for an address
@@ -38,7 +39,7 @@ POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:"
 def open_viewer(path: Path, *, wait: float = 2.0) -> None:
     """Open a recording in rerun's own window, which stays when this process ends; it has to survive `wait` seconds."""
     with tempfile.TemporaryFile() as log:
-        viewer = _rerun(str(path.resolve()), "--port", "auto", log=log)
+        viewer = _rerun(str(resolved(path)), "--port", "auto", log=log)
         try:
             code = viewer.wait(wait)
         except subprocess.TimeoutExpired:

@@ -8,13 +8,12 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from .console import duration, read_settings, size
 from .envs.registry import environment_class, make
 from .tables import table
+from .terminal import Console
 
 if TYPE_CHECKING:
     from .envs.base import Environment
@@ -105,7 +104,7 @@ def _kernels(kernels: dict[str, Any]) -> Table:
     found = [{row["name"]: row for row in kernels[way]["kernels"]} for way in WAYS]
     for name in dict.fromkeys([*found[1], *found[0]]):
         cells = [_spent(rows[name]["seconds"], rows[name]["share"]) if name in rows else ("", "") for rows in found]
-        shown.add_row(escape(name), *cells[0], *cells[1])
+        shown.add_row(name, *cells[0], *cells[1])
     shown.add_section()
     rest = [kernels[way]["seconds"] - sum(row["seconds"] for row in kernels[way]["kernels"]) for way in WAYS]
     cells = [_spent(seconds, seconds / kernels[way]["seconds"]) for way, seconds in zip(WAYS, rest, strict=True)]

@@ -14,13 +14,13 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from .console import duration, read_settings
 from .envs.registry import make
 from .tables import table
+from .terminal import Console
 
 if TYPE_CHECKING:
     from .envs.base import Environment

@@ -11,11 +11,10 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -29,6 +28,7 @@ from rich.progress import (
 from . import __version__
 from .envs.registry import completed, entries, make
 from .tables import table
+from .terminal import Console, Described
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -47,12 +47,15 @@ PACKAGES = (
 )
 
 
+TAKEN = {one.name for one in signature(make).parameters.values() if one.kind is one.KEYWORD_ONLY}  # not by options
+
+
 def list_environments() -> None:
     """Print every registered environment as a table; of ours none is imported for that."""
     found = table("name", "dim", "parameters", "model", "fidelities", title="environments")
     for entry in map(completed, entries().values()):
         row = (entry.name, entry.dim, entry.parameters, entry.model, ", ".join(entry.fidelities))
-        found.add_row(*map(escape, row))
+        found.add_row(*row)
     console = Console()
     console.print(found)
     console.print("`landscape envs NAME` shows one in full: bounds, options, examples, fidelities, what it models.")
@@ -69,7 +72,7 @@ def describe_environment(name: str) -> None:
     bounded = table("no.", "parameter", "lower", "upper", "unit")
     bounds = zip(env.space.lower.tolist(), env.space.upper.tolist(), strict=True)
     for number, (label, unit, (lower, upper)) in enumerate(zip(env.space.names, env.space.units, bounds, strict=True)):
-        bounded.add_row(str(number), escape(label), f"{lower:g}", f"{upper:g}", escape(unit))
+        bounded.add_row(str(number), label, f"{lower:g}", f"{upper:g}", unit)
     console.print(bounded)
     for fidelity in env.fidelities.values():
         console.print(f"fidelity {asdict(fidelity)}", markup=False)
@@ -88,7 +91,7 @@ def show_info() -> None:
         found.add_row(package, _installed(package))
     found.add_row("cpu", f"{cores()} cores for this process")
     for name in device_names() or ["none found"]:
-        found.add_row("cuda", escape(name))
+        found.add_row("cuda", name)
     Console().print(found)
 
 
@@ -241,7 +244,7 @@ def _announce(console: Console, job: Job, env: Environment) -> None:
 
 def follow(console: Console, job: Job, command: str) -> dict[str, Any]:
     """Run a job under a progress bar and return its summary."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    columns = (Described(), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=console) as bar:
         task: TaskID | None = None
 
@@ -273,11 +276,13 @@ def outcome(summary: dict[str, Any]) -> str:
 
 
 def read_settings(settings: Sequence[str], flag: str = "--set") -> dict[str, Any]:
-    """Return options given as name=value."""
+    """Return options given as name=value; of a scene, none may be called as something else that a scene is made of."""
     pairs = [setting.partition("=") for setting in settings]
     for setting, (name, equals, _) in zip(settings, pairs, strict=True):
         if not equals or not name:
             raise ValueError(f"{flag} takes name=value; got {setting!r}")
+        if flag == "--set" and name in TAKEN:
+            raise ValueError(f"--set takes a scene's own options; {name} is none, and chosen by --{name} if at all")
     return {name: value for name, _, value in pairs}
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-
 from .results import RUN, SLICE, inside
+from .terminal import Console
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -8,11 +8,11 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.console import Console
 
 from .envs.registry import environment_class, make
 from .gallery.page_data import EPISODES
 from .gallery_parts import LOSS, Part, read_record, seconds_of_one
+from .terminal import Console
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -6,8 +6,6 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-
 from . import measure_report, tradeoff_report
 from .envs.registry import environment_class, make
 from .gallery.measured import DEVICES, TRADEOFF
@@ -15,6 +13,7 @@ from .gallery_parts import Part, read_record
 from .ladder import LADDERS
 from .measure_report import MEASURES, REPORT, Subject
 from .results import SLICE
+from .terminal import Console
 
 if TYPE_CHECKING:
     from .tradeoff_report import Study
@@ -82,12 +81,12 @@ class Tradeoffs(Part):
     def make(self, console: Console) -> str:
         """Measure every rung; those that are measured stay in the study's own folder under out/ until the last is."""
         from .landscapes.draw.film import lighten
-        from .landscapes.files import write_json
+        from .landscapes.files import make_folder, write_json
 
         study = self._study()
         report = study.run(console)
         record, picture = self._files(study.env.device)
-        record.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(record.parent)
         shutil.copyfile(study.pieces.folder / tradeoff_report.PICTURE, picture)
         lighten(picture)
         write_json(record, report)

@@ -9,12 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-
 from .cluster import recipe
 from .console import follow, outcome, picture_of, provenance_of
 from .envs.registry import environment_class, make
 from .gallery.figures import Figure
+from .terminal import Console
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor

@@ -16,9 +16,6 @@ from http.server import SimpleHTTPRequestHandler
 from pathlib import Path
 from typing import Any, TypeVar
 
-from rich.console import Console
-from rich.markup import escape
-
 from .cluster import workers
 from .console import duration, size
 from .gallery.figures import Figure, chosen, data_folder, read_figures
@@ -29,6 +26,7 @@ from .landscapes.disk import full, is_full, until_full
 from .landscapes.files import tidy
 from .landscapes.loopback import LoopbackHandler, LoopbackServer
 from .tables import table
+from .terminal import Console
 
 T = TypeVar("T")
 PARTS: dict[str, type[Part]] = {
@@ -139,7 +137,7 @@ def list_figures(*, data: str | None, as_json: bool) -> None:
     for figure, of in found:
         dims = " ".join(map(str, figure.dims))
         row = (figure.id, str(figure.number or "ours"), figure.env, dims, figure.through, _said(of))
-        listed.add_row(*map(escape, row))
+        listed.add_row(*row)
     Console().print(listed)
     missing = sum(not of.finished for _, of in found)
     Console(soft_wrap=True).print(

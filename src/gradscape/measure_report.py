@@ -14,8 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from .console import duration, fill, size
@@ -23,11 +21,12 @@ from .envs.registry import environment_class, make
 from .gallery.figures import data_folder, read_figures
 from .kept_reports import REPORT, TABLE, check_summary, read_report, verdict_lines
 from .landscapes.disk import full, is_full
-from .landscapes.files import others, replacing, tidy, write_json
+from .landscapes.files import make_folder, others, replacing, tidy, write_json
 from .landscapes.identity import stored_identity
 from .measure_tables import by_environment, slices_markdown, slices_table
 from .results import SLICE, environment_of, inside
 from .tables import table
+from .terminal import Console, Described
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -222,7 +221,7 @@ def _fetch(console: Console, source: Path, folder: Path, key: dict[str, Any]) ->
     if (folder / REPORT).exists() or not all(file.exists() for file in files):
         return
     if _same(read_report(source / REPORT), key):
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         for file in [*files, *source.glob(ARRAYS)]:
             with replacing(folder / file.name) as partial:
                 shutil.copyfile(file, partial)
@@ -258,7 +257,7 @@ def _character(console: Console, env: Environment, dataset: xr.Dataset, settings
 
     losses, gradients = effort(dataset["loss"].ndim, settings["points"])
     _announce(console, env, losses, gradients)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    columns = (Described(), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     objective = within_box(env) if stored_identity(dataset).get("boxed") else env
     with Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=console) as bar:
         task = bar.add_task("episodes", total=losses + gradients)
@@ -407,7 +406,7 @@ def _show(record: dict[str, Any], as_json: bool, folder: Path) -> None:
     console = Console(highlight=False)
     found = table("measure", "value, 95 % interval", title=f"{record['name']} ({record['env']})")
     for name, text in named_measures(record).items():
-        found.add_row(escape(name), escape(text))
+        found.add_row(name, text)
     console.print(found)
     for line in verdict_lines(record):
         console.print(line, markup=False)

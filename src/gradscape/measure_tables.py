@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 from itertools import groupby
 from typing import Any
 
-from rich.markup import escape
 from rich.table import Table
 
 from .tables import table
@@ -37,7 +36,7 @@ def slices_table(records: Sequence[Record]) -> Table:
     """Return a row for each slice, for a terminal."""
     found = table(*HEADINGS, title="what landscapes are like")
     for record in records:
-        found.add_row(*map(escape, _row(record)))
+        found.add_row(*_row(record))
     return found
 
 

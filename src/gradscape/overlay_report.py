@@ -13,14 +13,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-
 from .console import fill
 from .envs.registry import environment_class
-from .landscapes.files import others, tidy
+from .landscapes.files import others, resolved, tidy
 from .landscapes.identity import stored_identity
 from .landscapes.slice_paths import there
 from .results import RUN, SLICE, environment_of, inside, run_tables
+from .terminal import Console
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -98,7 +97,7 @@ def view(file: str, *, serve: bool) -> None:
     import typer
 
     console.print(f"opening {path}", markup=False)
-    if typer.launch(str(path.resolve())):
+    if typer.launch(str(resolved(path))):
         raise OSError(f"no program of this system opens {path}; open it with one of your own")
 
 

@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE
-from rich.console import Console
-from rich.markup import escape
 
 from .console import duration, provenance_of, read_settings
 from .envs.registry import make
 from .search_report import search_progress
 from .tables import table
+from .terminal import Console
 
 if TYPE_CHECKING:
     from .envs.base import Environment
@@ -125,7 +124,7 @@ def show(report: dict[str, Any], console: Console, top: int) -> None:
     found.columns[0].no_wrap = True
     for row in rows[:top]:
         cells = ["" if row[name] is None else f"{row[name]:.3f}" for name in COLUMNS]
-        found.add_row(" ".join(map(str, row["dims"])), escape(_said(row, names)), *cells)
+        found.add_row(" ".join(map(str, row["dims"])), _said(row, names), *cells)
     failed = f", {report['failed']} failed" if report["failed"] else ""
     said = f"{report['env']} · {report['fidelity']}: {report['episodes']} episodes{failed}; {len(rows)} pairs"
     console.print(said, markup=False, highlight=False)

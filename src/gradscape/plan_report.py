@@ -14,14 +14,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.markup import escape
-
 from .console import duration, read_extent, read_settings, size
 from .envs.registry import environment_class, make
 from .gallery.figures import Figure, read_figures
 from .planned import Plan, of_slice, of_sweep
 from .tables import table
+from .terminal import Console
 from .tolerance import kept_rung
 
 if TYPE_CHECKING:
@@ -166,7 +164,7 @@ def _print(record: dict[str, Any]) -> None:
     )
     found = table("what", "how much", "", show_header=False)
     for name, amount, note in _rows(record):
-        found.add_row(name, amount, escape(note))
+        found.add_row(name, amount, note)
     console.print(found)
     each = record["seconds"]["simulating"] / record["episodes"]
     console.print(f"{each:.3g} s an episode, {record['rate']}", markup=False)
@@ -213,7 +211,7 @@ def _print_figures(records: Sequence[dict[str, Any]], as_json: bool) -> None:
         hours, memory = f"{record['device_hours']:.3g}", size(record["memory"]["host"])
         room = size(record["disk"]["bytes"])
         row = (str(record["episodes"]), hours, duration(record["wall"]), memory, room, record["rate"])
-        found.add_row(escape(record["figure"]), *map(escape, row))
+        found.add_row(record["figure"], *row)
     Console().print(found)
     Console(soft_wrap=True, highlight=False).print(
         f"{total['slices']} slices: {total['episodes']} episodes, {total['device_hours']:.3g} device hours, "

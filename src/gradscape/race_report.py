@@ -13,8 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-
 from . import cluster, race_workers
 from .console import duration, provenance_of, read_settings
 from .envs.registry import make
@@ -23,6 +21,7 @@ from .landscapes.files import clear, tidy, visible, write_json
 from .optim.registry import METHODS
 from .race_tables import seeds_said, show
 from .search_report import STORE, give_torch_one_thread, made, run_identity, search_progress
+from .terminal import Console
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor

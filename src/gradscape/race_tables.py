@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from .tables import table
+from .terminal import Console
 
 ENOUGH = 10  # seeds, as the paper has
 
@@ -34,9 +33,9 @@ def _ranks(figures: Mapping[str, Any]) -> Table:
         none = f"; none with {seeds_said(rank['unsuccessful'])}" if rank["unsuccessful"] else ""
         found.add_row(
             rank["method"],
-            escape(_ranged(rank["rank"], rank["rank_low"], rank["rank_high"], 2)),
+            _ranged(rank["rank"], rank["rank_low"], rank["rank_high"], 2),
             str(rank["wins"]),
-            escape(_ranged(rank["mean"], rank["low"], rank["high"], 3) + none),
+            _ranged(rank["mean"], rank["low"], rank["high"], 3) + none,
             str(rank["failed"]),
             f"{rank['forwards']:.0f}",
             f"{rank['seconds']:.3g}",
@@ -71,7 +70,7 @@ def _claims(figures: Mapping[str, Any]) -> Table:
     for claim in figures["claims"]:
         found = claim["difference"]
         numbers = _ranged(found["mean"], found["low"], found["high"], 3) if found else ""
-        shown.add_row(claim["claim"], claim["verdict"], escape(numbers), escape(claim["source"]))
+        shown.add_row(claim["claim"], claim["verdict"], numbers, claim["source"])
     return shown
 
 

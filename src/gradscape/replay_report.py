@@ -11,13 +11,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-
 from . import __version__
 from .console import provenance_of, read_settings
 from .envs.registry import make
 from .landscapes.files import others, tidy, write_json
 from .results import point_of
+from .terminal import Console
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -12,7 +12,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from .console import chosen_fidelity, duration, provenance_of, read_settings
@@ -21,6 +20,7 @@ from .landscapes.disk import until_full
 from .landscapes.files import clear, tidy, visible, write_json
 from .optim.registry import METHODS, code_digest, optimizer_class
 from .tables import table
+from .terminal import Console, Described
 
 if TYPE_CHECKING:
     from .envs.base import Environment
@@ -256,7 +256,7 @@ def run_folder(identity: dict[str, Any]) -> Path:
 
 def search_progress(console: Console) -> Progress:
     """Return a progress display for one run or several."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    columns = (Described(), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     return Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=console)
 
 

@@ -7,10 +7,9 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-
 from .landscapes.files import others, tidy
 from .results import SLICE, inside, run_tables
+from .terminal import Console
 
 PICTURE, MODEL = "surface.png", "surface.gltf"
 

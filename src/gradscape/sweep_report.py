@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from .cluster import recipe, workers
@@ -25,6 +24,7 @@ from .landscapes.disk import until_full
 from .landscapes.files import discard, tidy, visible, write_json
 from .landscapes.slice_paths import check_replaceable, filling
 from .swept import FRAMES, HORIZON, ONLY, SMOOTHING, Moved, moved
+from .terminal import Console, Described
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -195,7 +195,7 @@ class Job:
         from .landscapes.objective import Status
         from .landscapes.sampling import sample
 
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        columns = (Described(), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
         sampled: list[xr.Dataset] = []
         with Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=console) as bar:
             task, finished, failed = bar.add_task("episodes", total=self.total), 0, 0

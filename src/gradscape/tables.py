@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from rich.markup import escape
 from rich.table import Table
 
 
 def table(*headings: str, title: str | None = None, **look: Any) -> Table:
     """Return an empty table whose columns fold where the terminal is narrow; `look` is rich's."""
-    found = Table(title=None if title is None else escape(title), title_justify="left", **look)
+    found = Table(title=title, title_justify="left", **look)
     for heading in headings:
-        found.add_column(escape(heading), overflow="fold")
+        found.add_column(heading, overflow="fold")
     return found

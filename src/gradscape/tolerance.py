@@ -18,9 +18,8 @@ from .envs.registry import make
 from .ladder import expected_work
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from .envs.base import Environment, Fidelity
+    from .terminal import Console
 
 Row = Mapping[str, Any]
 FARTHER = 2.0  # times the least expected work, beyond which a rung is no candidate

@@ -15,13 +15,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE
-from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TimeElapsedColumn
 
 from .console import duration, provenance_of, read_settings, size
 from .envs.registry import environment_class, make
 from .tables import table
+from .terminal import Console, Described
 from .tolerance import keep
 
 if TYPE_CHECKING:
@@ -187,7 +186,7 @@ class Study:
         from .landscapes.tradeoff import Sample
 
         samples: dict[str, Sample] = {}
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        columns = (Described(), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
         with Progress(*columns, console=console) as bar:
             task = bar.add_task("rungs", total=len(self.rungs))
             for number, rung in enumerate(self.rungs):
@@ -301,7 +300,7 @@ def show(report: dict[str, Any], console: Console) -> None:
     found = table(*accuracy, "ms", "with grad", "memory", box=SIMPLE, padding=(0, 1), collapse_padding=True)
     for row in rows:
         mark = " *" if row["name"] in best else ""
-        found.add_row(escape(row["name"]) + mark, *_cells(row, reference=row["name"] == report["reference"]))
+        found.add_row(row["name"] + mark, *_cells(row, reference=row["name"] == report["reference"]))
     console.print(found)
     console.print(
         "median, 95 %: loss error as a share of the spread (95 % interval); rank: Spearman's correlation of losses; "

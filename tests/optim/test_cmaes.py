@@ -169,7 +169,7 @@ def test_nothing_is_printed_written_or_warned_of(tmp_path, monkeypatch, capfd) -
     ("dim", "options", "said"),
     [
         (1, {}, "two parameters or more; this space has 1"),
-        (2, {"sigma": 0.0}, "sigma takes a number above zero; got 0.0"),
+        (2, {"sigma": 0.0}, "option sigma takes numbers from 1e-09 to 1000; got 0.0"),
         (2, {"population": 2}, "population takes 0 or at least 3; got 2"),
     ],
 )

@@ -1,0 +1,173 @@
+"""Values that end with a message: options every scene has, paths with markup, loops, bytes that are no text, depth."""
+
+import ast
+import os
+import re
+from collections.abc import Callable
+from inspect import signature
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from rich.progress import Progress
+
+import gradscape
+from gradscape import Environment
+from gradscape.cli import app
+from gradscape.envs.registry import make
+from gradscape.landscapes.files import make_folder, resolved
+from gradscape.terminal import Console, Described
+
+from .command import Said
+
+DEEP = "/".join(["d"] * 2000)
+HOSTILE = ["[/b]", "loop", "caf\udce9"]
+SOURCES = [*Path(gradscape.__path__[0]).glob("*.py"), *Path(gradscape.__path__[0]).glob("verbs/*.py")]
+BASE = """
+envs
+methods
+slice branin --dims 0 1 --resolution 3
+sweep ackley --dims 0 1 --over 2 --set dim=3 --frames 2 --resolution 3
+optimize branin --method random --budget 5
+race branin --methods random --budget 5 --seeds 2
+overlay cut run
+surface cut
+replay bounce --no-film
+export cut
+view cut
+bounce --axis y --resolution 3
+plan branin
+bench branin --batch 2 --seconds 0
+check branin --points 2
+tradeoff bounce --points 2 --ladder dt
+pairs ackley --samples 2 --top 3
+report cut --points 2
+gallery compute --only bounce --part reports
+gallery list
+gallery build
+gallery serve
+""".strip().splitlines()
+
+
+def leaves() -> dict[tuple[str, ...], Any]:
+    top = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    found = {(name,): command for name, command in top.items() if name not in ("gallery", "info")}
+    return found | {("gallery", name): command for name, command in top["gallery"].commands.items()}
+
+
+VERBS = leaves()
+WORDS = {verb: next(words for line in BASE if (words := line.split())[: len(verb)] == [*verb]) for verb in VERBS}
+PATHS = [  # of what a verb says that it is a file or a folder
+    pytest.param(verb, param, id=f"{' '.join(verb)} {param.name}")
+    for verb, command in VERBS.items()
+    for param in command.params
+    if param.type_descriptor.annotation in (str, list[str]) and re.search(r"(?i)file|folder", param.help or "")
+]
+
+
+@pytest.fixture
+def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a loop, where what is valid is stopped and not computed."""
+
+    def stopped(*given: object, **options: object) -> Any:
+        raise KeyboardInterrupt
+
+    for name in ("landscapes.job.Job.cost", "gallery.build.build_site"):
+        monkeypatch.setattr(f"gradscape.{name}", stopped)
+    monkeypatch.setattr(Environment, "evaluate", stopped)
+    (tmp_path / "loop").symlink_to("loop")
+    return tmp_path
+
+
+def _is_option(param: Any) -> bool:
+    return bool(param.opts[0].startswith("-"))
+
+
+def said_with(verb: tuple[str, ...], param: Any, value: str) -> list[str]:
+    """Return a verb's words with a value in the place of an option's or an argument's."""
+    words = list(WORDS[verb])
+    if _is_option(param):
+        return [*words, param.opts[0], value]
+    places = [other.name for other in VERBS[verb].params if not _is_option(other)]
+    at = len(verb) + places.index(param.name)
+    return [*words[:at], value, *words[at + 1 :]]
+
+
+@pytest.mark.parametrize(("verb", "param"), PATHS)
+def test_a_path_nobody_meant_ends_with_a_message(
+    run: Callable[..., Said], desk: Path, verb: tuple[str, ...], param: Any
+) -> None:
+    for value in HOSTILE:
+        done = run(*said_with(verb, param, value), cwd=desk)
+        assert done.returncode in (0, 1, 2, 130), done.stderr
+        assert done.returncode == 0 or done.stderr.strip()
+        assert "\\[" not in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("verb", [verb for verb in VERBS if any(p.opts == ["--set"] for p in VERBS[verb].params)])
+def test_an_option_of_a_scene_is_not_called_as_what_every_scene_has(
+    run: Callable[..., Said], desk: Path, verb: tuple[str, ...]
+) -> None:
+    """Whatever `make` and a scene's class take themselves, and are given by the verb's own options."""
+    for name in sorted({*signature(make).parameters, *signature(Environment.__init__).parameters}):
+        done = run(*WORDS[verb], "--set", f"{name}=1", cwd=desk)
+        assert done.returncode == 2
+        assert len(done.stderr.splitlines()) == 1
+        assert name in done.stderr
+    assert [one.name for one in desk.iterdir()] == ["loop"]
+
+
+def test_every_verb_is_tried() -> None:
+    assert len(VERBS) == len(BASE)
+    assert len(PATHS) > 25
+
+
+def test_what_is_said_of_a_name_is_the_name(run: Callable[..., Said], desk: Path) -> None:
+    for name, shown in (("[/b]", "[/b]"), (":warning:", ":warning:"), ("caf\udce9", "caf\\udce9")):
+        done = run("gallery", "list", "--data", name, cwd=desk)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert f"figures in {shown}" in done.stdout
+
+
+def test_a_console_prints_what_it_is_given(capsys: pytest.CaptureFixture[str]) -> None:
+    console = Console(width=80)
+    with console.status("[/b] :warning:") as status, Progress(Described(), console=console) as bar:
+        status.update("[/c]")
+        bar.add_task("[/d] :warning:")
+        console.print("[/e] :warning:")
+    said = capsys.readouterr().out
+    assert "[/e] :warning:" in said
+    assert "[/d] :warning:" in said
+
+
+def test_every_console_is_that_one() -> None:
+    """What rich prints by itself reads markup in it, so that all of ours go through one class."""
+    assert len(SOURCES) > 30
+    for file in SOURCES:
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ImportFrom) and file.name != "terminal.py":
+                assert node.module not in ("rich.console", "rich.markup", "rich.status"), file
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "TextColumn":
+                assert "{" not in str(getattr(node.args[0], "value", "")), file  # `Described` shows what is a value
+
+
+def test_a_folder_is_made_however_deep(tmp_path: Path) -> None:
+    deep = tmp_path / "/".join(["d"] * 1200)
+    make_folder(deep)
+    assert deep.is_dir()
+    make_folder(deep)
+
+
+def test_a_loop_of_links_is_no_path(desk: Path) -> None:
+    for path in (desk / "loop", desk / "loop/x"):
+        with pytest.raises(ValueError, match=r"loop.* leads in a circle, by symbolic links; give another path"):
+            resolved(path)
+    assert resolved(desk / "not/there") == Path(os.path.realpath(desk)) / "not/there"
+
+
+def test_a_path_too_long_for_the_system_ends_in_a_line(run: Callable[..., Said], desk: Path) -> None:
+    done = run("slice", "branin", "--dims", "0", "1", "--out", f"{DEEP}/{DEEP}", cwd=desk)
+    assert done.returncode == 1
+    assert len(done.stderr.splitlines()) == 1
+    assert "File name too long" in done.stderr
