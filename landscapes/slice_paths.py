@@ -37,3 +37,15 @@ def is_slice(path: Path) -> bool:
         return zarr.open_group(place_of(path), mode="r", use_consolidated=False).attrs.get("gradscape_slice") == FORMAT
     except Exception:  # whatever else is there is none
         return False
+
+
+def corner(array: Path, rank: int) -> tuple[int, ...]:
+    """Return how many tiles along each of so many axes there are files of, in an array's folder as zarr names them."""
+    rows, columns = _numbers(array / "c"), set[int]()
+    if rank == 2:
+        columns = columns.union(*(_numbers(array / "c" / str(row)) for row in rows))
+    return tuple(max(numbers, default=-1) + 1 for numbers in (rows, columns)[:rank])
+
+
+def _numbers(folder: Path) -> set[int]:
+    return {int(file.name) for file in folder.iterdir() if file.name.isdecimal()} if folder.exists() else set()
