@@ -43,7 +43,7 @@ def require(what: str, value: int, need: Callable[[int], Need], folder: Path | N
         middle = (fits + too_large) // 2
         fits, too_large = (middle, too_large) if _fits(need(middle), there) else (fits, middle)
     wanted, name = need(value), "memory" if need(value).memory > there.memory else "disk"
-    most = f"{what} {fits} would fit" if fits else f"not even {what} 1 would fit"
+    most = f"{what} {_rounded_down(fits)} would fit" if fits else f"not even {what} 1 would fit"
     raise TooLargeError(
         f"{what} {value} takes about {size(getattr(wanted, name))} of {name}, and {size(getattr(there, name))} are "
         f"free here; {most}"
@@ -69,6 +69,12 @@ def size(count: float) -> str:
     unit = next((at for at, _ in enumerate(UNITS) if count < 1000.0 ** (at + 2)), len(UNITS) - 1)
     amount = count / 1000.0 ** (unit + 1)
     return f"{amount:.0f} {UNITS[unit]}" if unit < 2 else f"{amount:.1f} {UNITS[unit]}"
+
+
+def _rounded_down(value: int) -> int:
+    """Return a value to two digits: more of it would be no truer."""
+    digit = 10 ** max(0, len(str(value)) - 2)
+    return value // digit * digit
 
 
 def _fits(wanted: Need, there: Need) -> bool:

@@ -49,12 +49,12 @@ def need_of(shape: tuple[int, ...], dim: int, *, grad: bool) -> Need:
     return Need(4.0 * (8 * points + array) + DRAWN * points, 2.0 * array + tiles * (2 + grad) * BLOCK)
 
 
-def refuse_too_large(plane: Plane, space: ParameterSpace, path: Path | None, *, grad: bool) -> None:
+def refuse_too_large(plane: Plane, path: Path | None, *, grad: bool) -> None:
     """Refuse a slice that is larger than this machine, in memory alone where there is no path."""
     most = max(plane.resolution)
 
     def need(side: int) -> Need:
-        return need_of(tuple(-(-points * side // most) for points in plane.resolution), space.dim, grad=grad)
+        return need_of(tuple(-(-points * side // most) for points in plane.resolution), plane.dim, grad=grad)
 
     require("resolution", most, need, path)
 

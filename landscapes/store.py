@@ -101,7 +101,7 @@ class SliceStore:
                 raise StoreExistsError(f"{path} exists already; write elsewhere with --out, or replace it with --force")
             if taken.exists() and not is_slice(taken):
                 raise StoreError(f"{taken} is no slice store, so it is not replaced; move it away or write elsewhere")
-        refuse_too_large(plane, space, path, grad=grad)
+        refuse_too_large(plane, path, grad=grad)
         try:
             with placing(filling(path), overwrite=overwrite) as new:
                 group = zarr.create_group(new, zarr_format=3)
@@ -165,7 +165,7 @@ class SliceStore:
         grad: bool = True,
     ) -> SliceStore:
         """Make a store that lives as long as the object."""
-        refuse_too_large(plane, space, None, grad=grad)
+        refuse_too_large(plane, None, grad=grad)
         group = zarr.create_group(MemoryStore(), zarr_format=3)
         whole = full_identity(identity or {}, plane, space, grad=grad)
         lay_out(group, plane, space, whole, plain_json(provenance or {}, "a slice's provenance"), grad=grad)
