@@ -100,16 +100,17 @@ class Job:
 
     def run(self, progress: Callable[[Progress], None], *, command: str) -> dict[str, Any]:
         """Sample what is missing, draw each finer picture as it completes, write and return the summary."""
-        start, due = time.monotonic(), 0.0
+        start, drawn, pause = time.monotonic(), -PAUSE, PAUSE
         last: Progress | None = None
 
         def follow(now: Progress) -> None:
-            nonlocal due, last
+            nonlocal drawn, pause, last
             last = now
             progress(now)
-            if now.level_complete and now.done < now.total and (began := time.monotonic()) > due:
+            if now.level_complete and now.done < now.total and (began := time.monotonic()) - drawn > pause:
                 self.picture()
-                due = time.monotonic() + pause_after(time.monotonic() - began)
+                drawn = time.monotonic()
+                pause = pause_after(drawn - began)
 
         how: dict[str, Any] = {"grad": self.store.grad, "executor": self.executor, "made": self.made}
         dataset = sample(self.objective, self.plane, self.store, progress=follow, **how)
