@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..landscapes.capacity import Need, require
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.plane import Plane
 from ..landscapes.sampling import sample
@@ -73,6 +74,8 @@ def bench(
     envs, starts = _started(make, engine, against, follow)
     env = envs[engine]
     rates = []
+    for batch in batches:
+        require("batch", batch, partial(_need, env))
     for batch in batches or sorted({1, env.preferred_batch}):
         follow(f"timing batches of {batch}")
         rates += _rates(envs, _points(env, batch), seconds)
@@ -90,6 +93,11 @@ def bench(
         "kernels": kernels,
         "sampler": _sampler(env, quickest * seconds / 2),
     }
+
+
+def _need(env: Environment, batch: int) -> Need:
+    """Return what a batch takes: its points and gradients, some copies of them, and the episodes that run at once."""
+    return Need(8.0 * 8 * batch * env.space.dim + env.memory() * min(batch, env._share(batch) * env.threads))
 
 
 def _ratio(rates: Sequence[Mapping[str, Any]], way: str) -> float | None:

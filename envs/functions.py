@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import torch
@@ -20,7 +20,7 @@ from .options import NoOptions
 class AnyDimension:
     """`dim`: how many variables the function takes."""
 
-    dim: int = 2
+    dim: int = field(default=2, metadata={"most": 100_000})  # many more, and lists of their names alone fill memory
 
 
 class Function(Environment):
@@ -54,6 +54,10 @@ class Function(Environment):
     def minimizers(self) -> Float[Tensor, "count dim"]:
         """Where it is attained."""
         return torch.as_tensor(self.function.optimizers, dtype=torch.float64)
+
+    def memory(self) -> int:
+        """Estimate the bytes of one row: what torch keeps of it to differentiate, and its numbers."""
+        return 18_000 + 80 * self.space.dim
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         x = x.clone().requires_grad_(grad)

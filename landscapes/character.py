@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from . import gradients, verdict
+from .capacity import Need
 from .estimate import plain
 from .jumps import Count, Jumps, find_jumps
 from .noise import Noise, noise
@@ -22,6 +23,7 @@ from .store import plane_of
 from .verdict import Verdict, judge
 
 NOISE_POINTS, REPEATS, PAIRS = 16, 4, 12
+SECONDS, BYTES = (1.0, 4e-5), (80_000_000, 300)  # that a slice takes, and each of its samples (2026-11, one core)
 PAIRS_PER_POINT = 8  # steep pairs of samples that are looked into, for each point of a side of the subgrid
 
 
@@ -64,6 +66,16 @@ def effort(rank: int, points: int) -> tuple[int, int]:
     losses = NOISE_POINTS * (2 + 2 * REPEATS) + PAIRS_PER_POINT * points * 14
     losses += places * rank * 2 * len(gradients.SCALES)
     return losses, places * (1 + 2 * PAIRS * len(gradients.WIDTHS))
+
+
+def need_of(rank: int, dim: int, points: int) -> Need:
+    """Return what the points and gradients of `characterise` take, some copies of them included."""
+    return Need(8.0 * (4 * rank + 6 * dim) * 2 * PAIRS * float(points) ** 2)
+
+
+def own_cost(samples: int) -> tuple[float, int]:
+    """Return about how many seconds and bytes `characterise` takes itself for a slice of so many samples."""
+    return SECONDS[0] + SECONDS[1] * samples, BYTES[0] + BYTES[1] * samples
 
 
 def characterise(

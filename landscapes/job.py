@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import resource
 import sys
 import time
@@ -23,6 +22,7 @@ from .halving import Halving
 from .objective import Objective, Status
 from .plane import Plane
 from .sampling import Progress, sample
+from .slice_arrays import need_of
 from .slice_paths import SLICE, there
 from .spread import RemoteSite, Site, results, workers_of
 from .store import SliceStore, plane_of
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STORE, PICTURE, SUMMARY = SLICE, "landscape.png", "summary.json"
-PAUSE = 10.0  # least seconds between two pictures of an unfinished slice
+PAUSE, DRAWING = 10.0, 0.1  # between pictures of an unfinished slice: least seconds, and most of the time for them
 PATIENCE, FIRST_PATIENCE = 1.0, 10.0  # seconds that do for an estimate, and those that a first evaluation is given
 
 
@@ -100,16 +100,17 @@ class Job:
 
     def run(self, progress: Callable[[Progress], None], *, command: str) -> dict[str, Any]:
         """Sample what is missing, draw each finer picture as it completes, write and return the summary."""
-        start, drawn = time.monotonic(), -PAUSE
+        start, drawn, pause = time.monotonic(), -PAUSE, PAUSE
         last: Progress | None = None
 
         def follow(now: Progress) -> None:
-            nonlocal drawn, last
+            nonlocal drawn, pause, last
             last = now
             progress(now)
-            if now.level_complete and now.done < now.total and time.monotonic() - drawn > PAUSE:
+            if now.level_complete and now.done < now.total and (began := time.monotonic()) - drawn > pause:
                 self.picture()
                 drawn = time.monotonic()
+                pause = pause_after(drawn - began)
 
         how: dict[str, Any] = {"grad": self.store.grad, "executor": self.executor, "made": self.made}
         dataset = sample(self.objective, self.plane, self.store, progress=follow, **how)
@@ -164,6 +165,11 @@ class Job:
         }
 
 
+def pause_after(seconds: float) -> float:
+    """Return how long no picture of an unfinished slice follows one that took so many seconds."""
+    return max(PAUSE, seconds / DRAWING)
+
+
 def cost_of(objective: Objective, store: SliceStore) -> Cost:
     """Estimate what is left of a slice from its own first points, evaluated as they will be; that takes seconds."""
     pending = store.pending()
@@ -173,8 +179,8 @@ def cost_of(objective: Objective, store: SliceStore) -> Cost:
     getattr(objective, "prepare", lambda: None)()
     batch = first_points(store, pending, getattr(objective, "preferred_batch", 1))
     seconds = left * _seconds_per_point(objective, batch, grad=store.grad)
-    arrays = 8 * math.prod(store.shape) * (2 + store.plane.dim * store.grad)
-    return Cost(left, seconds, peak_memory() + arrays)
+    arrays = need_of(store.shape, store.plane.dim, grad=store.grad)
+    return Cost(left, seconds, peak_memory() + round(arrays.memory))
 
 
 def _cost_there(site: Site | RemoteSite) -> Cost:

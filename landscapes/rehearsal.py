@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from .job import PAUSE, first_points
+from .job import first_points, pause_after
 from .objective import Evaluation, Objective
 from .sampling import Progress, sample
 from .slice_arrays import write_finished
@@ -161,10 +161,9 @@ def drawn(draw: Callable[[], object], alike: Alike | None = None) -> tuple[float
     return max(0.0, took[0] - took[1]), took[1]
 
 
-def pictures(store: SliceStore, batches: int, seconds: float, once: float) -> int:
-    """Return how often `Job.run` should draw: at the end, and a coarse picture now and then before."""
-    levels = store.tiles()[-1].level
-    return 1 + min(levels, batches, 1 + int(seconds / (PAUSE + once)))
+def pictures(levels: int, batches: int, seconds: float, once: float) -> int:
+    """Return how often `Job.run` should draw: at the end, and of so many coarse pictures before some now and then."""
+    return 1 + min(levels, batches, 1 + int(seconds / (pause_after(once) + once)))
 
 
 def room_of(path: Path) -> Room:

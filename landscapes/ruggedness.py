@@ -15,6 +15,7 @@ import numpy as np
 import torch
 import xarray as xr
 from numpy.typing import NDArray
+from scipy import fft
 from scipy.spatial.distance import pdist
 
 from .estimate import Estimate, Values, jackknife, plain
@@ -24,6 +25,7 @@ FLAT = 1e-3  # a slope is effectively zero that would change the loss by less, a
 NOTABLE = 0.01  # the least depth of a notable minimum, as a fraction of the range
 THRESHOLDS = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)  # depths that minima are counted by, as fractions of the range
 BEST = 0.05  # share of the samples that dispersion calls the best
+PAIRED = 4096  # most samples whose pairs are gone through one by one, 8 million of them
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,7 @@ def information_content(loss: Values) -> tuple[float, float]:
     """
     walks = [_slopes(loss, axis) for axis in range(loss.ndim)]
     sizes = np.concatenate([[0.0], np.logspace(-6.05, 3.95, 101)])  # none is 1, the slope of every ramp
-    entropy = np.array([_entropy(walks, size) for size in sizes])
+    entropy = np.array([_entropy(counts) for counts in _pair_counts(walks, sizes)])
     if not np.isfinite(entropy).any():
         return math.nan, math.nan
     settled = sizes[(entropy < 0.05) & (sizes > 0)]
@@ -164,14 +166,33 @@ def dispersion(loss: Values) -> float:
 
     Lunacek & Whitley 2006, GECCO, as a ratio of mean distances.
     """
-    places, losses = _places(loss)
+    places, losses = np.argwhere(np.isfinite(loss)), loss[np.isfinite(loss)]
+    if len(losses) <= 2:
+        return math.nan
     best = places[np.argsort(losses, kind="stable")[: max(2, round(BEST * len(losses)))]]
-    return float(pdist(best).mean() / pdist(places).mean()) if len(losses) > 2 else math.nan
+    return mean_distance(best, loss.shape) / mean_distance(places, loss.shape)
+
+
+def mean_distance(places: NDArray[np.intp], shape: tuple[int, ...]) -> float:
+    """Return the mean distance of all pairs of samples of a slice of this shape, shape (count, rank).
+
+    Of many there are more pairs than memory holds, but few steps that samples can be apart: how many pairs are each is
+    the autocorrelation of where the samples are, by the Fourier transform, rounded to the whole numbers it is made of.
+    """
+    if len(places) <= PAIRED:
+        return float(pdist(places / _sides(shape)).mean())
+    there = np.zeros(shape)
+    there[tuple(places.T)] = 1.0
+    padded = [fft.next_fast_len(2 * points - 1, real=True) for points in shape]  # so that no end meets the other
+    pairs = np.rint(fft.irfftn(np.abs(fft.rfftn(there, padded)) ** 2, padded))
+    steps = [np.minimum(np.arange(size), size - np.arange(size)) for size in padded]
+    squares = np.ix_(*[(step / side) ** 2 for step, side in zip(steps, _sides(shape), strict=True)])
+    return float((pairs * np.sqrt(sum(squares))).sum() / (len(places) * (len(places) - 1)))
 
 
 def fitness_distance(loss: Values) -> float:
     """Return the correlation of losses with the distance to the lowest sample (Jones & Forrest 1995)."""
-    places, losses = _places(loss)
+    places, losses = np.argwhere(np.isfinite(loss)) / _sides(loss.shape), loss[np.isfinite(loss)]
     if len(losses) < 3 or losses.min() == losses.max():
         return math.nan
     return float(np.corrcoef(losses, np.linalg.norm(places - places[losses.argmin()], axis=1))[0, 1])
@@ -279,25 +300,39 @@ def _slopes(loss: Values, axis: int) -> Values:
     return slopes / whole if whole > 0 else slopes
 
 
-def _entropy(walks: list[Values], size: float) -> float:
-    """Return Munoz et al. 2015, eq. 7: the entropy of pairs of steps that differ, to base 6."""
-    counts = np.zeros(9)
+def _pair_counts(walks: list[Values], sizes: Values) -> Values:
+    """Count pairs of successive steps by their symbols at each of ascending sizes, shape (size, symbol, symbol).
+
+    A step's symbol is its sign, but 0 at every size that it does not exceed (Munoz et al. 2015, eq. 6). One pass over
+    the steps does for all sizes: a pair is counted from the size on where one of its symbols becomes 0.
+    """
+    counts = np.zeros((len(sizes) + 1) * 9)
     for walk in walks:
-        symbol = np.where(np.abs(walk) <= size, 0.0, np.sign(walk))  # NaN stays
-        both = np.isfinite(walk[:, :-1]) & np.isfinite(walk[:, 1:])
-        pairs = 3 * (symbol[:, :-1] + 1) + symbol[:, 1:] + 1
-        counts += np.bincount(pairs[both].astype(int), minlength=9)
+        known = np.isfinite(walk[:, :-1]) & np.isfinite(walk[:, 1:])
+        steps = walk[:, :-1][known], walk[:, 1:][known]
+        first, second = (np.searchsorted(sizes, np.abs(step)) for step in steps)  # the symbols are 0 from there on
+        both = [np.sign(step).astype(int) for step in steps]
+        sooner, later = np.minimum(first, second), np.maximum(first, second)
+        one, none = [both[0] * (first == later), both[1] * (second == later)], [0, 0]
+        for start, end, symbols in ((0, sooner, both), (sooner, later, one), (later, len(sizes), none)):
+            for at, change in ((start, 1), (end, -1)):
+                place = np.broadcast_to(9 * at + 3 * (symbols[0] + 1) + symbols[1] + 1, later.shape)
+                counts += change * np.bincount(place, minlength=counts.size)
+    return counts.reshape(-1, 3, 3).cumsum(axis=0)[:-1]
+
+
+def _entropy(counts: Values) -> float:
+    """Return Munoz et al. 2015, eq. 7: the entropy of pairs of steps that differ, to base 6."""
     if not counts.sum():
         return math.nan
-    shares = counts.reshape(3, 3)[~np.eye(3, dtype=bool)] / counts.sum()
+    shares = counts[~np.eye(3, dtype=bool)] / counts.sum()
     shares = shares[shares > 0]
     return float(-(shares * np.log(shares)).sum() / math.log(6))
 
 
-def _places(loss: Values) -> tuple[Values, Values]:
-    known = np.isfinite(loss)
-    sides = np.array([max(size - 1, 1) for size in loss.shape])
-    return np.argwhere(known) / sides, loss[known]
+def _sides(shape: tuple[int, ...]) -> NDArray[np.intp]:
+    """Return how many steps between samples make each side of the box."""
+    return np.array([max(points - 1, 1) for points in shape])
 
 
 def _plain(value: Any) -> Any:

@@ -70,25 +70,27 @@ def sample(
     status = store.status()
     counts: Counter[Status] = Counter({kind: int((status == kind).sum()) for kind in Status if kind != Status.MISSING})
     resumed, pending = counts.total(), store.pending(status)
-    levels = _levels(store, pending)
+    left = Counter(tile.level for tile in pending)  # tiles, by level
+    whole = 1 + store.tiles()[-1].level
+    levels = min(left, default=whole)
     _warn_of_damage(store, pending)
 
-    def report(left: Sequence[Tile]) -> None:
+    def report() -> None:
         nonlocal levels
-        before, levels = levels, _levels(store, left)
+        before, levels = levels, min(left, default=whole)
         if progress is not None:
             progress(Progress(counts.total(), status.size, resumed, dict(counts), levels, levels > before))
 
-    report(pending)
-    left, back = list(pending), ReadBack(store)
+    report()
+    back = ReadBack(store)
     site = Site(Halving(objective), store, made)
     with _resumable(store, counts), closing(_filled(site, pending, batch, executor)) as tiles:
         for filled in tiles:
             for note in filled.notes:
                 warnings.warn(note, RuntimeWarning, stacklevel=2)
             counts.update(filled.statuses)
-            left.remove(filled.tile)
-            report(left)
+            left -= Counter([filled.tile.level])  # none is kept at zero
+            report()
             if executor is not None:
                 back.look(filled.tile)
         dataset = store.dataset(back.values())
@@ -135,10 +137,6 @@ def _resumable(store: SliceStore, counts: Counter[Status]) -> Iterator[None]:
 def _check_store(store: SliceStore, objective: Objective, plane: Plane, *, grad: bool) -> None:
     wanted = {"plane": plane.record(), "parameters": list(objective.space.names), "gradients": grad}
     check_identity(store.path, wanted=wanted, found={name: store.identity[name] for name in wanted})
-
-
-def _levels(store: SliceStore, pending: Sequence[Tile]) -> int:
-    return pending[0].level if pending else 1 + store.tiles()[-1].level
 
 
 def _batches(store: SliceStore, batch: int, pending: set[Tile]) -> Iterator[list[Tile]]:

@@ -13,6 +13,7 @@ import xarray as xr
 import zarr
 from numpy.typing import NDArray
 
+from .capacity import BLOCK, Need, require
 from .identity import stored_identity
 from .integrity import tile_sum
 from .layout import CODECS, SMALL, analysis_chunks, consolidate, create_array, flags
@@ -27,6 +28,7 @@ AXES = ("u", "v")
 SUMS = "checksum"
 CF = "CF-1.11"
 FILES = store_files(("loss", "grad", "status", SUMS, *AXES, "dim", "unit"))  # of a slice on disk
+DRAWN = 150  # bytes that a picture takes for each sample
 COORDINATES = {"coordinates": "unit"}  # tells xarray that it is no variable
 
 
@@ -37,6 +39,28 @@ def axes_of(plane: Plane, parameters: list[str], units: list[str], *, ascending:
         values = axis.numpy()
         found[name] = values if ascending else values[coarse_to_fine(len(values), tile_side(len(values)))]
     return found | {"dim": np.array(parameters, dtype=object), "unit": np.array(units, dtype=object)}
+
+
+def need_of(shape: tuple[int, ...], dim: int, *, grad: bool) -> Need:
+    """Return what sampling a slice takes, at most: in memory beside what the process holds, and on the disk.
+
+    In memory there are four copies of the arrays when it is finished and sorted, and what a picture takes. On the disk
+    there are the files of the tiles, and for a moment the finished slice beside them.
+    """
+    points, depth = math.prod(shape), dim if grad else 0
+    tiles = math.prod(-(-side // tile_side(side)) for side in shape)
+    array = points * (9 + 8 * depth)
+    return Need(4.0 * (8 * points + array) + DRAWN * points, 2.0 * array + tiles * (2 + grad) * BLOCK)
+
+
+def refuse_too_large(plane: Plane, path: Path | None, *, grad: bool) -> None:
+    """Refuse a slice that is larger than this machine, in memory alone where there is no path."""
+    most = max(plane.resolution)
+
+    def need(side: int) -> Need:
+        return need_of(tuple(-(-points * side // most) for points in plane.resolution), plane.dim, grad=grad)
+
+    require("resolution", most, need, path)
 
 
 def lay_out(

@@ -47,3 +47,15 @@ def check_replaceable(store: Path) -> None:
     if not is_slice(store) and not lost_root(store, FILES):
         raise StoreError(f"{store} is no slice store, so it is not replaced; move it away or write elsewhere")
     check_ours(store, FILES, "a slice")
+
+
+def corner(array: Path, rank: int) -> tuple[int, ...]:
+    """Return how many tiles along each of so many axes there are files of, in an array's folder as zarr names them."""
+    rows, columns = _numbers(array / "c"), set[int]()
+    if rank == 2:
+        columns = columns.union(*(_numbers(array / "c" / str(row)) for row in rows))
+    return tuple(max(numbers, default=-1) + 1 for numbers in (rows, columns)[:rank])
+
+
+def _numbers(folder: Path) -> set[int]:
+    return {int(file.name) for file in folder.iterdir() if file.name.isdecimal()} if folder.exists() else set()

@@ -40,9 +40,9 @@ from .layout import consolidate, open_group
 from .objective import Evaluation, Status
 from .ownership import lost_root, remove
 from .plane import Plane
-from .slice_arrays import AXES, FILES, FORMAT, SUMS, attributes_of, axes_of, lay_out, write_finished
+from .slice_arrays import AXES, FILES, FORMAT, SUMS, attributes_of, axes_of, lay_out, refuse_too_large, write_finished
 from .slice_arrays import plane_of as plane_of
-from .slice_paths import SLICE, check_replaceable, filling, finished, place_of, there
+from .slice_paths import SLICE, check_replaceable, corner, filling, finished, place_of, there
 from .slice_paths import is_slice as is_slice
 from .space import ParameterSpace
 from .tiling import Tile
@@ -105,6 +105,7 @@ class SliceStore:
                 raise StoreExistsError(f"{path} exists already; write elsewhere with --out, or replace it with --force")
             if taken.exists():
                 check_replaceable(taken)
+        refuse_too_large(plane, path, grad=grad)
         try:
             with placing(filling(path), overwrite=overwrite) as new:
                 group = zarr.create_group(new, zarr_format=3)
@@ -171,6 +172,7 @@ class SliceStore:
         grad: bool = True,
     ) -> SliceStore:
         """Make a store that lives as long as the object."""
+        refuse_too_large(plane, None, grad=grad)
         group = zarr.create_group(MemoryStore(), zarr_format=3)
         whole = full_identity(identity or {}, plane, space, grad=grad)
         lay_out(group, plane, space, whole, plain_json(provenance or {}, "a slice's provenance"), grad=grad)
@@ -208,7 +210,8 @@ class SliceStore:
         A tile that another process has finished in the meantime is none of them.
         """
         try:
-            status = np.asarray(self._values["status"][:])
+            status, begun = np.zeros(self.shape, np.int8), self._begun(self._whole())
+            status[begun] = self._values["status"][begun]
             written = [tile for tile in pending if status[self._place(tile)].any()]
         except Exception:  # as in `_read`
             written = [tile for tile in pending if self._has_status(tile)]
@@ -379,10 +382,19 @@ class SliceStore:
 
     def _stored(self, box: tuple[slice, ...]) -> dict[str, NDArray[Any]]:
         """Read a box of every array; where its status says that nothing is there, nothing else is looked for."""
-        status = np.asarray(self._values["status"][box])
-        if not status.any():
-            return self._blank(box)
-        return {name: status if name == "status" else np.asarray(array[box]) for name, array in self._values.items()}
+        values, begun = self._blank(box), self._begun(box)
+        values["status"][begun] = self._values["status"][begun]
+        for name, array in self._values.items() if values["status"].any() else ():
+            if name != "status":
+                values[name][begun] = array[begun]
+        return values
+
+    def _begun(self, box: tuple[slice, ...]) -> tuple[slice, ...]:
+        """Return the corner of a box beyond which no tile is: looking for each of many files takes long."""
+        if self.place is None or self.ascending or box != self._whole():
+            return box
+        tiles = corner(self.place / "status", len(box))
+        return tuple(slice(min(n * side, at.stop)) for n, side, at in zip(tiles, self.side, box, strict=True))
 
     def _blank(self, box: tuple[slice, ...]) -> dict[str, NDArray[Any]]:
         shape = tuple(len(range(points)[at]) for at, points in zip(box, self.shape, strict=True))

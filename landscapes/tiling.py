@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from heapq import heappop, heappush
 from itertools import pairwise
 
 
@@ -30,14 +31,29 @@ def coarse_to_fine(points: int, side: int) -> list[int]:
     next ones the place in the cell that is farthest (cyclically) from those taken.
     """
     edges = [cell * points // side for cell in range(side + 1)]
-    cells = [[low + offset for offset in _offsets(high - low)] for low, high in pairwise(edges)]
+    orders = {width: _offsets(width) for width in {high - low for low, high in pairwise(edges)}}
+    cells = [[low + offset for offset in orders[high - low]] for low, high in pairwise(edges)]
     return [cell[turn] for turn in range(len(max(cells, key=len))) for cell in cells if turn < len(cell)]
 
 
 def _offsets(size: int) -> list[int]:
+    """Order the places of a cell: its middle, then always the first of those farthest from all before, cyclically.
+
+    Between two that are taken the farthest is halfway, so that gaps wait in a heap, the widest first.
+    """
     taken = [size // 2]
-    away = [min((at - taken[0]) % size, (taken[0] - at) % size) for at in range(size)]
+    gaps = [_halfway(taken[0], size, size)]
     while len(taken) < size:
-        taken.append(away.index(max(away)))
-        away = [min(far, (at - taken[-1]) % size, (taken[-1] - at) % size) for at, far in enumerate(away)]
+        _, at, start, width = heappop(gaps)
+        taken.append(at)
+        before = (at - start) % size
+        for low, between in ((start, before), (at, width - before)):
+            if between > 1:
+                heappush(gaps, _halfway(low, between, size))
     return taken
+
+
+def _halfway(start: int, width: int, size: int) -> tuple[int, int, int, int]:
+    """Return a gap between taken places of a cycle as the heap sorts it: how far its middle is, and where that is."""
+    middles = ((start + width // 2) % size, (start + width - width // 2) % size)  # of an odd gap there are two
+    return -(width // 2), min(middles), start, width

@@ -14,6 +14,7 @@ import gradscape
 from gradscape.envs.base import Environment
 from gradscape.landscapes.draw import page, sweep
 from gradscape.landscapes.rehearsal import Alike, drawn, pictures, room_of
+from gradscape.landscapes.slice_arrays import need_of
 from gradscape.landscapes.store import SliceStore
 
 from .clock import Clock
@@ -91,7 +92,7 @@ def test_a_plan_needs_the_memory_that_is_held_and_that_of_the_slice_to_come(
 ) -> None:
     monkeypatch.setattr("gradscape.landscapes.job.peak_memory", lambda: 10**9)
     planned = plan(run, tmp_path, "cartpole", "--dims", "0", "1", "--resolution", "16")
-    assert planned["memory"] == {"host": 10**9 + 8 * 16**2 * (2 + 400), "device": 0}  # loss, status, gradient
+    assert planned["memory"] == {"host": 10**9 + need_of((16, 16), 400, grad=True).memory, "device": 0}
 
 
 def test_what_a_first_drawing_loads_is_paid_once_and_what_is_made_up_to_draw_never(clock: Clock) -> None:
@@ -108,7 +109,7 @@ def test_pictures_come_with_finer_levels_batches_and_a_pause_between_them() -> N
     space = gradscape.ParameterSpace.box(["a", "b"], -1.0, 1.0)
     store = SliceStore.in_memory(gradscape.Plane.through(space, space.center, ("a", "b"), resolution=64), space)
     most = 1 + store.tiles()[-1].level
-    assert [pictures(store, *now) for now in ((99, 1e6, 1.0), (99, 0.0, 1.0), (99, 44.0, 1.0), (3, 44.0, 1.0))] == [
+    assert [pictures(most - 1, *now) for now in ((99, 1e6, 1.0), (99, 0.0, 1.0), (99, 44.0, 1.0), (3, 44.0, 1.0))] == [
         most, 2, 6, 4
     ]  # fmt: skip
 

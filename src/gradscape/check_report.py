@@ -19,6 +19,7 @@ from rich.text import Text
 
 from .console import duration, read_settings
 from .envs.registry import make
+from .landscapes.capacity import Need, require
 from .tables import table
 from .terminal import Console
 
@@ -56,6 +57,7 @@ def check(
     aside, options = Console(stderr=True, soft_wrap=True, highlight=False), read_settings(settings)
     console = aside if as_json else Console(soft_wrap=True, highlight=False)
     scene = Scene(name, make(name, fidelity=fidelity, device=device, engine=engine, **options), options)
+    require("points", points, partial(_need, scene.env.space.dim))
     found: list[Finding] = []
     try:
         with aside.status(f"{name}: preparing (kernels are compiled once, then kept)") as status:
@@ -102,6 +104,13 @@ def _findings(scene: Scene, points: int, seed: int, follow: Callable[[str], None
         expected=EXPECTED.get(scene.name, {}).get(scene.env.fidelity.name),
         follow=follow,
     )
+
+
+def _need(dim: int, points: int) -> Need:
+    """Return what the points and gradients of all checks take, a copy of each included."""
+    from .landscapes.conformance import episodes
+
+    return Need(4.0 * 8 * dim * sum(episodes(dim, points)))
 
 
 def _announcement(env: Environment, points: int) -> str:

@@ -27,6 +27,7 @@ from rich.progress import (
 
 from . import __version__
 from .envs.registry import completed, entries, make
+from .landscapes.capacity import size as size
 from .tables import table
 from .terminal import Console, Described
 
@@ -309,10 +310,3 @@ def duration(seconds: float) -> str:
     if seconds < 90:
         return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-
-
-def size(count: float) -> str:
-    """Return a number of bytes in words."""
-    if count < 1e6:
-        return f"{count / 1e3:.0f} kB"
-    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"

@@ -22,6 +22,7 @@ from .gallery.figures import Figure, chosen, data_folder, read_figures
 from .gallery_episodes import Episodes
 from .gallery_measures import Reports, Tradeoffs
 from .gallery_parts import Part, Searches, Slice, State, Sweep
+from .landscapes.capacity import require
 from .landscapes.disk import full, is_full, until_full
 from .landscapes.files import tidy
 from .landscapes.loopback import LoopbackHandler, LoopbackServer
@@ -53,8 +54,13 @@ def compute(
     if unknown := set(parts) - set(PARTS):
         raise ValueError(f"--part takes {', '.join(PARTS)}; got {', '.join(sorted(unknown))}")
     _refuse_missing(device)
+    from .landscapes.slice_arrays import need_of
+
     console, root = Console(stderr=True, soft_wrap=True, highlight=False), data_folder(data)
     figures = [_changed(figure, fidelity, resolution) for figure in chosen(read_figures(), only)]
+    if resolution:
+        rank = max(len(figure.dims) for figure in figures)
+        require("resolution", resolution, lambda points: need_of((points,) * rank, rank, grad=True), root)
     failed: set[str] = set()
     with workers(scheduler, device) as executor:
         for name, kind in PARTS.items():  # slices first: the others are made of them

@@ -20,6 +20,7 @@ from .console import duration, fill, size
 from .envs.registry import environment_class, make
 from .gallery.figures import data_folder, read_figures
 from .kept_reports import REPORT, TABLE, check_summary, read_report, verdict_lines
+from .landscapes.capacity import Need, require
 from .landscapes.disk import full, is_full
 from .landscapes.files import make_folder, others, replacing, tidy, write_json
 from .landscapes.identity import stored_identity
@@ -73,7 +74,7 @@ def report(
     if (what is None) != everything:
         raise ValueError("report takes a slice's folder, an environment, or --all for every figure of the gallery")
     root = data_folder(data)
-    subjects = _all(root) if what is None else _subjects(console, what, root, fidelity, device)
+    subjects = _all(root) if what is None else _subjects(console, what, root, fidelity, device, points)
     settings = {"points": points, "seed": seed}
     folder = Path(out) if out else Path("out") / _folder_name(what or "all", subjects, settings)
     single = len(subjects) == 1 and what is not None
@@ -106,7 +107,7 @@ def _all(root: Path) -> list[Subject]:
     return there
 
 
-def _subjects(console: Console, what: str, root: Path, fidelity: str | None, device: str) -> list[Subject]:
+def _subjects(console: Console, what: str, root: Path, fidelity: str | None, device: str, points: int) -> list[Subject]:
     """Return a slice, or an environment's figures, or a slice sampled now for want of any."""
     path = Path(what)
     if path.exists():
@@ -120,6 +121,7 @@ def _subjects(console: Console, what: str, root: Path, fidelity: str | None, dev
     from .landscapes.plane import Plane
 
     plane = Plane.through(env.space, env.space.center, list(range(min(2, env.space.dim))), resolution=RESOLUTION)
+    refuse_too_many(points, plane.rank, env.space.dim)
     sampled, _ = fill(console, env, plane)
     return [Subject(sampled.name, sampled / SLICE)]
 
@@ -185,6 +187,7 @@ def measured(
 
     One that is to be `drawn` is not taken from beside the slice without what it is drawn from.
     """
+    from .landscapes.character import own_cost
     from .landscapes.store import open_slice
 
     dataset = open_slice(subject.store)
@@ -196,6 +199,8 @@ def measured(
         _fetch(console, subject.store.parent, folder, key)
     if (folder / REPORT).exists():
         return _kept(console, folder, key, env.device)
+    refuse_too_many(settings["points"], dataset["loss"].ndim, env.space.dim)
+    require("number of samples", dataset["loss"].size, lambda count: Need(own_cost(count)[1]))
     _warn(console, subject, dataset, env)
     start = time.monotonic()
     character = _character(console, env, dataset, settings)
@@ -255,17 +260,17 @@ def _character(console: Console, env: Environment, dataset: xr.Dataset, settings
     from .landscapes.adapters import within_box
     from .landscapes.character import characterise, effort
 
-    losses, gradients = effort(dataset["loss"].ndim, settings["points"])
-    _announce(console, env, losses, gradients)
+    total = sum(effort(dataset["loss"].ndim, settings["points"]))
+    _announce(console, env, dataset, settings["points"])
     columns = (Described(), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     objective = within_box(env) if stored_identity(dataset).get("boxed") else env
     with Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=console) as bar:
-        task = bar.add_task("episodes", total=losses + gradients)
+        task = bar.add_task("episodes", total=total)
         counted = _Counted(objective, env.preferred_batch, lambda rows: bar.advance(task, rows))
         found = characterise(
             counted, dataset, rounding=PRECISION[env.fidelity.precision], events=env.events, **settings
         )
-        bar.update(task, completed=losses + gradients)
+        bar.update(task, completed=total)
     return found
 
 
@@ -293,14 +298,31 @@ class _Counted:
         return Evaluation(torch.cat([p.loss for p in parts]), slopes, torch.cat([p.status for p in parts]))
 
 
-def _announce(console: Console, env: Environment, losses: int, gradients: int) -> None:
+def refuse_too_many(points: int, rank: int, dim: int) -> None:
+    """Refuse more points along each axis than this machine has memory for."""
+    from .landscapes.character import need_of
+
+    require("points", points, lambda count: need_of(rank, dim, count))
+
+
+def _announce(console: Console, env: Environment, dataset: xr.Dataset, points: int) -> None:
+    """Say what a report takes: its episodes, and what is measured of the slice itself."""
+    from .landscapes.character import effort, need_of, own_cost
+    from .landscapes.job import peak_memory
+
+    rank = dataset["loss"].ndim
+    losses, gradients = effort(rank, points)
+    own_seconds, own_bytes = own_cost(dataset["loss"].size)
     with console.status(f"{env.name}: preparing (kernels are compiled once, then kept)"):
         env.prepare()
         seconds = seconds_of(env, losses, gradients)
-    memory = f", {size(env.memory() * env.preferred_batch)} of memory" if env.memory() else ""
+    episodes = env.memory() * env.preferred_batch
+    device = f", {size(episodes)} of the GPU's" if env.device == "cuda" else ""
+    memory = peak_memory() + own_bytes + need_of(rank, env.space.dim, points).memory + (0 if device else episodes)
     console.print(
         f"{env.name} · {env.fidelity.name} · {env.device}: up to {losses} episodes and {gradients} with gradients: "
-        f"about {duration(seconds)}{memory}",
+        f"about {duration(seconds)}, and {duration(own_seconds)} to measure {dataset['loss'].size} samples; "
+        f"{size(memory)} of memory{device}",
         markup=False,
     )
 

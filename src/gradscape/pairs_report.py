@@ -15,6 +15,7 @@ from rich.box import SIMPLE
 
 from .console import duration, provenance_of, read_settings
 from .envs.registry import make
+from .landscapes.capacity import Need, require
 from .search_report import search_progress
 from .tables import table
 from .terminal import Console
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from .landscapes.pairs import Design, Found
 
 RECORD = "pairs.json"
+NUMBERS = 60  # that are held for each parameter of a base point, copies included
 COLUMNS = ("score", "sensitivity", "interaction", "ruggedness", "disagreement")
 LEADERS = {"interaction": "strongest interaction", "ruggedness": "most rugged", "disagreement": "most misleading"}
 
@@ -53,6 +55,7 @@ def pairs(
     from .landscapes.pieces import Pieces
 
     samples = samples or default_samples(env.space.dim)
+    require("samples", samples, lambda count: Need(8.0 * NUMBERS * env.space.dim * count))
     design = Design.sobol(env.space, samples, seed=seed)
     identity = {**env.identity(), "samples": samples, "seed": seed}
     folder = Path(out) if out else Path("out") / _folder(identity)

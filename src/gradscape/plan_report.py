@@ -17,7 +17,9 @@ from typing import TYPE_CHECKING, Any
 from .console import duration, read_extent, read_settings, size
 from .envs.registry import environment_class, make
 from .gallery.figures import Figure, read_figures
+from .landscapes.capacity import TooLargeError
 from .planned import Plan, of_slice, of_sweep
+from .swept import refuse_too_large as refuse_sweep
 from .tables import table
 from .terminal import Console
 from .tolerance import kept_rung
@@ -70,7 +72,8 @@ def plan(
             made = partial(make, what, device=env.device, **options)
             found = of_sweep(env, plane, Path(folder), over, frames, made, grad=grad, began=began)
     found = _there(found, env, where, grad=grad)
-    record = {**_subject(env, plane, where), "over": over, "frames": frames if over else 1, **found.record(workers)}
+    about = {"over": over, "frames": frames if over else 1, "too_large": _too_large(plane, over, frames, grad=grad)}
+    record = {**_subject(env, plane, where), **about, **found.record(workers)}
     if as_json:
         print(json.dumps(record | {"command": shlex.join(["landscape", *sys.argv[1:]])}))
     else:
@@ -85,6 +88,20 @@ def _made(name: str, device: str, options: dict[str, Any]) -> tuple[Environment,
         return make(name, device="cpu", **options), device
     env = make(name, device=device, **options)
     return env, env.device
+
+
+def _too_large(plane: Plane, over: str | None, frames: int, *, grad: bool) -> str | None:
+    """Return why this machine would refuse what is planned, None where it would not."""
+    from .landscapes.slice_arrays import refuse_too_large as refuse_slice
+
+    try:
+        if over is None:
+            refuse_slice(plane, Path(), grad=grad)
+        else:
+            refuse_sweep(plane, frames, Path(), grad=grad, over=over)
+    except TooLargeError as error:
+        return str(error)
+    return None
 
 
 def _there(found: Plan, env: Environment, device: str, *, grad: bool) -> Plan:
@@ -168,6 +185,8 @@ def _print(record: dict[str, Any]) -> None:
     console.print(found)
     each = record["seconds"]["simulating"] / record["episodes"]
     console.print(f"{each:.3g} s an episode, {record['rate']}", markup=False)
+    if record["too_large"]:
+        console.print(f"too large for this machine: {record['too_large']}", markup=False)
 
 
 def _rows(record: dict[str, Any]) -> Iterator[tuple[str, str, str]]:

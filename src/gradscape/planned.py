@@ -5,22 +5,23 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .console import picture_of, provenance_of
 from .sweep_report import Job as SweepJob
-from .swept import SMOOTHING, moved
+from .swept import SMOOTHING, moved, need_of
 
 if TYPE_CHECKING:
     from .envs.base import Environment
     from .landscapes.plane import Plane
-    from .landscapes.rehearsal import Room
+    from .landscapes.rehearsal import Room, Stored
 
 HERE = "measured here, now"
 FEW, MORE = 2, 8  # frames of which films are made, to see what each frame takes
+MOST_POINTS, MOST_FRAMES = 128, 24  # of a rehearsal: points along each axis of a plane, and slices of a sweep
 SUMMARY = 1000  # bytes of a slice's summary, about
 
 
@@ -62,25 +63,35 @@ class Plan:
 
 
 def of_slice(env: Environment, plane: Plane, folder: Path, *, grad: bool, began: float) -> Plan:
-    """Plan a slice whose command would have begun at `began` on `time.perf_counter`'s clock."""
+    """Plan a slice whose command would have begun at `began` on `time.perf_counter`'s clock.
+
+    Of a large one a smaller one is rehearsed.
+    """
     from .landscapes.job import Job, peak_memory
     from .landscapes.rehearsal import Alike, Room, drawn, pictures, stored
 
+    little = _little(plane)
+    grown = Growth.of(little, plane, grad=grad)
     job = Job.open(
-        env, plane, folder, picture_of(env, plane),
+        env, little, folder, picture_of(env, little),
         identity=env.identity(), provenance=provenance_of(env, ""), grad=grad,
     )  # fmt: skip
     cost = job.cost()
-    start, memory = time.perf_counter() - began, cost.memory - peak_memory()
+    start, memory = time.perf_counter() - began, cost.memory - peak_memory() + grown.memory
     alike = Alike.of(env, job.store, cost.seconds / cost.episodes)
     kept = stored(alike, job.store)
     loading, once = drawn(lambda: job._save(alike.dataset(job.store)), alike)
-    batches = -(-cost.episodes // env.preferred_batch)
-    count = pictures(job.store, batches, cost.seconds + kept.seconds, once)
-    extra = SUMMARY + sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
+    episodes, simulating, writing = (
+        math.prod(plane.resolution),
+        grown.points * cost.seconds,
+        grown.points * kept.seconds,
+    )
+    batches = -(-episodes // env.preferred_batch)
+    count = pictures(grown.levels, batches, simulating + writing, once)
+    extra = Room(SUMMARY + sum(file.stat().st_size for file in folder.iterdir() if file.is_file()), 2)
     return Plan(
-        cost.episodes, batches, start, cost.seconds, kept.seconds, loading + count * once, memory + peak_memory(),
-        _gpu(env), Room(kept.finished.bytes + extra, kept.finished.files + 2), kept.filling,
+        episodes, batches, start, simulating, writing, loading + count * once, memory + peak_memory(), _gpu(env),
+        grown.finished(kept, 1, extra), grown.filling(kept), _rate(little, plane),
     )  # fmt: skip
 
 
@@ -95,9 +106,11 @@ def of_sweep(
     grad: bool,
     began: float,
 ) -> Plan:
-    """Plan a sweep."""
-    swept = moved(over, env, plane, frames, made)
-    job = SweepJob.open(env, swept, folder, command="", grad=grad and over != SMOOTHING)
+    """Plan a sweep; of a long one fewer frames are rehearsed, and of large slices smaller ones."""
+    little, grad = _little(plane), grad and over != SMOOTHING
+    grown, whole = Growth.of(little, plane, grad=grad), math.prod(plane.resolution)
+    swept = moved(over, env, little, min(frames, MOST_FRAMES), made)
+    job = SweepJob.open(env, swept, folder, command="", grad=grad)
     seconds, memory = job.cost()
     start, last = time.perf_counter() - began, len(job.stores) - 1
     from .landscapes.job import peak_memory
@@ -107,12 +120,79 @@ def of_sweep(
     alike = Alike.of(swept.env_at(last), job.stores[last], seconds / job.total)
     kept = stored(alike, job.stores[last])
     drawing, films = _filming(job, seconds / job.total, folder / "films", frames)
-    count, batches = len(job.stores), sum(-(-math.prod(s.shape) // env.preferred_batch) for s in job.stores)
-    extra = films + SUMMARY + 250 * frames
+    count = frames if len(job.stores) > 1 else 1
+    held = need_of(plane.resolution, plane.dim, frames, grad=grad, over=over).memory
+    held -= need_of(little.resolution, plane.dim, 0, grad=grad, over=over).memory
     return Plan(
-        job.total, batches, start, seconds, count * kept.seconds, drawing, memory + peak_memory(), _gpu(env),
-        Room(count * kept.finished.bytes + extra, count * kept.finished.files + 5), kept.filling,
+        count * whole, count * -(-whole // env.preferred_batch), start, seconds * count * whole / job.total,
+        count * grown.points * kept.seconds, drawing, round(memory + held) + peak_memory(), _gpu(env),
+        grown.finished(kept, count, Room(films + SUMMARY + 250 * frames, 5)), grown.filling(kept), _rate(little, plane),
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Say how much larger a slice is than the one that is rehearsed for it.
+
+    It has so many times as many `points` and `tiles`, so many more `chunks` once it is finished and bytes of `memory`,
+    and `levels` of coarse pictures.
+    """
+
+    points: float
+    tiles: float
+    chunks: int
+    memory: int
+    levels: int
+
+    @classmethod
+    def of(cls, little: Plane, plane: Plane, *, grad: bool) -> Growth:
+        """Compare two planes."""
+        from .landscapes.slice_arrays import need_of as slice_need
+
+        points, tiles = (math.prod(large) / math.prod(small) for large, small in (
+            (plane.resolution, little.resolution), (_tiles(plane), _tiles(little))
+        ))  # fmt: skip
+        less, more = (slice_need(one.resolution, one.dim, grad=grad).memory for one in (little, plane))
+        chunks = _chunks(plane, grad=grad) - _chunks(little, grad=grad)
+        return cls(points, tiles, chunks, round(more - less), max(_tiles(plane)) - 1)
+
+    def finished(self, kept: Stored, slices: int, extra: Room) -> Room:
+        """Return the room of so many slices, and of what else there is."""
+        one = round(self.points * kept.finished.bytes), kept.finished.files + self.chunks
+        return replace(extra, bytes=slices * one[0] + extra.bytes, files=slices * one[1] + extra.files)
+
+    def filling(self, kept: Stored) -> Room:
+        """Return the room of a slice's tiles."""
+        room = kept.filling
+        return replace(room, bytes=round(self.points * room.bytes), files=round(self.tiles * room.files))
+
+
+def _little(plane: Plane) -> Plane:
+    """Return a plane with no more points than a rehearsal takes."""
+    most = MOST_POINTS if plane.rank == 2 else MOST_POINTS**2
+    if max(plane.resolution) <= most:
+        return plane
+    return replace(plane, resolution=tuple(min(points, most) for points in plane.resolution))
+
+
+def _tiles(plane: Plane) -> list[int]:
+    """Return how many tiles there are along each axis."""
+    from .landscapes.tiling import tile_side
+
+    return [-(-points // tile_side(points)) for points in plane.resolution]
+
+
+def _chunks(plane: Plane, *, grad: bool) -> int:
+    """Return how many files hold the arrays of a finished slice."""
+    from .landscapes.layout import analysis_chunks
+
+    *sides, deep = analysis_chunks(plane.resolution, plane.dim)
+    flat = math.prod(-(-points // side) for points, side in zip(plane.resolution, sides, strict=True))
+    return flat * (2 + grad * -(-plane.dim // deep))
+
+
+def _rate(little: Plane, plane: Plane) -> str:
+    return HERE if little is plane else f"{HERE}, on {' x '.join(map(str, little.resolution))} points"
 
 
 def _filming(job: SweepJob, seconds_each: float, folder: Path, frames: int) -> tuple[float, int]:

@@ -66,7 +66,8 @@ def race(
     give_torch_one_thread()
     if not methods:
         chosen = _able(console, env, chosen)
-    job = Job.open(env, chosen, options, seeds=seeds, budget=budget, workers=workers, out=out, force=force)
+    with console.status(f"opening {len(chosen) * seeds} runs"):
+        job = Job.open(env, chosen, options, seeds=seeds, budget=budget, workers=workers, out=out, force=force)
     try:
         with until_full(job.kept):
             with cluster.workers(scheduler, env.device) as executor:
@@ -147,6 +148,7 @@ class Job:
         folder, command = Path(out) if out else _folder(env, options), shlex.join(["landscape", *sys.argv[1:]])
         if any(not file.is_dir() or visible(file) for file in visible(folder)) and not any(folder.glob(f"*-*/{STORE}")):
             raise ValueError(f"{folder} holds other files and no race; give --out a new or an empty folder")
+        _require(env, methods, options, seeds=seeds, budget=budget, folder=folder)
         makers = {
             (method, seed): partial(made, method, env, seed=seed, options=options.get(method, {}))
             for seed in range(seeds)
@@ -324,6 +326,24 @@ class Lines:
 
 def _least(losses: Sequence[float]) -> float:
     return min((loss for loss in losses if not math.isnan(loss)), default=math.nan)
+
+
+def _require(
+    env: Environment,
+    methods: Sequence[str],
+    options: Mapping[str, dict[str, str]],
+    *,
+    seeds: int,
+    budget: int,
+    folder: Path,
+) -> None:
+    """Refuse a race that is larger than this machine."""
+    from .optim.memory import Search, require_method, require_runs
+
+    require_runs(env.space.dim, budget, seeds, folder, abreast=len(methods))
+    for method in methods:
+        optimizer = made(method, env, seed=0, options=options.get(method, {}))
+        require_method(method, optimizer.options, Search(env.space.dim, env.decisions, budget))
 
 
 def _entry(env: Environment, maker: Any, folder: Path, *, budget: int, command: str, force: bool) -> racing.Entry:

@@ -57,8 +57,11 @@ def made(name: str, env: Environment, *, seed: int, options: dict[str, str]) -> 
     """Make a method for an environment, with options given as text."""
     kind = optimizer_class(name)
     from .envs.options import read_options
+    from .optim.memory import Search, require_method
 
-    return kind.on(env, seed=seed, options=read_options(name, kind.Options, options))
+    chosen = read_options(name, kind.Options, options)
+    require_method(name, chosen, Search(env.space.dim, env.decisions))
+    return kind.on(env, seed=seed, options=chosen)
 
 
 def give_torch_one_thread() -> None:
@@ -146,10 +149,13 @@ class Job:
         prints: Sequence[float] = (),
     ) -> Job:
         """Go on with the run in its folder, or begin it there; `force` begins anew where another run is."""
+        from .optim.memory import Search, require_method, require_runs
         from .optim.run import Run
 
         identity = run_identity(env, optimizer)
         folder = Path(out) if out else run_folder(identity)
+        require_runs(env.space.dim, budget, 1, folder)
+        require_method(optimizer.name, optimizer.options, Search(env.space.dim, env.decisions, budget))
         path = folder / STORE
         if not path.exists() and visible(folder):
             raise ValueError(f"{folder} holds other files and no run; give --out a new or an empty folder")

@@ -23,7 +23,7 @@ from .envs.registry import make
 from .landscapes.disk import until_full
 from .landscapes.files import discard, tidy, visible, write_json
 from .landscapes.slice_paths import check_replaceable, filling
-from .swept import FRAMES, HORIZON, ONLY, SMOOTHING, Moved, moved
+from .swept import FRAMES, HORIZON, ONLY, SMOOTHING, Moved, moved, refuse_too_large
 from .terminal import Console, Described
 
 if TYPE_CHECKING:
@@ -73,10 +73,12 @@ def sweep(
     plane = Plane.through(env.space, point_of(env, through), dims, resolution=resolution, extent=read_extent(extent))
     if plane.rank != 2 or frames < 2:
         raise ValueError(f"a sweep has two dims and two frames or more; got {', '.join(dims)} and {frames} frames")
-    swept = moved(over, env, plane, frames, made)
     grad = grad and over != SMOOTHING  # of smoothed losses there are no gradients to show
+    refuse_too_large(plane, frames, Path(out or "out"), grad=grad, over=over)
+    swept = moved(over, env, plane, frames, made)
     folder = Path(out) if out else sweep_folder(env, swept, over, grad=grad)
-    job = Job.open(env, swept, folder, command=shlex.join(["landscape", *sys.argv[1:]]), grad=grad, force=force)
+    with console.status(f"opening {len(swept.planes)} slices"):
+        job = Job.open(env, swept, folder, command=shlex.join(["landscape", *sys.argv[1:]]), grad=grad, force=force)
     with workers(scheduler, env.device) as executor:
         job = replace(job, executor=executor)
         try:

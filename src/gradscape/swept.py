@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .landscapes.capacity import BLOCK, Need, require
 from .landscapes.slice_paths import SLICE
 
 if TYPE_CHECKING:
@@ -19,6 +22,7 @@ if TYPE_CHECKING:
 
 SMOOTHING, WIDEST = "smoothing", 0.25  # the widest Gaussian's standard deviation, as a fraction of the box's sides
 HORIZON = "horizon"  # a scene option: the episode's duration as a multiple of the scene's own
+STORE_MEMORY, STORE_FILES = 100e3, 25  # what a slice takes beside its samples: bytes of its arrays' records, and files
 FRAMES, ONLY = "frames", SLICE  # the folder of a sweep's slices, and the slice where there is one
 
 
@@ -41,6 +45,27 @@ class Moved:
         if len(self.planes) == 1:
             return (ONLY,)
         return tuple(f"{FRAMES}/{number:03d}.zarr" for number in range(len(self.planes)))
+
+
+def refuse_too_large(plane: Plane, frames: int, folder: Path, *, grad: bool, over: str) -> None:
+    """Refuse a sweep of which a single frame is larger than this machine, or all of them are."""
+
+    def need(side: int, count: int) -> Need:
+        return need_of((side,) * plane.rank, plane.dim, count, grad=grad, over=over)
+
+    side = max(plane.resolution)
+    require("resolution", side, lambda points: need(points, 1), folder)
+    require("frames", frames, lambda count: need(side, count), folder)
+
+
+def need_of(shape: tuple[int, ...], dim: int, frames: int, *, grad: bool, over: str) -> Need:
+    """Return what sampling a sweep and filming it takes: every frame's slice is kept, of a smoothing's only one."""
+    from .landscapes.slice_arrays import need_of as slice_need
+
+    slices, samples = 1 if over == SMOOTHING else frames, math.prod(shape)
+    array, one = samples * (9 + 8 * dim * grad), slice_need(shape, dim, grad=grad)
+    memory = one.memory + slices * (STORE_MEMORY + array) + frames * 9.0 * samples
+    return Need(memory, one.disk + slices * (STORE_FILES * BLOCK + float(array)))
 
 
 def moved(over: str, env: Environment, plane: Plane, frames: int, made: Callable[..., Environment]) -> Moved:

@@ -19,6 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TimeE
 
 from .console import duration, provenance_of, read_settings, size
 from .envs.registry import environment_class, make
+from .landscapes.capacity import Need, require
 from .tables import table
 from .terminal import Console, Described
 from .tolerance import keep
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from .landscapes.pieces import Pieces
     from .landscapes.tradeoff import Sample
 
+COPIES = 50  # of the points: a loss and a gradient there by every rung
 RECORD, PICTURE = "tradeoff.json", "tradeoff.png"
 
 
@@ -56,6 +58,7 @@ def tradeoff(
     from .landscapes.disk import until_full
 
     refuse_single(env)
+    require("points", points, lambda count: Need(8.0 * COPIES * (1 + env.space.dim) * count))
     study = Study.open(env, points=points, seed=seed, ladders=ladders, out=out, force=force)
     try:
         with until_full(study.kept):

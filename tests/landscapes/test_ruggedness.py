@@ -1,6 +1,7 @@
 """Measures of losses on functions whose answers are known."""
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ import torch
 
 from gradscape import ParameterSpace, Plane, from_torch, sample
 from gradscape.landscapes import estimate, ruggedness
+from gradscape.landscapes.character import own_cost
+from gradscape.landscapes.store import SliceStore
 
 
 def grid(points: int, low: float = -1.0, high: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -162,3 +165,49 @@ def test_shares_have_the_exact_binomial_interval() -> None:
     assert (none.value, none.low) == (0, 0)
     assert none.high == pytest.approx(1 - 0.025 ** (1 / 30))
     assert math.isnan(estimate.share(0, 0).value)
+
+
+@pytest.mark.parametrize("shape", [(40,), (9, 13), (12, 12)])
+def test_a_mean_distance_without_pairs_is_that_of_all_pairs(
+    monkeypatch: pytest.MonkeyPatch, shape: tuple[int, ...]
+) -> None:
+    for count in (2, 7, math.prod(shape)):
+        places = np.argwhere(np.ones(shape))[np.random.default_rng(0).permutation(math.prod(shape))[:count]]
+        by_pairs = ruggedness.mean_distance(places, shape)
+        with monkeypatch.context() as patch:
+            patch.setattr(ruggedness, "PAIRED", 0)
+            assert ruggedness.mean_distance(places, shape) == pytest.approx(by_pairs, rel=1e-13)
+
+
+def entropy(walks: list[np.ndarray], size: float) -> float:
+    """Munoz et al. 2015, eqs. 6 and 7, for one size."""
+    counts = np.zeros(9)
+    for walk in walks:
+        symbol = np.where(np.abs(walk) <= size, 0.0, np.sign(walk))
+        both = np.isfinite(walk[:, :-1]) & np.isfinite(walk[:, 1:])
+        counts += np.bincount((3 * (symbol[:, :-1] + 1) + symbol[:, 1:] + 1)[both].astype(int), minlength=9)
+    shares = counts.reshape(3, 3)[~np.eye(3, dtype=bool)] / counts.sum()
+    return float(-(shares[shares > 0] * np.log(shares[shares > 0])).sum() / math.log(6))
+
+
+def test_the_entropies_of_all_sizes_in_one_pass_are_those_of_each_to_the_bit() -> None:
+    random = np.random.default_rng(0)
+    walks = [random.normal(size=(5, 30)), np.round(random.normal(size=(30, 4)), 1)]
+    walks[0][1, 7] = np.nan
+    sizes = np.array([0.0, 0.1, 0.2, 0.7, 1.5, 9.0])
+    found = [ruggedness._entropy(counts) for counts in ruggedness._pair_counts(walks, sizes)]
+    assert found == [entropy(walks, size) for size in sizes]
+
+
+def test_a_slice_of_many_samples_is_measured_in_the_memory_that_is_foretold() -> None:
+    """All pairs of 96 x 96 samples alone would be 340 MB."""
+    space = ParameterSpace.box(["a", "b"], -1.0, 1.0)
+    plane = Plane.through(space, space.center, ("a", "b"), resolution=96)
+    dataset = SliceStore.in_memory(plane, space).dataset()
+    a, b = np.meshgrid(dataset["u"], dataset["v"])
+    dataset["loss"].values[...], dataset["grad"].values[...] = np.sin(9 * a) + b**2, 1.0
+    tracemalloc.start()
+    ruggedness.ruggedness(dataset, floor=0.0)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < own_cost(dataset["loss"].size)[1]

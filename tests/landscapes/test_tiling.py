@@ -4,7 +4,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gradscape.landscapes.tiling import coarse_to_fine, tile_side
+from gradscape.landscapes import tiling
+from gradscape.landscapes.tiling import _offsets, coarse_to_fine, tile_side
 
 POINTS = st.integers(2, 600)
 FEW = settings(max_examples=40)
@@ -46,3 +47,27 @@ def test_tile_side_is_an_eighth_between_four_and_sixteen(points, side):
 
 def test_the_order_of_sixteen_points():
     assert coarse_to_fine(16, 4) == [2, 6, 10, 14, 0, 4, 8, 12, 1, 5, 9, 13, 3, 7, 11, 15]
+
+
+def farthest(size: int) -> list[int]:
+    """The order of a cell's places by going through all of them each time, as slices that are stored were ordered."""
+    taken = [size // 2]
+    away = [min((at - taken[0]) % size, (taken[0] - at) % size) for at in range(size)]
+    while len(taken) < size:
+        taken.append(away.index(max(away)))
+        away = [min(far, (at - taken[-1]) % size, (taken[-1] - at) % size) for at, far in enumerate(away)]
+    return taken
+
+
+@pytest.mark.parametrize("sizes", [range(1, 130), (255, 256, 257, 500)])
+def test_the_order_is_that_of_the_slices_that_are_stored(sizes):
+    assert all(_offsets(size) == farthest(size) for size in sizes)
+
+
+def test_the_order_of_many_points_takes_a_few_steps_for_each(monkeypatch):
+    steps = itertools.count()
+    push = tiling.heappush
+    monkeypatch.setattr(tiling, "heappush", lambda *given: (next(steps), push(*given)))
+    points = 10**5
+    assert sorted(coarse_to_fine(points, tile_side(points))) == list(range(points))
+    assert next(steps) <= 2 * points

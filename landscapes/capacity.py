@@ -1,0 +1,100 @@
+"""What this machine has room for: a size is reckoned before anything is allocated, and refused where it cannot fit."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+BLOCK = 4096  # bytes that a file takes on a disk, however small it is
+UNITS = ("kB", "MB", "GB", "TB", "PB", "EB")
+MEMINFO, CGROUPS = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
+
+
+class TooLargeError(ValueError):
+    """Say that a size does not fit into the memory or onto the disk of this machine."""
+
+
+@dataclass(frozen=True)
+class Need:
+    """Say what something takes, about: bytes of memory, and bytes on the disk."""
+
+    memory: float = 0.0
+    disk: float = 0.0
+
+    def times(self, count: float) -> Need:
+        """Return what so many of it take."""
+        return Need(count * self.memory, count * self.disk)
+
+
+def require(what: str, value: int, need: Callable[[int], Need], folder: Path | None = None) -> None:
+    """Refuse a value that takes more than there is, before it is allocated, and say up to which one it would fit.
+
+    `what` names the value, such as resolution, and `need` says what each value of it takes, a larger one no less.
+    Without a `folder` nothing is written.
+    """
+    there = Need(available_memory(), free_disk(folder) if folder else float("inf"))
+    if _fits(need(value), there):
+        return
+    fits, too_large = 0, value
+    while too_large - fits > 1:
+        middle = (fits + too_large) // 2
+        fits, too_large = (middle, too_large) if _fits(need(middle), there) else (fits, middle)
+    wanted, name = need(value), "memory" if need(value).memory > there.memory else "disk"
+    most = f"{what} {_rounded_down(fits)} would fit" if fits else f"not even {what} 1 would fit"
+    raise TooLargeError(
+        f"{what} {value} takes about {size(getattr(wanted, name))} of {name}, and {size(getattr(there, name))} are "
+        f"free here; {most}"
+    )
+
+
+def available_memory() -> float:
+    """Return how many bytes of memory can still be taken, by what the system and the groups of this process allow."""
+    if not MEMINFO.exists():
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    lines = dict(line.split(":") for line in MEMINFO.read_text().splitlines())
+    return min([1024.0 * int(lines["MemAvailable"].split()[0]), *_left_to_groups()])
+
+
+def free_disk(folder: Path) -> float:
+    """Return how many bytes are free on the disk that a folder is on, or will be."""
+    there = next((place for place in (folder, *folder.absolute().parents) if place.exists()), Path.cwd())
+    return float(shutil.disk_usage(there).free)
+
+
+def size(count: float) -> str:
+    """Return a number of bytes in words."""
+    unit = next((at for at, _ in enumerate(UNITS) if count < 1000.0 ** (at + 2)), len(UNITS) - 1)
+    amount = count / 1000.0 ** (unit + 1)
+    return f"{amount:.0f} {UNITS[unit]}" if unit < 2 else f"{amount:.1f} {UNITS[unit]}"
+
+
+def _rounded_down(value: int) -> int:
+    """Return a value to two digits: more of it would be no truer."""
+    digit = 10 ** max(0, len(str(value)) - 2)
+    return value // digit * digit
+
+
+def _fits(wanted: Need, there: Need) -> bool:
+    return wanted.memory <= there.memory and wanted.disk <= there.disk
+
+
+def _left_to_groups() -> list[float]:
+    """Return what the control groups (version 2) that this process is in leave of their limits, where they have one."""
+    try:
+        own = next(line[3:] for line in Path("/proc/self/cgroup").read_text().splitlines() if line.startswith("0::"))
+    except (OSError, StopIteration):
+        return []
+    group = CGROUPS / own.strip("/")
+    return [left for place in (group, *group.parents) if place.is_relative_to(CGROUPS) for left in _left_to(place)]
+
+
+def _left_to(group: Path) -> list[float]:
+    try:
+        most, taken = ((group / name).read_text().strip() for name in ("memory.max", "memory.current"))
+        stat = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+    except (OSError, ValueError):
+        return []
+    return [] if most == "max" else [float(most) - float(taken) + float(stat.get("inactive_file", 0))]
