@@ -6,7 +6,6 @@ A copy that xarray wrote (`Dataset.to_zarr`) has its layout once; its axes are h
 from __future__ import annotations
 
 import json
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,17 +15,6 @@ import zarr
 from numpy.typing import NDArray
 
 from .identity import StoreError
-
-
-def tile_sum(index: tuple[int, ...], values: Mapping[str, NDArray[Any]]) -> int:
-    """Return the checksum of a tile, above zero: of its place, and of what it holds by name.
-
-    A chunk has one of its own, which does not say where it belongs: two that were swapped would decode.
-    """
-    total = zlib.crc32(str(index).encode())
-    for name in sorted(values):
-        total = zlib.crc32(np.ascontiguousarray(values[name]).tobytes(), total)
-    return total + 1
 
 
 def check_integrity(path: Path, group: zarr.Group, axes: Mapping[str, NDArray[Any]], values: Sequence[str]) -> None:

@@ -71,13 +71,13 @@ def sample(
     counts: Counter[Status] = Counter({kind: int((status == kind).sum()) for kind in Status if kind != Status.MISSING})
     resumed, pending = counts.total(), store.pending(status)
     left = Counter(tile.level for tile in pending)  # tiles, by level
-    whole = 1 + store.tiles()[-1].level
-    levels = min(left, default=whole)
+    every = 1 + store.tiles()[-1].level
+    levels = min(left, default=every)
     _warn_of_damage(store, pending)
 
     def report() -> None:
         nonlocal levels
-        before, levels = levels, min(left, default=whole)
+        before, levels = levels, min(left, default=every)
         if progress is not None:
             progress(Progress(counts.total(), status.size, resumed, dict(counts), levels, levels > before))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,8 @@ import zarr
 from numpy.typing import NDArray
 
 from .capacity import BLOCK, Need, require
+from .checksums import SUMS, lay_out_sums, write_sums
 from .identity import stored_identity
-from .integrity import tile_sum
 from .layout import CODECS, SMALL, analysis_chunks, consolidate, create_array, flags
 from .objective import Status
 from .ownership import store_files
@@ -25,7 +25,6 @@ from .tiling import coarse_to_fine, tile_side
 
 FORMAT = 2
 AXES = ("u", "v")
-SUMS = "checksum"
 CF = "CF-1.11"
 FILES = store_files(("loss", "grad", "status", SUMS, *AXES, "dim", "unit"))  # of a slice on disk
 DRAWN = 150  # bytes that a picture takes for each sample
@@ -86,17 +85,11 @@ def lay_out(
         create_array(group, "grad", *deep, "float64", long_name=said)
     create_array(group, "status", shape, side, names, "int8", long_name="how the evaluation ended", **flags(Status))
     tiles = tuple(math.ceil(points / one) for points, one in zip(shape, side, strict=True))
-    _sums(group, tiles, (1,) * len(tiles), names)
+    lay_out_sums(group, tiles, (1,) * len(tiles), names)
     for number, name in enumerate(AXES[: plane.rank]):
         _keep(group, name, axes[name], (name,), _axis(plane, number))
     _keep(group, "dim", axes["dim"], ("dim",), {"long_name": "parameter"})
     _keep(group, "unit", axes["unit"], ("dim",), {"long_name": "unit of the parameter"})
-
-
-def _sums(group: zarr.Group, tiles: tuple[int, ...], chunks: tuple[int, ...], names: Sequence[str]) -> zarr.Array[Any]:
-    """Make the empty array of the tiles' checksums."""
-    said = "checksum (CRC-32, plus one) of a tile's place, gradient, loss and status"
-    return create_array(group, SUMS, tiles, chunks, tuple(f"{name}_tile" for name in names), "int64", long_name=said)
 
 
 def write_finished(path: Path, dataset: xr.Dataset) -> None:
@@ -114,20 +107,8 @@ def write_finished(path: Path, dataset: xr.Dataset) -> None:
             array[...] = values.to_numpy()
         else:
             _keep(group, str(name), values.to_numpy(), dims, values.attrs)
-    _keep_sums(group, dataset)
+    write_sums(group, dataset)
     consolidate(path)
-
-
-def _keep_sums(group: zarr.Group, dataset: xr.Dataset) -> None:
-    """Write the checksum of every chunk of a finished slice."""
-    samples, names = dataset["loss"].shape, [str(name) for name in dataset["loss"].dims]
-    sides = analysis_chunks(samples)
-    tiles = tuple(math.ceil(points / side) for points, side in zip(samples, sides, strict=True))
-    sums = np.zeros(tiles, dtype=np.int64)
-    for index in np.ndindex(*tiles):
-        place = tuple(slice(at * side, (at + 1) * side) for at, side in zip(index, sides, strict=True))
-        sums[index] = tile_sum(index, {str(name): one.to_numpy()[place] for name, one in dataset.items()})
-    _sums(group, tiles, tiles, names)[...] = sums
 
 
 def attributes_of(node: zarr.Group | zarr.Array[Any]) -> dict[str, Any]:

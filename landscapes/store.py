@@ -33,14 +33,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 from zarr.storage import MemoryStore
 
+from .checksums import Checksums, tile_sum
 from .files import placing, resolved
 from .identity import StoreError, StoreExistsError, check_identity, full_identity, plain_json
-from .integrity import check_integrity, check_layouts, tile_sum
+from .integrity import check_integrity, check_layouts
 from .layout import consolidate, open_group
 from .objective import Evaluation, Status
 from .ownership import lost_root, remove
 from .plane import Plane
-from .slice_arrays import AXES, FILES, FORMAT, SUMS, attributes_of, axes_of, lay_out, refuse_too_large, write_finished
+from .slice_arrays import AXES, FILES, FORMAT, attributes_of, axes_of, lay_out, refuse_too_large, write_finished
 from .slice_arrays import plane_of as plane_of
 from .slice_paths import SLICE, check_replaceable, corner, filling, finished, place_of, there
 from .slice_paths import is_slice as is_slice
@@ -77,8 +78,7 @@ class SliceStore:
         self._parameters, self._units = ([str(one) for one in np.asarray(arrays[name][:])] for name in ("dim", "unit"))
         self._attributes = {name: attributes_of(array) for name, array in arrays.items()}
         self.side = self._values["status"].chunks[: self.plane.rank]
-        sums = arrays.get(SUMS)  # none in a copy that xarray wrote of `dataset`
-        self._sums = sums if place and sums is not None and sums.shape == self._tile_counts() else None
+        self._sums = Checksums.of(group, self._tile_counts()) if place else None
 
     @classmethod
     def create(
@@ -223,7 +223,9 @@ class SliceStore:
             values = self._stored(self._place(tile))
         except Exception:  # as in `_read`
             return None
-        return None if (self._judged(values) == Status.MISSING).any() or not self._in_place(tile, values) else values
+        if self._sums and self._sums.one(tile.index) != tile_sum(tile.index, values):
+            return None
+        return None if (self._judged(values) == Status.MISSING).any() else values
 
     def statuses(self, tile: Tile) -> Counter[Status]:
         """Count how the points of a finished tile ended; nothing of one that is not finished."""
@@ -256,7 +258,7 @@ class SliceStore:
             arrays[name] = tensor.detach().cpu().numpy().reshape(shape + tensor.shape[1:]).astype(stored.dtype)
         try:
             if self._sums is not None:
-                self._sums[tile.index] = tile_sum(tile.index, arrays)
+                self._sums.write(tile.index, arrays)
             for name, values in arrays.items():
                 self._values[name][place] = values
         except FileNotFoundError:
@@ -332,15 +334,6 @@ class SliceStore:
     def _tile_counts(self) -> tuple[int, ...]:
         return tuple(math.ceil(points / side) for points, side in zip(self.shape, self.side, strict=True))
 
-    def _in_place(self, tile: Tile, values: Mapping[str, NDArray[Any]]) -> bool:
-        """Say whether what was read of a tile is what was written of this tile."""
-        if self._sums is None:
-            return True
-        try:
-            return bool(self._sums[tile.index] == tile_sum(tile.index, values))
-        except Exception:  # as in `_read`
-            return False
-
     def _has_status(self, tile: Tile) -> bool:
         try:
             return bool(np.asarray(self._values["status"][self._place(tile)]).any())
@@ -368,13 +361,13 @@ class SliceStore:
         except Exception:  # a damaged chunk raises whatever its codec does
             values = self._by_tile(box, {})
         status = self._judged(values)
-        for tile in self.tiles() if self._sums is not None or (status == Status.MISSING).any() else ():
+        sums = self._sums.read(self._tiles_begun()) if self._sums else None
+        for tile in self.tiles() if self._sums or (status == Status.MISSING).any() else ():
             place = self._place(tile)
             part = {name: array[place] for name, array in values.items()}
-            if not part["status"].any():
-                continue
-            if (part["status"] == Status.MISSING).any() or not self._in_place(tile, part):
-                part["status"][...] = Status.MISSING  # finished whole or not at all
+            torn = sums is not None and part["status"].any() and sums[tile.index] != tile_sum(tile.index, part)
+            if torn or (part["status"] == Status.MISSING).any():  # finished whole or not at all
+                part["status"][...] = Status.MISSING
         values["loss"][status == Status.MISSING] = np.nan
         if self.grad:
             values["grad"][status == Status.MISSING] = np.nan
@@ -391,10 +384,16 @@ class SliceStore:
 
     def _begun(self, box: tuple[slice, ...]) -> tuple[slice, ...]:
         """Return the corner of a box beyond which no tile is: looking for each of many files takes long."""
-        if self.place is None or self.ascending or box != self._whole():
+        if box != self._whole():
             return box
-        tiles = corner(self.place / "status", len(box))
-        return tuple(slice(min(n * side, at.stop)) for n, side, at in zip(tiles, self.side, box, strict=True))
+        begun = zip(self._tiles_begun(), self.side, self.shape, strict=True)
+        return tuple(slice(min(count * side, points)) for count, side, points in begun)
+
+    def _tiles_begun(self) -> tuple[int, ...]:
+        """Return how many tiles along each axis there may be."""
+        if self.place is None or self.ascending:
+            return self._tile_counts()
+        return corner(self.place / "status", len(self.dims))
 
     def _blank(self, box: tuple[slice, ...]) -> dict[str, NDArray[Any]]:
         shape = tuple(len(range(points)[at]) for at, points in zip(box, self.shape, strict=True))
