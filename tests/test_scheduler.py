@@ -100,7 +100,7 @@ def test_workers_here_listen_to_this_machine_and_to_holders_of_their_keys(execut
         met(address, context_of(executor._client.security))
         with pytest.raises(OSError, match="certificate does not match"):
             met(address, context_of(Security.temporary()))
-        with pytest.raises(OSError, match="closed|required"):
+        with pytest.raises(OSError, match=r"closed|required"):
             met(address, careless)
         with pytest.raises(OSError, match="closed"):
             met(address.replace("tls://", "tcp://"), None)
@@ -300,3 +300,10 @@ def test_an_address_where_nothing_answers_and_a_missing_dask_are_said(tmp_path, 
     said = run(*how, cwd=tmp_path)
     assert said.returncode == 2
     assert "pip install '.[distributed]'" in said.stderr
+
+
+def test_missing_cryptography_is_said_before_anything_listens(tmp_path, run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cryptography", None)
+    said = run("slice", "branin", "--dims", "0", "1", "--scheduler", "local:1", cwd=tmp_path)
+    assert (said.returncode, said.stderr.count("\n")) == (2, 1)
+    assert "--scheduler local needs cryptography: pip install '.[distributed]'" in said.stderr

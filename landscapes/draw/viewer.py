@@ -55,7 +55,7 @@ def served(path: Path) -> Iterator[str]:
     assets = _assets()
 
     class Handler(LoopbackHandler):
-        def do_GET(self) -> None:
+        def do_GET(self) -> None:  # noqa: N802 -- as http.server calls it
             asked = self.path.partition("?")[0]
             body = assets.get(asked)
             if asked == RECORDING:

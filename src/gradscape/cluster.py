@@ -20,6 +20,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from .envs.registry import make, source_of
+from .landscapes.loopback import LOOPBACK
 
 if TYPE_CHECKING:
     from .envs.base import Environment
@@ -29,6 +30,7 @@ DEAF = (
     "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"  # Ctrl-C is for the command, which ends its workers
 )
 ANSWER = 10.0  # seconds that a scheduler is given to answer in
+SCHEDULER_PAGES, WORKER_PAGES = (f"distributed.{which}.http.routes" for which in ("scheduler", "worker"))
 CLOSED = {"tls", "wss"}  # protocols that a scheduler cannot be reached by without a certificate
 INSTALL = "pip install '.[distributed]' in gradscape's sources"
 
@@ -78,14 +80,14 @@ def _greet(address: str) -> None:
 
     closed = parse_address(address)[0] in CLOSED
     try:
-        how = Security().get_connection_args("client")
+        how = Security().get_connection_args("client")  # type: ignore[no-untyped-call]
     except OSError as error:
         raise ValueError(f"the certificates that Dask's configuration names cannot be read: {error}") from None
     if closed and how["ssl_context"] is None:
         raise ValueError(f"{address} takes certificates; docs/clusters.md says where they are named")
 
     async def greeted() -> None:
-        comm = await asyncio.wait_for(connect(address, deserialize=False, **how), ANSWER)
+        comm = await asyncio.wait_for(connect(address, deserialize=False, **how), ANSWER)  # type: ignore[no-untyped-call]
         comm.abort()
 
     try:
@@ -129,14 +131,13 @@ def _local(count: int | None, device: str) -> Any:
 
     places = _gpus(count) if device == "cuda" or (device == "auto" and _names()) else _cores(count)
     security = _keys()
-    here = {"host": "127.0.0.1", "protocol": "tls", "security": security, "dashboard": False}
-    # without a dashboard, too, there are web servers: they get no pages, and no port that another cluster may have
-    web = {"scheduler": "distributed.scheduler.http.routes", "worker": "distributed.worker.http.routes"}
-    common = here | {"nthreads": 1, "memory_limit": 0, "silence_logs": logging.CRITICAL, "config": {web["worker"]: []}}
+    # Web servers are there without a dashboard, too: they get no pages, and no port that another cluster may have.
+    here = {"host": LOOPBACK, "protocol": "tls", "security": security, "dashboard": False}
+    common = here | {"nthreads": 1, "memory_limit": 0, "silence_logs": logging.CRITICAL, "config": {WORKER_PAGES: []}}
     specs = {number: {"cls": Nanny, "options": common | place} for number, place in enumerate(places)}
-    leader = {"cls": Scheduler, "options": here | {"dashboard_address": "127.0.0.1:0", "port": 0}}
-    with dask.config.set({web["scheduler"]: []}):
-        return SpecCluster(workers=specs, scheduler=leader, security=security, silence_logs=False)  # type: ignore[no-untyped-call]
+    scheduler = {"cls": Scheduler, "options": here | {"dashboard_address": f"{LOOPBACK}:0", "port": 0}}
+    with dask.config.set({SCHEDULER_PAGES: []}):
+        return SpecCluster(workers=specs, scheduler=scheduler, security=security, silence_logs=False)  # type: ignore[no-untyped-call]
 
 
 def _keys() -> Any:
