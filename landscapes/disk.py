@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TypeGuard
 
 CODES = (errno.ENOSPC, errno.EDQUOT)
 WORDS = "No space left on device"  # of a program that writes for us, such as ffmpeg
@@ -17,7 +18,7 @@ class DiskFullError(OSError):
         return str(self.strerror)
 
 
-def is_full(error: BaseException) -> bool:
+def is_full(error: BaseException) -> TypeGuard[OSError]:
     """Whether an error comes of a disk or a quota that is full."""
     return isinstance(error, OSError) and (error.errno in CODES or WORDS in str(error))
 

@@ -142,7 +142,7 @@ def _held(path: Path) -> tuple[Path, int]:
             lock = os.open(folder, os.O_RDONLY)
             with contextlib.suppress(OSError):  # a file system without locks: nobody can hold it, so nobody clears it
                 fcntl.flock(lock, fcntl.LOCK_EX)
-            if _is(folder, lock):
+            if folder.exists():  # its name is like no other, so it is this one
                 return folder, lock
             os.close(lock)
 
@@ -159,15 +159,6 @@ def _clear(folder: Path) -> None:
         lock = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if _is(folder, lock):
-                shutil.rmtree(folder, ignore_errors=True)
+            shutil.rmtree(folder, ignore_errors=True)
         finally:
             os.close(lock)
-
-
-def _is(folder: Path, lock: int) -> bool:
-    """Whether a descriptor is of the folder that is at a path now."""
-    try:
-        return os.path.samestat(folder.stat(), os.fstat(lock))
-    except FileNotFoundError:
-        return False

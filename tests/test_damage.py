@@ -18,8 +18,8 @@ MADE = {  # by folder: the verb that leaves it, then those that read it
     "race": ["race branin --methods random --seeds 1 --budget 4 --out race"],
     "told": ["report cut --points 2 --out told"],
     "pairs": ["pairs branin --samples 2 --out pairs"],
-    "trade": ["tradeoff bounce --points 2 --ladder precision --device cpu --out trade"],
-    "user": ["slice bounce --dims 0 1 --resolution 2 --tolerance 50% --device cpu --out chosen"],
+    "trade": ["tradeoff bounce --set horizon=0.05 --points 2 --ladder precision --device cpu --out trade"],
+    "user": ["slice bounce --set horizon=0.05 --dims 0 1 --resolution 2 --tolerance 50% --device cpu --out chosen"],
 }
 DAMAGES = ("", "[]", "{}", '{"attributes": 3', "cut")
 RUNS = {"run.zarr"}  # which have tests of their own

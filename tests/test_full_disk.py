@@ -30,7 +30,7 @@ WRITING = {  # the command, the file for which there is no room any more, what i
         "race branin --methods random --seeds 1 --budget 4 --out made", "race.json", "4 of 4 episodes are kept in made"
     ),
     "tradeoff": (
-        "tradeoff bounce --points 2 --ladder precision --device cpu --out made", "tradeoff.json",
+        "tradeoff bounce --set horizon=0.05 --points 2 --ladder precision --device cpu --out made", "tradeoff.json",
         "rungs are kept in made",
     ),
     "pairs": ("pairs branin --samples 2 --out made", "pairs.json", "2 batches are kept in made"),

@@ -48,7 +48,7 @@ def test_four_kills_change_no_bit(job: str, tmp_path: Path) -> None:
         (["optimize", "bounce", "--method", "random", *SEARCH], ".run.zarr"),
         (["race", "bounce", "--methods", "random", "--seeds", "2", *SEARCH], "random-0/.run.zarr"),
         (["tradeoff", "bounce", "--points", "2", "--ladder", "engine"], ".settings.json"),
-        (["pairs", "bounce", "--samples", "2"], "pieces/.moved-7.npz"),
+        (["pairs", "bounce", "--samples", "2"], ".pairs.json"),
         (["replay", "bounce", "--no-film"], ".episode.mp4"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else None,

@@ -10,8 +10,9 @@ from . import measure_report, tradeoff_report
 from .envs.registry import environment_class, make
 from .gallery.measured import DEVICES, TRADEOFF
 from .gallery_parts import Part, read_record
+from .kept_reports import REPORT
 from .ladder import LADDERS
-from .measure_report import MEASURES, REPORT, Subject
+from .measure_report import MEASURES, Subject
 from .results import SLICE
 from .terminal import Console
 
