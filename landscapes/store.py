@@ -250,8 +250,8 @@ class SliceStore:
             raise ValueError("this slice holds gradients; got an evaluation without, so evaluate with grad=True")
         if bool((evaluation.status == Status.MISSING).any()):
             raise ValueError("a tile is written whole; got an evaluation with status MISSING")
-        if self._taken_over():
-            return
+        if self._taken_over() or any(at >= count for at, count in zip(tile.index, self._tile_counts(), strict=True)):
+            return  # another process has finished the slice, which has larger and fewer tiles since
         arrays = {}
         for name, stored in self._values.items():  # loss, grad, status
             tensor: Tensor = getattr(evaluation, name)
@@ -375,15 +375,16 @@ class SliceStore:
 
     def _stored(self, box: tuple[slice, ...]) -> dict[str, NDArray[Any]]:
         """Read a box of every array; where its status says that nothing is there, nothing else is looked for."""
-        values, begun = self._blank(box), self._begun(box)
-        values["status"][begun] = self._values["status"][begun]
+        values, there = self._blank(box), self._begun(box)
+        inside = tuple(slice(len(range(points)[at])) for points, at in zip(self.shape, there, strict=True))
+        values["status"][inside] = self._values["status"][there]
         for name, array in self._values.items() if values["status"].any() else ():
             if name != "status":
-                values[name][begun] = array[begun]
+                values[name][inside] = array[there]
         return values
 
     def _begun(self, box: tuple[slice, ...]) -> tuple[slice, ...]:
-        """Return the corner of a box beyond which no tile is: looking for each of many files takes long."""
+        """Return the corner of the whole beyond which no tile is, since looking for each of many files takes long."""
         if box != self._whole():
             return box
         begun = zip(self._tiles_begun(), self.side, self.shape, strict=True)
