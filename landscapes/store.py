@@ -354,10 +354,11 @@ class SliceStore:
     def _stored(self, box: tuple[slice, ...]) -> dict[str, NDArray[Any]]:
         """Read a box of every array; where its status says that nothing is there, nothing else is looked for."""
         values, begun = self._blank(box), self._begun(box)
-        values["status"][begun] = self._values["status"][begun]
+        here = tuple(slice(len(range(points)[at])) for at, points in zip(begun, self.shape, strict=True))
+        values["status"][here] = self._values["status"][begun]
         for name, array in self._values.items() if values["status"].any() else ():
             if name != "status":
-                values[name][begun] = array[begun]
+                values[name][here] = array[begun]
         return values
 
     def _begun(self, box: tuple[slice, ...]) -> tuple[slice, ...]:
