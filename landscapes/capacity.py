@@ -73,7 +73,7 @@ def size(count: float) -> str:
 
 def _rounded_down(value: int) -> int:
     """Return a value to two digits: more of it would be no truer."""
-    digit = 10 ** max(0, len(str(value)) - 2)
+    digit: int = 10 ** max(0, len(str(value)) - 2)
     return value // digit * digit
 
 

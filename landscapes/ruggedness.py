@@ -304,7 +304,7 @@ def _pair_counts(walks: list[Values], sizes: Values) -> Values:
     """Count pairs of successive steps by their symbols at each of ascending sizes, shape (size, symbol, symbol).
 
     A step's symbol is its sign, but 0 at every size that it does not exceed (Munoz et al. 2015, eq. 6). One pass over
-    the steps does for all sizes: a pair is counted from the size on where one of its symbols becomes 0.
+    the steps does for all sizes: the symbols of a pair change where one of them becomes 0, and where the other does.
     """
     counts = np.zeros((len(sizes) + 1) * 9)
     for walk in walks:

@@ -76,7 +76,8 @@ def _random(options: Options, search: Search) -> float:
 
 
 def _cma_es(options: Options, search: Search) -> float:
-    return FLOAT * MATRICES * search.dim**2 + options["population"] * (POPULATION + 20 * FLOAT * search.dim)
+    member = POPULATION + 20 * FLOAT * search.dim
+    return FLOAT * MATRICES * search.dim**2 + options["population"] * member  # type: ignore[no-any-return]
 
 
 def _descents(options: Options, search: Search) -> float:

@@ -13,6 +13,7 @@ import xarray as xr
 import gradscape
 from gradscape.envs.base import Environment
 from gradscape.landscapes.draw import page, sweep
+from gradscape.landscapes.job import pause_after
 from gradscape.landscapes.rehearsal import Alike, drawn, pictures, room_of
 from gradscape.landscapes.slice_arrays import need_of
 from gradscape.landscapes.store import SliceStore
@@ -112,6 +113,27 @@ def test_pictures_come_with_finer_levels_batches_and_a_pause_between_them() -> N
     assert [pictures(most - 1, *now) for now in ((99, 1e6, 1.0), (99, 0.0, 1.0), (99, 44.0, 1.0), (3, 44.0, 1.0))] == [
         most, 2, 6, 4
     ]  # fmt: skip
+
+
+def test_no_more_than_a_tenth_of_the_time_goes_into_pictures_of_what_is_unfinished() -> None:
+    assert [pause_after(seconds) for seconds in (0.1, 1.0, 60.0)] == [10.0, 10.0, 600.0]
+
+
+def test_a_larger_job_is_planned_by_a_smaller_one(
+    run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four times the resolution, sixteen times the points: of each part as much as a rehearsal of all would say."""
+    said = ["branin", "--dims", "0", "1", "--resolution", "64"]
+    whole = plan(run, tmp_path, *said)
+    monkeypatch.setattr("gradscape.planned.MOST_POINTS", 32)
+    scaled = plan(run, tmp_path, *said)
+    assert scaled["rate"] == "measured here, now, on 32 x 32 points"
+    for name in ("episodes", "batches", "too_large"):
+        assert scaled[name] == whole[name]
+    assert scaled["seconds"]["simulating"] == pytest.approx(whole["seconds"]["simulating"])
+    assert scaled["disk"]["files"] == whole["disk"]["files"]
+    for filled in ("bytes", "files"):
+        assert scaled["disk"]["filling"][filled] == pytest.approx(whole["disk"]["filling"][filled], rel=0.6)
 
 
 def test_a_plan_leaves_nothing_behind_and_workers_share_what_can_be_shared(

@@ -19,7 +19,7 @@ from gradscape.landscapes.identity import StoreError, StoreMismatchError
 from gradscape.landscapes.layout import consolidate
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.plane import Plane
-from gradscape.landscapes.slice_paths import filling
+from gradscape.landscapes.slice_paths import corner, filling
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.store import SliceStore, open_slice, plane_of
 
@@ -434,3 +434,32 @@ def test_a_kill_at_any_instant_of_finishing_leaves_a_slice_whole(tmp_path):
             np.testing.assert_array_equal(open_slice(path)[name], whole[name])
         assert [file.name for file in desk.iterdir() if not file.name.startswith(".")] == ["slice.zarr"]
     assert places >= {frozenset({"slice.filling.zarr"}), frozenset({"slice.zarr"})}
+
+
+def test_of_a_slice_that_was_begun_only_the_corner_with_tiles_is_read(tmp_path, monkeypatch):
+    plane = Plane.through(SPACE, SPACE.center, ["x", "y"], resolution=(300, 200))
+    store = make(tmp_path / "s.zarr", plane=plane)
+    fill(store, store.tiles()[:3])
+    status, read = store._values["status"], []
+
+    class Seen:
+        shape, dtype, fill_value = status.shape, status.dtype, status.fill_value
+
+        def __getitem__(self, box):
+            read.append(np.asarray(status[box]))
+            return read[-1]
+
+    monkeypatch.setitem(store._values, "status", Seen())
+    assert store.pending(store.status()) == store.tiles()[3:]
+    assert store.damaged(store.tiles()[3:]) == []
+    assert {part.shape for part in read} == {(32, 32)}
+
+
+def test_nothing_is_looked_for_in_a_slice_that_is_not_begun(tmp_path):
+    line = Plane.through(SPACE, SPACE.center, ["x"], resolution=300)
+    store = make(tmp_path / "s.zarr", plane=line)
+    assert corner(store.place / "status", 1) == (0,)
+    assert store.pending() == store.tiles()
+    fill(store, store.tiles()[:2])
+    assert corner(store.place / "status", 1) == (2,)
+    assert store.pending() == store.tiles()[2:]
