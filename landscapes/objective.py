@@ -158,8 +158,9 @@ def name_of(objective: Objective) -> str:
 
 def _real(values: Any, what: str) -> Tensor:
     """Return a tensor of real numbers as it is, and one of what else holds some."""
-    real = isinstance(values, Tensor) and not values.is_complex() and values.dtype != torch.bool
-    return values if real else as_tensor(values, what)
+    if isinstance(values, Tensor) and not values.is_complex() and values.dtype != torch.bool:
+        return values
+    return as_tensor(values, what)
 
 
 def _known(status: Any) -> Tensor:
