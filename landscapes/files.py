@@ -34,8 +34,8 @@ def resolved(path: str | Path) -> Path:
 
 def make_folder(folder: Path) -> None:
     """Make a folder and those it is in, where they are missing, however deep: `mkdir` calls itself for each."""
-    for one in (*reversed(folder.parents), folder):
-        if not one.is_dir():
+    if not folder.is_dir():  # which raises OSError for a path that is too long, before any of it is made
+        for one in (*reversed(folder.parents), folder):
             one.mkdir(exist_ok=True)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -156,20 +156,21 @@ def name_of(objective: Objective) -> str:
     return str(getattr(objective, "name", type(objective).__name__))
 
 
-def _real(values: Any, what: str) -> Tensor:
+def _real(values: object, what: str) -> Tensor:
     """Return a tensor of real numbers as it is, and one of what else holds some."""
-    real = isinstance(values, Tensor) and not values.is_complex() and values.dtype != torch.bool
-    return values if real else as_tensor(values, what)
+    if isinstance(values, Tensor) and not values.is_complex() and values.dtype != torch.bool:
+        return values
+    return as_tensor(values, what)
 
 
-def _known(status: Any) -> Tensor:
+def _known(status: object) -> Tensor:
     """Return a tensor of statuses as it is, and refuse codes that mean none: as int8, 257 would be OK."""
-    status = _real(status, "a status")
-    sound = (status >= 0) & (status <= max(Status)) & (status % 1 == 0)
+    codes = _real(status, "a status")
+    sound = (codes >= 0) & (codes <= max(Status)) & (codes % 1 == 0)
     if not bool(sound.all()):
         known = ", ".join(f"{kind.value} {kind.name}" for kind in Status)
-        raise ValueError(f"a status is one of {known}; got {status[~sound][0].item()}")
-    return status
+        raise ValueError(f"a status is one of {known}; got {codes[~sound][0].item()}")
+    return codes
 
 
 def _present(grad: Tensor | None, who: str) -> Tensor:

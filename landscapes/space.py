@@ -48,8 +48,8 @@ class ParameterSpace:
         for field, value in (("names", names), ("units", tuple(map(str, units)))):
             object.__setattr__(self, field, value)
         for field, bound in (("lower", lower), ("upper", upper)):
-            values = torch.atleast_1d(as_tensor(bound, f"ParameterSpace's {field}"))
-            object.__setattr__(self, field, values.clone())  # what becomes of the caller's own is no bound
+            values = as_tensor(bound, f"ParameterSpace's {field}").clone()  # what becomes of the caller's is no bound
+            object.__setattr__(self, field, values if values.ndim else values[None])
         self._check()
 
     def _check(self) -> None:
