@@ -144,7 +144,7 @@ class Trial:
             return (failure if failure in BAD else "other"), f"{failure}: {forked.last_words(said)}"
         if ended.code:
             last = said.splitlines()[-1] if said else ""
-            named = f"{KINDS[name].where}/" in last or "`landscape " in last or last.endswith(KINDS[name].where)
+            named = KINDS[name].where in last or "`landscape " in last
             return (REFUSED if named else "refused without the name"), said
         wanted, wanted_out = self._wanted(name, command)
         found = self._numbers(folder)

@@ -35,6 +35,7 @@ LOADED = (
     *(f"gradscape.landscapes.draw.{name}" for name in ("contour", "profile", "curve", "sweep", "race", "relief")),
     *(f"gradscape.landscapes.draw.{name}" for name in ("sweep_stream", "stream", "overlay", "quality", "tradeoff")),
 )
+GRACE = 10.0  # seconds that what a process started has to end after it
 CACHES = (Path.home() / ".cache", Path("/dev"), Path("/proc"), Path("/sys"))  # where every process may write
 
 
@@ -74,7 +75,7 @@ def landscape(
     before: Callable[[], object] | None = None,
 ) -> Ended:
     """Run a command line in a folder, after `before`; data and temporary files that are a user's are under it, too."""
-    return alone(_command, list(command), folder=folder, limits=limits, before=before)
+    return alone(say, list(command), folder=folder, limits=limits, before=before)
 
 
 def alone(
@@ -95,7 +96,7 @@ def alone(
             (Path(said) / "stopped").touch()
             process.kill()
         process.join()
-        left = _ended(process.pid)
+        left = ended(process.pid)
         out, err = ((Path(said) / name).read_text(errors="replace") for name in ("out", "err"))
         stopped = (Path(said) / "stopped").exists()
     assert process.exitcode is not None
@@ -161,7 +162,8 @@ def at_home(folder: Path) -> None:
         os.environ.pop(name, None)
 
 
-def _command(command: list[str]) -> None:
+def say(command: Sequence[str]) -> None:
+    """Run a command line in this process, which it ends."""
     import torch
 
     from gradscape.cli import main
@@ -213,25 +215,27 @@ def _keep_within(*folders: Path) -> None:
     sys.addaudithook(watch)
 
 
-def _ended(group: int) -> tuple[str, ...]:
-    """Return what lives of a process's group after its end, and end it."""
-    found: tuple[str, ...] = ()
-    for _ in range(20):  # children that were told to end need a moment
-        found = tuple(_living(group))
-        if not found:
-            return ()
+def ended(group: int) -> tuple[str, ...]:
+    """Return what lives of a process's group some time after its end, and end it."""
+    deadline = time.monotonic() + GRACE
+    while found := tuple(name for _, name in living(group)):
+        if time.monotonic() > deadline:
+            break
         time.sleep(0.1)
+    else:
+        return ()
     with suppress(ProcessLookupError):
         os.killpg(group, signal.SIGKILL)
     return found
 
 
-def _living(group: int) -> list[str]:
-    names = []
+def living(group: int) -> list[tuple[int, str]]:
+    """Return the number and the name of every living process of a group."""
+    found = []
     for status in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError, ValueError):
             name, _, fields = status.read_text().partition(") ")
             state, _, own_group = fields.split()[:3]
             if int(own_group) == group and state not in "ZX":
-                names.append(name.partition("(")[2])
-    return names
+                found.append((int(status.parent.name), name.partition("(")[2]))
+    return found

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-MADE, READ = "made", "read"  # what a kind is made into, and where a verb that reads it writes
+MADE, READ = "made-1", "read-1"  # what a kind is made into, and where a verb that reads it writes: no words of English
 CUT = "slice ackley --set dim=3 --dims 0 1 --resolution 6 --out"
 SEARCH = "optimize ackley --set dim=3 --method cma-es --budget 30 --seed 1 --out"
 BOUNCE = "bounce --fidelity draft --device cpu"
@@ -29,7 +29,7 @@ VOLATILE |= {"folder", "wall", "versions", "code", "episodes"}
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of result: the command that makes it in `made`, what it needs beside it, and what reads it.
+    """A kind of result: the command that makes it in `MADE`, what it needs beside it, and what reads it.
 
     `stop` is patched in the process that makes it, so that it ends unfinished; `where` holds what is worth damaging.
     """
@@ -98,7 +98,7 @@ KINDS = {
     "kept tradeoff": Kind(
         f"tradeoff bounce --device cpu --set horizon=0.5 --points 2 --ladder precision --out {MADE}",
         (f"slice bounce --device cpu --tolerance 20% --set horizon=0.5 --dims 0 1 --resolution 3 --out {READ}",),
-        where="home",
+        where="home/gradscape",
     ),
     "report": Kind(
         f"report cut --points 2 --out {MADE} --json",
