@@ -5,8 +5,8 @@
 A command line is a valid one with one to three of its words lost, put in or replaced: options are those that the
 command declares, values are hostile ones (numbers beyond every size, markup, bytes that are no text, link loops, deep
 paths, damaged results). Each is run in a folder of its own that holds results of all kinds, whole and damaged, within
-limits of time and memory. It has to end by itself, or by Ctrl-C once it has said how long it takes, with exit code 0, 1,
-2 or 130, and where that is not 0 with a line that says why. Exit code 1 says that one did not.
+limits of time and memory. It has to end by itself, or by Ctrl-C once it has said how long it takes, with exit code 0,
+1, 2 or 130, and where that is not 0 with a line that says why. Exit code 1 says that one did not.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import typer
-
 from benchmarks import damage, forked, results
 from benchmarks.forked import Ended, Limits
+
 from gradscape.cli import app
 
 VALID = """
@@ -70,12 +71,60 @@ NUMBERS = ("0", "-1", "1", "2", "7", "1e9", "1e308", "-1e308", "1e400", "nan", "
 NUMBERS += ("100000", "1000000", "2147483648", "9223372036854775808", "9" * 400, "1.5", "5e-324", "1e-300", "-0.0", "")
 SIZES = ("0", "1", "2", "3", "85", "3000", "100000", "1000000", "2147483648", "100000000000", "9223372036854775808")
 WORDS = ("", " ", "-", "--", "=", "=1", "a=", "a,b", ",", ":", "0:1", "1:0", "nan:1", "0:inf", "5%", "nan%", "[/b]")
-WORDS += ("[red]x", "{}", "%s", "%00", "\0", "\udcff", "\u00e4 b", "x" * 5000, "d/" * 2000, "\n", "*", "..", "/", "~", "$HOME")
-WORDS += ("center", "random:0", "random:-1", "random:" + "9" * 30, "example:aim", "example:[/b]", "best:run", "best:race")
-WORDS += ("horizon", "smoothing", "pca", "x0", "draft", "reference", "cpu", "cuda", "taichi", "parquet", "local:0", "local:x")
+WORDS += (
+    "[red]x",
+    "{}",
+    "%s",
+    "%00",
+    "\0",
+    "\udcff",
+    "\u00e4 b",
+    "x" * 5000,
+    "d/" * 2000,
+    "\n",
+    "*",
+    "..",
+    "/",
+    "~",
+    "$HOME",
+)
+WORDS += (
+    "center",
+    "random:0",
+    "random:-1",
+    "random:" + "9" * 30,
+    "example:aim",
+    "example:[/b]",
+    "best:run",
+    "best:race",
+)
+WORDS += (
+    "horizon",
+    "smoothing",
+    "pca",
+    "x0",
+    "draft",
+    "reference",
+    "cpu",
+    "cuda",
+    "taichi",
+    "parquet",
+    "local:0",
+    "local:x",
+)
 WORDS += ("branin", "ackley", "bounce", "fluid", "cartpole", "sac", "ppo", "bo", "own.py:Bowl", "own.py:Torn", "own.py")
 NAMES = ("device", "engine", "fidelity", "deterministic", "name", "self", "dim", "horizon", "seed", "sigma", "initial")
-NAMES += ("learning_rate", "minibatches", "epochs", "warmup", "precision", "space", "cma-es.sigma", "random.x", "options")
+NAMES += (
+    "learning_rate",
+    "minibatches",
+    "epochs",
+    "warmup",
+    "precision",
+    "space",
+    "cma-es.sigma",
+    "random.x",
+    "options",
+)
 MADE = {
     "cut": "slice branin --dims 0 1 --resolution 4 --out",
     "run": "optimize branin --method cma-es --budget 12 --seed 1 --out",
@@ -87,6 +136,7 @@ MADE = {
     "data": "gallery compute --only pinball-2-0-1 --part slices --resolution 4 --fidelity draft --device cpu --data",
     "site": "gallery build --data data --out",
 }
+TORN = ("cut", "run", "race", "traded", "data")
 OWN = """
 import torch
 from gradscape import Environment, Fidelity, ParameterSpace
@@ -118,6 +168,7 @@ class Said:
     last: str
 
 
+@cache
 def verbs() -> dict[str, Any]:
     """Return every verb of the command with what it declares, those of the gallery by both of their words."""
 
@@ -178,8 +229,8 @@ def _value(chance: random.Random, after: str, places: Sequence[str]) -> str:
     return chance.choice(chance.choice([NUMBERS, WORDS, places]))
 
 
-def set_desk(folder: Path, limits: Limits) -> None:
-    """Fill a folder with results of all kinds, damaged ones of them, files of no use and names of bad kinds."""
+def set_desk(folder: Path, limits: Limits, made: Sequence[str] = tuple(MADE)) -> None:
+    """Fill a folder with results of the kinds named, damaged ones, files of no use and names of bad kinds."""
     folder.mkdir()
     (folder / "point.json").write_text("[1.0, 2.0, 0.5]")
     (folder / "f.json").write_text('{"a": [1, "b"]}')
@@ -190,11 +241,11 @@ def set_desk(folder: Path, limits: Limits) -> None:
     (folder / "empty").write_bytes(b"")
     (folder / "bytes.json").write_bytes(bytes(range(256)))
     chance = random.Random(0)
-    for name, command in MADE.items():
+    for name, command in ((name, MADE[name]) for name in made):
         ended = forked.landscape([*command.split(), name], folder, limits=limits, before=results.small)
         if ended.code:
             raise RuntimeError(f"{command} {name} ended with {ended.code}: {ended.err}")
-    for name in ("cut", "run", "race", "traded", "data"):
+    for name in (one for one in TORN if one in made):
         shutil.copytree(folder / name, folder / f"torn-{name}")
         for file in chance.sample(damage.files(folder / f"torn-{name}"), 2):
             damage.damage(chance, file)
@@ -216,13 +267,13 @@ def places(desk: Path) -> list[str]:
     return [*own, *(f"{name}/slice.zarr" for name in ("cut", "torn-cut")), "run/run.zarr", "race/random-0", "away/tmp"]
 
 
-def say(line: Sequence[str], desk: Path, folder: Path, limits: Limits) -> Ended:
-    """Say a command line in a copy of a desk."""
+def say(line: Sequence[str], desk: Path, folder: Path, limits: Limits, before: Any = None) -> Ended:
+    """Say a command line in a copy of a desk, after `before`."""
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(desk, folder, symlinks=True)
     serving = "--serve" in line or line[:2] == ["gallery", "serve"]
     patience = Limits(limits.cpu, 8.0, limits.memory) if serving else limits
-    return forked.landscape(line, folder, limits=patience)
+    return forked.landscape(line, folder, limits=patience, before=before)
 
 
 def outcome(ended: Ended, folder: Path) -> str:
@@ -242,7 +293,9 @@ def outcome(ended: Ended, folder: Path) -> str:
     return str(ended.code)
 
 
-def trial(count: int, seed: int, root: Path, wanted: Sequence[str] = (), limits: Limits | None = None) -> Iterator[Said]:
+def trial(
+    count: int, seed: int, root: Path, wanted: Sequence[str] = (), limits: Limits | None = None
+) -> Iterator[Said]:
     """Say so many command lines, and yield how each ended."""
     limits = limits or Limits(cpu=20, clock=40)
     desk, folder = root / "desk", root / "at"

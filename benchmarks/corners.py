@@ -2,10 +2,10 @@
 
     python -m benchmarks.corners [--env fluid] [--fidelity draft] [--horizon 0.1] [--json]
 
-Corners are those that `landscape check` takes; each is moved outward by shares of the box, up to numbers that no float32
-holds. An environment answers with a status for each point or refuses it in a line. A loss that is not finite and called
-OK is wrong, so is a finite one of an episode that failed, and so is one that is OK at parameters which its precision
-made infinite. Exit code 1 says that there was one.
+Corners are those that `landscape check` takes; each is moved outward by shares of the box, up to numbers that no
+float32 holds. An environment answers with a status for each point or refuses it in a line. A loss that is not finite
+and called OK is wrong, so is a finite one of an episode that failed, and so is one that is OK at parameters which its
+precision made infinite. Exit code 1 says that there was one.
 """
 
 from __future__ import annotations
@@ -112,7 +112,9 @@ def main() -> None:
         print(json.dumps([answer.__dict__ for answer in found]))
     else:
         counts = Counter((answer.env, answer.outcome) for answer in found)
-        print(f"{len(found)} points\n\n| environment | {' | '.join([*GOOD, *bad])} |\n|---|{'---|' * len([*GOOD, *bad])}")
+        print(
+            f"{len(found)} points\n\n| environment | {' | '.join([*GOOD, *bad])} |\n|---|{'---|' * len([*GOOD, *bad])}"
+        )
         for name in dict.fromkeys(answer.env for answer in found):
             print(f"| {name} | {' | '.join(str(counts[name, one]) for one in [*GOOD, *bad])} |")
     sys.exit(int(bool(bad)))

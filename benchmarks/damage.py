@@ -6,7 +6,8 @@ Every kind of result is made once by the verbs. A copy of it gets one damage to 
 hands do it: a byte changed, cut, emptied, removed, grown, two chunks swapped, a value changed deep inside of JSON, a
 folder or a loop in its place. Then a verb that reads it and the command that made it are run. Numbers must be right,
 missing, or computed again to the same bits; or the result is refused in a line that names it, and where that line
-recommends --force, the same command with --force makes the right numbers. Exit code 1 says that something else came out.
+recommends --force, the same command with --force makes the right numbers. Exit code 1 says that something else came
+out.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from typing import Any
 
 from benchmarks import forked, results
 from benchmarks.forked import Ended, Limits
-from benchmarks.results import KINDS, MADE, READ, Kind, Numbers
+from benchmarks.results import KINDS, Numbers
 
 RIGHT, AGAIN, REFUSED = "right", "computed again", "refused by name"
 GOOD = (RIGHT, AGAIN, REFUSED)
@@ -112,18 +113,15 @@ class Trial:
 
     def case(self, name: str, chance: random.Random) -> Iterator[Case]:
         """Damage a copy of a kind, read it, go on with it, and yield what came of either."""
-        kind, folder = KINDS[name], self.root / "damaged"
+        kind, damaged, folder = KINDS[name], self.root / "as-damaged", self.root / "damaged"
         whole = self.whole(name)
-        for command in (kind.make, *kind.reads):
-            self._wanted(name, command)
-        _copy(whole, folder)
-        file = chance.choice(files(folder / kind.where))
-        way, named = damage(chance, file), str(file.relative_to(folder))
-        after = _content(file)
+        _copy(whole, damaged)
+        file = chance.choice(files(damaged / kind.where))
+        way, named = damage(chance, file), str(file.relative_to(damaged))
         for command in ([chance.choice(kind.reads)] if kind.reads else []) + [kind.make]:
-            shutil.rmtree(folder / READ, ignore_errors=True)
+            _copy(damaged, folder)  # a verb that reads may go on with it, too
             outcome, said = self._outcome(name, command, folder)
-            if outcome == RIGHT and command == kind.make and _content(file) != after:
+            if outcome == RIGHT and command == kind.make and _content(folder / named) != _content(file):
                 outcome = AGAIN
             yield Case(name, way, named, command, outcome, said)
 

@@ -26,12 +26,24 @@ VERBS = ("bench", "check", "export", "gallery", "measure", "overlay", "pairs", "
 VERBS += ("surface", "sweep", "tradeoff")
 LOADED = (
     *(f"gradscape.{verb}_report" for verb in VERBS),
-    *("gradscape.tolerance", "gradscape.envs.bounce", "gradscape.envs.engines.rigid", "gradscape.envs.functions"),
+    *(
+        "gradscape.tolerance",
+        "gradscape.swept",
+        "gradscape.envs.bounce",
+        "gradscape.envs.engines.rigid",
+        "gradscape.envs.functions",
+    ),
     *("gradscape.envs.points", "gradscape.optim.race", "gradscape.optim.random", "gradscape.optim.descent"),
     *("gradscape.optim.cmaes", "gradscape.optim.surrogate", "gradscape.optim.standings", "gradscape.landscapes.export"),
     *("gradscape.landscapes.job", "gradscape.landscapes.adapters", "gradscape.landscapes.character"),
     *("gradscape.landscapes.pairs", "gradscape.landscapes.tradeoff", "gradscape.landscapes.overlay"),
     *("gradscape.gallery.build", "dask.array", "jinja2", "imageio_ffmpeg", "pyvista", "rerun", "cma"),
+    *(
+        "pydantic.type_adapter",
+        "pydantic.json_schema",
+        "pydantic.functional_validators",
+        "pydantic.fields",
+    ),
     *(f"gradscape.landscapes.draw.{name}" for name in ("contour", "profile", "curve", "sweep", "race", "relief")),
     *(f"gradscape.landscapes.draw.{name}" for name in ("sweep_stream", "stream", "overlay", "quality", "tradeoff")),
 )
@@ -41,7 +53,7 @@ CACHES = (Path.home() / ".cache", Path("/dev"), Path("/proc"), Path("/sys"))  # 
 
 def load() -> None:
     """Let the process that others are forked from load what the verbs need; it uses none of it."""
-    FORK.set_forkserver_preload([*LOADED, "benchmarks.results"])
+    FORK.set_forkserver_preload([*LOADED, "benchmarks.commands", "benchmarks.results"])
 
 
 @dataclass(frozen=True)
@@ -125,8 +137,11 @@ def last_words(said: str, most: int = 700) -> str:
     """Return the end of what was said; of a traceback where in this package it began, and what it was."""
     if "Traceback (most recent call last)" not in said:
         return said.strip()[-most:]
-    ours = re.findall(r'File "[^"]*?/((?:landscapes|envs|optim|gallery|gradscape)/(?!.*site-packages)[^"]*)", line (\d+), in (.*)', said)
-    errors = [line for line in said.splitlines() if re.match(r"[A-Za-z_.]*(Error|Exception|Warning|Interrupt)\b", line)]
+    ours = re.findall(
+        r'File "[^"]*?/((?:landscapes|envs|optim|gallery|gradscape)/(?!.*site-packages)[^"]*)", line (\d+), in (.*)',
+        said,
+    )
+    errors = re.findall(r"^[A-Za-z_][\w.]*(?:: .*|$)", said[said.index("Traceback") :], re.MULTILINE)
     where = " < ".join(f"{name}:{line} {function}" for name, line, function in reversed(ours[-3:]))
     return f"{errors[-1][:most] if errors else said.strip()[-200:]} ({where})"
 

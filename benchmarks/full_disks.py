@@ -4,9 +4,9 @@
 
 Every verb that writes is run on disks of its own (tmpfs, in a namespace: no rights are needed where Linux lets users
 have those) that have room for a share of the bytes, or of the files, which it writes undisturbed. It has to end with a
-line that says that the disk is full. Then the disk gets room, and the same command has to end in the numbers of the
-undisturbed, with nothing hidden left. Where nothing can be mounted no file may grow beyond so many bytes instead. Exit
-code 1 says that something else came out.
+line that says that the disk is full, and what to do. Then the disk gets room, and the same command has to end in the
+numbers of the undisturbed, with nothing hidden left. Where nothing can be mounted no file may grow beyond so many bytes
+instead. Exit code 1 says that something else came out.
 """
 
 from __future__ import annotations
@@ -28,15 +28,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks import commands, forked, results
+from benchmarks import forked, kills, results
 from benchmarks.forked import Ended, Limits
-from benchmarks.results import KINDS, MADE, READ, Numbers
+from benchmarks.results import KINDS, READ, Numbers
 
 DISK, ROOM = "disk", "size=1g,nr_inodes=100000"
 NEW_USER, NEW_MOUNTS, REMOUNT = 0x10000000, 0x00020000, 32  # of Linux: unshare(2), mount(2)
 WRITING = ("export", "overlay", "slice", "report", "gallery build")
 GOOD = ("room enough", "said full, then right")
 PATIENCE = 60.0  # seconds for a command, before Ctrl-C
+ADVICE = re.compile(r"make room|same command|run it again")
 FULL = re.compile(r"no space|no room|disk is full|too large", re.IGNORECASE)
 
 
@@ -148,10 +149,10 @@ def _judged(found: Found, whole: Found) -> tuple[str, str]:
     for when, ended in (("full", full), ("with room", again)):
         if failure := forked.failure(ended):
             return failure, f"{when}: {forked.last_words(ended.err)}"
-    if full.code and commands.RAW.search(full.err):
-        return "raw error", full.err
     if full.code and not FULL.search(full.err):
         return "not said to be full", full.err
+    if full.code and not ADVICE.search(full.err):
+        return "not said what to do", full.err
     if again.code:
         return "does not go on", f"{full.err}\nwith room: {again.err}"
     if wrong := results.wrong(found.numbers, whole.numbers) + results.missing(found.numbers, whole.numbers):
@@ -178,7 +179,7 @@ def _drive(needs: str, place: str, command: str, disk: Disk) -> None:
     after = os.statvfs(place)
     again = _run(command, told.parent)
     found = results.numbers(folder)
-    hidden = [str(path.relative_to(folder)) for path in folder.rglob(".*") if path.suffix in (".making", ".partial")]
+    hidden = [str(path.relative_to(folder)) for path in kills.hidden(folder)]
     told.write_text(json.dumps({
         "full": full, "again": again, "hidden": hidden,
         "numbers": {name: {"rows": one.rows, "whole": one.whole} for name, one in found.items()},
@@ -245,7 +246,9 @@ def table(cases: Sequence[Case]) -> str:
     shown = [*GOOD, *sorted({case.outcome for case in cases} - set(GOOD))]
     lines = [f"| result | {' | '.join(shown)} |", f"|---|{'---|' * len(shown)}"]
     kinds = list(dict.fromkeys(case.kind for case in cases))
-    return "\n".join([*lines, *(f"| {kind} | {' | '.join(str(counts[kind, one]) for one in shown)} |" for kind in kinds)])
+    return "\n".join(
+        [*lines, *(f"| {kind} | {' | '.join(str(counts[kind, one]) for one in shown)} |" for kind in kinds)]
+    )
 
 
 def main() -> None:

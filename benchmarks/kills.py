@@ -32,9 +32,9 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 import torch
-
 from benchmarks import results
 from benchmarks.forked import at_home, ended, living
+
 from gradscape.cli import main as landscape
 from gradscape.landscapes import tradeoff
 
@@ -130,6 +130,11 @@ def bits(folder: Path) -> tuple[int, str]:
     return done, digest.hexdigest()
 
 
+def hidden(folder: Path) -> list[Path]:
+    """Return what was being made in a folder and never was."""
+    return [path for path in folder.rglob(".*") if path.suffix in (".making", ".partial")]
+
+
 def held(folder: Path) -> tuple[int, str]:
     """Return the `bits` of a folder, read in a process of its own: none that has read a store is forked."""
     here, there = FORK.Pipe()
@@ -164,7 +169,7 @@ def disturbed(
         tally.kills["nothing" if not points else "all" if points == whole else "a part"] += 1
         done += 1
     tally.orphans += run(command, folder)[1]
-    tally.hidden += sum(path.suffix in (".making", ".partial") for path in folder.rglob(".*"))
+    tally.hidden += len(hidden(folder))
     return done
 
 
@@ -211,11 +216,14 @@ def main() -> None:
                        "orphans": one.orphans} for kind, one in tallies.items()}  # fmt: skip
         print(json.dumps(said))
     else:
-        print("| job | jobs | kills | with nothing, a part, all on disk | other bits | hidden files left "
-              "| processes left |\n|---|---|---|---|---|---|---|")
+        print(
+            "| job | jobs | kills | with nothing, a part, all on disk | other bits | hidden files left "
+            "| processes left |\n|---|---|---|---|---|---|---|"
+        )
         for kind, one in tallies.items():
             at = ", ".join(str(one.kills[where]) for where in ("nothing", "a part", "all"))
-            print(f"| {kind} | {one.jobs} | {one.kills.total()} | {at} | {one.other_bits} | {one.hidden} | {one.orphans} |")
+            ends = f"{one.other_bits} | {one.hidden} | {one.orphans}"
+            print(f"| {kind} | {one.jobs} | {one.kills.total()} | {at} | {ends} |")
     sys.exit(int(any(one.other_bits or one.hidden or one.orphans for one in tallies.values())))
 
 

@@ -65,7 +65,7 @@ def unfinished_run() -> None:
     run.Run.append = stopped  # type: ignore[method-assign]
 
 
-def _interrupted(*_: object) -> None:
+def _interrupted(*_: object, **__: object) -> None:
     raise KeyboardInterrupt
 
 
@@ -105,7 +105,10 @@ KINDS = {
         (f"report cut --points 2 --out {MADE} --print 85",),
         needs=(f"{CUT} cut",),
     ),
-    "overlay": Kind(f"overlay cut run --through best --resolution 4 --out {MADE}", needs=(f"{CUT} cut", f"{SEARCH} run")),
+    "overlay": Kind(
+        f"overlay cut run --through best --resolution 4 --out {MADE}",
+        needs=(f"{CUT} cut", f"{SEARCH} run"),
+    ),
     "replay": Kind(f"replay {BOUNCE} --no-film --out {MADE}"),
     "gallery": Kind(
         f"{GALLERY} --only pinball-2-0-1 --part slices --part sweeps --part episodes --part searches --part reports",
@@ -148,6 +151,17 @@ def small() -> None:
     gallery_measures.TURNED = ["precision"]
 
 
+def nothing() -> None:
+    """Let Ctrl-C come with the first episode, page or request, so that nothing is computed."""
+    from http.server import ThreadingHTTPServer
+
+    from gradscape.envs.base import Environment
+    from gradscape.gallery import build
+
+    for place, name in ((Environment, "evaluate"), (build, "build_site"), (ThreadingHTTPServer, "serve_forever")):
+        setattr(place, name, _interrupted)
+
+
 @dataclass(frozen=True)
 class Numbers:
     """What a file says: `rows`, each with the place of a number that there may also be none of, or one `whole`."""
@@ -157,7 +171,7 @@ class Numbers:
 
 
 def numbers(folder: Path) -> dict[str, Numbers]:
-    """Return what the files under a folder say, but for what differs every time; those that do not open are left out."""
+    """Return what files say, but for what differs every time; those that do not open are left out."""
     found = {}
     for path, read in _readable(folder):
         with suppress(Exception):  # whatever a damaged file raises
@@ -177,7 +191,7 @@ def wrong(found: dict[str, Numbers], wanted: dict[str, Numbers]) -> list[str]:
 
 
 def missing(found: dict[str, Numbers], wanted: dict[str, Numbers]) -> list[str]:
-    """Name what should be there and is not, whole or in part; what only pictures are drawn from may be asked for later."""
+    """Name what should be there and is not, whole or in part; what only pictures are drawn from may lack."""
     return [
         name
         for name, right in wanted.items()
@@ -193,7 +207,7 @@ def _readable(folder: Path) -> Iterator[tuple[Path, Callable[[Path], Numbers]]]:
             continue
         if path.suffix == ".zarr":
             yield path, _store
-        elif path.suffix in kinds and path.name != "settings.json":
+        elif path.suffix in kinds and path.name not in ("settings.json", "summary.json"):
             yield path, kinds[path.suffix]
 
 
@@ -241,7 +255,9 @@ def _table(path: Path) -> Numbers:
     """Return a table's rows by number, but for those that say that nothing is there."""
     rows = list(csv.DictReader(io.StringIO(path.read_text())))
     kept = {
-        str(number): json.dumps({name: cell for name, cell in row.items() if not name.startswith(("seconds", "forwards"))})
+        str(number): json.dumps(
+            {name: cell for name, cell in row.items() if not name.startswith(("seconds", "forwards"))}
+        )
         for number, row in enumerate(rows)
         if row.get("status") != "missing"
     }
