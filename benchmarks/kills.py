@@ -1,47 +1,61 @@
-"""Kill slices, sweeps, races and gallery runs at random moments, and compare what they end in with undisturbed runs.
+"""Kill jobs of all kinds at random moments, and compare what they end in with undisturbed runs.
 
-    python benchmarks/kills.py [--count 50] [--seed 0] [--json]
+    python -m benchmarks.kills [--count 50] [--seed 0] [--job slice --job workers] [--json]
 
 A job is begun in a folder of its own, killed (SIGKILL) up to four times, each time at a moment drawn from the time that
-it takes undisturbed, begun again by the same command, and then left to end. Every stored value must have the bits of
-the undisturbed run; `seconds` of searches, which are measured, are left out, and so is `forwards`, which follows from
-them. Exit code 1 says that a job ended in other bits. Jobs are forked from a process that has loaded what they need, so
-that moments fall into the work and not into its start.
+it takes undisturbed, begun again by the same command, and then left to end; of a job with workers the command, one
+worker or all of them are killed. Every stored value must have the bits of the undisturbed run; `seconds` of searches,
+which are measured, are left out, and so is `forwards`, which follows from them. No process of a killed job may go on
+for long, and nothing hidden may lie in its folder at the end. Exit code 1 says that it was otherwise. Jobs are forked
+from a process that has loaded what they need, so that moments fall into the work and not into its start.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import hashlib
 import importlib
 import json
 import multiprocessing
 import os
 import random
+import signal
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 
 import torch
+from benchmarks import results
+from benchmarks.forked import at_home, ended, living
 
 from gradscape.cli import main as landscape
+from gradscape.landscapes import tradeoff
 
 JOBS = {
     "slice": "slice bounce --dims 0 1 --resolution 32 --fidelity draft --out made",
     "sweep": "sweep bounce --dims 0 1 --over 2 --frames 3 --resolution 12 --fidelity draft --out made",
     "race": "race bounce --methods random,descents --seeds 2 --budget 40 --fidelity draft --out made",
     "gallery": "gallery compute --only bounce --part slices --resolution 96 --fidelity draft --device cpu --data made",
+    "pairs": "pairs bounce --samples 32 --fidelity draft --device cpu --out made",
+    "tradeoff": "tradeoff bounce --points 8 --ladder precision --device cpu --out made",
+    "report": "report branin --points 3 --out made",
+    "workers": "slice bounce --dims 0 1 --resolution 48 --fidelity draft --device cpu --scheduler local:2 --out made",
 }
+VICTIMS = ("parent", "worker", "all")  # of a job with workers
 LOADED = (  # by all jobs together
     *("search_report", "race_report", "sweep_report", "gallery_report", "envs.bounce", "envs.engines.rigid"),
+    *("pairs_report", "tradeoff_report", "measure_report", "landscapes.pairs", "landscapes.tradeoff"),
     *("envs.points", "optim.race", "optim.random", "optim.descent", "landscapes.adapters", "landscapes.job"),
     *(f"landscapes.draw.{name}" for name in ("contour", "profile", "sweep", "sweep_stream", "race")),
 )
+RECORDS = (".npz", "pairs.json", "report.json", "measures.json")  # of studies, beside stores
 MOST = 4  # times that one job is killed
 FORK = multiprocessing.get_context("fork")
 
@@ -53,12 +67,17 @@ class Tally:
     seconds: float
     jobs: int = 0
     other_bits: int = 0
+    hidden: int = 0  # files that were left by processes that were killed
+    orphans: int = 0
     kills: Counter[str] = field(default_factory=Counter)
 
 
 def work(command: str, folder: Path) -> None:
     """Run a command in a folder, silently."""
+    os.setsid()  # a group of its own
     os.chdir(folder)
+    at_home(folder)
+    tradeoff.TIMING = 0.02
     with open(os.devnull, "w") as nowhere:
         for stream in (1, 2):
             os.dup2(nowhere.fileno(), stream)
@@ -66,21 +85,27 @@ def work(command: str, folder: Path) -> None:
     landscape(command.split())
 
 
-def run(command: str, folder: Path, patience: float | None = None) -> bool:
-    """Run a command, kill it when patience is over, and say whether it ended before."""
+def run(command: str, folder: Path, patience: float | None = None, victim: str = "parent") -> tuple[bool, int]:
+    """Run a command, kill it when patience is over; say whether it ended before, and what of it lives on."""
     process = FORK.Process(target=work, args=(command, folder))
     process.start()
+    assert process.pid is not None
     process.join(patience)
-    if process.is_alive():
-        process.kill()
+    killed = process.is_alive()
+    if killed:
+        workers = [number for number, name in living(process.pid) if number != process.pid and "python" in name]
+        for number in {"parent": [process.pid], "worker": workers[:1], "all": [process.pid, *workers]}[victim]:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(number, signal.SIGKILL)
     process.join()
-    if process.exitcode not in (0, -9):
+    left = ended(process.pid)
+    if process.exitcode not in (0, -signal.SIGKILL, *([1] if killed and victim == "worker" else [])):
         raise RuntimeError(f"{command} left with exit code {process.exitcode} in {folder}")
-    return process.exitcode == 0
+    return process.exitcode == 0, len(left)
 
 
 def bits(folder: Path) -> tuple[int, str]:
-    """Return how many points the stores in a folder hold, and a digest of all their values."""
+    """Return how many points and records a folder holds, and a digest of all their values."""
     from gradscape.landscapes.store import SliceStore, is_slice
     from gradscape.optim.run import Run, is_run
 
@@ -98,7 +123,16 @@ def bits(folder: Path) -> tuple[int, str]:
         done += int((dataset["status"] > 0).sum())
         for name in sorted(dataset.data_vars):
             digest.update(str(name).encode() + dataset[name].to_numpy().tobytes())
+    for name, one in results.numbers(folder).items():
+        if name.endswith(RECORDS):
+            digest.update(f"{name} {one.whole}".encode())
+            done += 1
     return done, digest.hexdigest()
+
+
+def hidden(folder: Path) -> list[Path]:
+    """Return what was being made in a folder and never was."""
+    return [path for path in folder.rglob(".*") if path.suffix in (".making", ".partial")]
 
 
 def held(folder: Path) -> tuple[int, str]:
@@ -115,23 +149,36 @@ def _send_bits(folder: Path, answer: Connection) -> None:
     answer.send(bits(folder))
 
 
-def disturbed(command: str, folder: Path, kills: int, moment: Callable[[], float], whole: int, tally: Tally) -> int:
+def disturbed(
+    command: str,
+    folder: Path,
+    kills: int,
+    moment: Callable[[], float],
+    victim: Callable[[], str],
+    whole: int,
+    tally: Tally,
+) -> int:
     """Kill a job so often unless it ends before, let it end, and return how often it was killed."""
     done = 0
-    while done < kills and not run(command, folder, moment()):
+    while done < kills:
+        over, left = run(command, folder, moment(), victim())
+        tally.orphans += left
+        if over:
+            break
         points = held(folder)[0]
         tally.kills["nothing" if not points else "all" if points == whole else "a part"] += 1
         done += 1
-    run(command, folder)
+    tally.orphans += run(command, folder)[1]
+    tally.hidden += len(hidden(folder))
     return done
 
 
-def trial(count: int, seed: int, root: Path) -> dict[str, Tally]:
+def trial(count: int, seed: int, root: Path, kinds: Sequence[str] = tuple(JOBS)) -> dict[str, Tally]:
     """Kill jobs of all kinds in turn until so many kills are done."""
     chance, tallies, wanted = random.Random(seed), dict[str, Tally](), dict[str, tuple[int, str]]()
     left, number = count, 0
     while left:
-        kind = list(JOBS)[number % len(JOBS)]
+        kind = kinds[number % len(kinds)]
         if kind not in tallies:
             folder = root / f"{kind}-undisturbed"
             folder.mkdir()
@@ -142,9 +189,9 @@ def trial(count: int, seed: int, root: Path) -> dict[str, Tally]:
         tally, folder = tallies[kind], root / f"{kind}-{number}"
         folder.mkdir()
         kills = min(left, chance.randint(1, MOST))
-        left -= disturbed(
-            JOBS[kind], folder, kills, lambda tally=tally: chance.uniform(0, tally.seconds), wanted[kind][0], tally
-        )
+        victim = partial(chance.choice, VICTIMS if kind == "workers" else VICTIMS[:1])
+        moment = partial(chance.uniform, 0, tally.seconds)
+        left -= disturbed(JOBS[kind], folder, kills, moment, victim, wanted[kind][0], tally)
         tally.jobs += 1
         tally.other_bits += held(folder) != wanted[kind]
         number += 1
@@ -157,22 +204,27 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--job", action="append", choices=list(JOBS))
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
     for module in LOADED:
         importlib.import_module(f"gradscape.{module}")
     with tempfile.TemporaryDirectory() as root:
-        tallies = trial(given.count, given.seed, Path(root))
+        tallies = trial(given.count, given.seed, Path(root), given.job or list(JOBS))
     if given.json:
-        said = {kind: {"jobs": one.jobs, "kills": one.kills, "other_bits": one.other_bits}
-                for kind, one in tallies.items()}  # fmt: skip
+        said = {kind: {"jobs": one.jobs, "kills": one.kills, "other_bits": one.other_bits, "hidden": one.hidden,
+                       "orphans": one.orphans} for kind, one in tallies.items()}  # fmt: skip
         print(json.dumps(said))
     else:
-        print("| job | jobs | kills | with nothing, a part, all on disk | other bits |\n|---|---|---|---|---|")
+        print(
+            "| job | jobs | kills | with nothing, a part, all on disk | other bits | hidden files left "
+            "| processes left |\n|---|---|---|---|---|---|---|"
+        )
         for kind, one in tallies.items():
             at = ", ".join(str(one.kills[where]) for where in ("nothing", "a part", "all"))
-            print(f"| {kind} | {one.jobs} | {one.kills.total()} | {at} | {one.other_bits} |")
-    sys.exit(int(any(one.other_bits for one in tallies.values())))
+            ends = f"{one.other_bits} | {one.hidden} | {one.orphans}"
+            print(f"| {kind} | {one.jobs} | {one.kills.total()} | {at} | {ends} |")
+    sys.exit(int(any(one.other_bits or one.hidden or one.orphans for one in tallies.values())))
 
 
 if __name__ == "__main__":

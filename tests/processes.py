@@ -12,13 +12,13 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import count
-from multiprocessing import get_context
 from pathlib import Path
 from signal import SIGKILL, Signals
 from typing import Any
 
 import pytest
 import zarr
+from benchmarks.forked import FORK, LOADED
 
 from gradscape.cli import main
 from gradscape.landscapes import job
@@ -26,17 +26,10 @@ from gradscape.optim import run, search
 
 from .command import Said, leave_blank
 
-LOADED = (
-    *("search_report", "race_report", "sweep_report", "gallery_report", "envs.bounce", "envs.engines.rigid"),
-    *("envs.functions", "envs.points", "optim.race", "optim.random", "optim.cmaes", "optim.descent", "landscapes.job"),
-    *(f"landscapes.draw.{name}" for name in ("contour", "profile", "curve", "sweep", "sweep_stream", "race")),
-)
 CHANGES = {"os.mkdir", "os.rename", "os.remove", "os.rmdir"}  # events of PEP 578
 
 # Processes are forked from one that has loaded what they need, and has used nothing of it.
-PROCESSES = get_context("forkserver")
-OTHERS = ("pytest", "hypothesis", "dask.array", "jinja2", "imageio_ffmpeg")  # Dask's arrays are loaded by xarray
-PROCESSES.set_forkserver_preload([*OTHERS, *(f"gradscape.{name}" for name in LOADED)])
+FORK.set_forkserver_preload(["pytest", "hypothesis", "benchmarks.results", "benchmarks.commands", *LOADED])
 
 
 @dataclass(frozen=True)
@@ -60,9 +53,9 @@ class Ended(Said):
 
 def alone(work: Callable[[], object], folder: Path, stop: Instant | None = None) -> Ended:
     """Do work in a process of its own and in a folder, and wait for its end."""
-    changes = PROCESSES.Value("i", 0, lock=False)
+    changes = FORK.Value("i", 0, lock=False)
     with tempfile.TemporaryDirectory() as said:
-        process = PROCESSES.Process(target=_work, args=(work, folder, Path(said), changes, stop or Instant()))
+        process = FORK.Process(target=_work, args=(work, folder, Path(said), changes, stop or Instant()))
         process.start()
         process.join()
         out, err = ((Path(said) / name).read_text() for name in ("out", "err"))

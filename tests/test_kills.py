@@ -5,7 +5,7 @@ from pathlib import Path
 from signal import SIGKILL
 
 import pytest
-from benchmarks.kills import bits
+from benchmarks.kills import bits, hidden
 
 from gradscape.cli import main
 
@@ -17,6 +17,7 @@ JOBS = {
     "slice": ("slice bounce --dims 0 1 --resolution 12 --fidelity draft --out made", "landscape.png"),
     "sweep": ("sweep bounce --dims 0 1 --over 2 --frames 2 --resolution 8 --fidelity draft --out made", "sweep.gif"),
     "race": ("race bounce --methods random,descents --seeds 2 --budget 12 --fidelity draft --out made", "race.png"),
+    "pairs": ("pairs bounce --samples 2 --fidelity draft --device cpu --out made", "pairs.json"),
     "gallery": (
         "gallery compute --only bounce --part slices --resolution 24 --fidelity draft --device cpu --data made",
         "bounce-y",
@@ -24,19 +25,24 @@ JOBS = {
 }
 
 
+INSTANTS = {"pairs": [Instant(1), Instant(1, "moved-0"), Instant(1, "crossed-0"), Instant(1, "pairs.json")]}
+
+
 @pytest.mark.parametrize("job", JOBS)
 def test_four_kills_change_no_bit(job: str, tmp_path: Path) -> None:
     """One before anything is there, one before a tile's losses, one before a status, one when all values are there."""
     command, last = JOBS[job]
+    four = INSTANTS.get(job, [Instant(1), Instant(4, "loss/c"), Instant(5, "status/c"), Instant(1, last)])
     work, killed, whole = partial(landscape, *command.split()), tmp_path / "killed", tmp_path / "whole"
     for folder in (killed, whole):
         folder.mkdir()
-    for instant in (Instant(1), Instant(4, "loss/c"), Instant(5, "status/c"), Instant(1, last)):
+    for instant in four:
         assert alone(work, killed, instant).returncode == -SIGKILL
     for folder in (killed, whole):
         done = alone(work, folder)
         assert done.returncode == 0, done.stderr
     assert bits(killed) == bits(whole)
+    assert not hidden(killed)
     assert bits(whole)[0] > 0
 
 
