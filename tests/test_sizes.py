@@ -128,7 +128,7 @@ def test_an_option_that_takes_too_much_is_refused_by_name(name: str, option: str
 
 
 def test_a_method_is_refused_before_it_is_made(desk: Path) -> None:
-    done = alone(partial(limited, *"optimize ackley --set dim=100000 --method cma-es".split()), desk)
+    done = alone(partial(limited, *["optimize", "ackley", "--set", "dim=100000", "--method", "cma-es"]), desk)
     assert refused(done), done.stderr
 
 
