@@ -171,7 +171,8 @@ def _drive(needs: str, place: str, command: str, disk: Disk) -> None:
     here = os.statvfs(place)
     used, nodes = (here.f_blocks - here.f_bfree) * here.f_frsize, here.f_files - here.f_ffree
     if mounted:
-        space = "1g" if disk.space is None else used + disk.space // here.f_frsize * here.f_frsize
+        pages = max(1, (used + (disk.space or 0)) // here.f_frsize)  # of 0 there would be no bound
+        space = "1g" if disk.space is None else pages * here.f_frsize
         _mount(place, f"size={space},nr_inodes={100000 if disk.files is None else nodes + disk.files}", REMOUNT)
     full = _run(command, told.parent, limit=None if mounted else disk.space)
     if mounted:
