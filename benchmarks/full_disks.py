@@ -149,6 +149,8 @@ def _judged(found: Found, whole: Found) -> tuple[str, str]:
     for when, ended in (("full", full), ("with room", again)):
         if failure := forked.failure(ended):
             return failure, f"{when}: {forked.last_words(ended.err)}"
+    if not full.code and FULL.search(full.err):
+        return "met it and said done", full.err
     if full.code and not FULL.search(full.err):
         return "not said to be full", full.err
     if full.code and not ADVICE.search(full.err):
