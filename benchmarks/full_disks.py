@@ -149,6 +149,8 @@ def _judged(found: Found, whole: Found) -> tuple[str, str]:
     for when, ended in (("full", full), ("with room", again)):
         if failure := forked.failure(ended):
             return failure, f"{when}: {forked.last_words(ended.err)}"
+    if not full.code and FULL.search(full.err):
+        return "met it and said done", full.err
     if full.code and not FULL.search(full.err):
         return "not said to be full", full.err
     if full.code and not ADVICE.search(full.err):
@@ -171,7 +173,8 @@ def _drive(needs: str, place: str, command: str, disk: Disk) -> None:
     here = os.statvfs(place)
     used, nodes = (here.f_blocks - here.f_bfree) * here.f_frsize, here.f_files - here.f_ffree
     if mounted:
-        space = "1g" if disk.space is None else used + disk.space // here.f_frsize * here.f_frsize
+        pages = max(1, (used + (disk.space or 0)) // here.f_frsize)  # of 0 there would be no bound
+        space = "1g" if disk.space is None else pages * here.f_frsize
         _mount(place, f"size={space},nr_inodes={100000 if disk.files is None else nodes + disk.files}", REMOUNT)
     full = _run(command, told.parent, limit=None if mounted else disk.space)
     if mounted:
