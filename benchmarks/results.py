@@ -72,7 +72,8 @@ def _interrupted(*_: object, **__: object) -> None:
 KINDS = {
     "slice": Kind(
         f"{CUT} {MADE}",
-        (EXPORT, f"overlay {MADE} run --out {READ}", f"report {MADE} --points 2 --out {READ} --json", f"view {MADE}"),
+        (EXPORT, f"overlay {MADE} run --out {READ}", f"report {MADE} --points 2 --out {READ} --json", f"view {MADE}",
+         f"surface {MADE} --out {READ}"),
         needs=(f"{SEARCH} run",),
     ),
     "line": Kind(

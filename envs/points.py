@@ -39,7 +39,7 @@ def _read(environment: Environment, path: Path) -> Float[Tensor, " dim"]:
         else:
             values = np.loadtxt(path, delimiter="," if "," in path.read_text() else None, ndmin=1)
         flat = torch.from_numpy(np.asarray(values, dtype=np.float64).ravel())
-    except (ValueError, TypeError, OSError) as error:
+    except (ValueError, TypeError, OSError, EOFError) as error:
         raise ValueError(f"{path} holds no list of numbers: {' '.join(str(error).split())}") from None
     if len(flat) != environment.space.dim or not bool(flat.isfinite().all()):
         raise ValueError(

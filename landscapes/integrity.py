@@ -38,7 +38,8 @@ def check_integrity(path: Path, group: zarr.Group, axes: Mapping[str, NDArray[An
 def check_layouts(path: Path) -> None:
     """Raise StoreError, naming the file, where what says how an array is stored cannot be read."""
     for folder in sorted(one for one in path.iterdir() if one.is_dir()):
-        _read(folder)
+        if _read(folder).get("node_type") != "array":
+            raise _damaged(folder / "zarr.json", "it does not say how an array is stored")
 
 
 def _index(path: Path) -> dict[str, Any]:

@@ -61,6 +61,13 @@ def remove(folder: Path, ours: Ours) -> None:
             path.unlink(missing_ok=True)
 
 
+def clear_halves(folder: Path) -> None:
+    """Remove from a store that nobody else writes to what zarr had not written whole when a process was killed."""
+    for path, name in _files(folder):
+        if re.search(rf"{HALF}$", name):
+            path.unlink(missing_ok=True)
+
+
 def _files(folder: Path) -> Iterator[tuple[Path, str]]:
     """Yield the files of a folder at any depth, with their paths in it; a link to a folder is one of them."""
 

@@ -34,7 +34,7 @@ from ..landscapes.files import placing, resolved
 from ..landscapes.identity import StoreError, StoreExistsError, check_identity
 from ..landscapes.layout import FILL, consolidate, open_group
 from ..landscapes.objective import Evaluation, Status
-from ..landscapes.ownership import check_ours, lost_root
+from ..landscapes.ownership import check_ours, clear_halves, lost_root
 from ..landscapes.space import ParameterSpace
 from .base import Kind
 from .kept import CHUNK, STATE, Kept, checksums, damaged, digest_of, first_wrong
@@ -198,6 +198,7 @@ class Run:
             except BlockingIOError:
                 raise StoreError(f"{self.path} is being filled by another process; wait for it or stop it") from None
             self._check_in_place()
+            clear_halves(self.path)
             self._load(self.path)
             yield
         finally:

@@ -292,6 +292,15 @@ def test_a_file_of_somebody_elses_in_a_run_is_not_lost_by_force(tmp_path: Path) 
     assert Run.create(path, SPACE, identity={}, budget=3, overwrite=True).budget == 3
 
 
+def test_what_zarr_had_not_written_whole_goes_when_the_run_is_filled_again(tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run.zarr")
+    half = tmp_path / f"run.zarr/loss/c/0.{32 * 'a'}.partial"
+    half.parent.mkdir(parents=True)
+    half.write_bytes(b"half")
+    with run.filling():
+        assert not half.exists()
+
+
 def test_one_process_at_a_time_fills_a_run(tmp_path: Path) -> None:
     run = run_at(tmp_path / "run.zarr")
     other = os.open(tmp_path / "run.zarr", os.O_RDONLY)

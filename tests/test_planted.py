@@ -1,0 +1,156 @@
+"""Nothing that is read from a result's folder is run: somebody else's result is data, whatever is in it."""
+
+import contextlib
+import io
+import json
+import os
+import pickle
+import shutil
+import sys
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numcodecs.pickles
+import numpy as np
+import pytest
+import typer
+import zarr
+from benchmarks import results
+from benchmarks.damage import Trial, files
+from benchmarks.results import KINDS
+
+from gradscape import Environment
+from gradscape.cli import app, main
+
+from .processes import alone
+
+READ_AS_TEXT = {".json", ".md", ".csv", ".js", ".html", ".toml", ".css"}
+SHOWN = {".png", ".mp4", ".webp", ".rrd", ".gltf", ".pdf", ".svg"}  # and never read
+SPRUNG = "sprung"  # the folder that appears where what was planted is run
+
+
+class Trap:
+    """What makes a folder when it is unpickled."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.makedirs, (SPRUNG, 0o777, True)
+
+
+def traps() -> np.ndarray[Any, Any]:
+    found = np.empty(2, dtype=object)
+    found[:] = [Trap(), Trap()]
+    return found
+
+
+def archived() -> bytes:
+    """An archive of arrays that can only be unpickled."""
+    kept = io.BytesIO()
+    np.savez(kept, outline=traps(), loss=traps(), settings=traps())
+    return kept.getvalue()
+
+
+def old_store(place: Path) -> None:
+    """Put in the place of a zarr store one of format 2, which says the same of itself, and whose arrays are pickled."""
+    attributes = json.loads((place / "zarr.json").read_text())["attributes"]
+    names = [folder.name for folder in place.iterdir() if folder.is_dir()]
+    shutil.rmtree(place)
+    group = zarr.create_group(place, zarr_format=2)
+    group.attrs.update(attributes)
+    for name in names:
+        array = group.create_array(name, shape=(2,), chunks=(2,), dtype="float64")
+        about = json.loads((place / name / ".zarray").read_text())
+        about |= {"dtype": "|O", "filters": [{"id": "vlen-utf8"}, {"id": "pickle"}], "compressor": None}
+        about |= {"fill_value": ""}
+        (place / name / ".zarray").write_text(json.dumps(about))
+        (place / name / "0").write_bytes(pickle.dumps(Trap()))
+        assert array.shape == (2,)
+
+
+def planted(folder: Path) -> Iterator[Path]:
+    """Plant a trap in a file of each kind that is no text, chunk or picture, one after another, and in stores."""
+    seen = set[str]()
+    for file in [file for file in files(folder) if not file.name.isdecimal()]:
+        if file.name == "state" and "state" not in seen:
+            head, _, _ = file.read_bytes().partition(b"\n")
+            yield from replaced(file, head + b"\n" + pickle.dumps(Trap()))
+        if (kind := file.suffix or file.name) not in {*seen, *READ_AS_TEXT, *SHOWN}:
+            seen.add(kind)
+            yield from replaced(file, archived() if kind in (".npz", ".zip") else pickle.dumps(Trap()))
+    for store in [path for path in sorted(folder.rglob("*.zarr")) if (path / "zarr.json").exists()]:
+        if store.name not in seen:
+            seen.add(store.name)
+            kept = store.with_name("kept")
+            shutil.copytree(store, kept)
+            old_store(store)
+            yield store
+            shutil.rmtree(store)
+            kept.rename(store)
+
+
+def replaced(file: Path, content: bytes) -> Iterator[Path]:
+    kept = file.read_bytes()
+    file.write_bytes(content)
+    yield file
+    file.write_bytes(kept)
+
+
+def said(command: str) -> str:
+    """Run a command in this process, and return what it said."""
+    sys.argv = ["landscape", *command.split()]
+    heard = io.StringIO()
+    with contextlib.redirect_stderr(heard), contextlib.redirect_stdout(heard), contextlib.suppress(SystemExit):
+        main(command.split())
+    return heard.getvalue()
+
+
+def _interrupted(*_: object, **__: object) -> None:
+    raise KeyboardInterrupt
+
+
+def sprung(kind: str, whole: Path) -> None:
+    """Plant traps in copies of a result, and print the commands on it that spring one, or end in a traceback."""
+    results.small()
+    Environment.evaluate = _interrupted  # type: ignore[method-assign, assignment]
+    numcodecs.pickles.ALLOW_UNSAFE_PICKLE_DECODE = True  # as it was in earlier versions
+    place, copy = Path.cwd(), Path.cwd() / "planted"
+    shutil.copytree(whole, copy, symlinks=True)
+    for trap in planted(copy / KINDS[kind].where):
+        shutil.rmtree(place / "here", ignore_errors=True)
+        shutil.copytree(copy, place / "here", symlinks=True)
+        os.chdir(place / "here")
+        for command in (*KINDS[kind].reads, KINDS[kind].make):
+            told = said(command)
+            if Path(SPRUNG).exists() or "Traceback" in told:
+                print(f"{trap.relative_to(copy)}: {command}: {told}", flush=True)
+    print("tried", flush=True)
+
+
+@pytest.fixture(scope="module")
+def trial(tmp_path_factory: pytest.TempPathFactory) -> Trial:
+    return Trial(tmp_path_factory.mktemp("whole"))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_nothing_that_is_read_is_run(trial: Trial, tmp_path: Path, kind: str) -> None:
+    done = alone(partial(sprung, kind, trial.whole(kind)), tmp_path)
+    assert done.stdout.split() == ["tried"], done.stdout + done.stderr
+
+
+def test_a_trap_is_sprung_by_who_unpickles_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(numcodecs.pickles, "ALLOW_UNSAFE_PICKLE_DECODE", True)
+    place = tmp_path / "store.zarr"
+    zarr.create_group(place).create_array("loss", shape=(2,), dtype="float64")
+    old_store(place)
+    with contextlib.suppress(Exception):
+        zarr.open_group(place)["loss"][...]  # type: ignore[index]
+    assert Path(SPRUNG).exists()
+
+
+def test_every_verb_that_reads_a_folder_is_tried() -> None:
+    tried = {command.split()[0] for kind in KINDS.values() for command in (kind.make, *kind.reads)}
+    verbs = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    folders = {name for name, verb in verbs.items() if any("--out" in one.opts for one in verb.params)}
+    assert tried >= folders
