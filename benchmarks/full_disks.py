@@ -38,7 +38,7 @@ WRITING = ("export", "overlay", "slice", "report", "gallery build")
 GOOD = ("room enough", "said full, then right")
 PATIENCE = 60.0  # seconds for a command, before Ctrl-C
 ADVICE = re.compile(r"make room|same command|run it again")
-FULL = re.compile(r"no space|no room|disk is full|too large", re.IGNORECASE)
+FULL = re.compile(r"no space|no room|disk is full|too large|of disk, and .* free here", re.IGNORECASE)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+ENDLESS = 10**30  # larger values take no more: their powers are beyond what a float holds
 BLOCK = 4096  # bytes that a file takes on a disk, however small it is
 UNITS = ("kB", "MB", "GB", "TB", "PB", "EB")
 MEMINFO, CGROUPS = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
@@ -36,14 +37,16 @@ def require(what: str, value: int, need: Callable[[int], Need], folder: Path | N
     Without a `folder` nothing is written.
     """
     there = Need(available_memory(), free_disk(folder) if folder else float("inf"))
-    if _fits(need(value), there):
+    too_large = min(value, ENDLESS)
+    if _fits(need(too_large), there):
         return
-    fits, too_large = 0, value
+    fits = 0
     while too_large - fits > 1:
         middle = (fits + too_large) // 2
         fits, too_large = (middle, too_large) if _fits(need(middle), there) else (fits, middle)
-    wanted, name = need(value), "memory" if need(value).memory > there.memory else "disk"
-    most = f"{what} {_rounded_down(fits)} would fit" if fits else f"not even {what} 1 would fit"
+    wanted = need(min(value, ENDLESS))
+    name = "memory" if wanted.memory > there.memory else "disk"
+    most = f"{what} {_rounded_down(fits)} would fit" if fits else f"not even {what} 1 would fit, so make room"
     raise TooLargeError(
         f"{what} {value} takes about {size(getattr(wanted, name))} of {name}, and {size(getattr(there, name))} are "
         f"free here; {most}"

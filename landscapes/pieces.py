@@ -18,6 +18,7 @@ from .ownership import check_ours
 from .records import DamagedError, read_json, reading, text
 
 SETTINGS, PIECES = "settings.json", "pieces"
+PIECE = "piece"  # the array that says which one it is, so that two that were swapped are not taken for right
 PIECE = re.compile(r"[^/]+\.npz")  # the name of one
 
 
@@ -55,7 +56,10 @@ class Pieces:
             return None
         try:
             with reading(path, "it is computed again"), np.load(path, allow_pickle=False) as arrays:
-                return dict(arrays)
+                found = dict(arrays)
+                if str(found.pop(PIECE, name)) != name:  # those of earlier versions do not say
+                    raise ValueError("it is another piece")
+                return found
         except DamagedError as error:
             warnings.warn(str(error), RuntimeWarning, stacklevel=2)
             return None
@@ -63,7 +67,7 @@ class Pieces:
     def save(self, name: str, **arrays: Any) -> None:
         """Write a piece, whole or not at all."""
         with replacing(self._path(name)) as partial, partial.open("wb") as file:
-            np.savez(file, **arrays)
+            np.savez(file, **{PIECE: np.array(name), **arrays})
 
     def count(self) -> int:
         """Return how many pieces are there."""

@@ -174,11 +174,15 @@ def test_a_device_that_is_not_here_has_the_rate_that_tradeoff_kept(
     env = gradscape.make("flip", fidelity="draft", device="cpu", horizon=0.5)
     rung = {"name": "draft", "engine": "warp", "device": "cuda", "options": asdict(env.options), "batch": 8}
     rung |= {"fidelity": asdict(env.fidelity), "seconds": {"forward": 1.0, "with_gradient": 2.5}, "memory": 10}
-    report = {"env": "flip", "identity": {"options": asdict(env.options), "device": "cuda"}, "rungs": [rung]}
+    rung |= {"loss_error": {"p95": {"value": None}, "p95_relative": {"value": None}}, "compared": 4}
+    identity = {"options": asdict(env.options), "device": "cuda", "code": env.code, "engine": "warp"}
+    report = {"env": "flip", "identity": identity, "rungs": [rung], "reference": "draft", "loss_unit": env.loss_unit}
     from gradscape.tolerance import keep
 
     path = keep(report)
-    found = json.loads(run(*command, "--json", cwd=tmp_path).stdout)
+    done = run(*command, "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
     assert found["device"] == "cuda"
     assert (found["seconds"]["simulating"], found["batches"]) == (16 * 2.5, 2)
     assert str(path) in found["rate"]

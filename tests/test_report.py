@@ -37,7 +37,7 @@ def test_a_slice_is_reported_in_numbers_and_words(run: Run, cut: Path, tmp_path:
     assert record["noise"]["again"] == record["noise"]["batch"] == 0
     assert record["paper"] is None
     assert "with gradients: about" in done.stderr
-    assert re.search(r"s, and 1\.0 s to measure 576 samples; \d+ MB of memory\n", done.stderr)
+    assert re.search(r"s, and 1\.0 s to measure 576 samples; [\d.]+ [MG]B of memory\n", done.stderr)
     named = json.loads((tmp_path / "told/measures.json").read_text())
     assert named["Local minima deeper than 1 % of the range"] == "3"
     assert (tmp_path / "told/gradient-quality.png").read_bytes().startswith(b"\x89PNG")

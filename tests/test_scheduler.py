@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import uuid
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -84,7 +85,8 @@ def met(address: str, context: ssl.SSLContext | None) -> None:
         comm = await connect(address, ssl_context=context)
         comm.abort()
 
-    asyncio.run(greeted())
+    with ThreadPoolExecutor(1) as beside:  # of this thread, in which a browser's tests may have left a loop
+        beside.submit(asyncio.run, greeted()).result()
 
 
 def context_of(keys: Security) -> ssl.SSLContext:

@@ -19,7 +19,7 @@ from gradscape.cli import app, main
 from gradscape.landscapes.draw import viewer
 
 from .command import leave_blank
-from .processes import PROCESSES
+from .processes import FORK
 from .sockets import beyond_loopback, listening
 
 SMALL = """
@@ -149,7 +149,7 @@ def walk(folder: Path) -> None:
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, list[str], str]]:
     folder = tmp_path_factory.mktemp("sockets")
-    process = PROCESSES.Process(target=walk, args=(folder,))
+    process = FORK.Process(target=walk, args=(folder,))
     process.start()
     process.join()
     return json.loads((folder / "found.json").read_text())

@@ -13,7 +13,7 @@ import os
 import platform
 import sys
 from collections.abc import Iterator
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from functools import partial
@@ -91,7 +91,8 @@ def _greet(address: str) -> None:
         comm.abort()
 
     try:
-        asyncio.run(greeted())
+        with ThreadPoolExecutor(1) as beside:  # where this thread runs a loop of its own, as a notebook's does
+            beside.submit(asyncio.run, greeted()).result()
     except Exception as error:  # whatever it is that answers there, or does not
         said = f"{error}" or f"nothing is said there in {ANSWER:g} s"
         raise ConnectionError(f"no Dask scheduler answers at {address}: {said}") from error

@@ -20,7 +20,7 @@ from gradscape.landscapes.slice_paths import filling
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.store import SliceStore
 
-from ..processes import PROCESSES
+from ..processes import FORK
 
 SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
 PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 16))
@@ -193,8 +193,8 @@ def _fill(path: Path, barrier) -> None:
 
 
 def test_two_processes_fill_the_same_store_and_harm_nothing(tmp_path, whole):
-    barrier = PROCESSES.Barrier(2)
-    both = [PROCESSES.Process(target=_fill, args=(tmp_path / "s.zarr", barrier)) for _ in range(2)]
+    barrier = FORK.Barrier(2)
+    both = [FORK.Process(target=_fill, args=(tmp_path / "s.zarr", barrier)) for _ in range(2)]
     for process in both:
         process.start()
     for process in both:

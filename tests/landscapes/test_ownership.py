@@ -141,6 +141,21 @@ def test_a_damaged_piece_is_said_and_computed_again(content: bytes | None, tmp_p
         assert pieces.load("one") is None
 
 
+def test_pieces_in_each_others_place_are_computed_again(tmp_path: Path) -> None:
+    pieces = Pieces.open(tmp_path, {"seed": 0}, what="pairs")
+    for name in ("one", "two"):
+        pieces.save(name, loss=np.arange(3.0))
+    files = [tmp_path / f"pieces/{name}.npz" for name in ("one", "two")]
+    contents = [file.read_bytes() for file in files]
+    for file, content in zip(files, reversed(contents), strict=True):
+        file.write_bytes(content)
+    for name in ("one", "two"):
+        with pytest.warns(
+            RuntimeWarning, match=rf"{name}\.npz is damaged \(it is another piece\); it is computed again"
+        ):
+            assert pieces.load(name) is None
+
+
 def test_what_a_living_process_makes_is_held_and_nobody_clears_it_away(tmp_path: Path) -> None:
     file, folder = tmp_path / "file", tmp_path / "folder"
     with replacing(file) as half, placing(folder, overwrite=False) as new:

@@ -28,7 +28,7 @@ from gradscape.landscapes.spread import Site, WorkersLostError, equal_batches
 from gradscape.landscapes.store import SliceStore
 
 from ..clock import Clock
-from ..processes import PROCESSES
+from ..processes import FORK
 
 cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers need not find the tests
 SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
@@ -50,7 +50,7 @@ def same(one: SliceStore, other: SliceStore) -> bool:
 
 @pytest.fixture(scope="module")
 def processes():
-    with ProcessPoolExecutor(2, mp_context=PROCESSES) as pool:
+    with ProcessPoolExecutor(2, mp_context=FORK) as pool:
         yield pool
 
 
