@@ -18,7 +18,7 @@ from .ownership import check_ours
 from .records import DamagedError, read_json, reading, text
 
 SETTINGS, PIECES = "settings.json", "pieces"
-PIECE = "piece"  # the array that says which one it is, so that two that were swapped are not taken for right
+NAME = "piece"  # the array that says which one it is, so that two that were swapped are not taken for right
 PIECE = re.compile(r"[^/]+\.npz")  # the name of one
 
 
@@ -57,7 +57,7 @@ class Pieces:
         try:
             with reading(path, "it is computed again"), np.load(path, allow_pickle=False) as arrays:
                 found = dict(arrays)
-                if str(found.pop(PIECE, name)) != name:  # those of earlier versions do not say
+                if str(found.pop(NAME, name)) != name:  # those of earlier versions do not say
                     raise ValueError("it is another piece")
                 return found
         except DamagedError as error:
@@ -67,7 +67,7 @@ class Pieces:
     def save(self, name: str, **arrays: Any) -> None:
         """Write a piece, whole or not at all."""
         with replacing(self._path(name)) as partial, partial.open("wb") as file:
-            np.savez(file, **{PIECE: np.array(name), **arrays})
+            np.savez(file, **{NAME: np.array(name), **arrays})
 
     def count(self) -> int:
         """Return how many pieces are there."""
