@@ -53,6 +53,7 @@ CACHES = (Path.home() / ".cache", Path("/dev"), Path("/proc"), Path("/sys"))  # 
 
 def load() -> None:
     """Let the process that others are forked from load what the verbs need; it uses none of it."""
+    os.environ["PYTHONWARNINGS"] = "ignore::RuntimeWarning:runpy"  # that a program is imported by its parts, too
     FORK.set_forkserver_preload([*LOADED, "benchmarks.commands", "benchmarks.results"])
 
 

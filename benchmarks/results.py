@@ -240,7 +240,11 @@ def _of_dataset(dataset: Any) -> Numbers:
 
 
 def _json(path: Path) -> Numbers:
-    return Numbers({}, _digest(json.dumps(plain(json.loads(path.read_text())), sort_keys=True).encode()))
+    from gradscape.landscapes.records import unsigned
+
+    found = json.loads(path.read_text())
+    said = [unsigned(one) for one in found] if isinstance(found, list) else unsigned(found)
+    return Numbers({}, _digest(json.dumps(plain(said), sort_keys=True).encode()))
 
 
 def plain(value: Any) -> Any:

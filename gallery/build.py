@@ -31,12 +31,13 @@ from ..landscapes.files import placing, resolved
 from ..landscapes.identity import stored_identity, stored_provenance
 from ..landscapes.job import PICTURE, STORE
 from ..landscapes.ownership import check_ours
+from ..landscapes.records import reading
 from ..landscapes.slice_arrays import parameters_of, plane_of
 from ..landscapes.slice_paths import is_slice
 from ..landscapes.store import SliceStore, open_slice
 from .figures import HERE, Figure
 from .measured import MEASURES, QUALITY, REPORT, dark_name, place_tradeoffs, read_report
-from .page_data import nodes, numbers, read_episodes, read_measures, read_sweep
+from .page_data import REMAKE, nodes, numbers, read_episodes, read_measures, read_sweep
 from .runs import FOLDER
 from .trajectories import read_runs, trajectories
 
@@ -132,7 +133,8 @@ def _page(
     pictures = [PICTURE, THUMBNAIL, *(name for name in given if name.endswith(".png"))]
     for name in pictures:
         if not (folder / dark_name(name)).exists():
-            save_dark(folder / name, folder / dark_name(name))
+            with reading(source / name, REMAKE.format("slices")):
+                save_dark(folder / name, folder / dark_name(name))
     copied = [name for name in given if name not in pictures]
     entry = _entry(figure, dataset) | {
         "files": [NODES, "index.html", *copied, *(name for one in pictures for name in (one, dark_name(one)))],

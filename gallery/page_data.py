@@ -13,7 +13,7 @@ import xarray as xr
 
 from ..landscapes.job import flat_points
 from ..landscapes.objective import Status
-from ..landscapes.records import maybe, number, read_json, reading, text
+from ..landscapes.records import maybe, number, read_json, reading, text, unsigned
 from ..landscapes.store import plane_of
 
 EPISODES = "episodes.json"
@@ -95,7 +95,7 @@ def read_episodes(folder: Path, dataset: xr.Dataset) -> list[dict[str, Any]]:
         plane = plane_of(dataset)
         axes = [axis.tolist() for axis in plane.axes()]
         found: dict[tuple[int, int], dict[str, Any]] = {}
-        for said in json.loads(listed.read_text()):
+        for said in map(unsigned, json.loads(listed.read_text())):
             row, column = place = int(said["row"]), int(said["column"])
             if place in found:
                 found[place]["why"] += ", " + text(said["why"])

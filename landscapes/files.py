@@ -49,7 +49,12 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def visible(folder: Path) -> list[Path]:
-    """Return what a folder holds, but for hidden files: a process that was killed may have left what it was making."""
+    """Return what a folder holds, but for hidden files: a process that was killed may have left what it was making.
+
+    Raises ValueError where a file is in its place.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder} is a file and no folder; give another path")
     return [path for path in folder.iterdir() if not path.name.startswith(".")] if folder.exists() else []
 
 

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from .identity import StoreError
 
+ANEW = "restore it, or delete the slice, and the same command samples it anew"
+
 
 def check_integrity(path: Path, group: zarr.Group, axes: Mapping[str, NDArray[Any]], values: Sequence[str]) -> None:
     """Raise StoreError, naming the file, where a slice store's layout or axes are not what they were made.
@@ -73,4 +75,4 @@ def _read(folder: Path) -> dict[str, Any]:
 
 
 def _damaged(path: Path, why: str) -> StoreError:
-    return StoreError(f"{path} is damaged: {why}; restore it, or begin the slice anew with --force")
+    return StoreError(f"{path} is damaged: {why}; {ANEW}")

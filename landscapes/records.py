@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+import zlib
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from .files import write_json
+
+CHECKSUM = "checksum"  # of the rest of a record, which holds it under this name
 SHOWN = 160  # characters of what is wrong
 
 
@@ -28,12 +32,33 @@ def reading(path: Path, todo: str) -> Iterator[None]:
         raise DamagedError(f"{path} is damaged ({said[:SHOWN] or type(error).__name__}); {todo}") from error
 
 
+def write_record(path: Path, record: Mapping[str, Any]) -> None:
+    """Write what `read_json` reads again, with a checksum."""
+    write_json(path, signed(record))
+
+
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the JSON object that a file holds."""
-    found = json.loads(path.read_text())
+    """Return the JSON object that a file holds, held against its checksum if it has one."""
+    return unsigned(json.loads(path.read_text()))
+
+
+def signed(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record with its checksum."""
+    return {**record, CHECKSUM: _sum(json.loads(json.dumps(record)))}
+
+
+def unsigned(found: Any) -> dict[str, Any]:
+    """Return a record without its checksum; those of earlier versions have none."""
     if not isinstance(found, dict):
         raise TypeError("it is no JSON object")
-    return found
+    record = {name: value for name, value in found.items() if name != CHECKSUM}
+    if CHECKSUM in found and found[CHECKSUM] != _sum(record):
+        raise ValueError("it is not what was written")
+    return record
+
+
+def _sum(record: Mapping[str, Any]) -> int:
+    return zlib.crc32(json.dumps(record, sort_keys=True).encode())
 
 
 def text(value: Any) -> str:

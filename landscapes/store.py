@@ -36,7 +36,7 @@ from zarr.storage import MemoryStore
 from .checksums import Checksums, tile_sum
 from .files import placing, resolved
 from .identity import StoreError, StoreExistsError, check_identity, full_identity, plain_json
-from .integrity import check_integrity, check_layouts
+from .integrity import ANEW, check_integrity, check_layouts
 from .layout import consolidate, open_group
 from .objective import Evaluation, Status
 from .ownership import lost_root, remove
@@ -125,7 +125,7 @@ class SliceStore:
             raise StoreError(f"there is no slice store at {path}; make one with `landscape slice`")
         if not is_slice(place):
             if lost_root(place, FILES):
-                raise StoreError(f"{place / 'zarr.json'} is damaged; restore it, or begin the slice anew with --force")
+                raise StoreError(f"{place / 'zarr.json'} is damaged; {ANEW}")
             raise StoreError(f"{place} is no slice store of format {FORMAT}; move it away or write elsewhere")
         try:
             group = open_group(place, "r+")
@@ -138,7 +138,7 @@ class SliceStore:
         except Exception as error:  # a damaged axis or layout raises whatever reads it; of tiles nothing is read here
             check_layouts(place)
             raise StoreError(
-                f"{place} is damaged ({type(error).__name__}: {error}); begin anew with --force"
+                f"{place} is damaged ({type(error).__name__}: {error}); delete it, and the same command samples it anew"
             ) from error
 
     @classmethod

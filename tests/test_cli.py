@@ -124,10 +124,7 @@ def test_a_folder_of_other_files_is_left_alone(run: Callable[..., Said], tmp_pat
         (["slice", "branin", "--dims", "0", "1", "--set", "dim=3"], "branin has no option 'dim'"),
         (
             ["slice", "ackley", "--dims", "0", "1", "--set", "dim=two"],
-            (
-                ["slice", "ackley", "--dims", "0", "1", "--set", "dim=two"],
-                "dim takes a whole number above 0, at most 100000; got 'two'",
-            ),
+            "dim takes a whole number above 0, at most 100000; got 'two'",
         ),
         (["slice", "ackley", "--dims", "0", "1", "--set", "dim"], "--set takes name=value; got 'dim'"),
         (["slice", "bounce", "--dims", "0", "1", "--engine", "taichi"], "bounce has engine warp; got engine 'taichi'"),

@@ -13,6 +13,7 @@ from gradscape import measure_report
 from gradscape.envs.registry import entries
 from gradscape.gallery.figures import read_figures
 from gradscape.gallery.words import paper_words
+from gradscape.landscapes.records import read_json
 from gradscape.measure_tables import environments_table
 
 from .command import Said
@@ -31,14 +32,14 @@ def test_a_slice_is_reported_in_numbers_and_words(run: Run, cut: Path, tmp_path:
     done = run("report", "cut", "--points", "2", "--out", "told", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     record = json.loads(done.stdout)
-    assert record == {**json.loads((tmp_path / "told/report.json").read_text()), "folder": "told"}
+    assert record == {**read_json(tmp_path / "told/report.json"), "folder": "told"}
     assert record["losses"]["notable"] == 3  # Branin's minima
     assert record["verdict"]["words"] == ["smooth with local minima", "gradients good"]
     assert record["noise"]["again"] == record["noise"]["batch"] == 0
     assert record["paper"] is None
     assert "with gradients: about" in done.stderr
     assert re.search(r"s, and 1\.0 s to measure 576 samples; [\d.]+ [MG]B of memory\n", done.stderr)
-    named = json.loads((tmp_path / "told/measures.json").read_text())
+    named = read_json(tmp_path / "told/measures.json")
     assert named["Local minima deeper than 1 % of the range"] == "3"
     assert (tmp_path / "told/gradient-quality.png").read_bytes().startswith(b"\x89PNG")
     again = run("report", "cut", "--points", "2", "--out", "told", cwd=tmp_path)

@@ -17,6 +17,7 @@ from gradscape.envs.base import Environment, Fidelity, Work
 from gradscape.landscapes import tradeoff
 from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.records import read_json
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.tolerance import read_tolerance
 
@@ -87,7 +88,7 @@ def test_errors_and_order_of_convergence_are_those_of_the_scene(run: Command, tm
     done = run(*TRADE, "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
-    assert {**json.loads((tmp_path / "trade/tradeoff.json").read_text()), "folder": "trade"} == report
+    assert {**read_json(tmp_path / "trade/tradeoff.json"), "folder": "trade"} == report
     assert (tmp_path / "trade/tradeoff.png").read_bytes().startswith(b"\x89PNG")
     rungs = by_name(report)
     x = tradeoff.sobol_points(Converging.space, 16, seed=0)

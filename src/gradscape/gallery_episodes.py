@@ -64,6 +64,7 @@ class Episodes(Part):
     def make(self, console: Console) -> str:
         """Film every episode that is not there, and clear away those of other nodes."""
         from .landscapes.files import write_json
+        from .landscapes.records import signed
         from .landscapes.store import plane_of
 
         dataset, env = self._dataset, self._env(self.figure.fidelity)
@@ -72,12 +73,12 @@ class Episodes(Part):
             if node not in kept:
                 with console.status(f"{self.figure.id}: the episode of {node.why}"):
                     self._draw(env, plane, node)
-                write_json(self.folder / EPISODES, [asdict(one) for one in [*kept, node]])
+                write_json(self.folder / EPISODES, [signed(asdict(one)) for one in [*kept, node]])
                 kept.append(node)
         for file in self.folder.glob("episode-*"):
             if FILM.fullmatch(file.name) and file.stem not in {node.name for node in self._nodes}:
                 file.unlink()
-        write_json(self.folder / EPISODES, [asdict(node) for node in self._nodes])
+        write_json(self.folder / EPISODES, [signed(asdict(node)) for node in self._nodes])
         return f"{len(self._nodes)} episodes"
 
     def _draw(self, env: Environment, plane: Plane, node: Node) -> None:

@@ -10,9 +10,9 @@ from . import measure_report, tradeoff_report
 from .envs.registry import environment_class, make
 from .gallery.measured import DEVICES, TRADEOFF
 from .gallery_parts import Part, read_record
-from .kept_reports import REPORT
+from .kept_reports import ARRAYS, MEASURES, PICTURE, REPORT
 from .ladder import LADDERS
-from .measure_report import MEASURES, Subject
+from .measure_report import Subject
 from .results import SLICE
 from .terminal import Console
 
@@ -36,7 +36,7 @@ class Reports(Part):
         from .landscapes.store import is_slice, open_slice
 
         kept, store = read_record(self.folder / REPORT), self.folder / SLICE
-        if not isinstance(kept, dict) or not (self.folder / MEASURES).exists() or not is_slice(store):
+        if not isinstance(kept, dict) or read_record(self.folder / MEASURES) is None or not is_slice(store):
             return 1
         key = kept.get("key")
         return int(not isinstance(key, dict) or key.get("slice") != measure_report.digest(open_slice(store)))
@@ -52,13 +52,13 @@ class Reports(Part):
         from .gallery.words import paper_words
         from .landscapes.draw.film import lighten
 
-        files = [self.folder / name for name in (REPORT, MEASURES, measure_report.PICTURE, measure_report.ARRAYS)]
+        files = [self.folder / name for name in (REPORT, MEASURES, PICTURE, ARRAYS)]
         for file in files:
             file.unlink(missing_ok=True)
         settings = {"points": REPORT_POINTS, "seed": SEED}
         subject = Subject(self.figure.id, self.folder / SLICE)
         record = measure_report.measured(console, subject, self.folder, settings, self.device, paper_words())
-        lighten(self.folder / measure_report.PICTURE)
+        lighten(self.folder / PICTURE)
         return ", ".join(record["verdict"]["words"])
 
 
@@ -82,7 +82,8 @@ class Tradeoffs(Part):
     def make(self, console: Console) -> str:
         """Measure every rung; those that are measured stay in the study's own folder under out/ until the last is."""
         from .landscapes.draw.film import lighten
-        from .landscapes.files import make_folder, write_json
+        from .landscapes.files import make_folder
+        from .landscapes.records import write_record
 
         study = self._study()
         report = study.run(console)
@@ -90,7 +91,7 @@ class Tradeoffs(Part):
         make_folder(record.parent)
         shutil.copyfile(study.pieces.folder / tradeoff_report.PICTURE, picture)
         lighten(picture)
-        write_json(record, report)
+        write_record(record, report)
         return f"{len(report['rungs'])} rungs at {report['points']} points"
 
     def _places(self) -> list[tuple[Path, Path]]:

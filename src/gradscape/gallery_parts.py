@@ -156,13 +156,13 @@ class Sweep(Part):
     def make(self, console: Console) -> str:
         """Sample the sweep's slices and film them."""
         from .landscapes.draw.sweep import save_films
-        from .landscapes.files import write_json
+        from .landscapes.records import write_record
 
         job = self._job()
         drawn = job.sampled(console)
         save_films(drawn, self.folder / FILM, None, dpi=DPI, loss=LOSS)
         about = {"label": drawn.label, "low": drawn.values[0], "high": drawn.values[-1], "command": self.label()}
-        write_json(self.folder / ABOUT, {**self._settings, **about})
+        write_record(self.folder / ABOUT, {**self._settings, **about})
         return f"{FRAMES} frames of {COARSE} x {COARSE} points over {drawn.label}"
 
     @property
@@ -253,8 +253,11 @@ def seconds_of_one(env: Environment) -> float:
 
 
 def read_record(path: Path) -> Any:
-    """Return what a JSON file holds, None if there is none that can be read."""
+    """Return the record or the list of records that a JSON file holds, None if there is none that can be read."""
+    from .landscapes.records import unsigned
+
     try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError):
+        found = json.loads(path.read_text())
+        return [unsigned(one) for one in found] if isinstance(found, list) else unsigned(found)
+    except (OSError, TypeError, ValueError):
         return None

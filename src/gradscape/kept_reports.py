@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import shutil
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from .landscapes.files import make_folder, replacing
+from .landscapes.records import read_json, reading, text, write_record
 from .measure_tables import by_environment, slices_markdown
 
-REPORT, TABLE = "report.json", "report.md"
+if TYPE_CHECKING:
+    from .terminal import Console
+
+REPORT, TABLE, MEASURES = "report.json", "report.md", "measures.json"
+PICTURE = "gradient-quality.png"
+ARRAYS = "gradient-quality.npz"  # what the picture is drawn from, but for the slice
 
 
 def read_report(path: Path) -> dict[str, Any]:
     """Return the report of a slice, all of which can be shown; raise ValueError, naming the file, where it cannot."""
     from .landscapes.character import named_measures
-    from .landscapes.records import read_json, reading, text
 
     with reading(path, "delete it, and the same command measures the slice anew"):
         record = read_json(path)
@@ -48,3 +56,49 @@ def check_summary(folder: Path) -> None:
             f"{path} is not there, damaged or of something else than several slices, so that it and {TABLE} are not "
             "replaced; move both away, or give --out a new or an empty folder"
         )
+
+
+def fetch(console: Console, source: Path, folder: Path, key: dict[str, Any]) -> None:
+    """Copy the same report from beside its slice, where the gallery has it, rather than measure again."""
+    files = [source / name for name in (PICTURE, MEASURES, REPORT)]
+    if (folder / REPORT).exists() or not all(file.exists() for file in files):
+        return
+    if _same(read_report(source / REPORT), key):
+        make_folder(folder)
+        for file in [*files, *source.glob(ARRAYS)]:
+            with replacing(folder / file.name) as partial:
+                shutil.copyfile(file, partial)
+        console.print(f"{folder} is copied from {source}", markup=False)
+
+
+def _same(record: dict[str, Any], key: dict[str, Any]) -> bool:
+    """Say whether a report is of the slice and the settings; its code may be an older one, which is said."""
+    return all(record["key"].get(name) == key[name] for name in key if name != "code")
+
+
+def kept_report(console: Console, folder: Path, key: dict[str, Any], device: str) -> dict[str, Any]:
+    """Return the report that is there, on whatever device it was measured."""
+    kept = read_report(folder / REPORT)
+    if not _same(kept, key):
+        theirs = kept["key"]
+        said = ", ".join(
+            f"{name} {theirs.get(name)} there, {key[name]} here" for name in key if theirs.get(name) != key[name]
+        )
+        raise ValueError(f"{folder} holds another report ({said}); write elsewhere with --out, or delete it")
+    leave_measures(folder, kept)
+    elsewhere = f", measured on {kept['device']}" if kept["device"] != device else ""
+    console.print(f"{folder} is there already{elsewhere}", markup=False)
+    if kept["key"]["code"] != key["code"]:
+        said = f"by other code of the scenes, {kept['key']['code']}; this is {key['code']}"
+        console.print(f"warning: it was measured {said}. Delete the folder to measure it anew", markup=False)
+    return kept
+
+
+def leave_measures(folder: Path, record: dict[str, Any]) -> None:
+    """Write the report's numbers by their names, unless the same are there."""
+    from .landscapes.character import named_measures
+
+    with contextlib.suppress(OSError, TypeError, ValueError):  # not there, or damaged
+        if read_json(folder / MEASURES) == named_measures(record):
+            return
+    write_record(folder / MEASURES, named_measures(record))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import shlex
-import shutil
 import sys
 import time
 from collections.abc import Sequence
@@ -19,11 +18,23 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from .console import duration, fill, size
 from .envs.registry import environment_class, make
 from .gallery.figures import data_folder, read_figures
-from .kept_reports import REPORT, TABLE, check_summary, read_report, verdict_lines
+from .kept_reports import (
+    ARRAYS,
+    MEASURES,
+    PICTURE,
+    REPORT,
+    TABLE,
+    check_summary,
+    fetch,
+    kept_report,
+    leave_measures,
+    verdict_lines,
+)
 from .landscapes.capacity import Need, require
 from .landscapes.disk import full, is_full
-from .landscapes.files import make_folder, others, replacing, tidy, write_json
+from .landscapes.files import others, replacing, tidy, write_json
 from .landscapes.identity import stored_identity
+from .landscapes.records import write_record
 from .measure_tables import by_environment, slices_markdown, slices_table
 from .results import SLICE, environment_of, inside
 from .tables import table
@@ -38,8 +49,6 @@ if TYPE_CHECKING:
     from .landscapes.character import Character
     from .landscapes.objective import Evaluation, Objective
 
-PICTURE, MEASURES = "gradient-quality.png", "measures.json"
-ARRAYS = "gradient-quality.npz"  # what the picture is drawn from, but for the slice
 PRECISION = {"float32": 2.0**-23, "float64": 2.0**-52}
 RESOLUTION = 24  # points per axis of a slice that is sampled for its report
 TRIAL = 32  # most episodes that are timed beforehand
@@ -196,9 +205,9 @@ def measured(
     env = environment_of(dataset, device)
     key = {**settings, "slice": digest(dataset), "code": env.code}
     if not drawn or (subject.store.parent / ARRAYS).exists():
-        _fetch(console, subject.store.parent, folder, key)
+        fetch(console, subject.store.parent, folder, key)
     if (folder / REPORT).exists():
-        return _kept(console, folder, key, env.device)
+        return kept_report(console, folder, key, env.device)
     refuse_too_many(settings["points"], dataset["loss"].ndim, env.space.dim)
     require("number of samples", dataset["loss"].size, lambda count: Need(own_cost(count)[1]))
     _warn(console, subject, dataset, env)
@@ -218,41 +227,6 @@ def measured(
     }
     _leave(console, dataset, character, record, folder)
     return record
-
-
-def _fetch(console: Console, source: Path, folder: Path, key: dict[str, Any]) -> None:
-    """Copy the same report from beside its slice, where the gallery has it, rather than measure again."""
-    files = [source / name for name in (PICTURE, MEASURES, REPORT)]
-    if (folder / REPORT).exists() or not all(file.exists() for file in files):
-        return
-    if _same(read_report(source / REPORT), key):
-        make_folder(folder)
-        for file in [*files, *source.glob(ARRAYS)]:
-            with replacing(folder / file.name) as partial:
-                shutil.copyfile(file, partial)
-        console.print(f"{folder} is copied from {source}", markup=False)
-
-
-def _same(record: dict[str, Any], key: dict[str, Any]) -> bool:
-    """Say whether a report is of the slice and the settings; its code may be an older one, which is said."""
-    return all(record["key"].get(name) == key[name] for name in key if name != "code")
-
-
-def _kept(console: Console, folder: Path, key: dict[str, Any], device: str) -> dict[str, Any]:
-    """Return the report that is there, on whatever device it was measured."""
-    kept = read_report(folder / REPORT)
-    if not _same(kept, key):
-        theirs = kept["key"]
-        said = ", ".join(
-            f"{name} {theirs.get(name)} there, {key[name]} here" for name in key if theirs.get(name) != key[name]
-        )
-        raise ValueError(f"{folder} holds another report ({said}); write elsewhere with --out, or delete it")
-    elsewhere = f", measured on {kept['device']}" if kept["device"] != device else ""
-    console.print(f"{folder} is there already{elsewhere}", markup=False)
-    if kept["key"]["code"] != key["code"]:
-        said = f"by other code of the scenes, {kept['key']['code']}; this is {key['code']}"
-        console.print(f"warning: it was measured {said}. Delete the folder to measure it anew", markup=False)
-    return kept
 
 
 def _character(console: Console, env: Environment, dataset: xr.Dataset, settings: dict[str, Any]) -> Character:
@@ -362,15 +336,14 @@ def _leave(console: Console, dataset: xr.Dataset, character: Character, record: 
     import xarray as xr
 
     from .landscapes.bundle import save_bundle
-    from .landscapes.character import named_measures
     from .landscapes.draw.page import save
     from .landscapes.draw.quality import quality_figure
 
     noise = xr.Dataset({"deviation": character.noise.deviation})
     save_bundle(folder / ARRAYS, steps=character.steps, smooth=character.smooth, noise=noise)
     save(quality_figure(dataset, character.steps, character.samples, character.smooth), folder / PICTURE)
-    write_json(folder / MEASURES, named_measures(record))
-    write_json(folder / REPORT, record)
+    leave_measures(folder, record)
+    write_record(folder / REPORT, record)
     console.print(f"{folder}: {REPORT}, {MEASURES}, {PICTURE}, {ARRAYS}", markup=False)
 
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .landscapes.plane import Plane
 
 RESOLUTION = 16  # that of `landscape slice`
+DEVICES = ("auto", "cpu", "cuda")
 
 
 def plan(
@@ -51,6 +52,8 @@ def plan(
     """Predict what a slice, a sweep or a list of figures takes, and print it."""
     began = time.perf_counter() - time.process_time()  # about when this process did
     console = Console(stderr=True, soft_wrap=True, highlight=False)
+    if device not in DEVICES:
+        raise ValueError(f"--device takes {', '.join(DEVICES)}; got {device!r}")
     options: dict[str, Any] = {"fidelity": fidelity, "engine": engine, **read_settings(settings)}
     if what.endswith(".toml"):
         if over or extent or settings or through != "center":

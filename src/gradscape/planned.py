@@ -206,9 +206,10 @@ def _filming(job: SweepJob, seconds_each: float, folder: Path, frames: int) -> t
     shown = [round(at * last / (most - 1)) for at in range(most)]
     alike = {at: Alike.of(job.moved.env_at(at), job.stores[at], most * seconds_each) for at in set(shown)}
     datasets = [alike[at].dataset(job.stores[at]) for at in shown]
+    values = tuple(job.moved.values[at] for at in shown)
 
     def film(count: int) -> None:
-        sweep = Sweep(job.moved.label, job.moved.values[:count], datasets[:count])
+        sweep = Sweep(job.moved.label, values[:count], datasets[:count])
         save_films(sweep, folder / "sweep.mp4", folder / "sweep.gif")
         save_stream(sweep, folder / "sweep.rrd")
 

@@ -28,11 +28,11 @@ ENOUGH, SHORTEST = 1e6, 0.05  # work of an episode that is timed, if it can be s
 
 def keep(report: Mapping[str, Any]) -> Path:
     """Keep a report where `chosen` finds it, in the user's data folder, in the place of an earlier one."""
-    from .landscapes.files import write_json
+    from .landscapes.records import write_record
 
     identity = report["identity"]
     path = _kept(str(report["env"]), identity["options"], identity["device"])
-    write_json(path, report)
+    write_record(path, report)
     return path
 
 

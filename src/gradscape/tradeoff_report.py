@@ -166,11 +166,12 @@ class Study:
         report = self._report(samples)
         from .landscapes.draw.page import save
         from .landscapes.draw.tradeoff import tradeoff_figure
-        from .landscapes.files import tidy, write_json
+        from .landscapes.files import tidy
+        from .landscapes.records import write_record
 
         folder = self.pieces.folder
         save(tradeoff_figure(report), folder / PICTURE)
-        write_json(folder / RECORD, report)
+        write_record(folder / RECORD, report)
         tidy(folder)
         return report
 
