@@ -36,7 +36,7 @@ def open_run(path: Path) -> xr.Dataset:
             if torn := packed.testzip():  # a chunk that is not found would be one of nothing but its fill value
                 raise ValueError(f"{torn} in it is torn")
         with ZipStore(path, mode="r") as store:
-            table = xr.open_zarr(store, zarr_format=3, consolidated=False, **plain).load()
+            table: xr.Dataset = xr.open_zarr(store, zarr_format=3, consolidated=False, **plain).load()
         if lost := COLUMNS.keys() - table.variables.keys():
             raise ValueError(f"it lacks {', '.join(sorted(lost))}")
     return table

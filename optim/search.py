@@ -98,8 +98,8 @@ def _begun(objective: Objective, method: Optimizer | str, run: Run, gradient_cos
     if state is not None:
         optimizer = _restored(objective, method, run, state)
     else:
-        named = isinstance(method, str)
-        optimizer = optimizer_class(method).on(objective, seed=int(run.attributes["seed"])) if named else method
+        seed = int(run.attributes["seed"])
+        optimizer = optimizer_class(method).on(objective, seed=seed) if isinstance(method, str) else method
         optimizer.attach(objective)
     run.rewind()
     if state is None:

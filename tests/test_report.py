@@ -13,7 +13,7 @@ from gradscape import measure_report
 from gradscape.envs.registry import entries
 from gradscape.gallery.figures import read_figures
 from gradscape.gallery.words import paper_words
-from gradscape.landscapes.records import read_json
+from gradscape.landscapes.records import read_json, write_record
 from gradscape.measure_tables import environments_table
 
 from .command import Said
@@ -114,7 +114,7 @@ def test_one_slice_that_fails_does_not_lose_the_others(
 def test_a_report_measured_on_another_device_is_taken_and_named(run: Run, cut: Path, tmp_path: Path) -> None:
     run("report", "cut", "--points", "2", "--out", "told", cwd=tmp_path)
     file = tmp_path / "told/report.json"
-    file.write_text(json.dumps({**json.loads(file.read_text()), "device": "cuda"}))
+    write_record(file, {**read_json(file), "device": "cuda"})
     done = run("report", "cut", "--points", "2", "--out", "told", cwd=tmp_path)
     assert done.returncode == 0
     assert "told is there already, measured on cuda" in done.stderr

@@ -17,7 +17,7 @@ from gradscape.envs.base import Environment, Fidelity, Work
 from gradscape.landscapes import tradeoff
 from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.objective import Evaluation
-from gradscape.landscapes.records import read_json
+from gradscape.landscapes.records import read_json, write_record
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.tolerance import read_tolerance
 
@@ -266,10 +266,10 @@ def test_a_tolerance_that_nothing_meets_names_the_best(run: Command, tmp_path: P
     kept = Path(tmp_path / "data").rglob("*.json")
     run(*TRADE, cwd=tmp_path)
     (path,) = kept
-    report = json.loads(path.read_text())
+    report = read_json(path)
     report["rungs"] = [row for row in report["rungs"] if row["name"] != "reference" and "reference" not in row["name"]]
     report["identity"]["code"] = "older"
-    path.write_text(json.dumps(report))
+    write_record(path, report)
     how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--tolerance"]
     none = run(*how, "1e-9", cwd=tmp_path)
     assert none.returncode == 2
@@ -291,12 +291,12 @@ def test_the_gallerys_rungs_of_the_same_problem_are_found_where_nothing_of_the_u
     path.parent.mkdir(parents=True)
     monkeypatch.setattr("gradscape.tolerance.resources.files", lambda package: tmp_path)
     how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--tolerance", "50%"]
-    path.write_text(json.dumps({**report, "rungs": [softer, *report["rungs"]]}))
+    write_record(path, {**report, "rungs": [softer, *report["rungs"]]})
     done = run(*how, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert str(path) in done.stderr
     assert "softer: " not in done.stderr
-    path.write_text(json.dumps({**report, "identity": {**report["identity"], "options": {"ke": 1.0}}}))
+    write_record(path, {**report, "identity": {**report["identity"], "options": {"ke": 1.0}}})
     assert "no fidelities of converging with these options are measured" in run(*how, cwd=tmp_path).stderr
 
 

@@ -206,10 +206,11 @@ def _filming(job: SweepJob, seconds_each: float, folder: Path, frames: int) -> t
     shown = [round(at * last / (most - 1)) for at in range(most)]
     alike = {at: Alike.of(job.moved.env_at(at), job.stores[at], most * seconds_each) for at in set(shown)}
     datasets = [alike[at].dataset(job.stores[at]) for at in shown]
-    values = tuple(job.moved.values[at] for at in shown)
+    values = [job.moved.values[at] for at in shown]
 
     def film(count: int) -> None:
-        sweep = Sweep(job.moved.label, values[:count], datasets[:count])
+        at = range(most) if count == most else (0, most - 1)  # a few of them are the first and the last
+        sweep = Sweep(job.moved.label, tuple(values[one] for one in at), [datasets[one] for one in at])
         save_films(sweep, folder / "sweep.mp4", folder / "sweep.gif")
         save_stream(sweep, folder / "sweep.rrd")
 
