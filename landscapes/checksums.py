@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -59,6 +60,11 @@ def tile_sum(index: tuple[int, ...], values: Values) -> int:
     for name in sorted(values):
         total = zlib.crc32(np.ascontiguousarray(values[name]).tobytes(), total)
     return total + 1
+
+
+def text_sum(words: Iterable[str]) -> int:
+    """Return what a list of words comes to."""
+    return zlib.crc32(json.dumps(list(words)).encode())
 
 
 def lay_out_sums(

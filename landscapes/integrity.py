@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from .identity import StoreError
 
-ANEW = "restore it, or delete the slice, and the same command samples it anew"
+ANEW = "restore it, or sample the slice anew in another folder"
 
 
 def check_integrity(path: Path, group: zarr.Group, axes: Mapping[str, NDArray[Any]], values: Sequence[str]) -> None:

@@ -17,7 +17,7 @@ import xarray as xr
 from jaxtyping import Float
 from torch import Tensor
 
-from .files import clear, others, tidy, write_json
+from .files import clear, tidy, visible, write_json
 from .halving import Halving
 from .objective import Objective, Status
 from .plane import Plane
@@ -79,7 +79,7 @@ class Job:
     ) -> Job:
         """Go on with the slice in `folder`, or begin it there; `force` begins anew where another slice is."""
         path = folder / STORE
-        if not there(path) and others(folder, (PICTURE, SUMMARY), PICTURE):
+        if not there(path) and visible(folder):
             raise ValueError(f"{folder} holds other files and no slice; give --out a new or an empty folder")
         settings: dict[str, Any] = {"identity": identity, "provenance": provenance, "grad": grad}
         if force and there(path):

@@ -14,7 +14,7 @@ import zarr
 from numpy.typing import NDArray
 
 from .capacity import BLOCK, Need, require
-from .checksums import SUMS, lay_out_sums, write_sums
+from .checksums import SUMS, lay_out_sums, text_sum, write_sums
 from .identity import stored_identity
 from .layout import CODECS, SMALL, analysis_chunks, consolidate, create_array, flags
 from .objective import Status
@@ -89,7 +89,8 @@ def lay_out(
     for number, name in enumerate(AXES[: plane.rank]):
         _keep(group, name, axes[name], (name,), _axis(plane, number))
     _keep(group, "dim", axes["dim"], ("dim",), {"long_name": "parameter"})
-    _keep(group, "unit", axes["unit"], ("dim",), {"long_name": "unit of the parameter"})
+    said = {"long_name": "unit of the parameter", "checksum": text_sum(axes["unit"])}  # nothing else says them
+    _keep(group, "unit", axes["unit"], ("dim",), said)
 
 
 def write_finished(path: Path, dataset: xr.Dataset) -> None:

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from zarr.storage import MemoryStore
 
-from .checksums import Checksums, tile_sum
+from .checksums import Checksums, text_sum, tile_sum
 from .files import placing, resolved
 from .identity import StoreError, StoreExistsError, check_identity, full_identity, plain_json
 from .integrity import ANEW, check_integrity, check_layouts
@@ -131,15 +131,15 @@ class SliceStore:
             group = open_group(place, "r+")
             store = cls(group, path, place)
             axes = axes_of(store.plane, store.identity["parameters"], store._units, ascending=store.ascending)
+            if store._attributes["unit"].get("checksum", sums := text_sum(store._units)) != sums:
+                raise StoreError(f"{place / 'unit'} is damaged: it is not what was written; {ANEW}")
             check_integrity(place, group, axes, ["loss", "status", *(["grad"] if store.identity["gradients"] else [])])
             return store
         except StoreError:
             raise
         except Exception as error:  # a damaged axis or layout raises whatever reads it; of tiles nothing is read here
             check_layouts(place)
-            raise StoreError(
-                f"{place} is damaged ({type(error).__name__}: {error}); delete it, and the same command samples it anew"
-            ) from error
+            raise StoreError(f"{place} is damaged ({type(error).__name__}: {error}); {ANEW}") from error
 
     @classmethod
     def open_or_create(

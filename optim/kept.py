@@ -65,7 +65,7 @@ class Kept:
 
 def damaged(path: Path, why: str) -> StoreError:
     """Return the error that says of a run, or of a file in it, that it is not what was written."""
-    return StoreError(f"{path} is damaged: {why}; restore it, or delete the run, and the same command begins it anew")
+    return StoreError(f"{path} is damaged: {why}; restore it, or begin the run anew in another folder")
 
 
 def digest_of(attributes: Mapping[str, Any]) -> str:

@@ -122,7 +122,7 @@ def _restored(objective: Objective, method: Optimizer | str, run: Run, state: di
     except Exception as error:  # whatever the method stumbles upon
         raise StoreError(
             f"{run.path} keeps no state of {kind.name} that can be gone on from ({type(error).__name__}: {error}); "
-            "delete the run, and the same command begins it anew"
+            "begin the run anew in another folder"
         ) from error
 
 

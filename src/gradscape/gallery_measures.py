@@ -73,7 +73,7 @@ class Tradeoffs(Part):
     def left(self) -> int:
         """Return 1 where there is none, of an environment that has fidelities to trade."""
         some = len(environment_class(self.figure.env).fidelities) > 1
-        return int(some and not any(all(file.is_file() for file in files) for files in self._places()))
+        return int(some and not any(read_record(record) and picture.is_file() for record, picture in self._places()))
 
     def seconds_each(self) -> float:
         """Estimate all rungs by the work of their episodes."""

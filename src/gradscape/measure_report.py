@@ -202,6 +202,11 @@ def measured(
     dataset = open_slice(subject.store)
     if "grad" not in dataset or min(dataset["loss"].shape) < 3:
         raise ValueError(f"{subject.name}: report needs a slice with gradients and three samples per axis; got another")
+    if missing := int((dataset["status"] == 0).sum()):
+        raise ValueError(
+            f"{subject.store}: {missing} of {dataset['status'].size} samples are not there, or damaged; let the command "
+            "that samples the slice go on first"
+        )
     env = environment_of(dataset, device)
     key = {**settings, "slice": digest(dataset), "code": env.code}
     if not drawn or (subject.store.parent / ARRAYS).exists():

@@ -17,7 +17,7 @@ from . import cluster, race_workers
 from .console import duration, provenance_of, read_settings
 from .envs.registry import make
 from .landscapes.disk import until_full
-from .landscapes.files import clear, others, tidy, visible, write_json
+from .landscapes.files import clear, tidy, visible, write_json
 from .optim.registry import METHODS
 from .race_tables import seeds_said, show
 from .search_report import STORE, give_torch_one_thread, made, run_identity, search_progress
@@ -146,8 +146,7 @@ class Job:
     ) -> Job:
         """Go on with the race in its folder, or begin it there; seeds go by turns, so that methods stay level."""
         folder, command = Path(out) if out else _folder(env, options), shlex.join(["landscape", *sys.argv[1:]])
-        files = others(folder, (PICTURE, FIGURES), PICTURE)
-        if any(not file.is_dir() or visible(file) for file in files) and not any(folder.glob(f"*-*/{STORE}")):
+        if any(not file.is_dir() or visible(file) for file in visible(folder)) and not any(folder.glob(f"*-*/{STORE}")):
             raise ValueError(f"{folder} holds other files and no race; give --out a new or an empty folder")
         _require(env, methods, options, seeds=seeds, budget=budget, folder=folder)
         makers = {

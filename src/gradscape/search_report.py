@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from .console import chosen_fidelity, duration, provenance_of, read_settings
 from .envs.registry import make
 from .landscapes.disk import until_full
-from .landscapes.files import clear, others, tidy, write_json
+from .landscapes.files import clear, tidy, visible, write_json
 from .optim.registry import METHODS, code_digest, optimizer_class
 from .tables import table
 from .terminal import Console, Described
@@ -157,7 +157,7 @@ class Job:
         require_runs(env.space.dim, budget, 1, folder)
         require_method(optimizer.name, optimizer.options, Search(env.space.dim, env.decisions, budget))
         path = folder / STORE
-        if not path.exists() and others(folder, (PICTURE, SUMMARY), PICTURE):
+        if not path.exists() and visible(folder):
             raise ValueError(f"{folder} holds other files and no run; give --out a new or an empty folder")
         wanted: dict[str, Any] = {"identity": identity, "provenance": provenance_of(env, command), "budget": budget}
         if force and path.exists():

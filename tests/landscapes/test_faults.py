@@ -160,7 +160,7 @@ def test_a_damaged_axis_is_said_with_what_to_do(tmp_path):
     store_at(path)
     (file,) = (filling(path) / "u" / "c").iterdir()
     file.write_bytes(b"")
-    with pytest.raises(StoreError, match=r"s\.filling\.zarr is damaged .*delete it, and the same command"):
+    with pytest.raises(StoreError, match=r"s\.filling\.zarr is damaged .*restore it, or sample the slice anew"):
         store_at(path)
 
 
