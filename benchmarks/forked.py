@@ -190,7 +190,7 @@ def say(command: Sequence[str]) -> None:
 
 
 def _limit(limits: Limits, stopped: Path) -> None:
-    """Send Ctrl-C when the time is over, and end the process five seconds of CPU later."""
+    """Send Ctrl-C when the time is over, and end the process fifteen seconds of CPU later."""
 
     def patience_is_over(*_: object) -> None:
         stopped.touch()
@@ -201,7 +201,7 @@ def _limit(limits: Limits, stopped: Path) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.setitimer(signal.ITIMER_REAL, limits.clock)
     seconds = max(1, round(limits.cpu))
-    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 5))
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 15))  # what torch has built takes some to take down
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     pages = int(Path("/proc/self/statm").read_text().split()[0]) if Path("/proc/self/statm").exists() else 0
     room = pages * resource.getpagesize() + int(limits.memory)

@@ -89,8 +89,8 @@ def lay_out(
     for number, name in enumerate(AXES[: plane.rank]):
         _keep(group, name, axes[name], (name,), _axis(plane, number))
     _keep(group, "dim", axes["dim"], ("dim",), {"long_name": "parameter"})
-    said = {"long_name": "unit of the parameter", "checksum": text_sum(axes["unit"])}  # nothing else says them
-    _keep(group, "unit", axes["unit"], ("dim",), said)
+    about = {"long_name": "unit of the parameter", "checksum": text_sum(axes["unit"])}  # nothing else says them
+    _keep(group, "unit", axes["unit"], ("dim",), about)
 
 
 def write_finished(path: Path, dataset: xr.Dataset) -> None:

@@ -43,7 +43,9 @@ def bench(
         exact = deterministic and engine != against  # the other engine, Taichi, cannot
         return make(name, fidelity=fidelity, device=device, engine=engine, deterministic=exact, **options)
 
-    with Console(stderr=True).status("preparing") as status:
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    console.print(f"{name}: each rate is timed for {duration(seconds)} or more, without and with gradients")
+    with console.status("preparing") as status:
         found = measure(
             made, engine, against=against, batches=sorted(set(batches)), seconds=seconds, follow=status.update
         )

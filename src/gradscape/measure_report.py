@@ -204,7 +204,7 @@ def measured(
         raise ValueError(f"{subject.name}: report needs a slice with gradients and three samples per axis; got another")
     if missing := int((dataset["status"] == 0).sum()):
         raise ValueError(
-            f"{subject.store}: {missing} of {dataset['status'].size} samples are not there, or damaged; let the command "
+            f"{subject.store}: {missing} of {dataset['status'].size} samples are missing or damaged; let the command "
             "that samples the slice go on first"
         )
     env = environment_of(dataset, device)
