@@ -55,6 +55,7 @@ def replay(
     from .landscapes.draw.replay import save_replay
 
     caption = _caption(env, params, x, loss, status)
+    console.print(f"{caption.title}: {len(episode.time)} instants to draw{', and to film' if film else ''}")
     with console.status(f"{env.name}: drawing"):
         save_sheet(episode, folder / SHEET, caption=caption)
         said = f"{caption.title} · {caption.outcome}"
