@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from inspect import signature
 from io import TextIOWrapper
@@ -22,6 +23,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+LONG = 200  # characters of a path that an error shows
 _VERBS = (
     look.envs, look.info, look.slice_, look.sweep,
     search.methods, search.optimize, search.race, search.overlay,
@@ -72,7 +74,7 @@ def main(arguments: list[str] | None = None) -> Any:
     except ValueError as error:
         code = _fail(str(error), 2)
     except OSError as error:
-        code = _fail(_full(error) or str(error), 1)
+        code = _fail(_system(error), 1)
     except (KeyboardInterrupt, typer.Abort):
         code = _fail("stopped before anything was computed; the same command begins again", 130)
     sys.exit(code)
@@ -85,13 +87,18 @@ def _usage(error: Any) -> str:
     return f"{said} (`{context.command_path} --help` says what it takes)" if context else said
 
 
-def _full(error: OSError) -> str:
-    """Return what to say of a full disk where the verb has not said what is kept, nothing of any other error."""
+def _system(error: OSError) -> str:
+    """Return what to say where the system refused: of a full disk how to go on, of a file which, why and what to do."""
     from .landscapes.disk import DiskFullError, is_full
 
-    if isinstance(error, DiskFullError) or not is_full(error):
-        return ""
-    return f"the disk is full ({error}); each file that is there is whole: make room, and give the same command again"
+    if not isinstance(error, DiskFullError) and is_full(error):
+        return (
+            f"the disk is full ({error}); each file that is there is whole: make room, and give the same command again"
+        )
+    if error.filename is None or error.strerror is None:
+        return str(error)
+    name = os.fsdecode(error.filename2 or error.filename)
+    return f"{name if len(name) < LONG else name[:LONG] + '...'}: {error.strerror.lower()}; give another path"
 
 
 def _fail(message: str, code: int) -> int:

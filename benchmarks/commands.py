@@ -150,7 +150,9 @@ class Bowl(Environment):
 
 class Torn: pass
 """
-SAID_HOW_LONG = re.compile(r"about [\d.]|or more, without|to draw|is at http|until Ctrl-C|are there already|to compute|to measure")
+SAID_HOW_LONG = re.compile(
+    r"about [\d.]|or more, without|to draw|is at http|until Ctrl-C|are there already|to compute|to measure"
+)
 WARNING = re.compile(r"^\S+\.py:\d+: \w*Warning: ", re.MULTILINE)  # of a library, to whom it may concern
 RAW = re.compile(  # other people's errors, which say nothing of what is to be done
     r"landscape: (None$|Expecting |Extra data|invalid literal|could not convert|math domain|\[Errno|embedded null|"

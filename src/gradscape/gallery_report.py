@@ -167,12 +167,14 @@ def build(*, data: str | None, out: str) -> None:
     """Build the site and say what it holds."""
     from .gallery.build import build_site
 
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
     root, start = data_folder(data), time.perf_counter()
+    console.print(f"{out}: the pages of the figures in {root} are to draw")
     with until_full(lambda: f"{out} is as it was before"):
         manifest = build_site(read_figures(), root, Path(out))
     weight = sum(file.stat().st_size for file in Path(out).rglob("*") if file.is_file())
     missing = f", {len(manifest['missing'])} not sampled yet" if manifest["missing"] else ""
-    Console(stderr=True, soft_wrap=True, highlight=False).print(
+    console.print(
         f"{len(manifest['figures'])} figures{missing}; {size(weight)} in {duration(time.perf_counter() - start)}\n"
         f"open {Path(out) / 'index.html'}, or: landscape gallery serve --out {shlex.quote(out)}",
         markup=False,
