@@ -62,9 +62,9 @@ def tile_sum(index: tuple[int, ...], values: Values) -> int:
     return total + 1
 
 
-def text_sum(words: Iterable[str]) -> int:
-    """Return what a list of words comes to."""
-    return zlib.crc32(json.dumps(list(words)).encode())
+def text_sum(words: Iterable[str]) -> str:
+    """Return what a list of words comes to, in hexadecimal digits: netCDF has no attributes so large."""
+    return f"{zlib.crc32(json.dumps(list(words)).encode()):08x}"
 
 
 def lay_out_sums(

@@ -6,6 +6,7 @@ import json
 import shlex
 import sys
 from collections.abc import Sequence
+from itertools import count
 from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
@@ -44,11 +45,15 @@ def bench(
         return make(name, fidelity=fidelity, device=device, engine=engine, deterministic=exact, **options)
 
     console = Console(stderr=True, soft_wrap=True, highlight=False)
-    console.print(f"{name}: each rate is timed for {duration(seconds)} or more, without and with gradients")
+    announced = count()
     with console.status("preparing") as status:
-        found = measure(
-            made, engine, against=against, batches=sorted(set(batches)), seconds=seconds, follow=status.update
-        )
+
+        def follow(said: str) -> None:
+            if next(announced) == 0:  # what cannot be measured has been refused by then
+                console.print(f"{name}: each rate is timed for {duration(seconds)} or more, without and with gradients")
+            status.update(said)
+
+        found = measure(made, engine, against=against, batches=sorted(set(batches)), seconds=seconds, follow=follow)
     report = {**found, "command": shlex.join(["landscape", *sys.argv[1:]])}
     if as_json:
         print(json.dumps(report))
