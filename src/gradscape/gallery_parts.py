@@ -96,13 +96,15 @@ class Slice(Part):
     def state(self) -> State:
         """Look at the data without making an environment; who sampled it, and on what device, does not matter."""
         from .landscapes.job import STORE
+        from .landscapes.ownership import lost_root
+        from .landscapes.slice_arrays import FILES
         from .landscapes.store import SliceStore, is_slice
 
-        points = self.figure.resolution ** len(self.figure.dims)
-        if not is_slice(self.folder / STORE):
+        points, store = self.figure.resolution ** len(self.figure.dims), self.folder / STORE
+        if not is_slice(store) and not lost_root(store, FILES):
             return State(points, 0)
-        store = SliceStore.open(self.folder / STORE)
-        return State(points, int((store.status() > 0).sum()) if _same(self.figure, store.identity) else None)
+        kept = SliceStore.open(store)
+        return State(points, int((kept.status() > 0).sum()) if _same(self.figure, kept.identity) else None)
 
     def seconds_each(self) -> float:
         """Time a point."""
@@ -225,7 +227,15 @@ class Searches(Part):
 
     @property
     def _missing(self) -> list[str]:
-        return [method for method in METHODS if not self._file(method).exists()]
+        from .gallery.runs import open_run
+
+        missing = []
+        for method in METHODS:
+            try:
+                open_run(self._file(method))
+            except (OSError, ValueError):  # not there, or damaged
+                missing.append(method)
+        return missing
 
 
 def plane_of_figure(figure: Figure, env: Environment, resolution: int) -> Plane:
