@@ -206,7 +206,8 @@ def _filming(job: SweepJob, seconds_each: float, folder: Path, frames: int) -> t
     shown = [round(at * last / (most - 1)) for at in range(most)]
     alike = {at: Alike.of(job.moved.env_at(at), job.stores[at], most * seconds_each) for at in set(shown)}
     datasets = [alike[at].dataset(job.stores[at]) for at in shown]
-    values = [job.moved.values[at] for at in shown]
+    every = job.moved.values  # which may share a slice
+    values = [every[round(at * (len(every) - 1) / (most - 1))] for at in range(most)]
 
     def film(count: int) -> None:
         at = range(most) if count == most else (0, most - 1)  # a few of them are the first and the last
