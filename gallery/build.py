@@ -16,7 +16,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -47,10 +47,13 @@ SURFACES = ("surface.png", "surface.html", "surface.gltf", "surface.glb")
 POINTS = ("u", "v", "loss", "radius", "path", "hidden")  # of a trajectory, for the map alone
 
 
-def build_site(figures: Sequence[Figure], data: Path, out: Path) -> dict[str, Any]:
+def build_site(
+    figures: Sequence[Figure], data: Path, out: Path, follow: Callable[[int], None] = lambda count: None
+) -> dict[str, Any]:
     """Build the site of the figures that `data` has into `out`, whole or not at all, and return its manifest.
 
-    What is in `out` is replaced if a site built earlier is all that is there; anything else is refused.
+    What is in `out` is replaced if a site built earlier is all that is there; anything else is refused. `follow`
+    hears how many figures are drawn, before the first is.
     """
     out = resolved(out)
     _check(out)
@@ -59,6 +62,7 @@ def build_site(figures: Sequence[Figure], data: Path, out: Path) -> dict[str, An
         raise ValueError(f"{data} holds no slice of a figure; `landscape gallery compute` samples them")
     pages, tables = _templates(), read_runs(data / FOLDER)
     with placing(out, overwrite=True, check=partial(_check, out)) as new:
+        follow(len(there))
         shutil.copytree(HERE / "static", new / "static")
         traded = place_tradeoffs(data, new, [figure.env for figure in there])
         made = [_page(pages, figure, data / figure.id, new / figure.id, tables, traded) for figure in there]

@@ -169,9 +169,10 @@ def build(*, data: str | None, out: str) -> None:
 
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     root, start = data_folder(data), time.perf_counter()
-    console.print(f"{out}: the pages of the figures in {root} are to draw")
     with until_full(lambda: f"{out} is as it was before"):
-        manifest = build_site(read_figures(), root, Path(out))
+        manifest = build_site(
+            read_figures(), root, Path(out), lambda count: console.print(f"{out}: {count} figures to draw")
+        )
     weight = sum(file.stat().st_size for file in Path(out).rglob("*") if file.is_file())
     missing = f", {len(manifest['missing'])} not sampled yet" if manifest["missing"] else ""
     console.print(
