@@ -123,26 +123,34 @@ KINDS = {
 }  # fmt: skip
 
 
-def small() -> None:
-    """Let pictures be blank, nothing be repeated only to be timed, and searches and films of the gallery be few."""
+def leave_blank(put: Callable[[object, str, Any], object]) -> None:
+    """Let pictures and frames of films be blank, and not laid out: most of what a small job takes is drawing them.
+
+    `put` is setattr, or what does the same for a while.
+    """
     from matplotlib.figure import Figure
 
-    from gradscape import gallery_episodes, gallery_measures, gallery_parts
-    from gradscape.landscapes import job, tradeoff
     from gradscape.landscapes.draw import page
-    from gradscape.optim import search
 
     save = Figure.savefig
 
-    def leave_blank(figure: Figure, where: Any, **how: Any) -> None:
+    def leave(figure: Figure, where: Any, **how: Any) -> None:
         if how.get("format") == "rgba":  # a frame, whose size is known
             where.write(bytes(4 * math.prod(figure.canvas.get_width_height())))
         else:
             save(Figure(figsize=(0.1, 0.1)), where, **how)
 
-    Figure.savefig = leave_blank
-    page.settle = lambda picture: picture.set_layout_engine("none")
+    put(Figure, "savefig", leave)
+    put(page, "settle", lambda picture: picture.set_layout_engine("none"))
 
+
+def small() -> None:
+    """Let pictures be blank, nothing be repeated only to be timed, and searches and films of the gallery be few."""
+    from gradscape import gallery_episodes, gallery_measures, gallery_parts
+    from gradscape.landscapes import job, tradeoff
+    from gradscape.optim import search
+
+    leave_blank(setattr)
     tradeoff.TIMING = tradeoff.PATIENCE = 0.002
     search.MOMENT = job.PATIENCE = job.FIRST_PATIENCE = 0.0
     gallery_parts.METHODS, gallery_parts.BUDGET = ("random",), 8

@@ -10,11 +10,12 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from benchmarks.results import leave_blank
 from hypothesis import HealthCheck, settings
 
 from gradscape.cli import main
 
-from .command import NO_BROWSER, Said, leave_blank
+from .command import NO_BROWSER, Said
 
 # A shell that is not interactive starts what it sends to the background deaf to Ctrl-C; commands that tests interrupt
 # would inherit that.
@@ -52,7 +53,7 @@ def pytest_sessionfinish(session: pytest.Session) -> Generator[None]:
 def blank(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave pictures blank, but in tests marked `drawn`."""
     if request.node.get_closest_marker("drawn") is None:
-        leave_blank(monkeypatch)
+        leave_blank(monkeypatch.setattr)
 
 
 @pytest.fixture

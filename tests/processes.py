@@ -16,15 +16,15 @@ from pathlib import Path
 from signal import SIGKILL, Signals
 from typing import Any
 
-import pytest
 import zarr
 from benchmarks.forked import FORK, LOADED
+from benchmarks.results import leave_blank
 
 from gradscape.cli import main
 from gradscape.landscapes import job
 from gradscape.optim import run, search
 
-from .command import Said, leave_blank
+from .command import Said
 
 CHANGES = {"os.mkdir", "os.rename", "os.remove", "os.rmdir"}  # events of PEP 578
 
@@ -86,7 +86,7 @@ def _work(work: Callable[[], object], folder: Path, said: Path, changes: Any, st
     run.PAUSE, run.SHARE, search.MOMENT = 0.0, math.inf, 0.0  # writes after every proposal, times two episodes
     job.PAUSE, job.PATIENCE, job.FIRST_PATIENCE = math.inf, 0.0, 0.0  # draws no coarse picture
     zarr.config.set({"threading.max_workers": 1})  # so that its threads never take turns
-    leave_blank(pytest.MonkeyPatch())
+    leave_blank(setattr)
     sys.addaudithook(watch)
     work()
 

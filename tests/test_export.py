@@ -8,12 +8,13 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from benchmarks.results import leave_blank
 
 import gradscape
 from gradscape.cli import main
 from gradscape.landscapes.export import SUFFIXES
 
-from .command import Said, leave_blank
+from .command import Said
 
 READ = {"csv": pd.read_csv, "parquet": pd.read_parquet}
 
@@ -25,7 +26,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     how = ["--fidelity", "draft", "--device", "cpu"]
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        leave_blank(patch)
+        leave_blank(patch.setattr)
         for verb, more, out in (
             (["slice", "bounce", "--dims", "0", "2"], ["--resolution", "5"], "cut"),
             (["bounce", "--axis", "y"], ["--resolution", "6"], "line"),

@@ -14,6 +14,7 @@ from urllib.request import urlopen
 
 import numpy as np
 import pytest
+from benchmarks.results import leave_blank
 
 from gradscape import gallery_parts, gallery_report
 from gradscape.cli import main
@@ -21,8 +22,6 @@ from gradscape.envs.functions import Branin
 from gradscape.gallery.figures import Figure
 from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.store import open_slice
-
-from .command import leave_blank
 
 FIGURES = [
     Figure("bounce-y", "bounce", (1,), "It jumps.", number=8, through="example:aim", resolution=12, fidelity="draft"),
@@ -45,7 +44,7 @@ def compute(data: Path, *arguments: str) -> int:
 def listed() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gallery_report, "read_figures", lambda: list(FIGURES))
-        leave_blank(patch)
+        leave_blank(patch.setattr)
         yield
 
 

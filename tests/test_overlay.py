@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from benchmarks.results import leave_blank
 
 import gradscape
 from gradscape.cli import main
@@ -17,8 +18,6 @@ from gradscape.landscapes.draw import viewer
 from gradscape.landscapes.overlay import best_point, overlay
 from gradscape.landscapes.store import plane_of
 from gradscape.optim.run import Run
-
-from .command import leave_blank
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        leave_blank(patch)
+        leave_blank(patch.setattr)
         for command in commands:
             patch.setattr(sys, "argv", ["landscape", *command.split()])
             with pytest.raises(SystemExit) as left:

@@ -13,12 +13,12 @@ from typing import Any
 
 import pytest
 import typer
+from benchmarks.results import leave_blank
 
 from gradscape import cluster
 from gradscape.cli import app, main
 from gradscape.landscapes.draw import viewer
 
-from .command import leave_blank
 from .processes import FORK
 from .sockets import beyond_loopback, listening
 
@@ -123,7 +123,7 @@ def walk(folder: Path) -> None:
     os.chdir(folder)
     os.environ |= {"DISPLAY": ":none", "XDG_DATA_HOME": str(folder)}
     patch = pytest.MonkeyPatch()
-    leave_blank(patch)
+    leave_blank(patch.setattr)
     for name, value in (("TIMING", 0.002), ("PATIENCE", 0.002), ("RESAMPLES", 9)):
         patch.setattr(f"gradscape.landscapes.tradeoff.{name}", value)
     patch.setattr(viewer, "_rerun", windowless)
