@@ -11,8 +11,11 @@ from typing import Annotated, Any
 import typer
 
 from . import __version__
-from .verbs import gallery, look, measure, search
-from .verbs.dims import TakesDims
+from .commands import verbs_gallery as gallery
+from .commands import verbs_look as look
+from .commands import verbs_measure as measure
+from .commands import verbs_search as search
+from .commands.dims import TakesDims
 
 app = typer.Typer(
     name="landscape",
@@ -89,7 +92,7 @@ def _usage(error: Any) -> str:
 
 def _system(error: OSError) -> str:
     """Return what to say where the system refused: of a full disk how to go on, of a file which, why and what to do."""
-    from .landscapes.disk import DiskFullError, is_full
+    from .landscapes.storage.disk import DiskFullError, is_full
 
     if not isinstance(error, DiskFullError) and is_full(error):
         return (

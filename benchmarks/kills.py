@@ -33,10 +33,10 @@ from pathlib import Path
 
 import torch
 from benchmarks import results
-from benchmarks.forked import at_home, ended, living
+from benchmarks.forked import LOADED, at_home, ended, living
 
 from gradscape.cli import main as landscape
-from gradscape.landscapes import tradeoff
+from gradscape.landscapes.measures import fidelity as tradeoff
 
 JOBS = {
     "slice": "slice bounce --dims 0 1 --resolution 32 --fidelity draft --out made",
@@ -49,12 +49,6 @@ JOBS = {
     "workers": "slice bounce --dims 0 1 --resolution 48 --fidelity draft --device cpu --scheduler local:2 --out made",
 }
 VICTIMS = ("parent", "worker", "all")  # of a job with workers
-LOADED = (  # by all jobs together
-    *("search_report", "race_report", "sweep_report", "gallery_report", "envs.bounce", "envs.engines.rigid"),
-    *("pairs_report", "tradeoff_report", "measure_report", "landscapes.pairs", "landscapes.tradeoff"),
-    *("envs.points", "optim.race", "optim.random", "optim.descent", "landscapes.adapters", "landscapes.job"),
-    *(f"landscapes.draw.{name}" for name in ("contour", "profile", "sweep", "sweep_stream", "race")),
-)
 RECORDS = (".npz", "pairs.json", "report.json", "measures.json")  # of studies, beside stores
 MOST = 4  # times that one job is killed
 FORK = multiprocessing.get_context("fork")
@@ -106,7 +100,7 @@ def run(command: str, folder: Path, patience: float | None = None, victim: str =
 
 def bits(folder: Path) -> tuple[int, str]:
     """Return how many points and records a folder holds, and a digest of all their values."""
-    from gradscape.landscapes.store import SliceStore, is_slice
+    from gradscape.landscapes.storage.store import SliceStore, is_slice
     from gradscape.optim.run import Run, is_run
 
     digest, done = hashlib.sha256(), 0

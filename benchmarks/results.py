@@ -43,7 +43,7 @@ class Kind:
 
 def unfinished_slice() -> None:
     """Stop a slice when all its tiles are there."""
-    from gradscape.landscapes.store import SliceStore
+    from gradscape.landscapes.storage.store import SliceStore
 
     small()
     SliceStore.finish = _interrupted  # type: ignore[method-assign]
@@ -130,7 +130,7 @@ def leave_blank(put: Callable[[object, str, Any], object]) -> None:
     """
     from matplotlib.figure import Figure
 
-    from gradscape.landscapes.draw import page
+    from gradscape.landscapes.draw.figures import page
 
     save = Figure.savefig
 
@@ -146,8 +146,11 @@ def leave_blank(put: Callable[[object, str, Any], object]) -> None:
 
 def small() -> None:
     """Let pictures be blank, nothing be repeated only to be timed, and searches and films of the gallery be few."""
-    from gradscape import gallery_episodes, gallery_measures, gallery_parts
-    from gradscape.landscapes import job, tradeoff
+    from gradscape.gallery import episodes as gallery_episodes
+    from gradscape.gallery import measures as gallery_measures
+    from gradscape.gallery import parts as gallery_parts
+    from gradscape.jobs import slice as job
+    from gradscape.landscapes.measures import fidelity as tradeoff
     from gradscape.optim import search
 
     leave_blank(setattr)
@@ -165,7 +168,7 @@ def nothing() -> None:
     from http.server import ThreadingHTTPServer
 
     from gradscape.envs.base import Environment
-    from gradscape.gallery import build
+    from gradscape.gallery.site import build
 
     for place, name in ((Environment, "evaluate"), (build, "build_site"), (ThreadingHTTPServer, "serve_forever")):
         setattr(place, name, _interrupted)
@@ -221,7 +224,7 @@ def _readable(folder: Path) -> Iterator[tuple[Path, Callable[[Path], Numbers]]]:
 
 
 def _store(path: Path) -> Numbers:
-    from gradscape.landscapes.store import SliceStore, is_slice
+    from gradscape.landscapes.storage.store import SliceStore, is_slice
     from gradscape.optim.run import Run
 
     dataset = SliceStore.open(path).dataset() if is_slice(path) else Run.open(path).table()
@@ -248,7 +251,7 @@ def _of_dataset(dataset: Any) -> Numbers:
 
 
 def _json(path: Path) -> Numbers:
-    from gradscape.landscapes.records import unsigned
+    from gradscape.landscapes.storage.records import unsigned
 
     found = json.loads(path.read_text())
     said = [unsigned(one) for one in found] if isinstance(found, list) else unsigned(found)

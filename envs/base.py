@@ -19,8 +19,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..landscapes.episode import Episode as Episode
-from ..landscapes.halving import collect
 from ..landscapes.objective import Evaluation
+from ..landscapes.sampling.memory import collect
 from ..landscapes.space import ParameterSpace, as_tensor
 from .code import code_digest
 from .options import NoOptions, read_options

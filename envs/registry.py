@@ -16,7 +16,7 @@ from functools import cache
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ..landscapes.files import resolved
+from ..landscapes.storage.files import resolved
 from .importing import IN_FILE, module_of
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from platformdirs import user_cache_path
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from ..landscapes.files import replacing
+from ..landscapes.storage.files import replacing
 from .engines.manipulators import Kind, Tool
 from .engines.model import Model
 from .engines.raster import Raster

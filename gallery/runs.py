@@ -10,11 +10,11 @@ from zipfile import ZipFile
 import xarray as xr
 from zarr.storage import ZipStore
 
-from ..landscapes.files import replacing
-from ..landscapes.layout import SMALL
-from ..landscapes.records import reading
+from ..landscapes.storage.files import replacing
+from ..landscapes.storage.layout import SMALL
+from ..landscapes.storage.records import reading
 from ..optim.run_arrays import COLUMNS
-from .page_data import REMAKE
+from .site.page_data import REMAKE
 
 FOLDER, SUFFIX = "runs", ".zarr.zip"
 

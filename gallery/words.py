@@ -6,7 +6,7 @@ import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..landscapes.verdict import WORDS
+from ..landscapes.measures.classify import WORDS
 
 HERE = Path(__file__).parent
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from .files import replacing
-from .slice_arrays import parameters_of, plane_of
+from .storage.arrays import parameters_of, plane_of
+from .storage.files import replacing
 
 if TYPE_CHECKING:
     import pandas as pd

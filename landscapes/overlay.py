@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .plane import Plane
-from .store import plane_of
+from .storage.store import plane_of
 
 RECENT = 64  # how many evaluations ago an iterate's predecessor is looked for
 PARALLEL = 1e-12  # most by which the cosine between a step and the negative gradient may differ from 1

@@ -17,8 +17,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from ..landscapes.files import replacing
 from ..landscapes.identity import StoreError
+from ..landscapes.storage.files import replacing
 
 STATE = "state"
 CHUNK = 64  # rows

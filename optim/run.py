@@ -30,12 +30,12 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..landscapes.files import placing, resolved
 from ..landscapes.identity import StoreError, StoreExistsError, check_identity
-from ..landscapes.layout import FILL, consolidate, open_group
 from ..landscapes.objective import Evaluation, Status
-from ..landscapes.ownership import check_ours, clear_halves, lost_root
 from ..landscapes.space import ParameterSpace
+from ..landscapes.storage.files import placing, resolved
+from ..landscapes.storage.layout import FILL, consolidate, open_group
+from ..landscapes.storage.ownership import check_ours, clear_halves, lost_root
 from .base import Kind
 from .kept import CHUNK, STATE, Kept, checksums, damaged, digest_of, first_wrong
 from .run_arrays import COLUMNS, FILES, FORMAT, Columns, attributes_of, dims_of, empty, lay_out, plain, read_rows

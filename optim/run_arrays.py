@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from .. import __version__
 from ..landscapes.identity import plain_json
-from ..landscapes.layout import FILL, create_array, flags
 from ..landscapes.objective import Status
-from ..landscapes.ownership import store_files
 from ..landscapes.space import ParameterSpace
+from ..landscapes.storage.layout import FILL, create_array, flags
+from ..landscapes.storage.ownership import store_files
 from .base import Kind
 from .kept import CHUNK, STATE, damaged
 

@@ -21,7 +21,7 @@ from benchmarks.forked import FORK, LOADED
 from benchmarks.results import leave_blank
 
 from gradscape.cli import main
-from gradscape.landscapes import job
+from gradscape.jobs import slice as job
 from gradscape.optim import run, search
 
 from .command import Said

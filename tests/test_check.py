@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from gradscape import check_report
+from gradscape.commands import check_report
 from gradscape.envs.registry import Entry, entries, make
-from gradscape.landscapes import conformance
+from gradscape.landscapes.conformance import suite as conformance
 
 from .command import Said
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from gradscape import tolerance
-from gradscape.landscapes import tradeoff
+from gradscape.jobs import tolerance
+from gradscape.landscapes.measures import fidelity as tradeoff
 
 from .command import Said
 

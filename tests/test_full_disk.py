@@ -10,7 +10,7 @@ import pytest
 import typer
 
 from gradscape.cli import app
-from gradscape.landscapes import tradeoff
+from gradscape.landscapes.measures import fidelity as tradeoff
 
 from .command import Said
 
@@ -56,7 +56,7 @@ def test_every_verb_that_writes_is_tried() -> None:
 def test_a_full_disk_says_what_is_kept_and_the_same_command_goes_on(
     run: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, verb: str
 ) -> None:
-    monkeypatch.setattr("gradscape.tolerance.user_data_path", lambda name: tmp_path / "data" / name)
+    monkeypatch.setattr("gradscape.jobs.tolerance.user_data_path", lambda name: tmp_path / "data" / name)
     for name in ("TIMING", "PATIENCE"):
         monkeypatch.setattr(tradeoff, name, 0.002)
     monkeypatch.setattr(tradeoff, "RESAMPLES", 9)

@@ -18,7 +18,7 @@ from benchmarks.damage import BAD, Trial, damage, files
 from benchmarks.forked import Limits, last_words
 
 from gradscape import ParameterSpace, Plane, from_torch, open_run, open_slice, sample
-from gradscape.landscapes.store import SliceStore
+from gradscape.landscapes.storage.store import SliceStore
 from gradscape.optim.random import RandomSearch
 from gradscape.optim.run import Run
 from gradscape.optim.search import search

@@ -16,12 +16,13 @@ import numpy as np
 import pytest
 from benchmarks.results import leave_blank
 
-from gradscape import gallery_parts, gallery_report
 from gradscape.cli import main
+from gradscape.commands import gallery_report
 from gradscape.envs.functions import Branin
+from gradscape.gallery import parts as gallery_parts
 from gradscape.gallery.figures import Figure
 from gradscape.landscapes.identity import stored_identity
-from gradscape.landscapes.store import open_slice
+from gradscape.landscapes.storage.store import open_slice
 
 FIGURES = [
     Figure("bounce-y", "bounce", (1,), "It jumps.", number=8, through="example:aim", resolution=12, fidelity="draft"),

@@ -66,9 +66,9 @@ def test_what_a_kill_left_in_a_folder_is_no_other_file_and_goes(
     place.mkdir(parents=True)
     (place / "zarr.json").write_text("{}")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("gradscape.tolerance.user_data_path", lambda name: tmp_path / "data" / name)
+    monkeypatch.setattr("gradscape.jobs.tolerance.user_data_path", lambda name: tmp_path / "data" / name)
     for name in ("TIMING", "PATIENCE"):
-        monkeypatch.setattr(f"gradscape.landscapes.tradeoff.{name}", 0.002)
+        monkeypatch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", 0.002)
     with pytest.raises(SystemExit) as ended:
         main([*command, "--device", "cpu", "--out", "made"])
     assert not ended.value.code

@@ -12,11 +12,11 @@ import xarray as xr
 
 import gradscape
 from gradscape.envs.base import Environment
-from gradscape.landscapes.draw import page, sweep
-from gradscape.landscapes.job import pause_after
-from gradscape.landscapes.rehearsal import Alike, drawn, pictures, room_of
-from gradscape.landscapes.slice_arrays import need_of
-from gradscape.landscapes.store import SliceStore
+from gradscape.jobs.rehearsal import Alike, drawn, pictures, room_of
+from gradscape.jobs.slice import pause_after
+from gradscape.landscapes.draw.figures import page, sweep
+from gradscape.landscapes.storage.arrays import need_of
+from gradscape.landscapes.storage.store import SliceStore
 
 from .clock import Clock
 from .command import Said
@@ -33,7 +33,7 @@ EPISODE, TILE, PICTURE = 0.05, 0.035, 0.5  # seconds that it takes to simulate, 
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """Let what jobs are made of take its time on a clock of its own."""
     clock = Clock()
-    for module in ("landscapes.job", "landscapes.rehearsal", "planned", "plan_report", "sweep_report"):
+    for module in ("jobs.slice", "jobs.rehearsal", "jobs.planned", "commands.plan_report", "commands.sweep_report"):
         monkeypatch.setattr(f"gradscape.{module}.time", clock)
 
     def slow(owner: Any, name: str, price: Callable[..., float]) -> None:
@@ -91,7 +91,7 @@ def test_the_parts_of_a_plan_add_up_to_what_the_job_takes(
 def test_a_plan_needs_the_memory_that_is_held_and_that_of_the_slice_to_come(
     run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gradscape.landscapes.job.peak_memory", lambda: 10**9)
+    monkeypatch.setattr("gradscape.jobs.slice.peak_memory", lambda: 10**9)
     planned = plan(run, tmp_path, "cartpole", "--dims", "0", "1", "--resolution", "16")
     assert planned["memory"] == {"host": 10**9 + need_of((16, 16), 400, grad=True).memory, "device": 0}
 
@@ -125,7 +125,7 @@ def test_a_larger_job_is_planned_by_a_smaller_one(
     """Four times the resolution, sixteen times the points: of each part as much as a rehearsal of all would say."""
     said = ["branin", "--dims", "0", "1", "--resolution", "64"]
     whole = plan(run, tmp_path, *said)
-    monkeypatch.setattr("gradscape.planned.MOST_POINTS", 32)
+    monkeypatch.setattr("gradscape.jobs.planned.MOST_POINTS", 32)
     scaled = plan(run, tmp_path, *said)
     assert scaled["rate"] == "measured here, now, on 32 x 32 points"
     for name in ("episodes", "batches", "too_large"):
@@ -177,7 +177,7 @@ def test_a_device_that_is_not_here_has_the_rate_that_tradeoff_kept(
     rung |= {"loss_error": {"p95": {"value": None}, "p95_relative": {"value": None}}, "compared": 4}
     identity = {"options": asdict(env.options), "device": "cuda", "code": env.code, "engine": "warp"}
     report = {"env": "flip", "identity": identity, "rungs": [rung], "reference": "draft", "loss_unit": env.loss_unit}
-    from gradscape.tolerance import keep
+    from gradscape.jobs.tolerance import keep
 
     path = keep(report)
     done = run(*command, "--json", cwd=tmp_path)

@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 import typer
 
-from gradscape import overlay_report
 from gradscape.cli import app, main
+from gradscape.commands import overlay_report
+from gradscape.commands.measure_tables import environments_table
 from gradscape.gallery.figures import DATA, read_figures
-from gradscape.measure_tables import environments_table
 
 from .command import Said
 
@@ -141,7 +141,7 @@ def test_every_command_runs(
     monkeypatch.setattr("http.server.ThreadingHTTPServer.serve_forever", stop)
     monkeypatch.setattr(overlay_report, "_show", lambda console, path, serve: opened.append(path))
     for name, value in (("TIMING", 0.01), ("PATIENCE", 0.01), ("RESAMPLES", 9)):
-        monkeypatch.setattr(f"gradscape.landscapes.tradeoff.{name}", value)
+        monkeypatch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", value)
     done = run(*small(command), cwd=desk)
     assert done.returncode == 0, (small(command), done.stderr)
     assert bool(opened) == ("view" in command)

@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from gradscape import measure_report
+from gradscape.commands import measure_report
+from gradscape.commands.measure_tables import environments_table
 from gradscape.envs.registry import entries
 from gradscape.gallery.figures import read_figures
 from gradscape.gallery.words import paper_words
-from gradscape.landscapes.records import read_json, write_record
-from gradscape.measure_tables import environments_table
+from gradscape.landscapes.storage.records import read_json, write_record
 
 from .command import Said
 

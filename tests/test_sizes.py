@@ -10,9 +10,9 @@ from typing import Any, get_args
 import pytest
 import typer
 
-from gradscape import planned
 from gradscape.cli import app
 from gradscape.envs.registry import make
+from gradscape.jobs import planned
 from gradscape.landscapes.capacity import TooLargeError
 from gradscape.optim.memory import NEEDS, Search, require_method
 from gradscape.optim.registry import METHODS, optimizer_class

@@ -15,9 +15,9 @@ import pytest
 import typer
 from benchmarks.results import leave_blank
 
-from gradscape import cluster
 from gradscape.cli import app, main
-from gradscape.landscapes.draw import viewer
+from gradscape.jobs import workers as cluster
+from gradscape.landscapes.draw.recordings import viewer
 
 from .processes import FORK
 from .sockets import beyond_loopback, listening
@@ -125,7 +125,7 @@ def walk(folder: Path) -> None:
     patch = pytest.MonkeyPatch()
     leave_blank(patch.setattr)
     for name, value in (("TIMING", 0.002), ("PATIENCE", 0.002), ("RESAMPLES", 9)):
-        patch.setattr(f"gradscape.landscapes.tradeoff.{name}", value)
+        patch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", value)
     patch.setattr(viewer, "_rerun", windowless)
     sys.addaudithook(watch)
     found = {}

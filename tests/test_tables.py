@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 import gradscape
+from gradscape.commands.tables import table
+from gradscape.commands.terminal import Console
 from gradscape.envs.registry import entries
 from gradscape.gallery.figures import read_figures
 from gradscape.optim.registry import METHODS
-from gradscape.tables import table
-from gradscape.terminal import Console
 
 from .command import Said
 

@@ -11,15 +11,16 @@ import torch
 from torch import Tensor
 
 import gradscape
-from gradscape import ladder, tradeoff_report
+from gradscape.commands import tradeoff_report
 from gradscape.envs import registry
 from gradscape.envs.base import Environment, Fidelity, Work
-from gradscape.landscapes import tradeoff
+from gradscape.jobs import variants as ladder
+from gradscape.jobs.tolerance import read_tolerance
 from gradscape.landscapes.identity import stored_identity
+from gradscape.landscapes.measures import fidelity as tradeoff
 from gradscape.landscapes.objective import Evaluation
-from gradscape.landscapes.records import read_json, write_record
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.tolerance import read_tolerance
+from gradscape.landscapes.storage.records import read_json, write_record
 
 from .clock import Clock
 from .command import Said
@@ -62,7 +63,7 @@ class Converging(Environment):
 @pytest.fixture(autouse=True)
 def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Keep measurements in a folder of the test's own, and time by the clock of the scene."""
-    monkeypatch.setattr("gradscape.tolerance.user_data_path", lambda name: tmp_path / "data" / name)
+    monkeypatch.setattr("gradscape.jobs.tolerance.user_data_path", lambda name: tmp_path / "data" / name)
     for module in (tradeoff, tradeoff_report):
         monkeypatch.setattr(module, "time", CLOCK)
     monkeypatch.setattr(tradeoff, "RESAMPLES", 99)
@@ -289,7 +290,7 @@ def test_the_gallerys_rungs_of_the_same_problem_are_found_where_nothing_of_the_u
     softer["seconds"] = {"forward": 0.0, "with_gradient": 0.0}
     path = tmp_path / "data" / "tradeoff" / "converging-cpu.json"
     path.parent.mkdir(parents=True)
-    monkeypatch.setattr("gradscape.tolerance.resources.files", lambda package: tmp_path)
+    monkeypatch.setattr("gradscape.jobs.tolerance.resources.files", lambda package: tmp_path)
     how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--tolerance", "50%"]
     write_record(path, {**report, "rungs": [softer, *report["rungs"]]})
     done = run(*how, cwd=tmp_path)
@@ -347,7 +348,7 @@ def test_seconds_are_those_of_the_device_that_will_run(
     run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Errors measured on a GPU count here; its seconds do not: what may be quickest is timed, once, and kept."""
-    from gradscape import tolerance
+    from gradscape.jobs import tolerance
 
     report = json.loads(run(*TRADE, "--json", cwd=tmp_path).stdout)
     for kept in (tmp_path / "data").rglob("*.json"):

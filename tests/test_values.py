@@ -15,9 +15,9 @@ from rich.progress import Progress
 import gradscape
 from gradscape import Environment
 from gradscape.cli import app
+from gradscape.commands.terminal import Console, Described
 from gradscape.envs.registry import make
-from gradscape.landscapes.files import make_folder, resolved
-from gradscape.terminal import Console, Described
+from gradscape.landscapes.storage.files import make_folder, resolved
 
 from .command import Said
 
@@ -73,7 +73,7 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     def stopped(*given: object, **options: object) -> Any:
         raise KeyboardInterrupt
 
-    for name in ("landscapes.job.Job.cost", "gallery.build.build_site"):
+    for name in ("jobs.slice.Job.cost", "gallery.site.build.build_site"):
         monkeypatch.setattr(f"gradscape.{name}", stopped)
     monkeypatch.setattr(Environment, "evaluate", stopped)
     (tmp_path / "loop").symlink_to("loop")

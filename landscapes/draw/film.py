@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-from ..files import replacing
+from ..storage.files import replacing
 
 Picture = NDArray[np.uint8]
 

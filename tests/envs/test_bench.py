@@ -7,16 +7,16 @@ import torch
 import warp as wp
 
 from gradscape.envs.base import Environment, Fidelity, Work
-from gradscape.envs.bench import alternated, bench
 from gradscape.envs.bounce import Bounce
 from gradscape.envs.engines.model import Box
 from gradscape.envs.engines.replay import Replay
 from gradscape.envs.engines.runtime import KernelTime, cuda_available, kernel_times
 from gradscape.envs.fluid import Fluid
+from gradscape.jobs.bench import alternated, bench
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.landscapes.store import SliceStore
+from gradscape.landscapes.storage.store import SliceStore
 
 from ..clock import Clock
 
@@ -56,7 +56,7 @@ def report():
         write(store, tile, evaluation)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gradscape.envs.bench.time", CLOCK)
+        patch.setattr("gradscape.jobs.bench.time", CLOCK)
         patch.setattr(SliceStore, "write", slow)
         return bench(sleeper, "warp", against="taichi", batches=[1, 8], seconds=0.2)
 
@@ -90,7 +90,7 @@ def test_batches_are_repeated_for_the_seconds_given_and_twice_at_least(report):
 
 def test_the_best_repetition_counts(monkeypatch):
     monkeypatch.setattr(
-        "gradscape.envs.bench.alternated", lambda calls, seconds: {key: [3.0, 1.0, 2.0] for key in calls}
+        "gradscape.jobs.bench.alternated", lambda calls, seconds: {key: [3.0, 1.0, 2.0] for key in calls}
     )
     (row,) = bench(sleeper, "warp", batches=[1])["rates"]
     assert (row["forward"]["seconds"], row["with_gradient"]["seconds"], row["repetitions"]) == (1.0, 1.0, 3)
@@ -122,7 +122,7 @@ def test_calls_take_turns_and_are_repeated_whatever_they_take():
 
 def test_calls_end_before_a_round_would_end_too_late(monkeypatch):
     clock = Clock()
-    monkeypatch.setattr("gradscape.envs.bench.time", clock)
+    monkeypatch.setattr("gradscape.jobs.bench.time", clock)
     times = alternated({"a": lambda: clock.sleep(1.0), "b": lambda: clock.sleep(2.0)}, seconds=10.0)
     assert times == {"a": [1.0] * 3, "b": [2.0] * 3}
 

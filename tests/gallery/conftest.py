@@ -11,14 +11,14 @@ import imageio_ffmpeg
 import pytest
 import torch
 
-from gradscape.gallery.build import build_site
 from gradscape.gallery.figures import Figure
 from gradscape.gallery.runs import FOLDER, SUFFIX, save_run
+from gradscape.gallery.site.build import build_site
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.plane import Plane
-from gradscape.landscapes.sampling import sample
+from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.landscapes.store import SliceStore
+from gradscape.landscapes.storage.store import SliceStore
 from gradscape.optim.run import Run
 from gradscape.optim.search import search
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from gradscape.gallery import build
-from gradscape.gallery.build import build_site
-from gradscape.landscapes.draw import dark
+from gradscape.gallery.site import build
+from gradscape.gallery.site.build import build_site
+from gradscape.landscapes.draw.figures import dark
 
 from .conftest import FIGURES
 

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gradscape.gallery_report import Site
-from gradscape.landscapes.draw.relief import Relief, azimuth
+from gradscape.commands.gallery_report import Site
+from gradscape.landscapes.draw.loopback import LoopbackServer
+from gradscape.landscapes.draw.render.relief import Relief, azimuth
 from gradscape.landscapes.draw.style import LOSS_MAP, Scale
-from gradscape.landscapes.loopback import LoopbackServer
-from gradscape.landscapes.store import open_slice, plane_of
+from gradscape.landscapes.storage.store import open_slice, plane_of
 
 from .conftest import FIGURES
 

@@ -9,15 +9,18 @@ import pytest
 import torch
 import xarray as xr
 
-from gradscape import gallery_episodes, gallery_measures, gallery_parts, gallery_report
 from gradscape.cli import main
+from gradscape.commands import gallery_report
 from gradscape.envs.bounce import Bounce
+from gradscape.gallery import episodes as gallery_episodes
+from gradscape.gallery import measures as gallery_measures
+from gradscape.gallery import parts as gallery_parts
+from gradscape.gallery.episodes import Node, nodes_shown
 from gradscape.gallery.figures import Figure
 from gradscape.gallery.runs import open_run, save_run
-from gradscape.gallery_episodes import Node, nodes_shown
 from gradscape.landscapes.adapters import from_numpy
 from gradscape.landscapes.plane import Plane
-from gradscape.landscapes.sampling import sample
+from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.search import search
 
@@ -81,7 +84,7 @@ def small(blank: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     for name, value in (("REPORT_POINTS", 2), ("TRADEOFF_POINTS", 4), ("TURNED", ["precision"])):
         monkeypatch.setattr(gallery_measures, name, value)
     for name in ("TIMING", "PATIENCE"):
-        monkeypatch.setattr(f"gradscape.landscapes.tradeoff.{name}", 0.01)
+        monkeypatch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", 0.01)
     longer = {name: replace(one, dt=4 * one.dt) for name, one in Bounce.fidelities.items()}
     monkeypatch.setattr(Bounce, "fidelities", longer)
     monkeypatch.chdir(tmp_path)

@@ -10,11 +10,11 @@ from urllib.parse import urldefrag
 import numpy as np
 import pytest
 
-from gradscape.gallery.build import build_site
 from gradscape.gallery.figures import HERE
 from gradscape.gallery.runs import open_run
+from gradscape.gallery.site.build import build_site
 from gradscape.landscapes.identity import stored_identity
-from gradscape.landscapes.store import open_slice
+from gradscape.landscapes.storage.store import open_slice
 
 from .conftest import FIGURES, MEASURES, SWEEP
 
@@ -128,7 +128,7 @@ def test_a_search_lies_where_its_parameters_say(site: Path, data: Path) -> None:
 
 
 def test_a_search_of_other_options_is_not_laid_over_a_slice(data: Path) -> None:
-    from gradscape.gallery.trajectories import read_runs, trajectories
+    from gradscape.gallery.site.trajectories import read_runs, trajectories
 
     tables, dataset = read_runs(data / "runs"), open_slice(data / "full/slice.zarr")
     assert len(tables) == 4

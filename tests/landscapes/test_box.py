@@ -6,13 +6,13 @@ import torch
 
 from gradscape import Evaluation, ParameterSpace, Plane, Status, from_numpy, sample
 from gradscape.landscapes.adapters import within_box
-from gradscape.landscapes.character import characterise, named_measures
-from gradscape.landscapes.conformance import check
-from gradscape.landscapes.gradients import ladder, subgrid
+from gradscape.landscapes.conformance.suite import check
+from gradscape.landscapes.measures.fidelity import measure, sobol_points
+from gradscape.landscapes.measures.gradient_quality import ladder, subgrid
+from gradscape.landscapes.measures.profile import characterise, named_measures
+from gradscape.landscapes.measures.sensitivity import Design, explore
 from gradscape.landscapes.objective import evaluated
-from gradscape.landscapes.pairs import Design, explore
-from gradscape.landscapes.pieces import Pieces
-from gradscape.landscapes.tradeoff import measure, sobol_points
+from gradscape.landscapes.storage.checkpoint import Pieces
 
 BOUNDS = torch.tensor([[-1.0, 0.1, -3.0], [2.0, 0.7, 3.0]], dtype=torch.float64)
 SPACE = ParameterSpace(("a", "b", "c"), *BOUNDS, ("", "m", "s"))

@@ -8,8 +8,8 @@ import pytest
 from gradscape import ParameterSpace, Plane
 from gradscape.landscapes import capacity
 from gradscape.landscapes.capacity import Need, TooLargeError, require
-from gradscape.landscapes.slice_arrays import need_of
-from gradscape.landscapes.store import SliceStore
+from gradscape.landscapes.storage.arrays import need_of
+from gradscape.landscapes.storage.store import SliceStore
 
 
 @pytest.fixture

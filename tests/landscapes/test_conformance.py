@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from gradscape.landscapes.adapters import from_torch
-from gradscape.landscapes.conformance import check
-from gradscape.landscapes.extremes import CORNERS, Variant, corners
+from gradscape.landscapes.conformance.extremes import CORNERS, Variant, corners
+from gradscape.landscapes.conformance.suite import check
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.space import ParameterSpace
 

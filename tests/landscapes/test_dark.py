@@ -8,10 +8,11 @@ from matplotlib.colors import to_rgb
 from matplotlib.quiver import Quiver
 from PIL import Image
 
-from gradscape.landscapes.draw import page, style
-from gradscape.landscapes.draw.contour import landscape_figure
-from gradscape.landscapes.draw.dark import darken, save_dark, turned
-from gradscape.landscapes.draw.overlay import overlay_figure
+from gradscape.landscapes.draw import style
+from gradscape.landscapes.draw.figures import page
+from gradscape.landscapes.draw.figures.contour import landscape_figure
+from gradscape.landscapes.draw.figures.dark import darken, save_dark, turned
+from gradscape.landscapes.draw.figures.overlay import overlay_figure
 
 from .test_draw import DATASET
 from .test_overlay import LAID, SLICE

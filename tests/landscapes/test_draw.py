@@ -10,14 +10,15 @@ from matplotlib.colors import LogNorm
 from matplotlib.image import imread
 from matplotlib.quiver import Quiver
 
-from gradscape.landscapes.draw import page, style
-from gradscape.landscapes.draw.contour import landscape_figure
-from gradscape.landscapes.draw.profile import profile_figure
+from gradscape.landscapes.draw import style
+from gradscape.landscapes.draw.figures import page
+from gradscape.landscapes.draw.figures.contour import landscape_figure
+from gradscape.landscapes.draw.figures.profile import profile_figure
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.plane import Plane
-from gradscape.landscapes.sampling import sample
+from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.landscapes.store import SliceStore
+from gradscape.landscapes.storage.store import SliceStore
 
 SPACE = ParameterSpace(
     ("speed", "lift", "mass"),

@@ -11,14 +11,14 @@ import torch
 from gradscape.envs.engines import springs
 from gradscape.envs.registry import make
 from gradscape.landscapes.adapters import from_torch
-from gradscape.landscapes.halving import Halving, ran_out
 from gradscape.landscapes.identity import StoreError
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.plane import Plane
-from gradscape.landscapes.sampling import sample
-from gradscape.landscapes.slice_paths import filling
+from gradscape.landscapes.sampling.fill import sample
+from gradscape.landscapes.sampling.memory import Halving, ran_out
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.landscapes.store import SliceStore
+from gradscape.landscapes.storage.paths import filling
+from gradscape.landscapes.storage.store import SliceStore
 
 from ..processes import FORK
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gradscape import ParameterSpace, Plane, from_numpy, from_torch, sample
-from gradscape.landscapes import gradients
+from gradscape.landscapes.measures import gradient_quality as gradients
 
 SPACE = ParameterSpace.box(("x", "y"), -1.0, 3.0)
 PLANE = Plane.through(SPACE, SPACE.center, (0, 1), resolution=12)

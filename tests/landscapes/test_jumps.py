@@ -9,8 +9,8 @@ import torch
 import xarray as xr
 
 from gradscape import Objective, ParameterSpace, Plane, from_numpy, from_torch, sample
-from gradscape.landscapes.jumps import find_jumps
-from gradscape.landscapes.noise import noise
+from gradscape.landscapes.measures.discontinuities import find_jumps
+from gradscape.landscapes.measures.noise import noise
 
 SPACE = ParameterSpace.box(("x", "y"), -1.0, 1.0)
 EDGE = 0.2371

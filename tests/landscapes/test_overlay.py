@@ -6,11 +6,11 @@ from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import to_rgba
 
 from gradscape.landscapes.draw import style
-from gradscape.landscapes.draw.overlay import joint_scale, overlay_figure
+from gradscape.landscapes.draw.figures.overlay import joint_scale, overlay_figure
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.overlay import best_point, improvements, overlay, principal_plane
 from gradscape.landscapes.plane import Plane
-from gradscape.landscapes.sampling import sample
+from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
 
 # Units that differ a thousandfold: half-widths 1 m/s, 1000 N and 10.

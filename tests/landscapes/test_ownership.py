@@ -13,14 +13,14 @@ import torch
 from torch import Tensor
 
 from gradscape.landscapes.adapters import from_torch
-from gradscape.landscapes.files import discard, placing, replacing, tidy
 from gradscape.landscapes.identity import StoreError
-from gradscape.landscapes.pieces import Pieces
 from gradscape.landscapes.plane import Plane
-from gradscape.landscapes.sampling import sample
-from gradscape.landscapes.slice_paths import filling
+from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.landscapes.store import SliceStore
+from gradscape.landscapes.storage.checkpoint import Pieces
+from gradscape.landscapes.storage.files import discard, placing, replacing, tidy
+from gradscape.landscapes.storage.paths import filling
+from gradscape.landscapes.storage.store import SliceStore
 
 from ..processes import alone
 

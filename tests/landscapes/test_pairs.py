@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from gradscape.landscapes.adapters import from_numpy, from_torch
+from gradscape.landscapes.measures.sensitivity import Design, Found, default_samples, explore, rank
 from gradscape.landscapes.objective import Evaluation, Objective
-from gradscape.landscapes.pairs import Design, Found, default_samples, explore, rank
-from gradscape.landscapes.pieces import Pieces
 from gradscape.landscapes.space import ParameterSpace
+from gradscape.landscapes.storage.checkpoint import Pieces
 
 
 def found_in(fn: Callable[[Tensor], Tensor], dim: int, folder: Path, *, samples: int = 64, half: float = 1.0) -> Found:

@@ -14,22 +14,23 @@ import torch
 from matplotlib import rcParams
 from matplotlib.text import Text
 
-from gradscape.landscapes import draw, gradients
-from gradscape.landscapes.draw import page, typesetting
-from gradscape.landscapes.draw.contact import Caption, episode_figure
-from gradscape.landscapes.draw.contour import landscape_figure
-from gradscape.landscapes.draw.curve import run_figure
-from gradscape.landscapes.draw.overlay import overlay_figure
-from gradscape.landscapes.draw.profile import profile_figure
-from gradscape.landscapes.draw.quality import quality_figure
-from gradscape.landscapes.draw.race import race_figure
-from gradscape.landscapes.draw.surface import surface_figure
-from gradscape.landscapes.draw.sweep import Scales, frame_figure
-from gradscape.landscapes.draw.thumbnail import thumbnail_figure
-from gradscape.landscapes.draw.tradeoff import tradeoff_figure
+from gradscape.landscapes import draw
+from gradscape.landscapes.draw.figures import page, typesetting
+from gradscape.landscapes.draw.figures.contact import Caption, episode_figure
+from gradscape.landscapes.draw.figures.contour import landscape_figure
+from gradscape.landscapes.draw.figures.curve import run_figure
+from gradscape.landscapes.draw.figures.overlay import overlay_figure
+from gradscape.landscapes.draw.figures.profile import profile_figure
+from gradscape.landscapes.draw.figures.quality import quality_figure
+from gradscape.landscapes.draw.figures.race import race_figure
+from gradscape.landscapes.draw.figures.sweep import Scales, frame_figure
+from gradscape.landscapes.draw.figures.thumbnail import thumbnail_figure
+from gradscape.landscapes.draw.figures.tradeoff import tradeoff_figure
+from gradscape.landscapes.draw.render.surface import surface_figure
 from gradscape.landscapes.episode import Episode, Part, View
-from gradscape.landscapes.files import print_width
-from gradscape.landscapes.sampling import sample
+from gradscape.landscapes.measures import gradient_quality as gradients
+from gradscape.landscapes.sampling.fill import sample
+from gradscape.landscapes.storage.files import print_width
 from gradscape.optim.registry import METHODS
 
 from .test_curve import table

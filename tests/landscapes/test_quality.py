@@ -7,9 +7,9 @@ import pytest
 from matplotlib.text import Text
 
 from gradscape.landscapes.draw import style
-from gradscape.landscapes.draw.labels import Name, place
-from gradscape.landscapes.draw.page import Picture
-from gradscape.landscapes.draw.quality import quality_figure
+from gradscape.landscapes.draw.figures.labels import Name, place
+from gradscape.landscapes.draw.figures.page import Picture
+from gradscape.landscapes.draw.figures.quality import quality_figure
 
 from .test_print import PLANE, quality
 

@@ -15,10 +15,10 @@ from gradscape.envs.base import Environment
 from gradscape.envs.fluid import TANK_HEIGHT, TANK_WIDTH
 from gradscape.envs.outlines import about, skin, triangles
 from gradscape.envs.registry import BUILTIN, make
-from gradscape.landscapes.draw import materials
-from gradscape.landscapes.draw.contact import Caption, episode_figure, save_sheet
-from gradscape.landscapes.draw.replay import Shot, axes, frames, headed, missing, save_replay
-from gradscape.landscapes.draw.solids import lump, mesh
+from gradscape.landscapes.draw.figures.contact import Caption, episode_figure, save_sheet
+from gradscape.landscapes.draw.render import materials
+from gradscape.landscapes.draw.render.replay import Shot, axes, frames, headed, missing, save_replay
+from gradscape.landscapes.draw.render.solids import lump, mesh
 from gradscape.landscapes.episode import Episode, Part, View
 
 SCENES = [entry.name for entry in BUILTIN if "functions" not in entry.target]

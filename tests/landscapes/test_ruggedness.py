@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from gradscape import ParameterSpace, Plane, from_torch, sample
-from gradscape.landscapes import estimate, ruggedness
-from gradscape.landscapes.character import own_cost
-from gradscape.landscapes.store import SliceStore
+from gradscape.landscapes import statistics as estimate
+from gradscape.landscapes.measures import ruggedness
+from gradscape.landscapes.measures.profile import own_cost
+from gradscape.landscapes.storage.store import SliceStore
 
 
 def grid(points: int, low: float = -1.0, high: float = 1.0) -> tuple[np.ndarray, np.ndarray]:

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from gradscape.landscapes.identity import StoreError
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.plane import Plane
-from gradscape.landscapes.sampling import sample
+from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.landscapes.store import SliceStore
+from gradscape.landscapes.storage.store import SliceStore
 
 from ..processes import Instant, alone
 

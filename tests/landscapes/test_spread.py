@@ -16,16 +16,16 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gradscape.landscapes import spread
 from gradscape.landscapes.adapters import from_torch
-from gradscape.landscapes.halving import Halving
 from gradscape.landscapes.identity import StoreError
 from gradscape.landscapes.objective import Objective
 from gradscape.landscapes.plane import Plane
-from gradscape.landscapes.sampling import sample
+from gradscape.landscapes.sampling import distribution as spread
+from gradscape.landscapes.sampling.distribution import Site, WorkersLostError, equal_batches
+from gradscape.landscapes.sampling.fill import sample
+from gradscape.landscapes.sampling.memory import Halving
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.landscapes.spread import Site, WorkersLostError, equal_batches
-from gradscape.landscapes.store import SliceStore
+from gradscape.landscapes.storage.store import SliceStore
 
 from ..clock import Clock
 from ..processes import FORK

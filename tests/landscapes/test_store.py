@@ -16,12 +16,12 @@ import torch
 import xarray as xr
 
 from gradscape.landscapes.identity import StoreError, StoreMismatchError
-from gradscape.landscapes.layout import consolidate
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.plane import Plane
-from gradscape.landscapes.slice_paths import corner, filling
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.landscapes.store import SliceStore, open_slice, plane_of
+from gradscape.landscapes.storage.layout import consolidate
+from gradscape.landscapes.storage.paths import corner, filling
+from gradscape.landscapes.storage.store import SliceStore, open_slice, plane_of
 
 from ..processes import Instant, alone
 
@@ -238,7 +238,7 @@ def test_a_damaged_chunk_costs_exactly_its_tile(tmp_path, damage):
 
 @pytest.mark.parametrize("place", [filling, Path])
 def test_chunks_in_each_others_place_are_missing_and_not_taken_for_right(tmp_path, monkeypatch, place):
-    monkeypatch.setattr("gradscape.landscapes.layout.SIDE", 4)  # so that a finished slice has several, too
+    monkeypatch.setattr("gradscape.landscapes.storage.layout.SIDE", 4)  # so that a finished slice has several, too
     path = tmp_path / "s.zarr"
     (fill(make(path)) if place is filling else finished(path))
     whole, swapped = open_slice(path), 0

@@ -15,12 +15,12 @@ import torch
 import xarray as xr
 from rerun.chunk import RrdReader
 
-from gradscape.landscapes.draw import viewer
-from gradscape.landscapes.draw.stream import HEIGHT, SIDE, save_stream
+from gradscape.landscapes.draw.recordings import viewer
+from gradscape.landscapes.draw.recordings.runs import HEIGHT, SIDE, save_stream
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.overlay import overlay
 from gradscape.landscapes.plane import Plane
-from gradscape.landscapes.sampling import sample
+from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
 
 from ..processes import alone

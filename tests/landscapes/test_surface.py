@@ -9,10 +9,11 @@ import torch
 import xarray as xr
 from matplotlib.colors import to_rgb
 
-from gradscape.landscapes.draw import relief, style, surface
+from gradscape.landscapes.draw import style
+from gradscape.landscapes.draw.render import relief, surface
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.plane import Plane
-from gradscape.landscapes.sampling import sample
+from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
 
 SPACE = ParameterSpace.box(["a", "b"], -1.0, 1.0, "m")

@@ -13,12 +13,12 @@ from matplotlib.collections import QuadMesh
 from matplotlib.quiver import Quiver
 from rerun.chunk import RrdReader
 
+from gradscape.landscapes.draw.figures.sweep import Scales, Sweep, frame_figure, save_films
 from gradscape.landscapes.draw.film import picture, save_film
-from gradscape.landscapes.draw.sweep import Scales, Sweep, frame_figure, save_films
-from gradscape.landscapes.draw.sweep_stream import save_stream
+from gradscape.landscapes.draw.recordings.sweep import save_stream
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.plane import Plane
-from gradscape.landscapes.sampling import sample
+from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.smoothing import smoothed
 from gradscape.landscapes.space import ParameterSpace
 

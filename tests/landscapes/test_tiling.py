@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gradscape.landscapes import tiling
-from gradscape.landscapes.tiling import _offsets, coarse_to_fine, tile_side
+from gradscape.landscapes.storage import tiles as tiling
+from gradscape.landscapes.storage.tiles import _offsets, coarse_to_fine, tile_side
 
 POINTS = st.integers(2, 600)
 FEW = settings(max_examples=40)

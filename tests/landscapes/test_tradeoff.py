@@ -10,13 +10,13 @@ from matplotlib.text import Text
 from scipy.stats import spearmanr
 from torch import Tensor
 
-from gradscape.landscapes import tradeoff
 from gradscape.landscapes.adapters import from_torch
-from gradscape.landscapes.draw.page import save
-from gradscape.landscapes.draw.tradeoff import short, tradeoff_figure
+from gradscape.landscapes.draw.figures.page import save
+from gradscape.landscapes.draw.figures.tradeoff import short, tradeoff_figure
+from gradscape.landscapes.measures import fidelity as tradeoff
+from gradscape.landscapes.measures.fidelity import Estimate, Sample, cheapest, compare, front, gradient_error, order
 from gradscape.landscapes.objective import Status
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.landscapes.tradeoff import Estimate, Sample, cheapest, compare, front, gradient_error, order
 
 
 def sample(loss: list[float], failed: int = 0, grad: float = 1.0) -> Sample:

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from gradscape import ParameterSpace, Plane, from_torch, sample
-from gradscape.landscapes import gradients
-from gradscape.landscapes.character import Character, characterise, effort, named_measures
-from gradscape.landscapes.draw.page import save
-from gradscape.landscapes.draw.quality import quality_figure
-from gradscape.landscapes.verdict import WORDS
+from gradscape.landscapes.draw.figures.page import save
+from gradscape.landscapes.draw.figures.quality import quality_figure
+from gradscape.landscapes.measures import gradient_quality as gradients
+from gradscape.landscapes.measures.classify import WORDS
+from gradscape.landscapes.measures.profile import Character, characterise, effort, named_measures
 
 Function = Callable[[torch.Tensor], torch.Tensor]
 

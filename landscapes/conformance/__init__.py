@@ -1,0 +1,1 @@
+"""What every objective owes, one file for each family of checks."""

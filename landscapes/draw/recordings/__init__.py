@@ -1,0 +1,1 @@
+"""Scenes to walk around in and to play back (rerun)."""

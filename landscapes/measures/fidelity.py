@@ -1,0 +1,232 @@
+"""Accuracy against cost: the same points at a ladder of fidelities, each rung held against a reference."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, cast
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from scipy.stats import linregress, rankdata
+from torch import Tensor
+
+from ..objective import Objective, Status, evaluated
+from ..space import ParameterSpace
+
+TIMING = 4.0  # least seconds that repetitions of a quick batch take, each way
+PATIENCE = 60.0  # most seconds that a batch larger than the study's points may take
+RESAMPLES = 999  # of the bootstrap
+LEVEL = 0.95  # of its intervals
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """What one rung said at the points of a study, and what that cost.
+
+    `loss` [objective's unit], shape (point,); `grad` [loss unit / width of the box], shape (point, dim); `status`,
+    shape (point,); `forward` and `with_gradient` [s per episode], at best, in batches of `batch`.
+    """
+
+    loss: Array
+    grad: Array
+    status: NDArray[np.int8]
+    forward: float
+    with_gradient: float
+    batch: int
+
+    def arrays(self) -> dict[str, Any]:
+        """Return what `Sample(**arrays)` takes, for a file."""
+        return {name: np.asarray(getattr(self, name)) for name in self.__dataclass_fields__}
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Sample:
+        """Rebuild a sample from its `arrays`."""
+        plain: dict[str, Any] = {name: value if value.ndim else value.item() for name, value in arrays.items()}
+        return cls(**plain)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number and its bootstrap interval (95 %); None where it is not finite or not defined."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+
+    @classmethod
+    def of(cls, statistic: Callable[..., Array], *samples: Array, seed: int) -> Estimate:
+        """Estimate a statistic, a reduction along the last axis, of samples whose entries belong together.
+
+        Percentile bootstrap (Efron 1979). Infinite entries are allowed: they are worse than any number.
+        """
+        if not samples[0].size:
+            return cls(None, None, None)
+        rows = np.random.default_rng(seed).integers(samples[0].size, size=(RESAMPLES, samples[0].size))
+        again = statistic(*(sample[rows] for sample in samples))
+        again = np.append(again[~np.isnan(again)], np.inf if np.isnan(again).all() else [])
+        ends = np.quantile(again, ((1 - LEVEL) / 2, (1 + LEVEL) / 2), method="nearest")
+        return cls(*(_finite(float(value)) for value in (statistic(*samples), *ends)))
+
+
+def sobol_points(space: ParameterSpace, count: int, *, seed: int) -> Float[Tensor, "count dim"]:
+    """Return well-spread points of the box (Sobol, scrambled with the seed)."""
+    sobol = torch.quasirandom.SobolEngine(space.dim, scramble=True, seed=seed)  # type: ignore[no-untyped-call]
+    return space.from_unit(sobol.draw(count, dtype=torch.float64))
+
+
+def measure(
+    objective: Objective, x: Float[Tensor, "point dim"], *, follow: Callable[[int], None] = lambda done: None
+) -> Sample:
+    """Evaluate an objective at the points of a study, then time it; `follow` hears how many points are done.
+
+    Seconds are the best of repetitions, of batches as large as the objective prefers, or as patience allows.
+    """
+    at_once = getattr(objective, "preferred_batch", 1)
+    full = min(at_once, len(x))
+    getattr(objective, "prepare", lambda: None)()
+    began = time.perf_counter()
+    evaluated(objective, x[:1], grad=True)  # what is made at first use is made now, a batch's threads too if quick
+    if (time.perf_counter() - began) * full < TIMING:
+        evaluated(objective, x[:full], grad=True)
+    parts, seconds, done = [], [], 0
+    for part in torch.split(x, at_once):
+        began = time.perf_counter()
+        parts.append(evaluated(objective, part, grad=True))
+        seconds.append(time.perf_counter() - began)
+        follow(done := done + len(part))
+    batch = _filled(objective, x, full, at_once, seconds[0])
+    taken = min(seconds[: len(x) // full]) if len(batch) == full else np.inf
+    forward = _best(objective, batch, grad=False, known=np.inf)
+    with_gradient = _best(objective, batch, grad=True, known=taken)
+    widths = objective.space.upper - objective.space.lower
+    grad = torch.cat([cast("Tensor", part.grad) for part in parts]) * widths
+    loss, status = (torch.cat([getattr(part, name) for part in parts]).numpy() for name in ("loss", "status"))
+    return Sample(loss, grad.numpy(), status, forward, with_gradient, len(batch))
+
+
+def _filled(objective: Objective, x: Tensor, rows: int, at_once: int, took: float) -> Float[Tensor, "batch dim"]:
+    """Return the points repeated to as many as are worth evaluating at once, or to what takes `PATIENCE` at most."""
+    while rows < at_once and took * (more := min(4 * rows, at_once)) / rows < PATIENCE:
+        began = time.perf_counter()
+        objective.evaluate(x.repeat(-(-more // len(x)), 1)[:more], grad=True)
+        rows, took = more, time.perf_counter() - began
+    return x.repeat(-(-rows // len(x)), 1)[:rows]
+
+
+def _best(objective: Objective, batch: Float[Tensor, "batch dim"], *, grad: bool, known: float) -> float:
+    """Return seconds per episode, the least of repetitions; `known` is what the batch took before."""
+    best, start = known, time.perf_counter()
+    while not np.isfinite(best) or time.perf_counter() - start + best < TIMING:
+        began = time.perf_counter()
+        objective.evaluate(batch, grad=grad)
+        best = min(best, time.perf_counter() - began)
+    return best / len(batch)
+
+
+def compare(rung: Sample, reference: Sample, *, seed: int) -> dict[str, Any]:
+    """Hold a rung against the reference, at the points where that one did not fail.
+
+    `loss_error`: median and 95th percentile of |difference|, in the loss's unit and as a share of `spread` of the
+    reference; an episode that failed counts as infinitely far off, so that a percentile can be None. The 95th
+    percentile is the next larger error of the sample, not interpolated. Where both have a loss: `spearman`, rank
+    correlation of losses; `gradient`, medians of cosine and of relative error (gradients per width of the box; equal
+    where both are exactly zero, cosine 0 and infinitely far off where one is). `diverged`: share that failed.
+    """
+    known = reference.status == Status.OK
+    fine = known & (rung.status == Status.OK)
+    error = np.where(rung.status == Status.OK, np.abs(rung.loss - reference.loss), np.inf)[known]
+    cosine, off = gradient_error(rung.grad[fine], reference.grad[fine])
+    scale = spread(reference)
+    absolute = {"median": Estimate.of(_median, error, seed=seed), "p95": Estimate.of(_p95, error, seed=seed)}
+    return {
+        "loss_error": {name: asdict(found) for name, found in absolute.items()}
+        | {f"{name}_relative": _scaled(found, scale) for name, found in absolute.items()},
+        "spearman": asdict(Estimate.of(spearman, rung.loss[fine], reference.loss[fine], seed=seed)),
+        "gradient": {
+            "cosine": asdict(Estimate.of(_median, cosine, seed=seed)),
+            "relative_error": asdict(Estimate.of(_median, off, seed=seed)),
+        },
+        "diverged": float(1 - fine.sum() / known.sum()) if known.any() else None,
+        "compared": int(known.sum()),
+        "seconds": {"forward": rung.forward, "with_gradient": rung.with_gradient},
+        "batch": rung.batch,
+    }
+
+
+def spread(reference: Sample) -> float | None:
+    """Return what errors are shares of: the 5th to 95th percentile of the reference's losses; None without one."""
+    loss = reference.loss[reference.status == Status.OK]
+    width = float(np.subtract(*np.percentile(loss, (95, 5)))) if loss.size else 0.0
+    return width or None
+
+
+def gradient_error(grad: Array, reference: Array) -> tuple[Array, Array]:
+    """Return cosine and relative error of each gradient, shapes (point,); two that are exactly zero agree."""
+    sizes = np.linalg.norm(grad, axis=-1), np.linalg.norm(reference, axis=-1)
+    both = (sizes[0] == 0) & (sizes[1] == 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        units = [np.nan_to_num(g / size[:, None]) for g, size in zip((grad, reference), sizes, strict=True)]
+        off = np.linalg.norm(grad - reference, axis=-1) / sizes[1]
+    return np.where(both, 1.0, (units[0] * units[1]).sum(axis=-1)), np.where(both, 0.0, off)
+
+
+def spearman(a: Array, b: Array) -> Array:
+    """Return Spearman's rank correlation along the last axis, NaN where one side has a single value."""
+    ranks = [rankdata(side, axis=-1) for side in (a, b)]
+    ranks = [rank - rank.mean(axis=-1, keepdims=True) for rank in ranks]
+    with np.errstate(invalid="ignore"):
+        found: Array = (ranks[0] * ranks[1]).sum(-1) / np.sqrt((ranks[0] ** 2).sum(-1) * (ranks[1] ** 2).sum(-1))
+    return found
+
+
+def front(seconds: Sequence[float], error: Sequence[float]) -> list[int]:
+    """Return the numbers of those that no other beats in both, by time; one that is not finite is beaten."""
+    finite = [k for k in range(len(seconds)) if np.isfinite(seconds[k]) and np.isfinite(error[k])]
+    best, kept = np.inf, []
+    for k in sorted(finite, key=lambda k: (seconds[k], error[k])):
+        if error[k] < best:
+            best = error[k]
+            kept.append(k)
+    return kept
+
+
+def order(dt: Sequence[float], error: Sequence[float]) -> dict[str, float] | None:
+    """Fit error ~ dt^p: return p as `order` and its standard error; None below three errors that are positive."""
+    pairs = [(step, off) for step, off in zip(dt, error, strict=True) if np.isfinite(off) and off > 0]
+    if len(pairs) < 3:
+        return None
+    fit = linregress(*np.log(pairs).T)
+    return {"order": float(fit.slope), "standard_error": float(fit.stderr)}
+
+
+def cheapest(rungs: Sequence[Mapping[str, Any]], tolerance: float, *, relative: bool) -> Mapping[str, Any] | None:
+    """Return the rung that takes least time with gradient of those within a tolerance; None if none is."""
+    within = [rung for rung in rungs if (off := p95(rung, relative=relative)) is not None and off <= tolerance]
+    return min(within, key=lambda rung: float(rung["seconds"]["with_gradient"]), default=None)
+
+
+def p95(rung: Mapping[str, Any], *, relative: bool) -> float | None:
+    """Return a rung's 95th percentile of loss errors, as a share of the spread or in the loss's unit."""
+    value: float | None = rung["loss_error"]["p95_relative" if relative else "p95"]["value"]
+    return value
+
+
+def _median(values: Array) -> Array:
+    return np.asarray(np.median(values, axis=-1))
+
+
+def _p95(values: Array) -> Array:
+    return np.asarray(np.quantile(values, 0.95, axis=-1, method="higher"))
+
+
+def _scaled(found: Estimate, scale: float | None) -> dict[str, float | None]:
+    return {name: value / scale if value is not None and scale else None for name, value in asdict(found).items()}
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None

@@ -1,0 +1,89 @@
+"""An objective whose batches are halved when its device runs out of memory."""
+
+from __future__ import annotations
+
+import gc
+import re
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..objective import Evaluation, Objective, evaluated, name_of
+
+# What torch, Warp, Taichi and CUDA say; the first of them alone has a type of its own.
+SAID = re.compile(
+    r"out of memory|out of CUDA|fail\w* to allocate|can't allocate memory|not enough memory", re.IGNORECASE
+)
+
+
+class Halving:
+    """Evaluate an objective at fewer points at a time once its device ran out of memory, down to one.
+
+    That changes no result, given an objective whose rows do not depend on their batch. One that holds memory for all
+    rows it takes at once, such as an environment, is told to hold less by its method `shrink(rows)`.
+    """
+
+    def __init__(self, objective: Objective) -> None:
+        self.objective = objective
+        self.space = objective.space
+        self.name = name_of(objective)
+        self._notes: list[str] = []
+        self._most: int | None = None
+
+    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
+        """Return losses, and gradients if asked, at points `x` in the parameters' own units."""
+        parts: list[Evaluation] = []
+        start = 0
+        while start < len(x):
+            rows = x[start : start + (self._most or len(x))]
+            part = self._tried(rows, grad=grad)
+            if part is None:
+                collect()  # the arrays of the attempt that failed
+                self._most = len(rows) // 2
+                getattr(self.objective, "shrink", _keep)(self._most)
+                self._notes.append(f"{self.name} ran out of memory at {len(rows)} points; going on with {self._most}")
+                continue
+            parts.append(part)
+            start += len(rows)
+        return _joined(parts) if parts else Evaluation.empty(x.shape[1], grad=grad)
+
+    def take_notes(self) -> tuple[str, ...]:
+        """Return what to warn of since this was called last."""
+        notes, self._notes = tuple(self._notes), []
+        return notes
+
+    def _tried(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation | None:
+        """Return the evaluation, None where the device has too little memory for so many points."""
+        try:
+            return evaluated(self.objective, x, grad=grad)
+        except (RuntimeError, MemoryError) as error:
+            if not ran_out(error):
+                raise
+            if len(x) == 1:
+                raise MemoryError(
+                    f"{self.name} ran out of memory at a single point: {error}; end what else uses the device, "
+                    "or take a lower --fidelity or another --device"
+                ) from error
+            return None
+
+
+def collect() -> None:
+    """Free what objects that are gone held, of a GPU's memory too."""
+    gc.collect()  # some, such as a solver and its launches, refer to each other
+    torch.cuda.empty_cache()
+
+
+def _keep(rows: int) -> None:
+    """Leave an objective that holds no memory between evaluations as it is."""
+
+
+def ran_out(error: BaseException) -> bool:
+    """Say whether an error is one of too little memory, of the host or of a GPU."""
+    return isinstance(error, MemoryError | torch.OutOfMemoryError) or bool(SAID.search(str(error)))
+
+
+def _joined(parts: list[Evaluation]) -> Evaluation:
+    slopes = [part.grad for part in parts if part.grad is not None]
+    loss, status = (torch.cat([getattr(part, name) for part in parts]) for name in ("loss", "status"))
+    return Evaluation(loss, torch.cat(slopes) if slopes else None, status)

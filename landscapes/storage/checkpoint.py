@@ -1,0 +1,77 @@
+"""A study kept piece by piece: arrays by name in a folder, each written whole, so that a study can be stopped."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..identity import check_identity, plain_json
+from .files import discard, replacing, visible, write_json
+from .ownership import check_ours
+from .records import DamagedError, read_json, reading, text
+
+SETTINGS, PIECES = "settings.json", "pieces"
+NAME = "piece"  # the array that says which one it is, so that two that were swapped are not taken for right
+PIECE = re.compile(r"[^/]+\.npz")  # the name of one
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Hold the arrays of a study in `folder`, together with what decides its numbers."""
+
+    folder: Path
+
+    @classmethod
+    def open(cls, folder: Path, identity: Mapping[str, Any], *, what: str, force: bool = False) -> Pieces:
+        """Go on with a study of the same settings, or begin one; `force` begins anew where another one is.
+
+        Raises ValueError where the folder holds something else, StoreMismatchError where it holds another study.
+        """
+        wanted, path = plain_json({"kind": what, **identity}, f"a {what}'s identity"), folder / SETTINGS
+        if not path.exists() and visible(folder):
+            raise ValueError(f"{folder} holds other files and no {what}; give --out a new or an empty folder")
+        if path.exists():
+            with reading(path, f"it is no study's or damaged: write elsewhere with --out, or delete {folder}"):
+                found = read_json(path)
+                text(found["kind"])
+            if force:
+                check_ours(folder / PIECES, PIECE.fullmatch, f"a {what}")
+                discard(folder / PIECES)
+            else:
+                check_identity(folder, wanted=wanted, found=found, what="study")
+        write_json(path, wanted)
+        return cls(folder)
+
+    def load(self, name: str) -> dict[str, NDArray[Any]] | None:
+        """Return the arrays of a piece, None where it is not there, or damaged, which is said."""
+        path = self._path(name)
+        if not path.exists():
+            return None
+        try:
+            with reading(path, "it is computed again"), np.load(path, allow_pickle=False) as arrays:
+                found = dict(arrays)
+                if str(found.pop(NAME, name)) != name:  # those of earlier versions do not say
+                    raise ValueError("it is another piece")
+                return found
+        except DamagedError as error:
+            warnings.warn(str(error), RuntimeWarning, stacklevel=2)
+            return None
+
+    def save(self, name: str, **arrays: Any) -> None:
+        """Write a piece, whole or not at all."""
+        with replacing(self._path(name)) as partial, partial.open("wb") as file:
+            np.savez(file, **{NAME: np.array(name), **arrays})
+
+    def count(self) -> int:
+        """Return how many pieces are there."""
+        return len(list((self.folder / PIECES).glob("[!.]*.npz")))
+
+    def _path(self, name: str) -> Path:
+        return self.folder / PIECES / f"{name}.npz"
