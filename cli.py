@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from inspect import signature
 from io import TextIOWrapper
@@ -16,6 +17,7 @@ from .commands import verbs_look as look
 from .commands import verbs_measure as measure
 from .commands import verbs_search as search
 from .commands.dims import TakesDims
+from .commands.slice import bounce, slice_
 
 app = typer.Typer(
     name="landscape",
@@ -26,11 +28,12 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+STOPPED = 130  # the exit code of what Ctrl-C has ended
 LONG = 200  # characters of a path that an error shows
 _VERBS = (
-    look.envs, look.info, look.slice_, look.sweep,
+    look.envs, look.info, slice_, look.sweep,
     search.methods, search.optimize, search.race, search.overlay,
-    look.surface, look.replay, look.export, look.view, look.bounce,
+    look.surface, look.replay, look.export, look.view, bounce,
     measure.plan, measure.bench, measure.check, measure.tradeoff, measure.pairs, measure.report_,
 )  # fmt: skip
 
@@ -78,9 +81,20 @@ def main(arguments: list[str] | None = None) -> Any:
         code = _fail(str(error), 2)
     except OSError as error:
         code = _fail(_system(error), 1)
-    except (KeyboardInterrupt, typer.Abort):
-        code = _fail("stopped before anything was computed; the same command begins again", 130)
+    except (KeyboardInterrupt, typer.Abort) as stop:
+        code = _stop(stop) or _fail("stopped before anything was computed; the same command begins again", 130)
     sys.exit(code)
+
+
+def _stop(stop: BaseException) -> int:
+    """Say what is kept of a job that was stopped; return 0 where nothing was begun."""
+    from .jobs.watch import Stopped
+
+    if not isinstance(stop, Stopped):
+        return 0
+    again = shlex.join(["landscape", *sys.argv[1:]])
+    typer.echo(f"stopped: {stop}; the same command goes on from there: {again}", err=True)
+    return STOPPED
 
 
 def _usage(error: Any) -> str:

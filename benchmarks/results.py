@@ -149,13 +149,12 @@ def small() -> None:
     from gradscape.gallery import episodes as gallery_episodes
     from gradscape.gallery import measures as gallery_measures
     from gradscape.gallery import parts as gallery_parts
-    from gradscape.jobs import slice as job
+    from gradscape.landscapes import cost
     from gradscape.landscapes.measures import fidelity as tradeoff
-    from gradscape.optim import search
 
     leave_blank(setattr)
     tradeoff.TIMING = tradeoff.PATIENCE = 0.002
-    search.MOMENT = job.PATIENCE = job.FIRST_PATIENCE = 0.0
+    cost.MOMENT = cost.ENOUGH = cost.WARM_UP = 0.0
     gallery_parts.METHODS, gallery_parts.BUDGET = ("random",), 8
     gallery_parts.FRAMES, gallery_parts.COARSE = 2, 4
     gallery_episodes.LONGEST, gallery_episodes.HEIGHT = 2, 48

@@ -1,10 +1,18 @@
-"""Options that several verbs have."""
+"""The arguments and options that verbs share, each declared once.
+
+A verb that takes a `scene: SceneSpec` and is decorated with `takes_scene` has the options that make one in its place.
+"""
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Callable, Sequence
+from functools import wraps
+from inspect import Parameter, Signature, signature
+from typing import Annotated, Any
 
 import typer
+
+from ..jobs.scene import SceneSpec
 
 Env = Annotated[
     str,
@@ -80,3 +88,77 @@ Data = Annotated[
     str | None,
     typer.Option(help="Folder of the figures' data; by default a checkout's own, or else out/gallery-data."),
 ]
+
+SCENE: dict[str, tuple[Any, Any]] = {
+    "env": (Env, Parameter.empty),
+    "fidelity": (Fidelity, None),
+    "tolerance": (Tolerance, None),
+    "device": (Device, "auto"),
+    "engine": (Engine, "warp"),
+    "deterministic": (Deterministic, False),
+    "set_": (Set, None),
+}  # the options that make a SceneSpec, with their defaults
+
+
+def takes_scene(*without: str, **fixed: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a verb the options of a scene in the place of its parameter `scene`.
+
+    Those it goes `without` have no option; of those that are `fixed` the value is given, as a default where the verb
+    has the option.
+    """
+
+    def decorate(verb: Callable[..., None]) -> Callable[..., None]:
+        options = {
+            name: Parameter(name, Parameter.KEYWORD_ONLY, annotation=kind, default=fixed.get(name, default))
+            for name, (kind, default) in SCENE.items()
+            if name not in without
+        }
+
+        @wraps(verb)
+        def with_scene(**given: Any) -> None:
+            chosen = {name: given.pop(name) for name in options}
+            verb(scene=_scene(**{**fixed, **chosen}), **given)
+
+        own = [
+            one.replace(kind=Parameter.KEYWORD_ONLY)
+            for one in signature(verb, eval_str=True).parameters.values()
+            if one.name != "scene"
+        ]
+        first = [one for name, one in options.items() if name == "env"]
+        whole = [*first, *own, *(one for name, one in options.items() if name != "env")]
+        with_scene.__signature__ = Signature(whole)  # type: ignore[attr-defined]
+        with_scene.__annotations__ = {one.name: one.annotation for one in whole}
+        return with_scene
+
+    return decorate
+
+
+def _scene(*, env: str, set_: Sequence[str] | None = None, **how: Any) -> SceneSpec:
+    return SceneSpec(env, **how, options=read_settings(set_ or [], reserved=SCENE))
+
+
+def read_settings(
+    settings: Sequence[str], flag: str = "--set", *, reserved: Sequence[str] | dict[str, Any] = ()
+) -> dict[str, Any]:
+    """Return options given as name=value.
+
+    Raises ValueError where one is not so written, and for names of a scene that are options of the verb's own.
+    """
+    pairs = [setting.partition("=") for setting in settings]
+    for setting, (name, equals, _) in zip(settings, pairs, strict=True):
+        if not equals or not name:
+            raise ValueError(f"{flag} takes name=value; got {setting!r}")
+        if name in reserved:
+            raise ValueError(f"{flag} takes a scene's own options; {name} is none, and chosen by --{name} if at all")
+    return {name: value for name, _, value in pairs}
+
+
+def read_extent(text: str | None) -> float | tuple[float, float] | None:
+    """Return an extent given as a fraction or as LOW:HIGH. Raises ValueError where it is neither."""
+    if text is None:
+        return None
+    low, colon, high = text.partition(":")
+    try:
+        return (float(low), float(high)) if colon else float(low)
+    except ValueError:
+        raise ValueError(f"--extent takes a fraction or LOW:HIGH in the parameters' unit; got {text!r}") from None

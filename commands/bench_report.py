@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 from rich.table import Table
 
 from ..envs.registry import environment_class, make
-from .console import duration, read_settings, size
-from .tables import table
-from .terminal import Console
+from ..landscapes.capacity import size
+from ..landscapes.cost import duration
+from .arguments import read_settings
+from .terminal import Console, table
 
 if TYPE_CHECKING:
     from ..envs.base import Environment

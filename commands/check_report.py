@@ -19,9 +19,9 @@ from rich.text import Text
 
 from ..envs.registry import make
 from ..landscapes.capacity import Need, require
-from .console import duration, read_settings
-from .tables import table
-from .terminal import Console
+from ..landscapes.cost import duration
+from .arguments import read_settings
+from .terminal import Console, table
 
 if TYPE_CHECKING:
     from ..envs.base import Environment

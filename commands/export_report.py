@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..jobs.results import RUN, SLICE, inside
+from ..jobs.folder import RUN_STORE as RUN
+from ..jobs.folder import SLICE_STORE as SLICE
+from ..jobs.folder import store_in as inside
 from .terminal import Console
 
 if TYPE_CHECKING:

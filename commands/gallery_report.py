@@ -21,13 +21,12 @@ from ..gallery.figures import Figure, chosen, data_folder, read_figures
 from ..gallery.measures import Reports, Tradeoffs
 from ..gallery.parts import Part, Searches, Slice, State, Sweep
 from ..jobs.workers import workers
-from ..landscapes.capacity import require
+from ..landscapes.capacity import require, size
+from ..landscapes.cost import duration
 from ..landscapes.draw.loopback import LoopbackHandler, LoopbackServer
 from ..landscapes.storage.disk import full, is_full, until_full
 from ..landscapes.storage.files import tidy
-from .console import duration, size
-from .tables import table
-from .terminal import Console
+from .terminal import Console, table
 
 T = TypeVar("T")
 PARTS: dict[str, type[Part]] = {

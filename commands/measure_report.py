@@ -17,6 +17,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from ..envs.registry import environment_class, make
 from ..gallery.figures import data_folder, read_figures
+from ..jobs.folder import SLICE_STORE as SLICE
+from ..jobs.folder import store_in as inside
 from ..jobs.kept_reports import (
     ARRAYS,
     MEASURES,
@@ -29,16 +31,16 @@ from ..jobs.kept_reports import (
     leave_measures,
     verdict_lines,
 )
-from ..jobs.results import SLICE, environment_of, inside
-from ..landscapes.capacity import Need, require
+from ..jobs.scene import environment_of
+from ..landscapes.capacity import Need, require, size
+from ..landscapes.cost import duration
 from ..landscapes.identity import stored_identity
 from ..landscapes.storage.disk import full, is_full
 from ..landscapes.storage.files import others, replacing, tidy, write_json
 from ..landscapes.storage.records import write_record
-from .console import duration, fill, size
+from .console import fill
 from .measure_tables import by_environment, slices_markdown, slices_table
-from .tables import table
-from .terminal import Console, Described
+from .terminal import Console, Described, table
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.table import Table
 
-from .tables import table
+from .terminal import table
 
 Record = dict[str, Any]
 HEADINGS = ("slice", "minima", "flat", "jumps", "cosine", "measured", "the paper's words", "measured too")

@@ -14,7 +14,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..envs.registry import environment_class
-from ..jobs.results import RUN, SLICE, environment_of, inside, run_tables
+from ..jobs.folder import RUN_STORE as RUN
+from ..jobs.folder import SLICE_STORE as SLICE
+from ..jobs.folder import run_tables
+from ..jobs.folder import store_in as inside
+from ..jobs.scene import environment_of
 from ..landscapes.identity import stored_identity
 from ..landscapes.storage.files import others, resolved, tidy
 from ..landscapes.storage.paths import there

@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any
 from rich.box import SIMPLE
 
 from ..envs.registry import make
+from ..jobs.scene import provenance as provenance_of
 from ..landscapes.capacity import Need, require
-from .console import duration, provenance_of, read_settings
+from ..landscapes.cost import duration
+from .arguments import read_settings
 from .search_report import search_progress
-from .tables import table
-from .terminal import Console
+from .terminal import Console, table
 
 if TYPE_CHECKING:
     from ..envs.base import Environment

@@ -19,10 +19,10 @@ from ..gallery.figures import Figure, read_figures
 from ..jobs.planned import Plan, of_slice, of_sweep
 from ..jobs.swept import refuse_too_large as refuse_sweep
 from ..jobs.tolerance import kept_rung
-from ..landscapes.capacity import TooLargeError
-from .console import duration, read_extent, read_settings, size
-from .tables import table
-from .terminal import Console
+from ..landscapes.capacity import TooLargeError, size
+from ..landscapes.cost import duration
+from .arguments import read_extent, read_settings
+from .terminal import Console, table
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
@@ -63,7 +63,7 @@ def plan(
         return
     environment_class(what)  # a name that does not exist is refused before what measures is loaded
     env, where = _made(what, device, options)
-    from ..jobs.results import point_of
+    from ..jobs.scene import point_of
     from ..landscapes.plane import Plane
 
     window, side = read_extent(extent), resolution or RESOLUTION

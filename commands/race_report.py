@@ -16,10 +16,12 @@ from typing import TYPE_CHECKING, Any
 from ..envs.registry import make
 from ..jobs import race_workers
 from ..jobs import workers as cluster
+from ..jobs.scene import provenance as provenance_of
+from ..landscapes.cost import duration
 from ..landscapes.storage.disk import until_full
 from ..landscapes.storage.files import clear, tidy, visible, write_json
 from ..optim.registry import METHODS
-from .console import duration, provenance_of, read_settings
+from .arguments import read_settings
 from .race_tables import seeds_said, show
 from .search_report import STORE, give_torch_one_thread, made, run_identity, search_progress
 from .terminal import Console
@@ -28,8 +30,9 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from ..envs.base import Environment
+    from ..landscapes.cost import EpisodeCost
     from ..optim import race as racing
-    from ..optim.search import Cost, Progress
+    from ..optim.search import Progress
 
 PICTURE, FIGURES = "race.png", "race.json"
 
@@ -290,8 +293,8 @@ class Job:
         )
         return (known[0] if known else cost.ratio) if any(needs.values()) else None
 
-    def _cost(self, executor: Executor | None, *, grad: bool) -> Cost:
-        from ..optim.search import episode_cost
+    def _cost(self, executor: Executor | None, *, grad: bool) -> EpisodeCost:
+        from ..landscapes.cost import episode_cost
 
         return race_workers.cost(executor, self.env, grad=grad) if executor else episode_cost(self.env, grad=grad)
 

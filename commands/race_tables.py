@@ -7,8 +7,7 @@ from typing import Any
 
 from rich.table import Table
 
-from .tables import table
-from .terminal import Console
+from .terminal import Console, table
 
 ENOUGH = 10  # seeds, as the paper has
 

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 from .. import __version__
 from ..envs.registry import make
-from ..jobs.results import point_of
+from ..jobs.scene import point_of
+from ..jobs.scene import provenance as provenance_of
 from ..landscapes.storage.files import others, tidy, write_json
-from .console import provenance_of, read_settings
+from .arguments import read_settings
 from .terminal import Console
 
 if TYPE_CHECKING:

@@ -15,12 +15,14 @@ from typing import TYPE_CHECKING, Any
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ..envs.registry import make
+from ..jobs.scene import provenance as provenance_of
+from ..landscapes.cost import duration
 from ..landscapes.storage.disk import until_full
 from ..landscapes.storage.files import clear, tidy, visible, write_json
 from ..optim.registry import METHODS, code_digest, optimizer_class
-from .console import chosen_fidelity, duration, provenance_of, read_settings
-from .tables import table
-from .terminal import Console, Described
+from .arguments import read_settings
+from .console import chosen_fidelity
+from .terminal import Console, Described, table
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
@@ -227,7 +229,7 @@ class Job:
 
     def _announce(self, console: Console) -> float | None:
         """Say what is left to compute and return what a gradient costs, as far as the method asks for any."""
-        from ..optim.search import episode_cost
+        from ..landscapes.cost import episode_cost
 
         run, grad = self.filled, self.optimizer.needs_grad
         with console.status(f"{self.env.name}: preparing (kernels are compiled once, then kept)"):

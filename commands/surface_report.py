@@ -7,7 +7,9 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..jobs.results import SLICE, inside, run_tables
+from ..jobs.folder import SLICE_STORE as SLICE
+from ..jobs.folder import run_tables
+from ..jobs.folder import store_in as inside
 from ..landscapes.storage.files import others, tidy
 from .terminal import Console
 

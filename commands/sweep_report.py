@@ -18,12 +18,15 @@ import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ..envs.registry import make
+from ..jobs.scene import provenance as provenance_of
 from ..jobs.swept import FRAMES, HORIZON, ONLY, SMOOTHING, Moved, moved, refuse_too_large
 from ..jobs.workers import recipe, workers
+from ..landscapes.capacity import size
+from ..landscapes.cost import duration
 from ..landscapes.storage.disk import until_full
 from ..landscapes.storage.files import discard, tidy, visible, write_json
 from ..landscapes.storage.paths import check_replaceable, filling
-from .console import duration, provenance_of, read_extent, read_settings, size
+from .arguments import read_extent, read_settings
 from .terminal import Console, Described
 
 if TYPE_CHECKING:
@@ -67,7 +70,7 @@ def sweep(
     how: dict[str, Any] = {"fidelity": fidelity, "device": device, "engine": engine, "deterministic": deterministic}
     made = partial(make, name, **how, **read_settings(settings))
     env = made()
-    from ..jobs.results import point_of
+    from ..jobs.scene import point_of
     from ..landscapes.plane import Plane
 
     plane = Plane.through(env.space, point_of(env, through), dims, resolution=resolution, extent=read_extent(extent))
@@ -189,8 +192,8 @@ class Job:
             return 0.0, 0
         last = max(work)
         plane, store = self.moved.planes[last], self.stores[last]
-        env, how = self.moved.env_at(last), (store, _never_drawn, self.executor)
-        cost = job.Job(env, plane, self.folder, *how, recipe(env)).cost()
+        env, how = self.moved.env_at(last), (store, _never_drawn, "", self.executor)
+        cost = job.SliceJob(env, plane, self.folder, *how, recipe(env)).cost()
         return cost.seconds * sum(work.values()) / work[last], cost.memory
 
     def _sample(self, console: Console) -> list[xr.Dataset]:

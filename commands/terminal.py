@@ -1,33 +1,32 @@
-"""The terminal, as `landscape` writes to it: what stands in a name is neither markup nor an emoji's name."""
+"""The terminal, as the verbs write to it: tables, lines, bars and one JSON object."""
 
 from __future__ import annotations
 
+import json
+import shlex
+import sys
 from typing import Any
 
-from rich import console as rich
-from rich.progress import TextColumn
-from rich.status import Status
-from rich.text import Text
+from rich.table import Table
+
+from ..api.progress import Bars as Bars
+from ..api.progress import Console as Console
+from ..api.progress import Described as Described
 
 
-class Console(rich.Console):
-    """Print text as it is: names and paths are other people's, and may hold [brackets] and :colons:."""
-
-    def __init__(self, **look: Any) -> None:
-        super().__init__(markup=False, emoji=False, **look)
-
-    def status(self, status: rich.RenderableType, **look: Any) -> Status:
-        """Say what is being done while it is; the text of a status is markup whatever the console says."""
-        return _Plain(Text(status) if isinstance(status, str) else status, console=self, **look)
+def command_line() -> str:
+    """Return the command that this process runs, as one types it."""
+    return shlex.join(["landscape", *sys.argv[1:]])
 
 
-class _Plain(Status):
-    def update(self, status: rich.RenderableType | None = None, **look: Any) -> None:
-        super().update(Text(status) if isinstance(status, str) else status, **look)
+def table(*headings: str, title: str | None = None, **look: Any) -> Table:
+    """Return an empty table whose columns fold where the terminal is narrow; `look` is rich's."""
+    found = Table(title=title, title_justify="left", **look)
+    for heading in headings:
+        found.add_column(heading, overflow="fold")
+    return found
 
 
-class Described(TextColumn):
-    """Say beside a bar what it counts, as it is."""
-
-    def __init__(self) -> None:
-        super().__init__("{task.description}", markup=False)
+def print_json(record: dict[str, Any], **more: Any) -> None:
+    """Print one JSON object on standard output."""
+    print(json.dumps({**record, **more}))

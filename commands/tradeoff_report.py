@@ -18,11 +18,12 @@ from rich.box import SIMPLE
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TimeElapsedColumn
 
 from ..envs.registry import environment_class, make
+from ..jobs.scene import provenance as provenance_of
 from ..jobs.tolerance import keep
-from ..landscapes.capacity import Need, require
-from .console import duration, provenance_of, read_settings, size
-from .tables import table
-from .terminal import Console, Described
+from ..landscapes.capacity import Need, require, size
+from ..landscapes.cost import duration
+from .arguments import read_settings
+from .terminal import Console, Described, table
 
 if TYPE_CHECKING:
     from torch import Tensor

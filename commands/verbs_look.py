@@ -14,16 +14,13 @@ from .arguments import (
     Env,
     Extent,
     Fidelity,
-    Force,
     Json,
     NoGradients,
-    Out,
     Print,
     Resolution,
     Scheduler,
     Set,
     Through,
-    Tolerance,
 )
 
 
@@ -39,52 +36,6 @@ def info() -> None:
     from .console import show_info
 
     show_info()
-
-
-def slice_(
-    env: Env,
-    dims: Dims,
-    resolution: Resolution = 16,
-    fidelity: Fidelity = None,
-    tolerance: Tolerance = None,
-    device: Device = "auto",
-    engine: Engine = "warp",
-    deterministic: Deterministic = False,
-    through: Through = "center",
-    extent: Extent = None,
-    set_: Set = None,
-    no_gradients: NoGradients = False,
-    scheduler: Scheduler = None,
-    out: Out = None,
-    print_: Print = None,
-    json_: Json = False,
-    force: Force = False,
-) -> None:
-    """Sample losses and gradients over a plane through parameter space, and draw them.
-
-    Stop it at any moment: the same command goes on where it stopped.
-    """
-    from .console import cut
-
-    cut(
-        env,
-        dims,
-        resolution=resolution,
-        fidelity=fidelity,
-        tolerance=tolerance,
-        device=device,
-        engine=engine,
-        deterministic=deterministic,
-        through=through,
-        extent=extent,
-        settings=set_ or [],
-        grad=not no_gradients,
-        out=out,
-        prints=print_ or [],
-        as_json=json_,
-        force=force,
-        scheduler=scheduler,
-    )
 
 
 def sweep(
@@ -216,40 +167,3 @@ def view(
     from .overlay_report import view as show
 
     show(file, serve=serve)
-
-
-def bounce(
-    axis: Annotated[str, typer.Option(help="The initial velocity to vary: x, y or z.")],
-    resolution: Annotated[int, typer.Option(min=2, help="Number of velocities.")] = 512,
-    fidelity: Fidelity = "standard",
-    device: Device = "auto",
-    through: Through = "example:aim",
-    extent: Extent = None,
-    set_: Set = None,
-    out: Out = None,
-    print_: Print = None,
-    json_: Json = False,
-    force: Force = False,
-) -> None:
-    """Draw loss and gradient of the bouncing ball over one velocity, and mark where the number of bounces changes."""
-    from .console import cut
-
-    if axis not in ("x", "y", "z"):
-        raise ValueError(f"bounce varies the velocity along axis x, y or z; got {axis!r}")
-    cut(
-        "bounce",
-        (f"velocity {axis}",),
-        resolution=resolution,
-        fidelity=fidelity,
-        device=device,
-        engine="warp",
-        deterministic=False,
-        through=through,
-        extent=extent,
-        settings=set_ or [],
-        grad=True,
-        out=out,
-        prints=print_ or [],
-        as_json=json_,
-        force=force,
-    )

@@ -10,8 +10,8 @@ from ..commands import measure_report, tradeoff_report
 from ..commands.measure_report import Subject
 from ..commands.terminal import Console
 from ..envs.registry import environment_class, make
+from ..jobs.folder import SLICE_STORE as SLICE
 from ..jobs.kept_reports import ARRAYS, MEASURES, PICTURE, REPORT
-from ..jobs.results import SLICE
 from ..jobs.variants import LADDERS
 from .parts import Part, read_record
 from .site.measured import DEVICES, TRADEOFF

@@ -9,9 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..commands.console import follow, outcome, picture_of, provenance_of
 from ..commands.terminal import Console
 from ..envs.registry import environment_class, make
+from ..jobs.scene import provenance as provenance_of
+from ..jobs.slice import picture_of
 from ..jobs.workers import recipe
 from .figures import Figure
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from ..envs.base import Environment
-    from ..jobs.slice import Job
+    from ..jobs.slice import SliceJob
     from ..landscapes.plane import Plane
 
 DRAFT = "draft"  # fidelity of sweeps and searches, of which there are many episodes; of functions their only one
@@ -116,24 +117,32 @@ class Slice(Part):
         from ..jobs.slice import PICTURE
 
         job = self._open()
-        said = outcome(follow(console, job, self.figure.command(self.device)))
+        from ..api.progress import Bars
+
+        said = job.run(Bars(console)).outcome()
         if len(self.figure.dims) == 2:
             (self.folder / PICTURE).unlink()  # `landscape gallery build` draws planes; a line's events need episodes
         return said
 
-    def _open(self) -> Job:
-        from ..jobs.slice import STORE, Job
+    def _open(self) -> SliceJob:
+        from ..jobs.slice import STORE, SliceJob
         from ..landscapes.storage.store import is_slice
 
         env = self._env(self.figure.fidelity)
         plane = plane_of_figure(self.figure, env, self.figure.resolution)
         empty = is_slice(self.folder / STORE) and self.state().done == 0
-        return Job.open(
-            env, plane, self.folder, picture_of(env, plane),
-            identity=env.identity(), provenance=provenance_of(env, self.figure.command(self.device)),
+        return SliceJob.open(
+            env,
+            plane,
+            self.folder,
+            picture_of(env, plane),
+            identity=env.identity(),
+            provenance=provenance_of(env, self.figure.command(self.device)),
+            command=self.figure.command(self.device),
             force=empty,  # nothing is lost of a store made by other code or for another device
-            executor=self.executor, made=recipe(env),
-        )  # fmt: skip
+            executor=self.executor,
+            remake=recipe(env),
+        )
 
 
 class Sweep(Part):
@@ -257,7 +266,7 @@ def _same(figure: Figure, identity: dict[str, Any]) -> bool:
 
 def seconds_of_one(env: Environment) -> float:
     """Return the seconds of an episode without gradient."""
-    from ..optim.search import episode_cost
+    from ..landscapes.cost import episode_cost
 
     return episode_cost(env, grad=False).forward
 

@@ -10,8 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..commands.console import picture_of, provenance_of
 from ..commands.sweep_report import Job as SweepJob
+from .scene import provenance as provenance_of
+from .slice import picture_of
 from .swept import SMOOTHING, moved, need_of
 
 if TYPE_CHECKING:
@@ -68,11 +69,11 @@ def of_slice(env: Environment, plane: Plane, folder: Path, *, grad: bool, began:
     Of a large one a smaller one is rehearsed.
     """
     from .rehearsal import Alike, Room, drawn, pictures, stored
-    from .slice import Job, peak_memory
+    from .slice import SliceJob, peak_memory
 
     little = _little(plane)
     grown = Growth.of(little, plane, grad=grad)
-    job = Job.open(
+    job = SliceJob.open(
         env, little, folder, picture_of(env, little),
         identity=env.identity(), provenance=provenance_of(env, ""), grad=grad,
     )  # fmt: skip

@@ -14,8 +14,9 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from ..envs.base import Environment
+    from ..landscapes.cost import EpisodeCost
     from ..optim.race import Entry
-    from ..optim.search import Cost, Progress
+    from ..optim.search import Progress
 
 
 def search_all(
@@ -30,7 +31,7 @@ def search_all(
         yield entries[number], now
 
 
-def cost(executor: Executor, env: Environment, *, grad: bool) -> Cost:
+def cost(executor: Executor, env: Environment, *, grad: bool) -> EpisodeCost:
     """Return what an episode takes a worker."""
     from ..landscapes.sampling.distribution import results
 
@@ -59,8 +60,8 @@ def _search(
     return number, seen[-1]
 
 
-def _cost(there: bytes, grad: bool) -> Cost:
+def _cost(there: bytes, grad: bool) -> EpisodeCost:
+    from ..landscapes.cost import episode_cost
     from ..landscapes.sampling.distribution import kept
-    from ..optim.search import episode_cost
 
     return episode_cost(kept(there).objective, grad=grad)

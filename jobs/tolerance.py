@@ -18,8 +18,9 @@ from ..envs.registry import make
 from .variants import expected_work
 
 if TYPE_CHECKING:
-    from ..commands.terminal import Console
     from ..envs.base import Environment, Fidelity
+    from .scene import SceneSpec
+    from .watch import Watch
 
 Row = Mapping[str, Any]
 FARTHER = 2.0  # times the least expected work, beyond which a rung is no candidate
@@ -27,7 +28,7 @@ ENOUGH, SHORTEST = 1e6, 0.05  # work of an episode that is timed, if it can be s
 
 
 def keep(report: Mapping[str, Any]) -> Path:
-    """Keep a report where `chosen` finds it, in the user's data folder, in the place of an earlier one."""
+    """Keep a report where `choose_fidelity` finds it, in the user's data folder, in the place of an earlier one."""
     from ..landscapes.storage.records import write_record
 
     identity = report["identity"]
@@ -36,26 +37,19 @@ def keep(report: Mapping[str, Any]) -> Path:
     return path
 
 
-def chosen(
-    console: Console,
-    name: str,
-    tolerance: str,
-    *,
-    fidelity: str | None,
-    device: str,
-    engine: str,
-    options: Mapping[str, Any],
-) -> Fidelity:
+def choose_fidelity(spec: SceneSpec, watch: Watch) -> Fidelity:
     """Return the quickest measured fidelity whose 95th-percentile loss error is within a tolerance, and say why.
 
     Looks among the user's own reports, then in the gallery's; options of the scene must be those that were measured,
     and so must the engine. Errors may be of the other device; seconds are of this one, and measured now if need be.
     """
-    if fidelity is not None:
-        raise ValueError(f"--tolerance chooses the fidelity; got --fidelity {fidelity} too, leave out one of them")
+    if spec.fidelity is not None:
+        raise ValueError(f"--tolerance chooses the fidelity; got --fidelity {spec.fidelity} too, leave out one of them")
+    tolerance = str(spec.tolerance)
     limit, relative = read_tolerance(tolerance)
-    env = make(name, device=device, engine=engine, **options)
-    report, source, rows = _measured(env, options)
+    env = make(spec.name, device=spec.device, engine=spec.engine, **spec.options)
+    name = env.name
+    report, source, rows = _measured(env, spec.options)
     from ..envs.base import Fidelity
     from ..landscapes.measures.fidelity import p95
 
@@ -67,23 +61,22 @@ def chosen(
             f"no measured fidelity of {name} is within {tolerance}; the best is {best}, "
             f"{_amount(errors[best], relative, report)} off at the 95th percentile"
         )
-    row, known = _quickest(console, env, within)
+    row, known = _quickest(watch, env, within)
     if (ours := _code(env, report)) != (theirs := report["identity"]["code"]):
         said = f"measured with another version of the code of {name}, {theirs}, this is {ours}"
-        console.print(f"warning: {said}", markup=False)
+        watch.note(f"warning: {said}")
     amount = _amount(errors[row["name"]], relative, report)
     accuracy = f"its losses are {amount} off or less in 95 % of {row['compared']} points"
     if row["name"] == report["reference"]:
         accuracy = "it is what the others are held against, so that its own error is not known"
-    console.print(
+    watch.note(
         f"{row['name']}: the quickest of {len(within)} of {len(rows)} measured that are within {tolerance}; {accuracy} "
-        f"({source}); {known}",
-        markup=False,
+        f"({source}); {known}"
     )
     return Fidelity(**row["fidelity"])
 
 
-def _quickest(console: Console, env: Environment, rows: Sequence[Row]) -> tuple[Row, str]:
+def _quickest(watch: Watch, env: Environment, rows: Sequence[Row]) -> tuple[Row, str]:
     """Return the rung that takes least time on the environment's device, and what is known of that time."""
     if rows[0]["device"] == env.device:
         best = min(rows, key=lambda row: float(row["seconds"]["with_gradient"]))
@@ -94,7 +87,7 @@ def _quickest(console: Console, env: Environment, rows: Sequence[Row]) -> tuple[
     likely = [row for row in rows if work[row["name"]] <= FARTHER * min(work.values())]
     if len(likely) == 1:
         return likely[0], f"the others have {FARTHER:g} times its work and more; none was timed on {env.device}"
-    with console.status(f"{env.name}: timing {len(likely)} fidelities on {env.device}, where none was measured"):
+    with watch.busy(f"{env.name}: timing {len(likely)} fidelities on {env.device}, where none was measured"):
         timed = _timed(env, [made[row["name"]] for row in likely])
     best = min(likely, key=lambda row: timed[row["name"]])
     return best, f"{timed[best['name']]:.3g} s an episode with gradient, one alone on {env.device}, timed here"

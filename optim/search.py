@@ -8,15 +8,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from ..landscapes.cost import episode_cost
 from ..landscapes.identity import StoreError
 from ..landscapes.objective import Objective, evaluated, name_of
 from ..landscapes.space import whole
 from .base import Optimizer
 from .registry import optimizer_class
 from .run import Run
-
-MOMENT = 0.5  # seconds to spend on measuring what an episode costs
-LONG = 5.0  # seconds from which the first, which warms things up, must do
 
 
 @dataclass(frozen=True)
@@ -131,31 +129,3 @@ def _check(optimizer: Optimizer, count: int, *, grad: bool) -> None:
         raise ValueError(f"{optimizer.name} proposed no point; a proposal holds at least one")
     if grad and not optimizer.needs_grad:
         raise ValueError(f"{optimizer.name} asks for gradients, so its class must say needs_grad = True")
-
-
-@dataclass(frozen=True)
-class Cost:
-    """Say what an episode costs [s], alone, without gradient and with it; the latter NaN where it was not measured."""
-
-    forward: float
-    gradient: float
-
-    @property
-    def ratio(self) -> float:
-        """What an episode with gradient costs, in episodes without."""
-        return self.gradient / self.forward
-
-
-def episode_cost(objective: Objective, *, grad: bool = True) -> Cost:
-    """Measure one random episode, without and with gradient in turn: the best of those that fit into a moment."""
-    getattr(objective, "prepare", lambda: None)()
-    x = objective.space.uniform(1, seed=0)
-    best = {False: float("inf"), True: float("inf") if grad else float("nan")}
-    began, rounds = time.perf_counter(), 0
-    while time.perf_counter() - began < (MOMENT if rounds > 1 else LONG):
-        for way in (False, True) if grad else (False,):
-            start = time.perf_counter()
-            objective.evaluate(x, grad=way)
-            best[way] = min(best[way], time.perf_counter() - start)
-        rounds += 1
-    return Cost(best[False], best[True])

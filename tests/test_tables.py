@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 import gradscape
-from gradscape.commands.tables import table
-from gradscape.commands.terminal import Console
+from gradscape.commands.terminal import Console, table
 from gradscape.envs.registry import entries
 from gradscape.gallery.figures import read_figures
 from gradscape.optim.registry import METHODS

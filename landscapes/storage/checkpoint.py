@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..identity import check_identity, plain_json
 from .files import discard, replacing, visible, write_json
-from .ownership import check_ours
+from .ownership import check_ours, refuse_others
 from .records import DamagedError, read_json, reading, text
 
 SETTINGS, PIECES = "settings.json", "pieces"
@@ -35,8 +35,8 @@ class Pieces:
         Raises ValueError where the folder holds something else, StoreMismatchError where it holds another study.
         """
         wanted, path = plain_json({"kind": what, **identity}, f"a {what}'s identity"), folder / SETTINGS
-        if not path.exists() and visible(folder):
-            raise ValueError(f"{folder} holds other files and no {what}; give --out a new or an empty folder")
+        if not path.exists():
+            refuse_others(folder, visible(folder), what)
         if path.exists():
             with reading(path, f"it is no study's or damaged: write elsewhere with --out, or delete {folder}"):
                 found = read_json(path)

@@ -41,6 +41,17 @@ def check_ours(folder: Path, ours: Ours, what: str) -> None:
         )
 
 
+def refuse_others(folder: Path, strange: Iterable[Path], what: str) -> None:
+    """Raise ValueError, naming some, where a folder that results are to go to holds files of something else."""
+    names = sorted(path.name for path in strange)
+    if names:
+        more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+        raise ValueError(
+            f"{folder} holds other files and no {what}: {', '.join(names[:SHOWN])}{more}; "
+            "give --out a new or an empty folder"
+        )
+
+
 def lost_root(store: Path, ours: Ours) -> bool:
     """Whether a zarr store has lost the file that says what it is, and everything else in it is of ours."""
     try:

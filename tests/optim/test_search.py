@@ -8,13 +8,14 @@ import torch
 import xarray as xr
 
 from gradscape.landscapes.adapters import from_torch
+from gradscape.landscapes.cost import LONG, MOMENT, episode_cost
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind, NoOptions, Optimizer, Points, Proposal
 from gradscape.optim.cmaes import CMAES
 from gradscape.optim.random import RandomSearch
 from gradscape.optim.run import Run
-from gradscape.optim.search import LONG, MOMENT, Progress, episode_cost, search
+from gradscape.optim.search import Progress, search
 
 from ..clock import Clock
 from ..processes import Instant, alone
@@ -191,7 +192,8 @@ class Timed(Pit):
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    monkeypatch.setattr("gradscape.optim.search.time", clock)
+    for module in ("optim.search", "landscapes.cost"):
+        monkeypatch.setattr(f"gradscape.{module}.time", clock)
     return clock
 
 
