@@ -13,11 +13,17 @@ import typer
 
 from . import __version__
 from .commands import verbs_gallery as gallery
-from .commands import verbs_look as look
 from .commands import verbs_measure as measure
 from .commands import verbs_search as search
 from .commands.dims import TakesDims
+from .commands.envs import envs
+from .commands.export import export
+from .commands.info import info
+from .commands.replay import replay
 from .commands.slice import bounce, slice_
+from .commands.surface import surface
+from .commands.sweep import sweep
+from .commands.view import view
 
 app = typer.Typer(
     name="landscape",
@@ -31,9 +37,9 @@ app = typer.Typer(
 STOPPED = 130  # the exit code of what Ctrl-C has ended
 LONG = 200  # characters of a path that an error shows
 _VERBS = (
-    look.envs, look.info, slice_, look.sweep,
+    envs, info, slice_, sweep,
     search.methods, search.optimize, search.race, search.overlay,
-    look.surface, look.replay, look.export, look.view, bounce,
+    surface, replay, export, view, bounce,
     measure.plan, measure.bench, measure.check, measure.tradeoff, measure.pairs, measure.report_,
 )  # fmt: skip
 
