@@ -20,8 +20,8 @@ from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.smoothing import smoothed
 from gradscape.landscapes.storage.store import plane_of
 
-from .command import Said
-from .processes import Instant, alone, landscape
+from ..command import Said
+from ..processes import Instant, alone, landscape
 
 SWEEP = "sweep bounce --dims 0 1 --over 2 --frames 3 --resolution 5 --through example:aim --device cpu --out moved"
 FILES = ["frames", "summary.json", "sweep.gif", "sweep.mp4", "sweep.rrd"]
