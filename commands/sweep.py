@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -40,15 +40,19 @@ def sweep(
 
     Example: landscape sweep fluid --dims 6 8 --over 7 --frames 12
     """
-    from ..api.sweep import film
+    from ..jobs.scene import plane_through
+    from ..jobs.sweep import SweepJob
+    from ..jobs.workers import workers
     from .terminal import Bars, command_line, print_json
 
     bars = Bars()
-    job, summary = film(
-        scene, dims, over, frames=frames, resolution=resolution, through=through, extent=read_extent(extent),
-        grad=not no_gradients, out=Path(out) if out else None, force=force, command=command_line(), watch=bars,
-        scheduler=scheduler,
-    )  # fmt: skip
+    env, folder = scene.make(bars), Path(out) if out else None
+    plane = plane_through(env, dims, through=through, extent=read_extent(extent), resolution=resolution)
+    how: dict[str, Any] = {"command": command_line(), "grad": not no_gradients, "force": force}
+    with bars.busy(f"opening {frames} slices"):
+        job = SweepJob.of(env, plane, over, frames, out=folder, **how)
+    with workers(scheduler, env.device) as executor:
+        summary = replace(job, executor=executor).run(bars)
     bars.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
     if json_:
         print_json(asdict(summary), folder=str(job.folder))

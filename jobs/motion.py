@@ -41,7 +41,7 @@ class Motion:
     slices: Callable[[Sequence[xr.Dataset]], Sequence[xr.Dataset]] = list
 
     @classmethod
-    def of(cls, env: Environment, plane: Plane, over: str, frames: int) -> Motion:
+    def of(cls, env: Environment, plane: Plane, over: int | str, frames: int) -> Motion:
         """Return what `over` names: a parameter, horizon or smoothing.
 
         Raises ValueError for a parameter that the plane varies, and for a horizon that the scene does not have.
@@ -58,7 +58,7 @@ class Motion:
         return tuple(f"{FRAMES}/{number:03d}.zarr" for number in range(len(self.planes)))
 
 
-def refuse_too_large(plane: Plane, frames: int, folder: Path, *, grad: bool, over: str) -> None:
+def refuse_too_large(plane: Plane, frames: int, folder: Path, *, grad: bool, over: int | str) -> None:
     """Refuse a sweep of which a single frame is larger than this machine, or all of them are.
 
     Raises TooLargeError, which is a ValueError.
@@ -72,7 +72,7 @@ def refuse_too_large(plane: Plane, frames: int, folder: Path, *, grad: bool, ove
     require("frames", frames, lambda count: need(side, count), folder)
 
 
-def need_of(shape: tuple[int, ...], dim: int, frames: int, *, grad: bool, over: str) -> Need:
+def need_of(shape: tuple[int, ...], dim: int, frames: int, *, grad: bool, over: int | str) -> Need:
     """Return what sampling a sweep and filming it takes: every frame's slice is stored, of a smoothing's only one."""
     from ..landscapes.storage.arrays import need_of as slice_need
 
@@ -82,7 +82,7 @@ def need_of(shape: tuple[int, ...], dim: int, frames: int, *, grad: bool, over: 
     return Need(memory, one.disk + slices * (STORE_FILES * BLOCK + float(array)))
 
 
-def _parameter(name: str, env: Environment, plane: Plane, frames: int) -> Motion:
+def _parameter(name: int | str, env: Environment, plane: Plane, frames: int) -> Motion:
     """Move a parameter from one of its bounds to the other."""
     import torch
 

@@ -118,7 +118,7 @@ class SweepJob:
         cls,
         env: Environment,
         plane: Plane,
-        over: str,
+        over: int | str,
         frames: int,
         *,
         command: str,
@@ -267,7 +267,7 @@ class _Count:
         self.failed += int((dataset["status"] != Status.OK).sum())
 
 
-def sweep_folder(env: Environment, motion: Motion, over: str, *, grad: bool = True) -> Path:
+def sweep_folder(env: Environment, motion: Motion, over: int | str, *, grad: bool = True) -> Path:
     """Return a folder of its own for every different sweep, the same for the same one."""
     planes = [plane.record() for plane in motion.planes]
     axes = [int(row.nonzero()[0]) for row in motion.planes[0].basis]
