@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from . import __version__
-from .commands import verbs_gallery as gallery
+from .commands import gallery
 from .commands import verbs_look as look
 from .commands import verbs_measure as measure
 from .commands import verbs_search as search
