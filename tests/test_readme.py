@@ -16,7 +16,8 @@ import typer
 from gradscape.cli import app, main
 from gradscape.commands import overlay_report
 from gradscape.commands.measure_tables import environments_table
-from gradscape.gallery.figures import DATA, read_figures
+from gradscape.gallery.figures import read_figures
+from gradscape.gallery.files import DATA
 
 from .command import Said
 

@@ -59,8 +59,8 @@ def build_site(
     tables = read_runs(data)
     with placing(out, overwrite=True, check=partial(_check, out)) as new:
         follow(len(there))
-        site = _Site(new, _templates(), tables, place_tradeoffs(data, new, [figure.env for figure in there]))
         shutil.copytree(HERE / "static", new / "static")
+        site = _Site(new, _templates(), tables, place_tradeoffs(data, new, [figure.env for figure in there]))
         shown = [site.write_page(figure, data / figure.id) for figure in there]
         return site.write_index(shown, [figure.id for figure in figures if figure not in there])
 
