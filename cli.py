@@ -13,7 +13,7 @@ import typer
 from typer.core import TyperGroup
 
 from . import __version__
-from .commands import verbs_gallery as gallery
+from .commands import gallery
 from .commands import verbs_measure as measure
 from .commands import verbs_search as search
 from .commands.dims import TakesDims

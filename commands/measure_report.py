@@ -7,7 +7,7 @@ import json
 import shlex
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ..envs.registry import environment_class, make
-from ..gallery.figures import data_folder, read_figures
+from ..gallery.figures import read_figures
+from ..gallery.files import data_folder
 from ..jobs.folder import SLICE_STORE as SLICE
 from ..jobs.folder import store_in as inside
 from ..jobs.kept_reports import (
@@ -47,7 +48,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from ..envs.base import Environment
-    from ..gallery.words import Said
+    from ..gallery.paper import PaperWords
     from ..landscapes.measures.profile import Character
     from ..landscapes.objective import Evaluation, Objective
 
@@ -155,10 +156,11 @@ def _measured(
 
     One that fails among several is left out, and returned by name with what was wrong.
     """
-    from ..gallery.words import paper_words
+    from ..gallery.paper import read_paper
 
     records: list[dict[str, Any]] = []
     failed: dict[str, str] = {}
+    words = read_paper().words
 
     def kept() -> str:
         return f"{len(records)} of {len(subjects)} reports are kept in {places[0].parent}"
@@ -167,7 +169,7 @@ def _measured(
         if len(subjects) > 1:
             console.print(f"slice {number + 1} of {len(subjects)}: {subject.name}", markup=False)
         try:
-            records.append(measured(console, subject, folder, settings, device, paper_words(), drawn=bool(prints)))
+            records.append(measured(console, subject, folder, settings, device, words, drawn=bool(prints)))
             _print(console, subject, folder, prints)
             tidy(folder)
         except KeyboardInterrupt:
@@ -190,7 +192,7 @@ def measured(
     folder: Path,
     settings: dict[str, Any],
     device: str,
-    said: dict[str, Said],
+    said: Mapping[str, PaperWords],
     *,
     drawn: bool = False,
 ) -> dict[str, Any]:
@@ -333,7 +335,7 @@ def _warn(console: Console, subject: Subject, dataset: xr.Dataset, env: Environm
         console.print(f"warning: {subject.name} was sampled otherwise ({said}), so losses may differ", markup=False)
 
 
-def _beside(character: Character, said: Said | None) -> dict[str, Any] | None:
+def _beside(character: Character, said: PaperWords | None) -> dict[str, Any] | None:
     if said is None:
         return None
     return {"words": character.verdict.beside(said.words), "where": said.where}

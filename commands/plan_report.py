@@ -153,11 +153,9 @@ def _figures(
 
 
 def _figure(console: Console, figure: Figure, device: str, *, grad: bool, began: float) -> tuple[Plan, dict[str, Any]]:
-    from ..gallery.parts import plane_of_figure
-
     known = figure.fidelity if figure.fidelity in environment_class(figure.env).fidelities else None
     env, where = _made(figure.env, device, {"fidelity": known, **figure.options})
-    plane = plane_of_figure(figure, env, figure.resolution)
+    plane = figure.plane(env)
     with _rehearsing(console, env), tempfile.TemporaryDirectory() as folder:
         found = of_slice(env, plane, Path(folder), grad=grad, began=began)
     return _there(found, env, where, grad=grad), _subject(env, plane, where)
