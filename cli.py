@@ -15,8 +15,10 @@ from . import __version__
 from .commands import verbs_gallery as gallery
 from .commands import verbs_look as look
 from .commands import verbs_measure as measure
-from .commands import verbs_search as search
 from .commands.dims import TakesDims
+from .commands.optimize import methods, optimize
+from .commands.overlay import overlay
+from .commands.race import race
 from .commands.slice import bounce, slice_
 
 app = typer.Typer(
@@ -32,7 +34,7 @@ STOPPED = 130  # the exit code of what Ctrl-C has ended
 LONG = 200  # characters of a path that an error shows
 _VERBS = (
     look.envs, look.info, slice_, look.sweep,
-    search.methods, search.optimize, search.race, search.overlay,
+    methods, optimize, race, overlay,
     look.surface, look.replay, look.export, look.view, bounce,
     measure.plan, measure.bench, measure.check, measure.tradeoff, measure.pairs, measure.report_,
 )  # fmt: skip

@@ -209,18 +209,18 @@ class Searches(Part):
 
     def make(self, console: Console) -> str:
         """Run every method that has not run."""
-        from ..commands.search_report import Job, give_torch_one_thread, made
+        from ..api.progress import Bars
+        from ..jobs.search import SearchJob, make_optimizer
         from .runs import save_run
 
-        give_torch_one_thread()
         env = self._env(DRAFT)
         for method in self._missing:
             command = self.figure.search_command(
                 method, budget=BUDGET, seed=SEED, fidelity=env.fidelity.name, device=self.device
             )
-            job = Job.open(env, made(method, env, seed=SEED, options={}), budget=BUDGET, command=command)
-            job.run(console)
-            save_run(job.filled.table(), self._file(method))
+            job = SearchJob.of(env, make_optimizer(method, env, seed=SEED), budget=BUDGET, command=command)
+            job.run(Bars(console))
+            save_run(job.store.dataset(), self._file(method))
         return f"{len(METHODS)} runs of {BUDGET} episodes"
 
     @property

@@ -1,4 +1,4 @@
-"""The paper's orderings of optimisers as data, and which of them hold in a race.
+"""The paper's orderings of optimisers as data.
 
 "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL 2022; arXiv:2207.00167v1),
 section 5. Its names: Rand is `random` here, CMA-ES `cma-es`, RandDescents `descents`, BO `bo-descents` (it descends
@@ -9,44 +9,11 @@ cube lifted, a rope wrapped) is not, nor are the scenes we do not have: the one-
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from enum import StrEnum
 
-from .standings import Difference
+from .claims import Claim, Claims
 
 GRADIENT_BASED = ("descents", "bo-descents")  # the paper's baselines that use gradients
 BASELINES = ("random", "cma-es", *GRADIENT_BASED)
-
-
-@dataclass(frozen=True)
-class Claim:
-    """Say that the paper has one method ahead of another, or neither ahead (`alike`), and where."""
-
-    first: str
-    second: str
-    source: str
-    alike: bool = False
-
-    def __str__(self) -> str:
-        return f"{self.first} {'and' if self.alike else 'better than'} {self.second}{' alike' if self.alike else ''}"
-
-
-class Verdict(StrEnum):
-    """Say what a race makes of a claim."""
-
-    HOLDS = "holds"
-    FAILS = "does not hold"
-    UNDECIDED = "not decided"
-    NOT_RUN = "not run"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A claim, what the race makes of it, and the difference it was measured by, None where it was not run."""
-
-    claim: Claim
-    verdict: Verdict
-    difference: Difference | None
 
 
 def _ahead(first: str, seconds: Sequence[str], source: str) -> tuple[Claim, ...]:
@@ -96,22 +63,8 @@ SILENT: Mapping[str, str] = {
 }
 
 
-def findings(env: str, differences: Sequence[Difference]) -> list[Finding]:
-    """Return what a race on an environment makes of each of the paper's claims about it."""
-    measured = {(found.first, found.second): found for one in differences for found in (one, one.reversed)}
-    return [_finding(claim, measured.get((claim.first, claim.second))) for claim in CLAIMS.get(env, ())]
-
-
-def silence(env: str) -> str:
-    """Return why there is no claim about an environment."""
-    return SILENT.get(env, "The paper does not have this environment, so it claims nothing about it.")
-
-
-def _finding(claim: Claim, found: Difference | None) -> Finding:
-    """Judge a claim; that two are alike can be refuted by an interval, never shown."""
-    if found is None:
-        return Finding(claim, Verdict.NOT_RUN, None)
-    if found.better is None:
-        return Finding(claim, Verdict.UNDECIDED, found)
-    holds = not claim.alike and found.better == claim.first
-    return Finding(claim, Verdict.HOLDS if holds else Verdict.FAILS, found)
+def claims_about(env: str) -> Claims:
+    """Return what the paper claims of an environment, or why it claims nothing."""
+    if claims := CLAIMS.get(env):
+        return Claims(claims)
+    return Claims((), SILENT.get(env, "The paper does not have this environment, so it claims nothing about it."))
