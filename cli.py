@@ -10,6 +10,7 @@ from io import TextIOWrapper
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from . import __version__
 from .commands import verbs_gallery as gallery
@@ -21,8 +22,20 @@ from .commands.overlay import overlay
 from .commands.race import race
 from .commands.slice import bounce, slice_
 
+class Verbs(TyperGroup):
+    """The verbs of the command, of which Ctrl-C ends as it is raised: the library would make an exit code of it."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a verb; return what Ctrl-C has raised, for `main` to raise it again."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as stop:
+            return stop
+
+
 app = typer.Typer(
     name="landscape",
+    cls=Verbs,
     help="See, measure and search the loss landscapes of differentiable simulators.",
     add_completion=False,
     rich_markup_mode=None,
@@ -75,7 +88,9 @@ def main(arguments: list[str] | None = None) -> Any:
             stream.reconfigure(errors="backslashreplace")  # a file's name need not be text
     try:
         code = app(args=arguments, prog_name="landscape", standalone_mode=False)
-        if code == 130:  # what typer makes of Ctrl-C where a verb has not said what is kept
+        if isinstance(code, KeyboardInterrupt):
+            raise code
+        if code == STOPPED:  # what the library makes of Ctrl-C where no verb has begun
             raise KeyboardInterrupt
     except TyperException as error:
         code = _fail(_usage(error), 2)

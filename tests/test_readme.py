@@ -139,7 +139,7 @@ def test_every_command_runs(
 
     monkeypatch.setenv("XDG_DATA_HOME", str(desk / "data"))
     monkeypatch.setattr("http.server.ThreadingHTTPServer.serve_forever", stop)
-    monkeypatch.setattr(overlay_report, "_show", lambda console, path, serve: opened.append(path))
+    monkeypatch.setattr(overlay_report, "show", lambda console, path, serve: opened.append(path))
     for name, value in (("TIMING", 0.01), ("PATIENCE", 0.01), ("RESAMPLES", 9)):
         monkeypatch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", value)
     done = run(*small(command), cwd=desk)

@@ -66,7 +66,7 @@ def test_bo_evaluates_where_the_bound_of_all_it_knows_is_least_and_the_first_ten
 def test_bo_comes_closer_to_branins_minimum_than_chance_does():
     branin = make("branin")
     gaps = [
-        [search(branin, method(branin.space, seed=seed), budget=40).best - branin.minimum for seed in range(3)]
+        [search(branin, method(branin.space, seed=seed), budget=40).best_loss - branin.minimum for seed in range(3)]
         for method in (BO, RandomSearch)
     ]
     assert np.median(gaps[0]) < 0.1 * np.median(gaps[1])

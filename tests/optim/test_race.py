@@ -289,4 +289,4 @@ def test_progress_tells_which_run_it_is_of():
     entries, seen = field(), {}
     race(Bowl(), entries, budget=BUDGET, workers=2, gradient_cost=2.0, progress=lambda e, now: seen.update({e: now}))
     assert {(e.method, e.seed): now.done for e, now in seen.items()} == {(e.method, e.seed): BUDGET for e in entries}
-    assert all(now.best == e.run.best for e, now in seen.items())
+    assert all(now.best == e.run.best_loss for e, now in seen.items())

@@ -62,7 +62,7 @@ def test_a_run_reads_back_as_it_was_written(tmp_path: Path) -> None:
     assert table["kind"].values.tolist() == [Kind.DESCENT] * 4 + [Kind.POPULATION] * 2
     assert table["kind"].attrs["flag_meanings"].split()[Kind.POPULATION] == "population"
     assert again.failed == 1
-    assert again.best == 0.0
+    assert again.best_loss == 0.0
 
 
 def test_plain_xarray_reads_the_table_with_its_units(tmp_path: Path) -> None:

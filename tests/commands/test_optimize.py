@@ -14,9 +14,9 @@ from gradscape.envs.base import Environment
 from gradscape.landscapes.objective import Evaluation
 from gradscape.optim.runs.store import RunStore
 
-from .clock import Clock
-from .command import Said, modules
-from .processes import Instant, alone, landscape
+from ..clock import Clock
+from ..command import Said, modules
+from ..processes import Instant, alone, landscape
 
 QUICK = ["optimize", "branin", "--method", "cma-es", "--budget", "50"]
 

@@ -11,8 +11,8 @@ import pytest
 
 from gradscape.optim.runs.store import RunStore
 
-from .command import Said
-from .processes import Instant, alone, landscape
+from ..command import Said
+from ..processes import Instant, alone, landscape
 
 RACE = ["race", "branin", "--methods", "random,cma-es", "--methods", "descents", "--budget", "40", "--seeds", "3"]
 
