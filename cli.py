@@ -22,6 +22,7 @@ from .commands.overlay import overlay
 from .commands.race import race
 from .commands.slice import bounce, slice_
 
+
 class Verbs(TyperGroup):
     """The verbs of the command, of which Ctrl-C ends as it is raised: the library would make an exit code of it."""
 

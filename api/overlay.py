@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from ..jobs.watch import Watch
 from .progress import default_watch
+from .slice import open_slice
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from ..envs.base import Environment
-    from ..jobs.overlay import Overlay, OverlayJob
+    from ..jobs.overlay import Overlay
     from ..landscapes.slice import Slice
     from ..optim.runs.run import Run
 
@@ -38,47 +37,20 @@ def overlay(
     Raises ValueError for runs of other landscapes than the slice's, for a slice of a line, where there is no slice or
     run, and where the folder holds something else; Stopped where it is interrupted.
     """
-    watch = default_watch()
-    several = [runs] if isinstance(runs, str | Path) or not isinstance(runs, Sequence) else list(runs)
-    return open_overlay(
-        slice, several, through=through, plane=plane, resolution=resolution, device=device,
-        out=Path(out) if out else None, command="gradscape.overlay(...)", watch=watch,
-    ).run(watch)  # fmt: skip
-
-
-def open_overlay(
-    slice: str | Path | Slice,
-    runs: Sequence[str | Path | Run],
-    *,
-    through: str | None,
-    plane: str | None,
-    resolution: int | None,
-    device: str,
-    out: Path | None,
-    command: str,
-    watch: Watch,
-    prints: Sequence[float] = (),
-) -> OverlayJob:
-    """Open what `overlay` runs, and refuse what does not belong together; what more there is belongs to the command."""
-    from ..jobs.folder import SLICE_STORE, store_in
     from ..jobs.overlay import Cut, OverlayJob
-    from ..jobs.scene import environment_of
-    from ..landscapes.slice import Slice
-    from ..landscapes.storage.store import open_slice
 
-    cut = Cut.of(through, plane, resolution)
-    if not isinstance(slice, Slice):
-        slice = Slice(open_slice(store_in(Path(slice), SLICE_STORE)), Path(slice))
-    data, remake = slice.data, slice.remake
-
-    def make() -> Environment:
-        from ..envs.base import Environment
-
-        env = remake() if remake else None
-        return env if isinstance(env, Environment) else environment_of(data, device)
-
-    how: dict[str, Any] = {"cut": cut, "out": out, "prints": prints, "watch": watch}
-    return OverlayJob.of(slice, _tables(runs), remake=make, command=command, **how)
+    watch, cut = default_watch(), Cut.of(through, plane, resolution)
+    several = [runs] if isinstance(runs, str | Path) or not isinstance(runs, Sequence) else list(runs)
+    job = OverlayJob.of(
+        open_slice(slice) if isinstance(slice, str | Path) else slice,
+        _tables(several),
+        command="gradscape.overlay(...)",
+        cut=cut,
+        device=device,
+        out=Path(out) if out is not None else None,
+        watch=watch,
+    )
+    return job.run(watch)
 
 
 def _tables(runs: Sequence[str | Path | Run]) -> list[xr.Dataset]:

@@ -76,7 +76,6 @@ class Bars(Watch):
 
             yield advance
 
-
     @contextmanager
     def progress_of(self, totals: Mapping[str, int]) -> Iterator[AdvanceOne]:
         """Show a bar for each of several things, which is there from the beginning."""

@@ -39,16 +39,19 @@ def optimize(
 
     Example: landscape optimize fluid --method bo-leap --budget 300
     """
-    from ..api.search import search_scene
     from .terminal import Bars, command_line, print_json
 
-    bars, folder = Bars(), Path(out) if out else None
-    how: dict[str, Any] = {"out": folder, "force": force, "prints": print_ or [], "command": command_line()}
-    options = read_settings(option or [], "--option")
-    run, summary = search_scene(scene, method, budget=budget, seed=seed, method_options=options, watch=bars, **how)
+    bars, options = Bars(), read_settings(option or [], "--option")
+    env = scene.make(bars)
+    from ..jobs.search import SearchJob, make_optimizer
+
+    how: dict[str, Any] = {"out": Path(out) if out else None, "force": force, "prints": print_ or []}
+    optimizer = make_optimizer(method, env, seed=seed, options=options)
+    job = SearchJob.of(env, optimizer, budget=budget, command=command_line(), **how)
+    summary = job.run(bars)
     if json_:
-        print_json(summary.record(), folder=str(run.folder))
-    bars.note(f"{summary.outcome()}\n{run.folder}: {', '.join(summary.files)}")
+        print_json(summary.record(), folder=str(job.folder))
+    bars.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
 
 
 def _list() -> None:

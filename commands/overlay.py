@@ -35,8 +35,10 @@ def overlay(
 
     Example: landscape overlay out/fluid-6-8 out/race-fluid --through best
     """
-    from ..api.overlay import open_overlay
+    from ..api.slice import open_slice
     from ..envs.registry import environment_class
+    from ..jobs.folder import run_tables
+    from ..jobs.overlay import Cut, OverlayJob
     from .overlay_report import need_display, show
     from .terminal import Bars, command_line
 
@@ -44,9 +46,9 @@ def overlay(
         environment_class(env)  # which registers it
     if spawn and not serve:
         need_display("rerun's viewer", "leave out --spawn, or take --serve to look at it in a browser")
-    bars, folder = Bars(), Path(out) if out else None
-    how: dict[str, Any] = {"out": folder, "prints": print_ or [], "command": command_line(), "watch": bars}
-    job = open_overlay(slice_, runs, through=through, plane=plane, resolution=resolution, device=device, **how)
+    bars, cut = Bars(), Cut.of(through, plane, resolution)
+    how: dict[str, Any] = {"out": Path(out) if out else None, "prints": print_ or [], "watch": bars, "device": device}
+    job = OverlayJob.of(open_slice(slice_), run_tables(runs), command=command_line(), cut=cut, **how)
     drawn = job.run(bars)
     bars.note(f"{drawn.summary.outcome()}\n{drawn.folder}: {', '.join(drawn.files)}")
     if spawn or serve:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -51,32 +52,27 @@ def race(
 
     Example: landscape race fluid --methods random,bo-leap --budget 200 --seeds 3
     """
-    from ..api.search import race_scene
-    from ..jobs.race import check_methods
+    from ..jobs.race import RaceJob, check_methods
+    from ..jobs.workers import workers as cluster
     from ..optim.orderings import claims_about
     from .terminal import Bars, command_line, print_json
 
-    bars, folder = Bars(), Path(out) if out else None
+    if workers > 1 and scheduler:
+        raise ValueError(f"--scheduler has workers of its own, so --workers is 1; got {workers}")
     chosen = check_methods([name.strip() for text in methods or [] for name in text.split(",") if name.strip()])
-    how: dict[str, Any] = {"out": folder, "force": force, "prints": print_ or [], "command": command_line()}
-    summary = race_scene(
-        scene,
-        chosen,
-        budget=budget,
-        seeds=seeds,
-        method_options=_read_options(option or [], chosen),
-        workers=workers,
-        scheduler=scheduler,
-        claims_about=claims_about,
-        watch=bars,
-        **how,
-    )
-    record, folder = summary.record(), summary.race.folder
+    bars, options = Bars(), _read_options(option or [], chosen)
+    env = scene.make(bars)
+    how: dict[str, Any] = {"out": Path(out) if out else None, "force": force, "prints": print_ or [], "watch": bars}
+    how |= {"claims": claims_about(env.name), "command": command_line(), "options": options, "workers": workers}
+    job = RaceJob.of(env, chosen, budget=budget, seeds=seeds, **how)
+    with cluster(scheduler, env.device) as executor:
+        summary = replace(job, executor=executor).run(bars)
     if json_:
-        print_json({key: value for key, value in record.items() if key not in ("curves", "ecdf")}, folder=str(folder))
+        short = {key: value for key, value in summary.record().items() if key not in ("curves", "ecdf")}
+        print_json(short, folder=str(job.folder))
     else:
         _print(summary, claims=report)
-    bars.note(f"{folder}: {', '.join(summary.files)}")
+    bars.note(f"{job.folder}: {', '.join(summary.files)}")
 
 
 def _read_options(settings: Sequence[str], chosen: Sequence[str]) -> dict[str, dict[str, str]]:

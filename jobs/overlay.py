@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import xarray as xr
 
 from ..landscapes.identity import stored_identity
-from ..landscapes.objective import Status
+from ..landscapes.objective import Objective, Status
 from ..landscapes.overlay import best_point, overlay, principal_plane
 from ..landscapes.plane import Plane
 from ..landscapes.slice import Slice
@@ -19,13 +19,13 @@ from ..landscapes.storage.files import tidy, visible
 from ..landscapes.storage.paths import there
 from ..landscapes.storage.store import open_slice, plane_of
 from .folder import OVERLAY, ROOT, SLICE_STORE, folder_named, run_tables
+from .scene import environment_of
 from .slice import SliceJob
 from .watch import Watch, resumable
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from ..landscapes.draw.figures.page import Picture
 
-    from ..envs.base import Environment
 
 PICTURE, STREAM = OVERLAY.files
 PCA, BEST = "pca", "best"
@@ -114,19 +114,20 @@ class Overlay:
             files=self.files,
         )
 
-    def plot(self, *, width: float | None = None) -> Figure:
-        """Draw the runs over the slice: for a screen, or for a page so wide [mm]."""
+    def plot(self, *, width: float | None = None) -> Picture:
+        """Draw the runs over the slice; the picture is matplotlib's figure, `width` is that of a page [mm]."""
         from ..landscapes.draw.figures.overlay import overlay_figure
 
         return overlay_figure(self.slice.data, self.runs, width=width)
 
     def __repr__(self) -> str:
+        """Return in a line what it shows."""
         return f"<Overlay of {self.summary.outcome()}, in {self.folder}>"
 
 
 @dataclass(frozen=True)
 class OverlayJob:
-    """Runs to lay over a slice in `folder`; with a `cut` over one that is sampled there first, of what `remake` makes.
+    """Runs to lay over a slice in `folder`; with a `cut` over one that is sampled there first, on `device`.
 
     `prints` are widths of pages [mm] that the picture is also drawn for; `command` is how it is made again.
     """
@@ -134,9 +135,9 @@ class OverlayJob:
     slice: Slice
     runs: Sequence[xr.Dataset]
     folder: Path
-    remake: Callable[[], Environment]
     command: str
     cut: Cut | None = None
+    device: str = "auto"
     prints: Sequence[float] = ()
 
     @classmethod
@@ -145,9 +146,9 @@ class OverlayJob:
         slice: Slice,
         runs: Sequence[xr.Dataset],
         *,
-        remake: Callable[[], Environment],
         command: str,
         cut: Cut | None = None,
+        device: str = "auto",
         out: Path | None = None,
         prints: Sequence[float] = (),
         watch: Watch | None = None,
@@ -161,7 +162,7 @@ class OverlayJob:
         overlay(slice.data, runs)
         folder = out or overlay_folder(slice.data, runs, cut)
         OVERLAY.check(folder, allowed=[file for file in visible(folder) if there(file / SLICE_STORE)])
-        return cls(slice, runs, folder, remake, command, cut, prints)
+        return cls(slice, runs, folder, command, cut, device, prints)
 
     def run(self, watch: Watch | None = None) -> Overlay:
         """Sample the new slice, if there is to be one, lay the runs over it and write the files.
@@ -176,12 +177,18 @@ class OverlayJob:
         """Sample the slice that is cut anew."""
         assert self.cut is not None  # as `run` has seen
         plane = self.cut.plane(plane_of(self.slice.data), self.runs)
-        env = self.remake()
+        env = self._objective()
         how: dict[str, Any] = {"grad": "grad" in self.slice.data, "boxed": self.cut.principal}
         job = SliceJob.of(env, plane, command=self.command, root=self.folder, **how)
         summary = job.run(watch)
         watch.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
         return Slice(open_slice(job.folder / SLICE_STORE), job.folder, lambda: env)
+
+    def _objective(self) -> Objective:
+        """Return what the slice was sampled from."""
+        if self.device == "auto" and self.slice.remake:
+            return self.slice.remake()
+        return environment_of(self.slice.data, self.device)
 
     def _write(self, drawn: Overlay) -> Overlay:
         from ..landscapes.draw.figures.page import save, save_prints

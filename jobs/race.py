@@ -14,6 +14,7 @@ import cloudpickle
 from ..landscapes.cost import EpisodeCost, duration, episode_cost
 from ..landscapes.sampling.distribution import kept as objective_of
 from ..landscapes.sampling.distribution import results, workers_of
+from ..landscapes.space import whole
 from ..landscapes.storage.files import clear, tidy, visible, write_json
 from ..landscapes.storage.ownership import refuse_others
 from ..optim.claims import Claims, Finding, check_claims
@@ -108,32 +109,35 @@ class RaceJob:
         workers: int = 1,
         out: Path | None = None,
         force: bool = False,
-        executor: Executor | None = None,
         prints: Sequence[float] = (),
+        watch: Watch | None = None,
     ) -> RaceJob:
         """Go on with the race in `out`, by default a folder named after it, or begin it there; `force` begins anew.
 
-        Seeds go by turns, so that methods stay level. Raises ValueError where the folder holds something else, where
+        `methods` are by default all that can search the environment here. Seeds go by turns, so that methods stay
+        level. Raises ValueError where the folder holds something else, where
         the environment cannot be simulated in several threads at once and for methods and options that are not there,
         StoreMismatchError where it holds a run of other settings, and TooLargeError where the race would not fit this
         machine.
         """
-        check_threads(env, workers)
-        options = options or {}
+        watch, options = watch or Watch(), options or {}
+        budget, seeds = whole(budget, "a budget", least=1), whole(seeds, "a number of seeds", least=1)
+        check_threads(env, whole(workers, "a number of workers", least=1))
+        methods = check_methods(methods) or able_methods(env, watch)
         folder = out or race_folder(env, options)
         if not any(folder.glob(f"*-*/{RUN_STORE}")):
             refuse_others(folder, (one for one in visible(folder) if not one.is_dir() or visible(one)), RACE.kind)
         _require_room(env, methods, options, seeds=seeds, budget=budget, folder=folder)
-        competitors = [
-            _open_competitor(
-                env, method, seed, options.get(method, {}), folder, budget=budget, command=command, force=force
-            )
-            for seed in range(seeds)
-            for method in methods
-        ]
+        how: dict[str, Any] = {"budget": budget, "command": command, "force": force}
+        with watch.busy(f"opening {len(methods) * seeds} runs"):
+            competitors = [
+                _open_competitor(env, method, seed, options.get(method, {}), folder, **how)
+                for seed in range(seeds)
+                for method in methods
+            ]
         if force:
             clear(folder, (PICTURE, RACE_FIGURES), PICTURE)
-        return cls(env, competitors, folder, budget, command, claims or Claims(), workers, executor, prints)
+        return cls(env, competitors, folder, budget, command, claims or Claims(), workers, None, prints)
 
     @property
     def methods(self) -> list[str]:

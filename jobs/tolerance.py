@@ -189,7 +189,7 @@ def _kept(name: str, options: Mapping[str, Any], device: str) -> Path:
 def _found(name: str, options: dict[str, Any], device: str) -> tuple[dict[str, Any], Path] | None:
     """Return the report to choose from, and the file it is in."""
     devices = (device, *({"cpu", "cuda"} - {device}))
-    gallery = Path(str(resources.files(f"{__package__}.gallery"))) / "data" / "tradeoff"
+    gallery = Path(str(resources.files("gradscape.gallery"))) / "data" / "tradeoff"
     kept = [_kept(name, options, where) for where in devices]
     for path in (*kept, *(gallery / f"{name}-{where}.json" for where in devices)):
         if path.is_file():

@@ -24,7 +24,8 @@ from .search import SearchProgress, search
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
+
+    from ..landscapes.draw.figures.page import Picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,8 +143,11 @@ class Race:
         ]
         return pd.DataFrame(rows)
 
-    def plot(self, *, width: float | None = None) -> Figure:
-        """Draw best losses against episodes, and the share of targets reached: for a screen, or a page so wide [mm]."""
+    def plot(self, *, width: float | None = None) -> Picture:
+        """Draw best losses against episodes, and the share of targets reached.
+
+        The picture is matplotlib's figure, shown by a notebook as it is; `width` draws it for a page so wide [mm].
+        """
         from ..landscapes.draw.figures.race import race_figure
 
         return race_figure(self._picture, width=width)
@@ -177,6 +181,7 @@ class Race:
         )
 
     def __repr__(self) -> str:
+        """Return in a line what competed and what came out best."""
         best = self.statistics.ranks[0].method
         where = f", in {self.folder}" if self.folder else ""
         return (

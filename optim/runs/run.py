@@ -17,7 +17,8 @@ from ...landscapes.identity import stored_identity, stored_provenance
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
+
+    from ...landscapes.draw.figures.page import Picture
 
 LABELS = {"forwards": "forward equivalents"}  # of columns whose stored names say less
 
@@ -81,9 +82,10 @@ class Run:
 
         return frame(self.data).rename(columns=LABELS)
 
-    def plot(self, *, width: float | None = None) -> Figure:
-        """Draw every loss and the best so far against episodes: for a screen, or for a page so wide [mm].
+    def plot(self, *, width: float | None = None) -> Picture:
+        """Draw every loss and the best so far against episodes.
 
+        The picture is matplotlib's figure, shown by a notebook as it is; `width` draws it for a page so wide [mm].
         Raises ValueError where there is no episode yet.
         """
         if not self.data.sizes["evaluation"]:
@@ -93,6 +95,7 @@ class Run:
         return run_figure(self.data, width=width)
 
     def __repr__(self) -> str:
+        """Return in a line what searched and what it found."""
         count = self.data.sizes["evaluation"]
         found = f"best loss {self.best.loss:.6g}" if np.isfinite(self.data["loss"]).any() else "none succeeded"
         where = f", in {self.folder}" if self.folder else ""
