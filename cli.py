@@ -15,11 +15,13 @@ from typer.core import TyperGroup
 from . import __version__
 from .commands import gallery
 from .commands import verbs_measure as measure
-from .commands import verbs_search as search
 from .commands.dims import TakesDims
 from .commands.envs import envs
 from .commands.export import export
 from .commands.info import info
+from .commands.optimize import methods, optimize
+from .commands.overlay import overlay
+from .commands.race import race
 from .commands.replay import replay
 from .commands.slice import bounce, slice_
 from .commands.surface import surface
@@ -52,7 +54,7 @@ STOPPED = 130  # the exit code of what Ctrl-C has ended
 LONG = 200  # characters of a path that an error shows
 _VERBS = (
     envs, info, slice_, sweep,
-    search.methods, search.optimize, search.race, search.overlay,
+    methods, optimize, race, overlay,
     surface, replay, export, view, bounce,
     measure.plan, measure.bench, measure.check, measure.tradeoff, measure.pairs, measure.report_,
 )  # fmt: skip

@@ -18,8 +18,7 @@ from ..jobs.scene import provenance as provenance_of
 from ..landscapes.capacity import Need, require
 from ..landscapes.cost import duration
 from .arguments import read_settings
-from .search_report import search_progress
-from .terminal import Console, table
+from .terminal import Bars, Console, table
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
@@ -69,9 +68,8 @@ def pairs(
     try:
         with until_full(kept):
             _announce(console, env, design, folder)
-            with search_progress(console) as bar:
-                task = bar.add_task("episodes", total=design.episodes)
-                found = explore(env, design, pieces, follow=lambda done: bar.update(task, completed=done))
+            with Bars(console).progress(design.episodes) as advance:
+                found = explore(env, design, pieces, follow=advance)
             provenance = provenance_of(env, command)
             record = _record(env, design, found)
             report = {**identity, "set": read_settings(settings), **record, "provenance": provenance}

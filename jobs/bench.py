@@ -159,8 +159,7 @@ def _free(env: Environment) -> int:
 
 def _points(env: Environment, count: int) -> Float[Tensor, "count dim"]:
     """Return well-spread points of the box, the same for every engine."""
-    sobol = torch.quasirandom.SobolEngine(env.space.dim, scramble=True, seed=0)  # type: ignore[no-untyped-call]
-    return env.space.from_unit(sobol.draw(count, dtype=torch.float64))
+    return env.space.sobol(count, seed=0)
 
 
 def _rates(envs: Mapping[str, Environment], points: Tensor, seconds: float) -> list[dict[str, Any]]:

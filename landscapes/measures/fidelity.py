@@ -75,8 +75,7 @@ class Estimate:
 
 def sobol_points(space: ParameterSpace, count: int, *, seed: int) -> Float[Tensor, "count dim"]:
     """Return well-spread points of the box (Sobol, scrambled with the seed)."""
-    sobol = torch.quasirandom.SobolEngine(space.dim, scramble=True, seed=seed)  # type: ignore[no-untyped-call]
-    return space.from_unit(sobol.draw(count, dtype=torch.float64))
+    return space.sobol(count, seed=seed)
 
 
 def measure(

@@ -7,6 +7,8 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from .api.environments import list_envs
+    from .api.overlay import overlay
+    from .api.search import open_run, optimize, race
     from .api.slice import open_slice, slice
     from .envs.base import Environment, Fidelity
     from .envs.registry import make, register
@@ -18,7 +20,8 @@ if TYPE_CHECKING:
     from .landscapes.sampling.fill import sample
     from .landscapes.slice import Slice
     from .landscapes.space import ParameterSpace
-    from .optim.run import open_run
+    from .optim.race import Race
+    from .optim.runs.run import Run
 
 # Where `gradscape.<name>` is, imported when first used: nothing heavy loads before it is needed.
 _HOMES = {
@@ -29,6 +32,8 @@ _HOMES = {
     "Objective": "landscapes.objective",
     "ParameterSpace": "landscapes.space",
     "Plane": "landscapes.plane",
+    "Race": "optim.race",
+    "Run": "optim.runs.run",
     "SceneSpec": "jobs.scene",
     "Slice": "landscapes.slice",
     "Status": "landscapes.objective",
@@ -36,8 +41,11 @@ _HOMES = {
     "from_torch": "landscapes.adapters",
     "list_envs": "api.environments",
     "make": "envs.registry",
-    "open_run": "optim.run",
+    "open_run": "api.search",
     "open_slice": "api.slice",
+    "optimize": "api.search",
+    "overlay": "api.overlay",
+    "race": "api.search",
     "register": "envs.registry",
     "sample": "landscapes.sampling.fill",
     "slice": "api.slice",
@@ -51,6 +59,8 @@ __all__ = [
     "Objective",
     "ParameterSpace",
     "Plane",
+    "Race",
+    "Run",
     "SceneSpec",
     "Slice",
     "Status",
@@ -61,6 +71,9 @@ __all__ = [
     "make",
     "open_run",
     "open_slice",
+    "optimize",
+    "overlay",
+    "race",
     "register",
     "sample",
     "slice",
