@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.status import Status
 from rich.text import Text
 
-from ..jobs.watch import Advance, Watch
+from ..jobs.watch import Advance, Say, Watch
 
 
 class Console(rich.Console):
@@ -49,10 +49,10 @@ class Bars(Watch):
         self.console.print(text)
 
     @contextmanager
-    def busy(self, text: str) -> Iterator[None]:
-        """Turn a wheel beside a text."""
-        with self.console.status(text):
-            yield
+    def busy(self, text: str) -> Iterator[Say]:
+        """Turn a wheel beside a text, which may change."""
+        with self.console.status(text) as status:
+            yield status.update
 
     @contextmanager
     def progress(self, total: int, what: str = "episodes") -> Iterator[Advance]:

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from ..landscapes.storage.disk import until_full
 
 Advance = Callable[..., None]  # advance(done, said=""): so much is done, and what is said beside the bar
+Say = Callable[[str], None]  # say(text): what is being done now
 
 
 PREPARING = "preparing (kernels are compiled once, then kept)"
@@ -39,9 +40,9 @@ class Watch:
         """Take a line that is worth keeping: what a job will cost, a warning, what it has left out."""
 
     @contextmanager
-    def busy(self, text: str) -> Iterator[None]:
-        """Take what a job does that nothing can be counted of, as long as it does it."""
-        yield
+    def busy(self, text: str) -> Iterator[Say]:
+        """Take what a job does that nothing can be counted of, as long as it does it; give what says it otherwise."""
+        yield _ignore_text
 
     @contextmanager
     def progress(self, total: int, what: str = "episodes") -> Iterator[Advance]:
@@ -50,4 +51,8 @@ class Watch:
 
 
 def _ignore(done: int, said: str = "") -> None:
+    """Take no notice."""
+
+
+def _ignore_text(text: str) -> None:
     """Take no notice."""

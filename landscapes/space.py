@@ -130,6 +130,12 @@ def tensor_of(x: object, who: str) -> Float[Tensor, "*shape"]:
     return x if isinstance(x, Tensor) else as_tensor(x, who)
 
 
+def sobol(dim: int, count: int, *, seed: int) -> Float[Tensor, "count dim"]:
+    """Return well-spread points of the unit cube: Sobol's sequence, scrambled with the seed (Owen 1998)."""
+    engine = torch.quasirandom.SobolEngine(dim, scramble=True, seed=seed)  # type: ignore[no-untyped-call]
+    return engine.draw(count, dtype=torch.float64)
+
+
 def as_tensor(x: object, who: str) -> Float[Tensor, "*shape"]:
     """Return numbers, whole or floating, of a tensor, an array or lists as a float64 tensor on the CPU.
 

@@ -1,6 +1,6 @@
 """A landscape in words: rules with stated thresholds, from measures to what one says of a landscape.
 
-The thresholds were set on functions whose character is known, and on nothing else: the sphere, Rosenbrock's valley,
+The thresholds were set on functions whose landscape is known, and on nothing else: the sphere, Rosenbrock's valley,
 Himmelblau's function, Branin's, Rastrigin's, Ackley's and Levy's, white noise, a step, a plateau, and a bowl with fine
 ripples, at 48 x 48 samples.
 """
@@ -46,7 +46,7 @@ class Verdict:
         return [{"word": word, "measured": word in self.reasons} for word in said]
 
 
-def judge(found: Ruggedness, jumps: Jumps | None, cosine: Values) -> Verdict:
+def classify(found: Ruggedness, jumps: Jumps | None, cosine: Values) -> Verdict:
     """Put a landscape into words.
 
     `cosine` is that of its gradients with differences over two samples, NaN where neither shows a slope. A gradient

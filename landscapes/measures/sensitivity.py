@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..objective import Objective, Status, evaluated
-from ..space import ParameterSpace
+from ..space import ParameterSpace, sobol
 from ..storage.checkpoint import Pieces
 
 STEP, LINE = 0.025, 5  # of a short line: distance of its points in widths of the box, how many they are
@@ -39,8 +39,7 @@ class Design:
     @classmethod
     def sobol(cls, space: ParameterSpace, samples: int, *, seed: int) -> Design:
         """Return the design of so many base points."""
-        engine = torch.quasirandom.SobolEngine(2 * space.dim, scramble=True, seed=seed)  # type: ignore[no-untyped-call]
-        both = engine.draw(samples, dtype=torch.float64).numpy()
+        both = sobol(2 * space.dim, samples, seed=seed).numpy()
         return cls(space, both[:, : space.dim], both[:, space.dim :])
 
     @property
