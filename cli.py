@@ -93,7 +93,8 @@ def _stop(stop: BaseException) -> int:
     if not isinstance(stop, Stopped):
         return 0
     again = shlex.join(["landscape", *sys.argv[1:]])
-    typer.echo(f"stopped: {stop}; the same command goes on from there: {again}", err=True)
+    then = "goes on from there" if stop.kept else "begins again"
+    typer.echo(f"stopped: {stop}; the same command {then}: {again}", err=True)
     return STOPPED
 
 

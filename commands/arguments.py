@@ -99,6 +99,7 @@ SCENE: dict[str, tuple[Any, Any]] = {
     "deterministic": (Deterministic, False),
     "set_": (Set, None),
 }  # the options that make a SceneSpec, with their defaults
+OWN = set(SceneSpec.__dataclass_fields__)  # names that no option of a scene may have
 
 
 def takes_scene(*without: str, **fixed: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -135,12 +136,10 @@ def takes_scene(*without: str, **fixed: Any) -> Callable[[Callable[..., None]], 
 
 
 def _scene(*, env: str, set_: Sequence[str] | None = None, **how: Any) -> SceneSpec:
-    return SceneSpec(env, **how, options=read_settings(set_ or [], reserved=SCENE))
+    return SceneSpec(env, **how, options=read_settings(set_ or []))
 
 
-def read_settings(
-    settings: Sequence[str], flag: str = "--set", *, reserved: Sequence[str] | dict[str, Any] = ()
-) -> dict[str, Any]:
+def read_settings(settings: Sequence[str], flag: str = "--set") -> dict[str, Any]:
     """Return options given as name=value.
 
     Raises ValueError where one is not so written, and for names of a scene that are options of the verb's own.
@@ -149,7 +148,7 @@ def read_settings(
     for setting, (name, equals, _) in zip(settings, pairs, strict=True):
         if not equals or not name:
             raise ValueError(f"{flag} takes name=value; got {setting!r}")
-        if name in reserved:
+        if flag == "--set" and name in OWN:
             raise ValueError(f"{flag} takes a scene's own options; {name} is none, and chosen by --{name} if at all")
     return {name: value for name, _, value in pairs}
 

@@ -137,7 +137,7 @@ class CheckJob:
                 count += 1
                 yield finding
         except KeyboardInterrupt as error:
-            raise Stopped(f"{count} checks are done; nothing of them is kept") from error
+            raise Stopped(f"{count} checks are done, and nothing is kept of them", kept=False) from error
 
     def run(self, watch: Watch | None = None) -> CheckReport:
         """Check it and return all that was found. Raises Stopped where it is interrupted."""

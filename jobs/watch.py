@@ -15,7 +15,14 @@ PREPARING = "preparing (kernels are compiled once, then kept)"
 
 
 class Stopped(KeyboardInterrupt):
-    """Say what is kept of a job that Ctrl-C has stopped; the same call, or the same command, goes on from there."""
+    """Say what is kept of a job that Ctrl-C has stopped; the same call, or the same command, goes on from there.
+
+    Where nothing is `kept`, it begins again.
+    """
+
+    def __init__(self, said: str, *, kept: bool = True) -> None:
+        super().__init__(said)
+        self.kept = kept
 
 
 @contextmanager

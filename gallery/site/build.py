@@ -35,13 +35,14 @@ from ...landscapes.storage.ownership import check_ours
 from ...landscapes.storage.paths import is_slice
 from ...landscapes.storage.records import reading
 from ...landscapes.storage.store import SliceStore, open_slice
-from ..figures import HERE, Figure
+from ..figures import Figure
 from ..runs import FOLDER
 from .measured import MEASURES, QUALITY, REPORT, dark_name, place_tradeoffs, read_report
 from .page_data import REMAKE, nodes, numbers, read_episodes, read_measures, read_sweep
 from .trajectories import read_runs, trajectories
 
 SCHEMA = 2
+HERE = Path(__file__).parent
 MANIFEST, NODES, THUMBNAIL, SWEEP = "manifest.json", "nodes.js", "thumbnail.png", "sweep.mp4"
 SURFACES = ("surface.png", "surface.html", "surface.gltf", "surface.glb")
 POINTS = ("u", "v", "loss", "radius", "path", "hidden")  # of a trajectory, for the map alone
