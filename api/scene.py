@@ -24,6 +24,15 @@ class SceneKeywords(TypedDict, total=False):
     options: Mapping[str, Any]
 
 
+def spec_of(scene: str | type[Environment] | Environment | SceneSpec, keywords: SceneKeywords) -> SceneSpec:
+    """Return the spec of a name, a class, an environment, or of itself; raises ValueError as `environment` does."""
+    from ..envs.base import Environment
+
+    if isinstance(scene, Environment):
+        return SceneSpec.of(_refuse_keywords(scene, keywords))
+    return replace(scene if isinstance(scene, SceneSpec) else SceneSpec(scene), **keywords)
+
+
 def environment(
     scene: str | type[Environment] | Environment | SceneSpec, keywords: SceneKeywords, watch: Watch
 ) -> Environment:
@@ -35,8 +44,11 @@ def environment(
     from ..envs.base import Environment
 
     if isinstance(scene, Environment):
-        if keywords:
-            raise ValueError(f"{scene.name} is made already; got {', '.join(keywords)} too, so make it with them")
-        return scene
-    spec = scene if isinstance(scene, SceneSpec) else SceneSpec(scene)
-    return replace(spec, **keywords).make(watch)
+        return _refuse_keywords(scene, keywords)
+    return spec_of(scene, keywords).make(watch)
+
+
+def _refuse_keywords(env: Environment, keywords: SceneKeywords) -> Environment:
+    if keywords:
+        raise ValueError(f"{env.name} is made already; got {', '.join(keywords)} too, so make it with them")
+    return env

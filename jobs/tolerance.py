@@ -164,9 +164,7 @@ def read_tolerance(text: str) -> tuple[float, bool]:
     return value, text.endswith("%")
 
 
-def _candidates(
-    env: Environment, options: Mapping[str, Any]
-) -> tuple[Tradeoff, Path, Sequence[MeasuredVariant]]:
+def _candidates(env: Environment, options: Mapping[str, Any]) -> tuple[Tradeoff, Path, Sequence[MeasuredVariant]]:
     """Return the trade-off to choose from, its file, and its variants that solve the same problem on the engine."""
     measuring = ["landscape", "tradeoff", env.name, *(f"--set={key}={value}" for key, value in options.items())]
     found = _find(env.name, asdict(env.options), env.device)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -93,11 +92,13 @@ class TradeoffJob:
         Raises ValueError where the scene refuses the reference, Stopped where it is interrupted, and DiskFullError;
         the same job goes on from what is kept then.
         """
+        from ..landscapes.draw.figures.page import save
+
         watch = watch or Watch()
         with resumable(self.kept):
             self._announce(watch)
             found = self._conclude(self._measure(watch))
-            self._draw(found)
+            save(found.plot(), self.folder / PICTURE)
             write_record(self.folder / RECORD, found.record())
             tidy(self.folder)
         return found
@@ -244,18 +245,9 @@ class TradeoffJob:
             compare(sample, reference, seed=self.seed),
         )
 
-    def _draw(self, found: Tradeoff) -> None:
-        from ..landscapes.draw.figures.page import save
-        from ..landscapes.draw.figures.tradeoff import tradeoff_figure
-
-        save(tradeoff_figure(found.record()), self.folder / PICTURE)
-
     def print(self, found: Tradeoff) -> list[str]:
-        """Draw it for pages, too, and return the names of the files."""
+        """Draw it for pages, too, and return the names of the files. Raises DiskFullError."""
         from ..landscapes.draw.figures.page import save_prints
-        from ..landscapes.draw.figures.tradeoff import tradeoff_figure
 
-        record = found.record()
         with resumable(self.kept):
-            draw = partial(tradeoff_figure, record)
-            return save_prints(lambda width: draw(width=width), self.folder / PICTURE, self.prints)
+            return save_prints(lambda width: found.plot(width), self.folder / PICTURE, self.prints)

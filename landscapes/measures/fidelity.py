@@ -120,7 +120,7 @@ def measure(
 
 
 def _filled(objective: Objective, x: Tensor, rows: int, at_once: int, took: float) -> Float[Tensor, "batch dim"]:
-    """Return the points repeated to as many as are worth evaluating at once, or to what takes `LARGEST` seconds at most."""
+    """Return the points repeated to as many as are worth evaluating at once, or to what takes `LARGEST` seconds."""
     while rows < at_once and took * (more := min(4 * rows, at_once)) / rows < LARGEST:
         began = time.perf_counter()
         objective.evaluate(x.repeat(-(-more // len(x)), 1)[:more], grad=True)

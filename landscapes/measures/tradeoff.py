@@ -17,6 +17,8 @@ from .fidelity import Comparison, ConvergenceOrder, convergence_order, pareto_fr
 if TYPE_CHECKING:
     import pandas as pd
 
+    from ..draw.figures.page import Picture
+
 
 @dataclass(frozen=True)
 class MeasuredVariant:
@@ -178,8 +180,16 @@ class Tradeoff:
         """
         import pandas as pd
 
+    from ..draw.figures.page import Picture
+
         front, rows = set(self.front), sorted(self.variants, key=lambda one: one.seconds)
         return pd.DataFrame([{**_columns(row), "front": row.name in front} for row in rows]).set_index("name")
+
+    def plot(self, width: float | None = None) -> Picture:
+        """Draw loss errors over the time of an episode, for a screen, or for a page so wide [mm]."""
+        from ..draw.figures.tradeoff import tradeoff_figure
+
+        return tradeoff_figure(self.record(), width=width)
 
     def _repr_html_(self) -> str:
         """Show the table in a notebook."""
