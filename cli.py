@@ -14,10 +14,15 @@ import typer
 from . import __version__
 from .commands import verbs_gallery as gallery
 from .commands import verbs_look as look
-from .commands import verbs_measure as measure
 from .commands import verbs_search as search
+from .commands.bench import bench
+from .commands.check import check
 from .commands.dims import TakesDims
+from .commands.pairs import pairs
+from .commands.plan import plan
+from .commands.report import report_
 from .commands.slice import bounce, slice_
+from .commands.tradeoff import tradeoff
 
 app = typer.Typer(
     name="landscape",
@@ -34,7 +39,7 @@ _VERBS = (
     look.envs, look.info, slice_, look.sweep,
     search.methods, search.optimize, search.race, search.overlay,
     look.surface, look.replay, look.export, look.view, bounce,
-    measure.plan, measure.bench, measure.check, measure.tradeoff, measure.pairs, measure.report_,
+    plan, bench, check, tradeoff, pairs, report_,
 )  # fmt: skip
 
 for _verb in _VERBS:

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Unpack
 
 from ..jobs.scene import SceneSpec
-from ..jobs.watch import Watch, resumable
+from ..jobs.watch import Watch
 from .progress import default_watch
-from .scene import SceneKeywords, environment, spec_of
+from .scene import SceneKeywords, environment, say_call, spec_of
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
     from ..jobs.check import CheckReport
     from ..jobs.pairs import PairRanking
-    from ..jobs.report import Report, Subject
+    from ..jobs.report import Subject
+    from ..jobs.report_record import Report
     from ..landscapes.measures.tradeoff import Tradeoff
     from ..landscapes.slice import Slice
 
@@ -43,7 +43,7 @@ def report(
     """
     from ..jobs.report import ReportJob
 
-    watch, command = default_watch(), f"gradscape.report({what!r}, points={points}, seed={seed})"
+    watch, command = default_watch(), say_call("report", what, points=points, seed=seed, **keywords)
     subject = _subject(what, points, watch, keywords)
     job = ReportJob.open(
         [subject], what=subject.name, single=True, out=_path(out), points=points, seed=seed,
@@ -65,7 +65,7 @@ def check(scene: Scene, *, points: int = 4, seed: int = 0, **keywords: Unpack[Sc
 
     watch = default_watch()
     spec = spec_of(scene, keywords).resolve(watch)
-    command = f"gradscape.check({scene!r}, points={points}, seed={seed})"
+    command = say_call("check", scene, points=points, seed=seed, **keywords)
     return CheckJob.open(spec, points=points, seed=seed, command=command).run(watch)
 
 
@@ -89,9 +89,15 @@ def tradeoff(
     Raises ValueError where the scene has one fidelity only, StoreMismatchError where the folder holds another study,
     which `force` replaces; Stopped where it is interrupted.
     """
-    command = f"gradscape.tradeoff({scene!r}, points={points}, seed={seed})"
-    how = {"points": points, "seed": seed, "settings": variants, "out": _path(out), "force": force}
-    return measure_tradeoff(spec_of(scene, keywords), **how, command=command, watch=default_watch()).tradeoff
+    from ..jobs.tolerance import keep
+    from ..jobs.tradeoff import TradeoffJob
+
+    command = say_call("tradeoff", scene, points=points, seed=seed, variants=tuple(variants), **keywords)
+    spec, folder = spec_of(scene, keywords), _path(out)
+    job = TradeoffJob.open(spec, points=points, seed=seed, settings=variants, out=folder, force=force, command=command)
+    found = job.run(default_watch())
+    keep(found)
+    return found
 
 
 def pairs(
@@ -111,83 +117,16 @@ def pairs(
     Raises ValueError where the scene has one parameter, StoreMismatchError where the folder holds another study, which
     `force` replaces; Stopped where it is interrupted.
     """
-    command = f"gradscape.pairs({scene!r}, samples={samples}, seed={seed})"
-    spec, how = spec_of(scene, keywords), {"samples": samples, "seed": seed, "out": _path(out), "force": force}
-    return rank_pairs(spec, **how, command=command, watch=default_watch())[1]
-
-
-@dataclass(frozen=True)
-class TradeoffFiles:
-    """Say what a trade-off left: `files` in its `folder`, and a copy `kept` for `tolerance`."""
-
-    tradeoff: Tradeoff
-    folder: Path
-    files: tuple[str, ...]
-    kept: Path
-
-
-def measure_tradeoff(
-    scene: SceneSpec,
-    *,
-    points: int,
-    seed: int,
-    settings: Sequence[str],
-    out: Path | None,
-    force: bool,
-    command: str,
-    watch: Watch,
-    prints: Sequence[float] = (),
-) -> TradeoffFiles:
-    """Measure a trade-off as `tradeoff` does, and say where it is; what more there is belongs to the command."""
-    from ..jobs.tolerance import keep
-    from ..jobs.tradeoff import PICTURE, RECORD, TradeoffJob
-
-    job = TradeoffJob.open(
-        scene, points=points, seed=seed, settings=settings, out=out, force=force, prints=prints, command=command
-    )
-    found = job.run(watch)
-    printed = job.print(found)
-    with resumable(job.kept):
-        return TradeoffFiles(found, job.folder, (PICTURE, *printed, RECORD), keep(found))
-
-
-def rank_pairs(
-    scene: SceneSpec,
-    *,
-    samples: int | None,
-    seed: int,
-    out: Path | None,
-    force: bool,
-    command: str,
-    watch: Watch,
-) -> tuple[Path, PairRanking]:
-    """Rank pairs as `pairs` does, and return the folder and the ranking."""
     from ..jobs.pairs import PairsJob
 
-    env, options = scene.make(watch), scene.options
-    job = PairsJob.of(env, samples=samples, seed=seed, options=options, out=out, force=force, command=command)
-    return job.folder, job.run(watch)
-
-
-def sample_for_report(env: Environment, points: int, command: str, watch: Watch) -> Subject:
-    """Sample the slice that a scene without any is reported on by: its first two parameters, through the centre."""
-    from ..jobs.report import RESOLUTION, Subject, refuse_too_many
-    from .slice import sample
-
-    dims = list(range(min(2, env.space.dim)))
-    refuse_too_many(points, len(dims), env.space.dim)
-    found, summary = sample(
-        env, dims, resolution=RESOLUTION, through="center", extent=None, grad=True, out=None, force=False,
-        command=command, watch=watch,
-    )  # fmt: skip
-    if found.folder is None:
-        raise ValueError("a slice that is to be reported on lies on disk; this one does not")
-    watch.note(f"{summary.outcome()}\n{found.folder}: {', '.join(summary.files)}")
-    return Subject.of(found.folder)
+    watch, spec = default_watch(), spec_of(scene, keywords)
+    command = say_call("pairs", scene, samples=samples, seed=seed, **keywords)
+    job = PairsJob.open(spec.resolve(watch), samples=samples, seed=seed, out=_path(out), force=force, command=command)
+    return job.run(watch)
 
 
 def _subject(what: Slice | Path | Scene, points: int, watch: Watch, keywords: SceneKeywords) -> Subject:
-    from ..jobs.report import Subject
+    from ..jobs.report import Subject, sample_subject
     from ..landscapes.slice import Slice
 
     if isinstance(what, Slice):
@@ -196,7 +135,8 @@ def _subject(what: Slice | Path | Scene, points: int, watch: Watch, keywords: Sc
         return Subject.of(what.folder)
     if isinstance(what, Path) or (isinstance(what, str) and Path(what).exists()):
         return Subject.of(Path(what))
-    return sample_for_report(environment(what, keywords, watch), points, f"gradscape.report({what!r})", watch)
+    env = environment(what, keywords, watch)
+    return sample_subject(env, points, say_call("report", what, **keywords), watch)
 
 
 def _path(out: str | Path | None) -> Path | None:

@@ -42,21 +42,15 @@ def pairs(
 
     Example: landscape pairs fluid
     """
-    from ..api.measure import rank_pairs
+    from ..jobs.pairs import PairsJob
     from .terminal import Bars, Console, command_line, print_json
 
-    folder, ranking = rank_pairs(
-        scene,
-        samples=samples,
-        seed=seed,
-        out=Path(out) if out else None,
-        force=force,
-        command=command_line(),
-        watch=Bars(),
-    )
+    folder = Path(out) if out else None
+    job = PairsJob.open(scene, samples=samples, seed=seed, out=folder, force=force, command=command_line())
+    ranking = job.run(Bars())
     if json_:
         record = ranking.record()
-        print_json(record | {"pairs": record["pairs"][:top]}, folder=str(folder))
+        print_json(record | {"pairs": record["pairs"][:top]}, folder=str(job.folder))
     show(ranking, Console(stderr=json_), top)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,7 +10,8 @@ import typer
 from .arguments import Data, Device, Fidelity, Json, Of, Print, Seed
 
 if TYPE_CHECKING:
-    from ..jobs.report import Report, Reports, Subject
+    from ..jobs.report import Subject
+    from ..jobs.report_record import Report, Reports
     from .terminal import Bars
 
 
@@ -86,10 +86,9 @@ def _figures(root: Path) -> list[Subject]:
 
 def _subjects(what: str, root: Path, fidelity: str | None, device: str, points: int, bars: Bars) -> list[Subject]:
     """Return a slice, or an environment's figures, or a slice sampled now for want of any."""
-    from ..api.measure import sample_for_report
     from ..envs.registry import environment_class, make
     from ..gallery.figures import read_figures
-    from ..jobs.report import Subject
+    from ..jobs.report import Subject, sample_subject
     from .terminal import command_line
 
     if Path(what).exists():
@@ -98,7 +97,7 @@ def _subjects(what: str, root: Path, fidelity: str | None, device: str, points: 
     figures = [figure for figure in read_figures() if figure.env == what and fidelity in (None, figure.fidelity)]
     if found := [Subject.of(root / figure.id) for figure in figures if _is_finished(root / figure.id)]:
         return found
-    return [sample_for_report(make(what, fidelity=fidelity, device=device), points, command_line(), bars)]
+    return [sample_subject(make(what, fidelity=fidelity, device=device), points, command_line(), bars)]
 
 
 def _is_finished(folder: Path) -> bool:

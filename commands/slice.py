@@ -82,17 +82,36 @@ def _sample(
     prints: Sequence[float] | None,
     out: str | None,
     *,
+    resolution: int,
+    through: str,
+    grad: bool,
     as_json: bool,
-    **how: Any,
+    force: bool,
+    scheduler: str | None = None,
 ) -> None:
     """Sample a slice, and say what came out."""
-    from ..api.slice import sample
     from .terminal import Bars, command_line, print_json
 
     bars = Bars()
-    folder = Path(out) if out else None
-    how |= {"extent": read_extent(extent), "prints": prints or [], "out": folder}
-    made, summary = sample(scene, dims, **how, command=command_line(), watch=bars)
-    bars.note(f"{summary.outcome()}\n{made.folder}: {', '.join(summary.files)}")
+    env = scene.make(bars)
+    from ..jobs.scene import plane_through
+    from ..jobs.slice import SliceJob
+    from ..jobs.workers import workers
+
+    plane = plane_through(env, dims, through=through, extent=read_extent(extent), resolution=resolution)
+    folder, widths = Path(out) if out else None, prints or []
+    with workers(scheduler, env.device) as executor:
+        job = SliceJob.of(
+            env,
+            plane,
+            command=command_line(),
+            out=folder,
+            grad=grad,
+            force=force,
+            executor=executor,
+            prints=widths,
+        )
+        summary = job.run(bars)
+    bars.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
     if as_json:
-        print_json(asdict(summary), folder=str(made.folder))
+        print_json(asdict(summary), folder=str(job.folder))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -41,19 +41,20 @@ def tradeoff(
 
     Example: landscape tradeoff bounce --variants dt,precision
     """
-    from ..api.measure import measure_tradeoff
+    from ..jobs.tolerance import keep
+    from ..jobs.tradeoff import PICTURE, RECORD, TradeoffJob
     from .terminal import Bars, Console, command_line, print_json
 
-    bars = Bars()
     settings = [part for text in [*(variants or []), *(ladder or [])] for part in text.split(",") if part]
-    done = measure_tradeoff(
-        scene, points=points, seed=seed, settings=settings, out=Path(out) if out else None, force=force,
-        prints=print_ or [], command=command_line(), watch=bars,
-    )  # fmt: skip
-    show(done.tradeoff, Console(stderr=json_))
-    bars.note(f"{done.folder}: {', '.join(done.files)}; kept for --tolerance: {done.kept}")
+    how: dict[str, Any] = {"points": points, "seed": seed, "settings": settings, "force": force}
+    how |= {"out": Path(out) if out else None, "prints": print_ or [], "command": command_line()}
+    bars, job = Bars(), TradeoffJob.open(scene, **how)
+    found = job.run(bars)
+    files, kept = [PICTURE, *job.print(found), RECORD], keep(found)
+    show(found, Console(stderr=json_))
+    bars.note(f"{job.folder}: {', '.join(files)}; kept for --tolerance: {kept}")
     if json_:
-        print_json(done.tradeoff.record(), folder=str(done.folder))
+        print_json(found.record(), folder=str(job.folder))
 
 
 def show(found: Tradeoff, console: Console) -> None:
@@ -65,7 +66,7 @@ def show(found: Tradeoff, console: Console) -> None:
     console = Console(file=console.file, width=console.width, highlight=False)
     console.print(_subject(found))
     accuracy = ("variant", "median", "95 % of points", "rank", "cosine", "slope", "failed")
-    look = {"box": SIMPLE, "padding": (0, 1), "collapse_padding": True}
+    look: dict[str, Any] = {"box": SIMPLE, "padding": (0, 1), "collapse_padding": True}
     rows, best = table(*accuracy, "ms", "with grad", "memory", **look), set(found.front)
     for variant in sorted(found.variants, key=lambda one: one.seconds):
         mark = " *" if variant.name in best else ""

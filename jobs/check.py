@@ -46,7 +46,7 @@ def _materials(job: CheckJob) -> list[Variant]:
 
     if job.name in MATERIALS:
         option, *ends = MATERIALS[job.name]
-        return [Variant(f"{option} {end:g}", partial(job.spec.make, **{option: end})) for end in ends]
+        return [Variant(f"{option} {end:g}", _with_option(job.spec, option, end)) for end in ends]
     space = job.env.space
     stiff = [number for number, name in enumerate(space.names) if "stiffness" in name]
     if not stiff:
@@ -193,6 +193,11 @@ def _need(dim: int, points: int) -> Need:
     return Need(4.0 * 8 * dim * sum(episodes(dim, points)))
 
 
+def _with_option(scene: SceneSpec, option: str, value: float) -> Callable[[], Environment]:
+    """Return what makes a scene with one of its options changed."""
+    return replace(scene, options={**scene.options, option: value}).make
+
+
 def _twin(job: CheckJob) -> Callable[[], Environment] | None:
     """Return what makes the environment in the other precision, if it has one."""
     own = job.env.fidelity
@@ -248,7 +253,7 @@ def _horizons(job: CheckJob) -> list[Variant]:
     if "horizon" not in {field.name for field in fields(job.env.options)}:
         return [Variant("horizon 1x to 8x", why="it has no option `horizon`")]
     own = job.env.options.horizon
-    longer = [Variant(f"horizon {factor}x", partial(job.spec.make, horizon=factor * own)) for factor in FACTORS[1:]]
+    longer = [Variant(f"horizon {factor}x", _with_option(job.spec, "horizon", factor * own)) for factor in FACTORS[1:]]
     return [Variant("horizon 1x", lambda: job.env), *longer]
 
 

@@ -13,7 +13,7 @@ from ..landscapes.measures.sensitivity import Design, Pair, default_samples, exp
 from ..landscapes.storage.checkpoint import Pieces
 from ..landscapes.storage.files import tidy, write_json
 from .folder import PAIRS, ROOT, folder_named
-from .scene import provenance
+from .scene import SceneSpec, provenance
 from .watch import PREPARING, Watch, resumable
 
 if TYPE_CHECKING:
@@ -91,13 +91,12 @@ class PairsJob:
     command: str = ""
 
     @classmethod
-    def of(
+    def open(
         cls,
-        env: Environment,
+        scene: SceneSpec,
         *,
         samples: int | None = None,
         seed: int = 0,
-        options: Mapping[str, Any] | None = None,
         out: Path | None = None,
         root: Path = ROOT,
         force: bool = False,
@@ -109,6 +108,7 @@ class PairsJob:
         scene has one parameter, TooLargeError for more samples than there is memory for, StoreMismatchError where the
         folder holds another study.
         """
+        env = scene.make()
         dim = env.space.dim
         if dim < 2:
             raise ValueError(f"{env.name} has one parameter; a pair takes two")
@@ -117,7 +117,7 @@ class PairsJob:
         identity = {**env.identity(), "samples": samples, "seed": seed}
         folder = out or folder_named(["pairs", identity["objective"], identity["fidelity"], samples], identity, root)
         pieces = Pieces.open(folder, identity, what="pairs", force=force)
-        return cls(env, Design.sobol(env.space, samples, seed=seed), identity, pieces, options or {}, command)
+        return cls(env, Design.sobol(env.space, samples, seed=seed), identity, pieces, scene.options, command)
 
     @property
     def folder(self) -> Path:

@@ -56,6 +56,23 @@ class Subject:
         return cls(name, store_in(path, SLICE_STORE))
 
 
+def sample_subject(env: Environment, points: int, command: str, watch: Watch) -> Subject:
+    """Sample the slice that a scene without any is reported on by: its first two parameters, through the centre.
+
+    Raises TooLargeError for more points than a report has memory for, and as `SliceJob.run` does.
+    """
+    from .scene import plane_through
+    from .slice import SliceJob
+
+    dims = list(range(min(2, env.space.dim)))
+    refuse_too_many(points, len(dims), env.space.dim)
+    plane = plane_through(env, dims, through="center", extent=None, resolution=RESOLUTION)
+    job = SliceJob.of(env, plane, command=command)
+    summary = job.run(watch)
+    watch.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
+    return Subject.of(job.folder)
+
+
 @dataclass(frozen=True)
 class ReportJob:
     """Slices to measure: a `single` one into `folder`, several into folders of their own there.

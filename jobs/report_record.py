@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NotRequired, Protocol, TypedDict, cast
 
-from ..landscapes.measures.records import ProfileRecord
+from ..landscapes.measures.records import ProfileRecord, WordRecord
 from ..landscapes.storage.records import read_json, reading, text
 from .folder import REPORT
 from .report_tables import EnvironmentRecord, by_environment, slices_markdown
@@ -29,13 +29,6 @@ class PaperWords(Protocol):
 
     @property
     def where(self) -> str: ...  # noqa: D102
-
-
-class WordRecord(TypedDict):
-    """A word of the paper's, and whether it was measured too."""
-
-    word: str
-    measured: bool
 
 
 class PaperRecord(TypedDict):
@@ -148,7 +141,7 @@ class Report:
         return self.picture()(width=width)
 
     def picture(self) -> Callable[..., Picture]:
-        """Read what it is drawn from, and return what draws it for a page of any width. Raises ValueError as `plot` does."""
+        """Read what it is drawn from, and return what draws it, for any width. Raises ValueError as `plot` does."""
         import numpy as np
 
         from ..landscapes.draw.figures.quality import quality_figure

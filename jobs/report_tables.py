@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypedDict
 if TYPE_CHECKING:
     from ..landscapes.measures.records import ScaleRecord
     from ..landscapes.statistics import EstimateRecord
-    from .report import Report
+    from .report_record import Report
 
 HEADINGS = ("slice", "minima", "flat", "jumps", "cosine", "measured", "the paper's words", "measured too")
 ENVIRONMENTS = (

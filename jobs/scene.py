@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from ..envs.registry import environment_class, make
+from ..landscapes.objective import name_of
 from .watch import Watch
 
 if TYPE_CHECKING:
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from ..envs.base import Environment, Fidelity
+    from ..landscapes.objective import Objective
+    from ..landscapes.plane import Plane
 
 PACKAGES = (
     *("numpy", "torch", "warp-lang", "taichi", "xarray", "zarr", "matplotlib"),
@@ -67,13 +70,13 @@ class SceneSpec:
         return make(spec.name, **how, deterministic=spec.deterministic, **{**spec.options, **changes})
 
 
-def provenance(env: Environment, command: str) -> dict[str, Any]:
+def provenance(objective: Objective, command: str) -> dict[str, Any]:
     """Return what else is worth keeping with results: how they came about, when, and with which versions."""
     return {
         "command": command,
         "created": datetime.now(UTC).strftime("%Y-%m-%d"),
         "versions": {package: installed_version(package) for package in PACKAGES},
-        "loss_unit": env.loss_unit,
+        "loss_unit": getattr(objective, "loss_unit", ""),
     }
 
 
@@ -126,3 +129,34 @@ def point_of(env: Environment, text: str) -> Tensor:
     if searched != {env.name}:
         raise ValueError(f"{run} holds no runs of {env.name} alone; it holds those of {', '.join(sorted(searched))}")
     return best_point(tables)[0]
+
+
+def plane_through(
+    objective: Objective,
+    dims: Sequence[int | str],
+    *,
+    through: str | Tensor,
+    extent: float | tuple[float, float] | None,
+    resolution: int | Sequence[int],
+) -> Plane:
+    """Return the line or plane along one or two parameters through a point, which an environment may name.
+
+    Raises ValueError for parameters, points and extents that the objective's space does not have.
+    """
+    from ..landscapes.plane import Plane
+
+    point = _named_point(objective, through) if isinstance(through, str) else through
+    return Plane.through(objective.space, point, dims, resolution=resolution, extent=extent)
+
+
+def _named_point(objective: Objective, text: str) -> Tensor:
+    from ..envs.base import Environment
+
+    if isinstance(objective, Environment):
+        return point_of(objective, text)
+    kind, _, seed = text.partition(":")
+    if text == "center":
+        return objective.space.center
+    if kind == "random" and seed.isdecimal():
+        return objective.space.uniform(1, seed=int(seed))[0]
+    raise ValueError(f"{name_of(objective)} can be cut through center, random:SEED or a tensor; got {text!r}")

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from torch import Tensor
 from ..landscapes.adapters import within_box
 from ..landscapes.capacity import size
 from ..landscapes.cost import duration, seconds_per_episode
-from ..landscapes.objective import Objective, Status
+from ..landscapes.objective import Objective, Status, name_of
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.distribution import RemoteSite, Site, results, workers_of
 from ..landscapes.sampling.fill import Progress, sample
@@ -38,8 +38,6 @@ from .workers import recipe
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from ..envs.base import Environment
 
 STORE, PICTURE = SLICE.store, SLICE.picture
 PAUSE, DRAWING = 10.0, 0.1  # between pictures of an unfinished slice: least seconds, and most of the time for them
@@ -137,7 +135,7 @@ class SliceJob:
     @classmethod
     def of(
         cls,
-        env: Environment,
+        objective: Objective,
         plane: Plane,
         *,
         command: str,
@@ -149,24 +147,26 @@ class SliceJob:
         executor: Executor | None = None,
         prints: Sequence[float] = (),
     ) -> SliceJob:
-        """Open the slice of an environment in `out`, by default a folder named after it under `root`.
+        """Open the slice of an environment, or of any objective, in `out`, by default a folder named after it.
+
+        That folder is under `root`.
 
         `boxed` leaves out what lies beyond the parameters' bounds. With an `executor` its workers compute. Raises as
         `open` does.
         """
-        identity = env.identity() | ({"boxed": True} if boxed else {})
+        identity = identity_of(objective) | ({"boxed": True} if boxed else {})
         return cls.open(
-            within_box(env) if boxed else env,
+            within_box(objective) if boxed else objective,
             plane,
             out or _default_folder(identity, plane, grad, root),
-            picture_of(env, plane),
+            picture_of(objective, plane),
             identity=identity,
-            provenance=provenance(env, command),
+            provenance=provenance(objective, command),
             command=command,
             grad=grad,
             force=force,
             executor=executor,
-            remake=None if boxed else recipe(env),
+            remake=None if boxed else recipe(objective),
             prints=prints,
         )
 
@@ -273,8 +273,8 @@ class SliceJob:
         )
 
 
-def picture_of(env: Environment, plane: Plane) -> Draw:
-    """Return how a slice of an environment is drawn: a map, or a profile over a line."""
+def picture_of(objective: Objective, plane: Plane) -> Draw:
+    """Return how a slice is drawn: a map, or a profile over a line with the events of an environment's episodes."""
 
     def surface(dataset: xr.Dataset, width: float | None = None) -> Figure:
         from ..landscapes.draw.figures.contour import landscape_figure
@@ -284,8 +284,10 @@ def picture_of(env: Environment, plane: Plane) -> Draw:
     def profile(dataset: xr.Dataset, width: float | None = None) -> Figure:
         from ..landscapes.draw.figures.profile import profile_figure
 
-        u = torch.tensor(dataset["u"].to_numpy())
-        return profile_figure(dataset, events=env.events(plane.lift(u[:, None])), width=width)
+        u, env = torch.tensor(dataset["u"].to_numpy()), cast(Any, objective)
+        return profile_figure(
+            dataset, events=env.events(plane.lift(u[:, None])) if hasattr(env, "events") else {}, width=width
+        )
 
     return surface if plane.rank == 2 else profile
 
@@ -295,8 +297,15 @@ def _default_folder(identity: dict[str, Any], plane: Plane, grad: bool, root: Pa
     aligned = all(len(row.nonzero()) == 1 for row in plane.basis)
     axes = [str(int(row.nonzero()[0])) for row in plane.basis] if aligned else ["plane"]
     points = "x".join(map(str, plane.resolution))
-    parts = [identity["objective"], *axes, identity["fidelity"], points]
+    fidelity = [identity["fidelity"]] if "fidelity" in identity else []
+    parts = [identity["objective"], *axes, *fidelity, points]
     return folder_named(parts, [identity, plane.record(), grad], root)
+
+
+def identity_of(objective: Objective) -> dict[str, Any]:
+    """Return what decides an objective's numbers, as far as it says: an environment all, any other its name."""
+    say: Callable[[], dict[str, Any]] = getattr(objective, "identity", lambda: {"objective": name_of(objective)})
+    return say()
 
 
 def _gpu_memory(objective: Objective) -> str:

@@ -24,6 +24,7 @@ from ..landscapes.draw.loopback import LOOPBACK
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
+    from ..landscapes.objective import Objective
 
 LOCAL = "local"
 DEAF = (
@@ -104,8 +105,16 @@ def _greet(address: str) -> None:
         )
 
 
-def recipe(env: Environment) -> partial[Environment]:
-    """Return what makes an environment in another process, and refuses to make one of other code."""
+def recipe(objective: Objective) -> partial[Environment] | None:
+    """Return what makes an environment in another process, and refuses to make one of other code.
+
+    Any other objective has none, and is sent as it is.
+    """
+    from ..envs.base import Environment
+
+    if not isinstance(objective, Environment):
+        return None
+    env = objective
     how = {"fidelity": env.fidelity, "device": env.device, "engine": env.engine, "deterministic": env.deterministic}
     return partial(_made, source_of(env), env.code, how | asdict(env.options))
 

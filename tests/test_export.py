@@ -50,7 +50,7 @@ def test_a_table_has_a_row_for_each_sample_with_its_place_loss_status_and_gradie
     done = run("export", "cut", "--to", kind, cwd=results)
     assert done.returncode == 0, done.stderr
     assert done.stderr == f"cut/slice{SUFFIXES[kind]}: 25 samples\n"
-    table, slice_ = READ[kind](results / f"cut/slice{SUFFIXES[kind]}"), gradscape.open_slice(results / "cut")
+    table, slice_ = READ[kind](results / f"cut/slice{SUFFIXES[kind]}"), gradscape.open_slice(results / "cut").data
     gradients = [f"gradient by velocity {axis} [m²/(m/s)]" for axis in "xyz"]
     assert list(table) == ["velocity x [m/s]", "velocity z [m/s]", "loss [m²]", "status", *gradients]
     for row in table.to_dict("records"):
@@ -75,7 +75,7 @@ def test_a_run_has_a_row_for_each_episode(run: Callable[..., Said], results: Pat
 @pytest.mark.parametrize(("folder", "store"), [("cut", "slice"), ("line", "slice"), ("searched", "run")])
 def test_netcdf_keeps_arrays_names_and_units(run: Callable[..., Said], results: Path, folder: str, store: str) -> None:
     assert run("export", folder, "--to", "netcdf", cwd=results).returncode == 0
-    ours = {"slice": gradscape.open_slice, "run": gradscape.open_run}[store](results / folder)
+    ours = {"slice": lambda path: gradscape.open_slice(path).data, "run": gradscape.open_run}[store](results / folder)
     with xr.open_dataset(results / folder / f"{store}.nc") as back:
         for name in ours.data_vars:
             np.testing.assert_array_equal(back[name], ours[name])

@@ -70,7 +70,7 @@ def folder(tmp_path: Path) -> Path:
 def test_a_class_in_a_file_is_sliced_measured_searched_and_shown(run: Callable[..., Said], folder: Path) -> None:
     cut = run("slice", "arm.py:TwoLinkArm", "--dims", "elbow", "0", "--resolution", "9", "--out", "cut", cwd=folder)
     assert cut.returncode == 0, cut.stderr
-    dataset = gs.open_slice(folder / "cut")
+    dataset = gs.open_slice(folder / "cut").data
     assert stored_identity(dataset)["objective"] == "two-link-arm"
     assert dataset["loss"].attrs["units"] == "J"
     found = run("optimize", "arm.py:TwoLinkArm", "--method", "descents", "--budget", "9", "--out", "run", cwd=folder)
@@ -116,7 +116,7 @@ def test_a_line_has_one_dimension(run: Callable[..., Said], folder: Path, words:
     done = run(*command, "--resolution", "5", "--out", "line", "--json", cwd=folder)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["dims"] == ["elbow"]
-    line = gs.open_slice(folder / "line")
+    line = gs.open_slice(folder / "line").data
     np.testing.assert_allclose(line["loss"], (line["u"] - 1) ** 2 + 0.5)
     assert (folder / "line/landscape.png").exists()
     again = run(*command, "--resolution", "5", "--out", "line", cwd=folder)
@@ -197,7 +197,7 @@ def test_what_is_sampled_of_an_environment_keeps_its_unit_fidelity_and_options(t
     assert (identity["objective"], identity["fidelity"], identity["options"]["ke"]) == ("bounce", "draft", 2e4)
     assert dataset["loss"].attrs["units"] == "m²"
     dataset.to_zarr(tmp_path / "mine.zarr", consolidated=False)
-    again = gs.open_slice(tmp_path / "mine.zarr")
+    again = gs.open_slice(tmp_path / "mine.zarr").data
     assert again.attrs == dataset.attrs
     np.testing.assert_array_equal(again["grad"], dataset["grad"])
     function = gs.from_torch(lambda x: x[:, 0], env.space, name="first", loss_unit="m")

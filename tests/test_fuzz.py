@@ -17,8 +17,8 @@ from benchmarks import commands, full_disks, results
 from benchmarks.damage import BAD, Trial, damage, files
 from benchmarks.forked import Limits, last_words
 
-from gradscape import ParameterSpace, Plane, from_torch, open_run, open_slice, sample
-from gradscape.landscapes.storage.store import SliceStore
+from gradscape import ParameterSpace, Plane, from_torch, open_run, sample
+from gradscape.landscapes.storage.store import SliceStore, open_slice
 from gradscape.optim.random import RandomSearch
 from gradscape.optim.run import Run
 from gradscape.optim.search import search

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from gradscape.commands.measure_tables import environments_table
 
 from gradscape.commands import measure_report
-from gradscape.commands.measure_tables import environments_table
 from gradscape.envs.registry import entries
 from gradscape.gallery.figures import read_figures
 from gradscape.gallery.words import paper_words

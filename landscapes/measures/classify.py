@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from ..statistics import Values, plain
 from .discontinuities import Jumps
+from .records import WordRecord
 from .ruggedness import Ruggedness
 
 VERY_SMOOTH, SMOOTH, RUGGED, EXTREME = "very smooth", "smooth with local minima", "rugged", "extremely rugged"
@@ -41,7 +41,7 @@ class Verdict:
         """The words, in the order of `WORDS`."""
         return tuple(word for word in WORDS if word in self.reasons)
 
-    def beside(self, said: Sequence[str]) -> list[dict[str, Any]]:
+    def beside(self, said: Sequence[str]) -> list[WordRecord]:
         """Return each word of somebody else's, and whether it was measured."""
         return [{"word": word, "measured": word in self.reasons} for word in said]
 

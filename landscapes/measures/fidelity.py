@@ -280,6 +280,21 @@ def convergence_order(
     return ConvergenceOrder(tuple(names), float(fit.slope), float(fit.stderr))
 
 
+def cheapest(rows: Sequence[Mapping[str, Any]], tolerance: float, *, relative: bool) -> Mapping[str, Any] | None:
+    """Return the variant that takes least time with gradient of those within a tolerance, as files have it.
+
+    None where none is.
+    """
+    within = [row for row in rows if (off := p95(row, relative=relative)) is not None and off <= tolerance]
+    return min(within, key=lambda row: float(row["seconds"]["with_gradient"]), default=None)
+
+
+def p95(row: Mapping[str, Any], *, relative: bool) -> float | None:
+    """Return the 95th percentile of a variant's loss errors, as files have it, as a share or in the loss's unit."""
+    value: float | None = row["loss_error"]["p95_relative" if relative else "p95"]["value"]
+    return value
+
+
 def _median(values: Array) -> Array:
     return np.asarray(np.median(values, axis=-1))
 

@@ -92,6 +92,13 @@ class VerdictRecord(TypedDict):
     reasons: dict[str, str]
 
 
+class WordRecord(TypedDict):
+    """A word of somebody else's for a landscape, and whether it was measured too."""
+
+    word: str
+    measured: bool
+
+
 class BeyondRecord(TypedDict):
     """How many evaluations were `asked` for, and how many of them were `cut` as they lay beyond the box."""
 

@@ -180,8 +180,6 @@ class Tradeoff:
         """
         import pandas as pd
 
-    from ..draw.figures.page import Picture
-
         front, rows = set(self.front), sorted(self.variants, key=lambda one: one.seconds)
         return pd.DataFrame([{**_columns(row), "front": row.name in front} for row in rows]).set_index("name")
 

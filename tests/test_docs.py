@@ -1,4 +1,4 @@
-"""What the README says to type: every command and every block of Python is run, with small sizes."""
+"""What README and docs say to type: every command and every block of Python is run, with small sizes."""
 
 import json
 import re
@@ -12,24 +12,26 @@ from pathlib import Path
 
 import pytest
 import typer
+from gradscape.commands.measure_tables import environments_table
 
 from gradscape.cli import app, main
 from gradscape.commands import overlay_report
-from gradscape.commands.measure_tables import environments_table
 from gradscape.gallery.figures import DATA, read_figures
 
 from .command import Said
 
 ROOT = Path(__file__).parent.parent
-README = (ROOT / "README.md").read_text()
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+README = PAGES[0].read_text()
+TEXT = "\n".join(page.read_text() for page in PAGES)
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-BLOCKS = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+BLOCKS = re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL)
 PLACEHOLDER = re.compile(r"\.{3}|[\[\]|]|\b(?!CUDA)[A-Z]{1,}\b")  # in what a command may look like
 
 # What makes them small: words in the place of others, the values of options, and options that are added.
 WORDS = {"SLICE": "cut", "RUN": "run", "best:RUN": "best:run", "ADDRESS": "local:1", "local": "local:1", "cuda": "cpu"}
-WORDS |= {"standard": "draft", "gallery/data/flip-0-1": str(DATA / "flip-0-1"), "triple-move": "bounce"}
+WORDS |= {"tls://10.0.0.5:8786": "local:1", "throw": "cut", "standard": "draft", "gallery/data/flip-0-1": str(DATA / "flip-0-1"), "triple-move": "bounce"}
 VALUES = {"--resolution": "2", "--budget": "3", "--seeds": "1", "--frames": "2"}
 ADDED = {
     "race": ["--seeds", "1", "--budget", "3", "--device", "cpu"],
@@ -44,7 +46,7 @@ ADDED = {
     "gallery build": ["--data", "few", "--out", "site"],
     "gallery serve": ["--out", "served", "--port", "0"],
 }
-SCENES = {verb: {"fluid": "bounce"} for verb in ("race", "optimize", "tradeoff")}
+SCENES = {verb: {"fluid": "bounce", "flip": "bounce"} for verb in ("race", "optimize", "tradeoff")}
 SCENES["--tolerance"] = {"fluid": "bounce", "6": "0", "8": "1"}
 SHORT = {"slice": {"fluid", "assembly"}, "sweep": {"fluid"}, "replay": {"fluid"}, "plan": {"fluid"}}
 TENTH = ["--set", "horizon=0.1"]  # of an episode
@@ -53,8 +55,8 @@ TAICHI = ["--no-gradients"]  # whose kernels take minutes to compile with gradie
 
 def typed() -> list[str]:
     """Return every command that the README shows, in blocks and between words, comments left out."""
-    lines = re.findall(r"^    (landscape .*)$", README, flags=re.MULTILINE)
-    spans = re.findall(r"`(landscape [^`]*)`", README)
+    lines = re.findall(r"^    (landscape .*)$", TEXT, flags=re.MULTILINE)
+    spans = re.findall(r"`(landscape [^`]*)`", TEXT)
     found = [line.partition(" #")[0].strip() for line in lines] + [" ".join(span.split()) for span in spans]
     return list(dict.fromkeys(found))
 
@@ -160,14 +162,14 @@ def test_every_block_of_python_runs(desk: Path, number: int) -> None:
 
 def test_the_two_commands_are_the_makefiles() -> None:
     recipes = (ROOT / "Makefile").read_text()
-    said = re.search(r"make demo +# environment, install, then `(landscape [^`]*)`", README)
+    said = re.search(r"make demo +# installs gradscape, then runs `(landscape [^`]*)`", README)
     assert said
     assert f"$(BIN)/{said[1]}" in recipes
     assert re.search(r"^test: setup-test", recipes, flags=re.MULTILINE)
 
 
 def test_what_pip_is_told_to_install_is_there() -> None:
-    said = re.findall(r"pip install '?([^'`\n]+)'?", README)
+    said = re.findall(r"pip install '?([^'`\n]+)'?", TEXT)
     assert len(said) >= 3
     extras = {name for one in said for name in re.findall(r"^\.\[(\w+)\]$", one)}
     assert extras == {"rl", "distributed"} <= set(PROJECT["optional-dependencies"])
@@ -184,7 +186,7 @@ def test_the_example_package_registers_an_environment(tmp_path: Path) -> None:
     package = ROOT / "docs/example_package"
     entry = re.search(r'gradscape.environments"\]\n(.*?)\n\n', (package / "pyproject.toml").read_text(), re.DOTALL)
     assert entry
-    assert entry[1] in README
+    assert entry[1] in TEXT
     info = tmp_path / "throw_env-0.1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: throw-env\nVersion: 0.1.0\n")
@@ -196,11 +198,14 @@ def test_the_example_package_registers_an_environment(tmp_path: Path) -> None:
     assert "25 ok" in done.stderr
 
 
-def test_every_picture_and_file_the_readme_names_is_there() -> None:
-    named = [name for name in re.findall(r"\]\(([^)]+)\)", README) if "://" not in name]
-    assert len(named) >= 3
-    assert [name for name in named if not (ROOT / name.partition("#")[0]).exists()] == []
-    headings = {name: _headings(ROOT / name.partition("#")[0]) for name in named if "#" in name}
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_picture_and_file_that_a_page_names_is_there(page: Path) -> None:
+    text, here = page.read_text(), page.parent
+    named = [name for name in re.findall(r"\]\(([^)]+)\)", text) if "://" not in name]
+    assert [name for name in named if not (here / name.partition("#")[0]).exists()] == []
+    headings = {
+        name: _headings(here / name.partition("#")[0] if name[0] != "#" else page) for name in named if "#" in name
+    }
     assert [name for name, there in headings.items() if name.partition("#")[2] not in there] == []
 
 
@@ -214,6 +219,6 @@ def test_the_table_of_environments_is_what_the_reports_say() -> None:
     """It stands between two marks, and nowhere without reports; a failure prints what has to stand there."""
     files = [DATA / figure.id / "report.json" for figure in read_figures()]
     records = [json.loads(file.read_text()) for file in files if file.exists()]
-    found = re.findall(r"<!-- measured -->\n\n(.*?)\n<!-- /measured -->", README, flags=re.DOTALL)
+    found = re.findall(r"<!-- measured -->\n\n(.*?)\n<!-- /measured -->", TEXT, flags=re.DOTALL)
     wanted = [environments_table(records)] if records else []
     assert found == wanted, "between <!-- measured --> and <!-- /measured --> has to stand:\n\n" + "\n".join(wanted)
