@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 import typer
-from gradscape.commands.measure_tables import environments_table
+from gradscape.jobs.report_record import Report
+from gradscape.jobs.report_tables import environments_markdown
 
 from gradscape.cli import app, main
 from gradscape.commands import overlay_report
@@ -35,7 +36,7 @@ WORDS |= {"tls://10.0.0.5:8786": "local:1", "throw": "cut", "standard": "draft",
 VALUES = {"--resolution": "2", "--budget": "3", "--seeds": "1", "--frames": "2"}
 ADDED = {
     "race": ["--seeds", "1", "--budget", "3", "--device", "cpu"],
-    "tradeoff": ["--points", "2", "--ladder", "precision"],
+    "tradeoff": ["--points", "2", "--variants", "precision"],
     "replay": ["--no-film"],
     "bounce": ["--resolution", "3"],
     "slice": ["--resolution", "2"],
@@ -142,7 +143,7 @@ def test_every_command_runs(
     monkeypatch.setenv("XDG_DATA_HOME", str(desk / "data"))
     monkeypatch.setattr("http.server.ThreadingHTTPServer.serve_forever", stop)
     monkeypatch.setattr(overlay_report, "_show", lambda console, path, serve: opened.append(path))
-    for name, value in (("TIMING", 0.01), ("PATIENCE", 0.01), ("RESAMPLES", 9)):
+    for name, value in (("REPETITION", 0.01), ("LARGEST", 0.01), ("RESAMPLES", 9)):
         monkeypatch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", value)
     done = run(*small(command), cwd=desk)
     assert done.returncode == 0, (small(command), done.stderr)
@@ -218,7 +219,7 @@ def _headings(file: Path) -> set[str]:
 def test_the_table_of_environments_is_what_the_reports_say() -> None:
     """It stands between two marks, and nowhere without reports; a failure prints what has to stand there."""
     files = [DATA / figure.id / "report.json" for figure in read_figures()]
-    records = [json.loads(file.read_text()) for file in files if file.exists()]
+    reports = [Report.read(file) for file in files if file.exists()]
     found = re.findall(r"<!-- measured -->\n\n(.*?)\n<!-- /measured -->", TEXT, flags=re.DOTALL)
-    wanted = [environments_table(records)] if records else []
+    wanted = [environments_markdown(reports)] if reports else []
     assert found == wanted, "between <!-- measured --> and <!-- /measured --> has to stand:\n\n" + "\n".join(wanted)
