@@ -95,9 +95,9 @@ KINDS = {
         needs=(f"{CUT} cut",),
     ),
     "pairs": Kind(f"pairs ackley --set dim=3 --samples 2 --out {MADE} --json"),
-    "tradeoff": Kind(f"tradeoff bounce --device cpu --points 2 --ladder precision --out {MADE} --json"),
+    "tradeoff": Kind(f"tradeoff bounce --device cpu --points 2 --variants precision --out {MADE} --json"),
     "kept tradeoff": Kind(
-        f"tradeoff bounce --device cpu --set horizon=0.5 --points 2 --ladder precision --out {MADE}",
+        f"tradeoff bounce --device cpu --set horizon=0.5 --points 2 --variants precision --out {MADE}",
         (f"slice bounce --device cpu --tolerance 20% --set horizon=0.5 --dims 0 1 --resolution 3 --out {READ}",),
         where="home/gradscape",
     ),
@@ -153,7 +153,7 @@ def small() -> None:
     from gradscape.landscapes.measures import fidelity as tradeoff
 
     leave_blank(setattr)
-    tradeoff.TIMING = tradeoff.PATIENCE = 0.002
+    tradeoff.REPETITION = tradeoff.LARGEST = 0.002
     cost.MOMENT = cost.ENOUGH = cost.WARM_UP = 0.0
     gallery_parts.METHODS, gallery_parts.BUDGET = ("random",), 8
     gallery_parts.FRAMES, gallery_parts.COARSE = 2, 4

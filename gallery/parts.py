@@ -249,10 +249,3 @@ def seconds_of_one(env: Environment) -> float:
     from ..landscapes.cost import episode_cost
 
     return episode_cost(env, grad=False).forward
-
-
-def console_of(watch: Watch) -> Any:
-    """Return a console for a job that does not take a watch yet."""
-    from ..api.progress import Bars
-
-    return watch.console if isinstance(watch, Bars) else Bars().console

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,14 @@ LEVEL = 0.95
 BLOCKS = {1: (16,), 2: (4, 4)}  # parts of a line, or of a plane, that are left out one at a time
 
 
+class EstimateRecord(TypedDict):
+    """An estimate as plain JSON; None where nothing could be measured."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+
+
 @dataclass(frozen=True)
 class Estimate:
     """Hold a number and its 95 % interval; NaN where nothing could be measured."""
@@ -23,9 +32,9 @@ class Estimate:
     low: float
     high: float
 
-    def record(self) -> dict[str, float | None]:
+    def record(self) -> EstimateRecord:
         """Return it as plain JSON."""
-        return {name: plain(getattr(self, name)) for name in ("value", "low", "high")}
+        return {"value": plain(self.value), "low": plain(self.low), "high": plain(self.high)}
 
 
 def plain(value: float) -> float | None:

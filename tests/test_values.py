@@ -41,7 +41,7 @@ bounce --axis y --resolution 3
 plan branin
 bench branin --batch 2 --seconds 0
 check branin --points 2
-tradeoff bounce --points 2 --ladder dt
+tradeoff bounce --points 2 --variants dt
 pairs ackley --samples 2 --top 3
 report cut --points 2
 gallery compute --only bounce --part reports

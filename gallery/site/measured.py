@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ...landscapes.measures.classify import WORDS
-from ...landscapes.measures.fidelity import cheapest, front, p95
+from ...landscapes.measures.fidelity import cheapest, p95, pareto_front
 from ...landscapes.storage.records import maybe, number, read_json, reading, text
 from ..files import DEVICES, REMAKE, REPORT, TRADEOFFS, TradeoffFiles
 from .manifest import Interval, ReportEntry, Rung, Seconds, TradeoffEntry, Word
@@ -98,7 +98,7 @@ def _tradeoff(record: Record, files: TradeoffFiles) -> TradeoffEntry:
     reference = next(row for row in rows if row["name"] == record["reference"])
     quicker = [row for row in rows if _time(row) < _time(reference)]
     errors = [math.inf if (off := _error(row, record)) is None else off for row in quicker]
-    best = {quicker[place]["name"] for place in front([_time(row) for row in quicker], errors)}
+    best = {quicker[place]["name"] for place in pareto_front([_time(row) for row in quicker], errors)}
     return TradeoffEntry(
         **{name: text(record[name]) for name in ("env", "reference", "loss_unit", "command")},
         points=number(record["points"]),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +17,7 @@ from ..objective import Objective, evaluated
 from ..plane import Plane
 from ..statistics import Estimate, plain, share
 from ..storage.store import plane_of
+from .records import JumpRecord, JumpsRecord
 
 HALVINGS = 12  # a gap between samples is looked into down to 1/4096 of it
 PERSISTS = 3  # halvings over which a jump keeps more than half of its height, and a slope an eighth
@@ -59,17 +59,21 @@ class Jumps:
         """Share of the jumps across which an event is counted differently."""
         return None if self.counted is None else share(int(self.counted.sum()), len(self.counted))
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> JumpsRecord:
         """Return it as plain JSON, the highest jumps first."""
         order = self.height.argsort(descending=True)
         counted = [None] * len(order) if self.counted is None else self.counted[order].tolist()
         rows = zip(self.place[order].tolist(), self.height[order].tolist(), counted, strict=True)
-        numbers = {name: getattr(self, name) for name in ("least", "neighbours", "steep", "checked", "undecided")}
+        found: list[JumpRecord] = [{"place": place, "height": height, "event": event} for place, height, event in rows]
         return {
             "share": self.share.record(),
             "explained_by_events": self.explained.record() if self.explained else None,
-            **{name: plain(value) if isinstance(value, float) else value for name, value in numbers.items()},
-            "found": [{"place": place, "height": height, "event": event} for place, height, event in rows],
+            "least": plain(self.least),
+            "neighbours": self.neighbours,
+            "steep": self.steep,
+            "checked": self.checked,
+            "undecided": self.undecided,
+            "found": found,
         }
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -21,6 +20,7 @@ from ..objective import Objective, evaluated
 from ..plane import Plane
 from ..statistics import Values, mean, plain, share
 from ..storage.store import plane_of
+from .records import ScaleRecord, WidthRecord
 from .ruggedness import box_slopes
 
 SCALES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
@@ -102,9 +102,9 @@ def agreement(slope: Values, difference: Values, noise: float) -> dict[str, Valu
     return {name: np.where(seen, part, np.nan) for name, part in (("cosine", cosine), ("sign", sign), ("error", error))}
 
 
-def scale_table(found: xr.Dataset) -> list[dict[str, Any]]:
+def scale_table(found: xr.Dataset) -> list[ScaleRecord]:
     """Return one plain row per scale: points that show a slope, their mean cosine and sign agreement, median error."""
-    rows = []
+    rows = list[ScaleRecord]()
     for scale in found["scale"].to_numpy():
         cosine, sign, error = (found[name].sel(scale=scale).to_numpy() for name in ("cosine", "sign", "error"))
         seen = np.isfinite(cosine)
@@ -176,9 +176,9 @@ def disagreement(found: xr.Dataset) -> xr.DataArray:
     return apart
 
 
-def width_table(found: xr.Dataset) -> list[dict[str, Any]]:
+def width_table(found: xr.Dataset) -> list[WidthRecord]:
     """Return one plain row per width: points, share biased, disagreement, and zeroth order's variance over first's."""
-    rows = []
+    rows = list[WidthRecord]()
     for width in found["width"].to_numpy():
         part = found.sel(width=width)
         known = np.isfinite(part["bias"].to_numpy()).all(axis=-1)

@@ -10,6 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..objective import Objective, evaluated
+from ..statistics import plain
+from .records import NoiseRecord
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,15 @@ class Noise:
     def deviation(self) -> float:
         """The largest of the three [loss unit]."""
         return max(self.again, self.batch, self.rounding)
+
+    def record(self) -> NoiseRecord:
+        """Return it as plain JSON."""
+        return {
+            "again": plain(self.again),
+            "batch": plain(self.batch),
+            "rounding": plain(self.rounding),
+            "points": plain(self.points),
+        }
 
     def floor(self, samples: int) -> float:
         """Return how far apart noise alone should put the extremes of so many samples [loss unit].

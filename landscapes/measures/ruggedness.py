@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from scipy.spatial.distance import pdist
 
 from ..statistics import Estimate, Values, jackknife, plain
 from ..storage.store import plane_of
+from .records import LossesRecord
 
 FLAT = 1e-3  # a slope is effectively zero that would change the loss by less, as a fraction of its range, over the box
 NOTABLE = 0.01  # the least depth of a notable minimum, as a fraction of the range
@@ -228,9 +229,9 @@ class Ruggedness:
     dispersion: Estimate
     fitness_distance: Estimate
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> LossesRecord:
         """Return it as plain JSON."""
-        return {name: _plain(value) for name, value in vars(self).items()}
+        return cast("LossesRecord", {name: _plain(value) for name, value in vars(self).items()})
 
 
 def ruggedness(dataset: xr.Dataset, *, floor: float) -> Ruggedness:

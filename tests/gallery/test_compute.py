@@ -32,7 +32,7 @@ def small(blank: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         monkeypatch.setattr(gallery_episodes, name, value)
     for name, value in (("REPORT_POINTS", 2), ("TRADEOFF_POINTS", 4), ("TURNED", ["precision"])):
         monkeypatch.setattr(gallery_measures, name, value)
-    for name in ("TIMING", "PATIENCE"):
+    for name in ("REPETITION", "LARGEST"):
         monkeypatch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", 0.01)
     longer = {name: replace(one, dt=4 * one.dt) for name, one in Bounce.fidelities.items()}
     monkeypatch.setattr(Bounce, "fidelities", longer)

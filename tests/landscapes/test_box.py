@@ -9,7 +9,7 @@ from gradscape.landscapes.adapters import within_box
 from gradscape.landscapes.conformance.suite import check
 from gradscape.landscapes.measures.fidelity import measure, sobol_points
 from gradscape.landscapes.measures.gradient_quality import ladder, subgrid
-from gradscape.landscapes.measures.profile import characterise, named_measures
+from gradscape.landscapes.measures.profile import measure_profile, named_measures
 from gradscape.landscapes.measures.sensitivity import Design, explore
 from gradscape.landscapes.objective import evaluated
 from gradscape.landscapes.storage.checkpoint import Pieces
@@ -65,7 +65,7 @@ def test_a_window_beyond_the_box_shows_what_lies_in_it():
 @pytest.mark.parametrize("dims", [("a", "b"), ("c",)])
 def test_a_report_leaves_out_what_it_may_not_ask_for_and_says_how_much(dims):
     strict, free = (
-        characterise(one, sample(one, plane(*dims)), rounding=1e-16, points=8) for one in (Strict(), Inviting())
+        measure_profile(one, sample(one, plane(*dims)), rounding=1e-16, points=8) for one in (Strict(), Inviting())
     )
     assert 0 < strict.cut < strict.asked / 10
     assert strict.asked == free.asked

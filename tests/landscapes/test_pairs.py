@@ -11,18 +11,20 @@ import torch
 from torch import Tensor
 
 from gradscape.landscapes.adapters import from_numpy, from_torch
-from gradscape.landscapes.measures.sensitivity import Design, Found, default_samples, explore, rank
+from gradscape.landscapes.measures.sensitivity import Design, Responses, default_samples, explore, rank
 from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.checkpoint import Pieces
 
 
-def found_in(fn: Callable[[Tensor], Tensor], dim: int, folder: Path, *, samples: int = 64, half: float = 1.0) -> Found:
+def found_in(
+    fn: Callable[[Tensor], Tensor], dim: int, folder: Path, *, samples: int = 64, half: float = 1.0
+) -> Responses:
     space = ParameterSpace.box([f"x{k}" for k in range(dim)], -half, half)
     return explored(from_torch(fn, space), folder, samples=samples)
 
 
-def explored(objective: Objective, folder: Path, *, samples: int) -> Found:
+def explored(objective: Objective, folder: Path, *, samples: int) -> Responses:
     design = Design.sobol(objective.space, samples, seed=0)
     pieces = Pieces.open(folder, {"samples": samples}, what="pairs")
     return explore(objective, design, pieces)
@@ -46,10 +48,10 @@ def test_the_pair_that_matters_is_first(tmp_path: Path) -> None:
     """A product of x1 and x4 over a faint bowl of all."""
     found = found_in(lambda x: 3 * x[:, 1] * x[:, 4] + 0.05 * x.square().sum(dim=1), 6, tmp_path)
     rows = rank(found)
-    by_interaction = max(rows, key=lambda row: row["interaction"])
-    assert rows[0]["dims"] == by_interaction["dims"] == [1, 4]
-    assert by_interaction["interaction"] == pytest.approx(1, abs=0.2)
-    assert {tuple(row["dims"]) for row in rows} == {(i, j) for i in range(6) for j in range(i + 1, 6)}
+    by_interaction = max(rows, key=lambda row: row.interaction)
+    assert rows[0].dims == by_interaction.dims == (1, 4)
+    assert by_interaction.interaction == pytest.approx(1, abs=0.2)
+    assert {row.dims for row in rows} == {(i, j) for i in range(6) for j in range(i + 1, 6)}
 
 
 def test_the_rugged_pair_is_found_where_others_are_more_sensitive(tmp_path: Path) -> None:
@@ -60,9 +62,9 @@ def test_the_rugged_pair_is_found_where_others_are_more_sensitive(tmp_path: Path
 
     found = found_in(ripples, 5, tmp_path)
     rows = rank(found)
-    assert max(rows, key=lambda row: row["ruggedness"])["dims"] == [1, 3]
-    assert max(rows, key=lambda row: row["disagreement"])["dims"] == [1, 3]
-    assert max(rows, key=lambda row: row["sensitivity"])["dims"] in ([0, 2], [0, 4], [2, 4])
+    assert max(rows, key=lambda row: row.ruggedness).dims == (1, 3)
+    assert max(rows, key=lambda row: row.disagreement).dims == (1, 3)
+    assert max(rows, key=lambda row: row.sensitivity).dims in ((0, 2), (0, 4), (2, 4))
     smooth = [axis for axis in (0, 2, 4) if found.ruggedness()[axis] > 1e-9]
     assert not smooth
 
@@ -132,7 +134,7 @@ def test_failed_episodes_are_counted_and_left_out(tmp_path: Path) -> None:
     found = explored(Counted(corner=0.8), tmp_path, samples=16)
     assert found.failed > 0
     assert np.isfinite(found.total()).all()
-    assert all(np.isfinite(row["ruggedness"]) for row in rank(found))
+    assert all(np.isfinite(row.ruggedness) for row in rank(found))
 
 
 def test_another_study_and_other_files_are_refused(tmp_path: Path) -> None:

@@ -14,7 +14,15 @@ from gradscape.landscapes.adapters import from_torch
 from gradscape.landscapes.draw.figures.page import save
 from gradscape.landscapes.draw.figures.tradeoff import short, tradeoff_figure
 from gradscape.landscapes.measures import fidelity as tradeoff
-from gradscape.landscapes.measures.fidelity import Estimate, Sample, cheapest, compare, front, gradient_error, order
+from gradscape.landscapes.measures.fidelity import (
+    Bootstrap,
+    Sample,
+    cheapest,
+    compare,
+    convergence_order,
+    gradient_error,
+    pareto_front,
+)
 from gradscape.landscapes.objective import Status
 from gradscape.landscapes.space import ParameterSpace
 
@@ -38,21 +46,21 @@ def test_errors_are_shares_of_the_spread_between_the_5th_and_95th_percentile() -
     off = sample([k + (9.0 if k in (3, 50, 97) else 1.0) for k in range(101)])
     found = compare(off, reference, seed=0)
     assert tradeoff.spread(reference) == pytest.approx(90.0)
-    assert found["loss_error"]["median"]["value"] == 1.0
-    assert found["loss_error"]["median_relative"]["value"] == pytest.approx(1 / 90)
-    assert found["loss_error"]["p95"]["value"] == 1.0  # three in a hundred are farther off
-    assert found["loss_error"]["p95"]["high"] == 9.0
-    assert found["diverged"] == 0
+    assert found.loss_error.median.value == 1.0
+    assert found.loss_error.median_relative.value == pytest.approx(1 / 90)
+    assert found.loss_error.p95.value == 1.0  # three in a hundred are farther off
+    assert found.loss_error.p95.high == 9.0
+    assert found.diverged == 0
 
 
 def test_an_episode_that_failed_is_infinitely_far_off_and_a_failed_reference_is_left_out() -> None:
     reference = sample([float(k) for k in range(20)], failed=2)
     few, many = (compare(sample([k + 1.0 for k in range(20)], failed=lost), reference, seed=0) for lost in (2, 3))
-    assert few["compared"] == many["compared"] == 18
-    assert (few["diverged"], few["loss_error"]["p95"]["value"]) == (0, 1.0)
-    assert many["diverged"] == pytest.approx(1 / 18)
-    assert many["loss_error"]["p95"]["value"] is None
-    assert many["loss_error"]["median"]["value"] == 1.0
+    assert few.compared == many.compared == 18
+    assert (few.diverged, few.loss_error.p95.value) == (0, 1.0)
+    assert many.diverged == pytest.approx(1 / 18)
+    assert many.loss_error.p95.value is None
+    assert many.loss_error.median.value == 1.0
 
 
 def test_rank_correlation_is_spearmans() -> None:
@@ -71,7 +79,7 @@ def test_gradients_that_are_both_zero_agree_and_one_that_is_zero_alone_does_not(
 def test_intervals_cover_what_they_should() -> None:
     rng, hits = np.random.default_rng(1), 0
     for seed in range(200):
-        found = Estimate.of(lambda values: np.median(values, axis=-1), rng.normal(size=40), seed=seed)
+        found = Bootstrap.of(lambda values: np.median(values, axis=-1), rng.normal(size=40), seed=seed)
         assert found.low is not None
         assert found.high is not None
         hits += found.low <= 0 <= found.high
@@ -81,16 +89,16 @@ def test_intervals_cover_what_they_should() -> None:
 def test_the_front_holds_what_no_other_beats() -> None:
     seconds = [1.0, 2.0, 3.0, 2.5, 4.0, 0.5, 5.0]
     error = [0.5, 0.2, 0.2, 0.3, 0.1, np.inf, np.nan]
-    assert front(seconds, error) == [0, 1, 4]
+    assert pareto_front(seconds, error) == [0, 1, 4]
 
 
 @pytest.mark.parametrize("p", [1.0, 2.0, 4.0])
 def test_the_order_of_convergence_is_found(p: float) -> None:
     dt = np.array([0.1, 0.05, 0.025, 0.0125])
-    found = order(dt, 3.0 * dt**p)
+    found = convergence_order(dt, 3.0 * dt**p)
     assert found is not None
-    assert found["order"] == pytest.approx(p)
-    assert order(dt, [0.1, 0.05, np.inf, 0.0]) is None
+    assert found.order == pytest.approx(p)
+    assert convergence_order(dt, [0.1, 0.05, np.inf, 0.0]) is None
 
 
 def test_the_cheapest_rung_within_a_tolerance_is_chosen() -> None:
@@ -105,7 +113,7 @@ def test_the_cheapest_rung_within_a_tolerance_is_chosen() -> None:
 def test_gradients_are_per_width_of_the_box_and_points_are_evaluated_once_in_order(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(tradeoff, "TIMING", 0.01)
+    monkeypatch.setattr(tradeoff, "REPETITION", 0.01)
     space = ParameterSpace(("a", "b"), torch.tensor([0.0, 0.0]), torch.tensor([1.0, 10.0]), ("", ""))
     x = tradeoff.sobol_points(space, 8, seed=3)
     heard: list[int] = []
@@ -119,7 +127,7 @@ def test_gradients_are_per_width_of_the_box_and_points_are_evaluated_once_in_ord
 
 
 def test_seconds_are_those_of_an_episode_in_a_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tradeoff, "TIMING", 0.2)
+    monkeypatch.setattr(tradeoff, "REPETITION", 0.2)
     clock = [0.0]
     monkeypatch.setattr(tradeoff.time, "perf_counter", lambda: clock[0])
     space = ParameterSpace.box(["a"], 0.0, 1.0)

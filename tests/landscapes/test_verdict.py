@@ -12,16 +12,16 @@ from gradscape.landscapes.draw.figures.page import save
 from gradscape.landscapes.draw.figures.quality import quality_figure
 from gradscape.landscapes.measures import gradient_quality as gradients
 from gradscape.landscapes.measures.classify import WORDS
-from gradscape.landscapes.measures.profile import Character, characterise, effort, named_measures
+from gradscape.landscapes.measures.profile import Profile, effort, measure_profile, named_measures
 
 Function = Callable[[torch.Tensor], torch.Tensor]
 
 
-def character(fn: Function, low: float, high: float, dims: tuple[int, ...] = (0, 1)) -> Character:
+def profile(fn: Function, low: float, high: float, dims: tuple[int, ...] = (0, 1)) -> Profile:
     space = ParameterSpace.box(("x", "y"), low, high)
     objective = from_torch(fn, space)
     dataset = sample(objective, Plane.through(space, space.center, dims, resolution=48))
-    return characterise(objective, dataset, rounding=2**-52, points=2)
+    return measure_profile(objective, dataset, rounding=2**-52, points=2)
 
 
 def rastrigin(x: torch.Tensor) -> torch.Tensor:
@@ -59,13 +59,13 @@ def scrambled(x: torch.Tensor) -> torch.Tensor:
     ids=["bowl", "himmelblau", "rastrigin", "noise", "step", "plateau", "ripples"],
 )
 def test_words_fit_functions_that_are_known(fn: Function, box: tuple[float, float], words: set[str]) -> None:
-    found = character(fn, *box)
+    found = profile(fn, *box)
     assert set(found.verdict.words) == words
     assert set(found.verdict.reasons) == words
 
 
 def test_somebody_elses_words_are_held_against_ours() -> None:
-    verdict = character(lambda x: x.square().sum(1), -1, 1).verdict
+    verdict = profile(lambda x: x.square().sum(1), -1, 1).verdict
     assert verdict.beside(("very smooth", "rugged")) == [
         {"word": "very smooth", "measured": True},
         {"word": "rugged", "measured": False},
@@ -74,7 +74,7 @@ def test_somebody_elses_words_are_held_against_ours() -> None:
 
 
 def test_a_character_is_the_same_again_and_has_plain_names() -> None:
-    found = [character(rastrigin, -2, 2) for _ in range(2)]
+    found = [profile(rastrigin, -2, 2) for _ in range(2)]
     assert found[0].record() == found[1].record()
     named = named_measures(found[0].record())
     assert (
@@ -95,7 +95,7 @@ def test_no_more_is_evaluated_than_is_announced() -> None:
     objective = from_torch(counted, space)
     dataset = sample(objective, Plane.through(space, space.center, (0, 1), resolution=10))
     counts.update({True: 0, False: 0})
-    characterise(objective, dataset, rounding=2**-52, points=3)
+    measure_profile(objective, dataset, rounding=2**-52, points=3)
     assert (counts[False], counts[True]) == effort(2, 3)
 
 

@@ -123,8 +123,9 @@ def _scales(ax: Axes, steps: xr.Dataset, samples: xr.Dataset) -> list[Artist]:
         rows = [row for row in scale_table(found) if row["points"]]
         scale = [row["scale"] for row in rows]
         for name, colour, label in (("cosine", style.LINE, "mean cosine"), ("uphill", style.SLOPE_LINE, "uphill")):
-            value = np.array([row[name]["value"] for row in rows], dtype=float)
-            ends = np.array([[row[name][end] for end in ("low", "high")] for row in rows], dtype=float).reshape(-1, 2)
+            estimates = [row["cosine"] if name == "cosine" else row["uphill"] for row in rows]
+            value = np.array([one["value"] for one in estimates], dtype=float)
+            ends = np.array([(one["low"], one["high"]) for one in estimates], dtype=float).reshape(-1, 2)
             reach = np.abs(np.nan_to_num(ends - value[:, None])).T
             look = sheet.look({"linewidth": 1.1, "markersize": 4.5, "markeredgewidth": 1.0, "capsize": 2.0})
             look |= {"color": colour, "marker": "o" if name == "cosine" else "v"}

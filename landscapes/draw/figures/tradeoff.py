@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from ...measures.fidelity import front
+from ...measures.fidelity import pareto_front
 from .. import style
 from . import labels, page, panel
 
@@ -127,7 +127,7 @@ def _front(ax: Axes, report: Mapping[str, Any], rows: Rows, relative: bool) -> l
         np.inf if (off := _ends(row, relative)["value"]) is None or time >= end else off
         for time, row in zip(seconds, rows, strict=True)
     ]
-    best = front(seconds, errors)
+    best = pareto_front(seconds, errors)
     if not best:
         return []
     bottom = ax.get_ylim()[0]

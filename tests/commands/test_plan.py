@@ -4,7 +4,6 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,14 +11,14 @@ import xarray as xr
 
 import gradscape
 from gradscape.envs.base import Environment
-from gradscape.jobs.rehearsal import Alike, drawn, pictures, room_of
+from gradscape.jobs.rehearsal import Replica, count_pictures, room_of, time_drawing
 from gradscape.jobs.slice import pause_after
 from gradscape.landscapes.draw.figures import page, sweep
 from gradscape.landscapes.storage.arrays import need_of
 from gradscape.landscapes.storage.store import SliceStore
 
-from .clock import Clock
-from .command import Said
+from ..clock import Clock
+from ..command import Said
 
 JOBS = {
     "bounce": ["bounce", "--dims", "0", "1", "--resolution", "32", "--fidelity", "draft"],
@@ -33,14 +32,7 @@ EPISODE, TILE, PICTURE = 0.05, 0.035, 0.5  # seconds that it takes to simulate, 
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """Let what jobs are made of take its time on a clock of its own."""
     clock = Clock()
-    for module in (
-        "landscapes.cost",
-        "jobs.slice",
-        "jobs.rehearsal",
-        "jobs.planned",
-        "commands.plan_report",
-        "jobs.sweep",
-    ):
+    for module in ("jobs.slice", "jobs.rehearsal", "jobs.plan", "jobs.sweep", "commands.plan", "landscapes.cost"):
         monkeypatch.setattr(f"gradscape.{module}.time", clock)
 
     def slow(owner: Any, name: str, price: Callable[..., float]) -> None:
@@ -103,21 +95,16 @@ def test_a_plan_needs_the_memory_that_is_held_and_that_of_the_slice_to_come(
     assert planned["memory"] == {"host": 10**9 + need_of((16, 16), 400, grad=True).memory, "device": 0}
 
 
-def test_what_a_first_drawing_loads_is_paid_once_and_what_is_made_up_to_draw_never(clock: Clock) -> None:
-    alike, took = SimpleNamespace(seconds=7.0), iter((5.0, 2.0))
-
-    def draw() -> None:
-        clock.sleep(next(took) + 1.0)
-        alike.seconds += 1.0
-
-    assert drawn(draw, alike) == (3.0, 2.0)  # type: ignore[arg-type]
+def test_what_a_first_drawing_loads_is_paid_once(clock: Clock) -> None:
+    took = iter((5.0, 2.0))
+    assert time_drawing(lambda: clock.sleep(next(took))) == (3.0, 2.0)
 
 
 def test_pictures_come_with_finer_levels_batches_and_a_pause_between_them() -> None:
     space = gradscape.ParameterSpace.box(["a", "b"], -1.0, 1.0)
     store = SliceStore.in_memory(gradscape.Plane.through(space, space.center, ("a", "b"), resolution=64), space)
     most = 1 + store.tiles()[-1].level
-    assert [pictures(most - 1, *now) for now in ((99, 1e6, 1.0), (99, 0.0, 1.0), (99, 44.0, 1.0), (3, 44.0, 1.0))] == [
+    assert [count_pictures(most - 1, *now) for now in ((99, 1e6, 1.0), (99, 0.0, 1.0), (99, 44.0, 1.0), (3, 44.0, 1.0))] == [
         most, 2, 6, 4
     ]  # fmt: skip
 
@@ -132,7 +119,7 @@ def test_a_larger_job_is_planned_by_a_smaller_one(
     """Four times the resolution, sixteen times the points: of each part as much as a rehearsal of all would say."""
     said = ["branin", "--dims", "0", "1", "--resolution", "64"]
     whole = plan(run, tmp_path, *said)
-    monkeypatch.setattr("gradscape.jobs.planned.MOST_POINTS", 32)
+    monkeypatch.setattr("gradscape.jobs.plan.MOST_POINTS", 32)
     scaled = plan(run, tmp_path, *said)
     assert scaled["rate"] == "measured here, now, on 32 x 32 points"
     for name in ("episodes", "batches", "too_large"):
@@ -213,12 +200,12 @@ def test_bad_input_gets_one_line(run: Callable[..., Said], tmp_path: Path, argum
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_what_is_alike_keeps_failures_and_precision(tmp_path: Path) -> None:
+def test_a_replica_keeps_failures_and_precision(tmp_path: Path) -> None:
     env = gradscape.make("flip", fidelity="draft", device="cpu")
     plane = gradscape.Plane.through(env.space, env.space.center, ("0", "1"), resolution=8)
     store = SliceStore.create(tmp_path / "s.zarr", plane, env.space, identity={})
-    alike = Alike(env, store, rows=2)
-    said = alike.evaluate(env.space.center.expand(5, -1))
+    replica = Replica(env, store, rows=2)
+    said = replica.evaluate(env.space.center.expand(5, -1))
     true_at = store.points(store.tiles()[0])[:2]
     true = env.evaluate(true_at)
     nearest = [int((plane.project(true_at) - plane.project(env.space.center[None])).norm(dim=1).argmin())] * 5

@@ -11,19 +11,19 @@ import torch
 from torch import Tensor
 
 import gradscape
-from gradscape.commands import tradeoff_report
 from gradscape.envs import registry
 from gradscape.envs.base import Environment, Fidelity, Work
-from gradscape.jobs import variants as ladder
+from gradscape.jobs import variants
 from gradscape.jobs.tolerance import read_tolerance
+from gradscape.landscapes import cost
 from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.measures import fidelity as tradeoff
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.records import read_json, write_record
 
-from .clock import Clock
-from .command import Said
+from ..clock import Clock
+from ..command import Said
 
 Command = Callable[..., Said]
 CLOCK = Clock()
@@ -64,7 +64,7 @@ class Converging(Environment):
 def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Keep measurements in a folder of the test's own, and time by the clock of the scene."""
     monkeypatch.setattr("gradscape.jobs.tolerance.user_data_path", lambda name: tmp_path / "data" / name)
-    for module in (tradeoff, tradeoff_report):
+    for module in (tradeoff, cost):
         monkeypatch.setattr(module, "time", CLOCK)
     monkeypatch.setattr(tradeoff, "RESAMPLES", 99)
     monkeypatch.setitem(registry.entries(), "converging", registry.Entry("converging", f"{__name__}:Converging"))
@@ -106,13 +106,13 @@ def test_errors_and_order_of_convergence_are_those_of_the_scene(run: Command, tm
 def test_a_tradeoff_is_printed_without_being_measured_again(
     run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert run(*TRADE, "--ladder", "precision", cwd=tmp_path).returncode == 0
+    assert run(*TRADE, "--variants", "precision", cwd=tmp_path).returncode == 0
     monkeypatch.setattr(Converging, "_evaluate", None)
-    done = run(*TRADE, "--ladder", "precision", "--print", "85", cwd=tmp_path)
+    done = run(*TRADE, "--variants", "precision", "--print", "85", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "tradeoff-85mm.pdf, tradeoff-85mm.svg" in done.stderr
     assert (tmp_path / "trade/tradeoff-85mm.pdf").read_bytes().startswith(b"%PDF")
-    assert run(*TRADE, "--ladder", "precision", cwd=tmp_path).returncode == 0
+    assert run(*TRADE, "--variants", "precision", cwd=tmp_path).returncode == 0
 
 
 def test_rungs_that_are_refused_are_listed_and_those_that_diverge_are_counted(run: Command, tmp_path: Path) -> None:
@@ -137,7 +137,7 @@ def test_a_rung_whose_engine_gives_up_is_listed_too(
         return simulate(self, x, grad=grad)
 
     monkeypatch.setattr(Converging, "_evaluate", short_of_memory)
-    report = json.loads(run(*TRADE, "--ladder", "precision", "--json", cwd=tmp_path).stdout)
+    report = json.loads(run(*TRADE, "--variants", "precision", "--json", cwd=tmp_path).stdout)
     assert report["refused"] == [{"name": "standard", "why": "out of memory"}]
     assert {"draft", "draft-float64", "standard-float64", "reference"} < set(by_name(report))
 
@@ -156,17 +156,17 @@ def test_a_rung_is_gone_when_the_next_one_is_measured(
         return simulate(self, x, grad=grad)
 
     monkeypatch.setattr(Converging, "_evaluate", followed)
-    done = run(*TRADE, "--ladder", "precision", "--json", cwd=tmp_path)
+    done = run(*TRADE, "--variants", "precision", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert len(simulated) == 1 + len(json.loads(done.stdout)["rungs"])  # one for the estimate
 
 
 def test_a_dt_that_does_not_divide_the_episode_is_refused() -> None:
-    base = ladder.Rung.of(Converging(fidelity="draft"))
-    thirds = base.turned("thirds", "dt", fidelity=Fidelity("thirds", dt=0.3))
+    base = variants.Variant.of(Converging(fidelity="draft"))
+    thirds = base.change("thirds", "dt", fidelity=Fidelity("thirds", dt=0.3))
     with pytest.raises(ValueError, match=r"with dt 0.3 s it would be 0.9 times as long"):
         thirds.make("converging")
-    assert base.turned("halves", "dt", fidelity=Fidelity("halves", dt=0.05)).make("converging").fidelity.dt == 0.05
+    assert base.change("halves", "dt", fidelity=Fidelity("halves", dt=0.05)).make("converging").fidelity.dt == 0.05
 
 
 @pytest.mark.parametrize(
@@ -179,13 +179,13 @@ def test_a_dt_that_does_not_divide_the_episode_is_refused() -> None:
     ],
 )
 def test_scenes_have_the_rungs_of_their_knobs(scene: str, wanted: set[str]) -> None:
-    found = ladder.rungs(registry.make(scene, fidelity="reference", device="cpu"), ladder.LADDERS)
+    found = variants.variants(registry.make(scene, fidelity="reference", device="cpu"), variants.SETTINGS)
     names = [rung.name for rung in found]
     assert names[0] == "reference"
     assert wanted <= set(names)
     assert len({rung.key() for rung in found}) == len(found)
     assert ("draft-ke-x4" in names) == (scene == "bounce")
-    particles = {rung.ladder for rung in found} & {"particles"}
+    particles = {one.changed for one in found} & {"particles"}
     assert bool(particles) == (scene in ("fluid", "table"))
 
 
@@ -215,7 +215,7 @@ def test_a_stopped_study_goes_on_with_the_next_rung(
 
 
 def test_another_study_is_not_overwritten(run: Command, tmp_path: Path) -> None:
-    run(*TRADE, "--ladder", "dt", cwd=tmp_path)
+    run(*TRADE, "--variants", "dt", cwd=tmp_path)
     before = (tmp_path / "trade/tradeoff.json").read_bytes()
     other = run(*TRADE, "--seed", "1", cwd=tmp_path)
     assert other.returncode == 2
@@ -227,7 +227,7 @@ def test_another_study_is_not_overwritten(run: Command, tmp_path: Path) -> None:
     ("arguments", "said"),
     [
         (["tradeoff", "branin"], "branin has fidelity exact only; there is nothing to trade"),
-        (["tradeoff", "bounce", "--ladder", "speed"], "--ladder takes dt, resolution"),
+        (["tradeoff", "bounce", "--variants", "speed"], "--variants takes dt, resolution"),
         (
             ["slice", "bounce", "--dims", "0", "1", "--tolerance", "5%", "--set", "horizon=0.5"],
             "`landscape tradeoff bounce --set=horizon=0.5` measures them",
@@ -303,7 +303,7 @@ def test_the_gallerys_rungs_of_the_same_problem_are_found_where_nothing_of_the_u
 
 def test_a_slice_at_a_measured_fidelity_can_be_cut_anew(run: Command, tmp_path: Path) -> None:
     how = ["converging", "--device", "cpu", "--tolerance", "0.002"]
-    run(*TRADE, "--ladder", "dt", cwd=tmp_path)
+    run(*TRADE, "--variants", "dt", cwd=tmp_path)
     run("slice", *how, "--dims", "0", "1", "--resolution", "3", "--out", "cut", cwd=tmp_path)
     run("optimize", *how, "--method", "random", "--budget", "3", "--out", "searched", cwd=tmp_path)
     assert json.loads((tmp_path / "cut/summary.json").read_text())["fidelity"] == "standard-dt-x0.5"
@@ -357,14 +357,14 @@ def test_seconds_are_those_of_the_device_that_will_run(
 
     def slow(env: gradscape.Environment) -> float:
         timed.append(env.fidelity.name)
-        return ladder.expected_work(env)
+        return variants.expected_work(env)
 
-    monkeypatch.setattr(tolerance, "_seconds", slow)
+    monkeypatch.setattr(tolerance, "seconds_with_gradient", slow)
     how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--json"]
     errors = {row["name"]: row["loss_error"]["p95_relative"]["value"] for row in report["rungs"]}
     within = [name for name, off in errors.items() if off is not None and off <= 0.02]
     work = {
-        row["name"]: ladder.expected_work(gradscape.make("converging", fidelity=Fidelity(**row["fidelity"])))
+        row["name"]: variants.expected_work(gradscape.make("converging", fidelity=Fidelity(**row["fidelity"])))
         for row in report["rungs"]
     }
     done = run(*how, "--tolerance", "2%", cwd=tmp_path)

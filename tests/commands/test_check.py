@@ -9,14 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from gradscape.commands import check_report
-from gradscape.envs.registry import Entry, entries, make
+from gradscape.envs.registry import Entry, entries
+from gradscape.jobs import check as job
+from gradscape.jobs.scene import SceneSpec
 from gradscape.landscapes.conformance import suite as conformance
 
-from .command import Said
+from ..command import Said
 
 FUNCTIONS = [name for name, entry in entries().items() if set(entry.fidelities) == {"exact"}]
-BENCHMARKS = Path(__file__).parent.parent / "BENCHMARKS.md"
+BENCHMARKS = Path(__file__).parent.parent.parent / "BENCHMARKS.md"
 
 # Another package's environment: its gradient is wrong where asked to be.
 BOWL = '''
@@ -85,8 +86,9 @@ def test_quick_environments_pass_at_draft(name: str, run: Callable[..., Said], t
 @pytest.mark.parametrize("name", ["flip", "fluid"])
 def test_slow_environments_keep_their_promises_at_draft(name: str) -> None:
     """For a quarter of an episode: what they promise does not depend on its length."""
-    scene = check_report.Scene(name, make(name, device="cpu", horizon=0.25), {"horizon": 0.25})
-    findings = takewhile(lambda found: found.check != "finite differences", check_report._findings(scene, 2, 0, print))
+    scene = SceneSpec(name, device="cpu", options={"horizon": 0.25})
+    whole = job.CheckJob.open(scene, points=2).findings()
+    findings = takewhile(lambda found: found.check != "finite differences", whole)
     assert {found.check: found.outcome for found in findings} == dict.fromkeys(
         ["shapes", *conformance.PROMISES], "pass"
     )
@@ -147,7 +149,7 @@ def test_a_known_exception_is_printed_with_its_reason_until_it_is_none(
     run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bowl: None
 ) -> None:
     reasons = dict.fromkeys(("finite differences", "gradcheck"), "its gradient points downhill")
-    monkeypatch.setitem(check_report.EXPECTED, "bowl", {"only": reasons})
+    monkeypatch.setitem(job.EXPECTED, "bowl", {"only": reasons})
     excused = run("check", "bowl", "--set", "wrong=true", cwd=tmp_path)
     assert excused.returncode == 0
     assert excused.stdout.count("known: its gradient points downhill") == 2
@@ -166,7 +168,7 @@ def test_expectations_are_of_environments_and_fidelities_there_are() -> None:
     assert nowhere({"fluid": {"draft": {}, "best": {}}, "liquid": {"draft": {}}}) == [
         ("fluid", "best"), ("liquid", "draft")
     ]  # fmt: skip
-    assert nowhere(check_report.EXPECTED) == []
+    assert nowhere(job.EXPECTED) == []
 
 
 def test_an_interrupt_says_that_nothing_is_kept(
@@ -178,7 +180,7 @@ def test_an_interrupt_says_that_nothing_is_kept(
     monkeypatch.setitem(conformance.PROMISES, "determinism", interrupted)
     done = run("check", "branin", cwd=tmp_path)
     assert done.returncode == 130
-    assert "stopped after 4 checks; nothing is kept, the same command begins again" in done.stderr
+    assert "stopped: 4 checks are done, and nothing is kept of them; the same command begins again" in done.stderr
     assert "Traceback" not in done.stderr
 
 

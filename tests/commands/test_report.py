@@ -9,12 +9,13 @@ from typing import Any
 
 import pytest
 
-from gradscape.commands import measure_report
-from gradscape.commands.measure_tables import environments_table
 from gradscape.gallery.paper import read_paper
+from gradscape.jobs import report as job
+from gradscape.jobs.report_record import Report
+from gradscape.jobs.report_tables import environments_markdown
 from gradscape.landscapes.storage.records import read_json, write_record
 
-from .command import Said
+from ..command import Said
 
 Run = Callable[..., Said]
 
@@ -77,7 +78,7 @@ def test_all_makes_a_table_with_the_papers_words(run: Run, tmp_path: Path) -> No
     assert "all/bounce-x is there already" in again.stderr
     assert (tmp_path / "all/pinball-2-0-1/report.json").exists()
     assert "pinball-2-0-1" in again.stdout
-    measured = environments_table(summary["reports"]).splitlines()
+    measured = environments_markdown([Report.of_record(record) for record in summary["reports"]]).splitlines()
     assert len({line.count("|") for line in measured}) == 1
     assert measured[3].startswith("| `pinball-2` | 1 |")
 
@@ -87,14 +88,14 @@ def test_one_slice_that_fails_does_not_lose_the_others(
 ) -> None:
     for name in ("bounce-x", "bounce-y"):  # quick ones, in the places of figures
         run("slice", "branin", "--dims", "0", "1", "--resolution", "4", "--out", f"data/{name}", cwd=tmp_path)
-    measured, calls = measure_report._character, iter((True, False))
+    measure, calls = job.measure, iter((True, False))
 
     def failing(*parts: Any) -> object:
         if next(calls):
             raise RuntimeError("out of\nmemory")
-        return measured(*parts)
+        return measure(*parts)
 
-    monkeypatch.setattr(measure_report, "_character", failing)
+    monkeypatch.setattr(job, "measure", failing)
     command = ("report", "--all", "--data", "data", "--points", "2", "--out", "all")
     done = run(*command, "--json", cwd=tmp_path)
     assert done.returncode == 1
@@ -102,7 +103,7 @@ def test_one_slice_that_fails_does_not_lose_the_others(
     summary = json.loads(done.stdout)
     assert [record["name"] for record in summary["reports"]] == ["bounce-y"]
     assert list(summary["failed"]) == ["bounce-x"]
-    monkeypatch.setattr(measure_report, "_character", measured)
+    monkeypatch.setattr(job, "measure", measure)
     again = run(*command, cwd=tmp_path)
     assert again.returncode == 0
     assert "all/bounce-y is there already" in again.stderr
@@ -133,11 +134,13 @@ def test_a_report_beside_its_slice_is_copied_unless_it_is_another(run: Run, cut:
 
 
 def test_a_row_of_an_environment_spans_its_slices_and_says_whether_the_paper_agrees() -> None:
-    def record(notable: int, cosine: float, words: list[str]) -> dict[str, Any]:
+    def report(notable: int, cosine: float, words: list[str]) -> Report:
         def scale(points: int, value: float) -> dict[str, Any]:
             return {"points": points, "cosine": {"value": value}}
 
-        return {
+        own = dict.fromkeys(("name", "options", "fidelity", "device", "seconds", "command", "key"))
+        record = {
+            **own,
             "env": "fluid",
             "losses": {"notable": notable, "flat": {"value": notable / 100}},
             "jumps": {"share": {"value": None}},
@@ -146,15 +149,16 @@ def test_a_row_of_an_environment_spans_its_slices_and_says_whether_the_paper_agr
             "verdict": {"words": words},
             "paper": {"words": [{"word": word, "measured": word in words} for word in ("rugged", "gradients good")]},
         }
+        return Report.of_record(record)
 
-    two = [record(2, 0.5, ["rugged"]), record(12, -0.25, ["rugged", "gradients good"])]
-    row = environments_table(two).splitlines()[2]
+    two = [report(2, 0.5, ["rugged"]), report(12, -0.25, ["rugged", "gradients good"])]
+    row = environments_markdown(two).splitlines()[2]
     assert row == (
         "| `fluid` | 2 | 2 to 12 | 2 to 12 % |  | −0.25 to 0.50 | −0.12 to 0.25 | "
         "rugged, gradients good (1 of 2) | rugged, gradients good (1 of 2) | in part |"
     )
-    assert environments_table(two[1:]).endswith("| yes |\n")
-    assert environments_table([record(0, 0.0, [])]).endswith("| no |\n")
+    assert environments_markdown(two[1:]).endswith("| yes |\n")
+    assert environments_markdown([report(0, 0.0, [])]).endswith("| no |\n")
 
 
 def test_a_stopped_report_says_what_is_kept(
@@ -163,7 +167,7 @@ def test_a_stopped_report_says_what_is_kept(
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(measure_report, "_character", stop)
+    monkeypatch.setattr(job, "measure", stop)
     done = run("report", "cut", "--out", "told", cwd=tmp_path)
     assert done.returncode == 130
     assert "stopped: 0 of 1 reports are kept" in done.stderr

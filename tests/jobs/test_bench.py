@@ -12,7 +12,8 @@ from gradscape.envs.engines.model import Box
 from gradscape.envs.engines.replay import Replay
 from gradscape.envs.engines.runtime import KernelTime, cuda_available, kernel_times
 from gradscape.envs.fluid import Fluid
-from gradscape.jobs.bench import alternated, bench
+from gradscape.jobs.bench import BenchJob, alternate
+from gradscape.jobs.watch import Watch
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.space import ParameterSpace
@@ -58,7 +59,7 @@ def report():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gradscape.jobs.bench.time", CLOCK)
         patch.setattr(SliceStore, "write", slow)
-        return bench(sleeper, "warp", against="taichi", batches=[1, 8], seconds=0.2)
+        return BenchJob(sleeper, "warp", against="taichi", batches=[1, 8], seconds=0.2).run().record()
 
 
 def test_rates_are_what_one_batch_took(report):
@@ -90,9 +91,9 @@ def test_batches_are_repeated_for_the_seconds_given_and_twice_at_least(report):
 
 def test_the_best_repetition_counts(monkeypatch):
     monkeypatch.setattr(
-        "gradscape.jobs.bench.alternated", lambda calls, seconds: {key: [3.0, 1.0, 2.0] for key in calls}
+        "gradscape.jobs.bench.alternate", lambda calls, seconds: {key: [3.0, 1.0, 2.0] for key in calls}
     )
-    (row,) = bench(sleeper, "warp", batches=[1])["rates"]
+    (row,) = BenchJob(sleeper, "warp", batches=[1]).run().record()["rates"]
     assert (row["forward"]["seconds"], row["with_gradient"]["seconds"], row["repetitions"]) == (1.0, 1.0, 3)
 
 
@@ -115,7 +116,7 @@ def test_simulating_is_not_the_samplers_own_time(report):
 
 def test_calls_take_turns_and_are_repeated_whatever_they_take():
     made = []
-    times = alternated({"a": lambda: made.append("a"), "b": lambda: made.append("b")}, seconds=0.0)
+    times = alternate({"a": lambda: made.append("a"), "b": lambda: made.append("b")}, seconds=0.0)
     assert made == ["a", "b", "a", "b"]
     assert {key: len(found) for key, found in times.items()} == {"a": 2, "b": 2}
 
@@ -123,7 +124,7 @@ def test_calls_take_turns_and_are_repeated_whatever_they_take():
 def test_calls_end_before_a_round_would_end_too_late(monkeypatch):
     clock = Clock()
     monkeypatch.setattr("gradscape.jobs.bench.time", clock)
-    times = alternated({"a": lambda: clock.sleep(1.0), "b": lambda: clock.sleep(2.0)}, seconds=10.0)
+    times = alternate({"a": lambda: clock.sleep(1.0), "b": lambda: clock.sleep(2.0)}, seconds=10.0)
     assert times == {"a": [1.0] * 3, "b": [2.0] * 3}
 
 
@@ -132,10 +133,11 @@ def timed(request, monkeypatch):
     """Return kernels' times by the way of a ball's flight; on a CPU every look at the clock takes a second."""
     if request.param == "cpu":
         clock = Clock(tick=1.0)
-        for module in ("bench", "engines.runtime"):
-            monkeypatch.setattr(f"gradscape.envs.{module}.time", clock)
+        for module in ("jobs.bench", "envs.engines.runtime"):
+            monkeypatch.setattr(f"gradscape.{module}.time", clock)
         monkeypatch.setattr(Bounce, "threads", 1)  # a solver takes fewer rows than are worth evaluating at once
-    return bench(lambda engine: Bounce(device=request.param, engine=engine), "warp", batches=[1], seconds=0.0)
+    job = BenchJob(lambda engine: Bounce(device=request.param, engine=engine), "warp", batches=[1], seconds=0.0)
+    return job.run().record()
 
 
 def test_every_kernel_is_timed_within_the_time_that_passes(timed):
@@ -182,7 +184,9 @@ def test_kernels_are_launched_one_by_one_to_be_timed(monkeypatch):
 
 @GPU
 def test_a_gpu_holds_what_was_estimated_or_more_where_it_has_room():
-    found = bench(lambda engine: Fluid(device="cuda", engine=engine), "warp", batches=[1], seconds=0.0)
+    found = (
+        BenchJob(lambda engine: Fluid(device="cuda", engine=engine), "warp", batches=[1], seconds=0.0).run().record()
+    )
     assert found["memory"]["measured"] / found["memory"]["estimated"] > 0.3
 
 
@@ -202,7 +206,8 @@ def test_launches_are_timed_within_the_block_only():
     ],
 )
 def test_an_engine_that_is_not_there_is_refused_before_anything_runs(engine, against, said):
-    heard = []
+    heard, watch = [], Watch()
+    watch.note = heard.append
     with pytest.raises(ValueError, match=said):
-        bench(lambda name: Bounce(device="cpu", engine=name), engine, against=against, follow=heard.append)
+        BenchJob(lambda name: Bounce(device="cpu", engine=name), engine, against=against).run(watch)
     assert heard == []

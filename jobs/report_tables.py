@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from itertools import groupby
-from typing import Any
+from typing import TYPE_CHECKING, TypedDict
 
-from rich.table import Table
+if TYPE_CHECKING:
+    from ..landscapes.measures.records import ScaleRecord
+    from ..landscapes.statistics import EstimateRecord
+    from .report_record import Report
 
-from .terminal import table
-
-Record = dict[str, Any]
 HEADINGS = ("slice", "minima", "flat", "jumps", "cosine", "measured", "the paper's words", "measured too")
 ENVIRONMENTS = (
     "environment", "slices", "minima", "flat", "jumps", "cosine, small step", "cosine, two samples", "measured",
@@ -19,67 +19,73 @@ ENVIRONMENTS = (
 SEEN = 0.5  # of the points that any step sees, for a smaller one to be worth showing
 
 
-def by_environment(records: Sequence[Record]) -> dict[str, Record]:
-    """Return by environment in how many of its slices each word was measured, and each of the paper's."""
-    found: dict[str, Record] = {}
-    for record in records:
-        entry = found.setdefault(record["env"], {"slices": 0, "measured": {}, "paper": {}})
+class EnvironmentRecord(TypedDict):
+    """In how many `slices` of an environment each word was measured, and each of the paper's."""
+
+    slices: int
+    measured: dict[str, int]
+    paper: dict[str, int]
+
+
+def by_environment(reports: Sequence[Report]) -> dict[str, EnvironmentRecord]:
+    """Count by environment in how many of its slices each word was measured, and each of the paper's."""
+    found: dict[str, EnvironmentRecord] = {}
+    for report in reports:
+        entry = found.setdefault(report.env, {"slices": 0, "measured": {}, "paper": {}})
         entry["slices"] += 1
-        for word in record["verdict"]["words"]:
+        for word in report.words:
             entry["measured"][word] = entry["measured"].get(word, 0) + 1
-        for one in (record["paper"] or {"words": []})["words"]:
+        for one in report.paper["words"] if report.paper else []:
             entry["paper"][one["word"]] = entry["paper"].get(one["word"], 0) + one["measured"]
     return found
 
 
-def slices_table(records: Sequence[Record]) -> Table:
-    """Return a row for each slice, for a terminal."""
-    found = table(*HEADINGS, title="what landscapes are like")
-    for record in records:
-        found.add_row(*_row(record))
-    return found
+def slice_rows(reports: Sequence[Report]) -> list[tuple[str, ...]]:
+    """Return a row for each slice, under `HEADINGS`."""
+    return [_slice(report) for report in reports]
 
 
-def slices_markdown(records: Sequence[Record]) -> str:
+def slices_markdown(reports: Sequence[Report]) -> str:
     """Return a row for each slice, as Markdown."""
-    return _markdown(HEADINGS, map(_row, records))
+    return _markdown(HEADINGS, slice_rows(reports))
 
 
-def environments_table(records: Sequence[Record]) -> str:
+def environments_markdown(reports: Sequence[Report]) -> str:
     """Return a row for each environment, as Markdown: the least and the most of its slices, and the words.
 
     The small step is the smallest that sees a slope above the noise at half as many points as any step does.
     """
-    groups = groupby(records, key=lambda record: str(record["env"]))
+    groups = groupby(reports, key=lambda report: report.env)
     return _markdown(ENVIRONMENTS, (_environment(env, list(group)) for env, group in groups))
 
 
-def _environment(env: str, records: Sequence[Record]) -> tuple[str, ...]:
+def _environment(env: str, reports: Sequence[Report]) -> tuple[str, ...]:
     from ..landscapes.measures.classify import WORDS
 
-    words, count = by_environment(records)[env], len(records)
+    words, count = by_environment(reports)[env], len(reports)
     measured = [_of(word, words["measured"][word], count) for word in WORDS if word in words["measured"]]
-    samples = [(record["differences_of_samples"] or [None])[0] for record in records]
+    profiles = [report.profile for report in reports]
+    samples = [profile["differences_of_samples"][0] for profile in profiles if profile["differences_of_samples"]]
     return (
         f"`{env}`",
         str(count),
-        _span([record["losses"]["notable"] for record in records], "{:.0f}"),
-        _span([_value(record["losses"]["flat"], 100) for record in records], "{:.0f} %"),
-        _span([_value(record["jumps"]["share"], 100) for record in records], "{:.1f} %"),
-        _span([_value(_small(record["differences"])["cosine"]) for record in records], "{:z.2f}"),
-        _span([_value(row["cosine"]) for row in samples if row], "{:z.2f}"),
+        _span([profile["losses"]["notable"] for profile in profiles], "{:.0f}"),
+        _span([_value(profile["losses"]["flat"], 100) for profile in profiles], "{:.0f} %"),
+        _span([_value(profile["jumps"]["share"], 100) for profile in profiles], "{:.1f} %"),
+        _span([_value(_small(profile["differences"])["cosine"]) for profile in profiles], "{:z.2f}"),
+        _span([_value(row["cosine"]) for row in samples], "{:z.2f}"),
         ", ".join(measured),
         ", ".join(_of(word, hits, count) for word, hits in words["paper"].items()),
         _agreement(list(words["paper"].values()), count),
     )
 
 
-def _small(rows: Sequence[Record]) -> Record:
+def _small(rows: Sequence[ScaleRecord]) -> ScaleRecord:
     most = max(row["points"] for row in rows)
     return next(row for row in rows if row["points"] >= SEEN * most)
 
 
-def _value(estimate: Record | None, scale: float = 1.0) -> float | None:
+def _value(estimate: EstimateRecord | None, scale: float = 1.0) -> float | None:
     return None if estimate is None or estimate["value"] is None else scale * float(estimate["value"])
 
 
@@ -103,18 +109,17 @@ def _agreement(hits: Sequence[int], count: int) -> str:
     return "yes" if min(hits) == count else "in part" if max(hits) else "no"
 
 
-def _row(record: Record) -> tuple[str, ...]:
-    losses = record["losses"]
-    near = (record["differences_of_samples"] or [{"cosine": None}])[0]["cosine"]
-    words = (record["paper"] or {"words": []})["words"]
+def _slice(report: Report) -> tuple[str, ...]:
+    losses, samples = report.profile["losses"], report.profile["differences_of_samples"]
+    words = report.paper["words"] if report.paper else []
     hits = sum(one["measured"] for one in words)
     return (
-        record["name"],
+        report.name,
         str(losses["notable"]),
         _span([_value(losses["flat"], 100)], "{:.1f} %"),
-        _span([_value(record["jumps"]["share"], 100)], "{:.1f} %"),
-        _span([_value(near)], "{:z.2f}"),
-        ", ".join(record["verdict"]["words"]),
+        _span([_value(report.profile["jumps"]["share"], 100)], "{:.1f} %"),
+        _span([_value(samples[0]["cosine"]) if samples else None], "{:z.2f}"),
+        ", ".join(report.words),
         ", ".join(one["word"] for one in words),
         f"{hits} of {len(words)}" if words else "",
     )
