@@ -223,7 +223,8 @@ def _readable(folder: Path) -> Iterator[tuple[Path, Callable[[Path], Numbers]]]:
 
 
 def _store(path: Path) -> Numbers:
-    from gradscape.landscapes.storage.store import SliceStore, is_slice
+    from gradscape.landscapes.storage.paths import is_slice
+    from gradscape.landscapes.storage.store import SliceStore
     from gradscape.optim.run import Run
 
     dataset = SliceStore.open(path).dataset() if is_slice(path) else Run.open(path).table()

@@ -138,7 +138,8 @@ def _subjects(console: Console, what: str, root: Path, fidelity: str | None, dev
 
 
 def _finished(store: Path) -> bool:
-    from ..landscapes.storage.store import SliceStore, is_slice
+    from ..landscapes.storage.paths import is_slice
+    from ..landscapes.storage.store import SliceStore
 
     return is_slice(store) and not SliceStore.open(store).pending()
 

@@ -147,8 +147,8 @@ def _plane(
     resolution: int | None,
 ) -> Plane:
     """Return the plane of a new slice: parallel to the one there is, or the runs' principal one."""
+    from ..landscapes.identity import plane_of
     from ..landscapes.overlay import best_point, principal_plane
-    from ..landscapes.storage.store import plane_of
 
     present = plane_of(dataset)
     shape = (resolution,) * present.rank if resolution else present.resolution

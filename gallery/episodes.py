@@ -63,9 +63,9 @@ class Episodes(Part):
 
     def make(self, console: Console) -> str:
         """Film every episode that is not there, and clear away those of other nodes."""
+        from ..landscapes.identity import plane_of
         from ..landscapes.storage.files import write_json
         from ..landscapes.storage.records import signed
-        from ..landscapes.storage.store import plane_of
 
         dataset, env = self._dataset, self._env(self.figure.fidelity)
         plane, kept = plane_of(dataset), self._kept()
@@ -121,8 +121,8 @@ class Episodes(Part):
 
 def nodes_shown(dataset: xr.Dataset, through: Float[Tensor, " dim"]) -> list[Node]:
     """Choose the nodes of least, median and largest loss, and the one nearest the point the slice goes through."""
+    from ..landscapes.identity import plane_of
     from ..landscapes.objective import Status
-    from ..landscapes.storage.store import plane_of
 
     loss, status = np.atleast_2d(dataset["loss"].to_numpy()), np.atleast_2d(dataset["status"].to_numpy())
     plane = plane_of(dataset)

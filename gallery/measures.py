@@ -33,7 +33,8 @@ class Reports(Part):
 
     def left(self) -> int:
         """Return 1 where there is no report of this slice."""
-        from ..landscapes.storage.store import is_slice, open_slice
+        from ..landscapes.storage.paths import is_slice
+        from ..landscapes.storage.store import open_slice
 
         kept, store = read_record(self.folder / REPORT), self.folder / SLICE
         if not isinstance(kept, dict) or read_record(self.folder / MEASURES) is None or not is_slice(store):

@@ -99,7 +99,8 @@ class Slice(Part):
         from ..jobs.slice import STORE
         from ..landscapes.storage.arrays import FILES
         from ..landscapes.storage.ownership import lost_root
-        from ..landscapes.storage.store import SliceStore, is_slice
+        from ..landscapes.storage.paths import is_slice
+        from ..landscapes.storage.store import SliceStore
 
         points, store = self.figure.resolution ** len(self.figure.dims), self.folder / STORE
         if not is_slice(store) and not lost_root(store, FILES):
@@ -126,7 +127,7 @@ class Slice(Part):
 
     def _open(self) -> SliceJob:
         from ..jobs.slice import STORE, SliceJob
-        from ..landscapes.storage.store import is_slice
+        from ..landscapes.storage.paths import is_slice
 
         env = self._env(self.figure.fidelity)
         plane = plane_of_figure(self.figure, env, self.figure.resolution)

@@ -21,6 +21,7 @@ from torch import Tensor
 from ..landscapes.adapters import within_box
 from ..landscapes.capacity import size
 from ..landscapes.cost import duration, seconds_per_episode
+from ..landscapes.identity import plane_of
 from ..landscapes.objective import Objective, Status
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.distribution import RemoteSite, Site, results, workers_of
@@ -29,7 +30,7 @@ from ..landscapes.sampling.memory import Halving
 from ..landscapes.storage.arrays import need_of
 from ..landscapes.storage.files import clear, tidy, write_json
 from ..landscapes.storage.paths import there
-from ..landscapes.storage.store import SliceStore, plane_of
+from ..landscapes.storage.store import SliceStore
 from ..landscapes.storage.tiles import Tile
 from .folder import ROOT, SLICE, SUMMARY, folder_named
 from .scene import provenance

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from .storage.arrays import parameters_of, plane_of
+from .identity import plane_of
+from .storage.arrays import parameters_of
 from .storage.files import replacing
 
 if TYPE_CHECKING:

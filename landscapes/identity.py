@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .. import __version__
+from .plain import plain_json
 from .plane import Plane
 from .space import ParameterSpace
 
@@ -29,8 +30,20 @@ class StoreMismatchError(StoreError):
     """Say that a store was made by other settings."""
 
 
+class DamagedError(StoreError):
+    """Say which file is not what was written."""
+
+    @classmethod
+    def of(cls, path: Path, why: str, todo: str) -> DamagedError:
+        """Return the one sentence of it: which file, why, and what to do."""
+        return cls(f"{path} is damaged ({why}); {todo}")
+
+
 def full_identity(identity: Mapping[str, Any], plane: Plane, space: ParameterSpace, *, grad: bool) -> dict[str, Any]:
-    """Add to a caller's settings what the slice itself decides, as plain JSON."""
+    """Add to a caller's settings what the slice itself decides, as plain JSON.
+
+    Raises ValueError where the settings hold a name of the slice's own, or are not plain JSON.
+    """
     own = {"plane": plane.record(), "parameters": space.names, "gradients": grad, "gradscape": __version__}
     if clash := own.keys() & identity.keys():
         raise ValueError(f"a slice's identity gets {', '.join(sorted(clash))} from the slice; leave them out")
@@ -38,13 +51,24 @@ def full_identity(identity: Mapping[str, Any], plane: Plane, space: ParameterSpa
 
 
 def stored_identity(dataset: xr.Dataset) -> dict[str, Any]:
-    """Return what decides the numbers of a slice or a run: objective, options, fidelity, device and so on."""
+    """Return what decides the numbers of a slice or a run: objective, options, fidelity, device and so on.
+
+    Raises ValueError where the dataset is neither.
+    """
     return _decoded(dataset, "identity")
 
 
 def stored_provenance(dataset: xr.Dataset) -> dict[str, Any]:
-    """Return what else is known of how a slice or a run was made: command, date, versions, the loss's unit."""
+    """Return what else is known of how a slice or a run was made: command, date, versions, the loss's unit.
+
+    Raises ValueError where the dataset is neither.
+    """
     return _decoded(dataset, "provenance")
+
+
+def plane_of(dataset: xr.Dataset) -> Plane:
+    """Return the plane that a slice was sampled on; raises ValueError where the dataset is no slice."""
+    return Plane.from_record(stored_identity(dataset)["plane"])
 
 
 def _decoded(dataset: xr.Dataset, name: str) -> dict[str, Any]:
@@ -55,15 +79,6 @@ def _decoded(dataset: xr.Dataset, name: str) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise ValueError(f"no slice or run of gradscape: the dataset's attribute {name} is missing or no JSON object")
     return found
-
-
-def plain_json(settings: Mapping[str, Any], what: str) -> dict[str, Any]:
-    """Return settings as they come back from JSON: tuples are lists, keys are strings."""
-    try:
-        plain: dict[str, Any] = json.loads(json.dumps(settings, allow_nan=False))
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{what} must be plain JSON (numbers, strings, lists, dicts): {error}") from None
-    return plain
 
 
 def check_identity(

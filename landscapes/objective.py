@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Protocol, runtime_checkable
@@ -64,6 +65,25 @@ class Evaluation:
         loss = loss.masked_fill(blank, torch.nan)
         grad = None if grad is None else grad.masked_fill(blank[:, None], torch.nan)
         return cls(loss, grad, status)
+
+    @classmethod
+    def join(cls, parts: Iterable[Evaluation], *, dim: int, grad: bool) -> Evaluation:
+        """Return the evaluation of several batches, one after the other; of none, that of no points at all.
+
+        Gradients are left out unless `grad` asks for them. Raises ValueError where a part has none of those asked for.
+        """
+        parts = list(parts)
+        if not parts:
+            return cls.empty(dim, grad=grad)
+        slopes = [part.grad for part in parts if part.grad is not None] if grad else []
+        if grad and len(slopes) < len(parts):
+            raise ValueError(f"{len(parts) - len(slopes)} of {len(parts)} evaluations to join have no gradients")
+        loss, status = torch.cat([part.loss for part in parts]), torch.cat([part.status for part in parts])
+        return cls(loss, torch.cat(slopes) if grad else None, status)
+
+    def rows(self, rows: slice | Int[Tensor, " some"]) -> Evaluation:
+        """Return the evaluation of some of the points."""
+        return Evaluation(self.loss[rows], None if self.grad is None else self.grad[rows], self.status[rows])
 
     @classmethod
     def empty(cls, dim: int, *, grad: bool) -> Evaluation:

@@ -13,8 +13,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from .identity import plane_of
 from .plane import Plane
-from .storage.store import plane_of
 
 RECENT = 64  # how many evaluations ago an iterate's predecessor is looked for
 PARALLEL = 1e-12  # most by which the cosine between a step and the negative gradient may differ from 1

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from .storage.store import plane_of
+from .identity import plane_of
 
 
 def smoothed(dataset: xr.Dataset, width: float) -> xr.Dataset:

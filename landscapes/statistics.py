@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from .plain import finite
+
 Values = NDArray[np.float64]
 LEVEL = 0.95
 BLOCKS = {1: (16,), 2: (4, 4)}  # parts of a line, or of a plane, that are left out one at a time
@@ -25,12 +27,7 @@ class Estimate:
 
     def record(self) -> dict[str, float | None]:
         """Return it as plain JSON."""
-        return {name: plain(getattr(self, name)) for name in ("value", "low", "high")}
-
-
-def plain(value: float) -> float | None:
-    """Return a number as JSON has it: None where it is not finite."""
-    return float(value) if math.isfinite(value) else None
+        return {name: finite(getattr(self, name)) for name in ("value", "low", "high")}
 
 
 def jackknife(

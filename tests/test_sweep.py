@@ -15,10 +15,9 @@ import xarray as xr
 
 import gradscape
 from gradscape.cli import main
-from gradscape.landscapes.identity import stored_identity
+from gradscape.landscapes.identity import plane_of, stored_identity
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.smoothing import smoothed
-from gradscape.landscapes.storage.store import plane_of
 
 from .command import Said
 from .processes import Instant, alone, landscape

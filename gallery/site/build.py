@@ -28,8 +28,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from ... import __version__
 from ...envs.registry import entries
 from ...jobs.slice import PICTURE, STORE
-from ...landscapes.identity import stored_identity, stored_provenance
-from ...landscapes.storage.arrays import parameters_of, plane_of
+from ...landscapes.identity import plane_of, stored_identity, stored_provenance
+from ...landscapes.storage.arrays import parameters_of
 from ...landscapes.storage.files import placing, resolved
 from ...landscapes.storage.ownership import check_ours
 from ...landscapes.storage.paths import is_slice

@@ -12,9 +12,9 @@ import torch
 import xarray as xr
 
 from ...jobs.slice import flat_points
+from ...landscapes.identity import plane_of
 from ...landscapes.objective import Status
 from ...landscapes.storage.records import maybe, number, read_json, reading, text, unsigned
-from ...landscapes.storage.store import plane_of
 
 EPISODES = "episodes.json"
 REMAKE = "delete it, and `landscape gallery compute --part {}` makes it anew"

@@ -74,8 +74,7 @@ class Subject:
 
     def rows(self, rows: Int[Tensor, " some"]) -> Evaluation:
         """Return the evaluation of some of the points."""
-        grad = None if self.first.grad is None else self.first.grad[rows]
-        return Evaluation(self.first.loss[rows], grad, self.first.status[rows])
+        return self.first.rows(rows)
 
     def apart(self, found: Evaluation, wanted: Evaluation) -> tuple[float, float]:
         """Return the largest differences between losses and between gradients, as shares."""

@@ -167,8 +167,7 @@ def _refuses_nan(subject: Subject, name: str) -> Finding:
     except ValueError:
         return verdict(name, True, "refused")
     others = subject.rows(torch.arange(1, len(x)))
-    rest = Evaluation(found.loss[1:], None if found.grad is None else found.grad[1:], found.status[1:])
-    clean = subject.same(rest, others)
+    clean = subject.same(found.rows(slice(1, None)), others)
     ok = int(found.status[0]) != Status.OK and clean
     why = "the other rows changed with it" if not clean else "a row of nan was given a loss and status OK"
     return verdict(name, ok, f"answered by status {Status(int(found.status[0])).name}", why)
@@ -187,7 +186,8 @@ def _deterministic(subject: Subject, name: str) -> Finding:
 def _alone(subject: Subject, name: str) -> Finding:
     """Evaluate the first row and the last by themselves."""
     rows = torch.tensor([0, len(subject.x) - 1])
-    return _compared(subject, name, _joined([subject.evaluate(subject.x[row][None]) for row in rows]), rows)
+    parts = [subject.evaluate(subject.x[row][None]) for row in rows]
+    return _compared(subject, name, Evaluation.join(parts, dim=subject.x.shape[1], grad=True), rows)
 
 
 def _permuted(subject: Subject, name: str) -> Finding:
@@ -201,11 +201,6 @@ def _compared(subject: Subject, name: str, found: Evaluation, rows: Tensor) -> F
     figure = "same bits" if max(apart) == 0 else f"loss {apart[0]:.1e} of its range, gradient {apart[1]:.1e} apart"
     why = f"at most {limits[0]:.0e} and {limits[1]:.0e} is wanted: a row depends on the rows it is evaluated with"
     return verdict(name, all(a <= limit for a, limit in zip(apart, limits, strict=True)), figure, why)
-
-
-def _joined(parts: Sequence[Evaluation]) -> Evaluation:
-    grads = [part.grad for part in parts if part.grad is not None]
-    return Evaluation(torch.cat([p.loss for p in parts]), torch.cat(grads), torch.cat([p.status for p in parts]))
 
 
 def _empty(subject: Subject, name: str) -> Finding:

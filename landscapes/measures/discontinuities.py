@@ -14,10 +14,11 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..identity import plane_of
 from ..objective import Objective, evaluated
+from ..plain import plain
 from ..plane import Plane
-from ..statistics import Estimate, plain, share
-from ..storage.store import plane_of
+from ..statistics import Estimate, share
 
 HALVINGS = 12  # a gap between samples is looked into down to 1/4096 of it
 PERSISTS = 3  # halvings over which a jump keeps more than half of its height, and a slope an eighth
@@ -68,7 +69,7 @@ class Jumps:
         return {
             "share": self.share.record(),
             "explained_by_events": self.explained.record() if self.explained else None,
-            **{name: plain(value) if isinstance(value, float) else value for name, value in numbers.items()},
+            **{name: plain(value) for name, value in numbers.items()},
             "found": [{"place": place, "height": height, "event": event} for place, height, event in rows],
         }
 

@@ -17,10 +17,11 @@ from jaxtyping import Float
 from scipy import stats
 from torch import Tensor
 
+from ..identity import plane_of
 from ..objective import Objective, evaluated
+from ..plain import finite
 from ..plane import Plane
-from ..statistics import Values, mean, plain, share
-from ..storage.store import plane_of
+from ..statistics import Values, mean, share
 from .ruggedness import box_slopes
 
 SCALES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
@@ -116,7 +117,7 @@ def scale_table(found: xr.Dataset) -> list[dict[str, Any]]:
                 "cosine": mean(cosine[seen], least=-1, most=1).record(),
                 "sign": mean(sign[seen], least=0, most=1).record(),
                 "uphill": share(int((cosine[seen] < 0).sum()), int(seen.sum())).record(),
-                "error": plain(float(np.median(error[seen]))) if seen.any() else None,
+                "error": finite(float(np.median(error[seen]))) if seen.any() else None,
             }
         )
     return rows
@@ -193,7 +194,7 @@ def width_table(found: xr.Dataset) -> list[dict[str, Any]]:
                 "of": len(known),
                 "biased": share(int(flags.sum()), int(known.sum())).record(),
                 "disagreement": mean(disagreement(found).sel(width=width).to_numpy()[known], least=0, most=1).record(),
-                "variance_ratio": plain(float(np.nanmedian(ratio))) if np.isfinite(ratio).any() else None,
+                "variance_ratio": finite(float(np.nanmedian(ratio))) if np.isfinite(ratio).any() else None,
             }
         )
     return rows

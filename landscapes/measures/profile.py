@@ -13,9 +13,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..capacity import Need
+from ..identity import plane_of
 from ..objective import Evaluation, Objective, evaluated, in_box, name_of
-from ..statistics import plain
-from ..storage.store import plane_of
+from ..plain import finite
 from . import classify as verdict
 from . import gradient_quality as gradients
 from .classify import Verdict, judge
@@ -50,7 +50,7 @@ class Character:
         """Return it as plain JSON."""
         return {
             "losses": self.losses.record(),
-            "noise": {name: plain(value) for name, value in vars(self.noise).items()},
+            "noise": {name: finite(value) for name, value in vars(self.noise).items()},
             "jumps": self.jumps.record(),
             "differences": gradients.scale_table(self.steps),
             "differences_of_samples": gradients.scale_table(self.samples),

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.spatial.distance import pdist
 
-from ..statistics import Estimate, Values, jackknife, plain
-from ..storage.store import plane_of
+from ..identity import plane_of
+from ..plain import plain
+from ..statistics import Estimate, Values, jackknife
 
 FLAT = 1e-3  # a slope is effectively zero that would change the loss by less, as a fraction of its range, over the box
 NOTABLE = 0.01  # the least depth of a notable minimum, as a fraction of the range
@@ -230,7 +231,7 @@ class Ruggedness:
 
     def record(self) -> dict[str, Any]:
         """Return it as plain JSON."""
-        return {name: _plain(value) for name, value in vars(self).items()}
+        return {name: plain(value) for name, value in vars(self).items()}
 
 
 def ruggedness(dataset: xr.Dataset, *, floor: float) -> Ruggedness:
@@ -333,11 +334,3 @@ def _entropy(counts: Values) -> float:
 def _sides(shape: tuple[int, ...]) -> NDArray[np.intp]:
     """Return how many steps between samples make each side of the box."""
     return np.array([max(points - 1, 1) for points in shape])
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Estimate):
-        return value.record()
-    if isinstance(value, tuple):
-        return [_plain(part) for part in value]
-    return plain(value) if isinstance(value, float) else value

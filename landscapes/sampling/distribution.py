@@ -24,7 +24,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..identity import StoreError, check_identity
-from ..objective import Evaluation, Objective, Status, name_of
+from ..objective import Objective, Status, name_of
 from ..storage.paths import place_of
 from ..storage.store import SliceStore
 from ..storage.tiles import Tile
@@ -73,11 +73,9 @@ class Site:
         notes = self.objective.take_notes()
         start = 0
         for tile, part in zip(tiles, parts, strict=True):
-            rows = slice(start, start := start + len(part))
-            gradient = None if evaluation.grad is None else evaluation.grad[rows]
-            status = evaluation.status[rows]
-            self.store.write(tile, Evaluation(evaluation.loss[rows], gradient, status))
-            yield Filled(tile, Counter(map(Status, status.tolist())), notes)
+            rows = evaluation.rows(slice(start, start := start + len(part)))
+            self.store.write(tile, rows)
+            yield Filled(tile, Counter(map(Status, rows.status.tolist())), notes)
             notes = ()
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -46,7 +46,7 @@ class Halving:
                 continue
             parts.append(part)
             start += len(rows)
-        return _joined(parts) if parts else Evaluation.empty(x.shape[1], grad=grad)
+        return Evaluation.join(parts, dim=x.shape[1], grad=grad)
 
     def take_notes(self) -> tuple[str, ...]:
         """Return what to warn of since this was called last."""
@@ -81,9 +81,3 @@ def _keep(rows: int) -> None:
 def ran_out(error: BaseException) -> bool:
     """Say whether an error is one of too little memory, of the host or of a GPU."""
     return isinstance(error, MemoryError | torch.OutOfMemoryError) or bool(SAID.search(str(error)))
-
-
-def _joined(parts: list[Evaluation]) -> Evaluation:
-    slopes = [part.grad for part in parts if part.grad is not None]
-    loss, status = (torch.cat([getattr(part, name) for part in parts]) for name in ("loss", "status"))
-    return Evaluation(loss, torch.cat(slopes) if slopes else None, status)

@@ -14,7 +14,6 @@ import zarr
 from numpy.typing import NDArray
 
 from ..capacity import BLOCK, Need, require
-from ..identity import stored_identity
 from ..objective import Status
 from ..plane import Plane
 from ..space import ParameterSpace
@@ -121,11 +120,6 @@ def parameters_of(dataset: xr.Dataset) -> list[tuple[str, str]]:
     """Return the name and the unit of every parameter of a slice."""
     names, units = (map(str, dataset[name].to_numpy()) for name in ("dim", "unit"))
     return list(zip(names, units, strict=True))
-
-
-def plane_of(dataset: xr.Dataset) -> Plane:
-    """Return the plane that a slice was sampled on."""
-    return Plane.from_record(stored_identity(dataset)["plane"])
 
 
 def _axis(plane: Plane, number: int) -> dict[str, str]:

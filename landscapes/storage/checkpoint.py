@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..identity import check_identity, plain_json
+from ..identity import DamagedError, check_identity
+from ..plain import plain_json
 from .files import discard, replacing, visible, write_json
 from .ownership import check_ours, refuse_others
-from .records import DamagedError, read_json, reading, text
+from .records import read_json, reading, text
 
 SETTINGS, PIECES = "settings.json", "pieces"
 NAME = "piece"  # the array that says which one it is, so that two that were swapped are not taken for right

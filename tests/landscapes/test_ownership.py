@@ -83,7 +83,7 @@ def test_a_slice_without_its_root_can_be_begun_anew_as_its_refusal_says(
 ) -> None:
     root = made(tmp_path / "slice.zarr") / "zarr.json"
     root.unlink() if damage is None else root.write_text(damage)
-    with pytest.raises(StoreError, match=r"zarr\.json is damaged; restore it, or sample the slice anew"):
+    with pytest.raises(StoreError, match=r"zarr\.json is damaged .*; restore it, or sample the slice anew"):
         SliceStore.open(tmp_path / "slice.zarr")
     assert make(tmp_path / "slice.zarr", overwrite=True).pending()
 

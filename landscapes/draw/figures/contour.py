@@ -14,8 +14,8 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 from numpy.typing import NDArray
 
+from ...identity import plane_of
 from ...plane import Plane
-from ...storage.store import plane_of
 from .. import style
 from . import page, panel
 

@@ -15,10 +15,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
+from ...identity import plane_of
 from ...objective import Status
 from ...overlay import improvements
 from ...plane import Plane
-from ...storage.store import plane_of
 from .. import style
 from . import contour, labels, page, panel
 

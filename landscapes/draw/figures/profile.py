@@ -12,8 +12,8 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
 
+from ...identity import plane_of
 from ...plane import Plane
-from ...storage.store import plane_of
 from .. import style
 from . import page, panel, typesetting
 

@@ -15,9 +15,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
+from ...identity import plane_of
 from ...measures.gradient_quality import biased, disagreement, scale_table
 from ...measures.ruggedness import box_slopes
-from ...storage.store import plane_of
 from .. import style
 from . import contour, page, panel
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from ...storage.store import plane_of
+from ...identity import plane_of
 from .. import film, style
 from . import contour, page, panel, typesetting
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from ...storage.store import plane_of
+from ...identity import plane_of
 from .. import style
 from .page import Picture
 

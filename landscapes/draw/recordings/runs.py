@@ -15,10 +15,10 @@ import xarray as xr
 from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 
+from ...identity import plane_of
 from ...objective import Status
 from ...overlay import improvements
 from ...plane import Plane
-from ...storage.store import plane_of
 from .. import style
 from ..figures import contour, page
 from ..figures.overlay import by_kind, farthest, half_widths, joint_scale

@@ -17,9 +17,9 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from ...identity import plane_of
 from ...objective import Status
 from ...storage.files import replacing
-from ...storage.store import plane_of
 from .. import style
 from ..figures import page, panel
 from ..figures.overlay import by_kind, joint_scale
