@@ -20,7 +20,7 @@ from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.paths import filling
 from gradscape.landscapes.storage.store import SliceStore
 
-from ..processes import FORK
+from ...processes import FORK
 
 SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
 PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 16))

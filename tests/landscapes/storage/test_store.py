@@ -23,7 +23,7 @@ from gradscape.landscapes.storage.layout import consolidate
 from gradscape.landscapes.storage.paths import corner, filling
 from gradscape.landscapes.storage.store import SliceStore, open_slice
 
-from ..processes import Instant, alone
+from ...processes import Instant, alone
 
 SPACE = ParameterSpace(
     ("x", "y", "z"), -torch.ones(3).double(), torch.tensor([1.0, 2.0, 3.0]).double(), ("m", "m/s", "")

@@ -27,8 +27,8 @@ from gradscape.landscapes.sampling.memory import Halving
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.store import SliceStore
 
-from ..clock import Clock
-from ..processes import FORK
+from ...clock import Clock
+from ...processes import FORK
 
 cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers need not find the tests
 SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")

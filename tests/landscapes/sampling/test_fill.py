@@ -17,7 +17,7 @@ from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.store import SliceStore
 
-from ..processes import Instant, alone
+from ...processes import Instant, alone
 
 SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
 PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 16))

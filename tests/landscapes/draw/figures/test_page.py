@@ -33,12 +33,12 @@ from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.storage.files import print_width
 from gradscape.optim.registry import METHODS
 
+from ...measures.test_fidelity import REPORT
+from ...test_overlay import LAID, SLICE
+from .test_contour import BOUNCES, DATASET, LINE, Bowl, plane
 from .test_curve import table
-from .test_draw import BOUNCES, DATASET, LINE, Bowl, plane
-from .test_draw_race import race
-from .test_overlay import LAID, SLICE
+from .test_race import race
 from .test_sweep import SWEEP
-from .test_tradeoff import REPORT
 
 INCH, WIDTHS = 25.4, (85.0, 170.0)
 COMMAND = "landscape slice bowl --dims speed lift --resolution 16 --fidelity standard --through example:somewhere"

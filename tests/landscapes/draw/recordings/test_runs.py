@@ -23,7 +23,7 @@ from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
 
-from ..processes import alone
+from ....processes import alone
 
 SPACE = ParameterSpace.box(("a", "b", "c"), -1.0, 1.0, "m")
 

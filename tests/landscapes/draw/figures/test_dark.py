@@ -14,8 +14,8 @@ from gradscape.landscapes.draw.figures.contour import landscape_figure
 from gradscape.landscapes.draw.figures.dark import darken, save_dark, turned
 from gradscape.landscapes.draw.figures.overlay import overlay_figure
 
-from .test_draw import DATASET
-from .test_overlay import LAID, SLICE
+from ...test_overlay import LAID, SLICE
+from .test_contour import DATASET
 
 NIGHT, INK = (np.array(to_rgb(name)) for name in (style.NIGHT, style.NIGHT_INK))
 

@@ -22,7 +22,7 @@ from gradscape.landscapes.storage.files import discard, placing, replacing, tidy
 from gradscape.landscapes.storage.paths import filling
 from gradscape.landscapes.storage.store import SliceStore
 
-from ..processes import alone
+from ...processes import alone
 
 SPACE = ParameterSpace.box(("x", "y"), -1.0, 1.0)
 PLANE = Plane.through(SPACE, SPACE.center, ("x", "y"), resolution=9)
