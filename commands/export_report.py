@@ -34,13 +34,13 @@ def export(what: str, *, to: str, out: str | None, force: bool) -> None:
 
 def _read(path: Path) -> tuple[xr.Dataset, Path]:
     """Return what is in a results folder or a store, and where the store is."""
-    from ..landscapes.storage.paths import finished, is_slice
+    from ..landscapes.storage.paths import finished_path, is_slice
     from ..landscapes.storage.store import open_slice
     from ..optim.run import is_run, open_run
 
     slice_, run = inside(path, SLICE), inside(path, RUN)
     if is_slice(slice_) or slice_ != path:  # one that is damaged is refused by what opens it
-        return open_slice(slice_), finished(slice_)
+        return open_slice(slice_), finished_path(slice_)
     if is_run(run) or run != path:
         return open_run(run), run
     raise ValueError(f"{path} is no slice and no run; give the folder that `landscape slice` or `optimize` left")

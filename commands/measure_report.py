@@ -36,7 +36,7 @@ from ..landscapes.capacity import Need, require, size
 from ..landscapes.cost import duration
 from ..landscapes.identity import stored_identity
 from ..landscapes.storage.disk import full, is_full
-from ..landscapes.storage.files import others, replacing, tidy, write_json
+from ..landscapes.storage.files import other_files, replacing, tidy, write_json
 from ..landscapes.storage.records import write_record
 from .console import fill
 from .measure_tables import by_environment, slices_markdown, slices_table
@@ -367,12 +367,12 @@ def _print(console: Console, subject: Subject, folder: Path, prints: Sequence[fl
 
     from ..landscapes.draw.figures.page import save_prints
     from ..landscapes.draw.figures.quality import quality_figure
-    from ..landscapes.measures.gradient_quality import of_samples
+    from ..landscapes.measures.gradient_quality import compare_samples
     from ..landscapes.storage.bundle import open_bundle
     from ..landscapes.storage.store import open_slice
 
     dataset, kept = open_slice(subject.store), open_bundle(folder / ARRAYS)
-    samples = of_samples(dataset, deviation=float(np.nan_to_num(kept["noise"]["deviation"])))
+    samples = compare_samples(dataset, deviation=float(np.nan_to_num(kept["noise"]["deviation"])))
     draw = partial(quality_figure, dataset, kept["steps"], samples, kept["smooth"])
     printed = save_prints(lambda width: draw(width=width), folder / PICTURE, prints)
     console.print(f"{folder}: {', '.join(printed)}", markup=False)
@@ -395,7 +395,7 @@ def _check(folder: Path, single: bool) -> None:
     ours = {REPORT, MEASURES, PICTURE, ARRAYS} if single else {REPORT, TABLE}
     if not single:
         check_summary(folder)
-    if any(single or not (file / PICTURE).exists() for file in others(folder, ours, PICTURE)):
+    if any(single or not (file / PICTURE).exists() for file in other_files(folder, ours, PICTURE)):
         raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
 
 

@@ -20,8 +20,8 @@ from ..jobs.folder import run_tables
 from ..jobs.folder import store_in as inside
 from ..jobs.scene import environment_of
 from ..landscapes.identity import stored_identity
-from ..landscapes.storage.files import others, resolved, tidy
-from ..landscapes.storage.paths import there
+from ..landscapes.storage.files import other_files, resolve, tidy
+from ..landscapes.storage.paths import slice_exists
 from .console import fill
 from .terminal import Console
 
@@ -101,7 +101,7 @@ def view(file: str, *, serve: bool) -> None:
     import typer
 
     console.print(f"opening {path}", markup=False)
-    if typer.launch(str(resolved(path))):
+    if typer.launch(str(resolve(path))):
         raise OSError(f"no program of this system opens {path}; open it with one of your own")
 
 
@@ -132,7 +132,7 @@ def _folder(out: str | None, dataset: xr.Dataset, tables: Sequence[xr.Dataset], 
         digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:6]
         return Path("out") / f"overlay-{ours['objective']}-{digest}"
     folder = Path(out)
-    if any(not there(file / SLICE) for file in others(folder, (PICTURE, STREAM), PICTURE)):
+    if any(not slice_exists(file / SLICE) for file in other_files(folder, (PICTURE, STREAM), PICTURE)):
         raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
     return folder
 
@@ -160,7 +160,7 @@ def _plane(
     if principal:
         return principal_plane(tables, resolution=shape, through=point)
     assert point is not None  # as --through is given where --plane is not
-    return replace(present.moved(point), resolution=shape)
+    return replace(present.shift_to(point), resolution=shape)
 
 
 def _write(dataset: xr.Dataset, placed: Sequence[xr.Dataset], folder: Path, prints: Sequence[float]) -> list[str]:
@@ -206,14 +206,14 @@ def _shown(path: Path, *, serve: bool) -> Path:
 
 
 def _show(console: Console, path: Path, *, serve: bool) -> None:
-    from ..landscapes.draw.recordings.viewer import open_viewer, served
+    from ..landscapes.draw.recordings.viewer import open_viewer, serve_recording
 
     if not serve:
         _need_display(path, f"look at it in a browser: landscape view {shlex.quote(str(path))} --serve")
         console.print(f"opening {path} in rerun's viewer", markup=False)
         open_viewer(path)
         return
-    with served(path) as address:
+    with serve_recording(path) as address:
         try:
             console.print(f"{path} is at {address} until Ctrl-C", markup=False)
             while True:

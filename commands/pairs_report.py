@@ -51,7 +51,7 @@ def pairs(
     if env.space.dim < 2:
         raise ValueError(f"{name} has one parameter; a pair takes two")
     from ..landscapes.measures.sensitivity import Design, default_samples, explore
-    from ..landscapes.storage.checkpoint import Pieces
+    from ..landscapes.storage.checkpoint import Checkpoint
     from ..landscapes.storage.disk import until_full
     from ..landscapes.storage.files import tidy, write_json
 
@@ -60,7 +60,7 @@ def pairs(
     design = Design.sobol(env.space, samples, seed=seed)
     identity = {**env.identity(), "samples": samples, "seed": seed}
     folder = Path(out) if out else Path("out") / _folder(identity)
-    pieces = Pieces.open(folder, identity, what="pairs", force=force)
+    pieces = Checkpoint.open(folder, identity, what="pairs", force=force)
     command = shlex.join(["landscape", *sys.argv[1:]])
 
     def kept() -> str:

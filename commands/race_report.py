@@ -19,7 +19,7 @@ from ..jobs import workers as cluster
 from ..jobs.scene import provenance as provenance_of
 from ..landscapes.cost import duration
 from ..landscapes.storage.disk import until_full
-from ..landscapes.storage.files import clear, tidy, visible, write_json
+from ..landscapes.storage.files import clear, tidy, visible_files, write_json
 from ..optim.registry import METHODS
 from .arguments import read_settings
 from .race_tables import seeds_said, show
@@ -150,7 +150,9 @@ class Job:
     ) -> Job:
         """Go on with the race in its folder, or begin it there; seeds go by turns, so that methods stay level."""
         folder, command = Path(out) if out else _folder(env, options), shlex.join(["landscape", *sys.argv[1:]])
-        if any(not file.is_dir() or visible(file) for file in visible(folder)) and not any(folder.glob(f"*-*/{STORE}")):
+        if any(not file.is_dir() or visible_files(file) for file in visible_files(folder)) and not any(
+            folder.glob(f"*-*/{STORE}")
+        ):
             raise ValueError(f"{folder} holds other files and no race; give --out a new or an empty folder")
         _require(env, methods, options, seeds=seeds, budget=budget, folder=folder)
         makers = {

@@ -15,7 +15,7 @@ from .. import __version__
 from ..envs.registry import make
 from ..jobs.scene import point_of
 from ..jobs.scene import provenance as provenance_of
-from ..landscapes.storage.files import others, tidy, write_json
+from ..landscapes.storage.files import other_files, tidy, write_json
 from .arguments import read_settings
 from .terminal import Console
 
@@ -100,7 +100,7 @@ def _folder(out: str | None, env: Environment, x: Tensor) -> Path:
         settings = json.dumps([env.identity(), x.tolist()], sort_keys=True)
         return Path("out") / f"replay-{env.name}-{hashlib.sha256(settings.encode()).hexdigest()[:6]}"
     folder = Path(out)
-    if others(folder, (SHEET, STREAM, FILM, LOOP, RECORD), SHEET):
+    if other_files(folder, (SHEET, STREAM, FILM, LOOP, RECORD), SHEET):
         raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
     return folder
 

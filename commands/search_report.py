@@ -18,7 +18,7 @@ from ..envs.registry import make
 from ..jobs.scene import provenance as provenance_of
 from ..landscapes.cost import duration
 from ..landscapes.storage.disk import until_full
-from ..landscapes.storage.files import clear, tidy, visible, write_json
+from ..landscapes.storage.files import clear, tidy, visible_files, write_json
 from ..optim.registry import METHODS, code_digest, optimizer_class
 from .arguments import read_settings
 from .console import chosen_fidelity
@@ -159,7 +159,7 @@ class Job:
         require_runs(env.space.dim, budget, 1, folder)
         require_method(optimizer.name, optimizer.options, Search(env.space.dim, env.decisions, budget))
         path = folder / STORE
-        if not path.exists() and visible(folder):
+        if not path.exists() and visible_files(folder):
             raise ValueError(f"{folder} holds other files and no run; give --out a new or an empty folder")
         wanted: dict[str, Any] = {"identity": identity, "provenance": provenance_of(env, command), "budget": budget}
         if force and path.exists():

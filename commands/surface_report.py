@@ -10,7 +10,7 @@ from pathlib import Path
 from ..jobs.folder import SLICE_STORE as SLICE
 from ..jobs.folder import run_tables
 from ..jobs.folder import store_in as inside
-from ..landscapes.storage.files import others, tidy
+from ..landscapes.storage.files import other_files, tidy
 from .terminal import Console
 
 PICTURE, MODEL = "surface.png", "surface.gltf"
@@ -50,6 +50,6 @@ def _folder(out: str | None, content: list[object], objective: str) -> Path:
         digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:6]
         return Path("out") / f"surface-{objective}-{digest}"
     folder = Path(out)
-    if others(folder, (PICTURE, MODEL), PICTURE):
+    if other_files(folder, (PICTURE, MODEL), PICTURE):
         raise ValueError(f"{folder} holds other files; give --out a new or an empty folder")
     return folder

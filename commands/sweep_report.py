@@ -24,8 +24,8 @@ from ..jobs.workers import recipe, workers
 from ..landscapes.capacity import size
 from ..landscapes.cost import duration
 from ..landscapes.storage.disk import until_full
-from ..landscapes.storage.files import discard, tidy, visible, write_json
-from ..landscapes.storage.paths import check_replaceable, filling
+from ..landscapes.storage.files import discard, tidy, visible_files, write_json
+from ..landscapes.storage.paths import check_replaceable, filling_path
 from .arguments import read_extent, read_settings
 from .terminal import Console, Described
 
@@ -256,16 +256,16 @@ def sweep_folder(env: Environment, moved: Moved, over: str, *, grad: bool = True
 
 def _check(folder: Path) -> None:
     """Refuse a folder that holds anything but a sweep."""
-    slices = {FRAMES, ONLY, filling(Path(ONLY)).name}
-    present = {file.name for file in visible(folder)}
-    strange = [file for file in visible(folder / FRAMES) if not FRAME.fullmatch(file.name)]
+    slices = {FRAMES, ONLY, filling_path(Path(ONLY)).name}
+    present = {file.name for file in visible_files(folder)}
+    strange = [file for file in visible_files(folder / FRAMES) if not FRAME.fullmatch(file.name)]
     if strange or present - slices - {FILM, GIF, STREAM, SUMMARY} or (present and not present & slices):
         raise ValueError(f"{folder} holds other files and no sweep; give --out a new or an empty folder")
 
 
 def _clear(folder: Path) -> None:
     """Remove the slices of a sweep, and what was made of them."""
-    places = [*visible(folder / FRAMES), folder / ONLY, filling(folder / ONLY)]
+    places = [*visible_files(folder / FRAMES), folder / ONLY, filling_path(folder / ONLY)]
     stores = [store for store in places if store.exists()]
     for store in stores:
         check_replaceable(store)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ..envs.base import Environment
     from ..jobs.variants import Rung
     from ..landscapes.measures.fidelity import Sample
-    from ..landscapes.storage.checkpoint import Pieces
+    from ..landscapes.storage.checkpoint import Checkpoint
 
 COPIES = 50  # of the points: a loss and a gradient there by every rung
 RECORD, PICTURE = "tradeoff.json", "tradeoff.png"
@@ -86,7 +86,7 @@ class Study:
     rungs: list[Rung]
     x: Tensor
     seed: int
-    pieces: Pieces
+    pieces: Checkpoint
     refused: dict[str, str]
     command: str
 
@@ -97,14 +97,14 @@ class Study:
         """Go on with the study in its folder, or begin it there."""
         from ..jobs.variants import LADDERS, rungs
         from ..landscapes.measures.fidelity import sobol_points
-        from ..landscapes.storage.checkpoint import Pieces
+        from ..landscapes.storage.checkpoint import Checkpoint
 
         chosen = [part for text in ladders for part in text.split(",") if part] or list(LADDERS)
         found = rungs(env, chosen)
         identity = {**env.identity(), "points": points, "seed": seed}
         digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:6]
         folder = Path(out) if out else Path("out") / f"tradeoff-{env.name}-{points}-{digest}"
-        pieces = Pieces.open(folder, identity, what="tradeoff", force=force)
+        pieces = Checkpoint.open(folder, identity, what="tradeoff", force=force)
         x = sobol_points(env.space, points, seed=seed)
         command = shlex.join(["landscape", *sys.argv[1:]])
         return cls(env, found, x, seed, pieces, {}, command)
@@ -214,9 +214,9 @@ class Study:
         seem slow.
         """
         from ..landscapes.measures.fidelity import measure
-        from ..landscapes.sampling.memory import collect
+        from ..landscapes.sampling.memory import free_memory
 
-        collect()
+        free_memory()
         for _, env in self._made([rung]):
             try:
                 return measure(env, self.x, follow=follow)

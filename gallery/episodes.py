@@ -65,7 +65,7 @@ class Episodes(Part):
         """Film every episode that is not there, and clear away those of other nodes."""
         from ..landscapes.identity import plane_of
         from ..landscapes.storage.files import write_json
-        from ..landscapes.storage.records import signed
+        from ..landscapes.storage.records import sign
 
         dataset, env = self._dataset, self._env(self.figure.fidelity)
         plane, kept = plane_of(dataset), self._kept()
@@ -73,12 +73,12 @@ class Episodes(Part):
             if node not in kept:
                 with console.status(f"{self.figure.id}: the episode of {node.why}"):
                     self._draw(env, plane, node)
-                write_json(self.folder / EPISODES, [signed(asdict(one)) for one in [*kept, node]])
+                write_json(self.folder / EPISODES, [sign(asdict(one)) for one in [*kept, node]])
                 kept.append(node)
         for file in self.folder.glob("episode-*"):
             if FILM.fullmatch(file.name) and file.stem not in {node.name for node in self._nodes}:
                 file.unlink()
-        write_json(self.folder / EPISODES, [signed(asdict(node)) for node in self._nodes])
+        write_json(self.folder / EPISODES, [sign(asdict(node)) for node in self._nodes])
         return f"{len(self._nodes)} episodes"
 
     def _draw(self, env: Environment, plane: Plane, node: Node) -> None:

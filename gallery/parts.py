@@ -274,10 +274,10 @@ def seconds_of_one(env: Environment) -> float:
 
 def read_record(path: Path) -> Any:
     """Return the record or the list of records that a JSON file holds, None if there is none that can be read."""
-    from ..landscapes.storage.records import unsigned
+    from ..landscapes.storage.records import verify
 
     try:
         found = json.loads(path.read_text())
-        return [unsigned(one) for one in found] if isinstance(found, list) else unsigned(found)
+        return [verify(one) for one in found] if isinstance(found, list) else verify(found)
     except (OSError, TypeError, ValueError):
         return None

@@ -23,19 +23,19 @@ def search_all(
     executor: Executor, env: Environment, entries: Sequence[Entry], *, budget: int, ratio: float | None
 ) -> Iterator[tuple[Entry, Progress]]:
     """Let workers fill runs, and yield each with how far it came as it ends."""
-    from ..landscapes.sampling.distribution import results
+    from ..landscapes.sampling.distribution import run_tasks
 
     there = cloudpickle.dumps(recipe(env))
     tasks = [(number, there, *_told(entry), budget, ratio) for number, entry in enumerate(entries)]
-    for number, now in results(executor, _search, tasks):
+    for number, now in run_tasks(executor, _search, tasks):
         yield entries[number], now
 
 
 def cost(executor: Executor, env: Environment, *, grad: bool) -> EpisodeCost:
     """Return what an episode takes a worker."""
-    from ..landscapes.sampling.distribution import results
+    from ..landscapes.sampling.distribution import run_tasks
 
-    (found,) = results(executor, _cost, [(cloudpickle.dumps(recipe(env)), grad)])
+    (found,) = run_tasks(executor, _cost, [(cloudpickle.dumps(recipe(env)), grad)])
     return found
 
 
@@ -48,12 +48,12 @@ def _told(entry: Entry) -> tuple[str, dict[str, Any]]:
 def _search(
     number: int, there: bytes, path: str, how: dict[str, Any], budget: int, ratio: float | None
 ) -> tuple[int, Progress]:
-    from ..landscapes.sampling.distribution import kept
+    from ..landscapes.sampling.distribution import make_objective
     from ..optim.run import Run
     from ..optim.search import search
 
     give_torch_one_thread()
-    env: Any = kept(there).objective
+    env: Any = make_objective(there).objective
     seen: list[Progress] = []
     optimizer = made(how["method"], env, seed=how["seed"], options=how["options"])
     search(env, optimizer, Run.open(path), budget=budget, gradient_cost=ratio, progress=seen.append)
@@ -62,6 +62,6 @@ def _search(
 
 def _cost(there: bytes, grad: bool) -> EpisodeCost:
     from ..landscapes.cost import episode_cost
-    from ..landscapes.sampling.distribution import kept
+    from ..landscapes.sampling.distribution import make_objective
 
-    return episode_cost(kept(there).objective, grad=grad)
+    return episode_cost(make_objective(there).objective, grad=grad)

@@ -203,7 +203,7 @@ def _read(name: str, path: Path) -> dict[str, Any]:
     """Return what `landscape tradeoff` left in a file, all that is needed of it at hand."""
     from ..envs.base import Fidelity
     from ..landscapes.measures.fidelity import p95
-    from ..landscapes.storage.records import maybe, number, read_json, reading, text
+    from ..landscapes.storage.records import number, optional, read_json, reading, text
 
     with reading(path, f"delete it, and `landscape tradeoff {name}` measures it anew"):
         report = read_json(path)
@@ -215,7 +215,7 @@ def _read(name: str, path: Path) -> dict[str, Any]:
             for said in (row["name"], row["engine"], row["device"]):
                 text(said)
             for found in (p95(row, relative=True), p95(row, relative=False), row["compared"]):
-                maybe(number, found)
+                optional(number, found)
             number(row["seconds"]["with_gradient"])
             dict(row["options"])
         dict(identity["options"])

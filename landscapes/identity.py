@@ -55,7 +55,7 @@ def stored_identity(dataset: xr.Dataset) -> dict[str, Any]:
 
     Raises ValueError where the dataset is neither.
     """
-    return _decoded(dataset, "identity")
+    return _decode(dataset, "identity")
 
 
 def stored_provenance(dataset: xr.Dataset) -> dict[str, Any]:
@@ -63,7 +63,7 @@ def stored_provenance(dataset: xr.Dataset) -> dict[str, Any]:
 
     Raises ValueError where the dataset is neither.
     """
-    return _decoded(dataset, "provenance")
+    return _decode(dataset, "provenance")
 
 
 def plane_of(dataset: xr.Dataset) -> Plane:
@@ -71,7 +71,7 @@ def plane_of(dataset: xr.Dataset) -> Plane:
     return Plane.from_record(stored_identity(dataset)["plane"])
 
 
-def _decoded(dataset: xr.Dataset, name: str) -> dict[str, Any]:
+def _decode(dataset: xr.Dataset, name: str) -> dict[str, Any]:
     try:
         found = json.loads(dataset.attrs[name])
     except (KeyError, TypeError, ValueError):
@@ -89,7 +89,7 @@ def check_identity(
         return
     ours, theirs = dict(_leaves(wanted)), dict(_leaves(found))
     names = [name for name in ours | theirs if ours.get(name) != theirs.get(name)]
-    said = [f"{name}: wanted {_shown(ours, name)}, found {_shown(theirs, name)}" for name in names[:SHOWN]]
+    said = [f"{name}: wanted {_show(ours, name)}, found {_show(theirs, name)}" for name in names[:SHOWN]]
     if len(names) > SHOWN:
         said.append(f"and {len(names) - SHOWN} more")
     raise StoreMismatchError(
@@ -109,5 +109,5 @@ def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
         yield name, value
 
 
-def _shown(settings: Mapping[str, Any], name: str) -> str:
+def _show(settings: Mapping[str, Any], name: str) -> str:
     return repr(settings[name]) if name in settings else "none"

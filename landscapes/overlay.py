@@ -41,13 +41,13 @@ def lay(dataset: xr.Dataset, table: xr.Dataset, label: str) -> xr.Dataset:
     parameters = [str(name) for name in dataset["dim"].to_numpy()]
     if parameters != [str(name) for name in table["dim"].to_numpy()]:
         raise ValueError(
-            f"{label} searched {table.sizes['dim']} parameters ({_shown(table)}), "
-            f"the slice has {len(parameters)} ({_shown(dataset)}); lay runs over slices of the same environment"
+            f"{label} searched {table.sizes['dim']} parameters ({_list_parameters(table)}), the slice has "
+            f"{len(parameters)} ({_list_parameters(dataset)}); lay runs over slices of the same environment"
         )
     half, x = _box(table)[1], _points(table)
     scaled = replace(plane, origin=plane.origin / half, basis=plane.basis / half)
     place = scaled.project(x / half)
-    low, high = plane.window()
+    low, high = plane.cell_bounds()
     outside = ((place < low) | (place > high)).any(dim=1).numpy()
     axes = dict(zip(("u", "v"), place.numpy().T, strict=False))
     columns = {
@@ -90,7 +90,7 @@ def principal_plane(
     scaled = torch.cat([(_points(table) - center) / half for table in tables])
     flat = Plane.principal(scaled, resolution=resolution)
     if through is not None:
-        flat = flat.moved((through - center) / half)
+        flat = flat.shift_to((through - center) / half)
     return replace(flat, origin=center + half * flat.origin, basis=half * flat.basis)
 
 
@@ -114,13 +114,13 @@ def _previous(table: xr.Dataset) -> NDArray[np.intp]:
     for row in np.flatnonzero(np.isfinite(slope).all(axis=1) | np.isnan(table["loss"].to_numpy())):
         first = max(0, int(row) - RECENT)
         earlier = first + np.flatnonzero(free[first:row])
-        if len(earlier) and (near := _aligned(z[row] - z[earlier], slope[earlier], np.abs(z[row]) < 1 - 1e-9)).any():
+        if len(earlier) and (near := _is_aligned(z[row] - z[earlier], slope[earlier], np.abs(z[row]) < 1 - 1e-9)).any():
             found[row] = earlier[near][np.argmin(np.linalg.norm(z[row] - z[earlier[near]], axis=1))]
             free[found[row]] = False
     return found
 
 
-def _aligned(step: NDArray[np.float64], slope: NDArray[np.float64], inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _is_aligned(step: NDArray[np.float64], slope: NDArray[np.float64], inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
     step, slope = step[:, inside], slope[:, inside]
     with np.errstate(divide="ignore", invalid="ignore"):
         cosine = (step * slope).sum(axis=1) / np.linalg.norm(step, axis=1) / np.linalg.norm(slope, axis=1)
@@ -148,6 +148,6 @@ def _points(table: xr.Dataset) -> Float[Tensor, "evaluation dim"]:
     return torch.from_numpy(table["x"].to_numpy().copy())
 
 
-def _shown(dataset: xr.Dataset) -> str:
+def _list_parameters(dataset: xr.Dataset) -> str:
     names = [str(name) for name in dataset["dim"].to_numpy()]
     return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")

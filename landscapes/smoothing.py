@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from .identity import plane_of
 
 
-def smoothed(dataset: xr.Dataset, width: float) -> xr.Dataset:
+def smooth(dataset: xr.Dataset, width: float) -> xr.Dataset:
     """Average a slice's losses by a Gaussian of standard deviation `width`, a fraction of each side of its box.
 
     Only samples that are there count: weights beyond the box and on failed samples are left out and the others scaled

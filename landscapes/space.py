@@ -95,8 +95,8 @@ class ParameterSpace:
 
     def uniform(self, count: int, *, seed: int) -> Float[Tensor, "count dim"]:
         """Draw points uniformly from the box; the same seed gives the same points."""
-        generator = torch.Generator().manual_seed(whole(seed, "a seed"))
-        count = whole(count, "a count of points")
+        generator = torch.Generator().manual_seed(as_whole(seed, "a seed"))
+        count = as_whole(count, "a count of points")
         return self.from_unit(torch.rand(count, self.dim, generator=generator, dtype=torch.float64))
 
     def index(self, parameter: str | int) -> int:
@@ -112,7 +112,7 @@ class ParameterSpace:
         return number
 
 
-def whole(value: object, what: str, *, least: int = 0) -> int:
+def as_whole(value: object, what: str, *, least: int = 0) -> int:
     """Return a whole number of 64 bits that is not below `least`; raises ValueError, which says `what` it is, else."""
     try:
         number = least - 1 if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type] # as it tells

@@ -13,7 +13,7 @@ from scipy import stats
 from .plain import finite
 
 Values = NDArray[np.float64]
-LEVEL = 0.95
+CONFIDENCE = 0.95
 BLOCKS = {1: (16,), 2: (4, 4)}  # parts of a line, or of a plane, that are left out one at a time
 
 
@@ -49,7 +49,7 @@ def jackknife(
     if len(known) < 2 or not math.isfinite(value):
         return Estimate(value, math.nan, math.nan)
     deviation = math.sqrt((len(known) - 1) * float(np.mean((known - known.mean()) ** 2)))
-    reach = deviation * float(stats.t.ppf((1 + LEVEL) / 2, len(known) - 1))
+    reach = deviation * float(stats.t.ppf((1 + CONFIDENCE) / 2, len(known) - 1))
     return Estimate(value, max(least, value - reach), min(most, value + reach))
 
 
@@ -57,7 +57,7 @@ def share(hits: int, tries: int) -> Estimate:
     """Return a share with its exact binomial interval (Clopper & Pearson 1934)."""
     if not tries:
         return Estimate(math.nan, math.nan, math.nan)
-    interval = stats.binomtest(hits, tries).proportion_ci(LEVEL)
+    interval = stats.binomtest(hits, tries).proportion_ci(CONFIDENCE)
     return Estimate(hits / tries, float(interval.low), float(interval.high))
 
 
@@ -69,5 +69,5 @@ def mean(values: Values, *, least: float = -np.inf, most: float = np.inf) -> Est
     value = float(known.mean())
     if len(known) == 1:
         return Estimate(value, math.nan, math.nan)
-    reach = float(stats.sem(known) * stats.t.ppf((1 + LEVEL) / 2, len(known) - 1))
+    reach = float(stats.sem(known) * stats.t.ppf((1 + CONFIDENCE) / 2, len(known) - 1))
     return Estimate(value, max(least, value - reach), min(most, value + reach))

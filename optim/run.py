@@ -33,7 +33,7 @@ from torch import Tensor
 from ..landscapes.identity import StoreError, StoreExistsError, check_identity
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
-from ..landscapes.storage.files import placing, resolved
+from ..landscapes.storage.files import placing, resolve
 from ..landscapes.storage.layout import FILL, consolidate, open_group
 from ..landscapes.storage.ownership import check_ours, clear_halves, lost_root
 from .base import Kind
@@ -81,7 +81,7 @@ class Run:
         overwrite: bool = False,
     ) -> Run:
         """Make an empty run at a path where there is none, all at once; `overwrite` replaces a run, nothing else."""
-        path = resolved(path)
+        path = resolve(path)
         attributes = attributes_of(space, identity, provenance or {}, budget)
         if path.exists() and not overwrite:
             raise StoreExistsError(f"{path} exists already; write elsewhere with --out, or replace it with --force")
@@ -99,7 +99,7 @@ class Run:
     @classmethod
     def open(cls, path: str | Path) -> Run:
         """Open a run that exists."""
-        path = resolved(path)
+        path = resolve(path)
         if not path.exists():
             raise StoreError(f"there is no run at {path}; make one with `landscape optimize`")
         if not is_run(path):

@@ -30,7 +30,7 @@ from ...envs.registry import entries
 from ...jobs.slice import PICTURE, STORE
 from ...landscapes.identity import plane_of, stored_identity, stored_provenance
 from ...landscapes.storage.arrays import parameters_of
-from ...landscapes.storage.files import placing, resolved
+from ...landscapes.storage.files import placing, resolve
 from ...landscapes.storage.ownership import check_ours
 from ...landscapes.storage.paths import is_slice
 from ...landscapes.storage.records import reading
@@ -55,7 +55,7 @@ def build_site(
     What is in `out` is replaced if a site built earlier is all that is there; anything else is refused. `follow`
     hears how many figures are drawn, before the first is.
     """
-    out = resolved(out)
+    out = resolve(out)
     _check(out)
     there = [figure for figure in figures if _sampled(data / figure.id / STORE)]
     if not there:

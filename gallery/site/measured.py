@@ -10,7 +10,7 @@ from typing import Any
 
 from ...landscapes.measures.classify import WORDS
 from ...landscapes.measures.fidelity import cheapest, front, p95
-from ...landscapes.storage.records import maybe, number, read_json, reading, text
+from ...landscapes.storage.records import number, optional, read_json, reading, text
 from .page_data import REMAKE
 
 Record = Mapping[str, Any]
@@ -107,7 +107,11 @@ def _tradeoff(record: Record, name: str) -> dict[str, Any]:
     best = {quicker[number]["name"] for number in front([_time(row) for row in quicker], errors)}
     return {
         **{name: text(record[name]) for name in ("env", "reference", "loss_unit", "command")},
-        **{"points": number(record["points"]), "spread": maybe(number, record["spread"]), "refused": record["refused"]},
+        **{
+            "points": number(record["points"]),
+            "spread": optional(number, record["spread"]),
+            "refused": record["refused"],
+        },
         "options": dict(record["identity"]["options"]),
         "device": text(record["identity"]["device"]),
         "picture": f"{TRADEOFF}/{name}.png",
@@ -122,10 +126,10 @@ def _rung(row: Record, record: Record, best: set[str]) -> dict[str, Any]:
     return {
         "name": text(row["name"]),
         "front": row["name"] in best,
-        "error": {end: maybe(number, error[end]) for end in ("value", "low", "high")},
-        "spearman": maybe(number, row["spearman"]["value"]),
-        "cosine": maybe(number, row["gradient"]["cosine"]["value"]),
-        "diverged": maybe(number, row["diverged"]),
+        "error": {end: optional(number, error[end]) for end in ("value", "low", "high")},
+        "spearman": optional(number, row["spearman"]["value"]),
+        "cosine": optional(number, row["gradient"]["cosine"]["value"]),
+        "diverged": optional(number, row["diverged"]),
         "seconds": {way: number(row["seconds"][way]) for way in ("forward", "with_gradient")},
         "memory": number(row["memory"]),
     }

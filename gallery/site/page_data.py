@@ -14,7 +14,7 @@ import xarray as xr
 from ...jobs.slice import flat_points
 from ...landscapes.identity import plane_of
 from ...landscapes.objective import Status
-from ...landscapes.storage.records import maybe, number, read_json, reading, text, unsigned
+from ...landscapes.storage.records import number, optional, read_json, reading, text, verify
 
 EPISODES = "episodes.json"
 REMAKE = "delete it, and `landscape gallery compute --part {}` makes it anew"
@@ -95,7 +95,7 @@ def read_episodes(folder: Path, dataset: xr.Dataset) -> list[dict[str, Any]]:
         plane = plane_of(dataset)
         axes = [axis.tolist() for axis in plane.axes()]
         found: dict[tuple[int, int], dict[str, Any]] = {}
-        for said in map(unsigned, json.loads(listed.read_text())):
+        for said in map(verify, json.loads(listed.read_text())):
             row, column = place = int(said["row"]), int(said["column"])
             if place in found:
                 found[place]["why"] += ", " + text(said["why"])
@@ -103,7 +103,7 @@ def read_episodes(folder: Path, dataset: xr.Dataset) -> list[dict[str, Any]]:
             files = {kind: f"episode-{row}-{column}.{kind}" for kind in ("mp4", "webp")}
             found[place] = {
                 **{"row": row, "column": column, "why": text(said["why"])},
-                **{"loss": maybe(number, said["loss"]), "status": Status[said["status"]].name},
+                **{"loss": optional(number, said["loss"]), "status": Status[said["status"]].name},
                 "at": {
                     label: axis[_counted(at)]
                     for label, axis, at in zip(plane.labels, axes, (column, row), strict=False)

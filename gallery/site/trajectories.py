@@ -29,11 +29,11 @@ def trajectories(dataset: xr.Dataset, tables: Sequence[xr.Dataset]) -> list[dict
     smaller, the farther off the slice), whether it is beyond the map and whether it failed. `path` holds the points
     that were the best so far.
     """
-    from ...landscapes.draw.figures.overlay import farthest
+    from ...landscapes.draw.figures.overlay import farthest_distance
 
     own = [table for table in tables if _same(stored_identity(table), stored_identity(dataset))]
     runs = [lay(dataset, table, f"{table.attrs['method']}, seed {table.attrs['seed']}") for table in own]
-    reach = farthest(runs)
+    reach = farthest_distance(runs)
     points = sum(run.sizes["evaluation"] for run in runs)
     top = float("inf") if "v" in dataset.dims else float(dataset["loss"].max())  # of what a line's map shows
     found = [_trajectory(run, reach, points, top) for run in runs]

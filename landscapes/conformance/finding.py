@@ -29,7 +29,7 @@ class Finding:
         """Whether this makes the whole fail."""
         return self.outcome in (FAIL, UNEXPECTED)
 
-    def against(self, expected: Mapping[str, str]) -> Finding:
+    def excuse(self, expected: Mapping[str, str]) -> Finding:
         """Return the finding judged by the failures that are `expected`, check -> reason."""
         if self.check not in expected or self.outcome == SKIP:
             return self

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.gradcheck import GradcheckError
 
-from ..objective import Objective, Status, evaluated
+from ..objective import Objective, Status, evaluate
 from .finding import SKIP, Finding, verdict
 from .subject import Subject, difference, size
 
@@ -27,7 +27,7 @@ Function = Callable[[Tensor], Tensor]
 Row = dict[str, float | None]
 
 
-def ladder(subject: Subject, name: str) -> Finding:
+def check_slopes(subject: Subject, name: str) -> Finding:
     """Hold slopes along random directions and axes against central differences, one row of the table for each step.
 
     What passes is the agreement at the best step: a median relative error of at most ten times the third root of the
@@ -87,7 +87,7 @@ def _step(subject: Subject, base: Tensor, direction: Tensor, exact: Tensor, step
     What the noise between repeats explains of a difference is no error.
     """
     ends = torch.cat([base + step * direction, base - step * direction])
-    loss = evaluated(subject.objective, subject.objective.space.from_unit(ends), grad=False).loss
+    loss = evaluate(subject.objective, subject.objective.space.from_unit(ends), grad=False).loss
     ahead, behind = loss.chunk(2)
     slope = (ahead - behind) / (2 * step)
     noise = subject.noise[0] * subject.scale / step
@@ -158,12 +158,12 @@ class _Bridge(torch.autograd.Function):
         ctx.objective = objective
         ctx.save_for_backward(x)
         with torch.enable_grad():  # torch switches it off around `forward` and `backward`
-            return evaluated(objective, x.detach(), grad=False).loss
+            return evaluate(objective, x.detach(), grad=False).loss
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_loss: Float[Tensor, " batch"]) -> tuple[Tensor, None]:
         (x,) = ctx.saved_tensors
         with torch.enable_grad():
-            grad = evaluated(ctx.objective, x.detach(), grad=True).grad
+            grad = evaluate(ctx.objective, x.detach(), grad=True).grad
         return grad_loss[:, None] * (x.new_zeros(x.shape) if grad is None else grad), None

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..identity import plane_of
-from ..objective import Objective, evaluated
+from ..objective import Objective, evaluate
 from ..plain import plain
 from ..plane import Plane
 from ..statistics import Estimate, share
@@ -89,10 +89,10 @@ def find_jumps(
     jump keeps its height, a slope loses half of it every time.
     """
     plane = plane_of(dataset)
-    ends, neighbours = _steep(dataset, plane, least)
+    ends, neighbours = _steep_pairs(dataset, plane, least)
     drawn = np.sort(np.random.default_rng(seed).permutation(len(ends))[:most])
     low, high = (torch.from_numpy(ends[drawn][:, side]) for side in (0, 1))
-    low, high, gaps = _bisected(objective, plane, low, high)
+    low, high, gaps = _bisect(objective, plane, low, high)
     decided = gaps.isfinite().all(dim=0)
     last, earlier = gaps[-1], gaps[-1 - PERSISTS]
     found = decided & (last >= least) & (last > earlier / 2)
@@ -103,7 +103,7 @@ def find_jumps(
     )  # fmt: skip
 
 
-def _steep(dataset: xr.Dataset, plane: Plane, least: float) -> tuple[NDArray[np.float64], int]:
+def _steep_pairs(dataset: xr.Dataset, plane: Plane, least: float) -> tuple[NDArray[np.float64], int]:
     """Return the ends of pairs that differ so much, shape (pairs, 2, rank), and how many pairs there are."""
     loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
     axes = [axis.numpy() for axis in plane.axes()]
@@ -118,13 +118,13 @@ def _steep(dataset: xr.Dataset, plane: Plane, least: float) -> tuple[NDArray[np.
     return np.concatenate(pairs), neighbours
 
 
-def _bisected(
+def _bisect(
     objective: Objective, plane: Plane, low: Float[Tensor, "pairs rank"], high: Float[Tensor, "pairs rank"]
 ) -> tuple[Tensor, Tensor, Float[Tensor, "halvings pairs"]]:
     """Halve every pair towards the larger difference; return its last ends and the difference after each halving."""
 
     def losses(u: Float[Tensor, "pairs rank"]) -> Float[Tensor, " pairs"]:
-        return evaluated(objective, plane.lift(u), grad=False).loss
+        return evaluate(objective, plane.lift(u), grad=False).loss
 
     below, above = losses(low), losses(high)  # anew: a slice may come from another device
     gaps = [(above - below).abs()]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.stats import linregress, rankdata
 from torch import Tensor
 
-from ..objective import Objective, Status, evaluated
+from ..objective import Objective, Status, evaluate
 from ..space import ParameterSpace
 
 TIMING = 4.0  # least seconds that repetitions of a quick batch take, each way
@@ -90,13 +90,13 @@ def measure(
     full = min(at_once, len(x))
     getattr(objective, "prepare", lambda: None)()
     began = time.perf_counter()
-    evaluated(objective, x[:1], grad=True)  # what is made at first use is made now, a batch's threads too if quick
+    evaluate(objective, x[:1], grad=True)  # what is made at first use is made now, a batch's threads too if quick
     if (time.perf_counter() - began) * full < TIMING:
-        evaluated(objective, x[:full], grad=True)
+        evaluate(objective, x[:full], grad=True)
     parts, seconds, done = [], [], 0
     for part in torch.split(x, at_once):
         began = time.perf_counter()
-        parts.append(evaluated(objective, part, grad=True))
+        parts.append(evaluate(objective, part, grad=True))
         seconds.append(time.perf_counter() - began)
         follow(done := done + len(part))
     batch = _filled(objective, x, full, at_once, seconds[0])

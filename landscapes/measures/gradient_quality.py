@@ -18,7 +18,7 @@ from scipy import stats
 from torch import Tensor
 
 from ..identity import plane_of
-from ..objective import Objective, evaluated
+from ..objective import Objective, evaluate
 from ..plain import finite
 from ..plane import Plane
 from ..statistics import Values, mean, share
@@ -38,7 +38,7 @@ def subgrid(plane: Plane, points: int) -> Float[Tensor, "count rank"]:
     return plane.lower + grid * (plane.upper - plane.lower)
 
 
-def ladder(
+def compare_differences(
     objective: Objective,
     plane: Plane,
     u: Float[Tensor, "count rank"],
@@ -51,32 +51,32 @@ def ladder(
     Returns `cosine`, `sign` and `error`, dims (scale, point), as in `agreement`, and `place`, dims (point, axis).
     """
     sides = plane.upper - plane.lower
-    exact = evaluated(objective, plane.lift(u), grad=True)
+    exact = evaluate(objective, plane.lift(u), grad=True)
     assert exact.grad is not None  # as it was asked for
     slope = plane.slope(exact.grad) * sides
     steps = torch.eye(plane.rank, dtype=torch.float64) * sides
     parts = []
     for scale in scales:
         ends = torch.stack([u[:, None] + way * scale / 2 * steps for way in (-1, 1)])
-        loss = evaluated(objective, plane.lift(ends.reshape(-1, plane.rank)), grad=False).loss
+        loss = evaluate(objective, plane.lift(ends.reshape(-1, plane.rank)), grad=False).loss
         below, above = loss.reshape(2, len(u), plane.rank)
         parts.append(agreement(slope.numpy(), ((above - below) / scale).numpy(), math.sqrt(2) * deviation / scale))
     found = {name: (("scale", "point"), np.stack([part[name] for part in parts])) for name in parts[0]}
     return xr.Dataset(found, {"scale": list(scales), "place": (("point", "axis"), u.numpy())})
 
 
-def of_samples(dataset: xr.Dataset, *, deviation: float = 0.0) -> xr.Dataset:
+def compare_samples(dataset: xr.Dataset, *, deviation: float = 0.0) -> xr.Dataset:
     """Hold a slice's gradients against differences of its own losses, over 2, 4 and 8 of its steps: no evaluation.
 
-    Returns what `ladder` does, dims (scale, v, u); scales are by the longer axis's samples. Samples too close to the
-    border for a central difference have none.
+    Returns what `compare_differences` does, dims (scale, v, u); scales are by the longer axis's samples. Samples too
+    close to the border for a central difference have none.
     """
     plane = plane_of(dataset)
     loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
     strides = [stride for stride in STRIDES if 2 * stride < min(loss.shape)]
     parts = []
     for stride in strides:
-        axes = [_central(loss, axis, stride) for axis in range(loss.ndim)][::-1]  # u first
+        axes = [_central_differences(loss, axis, stride) for axis in range(loss.ndim)][::-1]  # u first
         widths = np.array([2 * stride / (size - 1) for size in plane.resolution])
         fuzz = math.sqrt(2) * deviation / widths.min()
         parts.append(agreement(box_slopes(dataset), np.stack(axes, axis=-1), fuzz))
@@ -150,18 +150,18 @@ def smoothed_slopes(
     for width in widths:
         w = torch.randn(len(u), pairs, plane.rank, generator=generator, dtype=torch.float64)
         ends = u[:, None] + torch.stack([w, -w]) * width * sides
-        found = evaluated(objective, plane.lift(ends.reshape(-1, plane.rank)), grad=True)
+        found = evaluate(objective, plane.lift(ends.reshape(-1, plane.rank)), grad=True)
         assert found.grad is not None  # as it was asked for
         slopes = (plane.slope(found.grad) * sides).reshape(2, len(u), pairs, plane.rank)
         above, below = found.loss.reshape(2, len(u), pairs)
-        parts.append(_orders(slopes.mean(dim=0), (above - below) / (2 * width), w))
+        parts.append(_compare_orders(slopes.mean(dim=0), (above - below) / (2 * width), w))
     dims = ("width", "point", "axis")
     stacked = {name: np.stack([part[name] for part in parts]) for name in parts[0]}
     shaped = {name: (dims[: values.ndim], values) for name, values in stacked.items()}
     return xr.Dataset(shaped, {"width": list(widths), "place": (("point", "axis"), u.numpy())})
 
 
-def biased(found: xr.Dataset) -> xr.DataArray:
+def find_bias(found: xr.Dataset) -> xr.DataArray:
     """Say at which points first order is biased along an axis, by more than a little and than chance would have it."""
     level = 1 - CHANCE / 2 / found.sizes["axis"]
     sure = xr.apply_ufunc(lambda count: stats.t.ppf(level, np.maximum(count - 1, 1)), found["count"])
@@ -186,7 +186,7 @@ def width_table(found: xr.Dataset) -> list[dict[str, Any]]:
         first, zeroth = (part[f"{name}_variance"].sum("axis").to_numpy()[known] for name in ("first", "zeroth"))
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = zeroth / first
-        flags = biased(found).sel(width=width).to_numpy()[known]
+        flags = find_bias(found).sel(width=width).to_numpy()[known]
         rows.append(
             {
                 "width": float(width),
@@ -200,7 +200,7 @@ def width_table(found: xr.Dataset) -> list[dict[str, Any]]:
     return rows
 
 
-def _central(loss: Values, axis: int, stride: int) -> Values:
+def _central_differences(loss: Values, axis: int, stride: int) -> Values:
     """Return central differences over 2 * stride samples [loss unit per side of the box]."""
     size = loss.shape[axis]
     moved = np.moveaxis(loss, axis, 0)
@@ -209,7 +209,7 @@ def _central(loss: Values, axis: int, stride: int) -> Values:
     return np.moveaxis(difference, 0, axis)
 
 
-def _orders(
+def _compare_orders(
     first: Float[Tensor, "point pair axis"], half: Float[Tensor, "point pair"], w: Float[Tensor, "point pair axis"]
 ) -> dict[str, Values]:
     """Return means, errors and variances over the pairs that succeed; NaN with too few to fit a line without one."""
@@ -222,7 +222,7 @@ def _orders(
         spread = torch.where(seen, values - total[:, None], 0.0).square().sum(dim=1) / (count - 1)
         return torch.where(enough, total, torch.nan), torch.where(enough, spread, torch.nan)
 
-    steady = _steadied(torch.where(known, half, 0.0), torch.where(seen, w, 0.0))
+    steady = _reduce_variance(torch.where(known, half, 0.0), torch.where(seen, w, 0.0))
     values = {"first": first, "zeroth": steady, "bias": first - steady}
     found = {"count": count[:, 0], "zeroth_variance": moments(half[..., None] * w)[1]}
     for name, sample in values.items():
@@ -233,7 +233,7 @@ def _orders(
     return {name: part.numpy() for name, part in found.items()}
 
 
-def _steadied(half: Float[Tensor, "point pair"], w: Float[Tensor, "point pair axis"]) -> Tensor:
+def _reduce_variance(half: Float[Tensor, "point pair"], w: Float[Tensor, "point pair axis"]) -> Tensor:
     """Return each pair's zeroth-order sample with the fit of the others as its control variate."""
     gram, moment = w[..., :, None] * w[..., None, :], w * half[..., None]
     gram, moment = (part.sum(dim=1, keepdim=True) - part for part in (gram, moment))

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..objective import Objective, evaluated
+from ..objective import Objective, evaluate
 
 
 @dataclass(frozen=True)
@@ -46,15 +46,15 @@ def noise(
     Root mean squares over points that succeed. `rounding` draws are uniform, as fractions of the parameters' ranges.
     """
     generator = torch.Generator().manual_seed(seed)
-    first = evaluated(objective, x, grad=False).loss
-    again = torch.stack([evaluated(objective, x, grad=False).loss for _ in range(repeats)])
+    first = evaluate(objective, x, grad=False).loss
+    again = torch.stack([evaluate(objective, x, grad=False).loss for _ in range(repeats)])
     order = torch.randperm(len(x), generator=generator)
     shuffled = torch.full_like(first, torch.nan)
     for part in torch.split(order, max(1, len(x) // 3)):
-        shuffled[part] = evaluated(objective, x[part], grad=False).loss
+        shuffled[part] = evaluate(objective, x[part], grad=False).loss
     reach = rounding * (objective.space.upper - objective.space.lower)
     moves = 2 * torch.rand(repeats, *x.shape, generator=generator, dtype=torch.float64) - 1
-    moved = torch.stack([evaluated(objective, x + move * reach, grad=False).loss for move in moves])
+    moved = torch.stack([evaluate(objective, x + move * reach, grad=False).loss for move in moves])
     return Noise(_deviation(first, again), _deviation(first, shuffled[None]), _deviation(first, moved), len(x))
 
 

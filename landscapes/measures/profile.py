@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..capacity import Need
 from ..identity import plane_of
-from ..objective import Evaluation, Objective, evaluated, in_box, name_of
+from ..objective import Evaluation, Objective, evaluate, in_box, name_of
 from ..plain import finite
 from . import classify as verdict
 from . import gradient_quality as gradients
@@ -104,9 +104,9 @@ def characterise(
     least = max(floor, float(np.nan_to_num(found.range)) / (max(plane.resolution) - 1) / 2)
     jumps = find_jumps(objective, dataset, least=least, most=PAIRS_PER_POINT * points, seed=seed, events=events)
     deviation = float(np.nan_to_num(fuzz.deviation))
-    steps = gradients.ladder(objective, plane, places, deviation=deviation)
+    steps = gradients.compare_differences(objective, plane, places, deviation=deviation)
     smooth = gradients.smoothed_slopes(objective, plane, places, pairs=PAIRS, seed=seed)
-    samples = gradients.of_samples(dataset, deviation=deviation)
+    samples = gradients.compare_samples(dataset, deviation=deviation)
     cosine = samples["cosine"].isel(scale=0).to_numpy()
     words = judge(found, jumps, cosine)
     return Character(found, fuzz, jumps, steps, samples, smooth, words, objective.asked, objective.cut)
@@ -125,7 +125,7 @@ class _Within:
         self.asked += len(x)
         if not getattr(self.objective, "beyond_box", False):
             self.cut += int((~in_box(self.space, x)).sum())
-        return evaluated(self.objective, x, grad=grad)
+        return evaluate(self.objective, x, grad=grad)
 
 
 def named_measures(record: Mapping[str, Any]) -> dict[str, str]:

@@ -79,7 +79,7 @@ def basins(loss: Values, sample: NDArray[np.intp]) -> Values:
     return shares
 
 
-def halved(loss: Values, depth: float) -> tuple[int, int]:
+def minima_of_halves(loss: Values, depth: float) -> tuple[int, int]:
     """Return the fewest and the most minima deeper than `depth` that every second sample would have shown."""
     starts = np.ndindex((2,) * loss.ndim)
     counts = [minima(loss[tuple(slice(at, None, 2) for at in start)]).count(depth) for start in starts]
@@ -92,7 +92,7 @@ def span(loss: Values) -> float:
     return float(known.max() - known.min()) if known.size else math.nan
 
 
-def level(loss: Values, depth: float) -> Values:
+def level_samples(loss: Values, depth: float) -> Values:
     """Return 1 for each sample that no neighbour along an axis differs from by more than `depth`, 0 for others."""
     most = np.zeros_like(loss)
     for axis in range(loss.ndim):
@@ -248,14 +248,14 @@ def ruggedness(dataset: xr.Dataset, *, floor: float) -> Ruggedness:
         range=whole,
         floor=floor,
         minima=found.count(floor),
-        minima_halved=halved(loss, floor),
+        minima_halved=minima_of_halves(loss, floor),
         notable=len(notable),
         curve={part: found.count(part * whole) for part in THRESHOLDS},
         largest_basin=float(shares.max()),
         lowest_basin=float(shares[0]),
         zero=None if slopes is None else jackknife(_mean, _below(slopes, 0.0), least=0.0, most=1.0),
         flat=None if slopes is None else jackknife(_mean, _below(slopes, FLAT * whole), least=0.0, most=1.0),
-        level=jackknife(_mean, level(loss, floor), least=0.0, most=1.0),
+        level=jackknife(_mean, level_samples(loss, floor), least=0.0, most=1.0),
         correlation_length=tuple(
             jackknife(lambda part, axis=axis: correlation_length(part, axis), loss, least=0.0, most=1.0)  # type: ignore[misc]
             for axis in axes

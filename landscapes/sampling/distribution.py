@@ -28,10 +28,11 @@ from ..objective import Objective, Status, name_of
 from ..storage.paths import place_of
 from ..storage.store import SliceStore
 from ..storage.tiles import Tile
-from .memory import Halving, collect
+from .memory import MemoryBound, free_memory
 
 T = TypeVar("T")
-POLL, PATIENCE = 1.0, 60.0  # seconds between looks at the workers, and without any worker before they are given up
+POLL = 1.0  # seconds between looks at the workers
+WITHOUT_WORKERS = 60.0  # seconds without any worker after which they are given up
 LATE = 120.0  # seconds in which what a worker wrote must appear here: NFS remembers for up to 60 what was not there
 
 
@@ -40,7 +41,7 @@ class WorkersLostError(OSError):
 
 
 @dataclass(frozen=True)
-class Filled:
+class FilledTile:
     """A finished tile: how its points ended, and what to warn of."""
 
     tile: Tile
@@ -56,7 +57,7 @@ class Site:
     there. Without `made` the objective itself is pickled.
     """
 
-    objective: Halving
+    objective: MemoryBound
     store: SliceStore
     made: Callable[[], Objective] | None = None
 
@@ -64,7 +65,7 @@ class Site:
         """Return the site as it is in this process."""
         return self
 
-    def fill(self, tiles: Sequence[Tile]) -> Iterator[Filled]:
+    def fill(self, tiles: Sequence[Tile]) -> Iterator[FilledTile]:
         """Evaluate tiles in one batch, and write them one by one."""
         if not tiles:
             return
@@ -75,7 +76,7 @@ class Site:
         for tile, part in zip(tiles, parts, strict=True):
             rows = evaluation.rows(slice(start, start := start + len(part)))
             self.store.write(tile, rows)
-            yield Filled(tile, Counter(map(Status, rows.status.tolist())), notes)
+            yield FilledTile(tile, Counter(map(Status, rows.status.tolist())), notes)
             notes = ()
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -105,15 +106,15 @@ class RemoteSite:
             at = place_of(Path(self.path)).stat()
         except FileNotFoundError:
             raise StoreError(f"a worker finds no {self.path}; workers need a file system that they share") from None
-        store = opened(self.path, at.st_ino, at.st_mtime_ns)
+        store = open_store(self.path, at.st_ino, at.st_mtime_ns)
         check_identity(store.path, wanted=self.identity, found=store.identity)
-        return Site(kept(self.recipe), store)
+        return Site(make_objective(self.recipe), store)
 
-    def fill(self, tiles: Sequence[Tile]) -> Iterator[Filled]:
+    def fill(self, tiles: Sequence[Tile]) -> Iterator[FilledTile]:
         """Do what `Site.fill` does, but for tiles that a worker finished before it died."""
         site = self.here()
         found = {tile: site.store.statuses(tile) for tile in tiles}
-        yield from (Filled(tile, statuses) for tile, statuses in found.items() if statuses)
+        yield from (FilledTile(tile, statuses) for tile, statuses in found.items() if statuses)
         yield from site.fill([tile for tile, statuses in found.items() if not statuses])
 
 
@@ -128,16 +129,16 @@ class _Itself:
 
 
 @lru_cache(maxsize=1)
-def opened(path: str, inode: int, changed: int) -> SliceStore:
+def open_store(path: str, inode: int, changed: int) -> SliceStore:
     """Return an open store, the last one as it is; `inode` and `changed` [ns] tell it from one that replaced it."""
     return SliceStore.open(path)
 
 
-_objectives: dict[bytes, Halving] = {}
+_objectives: dict[bytes, MemoryBound] = {}
 _making = threading.Lock()
 
 
-def kept(recipe: bytes) -> Halving:
+def make_objective(recipe: bytes) -> MemoryBound:
     """Return the objective that a pickled function makes, once in this process; only the last one is kept.
 
     It may hold all of a GPU's memory.
@@ -145,8 +146,8 @@ def kept(recipe: bytes) -> Halving:
     with _making:
         if recipe not in _objectives:
             _objectives.clear()
-            collect()
-            _objectives[recipe] = Halving(pickle.loads(recipe)())
+            free_memory()
+            _objectives[recipe] = MemoryBound(pickle.loads(recipe)())
         return _objectives[recipe]
 
 
@@ -176,7 +177,7 @@ class ReadBack:
 
     def look(self, tile: Tile) -> None:
         """Read a tile if it is to be seen already: a file system that machines share may show it later."""
-        values = self._store.finished(tile)
+        values = self._store.read_tile(tile)
         if values is None:
             self._late.append(tile)
         else:
@@ -207,17 +208,17 @@ def workers_of(executor: Executor) -> int:
     return int(getattr(executor, "_max_workers", 1))
 
 
-def spread(site: Site, groups: Sequence[Sequence[Tile]], executor: Executor) -> Iterator[Filled]:
+def distribute(site: Site, groups: Sequence[Sequence[Tile]], executor: Executor) -> Iterator[FilledTile]:
     """Let an executor's workers fill batches of tiles, and yield each tile when its batch is done."""
-    yield from chain.from_iterable(results(executor, _filled, [(site, group) for group in groups]))
+    yield from chain.from_iterable(run_tasks(executor, _fill, [(site, group) for group in groups]))
 
 
-def results(executor: Executor, work: Callable[..., T], tasks: Iterable[Sequence[Any]]) -> Iterator[T]:
+def run_tasks(executor: Executor, work: Callable[..., T], tasks: Iterable[Sequence[Any]]) -> Iterator[T]:
     """Let workers do tasks, and yield each result when it is there; what is not begun when that ends is cancelled."""
     futures: list[Future[T]] = []
     try:
         futures += [executor.submit(work, *task) for task in tasks]
-        for future in _finished(executor, futures):
+        for future in _wait_for(executor, futures):
             yield future.result()
     except (CancelledError, BrokenExecutor) as error:
         raise WorkersLostError(f"the workers are gone ({str(error) or type(error).__name__})") from error
@@ -226,19 +227,19 @@ def results(executor: Executor, work: Callable[..., T], tasks: Iterable[Sequence
             future.cancel()
 
 
-def _finished(executor: Executor, futures: Iterable[Future[T]]) -> Iterator[Future[T]]:
+def _wait_for(executor: Executor, futures: Iterable[Future[T]]) -> Iterator[Future[T]]:
     """Yield futures as they end, and give up where nobody is left to work on them."""
     pending, seen = set(futures), time.monotonic()
     while pending:
         done, pending = wait(pending, timeout=POLL, return_when=FIRST_COMPLETED)
         yield from done
-        if done or _manned(executor):
+        if done or _has_workers(executor):
             seen = time.monotonic()
-        elif time.monotonic() - seen > PATIENCE:
-            raise WorkersLostError(f"the workers are gone (none was there for {PATIENCE:g} s)")
+        elif time.monotonic() - seen > WITHOUT_WORKERS:
+            raise WorkersLostError(f"the workers are gone (none was there for {WITHOUT_WORKERS:g} s)")
 
 
-def _manned(executor: Executor) -> bool:
+def _has_workers(executor: Executor) -> bool:
     """Say whether an executor has a worker, as far as it can be asked."""
     client = getattr(executor, "_client", None)  # Dask's
     try:
@@ -247,5 +248,5 @@ def _manned(executor: Executor) -> bool:
         return False
 
 
-def _filled(site: Site | RemoteSite, tiles: Sequence[Tile]) -> list[Filled]:
+def _fill(site: Site | RemoteSite, tiles: Sequence[Tile]) -> list[FilledTile]:
     return list(site.fill(tiles))

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..objective import Evaluation, Objective, evaluated, name_of
+from ..objective import Evaluation, Objective, evaluate, name_of
 
 # What torch, Warp, Taichi and CUDA say; the first of them alone has a type of its own.
 SAID = re.compile(
@@ -17,7 +17,7 @@ SAID = re.compile(
 )
 
 
-class Halving:
+class MemoryBound:
     """Evaluate an objective at fewer points at a time once its device ran out of memory, down to one.
 
     That changes no result, given an objective whose rows do not depend on their batch. One that holds memory for all
@@ -37,9 +37,9 @@ class Halving:
         start = 0
         while start < len(x):
             rows = x[start : start + (self._most or len(x))]
-            part = self._tried(rows, grad=grad)
+            part = self._try(rows, grad=grad)
             if part is None:
-                collect()  # the arrays of the attempt that failed
+                free_memory()  # the arrays of the attempt that failed
                 self._most = len(rows) // 2
                 getattr(self.objective, "shrink", _keep)(self._most)
                 self._notes.append(f"{self.name} ran out of memory at {len(rows)} points; going on with {self._most}")
@@ -53,12 +53,12 @@ class Halving:
         notes, self._notes = tuple(self._notes), []
         return notes
 
-    def _tried(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation | None:
+    def _try(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation | None:
         """Return the evaluation, None where the device has too little memory for so many points."""
         try:
-            return evaluated(self.objective, x, grad=grad)
+            return evaluate(self.objective, x, grad=grad)
         except (RuntimeError, MemoryError) as error:
-            if not ran_out(error):
+            if not is_out_of_memory(error):
                 raise
             if len(x) == 1:
                 raise MemoryError(
@@ -68,7 +68,7 @@ class Halving:
             return None
 
 
-def collect() -> None:
+def free_memory() -> None:
     """Free what objects that are gone held, of a GPU's memory too."""
     gc.collect()  # some, such as a solver and its launches, refer to each other
     torch.cuda.empty_cache()
@@ -78,6 +78,6 @@ def _keep(rows: int) -> None:
     """Leave an objective that holds no memory between evaluations as it is."""
 
 
-def ran_out(error: BaseException) -> bool:
+def is_out_of_memory(error: BaseException) -> bool:
     """Say whether an error is one of too little memory, of the host or of a GPU."""
     return isinstance(error, MemoryError | torch.OutOfMemoryError) or bool(SAID.search(str(error)))

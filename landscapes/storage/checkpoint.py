@@ -14,37 +14,37 @@ from numpy.typing import NDArray
 
 from ..identity import DamagedError, check_identity
 from ..plain import plain_json
-from .files import discard, replacing, visible, write_json
+from .files import discard, replacing, visible_files, write_json
 from .ownership import check_ours, refuse_others
 from .records import read_json, reading, text
 
-SETTINGS, PIECES = "settings.json", "pieces"
+SETTINGS, PARTS = "settings.json", "pieces"
 NAME = "piece"  # the array that says which one it is, so that two that were swapped are not taken for right
-PIECE = re.compile(r"[^/]+\.npz")  # the name of one
+PART = re.compile(r"[^/]+\.npz")  # the name of one
 
 
 @dataclass(frozen=True)
-class Pieces:
+class Checkpoint:
     """Hold the arrays of a study in `folder`, together with what decides its numbers."""
 
     folder: Path
 
     @classmethod
-    def open(cls, folder: Path, identity: Mapping[str, Any], *, what: str, force: bool = False) -> Pieces:
+    def open(cls, folder: Path, identity: Mapping[str, Any], *, what: str, force: bool = False) -> Checkpoint:
         """Go on with a study of the same settings, or begin one; `force` begins anew where another one is.
 
         Raises ValueError where the folder holds something else, StoreMismatchError where it holds another study.
         """
         wanted, path = plain_json({"kind": what, **identity}, f"a {what}'s identity"), folder / SETTINGS
         if not path.exists():
-            refuse_others(folder, visible(folder), what)
+            refuse_others(folder, visible_files(folder), what)
         if path.exists():
             with reading(path, f"it is no study's or damaged: write elsewhere with --out, or delete {folder}"):
                 found = read_json(path)
                 text(found["kind"])
             if force:
-                check_ours(folder / PIECES, PIECE.fullmatch, f"a {what}")
-                discard(folder / PIECES)
+                check_ours(folder / PARTS, PART.fullmatch, f"a {what}")
+                discard(folder / PARTS)
             else:
                 check_identity(folder, wanted=wanted, found=found, what="study")
         write_json(path, wanted)
@@ -72,7 +72,7 @@ class Pieces:
 
     def count(self) -> int:
         """Return how many pieces are there."""
-        return len(list((self.folder / PIECES).glob("[!.]*.npz")))
+        return len(list((self.folder / PARTS).glob("[!.]*.npz")))
 
     def _path(self, name: str) -> Path:
-        return self.folder / PIECES / f"{name}.npz"
+        return self.folder / PARTS / f"{name}.npz"

@@ -23,7 +23,7 @@ def store_files(arrays: Iterable[str], *others: str) -> Ours:
     return re.compile(rf"{root}|(?:{names})/(?:{root}|c(?:/\d+)*(?:{HALF})?){own}").fullmatch
 
 
-def foreign(folder: Path, ours: Ours) -> Iterator[str]:
+def foreign_files(folder: Path, ours: Ours) -> Iterator[str]:
     """Yield the files of a folder, at any depth, that are not `ours`, by their paths in it; a link never is."""
     for path, name in _files(folder):
         if path.is_symlink() or not (ours(name) or any(map(MAKING.fullmatch, Path(name).parts))):
@@ -32,7 +32,7 @@ def foreign(folder: Path, ours: Ours) -> Iterator[str]:
 
 def check_ours(folder: Path, ours: Ours, what: str) -> None:
     """Raise ValueError, naming some, where a folder that is to be replaced holds files that no such thing does."""
-    others = list(islice(foreign(folder, ours), SHOWN + 1))
+    others = list(islice(foreign_files(folder, ours), SHOWN + 1))
     if others:
         more = " and more" if len(others) > SHOWN else ""
         raise ValueError(
@@ -59,12 +59,12 @@ def lost_root(store: Path, ours: Ours) -> bool:
     except (OSError, ValueError):
         said = None
     known = isinstance(said, dict) and isinstance(said.get("attributes"), dict)
-    return not known and (store / "status").is_dir() and not any(foreign(store, ours))
+    return not known and (store / "status").is_dir() and not any(foreign_files(store, ours))
 
 
 def remove(folder: Path, ours: Ours) -> None:
     """Remove a folder, at once where everything in it is of ours; what is not stays where it is."""
-    if not any(foreign(folder, ours)):
+    if not any(foreign_files(folder, ours)):
         discard(folder)
         return
     for path, name in _files(folder):

@@ -7,22 +7,22 @@ from pathlib import Path
 SLICE, FILLING = "slice.zarr", ".filling.zarr"
 
 
-def filling(path: Path) -> Path:
+def filling_path(path: Path) -> Path:
     """Return where the tiles of a slice are while it is being filled: slice.filling.zarr beside slice.zarr."""
     return path.with_name(path.name.removesuffix(".zarr") + FILLING)
 
 
-def finished(path: Path) -> Path:
+def finished_path(path: Path) -> Path:
     """Return where a slice will be once it is finished, given that place or the one of its tiles."""
     return path.with_name(path.name.removesuffix(FILLING) + ".zarr") if path.name.endswith(FILLING) else path
 
 
 def place_of(path: Path) -> Path:
     """Return where a slice is now."""
-    return path if path.exists() else filling(path)
+    return path if path.exists() else filling_path(path)
 
 
-def there(path: Path) -> bool:
+def slice_exists(path: Path) -> bool:
     """Say whether anything is in the place of a slice or of its tiles."""
     return place_of(path).exists()
 

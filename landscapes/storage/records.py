@@ -31,20 +31,20 @@ def reading(path: Path, todo: str) -> Iterator[None]:
 
 def write_record(path: Path, record: Mapping[str, Any]) -> None:
     """Write what `read_json` reads again, with a checksum."""
-    write_json(path, signed(record))
+    write_json(path, sign(record))
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """Return the JSON object that a file holds, held against its checksum if it has one."""
-    return unsigned(json.loads(path.read_text()))
+    return verify(json.loads(path.read_text()))
 
 
-def signed(record: Mapping[str, Any]) -> dict[str, Any]:
+def sign(record: Mapping[str, Any]) -> dict[str, Any]:
     """Return a record with its checksum."""
     return {**record, CHECKSUM: _sum(json.loads(json.dumps(record)))}
 
 
-def unsigned(found: Any) -> dict[str, Any]:
+def verify(found: Any) -> dict[str, Any]:
     """Return a record without its checksum; those of earlier versions have none."""
     if not isinstance(found, dict):
         raise TypeError("it is no JSON object")
@@ -72,6 +72,6 @@ def number(value: Any) -> float:
     return value
 
 
-def maybe(kind: Callable[[Any], Any], value: Any) -> Any:
+def optional(kind: Callable[[Any], Any], value: Any) -> Any:
     """Return what has to be of a kind, or None."""
     return None if value is None else kind(value)

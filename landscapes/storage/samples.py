@@ -77,7 +77,7 @@ class Samples:
     def written(self, tiles: Sequence[Tile]) -> list[Tile]:
         """Return those of the tiles that something was written of: their status is there, or torn."""
         try:
-            status, begun = np.zeros(self.shape, np.int8), self._begun(self.whole)
+            status, begun = np.zeros(self.shape, np.int8), self._begun_corner(self.whole)
             status[begun] = self.arrays["status"][begun]
             return [tile for tile in tiles if status[self.place(tile)].any()]
         except Exception:  # as in `read`
@@ -115,7 +115,7 @@ class Samples:
 
     def _load(self, box: Box) -> Arrays:
         """Read a box of every array; where its status says that nothing is there, nothing else is looked for."""
-        values, begun = self._blank(box), self._begun(box)
+        values, begun = self._blank(box), self._begun_corner(box)
         inside = tuple(slice(len(range(points)[at])) for points, at in zip(self.shape, begun, strict=True))
         values["status"][inside] = self.arrays["status"][begun]
         for name, array in self.arrays.items() if values["status"].any() else ():
@@ -139,7 +139,7 @@ class Samples:
         except Exception:  # as in `read`
             return True
 
-    def _begun(self, box: Box) -> Box:
+    def _begun_corner(self, box: Box) -> Box:
         """Return the corner of the whole beyond which no tile is, since looking for each of many files takes long."""
         if box != self.whole:
             return box

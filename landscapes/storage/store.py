@@ -39,12 +39,12 @@ from ..plane import Plane
 from ..space import ParameterSpace
 from .arrays import AXES, FILES, FORMAT, attributes_of, axes_of, lay_out, refuse_too_large, write_finished
 from .checksums import text_sum
-from .files import placing, resolved
+from .files import placing, resolve
 from .integrity import check_integrity, check_layouts, damage
 from .layout import consolidate, open_group
 from .ownership import lost_root, remove
-from .paths import SLICE, check_replaceable, filling, finished, is_slice, place_of, there
-from .samples import Samples
+from .paths import SLICE, check_replaceable, filling_path, finished_path, is_slice, place_of, slice_exists
+from .samples import Arrays, Samples
 from .tiles import Tile
 
 T = TypeVar("T")
@@ -94,16 +94,16 @@ class SliceStore:
         and version are added here. `provenance` is anything else worth keeping. Both must be plain JSON. `overwrite`
         replaces a slice store with nothing else in it, and refuses to replace anything else.
         """
-        path = resolved(path)
+        path = resolve(path)
         whole = full_identity(identity, plane, space, grad=grad)
-        for taken in (path, filling(path)):
+        for taken in (path, filling_path(path)):
             if taken.exists() and not overwrite:
                 raise StoreExistsError(f"{path} exists already; write elsewhere with --out, or replace it with --force")
             if taken.exists():
                 check_replaceable(taken)
         refuse_too_large(plane, path, grad=grad)
         try:
-            with placing(filling(path), overwrite=overwrite) as new:
+            with placing(filling_path(path), overwrite=overwrite) as new:
                 group = zarr.create_group(new, zarr_format=3)
                 lay_out(group, plane, space, whole, plain_json(provenance or {}, "a slice's provenance"), grad=grad)
                 consolidate(new)
@@ -115,7 +115,7 @@ class SliceStore:
     @classmethod
     def open(cls, path: str | Path) -> SliceStore:
         """Open a store that exists, the finished slice where there is one."""
-        path = finished(resolved(path))
+        path = finished_path(resolve(path))
         place = place_of(path)
         if not place.exists():
             raise StoreError(f"there is no slice store at {path}; make one with `landscape slice`")
@@ -154,7 +154,7 @@ class SliceStore:
         store = cls.open(path)
         check_identity(store.path, wanted=full_identity(identity, plane, space, grad=grad), found=store.identity)
         if store.ascending and store.path:
-            remove(filling(store.path), FILES)  # left by a process that was killed when it had finished the slice
+            remove(filling_path(store.path), FILES)  # left by a process that was killed when it had finished the slice
         return store
 
     @classmethod
@@ -198,20 +198,20 @@ class SliceStore:
         status = self.status() if status is None else status
         return [tile for tile in self.tiles() if (status[self._samples.place(tile)] == Status.MISSING).any()]
 
-    def damaged(self, pending: Sequence[Tile]) -> list[Tile]:
+    def damaged_tiles(self, pending: Sequence[Tile]) -> list[Tile]:
         """Return those of the tiles not finished that once were: their status is there, or torn.
 
         A tile that another process has finished in the meantime is none of them.
         """
         return [tile for tile in self._samples.written(pending) if not self.statuses(tile)]
 
-    def finished(self, tile: Tile) -> dict[str, NDArray[Any]] | None:
+    def read_tile(self, tile: Tile) -> dict[str, NDArray[Any]] | None:
         """Return the arrays of a tile that is finished, None of one that is not."""
         return self._samples.read_tile(tile)
 
     def statuses(self, tile: Tile) -> Counter[Status]:
         """Count how the points of a finished tile ended; nothing of one that is not finished."""
-        values = self.finished(tile)
+        values = self.read_tile(tile)
         return Counter() if values is None else Counter(map(Status, values["status"].ravel().tolist()))
 
     def count(self, tile: Tile) -> int:
@@ -233,35 +233,35 @@ class SliceStore:
         if bool((evaluation.status == Status.MISSING).any()):
             raise ValueError("a tile is written whole; got an evaluation with status MISSING")
         counts = zip(tile.index, self._samples.tile_counts, strict=True)
-        if self._taken_over() or any(at >= count for at, count in counts):
+        if self._follow_finished() or any(at >= count for at, count in counts):
             return  # another process has finished the slice, which has larger and fewer tiles since
-        arrays = {}
+        arrays: Arrays = {}
         for name, stored in self._samples.arrays.items():
             tensor: Tensor = getattr(evaluation, name)
             arrays[name] = tensor.detach().cpu().numpy().reshape(shape + tensor.shape[1:]).astype(stored.dtype)
         try:
             self._samples.write_tile(tile, arrays)
         except FileNotFoundError:
-            if not self._taken_over():
+            if not self._follow_finished():
                 raise
 
     def status(self) -> NDArray[np.int8]:
         """Return the status of every point in stored order, MISSING wherever a tile is not finished."""
-        return self._steady(lambda: self._samples.read(self._samples.whole)["status"])
+        return self._read_steadily(lambda: self._samples.read(self._samples.whole)["status"])
 
     def dataset(self, known: Mapping[Tile, Mapping[str, NDArray[Any]]] | None = None) -> xr.Dataset:
         """Return everything sampled so far, axes ascending; MISSING and NaN where nothing is.
 
-        `known` spares reading tiles again: what `finished` returned of them.
+        `known` spares reading tiles again: what `read_tile` returned of them.
         """
-        return self._steady(lambda: self._dataset(self._samples.whole, None if self.ascending else known))
+        return self._read_steadily(lambda: self._dataset(self._samples.whole, None if self.ascending else known))
 
     def finish(self, dataset: xr.Dataset) -> None:
         """Put the whole slice, which `dataset` returned, in the place of its tiles: ascending, in large chunks.
 
         It appears at once, and only then the tiles go.
         """
-        if self.path is None or self.ascending or self._taken_over():
+        if self.path is None or self.ascending or self._follow_finished():
             return
         if bool((dataset["status"] == Status.MISSING).any()):
             raise StoreError(f"{self.path} is not complete; run the command that samples it again")
@@ -277,13 +277,13 @@ class SliceStore:
         level = 0 if self.ascending else pending[0].level
         return self._dataset(tuple(slice(level * side) for side in self._samples.side)) if level else None
 
-    def _steady(self, read: Callable[[], T]) -> T:
+    def _read_steadily(self, read: Callable[[], T]) -> T:
         """Return what is read, once more where another process has finished the slice meanwhile."""
-        self._taken_over()
+        self._follow_finished()
         found = read()
-        return read() if self._taken_over() else found
+        return read() if self._follow_finished() else found
 
-    def _taken_over(self) -> bool:
+    def _follow_finished(self) -> bool:
         """Go on with the finished slice where another process has finished this one meanwhile, and say whether it has.
 
         Raise StoreError where the store was replaced or removed.
@@ -302,7 +302,7 @@ class SliceStore:
     def _move_on(self, path: Path) -> None:
         """Become the finished slice, and clear the tiles away."""
         self._adopt(open_group(path, "r+"), path, path)
-        remove(filling(path), FILES)
+        remove(filling_path(path), FILES)
 
     def _dataset(
         self, box: tuple[slice, ...], known: Mapping[Tile, Mapping[str, NDArray[Any]]] | None = None
@@ -326,4 +326,4 @@ def open_slice(path: str | Path) -> xr.Dataset:
     `path` is the slice, or the folder that `landscape slice` left it in.
     """
     path = Path(path)
-    return SliceStore.open(path / SLICE if there(path / SLICE) else path).dataset()
+    return SliceStore.open(path / SLICE if slice_exists(path / SLICE) else path).dataset()

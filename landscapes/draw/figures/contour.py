@@ -58,7 +58,7 @@ def frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
     panel.name_axes(ax, y=plane.labels[1])
     status = dataset["status"].to_numpy()
     edges = cell_edges(dataset)
-    for kind, look in style.LOOKS.items():
+    for kind, look in style.STATUS_LOOKS.items():
         if (where := status == kind).any():
             patch = PathPatch(_cells(*edges, where), **look, zorder=1.5, antialiased=False, gid=kind.name)
             ax.add_patch(patch)
@@ -100,7 +100,7 @@ def loss_map(ax: Axes, dataset: xr.Dataset, scale: style.Scale) -> None:
 def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> list[Artist]:
     """Draw the negated gradients as arrows, on the slice's own scale unless given; return the legend's entries."""
     plane = plane_of(dataset)
-    rows, columns = (thinned(dataset.sizes[name]) for name in ("v", "u"))
+    rows, columns = (pick_arrows(dataset.sizes[name]) for name in ("v", "u"))
     slope = plane.slope(torch.from_numpy(dataset["grad"].to_numpy())).numpy()
     size, label = magnitude(slope, plane, dataset["loss"].attrs.get("units", ""))
     flat = size == 0
@@ -161,7 +161,7 @@ def magnitude(slope: Grid, plane: Plane, loss_unit: str) -> tuple[Grid, str]:
 
 
 def _limits(plane: Plane, axis: int) -> tuple[float, float]:
-    low, high = plane.window()
+    low, high = plane.cell_bounds()
     return float(low[axis]), float(high[axis])
 
 
@@ -187,7 +187,7 @@ def _edges(centers: Grid, low: float, high: float) -> Grid:
     return np.concatenate([[low], (centers[1:] + centers[:-1]) / 2, [high]])
 
 
-def thinned(points: int) -> NDArray[np.intp]:
+def pick_arrows(points: int) -> NDArray[np.intp]:
     """Return which of so many points along an axis keep their arrow."""
     step = -(-points // style.ARROWS)
     return cast("NDArray[np.intp]", np.arange((points - 1) % step // 2, points, step))

@@ -46,10 +46,10 @@ def _darken(artist: Artist) -> None:
             continue
         found = to_rgba_array(value)
         if len(found):
-            write(turned(found) if np.ndim(value) == 2 else tuple(turned(found)[0]))
+            write(invert_greys(found) if np.ndim(value) == 2 else tuple(invert_greys(found)[0]))
     strokes = [_gc(effect) for effect in artist.get_path_effects() or [] if isinstance(effect, withStroke)]
     if strokes:
-        grounds = [tuple(turned(to_rgba_array(stroke["foreground"]))[0]) for stroke in strokes]
+        grounds = [tuple(invert_greys(to_rgba_array(stroke["foreground"]))[0]) for stroke in strokes]
         artist.set_path_effects(
             [withStroke(**{**stroke, "foreground": ground}) for stroke, ground in zip(strokes, grounds, strict=True)]
         )
@@ -60,7 +60,7 @@ def _gc(effect: Any) -> dict[str, Any]:
     return found
 
 
-def turned(colours: Colours) -> Colours:
+def invert_greys(colours: Colours) -> Colours:
     """Return colours, shape (..., 3 or 4), greys among them as light on the dark ground as they were dark on white."""
     rgb, rest = colours[..., :3], colours[..., 3:]
     level, chroma = rgb.mean(axis=-1, keepdims=True), np.ptp(rgb, axis=-1, keepdims=True)
@@ -80,7 +80,7 @@ def save_dark(source: Path, target: Path) -> None:
     paper, pale = (level > PAPER) & (chroma < PALE_GREY[0]), (level > PALE) & (chroma > PALE_GREY[0])
     edge = binary_dilation(paper, iterations=NEAR) & pale
     ground = to_rgba_array(style.NIGHT)[0, :3]
-    dark = turned(light)
+    dark = invert_greys(light)
     dark[edge] = light[edge] - light[edge].min(axis=-1, keepdims=True) * (1 - ground)
     pixels = Image.fromarray(np.rint(255 * np.clip(dark, 0.0, 1.0)).astype(np.uint8))
     with replacing(target) as partial:

@@ -38,7 +38,7 @@ def overlay_figure(dataset: xr.Dataset, runs: Runs, *, width: float | None = Non
     crosses. On the right, or below it on a narrow page, every point is held against the sample it lies over: it is on
     the diagonal if the map tells its loss.
     """
-    plane, reach = plane_of(dataset), farthest(runs)
+    plane, reach = plane_of(dataset), farthest_distance(runs)
     sheet = style.Sheet.of(width, pitch=PITCH, columns=2)
     picture = page.Picture(sheet, 2 / sheet.columns * sheet.pitch)
     over, against = panel.grid(picture, 2)
@@ -50,7 +50,7 @@ def overlay_figure(dataset: xr.Dataset, runs: Runs, *, width: float | None = Non
         _draw_run(over, run, plane, scale, reach, _count(runs))
         _join_improvements(over, run, plane, len(runs))
     _draw_against(against, dataset, runs, reach)
-    page.head(picture, over, dataset, f"{page.title(dataset)} · {_said(runs)}")
+    page.head(picture, over, dataset, f"{page.title(dataset)} · {_describe_runs(runs)}")
     entries = [*_run_entries(sheet, runs), *_order_entries(sheet, runs), *_kind_entries(sheet, runs)]
     entries += [*_distance_entries(sheet, runs, reach), *_count_entries(sheet, runs)]
     page.finish(picture, [*entries, *page.failure_key(dataset)])
@@ -74,7 +74,7 @@ def joint_scale(dataset: xr.Dataset, runs: Runs) -> style.Scale:
     return style.Scale.of_loss(np.clip(values, floor, high)).over(values)
 
 
-def farthest(runs: Runs) -> float:
+def farthest_distance(runs: Runs) -> float:
     """Return the greatest distance of any point from the plane [half-widths of the box], 0 where it is rounding."""
     most = max((float(run["distance"].max()) for run in runs if run.sizes["evaluation"]), default=0.0)
     return most if most > 1e-9 else 0.0
@@ -84,10 +84,10 @@ def _draw_run(ax: Axes, run: xr.Dataset, plane: Plane, scale: style.Scale, reach
     color, sheet = style.method(run)["color"], page.sheet_of(ax)
     place = _places(run, plane)
     loss, distance, outside = (run[name].to_numpy() for name in ("loss", "distance", "outside"))
-    ax.add_collection(_trail(run, place, reach, sheet))
+    ax.add_collection(_descent_lines(run, place, reach, sheet))
     areas = sheet.weight**2 * style.point_areas(distance, reach, points)
     for name, here in by_kind(run):
-        look: dict[str, Any] = {"edgecolors": color, "marker": style.KINDS[name]["marker"]}
+        look: dict[str, Any] = {"edgecolors": color, "marker": style.POINT_MARKS[name]["marker"]}
         if (some := here & ~outside & np.isfinite(loss)).any():
             u, v = place[some].T
             ax.scatter(u, v, s=areas[some], marker=look["marker"], **sheet.look(style.HALO))
@@ -98,7 +98,7 @@ def _draw_run(ax: Axes, run: xr.Dataset, plane: Plane, scale: style.Scale, reach
             ax.scatter(u, v, gid="outside", **look, **sheet.look(style.BORDER))
     failed = (run["status"].to_numpy() != Status.OK) & ~outside
     if failed.any():
-        ax.scatter(place[failed, 0], place[failed, 1], **sheet.look(style.BROKEN), gid="failed")
+        ax.scatter(place[failed, 0], place[failed, 1], **sheet.look(style.FAILED_MARK), gid="failed")
     if np.isfinite(loss).any():
         row = int(np.nanargmin(loss))
         inside = "none" if outside[row] else [style.LOSS_MAP(scale.norm(loss[row]))]
@@ -109,7 +109,7 @@ def _draw_run(ax: Axes, run: xr.Dataset, plane: Plane, scale: style.Scale, reach
 
 def _places(run: xr.Dataset, plane: Plane) -> NDArray[np.float64]:
     """Return where a run's points are drawn, shape (point, 2): those beyond the window at its border."""
-    low, high = (side.numpy() for side in plane.window())
+    low, high = (side.numpy() for side in plane.cell_bounds())
     found: NDArray[np.float64] = np.clip(np.stack([run["u"], run["v"]], axis=1), low, high)
     return found
 
@@ -121,7 +121,7 @@ def by_kind(run: xr.Dataset) -> list[tuple[str, NDArray[np.bool_]]]:
     return [(name, kind == code) for code, name in pairs if (kind == code).any()]
 
 
-def _trail(run: xr.Dataset, place: NDArray[np.float64], reach: float, sheet: style.Sheet) -> LineCollection:
+def _descent_lines(run: xr.Dataset, place: NDArray[np.float64], reach: float, sheet: style.Sheet) -> LineCollection:
     rows = np.flatnonzero(run["previous"].to_numpy() >= 0)
     before = run["previous"].to_numpy()[rows]
     distance = run["distance"].to_numpy()
@@ -129,12 +129,12 @@ def _trail(run: xr.Dataset, place: NDArray[np.float64], reach: float, sheet: sty
     colors = np.tile(to_rgba(style.method(run)["color"]), (len(rows), 1))
     colors[:, 3] = 1 - (1 - style.FAINTEST) * away
     lines = np.stack([place[before], place[rows]], axis=1)
-    return LineCollection(list(lines), colors=colors, gid="descents", **sheet.look(style.TRAIL))
+    return LineCollection(list(lines), colors=colors, gid="descents", **sheet.look(style.DESCENT_LINE))
 
 
 def _join_improvements(ax: Axes, run: xr.Dataset, plane: Plane, runs: int) -> None:
     thinner = min(1.0, (CROWD / runs) ** 0.5)
-    for look in style.ORDER:
+    for look in style.IMPROVEMENTS:
         scaled = page.sheet_of(ax).look(look | {"linewidth": thinner * look["linewidth"]})
         ax.plot(*_places(run, plane)[improvements(run)].T, gid="order", **scaled)
 
@@ -165,7 +165,7 @@ def _draw_against(ax: Axes, dataset: xr.Dataset, runs: Runs, reach: float) -> No
         look = {"facecolors": style.method(run)["color"], "edgecolors": "white", **sheet.look(style.OVERLAID)}
         for name, here in by_kind(run):
             at = some & here
-            ax.scatter(beneath[at], loss[at], s=areas[at], marker=style.KINDS[name]["marker"], gid=name, **look)
+            ax.scatter(beneath[at], loss[at], s=areas[at], marker=style.POINT_MARKS[name]["marker"], gid=name, **look)
     unit = dataset["loss"].attrs.get("units", "")
     per = f" [{unit}]" if unit else ""
     panel.name_axes(ax, f"loss of the sample beneath{per}", f"loss of the point itself{per}")
@@ -196,11 +196,11 @@ def _run_entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
         name = f"{method}, seed {own[0].attrs['seed']}" if len(own) == 1 else f"{method}, {len(own)} runs"
         look = sheet.look({"linewidth": 1.6, "marker": "*", "markersize": 10, "markeredgewidth": 1.0})
         look |= {"color": style.method(own[0])["color"], "markerfacecolor": "white"}
-        entries.append(Line2D([], [], **look, label=f"{name}: {_best_said(own)}"))
+        entries.append(Line2D([], [], **look, label=f"{name}: {_describe_best(own)}"))
     return entries
 
 
-def _best_said(runs: Runs) -> str:
+def _describe_best(runs: Runs) -> str:
     found = [(float(run["best"][-1]), run) for run in runs if run.sizes["evaluation"] and run["best"][-1].notnull()]
     if not found:
         return "no episode succeeded"
@@ -223,8 +223,8 @@ def _order_entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
     """Say what the white lines are, where there is any."""
     if not any(len(improvements(run)) > 1 for run in runs):
         return []
-    effects = [withStroke(linewidth=sheet.weight * style.ORDER[0]["linewidth"], foreground=style.INK)]
-    look = sheet.look(style.ORDER[1]) | {"path_effects": effects}
+    effects = [withStroke(linewidth=sheet.weight * style.IMPROVEMENTS[0]["linewidth"], foreground=style.INK)]
+    look = sheet.look(style.IMPROVEMENTS[1]) | {"path_effects": effects}
     return [Line2D([], [], **look, label="the best so far, from one to the next; numbers are episodes")]
 
 
@@ -235,7 +235,7 @@ def _kind_entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
             counts[name] = counts.get(name, 0) + int(here.sum())
     look = _mark(sheet, markerfacecolor="white")
     return [
-        Line2D([], [], marker=style.KINDS[name]["marker"], **look, label=f"{name} point: {count}")
+        Line2D([], [], marker=style.POINT_MARKS[name]["marker"], **look, label=f"{name} point: {count}")
         for name, count in counts.items()
     ]
 
@@ -271,5 +271,5 @@ def _count(runs: Runs) -> int:
     return sum(run.sizes["evaluation"] for run in runs)
 
 
-def _said(runs: Runs) -> str:
+def _describe_runs(runs: Runs) -> str:
     return f"{len(runs)} run{'s' if len(runs) != 1 else ''}, {_count(runs)} episodes"

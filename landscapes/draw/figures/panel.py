@@ -13,7 +13,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullForm
 
 from .. import style
 from .page import Picture, picture_of, sheet_of, write_over
-from .typesetting import across, upright
+from .typesetting import side_room, title_room
 
 NARROW = 1.8  # room of a panel that has fewer ticks [inch]
 
@@ -42,7 +42,7 @@ def name_axes(ax: Axes, x: str | None = None, y: str | None = None) -> None:
     """Write what is along the axes, with its unit."""
     for axis, said in ((ax.xaxis, x), (ax.yaxis, y)):
         if said is not None:
-            _name(ax, axis, said, (lambda: across(ax)) if axis is ax.xaxis else (lambda: upright(ax)))
+            _name(ax, axis, said, (lambda: title_room(ax)) if axis is ax.xaxis else (lambda: side_room(ax)))
 
 
 def name_outer(ax: Axes, x: str, y: str) -> None:
@@ -69,7 +69,7 @@ def colour_bar(ax: Axes, drawn: ScalarMappable, label: str, scale: style.Scale |
     place: dict[str, Any] = {"fraction": 0.05, "pad": 0.02, "extend": scale.extend if scale else "neither"} | how
     bar = ax.figure.colorbar(drawn, ax=ax, **place)
     lying = bar.orientation == "horizontal"
-    _name(ax, bar.long_axis, label, (lambda: across(ax)) if lying else (lambda: upright(ax)))
+    _name(ax, bar.long_axis, label, (lambda: title_room(ax)) if lying else (lambda: side_room(ax)))
     bar.ax.tick_params(which="both", **_ticks(sheet))
     bar.ax.tick_params(which="minor", length=2 * sheet.type)
     bar.outline.set(edgecolor=style.QUIET, linewidth=max(0.4, 0.6 * sheet.weight))

@@ -108,7 +108,7 @@ def _frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
     ax.set_xlim(float(plane.lower[0]), float(plane.upper[0]))
     u, status = dataset["u"].to_numpy(), dataset["status"].to_numpy()
     edges = np.concatenate([u[:1], (u[1:] + u[:-1]) / 2, u[-1:]])
-    for kind, look in style.LOOKS.items():
+    for kind, look in style.STATUS_LOOKS.items():
         for start, stop in _runs(status == kind):
             ax.axvspan(edges[start], edges[stop], **look, zorder=0.6, gid=kind.name)
 
@@ -131,7 +131,7 @@ def _draw_strip(strip: Axes, panels: list[Axes], u: NDArray[np.float64], name: s
             strip.text((low + high) / 2, 0.5, str(label), size=sheet.small, color=style.INK, ha="center", va="center")
     for edge in edges[1:-1]:
         for ax in panels:
-            ax.axvline(edge, color=style.FAINT, linewidth=sheet.weight * style.thin(len(meets)), zorder=0.7)
+            ax.axvline(edge, color=style.FAINT, linewidth=sheet.weight * style.hairline_width(len(meets)), zorder=0.7)
     strip.set_ylim(0, 1)
     strip.set_yticks([])
     strip.tick_params(bottom=False, labelbottom=False)

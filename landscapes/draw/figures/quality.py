@@ -16,7 +16,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from ...identity import plane_of
-from ...measures.gradient_quality import biased, disagreement, scale_table
+from ...measures.gradient_quality import disagreement, find_bias, scale_table
 from ...measures.ruggedness import box_slopes
 from .. import style
 from . import contour, page, panel
@@ -76,14 +76,14 @@ def _share_names(axes: dict[str, Axes], rows: Sequence[Sequence[str]], kind: Seq
 
 
 def _signs(sheet: style.Sheet, dataset: xr.Dataset) -> list[Artist]:
-    sure = Line2D([], [], **sheet.look(style.SURE), label="first order is biased beyond chance (p < 0.001)")
-    unseen = Patch(**style.UNSEEN, label="no slope above the noise, or too close to the border")
+    sure = Line2D([], [], **sheet.look(style.BIASED), label="first order is biased beyond chance (p < 0.001)")
+    unseen = Patch(**style.NO_SLOPE, label="no slope above the noise, or too close to the border")
     return [sure, *([unseen] if dataset["loss"].ndim == 2 else []), *page.failure_key(dataset)]
 
 
 def _cosine_map(ax: Axes, dataset: xr.Dataset, found: xr.Dataset, *, last: bool) -> None:
     plane, cosine = plane_of(dataset), found["cosine"].to_numpy()
-    ax.set_facecolor(style.UNSEEN["facecolor"])
+    ax.set_facecolor(style.NO_SLOPE["facecolor"])
     drawn = ax.imshow(np.ma.masked_invalid(cosine), extent=_extent(dataset), **style.COSINE)
     contour.frame(ax, dataset, plane)
     panel.name_axes(ax, plane.labels[0])
@@ -150,13 +150,13 @@ def _scales(ax: Axes, steps: xr.Dataset, samples: xr.Dataset) -> list[Artist]:
 def _disagreement_map(ax: Axes, dataset: xr.Dataset, smooth: xr.Dataset, number: int) -> list[Artist]:
     plane, place = plane_of(dataset), smooth["place"].to_numpy()
     side = round(len(place) ** 0.5)
-    apart, sure = (of(smooth).isel(width=number).to_numpy() for of in (disagreement, biased))
+    apart, sure = (of(smooth).isel(width=number).to_numpy() for of in (disagreement, find_bias))
     low, high = plane.lower.tolist(), plane.upper.tolist()
-    ax.set_facecolor(style.UNSEEN["facecolor"])
+    ax.set_facecolor(style.NO_SLOPE["facecolor"])
     drawn = ax.imshow(
-        np.ma.masked_invalid(apart.reshape(side, side)), extent=(low[0], high[0], low[1], high[1]), **style.APART
+        np.ma.masked_invalid(apart.reshape(side, side)), extent=(low[0], high[0], low[1], high[1]), **style.DISAGREEMENT
     )
-    ax.plot(*place[sure].T, **page.sheet_of(ax).look(style.SURE))
+    ax.plot(*place[sure].T, **page.sheet_of(ax).look(style.BIASED))
     panel.dress(ax)
     ax.set_box_aspect(1)
     panel.name_axes(ax, *plane.labels)
@@ -175,8 +175,8 @@ def _two_orders(ax: Axes, dataset: xr.Dataset, smooth: xr.Dataset, number: int) 
         ax.errorbar(place, found[name].to_numpy()[:, 0], error, **look)
         del look["capsize"]
         entries.append(Line2D([], [], **look, label=f"{name} order"))
-    sure = biased(smooth).isel(width=number).to_numpy()
-    ax.plot(place[sure], found["first"].to_numpy()[sure, 0], **sheet.look(style.SURE), zorder=4)
+    sure = find_bias(smooth).isel(width=number).to_numpy()
+    ax.plot(place[sure], found["first"].to_numpy()[sure, 0], **sheet.look(style.BIASED), zorder=4)
     panel.dress(ax)
     ax.set_box_aspect(1)
     panel.name_axes(ax, plane.labels[0], _slope_label(dataset))
@@ -198,5 +198,5 @@ def _percent(share: xr.DataArray) -> str:
 
 
 def _extent(dataset: xr.Dataset) -> tuple[float, float, float, float]:
-    low, high = (end.tolist() for end in plane_of(dataset).window())
+    low, high = (end.tolist() for end in plane_of(dataset).cell_bounds())
     return low[0], high[0], low[1], high[1]

@@ -50,10 +50,10 @@ def _draw_method(losses: Axes, shares: Axes, dataset: xr.Dataset, row: int) -> A
     name = str(one["method"].item())
     look = page.sheet_of(losses).look(style.METHOD_LINE | style.METHODS.get(name, style.OTHER_METHOD))
     look |= {"drawstyle": "steps-post", "markevery": (APART * (row + 0.5) / dataset.sizes["method"], APART)}
-    episodes, mean, low, high = (_known(one[key], one["mean"]) for key in ("episodes", "mean", "low", "high"))
+    episodes, mean, low, high = (_where_finite(one[key], one["mean"]) for key in ("episodes", "mean", "low", "high"))
     (line,) = losses.plot(episodes, mean, label=_label(name, one, dataset), **look)
     losses.fill_between(episodes, low, high, step="post", color=look["color"], **style.METHOD_BAND)
-    hits = np.sort(_known(one["hit"], one["hit"]))
+    hits = np.sort(_where_finite(one["hit"], one["hit"]))
     share = np.arange(len(hits) + 1) / max(one["hit"].size, 1)
     shares.plot([1, *hits, dataset.attrs["budget"]], [*share, share[-1]], **look)
     return line
@@ -64,7 +64,7 @@ def _label(name: str, one: xr.Dataset, dataset: xr.Dataset) -> str:
     return f"{name} (no success with {count} of {seeds} seeds, so no mean)" if count else name
 
 
-def _known(values: xr.DataArray, where: xr.DataArray) -> NDArray[np.float64]:
+def _where_finite(values: xr.DataArray, where: xr.DataArray) -> NDArray[np.float64]:
     found: NDArray[np.float64] = values.to_numpy()[np.isfinite(where.to_numpy())]
     return found
 

@@ -35,7 +35,7 @@ class Sweep:
         """The label without its unit."""
         return self.label.partition(" [")[0]
 
-    def said(self, value: float) -> str:
+    def write_value(self, value: float) -> str:
         """Write a value with its unit, and as many decimals for each of them."""
         span = abs(self.values[-1] - self.values[0])
         decimals = min(9, max(0, 2 - math.floor(math.log10(span))))
@@ -143,7 +143,7 @@ def _write(picture: page.Picture, layout: Layout, dataset: xr.Dataset) -> None:
     x, y, *_ = layout.box(left, layout.height - 0.36 * sheet.type, 0.0, 0.0)
     picture.text(x, y, page.title(dataset), size=sheet.title, color=style.INK, parse_math=False)
     x, y, *_ = layout.box(left, 0.08, 0.0, 0.0)
-    said = typesetting.wrapped(page.provenance(dataset), room, sheet.small)
+    said = typesetting.wrap_text(page.provenance(dataset), room, sheet.small)
     picture.text(x, y, said, size=sheet.small, color=style.QUIET, parse_math=False)
 
 
@@ -173,6 +173,6 @@ def _draw_range(picture: page.Picture, layout: Layout, sweep: Sweep, value: floa
     plain: dict[str, Any] = {"textcoords": "offset points", "parse_math": False, "annotation_clip": False}
     for end, at in ((low, "left"), (high, "right")):
         look: dict[str, Any] = {"size": sheet.tick, "color": style.QUIET, "ha": at, "va": "top"}
-        ax.annotate(sweep.said(end), (end, 0), (0, -7 * sheet.type), **look, **plain)
-    said, look = f"{sweep.name} = {sweep.said(value)}", {"size": sheet.label + 1, "color": style.INK}
+        ax.annotate(sweep.write_value(end), (end, 0), (0, -7 * sheet.type), **look, **plain)
+    said, look = f"{sweep.name} = {sweep.write_value(value)}", {"size": sheet.label + 1, "color": style.INK}
     ax.annotate(said, (low, 0), (0, 8 * sheet.type), weight="bold", **look, **plain)

@@ -43,7 +43,7 @@ def tradeoff_figure(report: Mapping[str, Any], *, width: float | None = None) ->
 
 def _draw(report: Mapping[str, Any], sheet: style.Sheet, keyed: Sequence[str]) -> tuple[page.Picture, list[str]]:
     """Draw the picture, those of the rungs that are `keyed` by number; return it and those there was no room for."""
-    report, time = _timed(report)
+    report, time = _add_times(report)
     relative = report["spread"] is not None
     picture = page.Picture(sheet, sheet.width)
     ax = picture.subplots()
@@ -51,16 +51,19 @@ def _draw(report: Mapping[str, Any], sheet: style.Sheet, keyed: Sequence[str]) -
     ax.set_box_aspect(SHAPE if sheet.zoom > 0.75 else NARROW)
     rows = [row for row in report["rungs"] if row["name"] != report["reference"]]
     low, high = _limits(ax, report, rows, relative)
-    entries = _front(ax, report, rows, relative)
-    entries += _rungs(ax, rows, relative, low, high)
-    entries += [Line2D([], [], **sheet.look(style.WHISKER), label="95 % interval"), _against(ax, report, time)]
+    entries = _draw_front(ax, report, rows, relative)
+    entries += _draw_variants(ax, rows, relative, low, high)
+    entries += [
+        Line2D([], [], **sheet.look(style.INTERVAL_LINE), label="95 % interval"),
+        _draw_reference(ax, report, time),
+    ]
     unit = f" [{report['loss_unit']}]" if report["loss_unit"] else ""
     what = "loss error, 95th percentile"
     how = f"{what} [% of the losses' spread]" if relative else what + unit
     panel.name_axes(ax, f"time of an episode with gradient [{time}]", how)
-    _head(picture, ax, report)
+    _write_head(picture, ax, report)
     numbers = {name: str(number) for number, name in enumerate(keyed, start=1)}
-    page.finish(picture, [*entries, *_keys(sheet, rows, numbers)], columns=3)
+    page.finish(picture, [*entries, *_number_entries(sheet, rows, numbers)], columns=3)
     return picture, _name(ax, rows, numbers, relative, low, high)
 
 
@@ -76,7 +79,7 @@ def _limits(ax: Axes, report: Mapping[str, Any], rows: Rows, relative: bool) -> 
     return low / ROOM, high * ROOM
 
 
-def _timed(report: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+def _add_times(report: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
     """Give each rung the `time` of an episode with gradient, in a unit that suits the reference; return that too."""
     long = _reference(report)["seconds"]["with_gradient"] >= 2.0
     factor, unit = (1.0, "s") if long else (1e3, "ms")
@@ -95,10 +98,10 @@ def _error(row: Mapping[str, Any], relative: bool, low: float, high: float) -> f
     return high if value is None else max(value, low)
 
 
-def _rungs(ax: Axes, rows: Rows, relative: bool, low: float, high: float) -> list[Artist]:
+def _draw_variants(ax: Axes, rows: Rows, relative: bool, low: float, high: float) -> list[Artist]:
     entries: list[Artist] = []
     sheet = page.sheet_of(ax)
-    for ladder, look in style.LADDERS.items():
+    for ladder, look in style.VARIANTS.items():
         members = [row for row in rows if row["ladder"] == ladder]
         if not members:
             continue
@@ -109,17 +112,20 @@ def _rungs(ax: Axes, rows: Rows, relative: bool, low: float, high: float) -> lis
             if ends["value"] is not None:
                 top = high if ends["high"] is None else ends["high"]
                 ax.plot(
-                    [x, x], [max(ends["low"] or low, low), max(top, low)], gid=INTERVAL, **sheet.look(style.WHISKER)
+                    [x, x],
+                    [max(ends["low"] or low, low), max(top, low)],
+                    gid=INTERVAL,
+                    **sheet.look(style.INTERVAL_LINE),
                 )
         lost = sum(_ends(row, relative)["value"] is None for row in members)
         label = f"{ladder} ({lost} failed too often: on the edge)" if lost else ladder
-        mark = sheet.look(style.RUNG | look)
+        mark = sheet.look(style.VARIANT_MARK | look)
         ax.plot(seconds, errors, **mark, gid=ladder, clip_on=False)
         entries.append(Line2D([], [], **mark, label=label))
     return entries
 
 
-def _front(ax: Axes, report: Mapping[str, Any], rows: Rows, relative: bool) -> list[Artist]:
+def _draw_front(ax: Axes, report: Mapping[str, Any], rows: Rows, relative: bool) -> list[Artist]:
     """Draw the front as steps: at any time, the least error that so much time buys, until it buys the reference."""
     end = _reference(report)["time"]
     seconds = [row["time"] for row in rows]
@@ -142,19 +148,21 @@ def _reference(report: Mapping[str, Any]) -> Mapping[str, Any]:
     return found
 
 
-def _against(ax: Axes, report: Mapping[str, Any], unit: str) -> Artist:
+def _draw_reference(ax: Axes, report: Mapping[str, Any], unit: str) -> Artist:
     row = _reference(report)
     seconds = row["time"]
     label = f"{row['name']}: {style.number(seconds)} {unit}, error 0 by definition"
-    line: Artist = ax.axvline(seconds, **page.sheet_of(ax).look(style.AGAINST), label=label)
+    line: Artist = ax.axvline(seconds, **page.sheet_of(ax).look(style.REFERENCE_LINE), label=label)
     return line
 
 
-def _keys(sheet: style.Sheet, rows: Rows, numbers: Mapping[str, str]) -> list[Artist]:
+def _number_entries(sheet: style.Sheet, rows: Rows, numbers: Mapping[str, str]) -> list[Artist]:
     """Return what the numbers of rungs stand for, with their marks."""
     found = {row["name"]: row for row in rows}
-    looks = {name: sheet.look(style.RUNG | style.LADDERS[found[name]["ladder"]]) for name in numbers}
-    return [Line2D([], [], **looks[name], label=f"{number}: {short(found[name])}") for name, number in numbers.items()]
+    looks = {name: sheet.look(style.VARIANT_MARK | style.VARIANTS[found[name]["ladder"]]) for name in numbers}
+    return [
+        Line2D([], [], **looks[name], label=f"{number}: {short_name(found[name])}") for name, number in numbers.items()
+    ]
 
 
 def _name(ax: Axes, rows: Rows, numbers: Mapping[str, str], relative: bool, low: float, high: float) -> list[str]:
@@ -170,7 +178,7 @@ def _name(ax: Axes, rows: Rows, numbers: Mapping[str, str], relative: bool, low:
     )
     rows = sorted(rows, key=lambda row: (row["name"] not in numbers, row["ladder"] != "named"))
     names = [
-        labels.Name(numbers.get(row["name"], short(row)), (row["time"], _error(row, relative, low, high)))
+        labels.Name(numbers.get(row["name"], short_name(row)), (row["time"], _error(row, relative, low, high)))
         for row in rows
     ]
     gaps = [gap * sheet.type for gap in GAPS]
@@ -178,7 +186,7 @@ def _name(ax: Axes, rows: Rows, numbers: Mapping[str, str], relative: bool, low:
     return [rows[number]["name"] for number in left]
 
 
-def short(row: Mapping[str, Any]) -> str:
+def short_name(row: Mapping[str, Any]) -> str:
     """Return a rung's name without what its mark says: of standard-dt-x0.5, standard \N{MULTIPLICATION SIGN}0.5."""
     base, *turned = str(row["name"]).replace(" on ", "-").split("-")
     if row["ladder"] == "named" or not turned:
@@ -197,7 +205,7 @@ def _outline(line: Line2D) -> NDArray[np.float64]:
     return between.reshape(-1, 2)
 
 
-def _head(picture: page.Picture, ax: Axes, report: Mapping[str, Any]) -> None:
+def _write_head(picture: page.Picture, ax: Axes, report: Mapping[str, Any]) -> None:
     page.entitle(picture, f"{report['env']} · accuracy against time · {report['points']} points")
     known = {**report["provenance"], **report["identity"]}
     said = [f"{known[key]}" for key in ("device", "created", "command") if known.get(key)]

@@ -37,7 +37,7 @@ class Relief:
 
     def at(self, u: Grid, v: Grid, loss: Grid) -> Grid:
         """Return positions, shape (..., 3)."""
-        low, high = (side.numpy() for side in self.plane.window())
+        low, high = (side.numpy() for side in self.plane.cell_bounds())
         flat = SIDE * ((np.stack([u, v], axis=-1) - low) / (high - low) - 0.5)
         return np.concatenate([flat, self.height(loss)[..., None]], axis=-1)
 
@@ -56,7 +56,7 @@ class Relief:
 
         Of the loss none is at the foot, where another axis begins.
         """
-        low, high = [*zip(*(side.tolist() for side in self.plane.window()), strict=True), self.scale.ends][axis]
+        low, high = [*zip(*(side.tolist() for side in self.plane.cell_bounds()), strict=True), self.scale.ends][axis]
         logarithmic = axis == 2 and self.scale.logarithmic
         ticks = np.asarray((LogLocator(numticks=6) if logarithmic else MaxNLocator(5)).tick_values(low, high))
         ticks = ticks[(ticks >= low) & (ticks <= high)]
@@ -159,11 +159,11 @@ def azimuth(relief: Relief, dataset: xr.Dataset) -> float:
     if not np.isfinite(height).any():
         return AZIMUTHS[0]
     rows, columns = np.nonzero(height <= np.nanquantile(height, LOWEST))
-    seen = [_seen(np.nan_to_num(height, nan=0.0), rows, columns, np.radians(angle)) for angle in AZIMUTHS]
+    seen = [_visible_share(np.nan_to_num(height, nan=0.0), rows, columns, np.radians(angle)) for angle in AZIMUTHS]
     return AZIMUTHS[int(np.argmax(np.round(seen, 6)))]  # the first of equals
 
 
-def _seen(height: Grid, rows: NDArray[np.intp], columns: NDArray[np.intp], angle: float) -> float:
+def _visible_share(height: Grid, rows: NDArray[np.intp], columns: NDArray[np.intp], angle: float) -> float:
     """Return which share of the cells the eye sees: on the way to it, nothing is higher than the line of sight."""
     way = np.linspace(0.0, 1.5 * SIDE, STEPS)[1:, None]
     size = np.array(height.shape)

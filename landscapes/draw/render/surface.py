@@ -158,7 +158,7 @@ def _add_run(plotter: pv.Plotter, body: Relief, run: xr.Dataset) -> None:
         if (here & shown).any():
             ball = pv.Sphere(radius=POINT, theta_resolution=16, phi_resolution=16)
             points = pv.PolyData(places[here & shown]).glyph(geom=ball, scale=False, orient=False)
-            look = {"color": style.KINDS[name]["color"], "smooth_shading": True, **MATTER}
+            look = {"color": style.POINT_MARKS[name]["color"], "smooth_shading": True, **MATTER}
             plotter.add_mesh(points, name=f"{label} {name}", reset_camera=False, **look)
     previous = run["previous"].to_numpy()
     rows = np.flatnonzero((previous >= 0) & shown & shown[previous])
@@ -213,7 +213,7 @@ def _entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
     """Return legend entries of methods and of kinds of points."""
     dot = sheet.look({"linestyle": "none", "marker": "o", "markersize": 6.0})
     kinds = dict.fromkeys(name for run in runs for name, _ in by_kind(run))
-    found: list[Artist] = [Line2D([], [], color=style.KINDS[name]["color"], **dot, label=name) for name in kinds]
+    found: list[Artist] = [Line2D([], [], color=style.POINT_MARKS[name]["color"], **dot, label=name) for name in kinds]
     methods = {str(run.attrs["method"]): style.method(run)["color"] for run in runs}
     large = dot | {"markersize": 10.0 * sheet.weight}
     bests = [Line2D([], [], color=color, **large, label=f"{m}: best") for m, color in methods.items()]
