@@ -51,6 +51,8 @@ def from_numpy(
     `differences` makes gradients by central differences with that step, a fraction of each parameter's range; at the
     bounds they are one-sided, since the function is not asked beyond them. With `vectorized=False` the function takes a
     single point, shape (dim,), and returns one loss, or that and its gradient.
+
+    Raises ValueError where `differences` is no fraction of the bounds, or lost in rounding beside them.
     """
     differences = None if differences is None else _step(differences, space)
     return _NumpyObjective(fn if vectorized else _Pointwise(fn, list), space, name or _name(fn), loss_unit, differences)

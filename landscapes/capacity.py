@@ -35,6 +35,8 @@ def require(what: str, value: int, need: Callable[[int], Need], folder: Path | N
 
     `what` names the value, such as resolution, and `need` says what each value of it takes, a larger one no less.
     Without a `folder` nothing is written.
+
+    Raises TooLargeError where it does not fit.
     """
     there = Need(available_memory(), free_disk(folder) if folder else float("inf"))
     too_large = min(value, ENDLESS)

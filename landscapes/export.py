@@ -22,6 +22,8 @@ def save_as(dataset: xr.Dataset, path: Path, kind: str) -> None:
     """Write a slice or a run as csv, parquet or netcdf, whole or not at all.
 
     The first two hold `frame`; the last holds the dataset itself, with all of its attributes.
+
+    Raises ValueError where `kind` is another.
     """
     if kind not in SUFFIXES:
         raise ValueError(f"a slice or a run is exported to {', '.join(SUFFIXES)}; got {kind!r}")

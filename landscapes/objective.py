@@ -54,6 +54,8 @@ class Evaluation:
         """Make an evaluation from raw results: mark non-finite rows, keep what `failed` says, blank every failure.
 
         `failed` holds a Status per row, OK where nothing is known to have gone wrong.
+
+        Raises ValueError where results are no real numbers, or codes in `failed` mean no Status.
         """
         loss, grad = _real(loss, "a loss"), None if grad is None else _real(grad, "a gradient")
         status = torch.full(loss.shape, Status.OK, dtype=torch.int8)
@@ -111,6 +113,8 @@ def evaluate(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool)
     """Evaluate an objective, hold the result against the protocol, and blank every failure.
 
     Points beyond its bounds have left the domain (status ESCAPED), unless the objective invites them.
+
+    Raises ValueError where the objective's answer is not what the protocol says, and what it raises itself.
     """
     invited = getattr(objective, "beyond_box", False)
     raw = _ask(objective, x, grad=grad) if invited else evaluate_inside(objective, x, grad=grad)
@@ -123,6 +127,8 @@ def evaluate_inside(objective: Objective, x: Float[Tensor, "batch dim"], *, grad
     """Evaluate an objective at those of the points that lie in its box; the others have left the domain.
 
     What is no point at all, of a wrong shape or not a number, is for the objective to refuse.
+
+    Raises what `evaluate` does.
     """
     if x.ndim != 2 or x.shape[1] != objective.space.dim:
         return objective.evaluate(x, grad=grad)

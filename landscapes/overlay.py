@@ -28,6 +28,8 @@ def overlay(dataset: xr.Dataset, tables: Sequence[xr.Dataset]) -> list[xr.Datase
     the loss of the sample whose cell is there, NaN outside and where that sample failed; `previous`, the row whose
     gradient led to this one, -1 for none; `best`, the least loss so far. Nearness is measured in the box scaled to
     [-1, 1], so that the parameters' units do not count. The attribute `label` tells runs apart.
+
+    Raises ValueError where the slice is a line, or a run searched other parameters.
     """
     plane = plane_of(dataset)
     if plane.rank != 2:
@@ -36,7 +38,10 @@ def overlay(dataset: xr.Dataset, tables: Sequence[xr.Dataset]) -> list[xr.Datase
 
 
 def lay(dataset: xr.Dataset, table: xr.Dataset, label: str) -> xr.Dataset:
-    """Lay one run over a line, where no point has a `v`, or a plane, as `overlay` does."""
+    """Lay one run over a line, where no point has a `v`, or a plane, as `overlay` does.
+
+    Raises ValueError where the run searched other parameters than the slice has.
+    """
     plane = plane_of(dataset)
     parameters = [str(name) for name in dataset["dim"].to_numpy()]
     if parameters != [str(name) for name in table["dim"].to_numpy()]:
@@ -70,7 +75,10 @@ def improvements(run: xr.Dataset) -> NDArray[np.intp]:
 
 
 def best_point(tables: Sequence[xr.Dataset]) -> tuple[Float[Tensor, " dim"], float]:
-    """Return the point of least loss among all the runs, and its loss."""
+    """Return the point of least loss among all the runs, and its loss.
+
+    Raises ValueError where no episode succeeded.
+    """
     losses = np.concatenate([table["loss"].to_numpy() for table in tables])
     if not np.isfinite(losses).any():
         raise ValueError("no episode of these runs succeeded, so there is no best point")
@@ -85,6 +93,8 @@ def principal_plane(
     """Lay a plane through the principal directions of the runs' points, found in the box scaled to [-1, 1].
 
     Its coordinates are in half-widths of the box. With `through` it is moved, parallel to itself, to hold that point.
+
+    Raises ValueError where the points are too few, or spread in one direction alone.
     """
     center, half = _box(tables[0])
     scaled = torch.cat([(_points(table) - center) / half for table in tables])

@@ -77,6 +77,8 @@ class Plane:
         The plane coordinate is the parameter's own value. `extent` is None for the parameters' bounds, a fraction of
         them for a window of that size around `origin` (moved to stay inside the bounds if it fits), or a pair (lower,
         upper) in the parameters' units, each one number or one per axis.
+
+        Raises ValueError where parameters, point, resolution or extent are none of this space's.
         """
         numbers = [space.index(dim) for dim in dims]
         if len(numbers) not in (1, 2) or len(set(numbers)) != len(numbers):
@@ -103,7 +105,10 @@ class Plane:
         extent: tuple[Bound, Bound] = (-1.0, 1.0),
         labels: Sequence[str] | None = None,
     ) -> Plane:
-        """Span a plane by any directions, kept as given: coordinate 1 is one whole `directions[i]` from `origin`."""
+        """Span a plane by any directions, kept as given: coordinate 1 is one whole `directions[i]` from `origin`.
+
+        Raises ValueError where the directions are zero or parallel, or sizes do not fit each other.
+        """
         origin, directions = (as_tensor(t, "a slice's point and directions") for t in (origin, directions))
         rank = len(directions)
         lower, upper = _ends(extent, rank)
@@ -124,6 +129,8 @@ class Plane:
         The origin is their mean and the directions have unit length, the largest component positive. The axes cover
         the projected points and a `margin`, as a fraction of their range. Parameters count in their own units: where
         these differ wildly, run it on a space of comparable ones.
+
+        Raises ValueError where the points are too few, not finite, or spread in fewer directions than `rank`.
         """
         points = as_tensor(points, "a principal plane")
         if points.ndim != 2 or len(points) <= rank:

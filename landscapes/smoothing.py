@@ -15,6 +15,8 @@ def smooth(dataset: xr.Dataset, width: float) -> xr.Dataset:
     Only samples that are there count: weights beyond the box and on failed samples are left out and the others scaled
     to sum to one, so that no value is invented; a failed sample stays failed. Gradients are left out. Width 0 is the
     slice itself.
+
+    Raises ValueError where the width is negative.
     """
     if not width >= 0:
         raise ValueError(f"a slice is smoothed over a width that is not negative; got {width}")

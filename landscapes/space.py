@@ -94,13 +94,19 @@ class ParameterSpace:
         return (tensor_of(x, "to_unit") - self.lower) / (self.upper - self.lower)
 
     def uniform(self, count: int, *, seed: int) -> Float[Tensor, "count dim"]:
-        """Draw points uniformly from the box; the same seed gives the same points."""
+        """Draw points uniformly from the box; the same seed gives the same points.
+
+        Raises ValueError where the count or the seed is no whole number.
+        """
         generator = torch.Generator().manual_seed(as_whole(seed, "a seed"))
         count = as_whole(count, "a count of points")
         return self.from_unit(torch.rand(count, self.dim, generator=generator, dtype=torch.float64))
 
     def index(self, parameter: str | int) -> int:
-        """Return the number of a parameter given by name or by number."""
+        """Return the number of a parameter given by name or by number.
+
+        Raises ValueError where there is none.
+        """
         if isinstance(parameter, str) and parameter in self.names:
             return self.names.index(parameter)
         try:

@@ -38,6 +38,8 @@ def check(
     in the other precision: gradients are judged in float64 where there is one. `variants` are further ways to push it.
     `expected` holds the checks that are known to fail, with the reason: such a failure is excused, and a pass is not.
     `follow` is called with the name of each check before it runs.
+
+    Raises ValueError where there are fewer than 2 points; what the objective raises is a finding.
     """
     if points < 2:
         raise ValueError(f"check takes at least 2 points, to compare rows of a batch; got {points}")

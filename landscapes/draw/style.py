@@ -140,6 +140,8 @@ class Sheet:
         """Return a screen's, `columns` panels of a `pitch` [inch], or that of a page `width` millimetres wide.
 
         There, as many of the `panels` stand side by side as have `least` millimetres each; type has a journal's sizes.
+
+        Raises ValueError where the page is narrower or wider than any that is printed.
         """
         if width is None:
             return cls(columns * pitch, columns, 1.0)

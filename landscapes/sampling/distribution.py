@@ -101,7 +101,10 @@ class RemoteSite:
     identity: Mapping[str, Any]
 
     def here(self) -> Site:
-        """Return the site with its objective, made where this process has not made it yet, and its store."""
+        """Return the site with its objective, made where this process has not made it yet, and its store.
+
+        Raises StoreError where this process does not see the store, StoreMismatchError where it is another one.
+        """
         try:
             at = place_of(Path(self.path)).stat()
         except FileNotFoundError:
@@ -214,7 +217,10 @@ def distribute(site: Site, groups: Sequence[Sequence[Tile]], executor: Executor)
 
 
 def run_tasks(executor: Executor, work: Callable[..., T], tasks: Iterable[Sequence[Any]]) -> Iterator[T]:
-    """Let workers do tasks, and yield each result when it is there; what is not begun when that ends is cancelled."""
+    """Let workers do tasks, and yield each result when it is there; what is not begun when that ends is cancelled.
+
+    Raises WorkersLostError where nobody is left to do them, and what a task raises.
+    """
     futures: list[Future[T]] = []
     try:
         futures += [executor.submit(work, *task) for task in tasks]

@@ -62,6 +62,10 @@ def sample(
     With an `executor` its workers evaluate batches and write them to the store, which processes must see at the same
     path. Threads share the objective; in a process `made`, a function that can be pickled, makes it once, or else it is
     pickled itself. Batches are equal then, and of at most `batch` points. Where workers are lost, `WorkersLostError`.
+
+    Raises StoreMismatchError where the store was made by other settings, TooLargeError where the slice does not fit
+    into memory, DiskFullError and WorkersLostError where filling ended early, which say what is kept, and MemoryError
+    where a single point is too much for the device.
     """
     if store is None:
         store = SliceStore.in_memory(plane, objective.space, **_describe(objective), grad=grad)

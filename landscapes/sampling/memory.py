@@ -32,7 +32,10 @@ class MemoryBound:
         self._most: int | None = None
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
-        """Return losses, and gradients if asked, at points `x` in the parameters' own units."""
+        """Return losses, and gradients if asked, at points `x` in the parameters' own units.
+
+        Raises MemoryError where the device has too little memory for a single point.
+        """
         parts: list[Evaluation] = []
         start = 0
         while start < len(x):

@@ -52,7 +52,10 @@ def need_of(shape: tuple[int, ...], dim: int, *, grad: bool) -> Need:
 
 
 def refuse_too_large(plane: Plane, path: Path | None, *, grad: bool) -> None:
-    """Refuse a slice that is larger than this machine, in memory alone where there is no path."""
+    """Refuse a slice that is larger than this machine, in memory alone where there is no path.
+
+    Raises TooLargeError.
+    """
     most = max(plane.resolution)
 
     def need(side: int) -> Need:

@@ -31,7 +31,10 @@ def full(error: OSError, kept: str) -> DiskFullError:
 
 @contextmanager
 def until_full(kept: Callable[[], str]) -> Iterator[None]:
-    """Say what is `kept` where the disk is full, unless that is said already."""
+    """Say what is `kept` where the disk is full, unless that is said already.
+
+    Raises DiskFullError then; every other error passes.
+    """
     try:
         yield
     except OSError as error:

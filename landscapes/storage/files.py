@@ -91,6 +91,8 @@ def placing(path: Path, *, overwrite: bool, check: Callable[[], None] = lambda: 
     """Give a folder's path of its own to build at, and rename it to `path` at the end, unless that is taken by then.
 
     `check` is called just before a folder that is there is replaced, to refuse that.
+
+    Raises FileExistsError where another process has made it meanwhile, and what `check` raises.
     """
     with _hidden_folder(path) as folder:
         new, old = folder / f"{path.name}.partial", folder / f"{path.name}.replaced"

@@ -19,7 +19,10 @@ SHOWN = 160  # characters of what is wrong
 
 @contextmanager
 def reading(path: Path, todo: str) -> Iterator[None]:
-    """Read a file of ours and take from it what is needed, all within: what goes wrong then is the file's fault."""
+    """Read a file of ours and take from it what is needed, all within: what goes wrong then is the file's fault.
+
+    Raises DamagedError, which says what `todo`; that a file is missing or may not be read passes.
+    """
     try:
         yield
     except (DamagedError, FileNotFoundError, PermissionError, IsADirectoryError):
@@ -35,7 +38,10 @@ def write_record(path: Path, record: Mapping[str, Any]) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the JSON object that a file holds, held against its checksum if it has one."""
+    """Return the JSON object that a file holds, held against its checksum if it has one.
+
+    Raises ValueError where it is no JSON or not what was written, TypeError where it is no object.
+    """
     return verify(json.loads(path.read_text()))
 
 
@@ -45,7 +51,10 @@ def sign(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def verify(found: Any) -> dict[str, Any]:
-    """Return a record without its checksum; those of earlier versions have none."""
+    """Return a record without its checksum; those of earlier versions have none.
+
+    Raises TypeError where it is no JSON object, ValueError where the checksum is not that of the rest.
+    """
     if not isinstance(found, dict):
         raise TypeError("it is no JSON object")
     record = {name: value for name, value in found.items() if name != CHECKSUM}
@@ -59,14 +68,20 @@ def _sum(record: Mapping[str, Any]) -> int:
 
 
 def text(value: Any) -> str:
-    """Return what has to be a string."""
+    """Return what has to be a string.
+
+    Raises TypeError where it is none.
+    """
     if not isinstance(value, str):
         raise TypeError(f"{value!r} is no text")
     return value
 
 
 def number(value: Any) -> float:
-    """Return what has to be a finite number, as it is."""
+    """Return what has to be a finite number, as it is.
+
+    Raises TypeError where it is none.
+    """
     if not isinstance(value, int | float) or not math.isfinite(value):
         raise TypeError(f"{value!r} is no number")
     return value

@@ -93,6 +93,9 @@ class SliceStore:
         `identity` holds what decides the numbers (objective, options, fidelity, device); plane, parameters, gradients
         and version are added here. `provenance` is anything else worth keeping. Both must be plain JSON. `overwrite`
         replaces a slice store with nothing else in it, and refuses to replace anything else.
+
+        Raises StoreExistsError where the path is taken, StoreError where what is there is not replaced, and
+        TooLargeError where the slice does not fit onto the disk or into memory.
         """
         path = resolve(path)
         whole = full_identity(identity, plane, space, grad=grad)
@@ -114,7 +117,10 @@ class SliceStore:
 
     @classmethod
     def open(cls, path: str | Path) -> SliceStore:
-        """Open a store that exists, the finished slice where there is one."""
+        """Open a store that exists, the finished slice where there is one.
+
+        Raises StoreError where there is none, DamagedError where it is not what was written.
+        """
         path = finished_path(resolve(path))
         place = place_of(path)
         if not place.exists():
@@ -167,7 +173,10 @@ class SliceStore:
         provenance: Mapping[str, Any] | None = None,
         grad: bool = True,
     ) -> SliceStore:
-        """Make a store that lives as long as the object."""
+        """Make a store that lives as long as the object.
+
+        Raises TooLargeError where it does not fit into memory.
+        """
         refuse_too_large(plane, None, grad=grad)
         group = zarr.create_group(MemoryStore(), zarr_format=3)
         whole = full_identity(identity or {}, plane, space, grad=grad)
@@ -226,7 +235,11 @@ class SliceStore:
         return self.plane.lift(torch.from_numpy(np.stack([axis.ravel() for axis in grid], axis=1)))
 
     def write(self, tile: Tile, evaluation: Evaluation) -> None:
-        """Write a whole tile, status last; `evaluation` has its points in the order of `points`, failures blanked."""
+        """Write a whole tile, status last; `evaluation` has its points in the order of `points`, failures blanked.
+
+        Raises ValueError where gradients are missing or a point was not evaluated, StoreError where the store was
+        replaced.
+        """
         shape = tuple(at.stop - at.start for at in self._samples.place(tile))
         if self.grad and evaluation.grad is None:
             raise ValueError("this slice holds gradients; got an evaluation without, so evaluate with grad=True")
@@ -253,6 +266,8 @@ class SliceStore:
         """Return everything sampled so far, axes ascending; MISSING and NaN where nothing is.
 
         `known` spares reading tiles again: what `read_tile` returned of them.
+
+        Raises StoreError where the store was replaced.
         """
         return self._read_steadily(lambda: self._dataset(self._samples.whole, None if self.ascending else known))
 
@@ -260,6 +275,8 @@ class SliceStore:
         """Put the whole slice, which `dataset` returned, in the place of its tiles: ascending, in large chunks.
 
         It appears at once, and only then the tiles go.
+
+        Raises StoreError where the slice is not complete, or the store was replaced.
         """
         if self.path is None or self.ascending or self._follow_finished():
             return
@@ -324,6 +341,8 @@ def open_slice(path: str | Path) -> xr.Dataset:
     """Read a slice from disk: loss and gradient in float64, axes ascending, MISSING where it is not sampled yet.
 
     `path` is the slice, or the folder that `landscape slice` left it in.
+
+    Raises StoreError where there is no slice, DamagedError where it is not what was written.
     """
     path = Path(path)
     return SliceStore.open(path / SLICE if slice_exists(path / SLICE) else path).dataset()

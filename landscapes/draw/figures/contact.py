@@ -44,7 +44,10 @@ class Caption:
 
 
 def save_sheet(episode: Episode, path: str | Path, *, caption: Caption | None = None, keys: int = KEYS) -> None:
-    """Write key frames side by side as PNG, PDF or SVG, by the file's ending."""
+    """Write key frames side by side as PNG, PDF or SVG, by the file's ending.
+
+    Raises ValueError where the episode has no `parts`, or the ending is no picture's.
+    """
     page.save(episode_figure(episode, caption=caption, keys=keys), path)
 
 
@@ -54,6 +57,8 @@ def episode_figure(
     """Draw evenly spaced frames, first and last among them, each over its time; then a target of particles.
 
     The first has a scale. It is right at the middle of the view: what is nearer to the eye is larger.
+
+    Raises ValueError where the episode has no `parts`, or the page is too narrow or too wide.
     """
     chosen, caption = replay.pick_frames(episode, keys), caption or Caption()
     shown = [*replay.frames(episode, chosen, marked=False)]

@@ -31,6 +31,8 @@ def landscape_figure(dataset: xr.Dataset, *, width: float | None = None) -> page
     arrows are equally long and point down the steepest slope of the picture as it is seen, its axes scaled to the same
     length; their colour is the magnitude of the gradient along the plane. Failures are hatched and counted. `width` is
     that of a page for print [mm]; as for every picture, without it the picture is as large as suits a screen.
+
+    Raises ValueError where the slice is a line, or the page too narrow or too wide.
     """
     plane = plane_of(dataset)
     if plane.rank != 2:

@@ -37,6 +37,8 @@ def overlay_figure(dataset: xr.Dataset, runs: Runs, *, width: float | None = Non
     number says in which episode they came. Points beyond the map are hollow and at its border; failed episodes are
     crosses. On the right, or below it on a narrow page, every point is held against the sample it lies over: it is on
     the diagonal if the map tells its loss.
+
+    Raises ValueError where the page is too narrow or too wide.
     """
     plane, reach = plane_of(dataset), farthest_distance(runs)
     sheet = style.Sheet.of(width, pitch=PITCH, columns=2)

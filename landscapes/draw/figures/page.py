@@ -77,7 +77,10 @@ def write_over(ax: Axes, text: str, *, size: float, color: str) -> None:
 
 
 def picture_of(ax: Axes) -> Picture:
-    """Return the picture that a panel is in."""
+    """Return the picture that a panel is in.
+
+    Raises TypeError where it is in a figure that is no Picture.
+    """
     picture = ax.get_figure(root=True)
     if not isinstance(picture, Picture):
         raise TypeError(f"panels are drawn in a Picture, which knows its sheet; got one in a {type(picture).__name__}")
@@ -158,7 +161,10 @@ def _key(picture: Picture, entries: Sequence[Artist], columns: int, heading: str
 
 
 def save(figure: Figure, path: str | Path) -> None:
-    """Write a figure as PNG, PDF or SVG, by the file's ending, whole or not at all."""
+    """Write a figure as PNG, PDF or SVG, by the file's ending, whole or not at all.
+
+    Raises ValueError where the ending is another.
+    """
     path = Path(path)
     kind = path.suffix.lower().removeprefix(".")
     if kind not in DATED:
@@ -172,6 +178,8 @@ def save_prints(draw: Callable[[float], Figure], path: Path, widths: Sequence[fl
     """Write what `draw` draws for a page of so many millimetres as PDF and SVG beside `path`; return their names.
 
     Those that are there from before are drawn anew, so that none is of something else.
+
+    Raises ValueError where a width is no page's.
     """
     before = {width for file in visible_files(path.parent) if (width := print_width(file.name, path.name))}
     names = []

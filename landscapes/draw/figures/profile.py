@@ -29,6 +29,8 @@ def profile_figure(
 
     `events` maps a name to a whole number per point (how many bounces, say): each is a strip on top, labelled where
     there is room, and a thin line through the panels wherever it changes. Failures are hatched and counted.
+
+    Raises ValueError where the slice is a plane, or the page too narrow or too wide.
     """
     plane = plane_of(dataset)
     if plane.rank != 1:

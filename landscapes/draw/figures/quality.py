@@ -35,6 +35,8 @@ def quality_figure(
     `steps` is of `gradients.ladder`, `samples` of `gradients.of_samples` and `smooth` of `gradients.smoothed_slopes`.
     Panels that show the same by the same colours share a colour bar, beside the last of them. Six panels one below the
     other would be higher than a printed page: on a narrow one they are in pairs.
+
+    Raises ValueError where the page is too narrow or too wide.
     """
     plane = plane_of(dataset)
     sheet = style.Sheet.of(width, pitch=PITCH, columns=3, least=LEAST)

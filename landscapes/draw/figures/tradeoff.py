@@ -31,6 +31,8 @@ def tradeoff_figure(report: Mapping[str, Any], *, width: float | None = None) ->
     the upper edge, counted in the legend, those that are exactly right on the lower one. Every rung is named, shortly:
     its mark says what was turned, the name from which fidelity on and to what. Where it is crowded a line leads to the
     name, or it stands in the legend, by number.
+
+    Raises ValueError where the page is too narrow or too wide.
     """
     sheet = style.Sheet.of(width, pitch=PITCH)
     keyed: list[str] = []

@@ -37,7 +37,10 @@ POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:"
 
 
 def open_viewer(path: Path, *, wait: float = 2.0) -> None:
-    """Open a recording in rerun's own window, which stays when this process ends; it has to survive `wait` seconds."""
+    """Open a recording in rerun's own window, which stays when this process ends; it has to survive `wait` seconds.
+
+    Raises OSError where it does not open, or rerun's program is not installed.
+    """
     with tempfile.TemporaryFile() as log:
         viewer = _rerun(str(resolve(path)), "--port", "auto", log=log)
         try:
@@ -51,7 +54,10 @@ def open_viewer(path: Path, *, wait: float = 2.0) -> None:
 
 @contextmanager
 def serve_recording(path: Path) -> Iterator[str]:
-    """Serve a recording with rerun's web viewer on the loopback interface, and give the address to open."""
+    """Serve a recording with rerun's web viewer on the loopback interface, and give the address to open.
+
+    Raises OSError where rerun's own server does not answer, or its program is not installed.
+    """
     assets = _assets()
 
     class Handler(LoopbackHandler):

@@ -36,7 +36,10 @@ SAMPLES = 40_000  # of the surfaces that throw it
 
 
 def save_replay(episode: Episode, mp4: str | Path, gif: str | Path, *, title: str = "", longest: int = LONGEST) -> int:
-    """Write evenly spaced frames, first and last among them, under a title as MP4 and GIF; return how many."""
+    """Write evenly spaced frames, first and last among them, under a title as MP4 and GIF; return how many.
+
+    Raises ValueError where the episode has no `parts`, OSError where ffmpeg could not write.
+    """
     count = min(longest, len(episode.time))
     pictures = add_title(frames(episode, pick_frames(episode, count)), title)
     save_film(pictures, Path(mp4), Path(gif), count=count, rate=RATE)
@@ -74,6 +77,8 @@ def frames(episode: Episode, chosen: Sequence[int], *, height: int = HEIGHT, mar
     """Yield pictures of the chosen frames, shape (height, width, 3); each has its time and a scale unless not `marked`.
 
     The scale is right at the middle of the view: what is nearer is larger.
+
+    Raises ValueError where the episode has no `parts`.
     """
     if not episode.parts:
         raise ValueError("the episode says not what its parts look like; give Episode its `parts`")

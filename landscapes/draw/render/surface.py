@@ -63,6 +63,8 @@ def save_surface(dataset: xr.Dataset, runs: Runs, png: str | Path, gltf: str | P
 
     The model is turned so that who opens it looks at it from where the picture does: in glTF y points up and z to who
     looks.
+
+    Raises ValueError where the slice is a line.
     """
     page.save(surface_figure(dataset, runs), png)
     with scene(dataset, runs) as shown, replacing(Path(gltf)) as partial:
@@ -79,6 +81,8 @@ def surface_figure(dataset: xr.Dataset, runs: Runs = (), *, width: float | None 
     """Draw a slice as a body whose height and colour are the loss: every sample is flat, those that failed are holes.
 
     It is seen from the side, of eight, from which most of the valley is, its lowest tenth.
+
+    Raises ValueError where the slice is a line, or the page too narrow or too wide.
     """
     sheet = style.Sheet.of(width, pitch=PITCH)
     fine = max(1.0, FINE * sheet.width / PIXELS[0]) if width else 1.0
@@ -105,7 +109,10 @@ def surface_figure(dataset: xr.Dataset, runs: Runs = (), *, width: float | None 
 
 @contextmanager
 def scene(dataset: xr.Dataset, runs: Runs, *, pixels: tuple[int, int] = PIXELS) -> Iterator[Shown]:
-    """Give the scene of a slice and of runs laid over it."""
+    """Give the scene of a slice and of runs laid over it.
+
+    Raises ValueError where the slice is a line.
+    """
     plane = plane_of(dataset)
     if plane.rank != 2:
         raise ValueError(f"a surface shows a plane; got a slice of rank {plane.rank}, so vary two parameters")
