@@ -1,4 +1,4 @@
-"""Anyone's function as an objective, with one line."""
+"""Adapters that make an objective of a torch or numpy function."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What this machine has room for: a size is reckoned before anything is allocated, and refused where it cannot fit."""
+"""The memory and the disk that are free: a size that cannot fit is refused before anything is allocated."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ MEMINFO, CGROUPS = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
 
 
 class TooLargeError(ValueError):
-    """Say that a size does not fit into the memory or onto the disk of this machine."""
+    """A size does not fit into the memory or onto the disk of this machine."""
 
 
 @dataclass(frozen=True)
 class Need:
-    """Say what something takes, about: bytes of memory, and bytes on the disk."""
+    """Hold an estimate of the bytes of memory and of disk that something takes."""
 
     memory: float = 0.0
     disk: float = 0.0
 
     def times(self, count: float) -> Need:
-        """Return what so many of it take."""
+        """Return the need of `count` such things."""
         return Need(count * self.memory, count * self.disk)
 
 
@@ -70,14 +70,14 @@ def free_disk(folder: Path) -> float:
 
 
 def size(count: float) -> str:
-    """Return a number of bytes in words."""
+    """Write a number of bytes with a unit, such as "2 MB"."""
     unit = next((at for at, _ in enumerate(UNITS) if count < 1000.0 ** (at + 2)), len(UNITS) - 1)
     amount = count / 1000.0 ** (unit + 1)
     return f"{amount:.0f} {UNITS[unit]}" if unit < 2 else f"{amount:.1f} {UNITS[unit]}"
 
 
 def _round_down(value: int) -> int:
-    """Return a value to two digits: more of it would be no truer."""
+    """Round a value down to two digits: more would pretend to more accuracy than an estimate has."""
     digit: int = 10 ** max(0, len(str(value)) - 2)
     return value // digit * digit
 

@@ -1,4 +1,4 @@
-"""What makes two slices, or two runs, the same, and the refusal to mix two that differ."""
+"""The identity of a slice or a run: all settings that decide its numbers; stores of different ones are never mixed."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ SHOWN = 6
 
 
 class StoreError(ValueError):
-    """Say that a path does not hold the store that was asked for."""
+    """A path does not hold the store that was asked for."""
 
 
 class StoreExistsError(StoreError):
-    """Say that a store is not made because its path is taken."""
+    """A store is not made because its path is taken."""
 
 
 class StoreMismatchError(StoreError):
-    """Say that a store was made by other settings."""
+    """A store was made by other settings."""
 
 
 class DamagedError(StoreError):
-    """Say which file is not what was written."""
+    """A file is not what was written."""
 
     @classmethod
     def of(cls, path: Path, why: str, todo: str) -> DamagedError:
-        """Return the one sentence of it: which file, why, and what to do."""
+        """Return the error for a file, with the reason and what to do."""
         return cls(f"{path} is damaged ({why}); {todo}")
 
 

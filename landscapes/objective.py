@@ -1,4 +1,4 @@
-"""What can be evaluated at a batch of points, and what an evaluation says."""
+"""Objectives, which are evaluated at a batch of points, and the records of their results."""
 
 from __future__ import annotations
 

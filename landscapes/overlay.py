@@ -1,4 +1,4 @@
-"""Runs laid over a slice: where their points fall, how far off the plane they are, what the slice shows there."""
+"""Runs laid over a slice: the plane coordinates of their points, their distances from the plane, the losses beneath."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PARALLEL = 1e-12  # most by which the cosine between a step and the negative gra
 
 
 def overlay(dataset: xr.Dataset, tables: Sequence[xr.Dataset]) -> list[xr.Dataset]:
-    """Lay runs over a slice of rank 2: return their tables with where each point falls.
+    """Lay runs over a slice of rank 2: return their tables with the plane coordinates of each point.
 
     Added are, over `evaluation`: `u` and `v` [plane units], the nearest point of the plane; `distance` to it
     [half-widths of the box]; `outside`, whether it lies beyond what the slice's picture covers; `beneath` [loss unit],

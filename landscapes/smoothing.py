@@ -1,4 +1,4 @@
-"""A slice as seen through a Gaussian: every loss an average over the samples around it."""
+"""Smoothing of a slice by a Gaussian: each loss becomes a weighted mean of the samples around it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A measured number with the interval that its sampling leaves open."""
+"""Estimates: a measured number with its confidence interval."""
 
 from __future__ import annotations
 

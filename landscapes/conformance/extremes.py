@@ -1,4 +1,4 @@
-"""What an objective says at the edge of what it is made for: a number or a status, never a silent NaN."""
+"""Checks at the edges of an objective's domain: it returns a number or a status, never a silent NaN."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def _check_variant(subject: Subject, variant: Variant) -> Finding:
 
 
 def _check_energy(subject: Subject, name: str) -> Finding:
-    """Want the energy of motions that nothing drives to stay or to fall, where the objective offers it.
+    """Check that the energy of undriven motions does not rise, where the objective offers `energy`.
 
     `energy(x)` returns it over time, shape (batch, step), counted from rest at the lowest place, or None.
     """

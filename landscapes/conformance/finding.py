@@ -1,4 +1,4 @@
-"""What a check of an objective found."""
+"""The result of one check of an objective."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Finding:
         return self.outcome in (FAIL, UNEXPECTED)
 
     def excuse(self, expected: Mapping[str, str]) -> Finding:
-        """Return the finding judged by the failures that are `expected`, check -> reason."""
+        """Return the finding with an expected failure excused; `expected` maps names of checks to reasons."""
         if self.check not in expected or self.outcome == SKIP:
             return self
         reason = expected[self.check]

@@ -1,4 +1,4 @@
-"""Whether a gradient is that of the loss: against differences on a ladder of steps, by gradcheck, and twice."""
+"""Checks of gradients: against central differences over several steps, by gradcheck, and by two backward passes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Row = dict[str, float | None]
 
 
 def check_slopes(subject: Subject, name: str) -> Finding:
-    """Hold slopes along random directions and axes against central differences, one row of the table for each step.
+    """Compare slopes along random directions and axes with central differences, one row of the table for each step.
 
     What passes is the agreement at the best step: a median relative error of at most ten times the third root of the
     precision, where central differences are exact to its two thirds. A slope that its loss's noise hides is left out.

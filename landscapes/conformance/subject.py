@@ -1,4 +1,4 @@
-"""What the checks of an objective share: its points, their evaluation, and the noise between repeats."""
+"""The subject of a conformance check: an objective, its evaluation at some points, and the noise between repeats."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The checks that every objective must pass, anyone's: what it promises, whether its gradient is true, its extremes."""
+"""The conformance suite: the protocol of an objective, its gradients, and its extremes."""
 
 from __future__ import annotations
 
@@ -161,7 +161,7 @@ def _refuses(objective: Objective, x: Tensor) -> bool:
 
 
 def _check_refusal_of_nan(subject: Subject, name: str) -> Finding:
-    """Want a ValueError, or a status other than OK for the row and no harm to the others."""
+    """Check that nan is refused by a ValueError, or by a status of its row that changes no other row."""
     x = subject.x.clone()
     x[0, -1] = torch.nan
     try:

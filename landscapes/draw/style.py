@@ -1,4 +1,4 @@
-"""Colours, weights, type sizes and norms of every picture; nothing else sets style."""
+"""Colours, line weights, type sizes and colour norms of all pictures; no other module sets style."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ WEIGHTS = {"linewidth": 1, "linewidths": 1, "markersize": 1, "markeredgewidth": 
 
 @dataclass(frozen=True)
 class Sheet:
-    """What a picture's place decides: a screen, as wide as its panels, or a printed page that is so wide."""
+    """Sizes of a picture for its medium: a screen, as wide as its panels need, or a printed page of a given width."""
 
     width: float  # [inch]
     columns: int  # panels side by side
@@ -260,7 +260,7 @@ def log_axis(axis: Axis) -> None:
 
 
 def stroke(points: int) -> dict[str, Any]:
-    """Return how a line of so many points is drawn: with its points where they can be told apart."""
+    """Return the look of a line of so many points: with markers where they can be told apart."""
     return {"linewidth": 1.1, "marker": "o" if points <= 100 else "", "markersize": 2.4}
 
 
@@ -270,7 +270,7 @@ def method(run: xr.Dataset) -> dict[str, Any]:
 
 
 def point_areas(distance: NDArray[np.float64], reach: float, points: int) -> NDArray[np.float64]:
-    """Return how large so many points are drawn [pt^2]: smaller the farther off the plane, `reach` being farthest."""
+    """Return marker areas of so many points [pt^2], which fall with the distance from the plane, at most `reach`."""
     least, most = NEAR
     area = max(least, min(most, most * (150 / max(points, 1)) ** 0.35))
     share: NDArray[np.float64] = 1 - (1 - FAR) * distance / reach if reach else np.ones_like(distance)

@@ -1,4 +1,4 @@
-"""Where a loss jumps: neighbouring samples that differ however close one looks."""
+"""Discontinuities of a loss: differences between neighbouring samples that do not vanish on a finer look."""
 
 from __future__ import annotations
 

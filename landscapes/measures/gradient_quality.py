@@ -1,4 +1,4 @@
-"""How good gradients are, and at what scale: against finite differences, and first order against zeroth order.
+"""Gradient quality by scale: against finite differences, and first order against zeroth order.
 
 Slopes are taken along the plane's axes, per side of its box, as a picture shows them; scales and widths are fractions
 of the box.

@@ -1,4 +1,4 @@
-"""What noise alone does to a loss: a difference below it is no feature."""
+"""The noise of a loss, below which a difference is no feature of the landscape."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the losses of a slice are like: minima and basins, flatness, correlation, variation, information.
+"""Ruggedness of the losses of a slice: minima and basins, flatness, correlation, variation, information.
 
 Every measure takes losses, shape (u,) or (v, u), at evenly spaced samples of a box whose sides count as 1, NaN where an
 evaluation failed; what is missing is left out, never filled in.
@@ -201,7 +201,7 @@ def fitness_distance(loss: Values) -> float:
 
 @dataclass(frozen=True)
 class Ruggedness:
-    """Hold what a slice's losses are like; `floor` [loss unit] is the span of what noise alone would do to them.
+    """Hold the measures of a slice's losses; `floor` [loss unit] is the range that noise alone would give them.
 
     `minima` counts those deeper than the floor, `minima_halved` what every second sample shows of them; `curve` counts
     by depths in fractions of the range. `zero` and `flat` are shares of samples whose gradient along the plane is
@@ -235,7 +235,7 @@ class Ruggedness:
 
 
 def ruggedness(dataset: xr.Dataset, *, floor: float) -> Ruggedness:
-    """Measure a slice's losses, and how much of it is flat."""
+    """Measure the ruggedness of a slice."""
     loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
     found, whole = minima(loss), span(loss)
     notable = found.sample[found.depth > max(floor, NOTABLE * whole)]

@@ -1,4 +1,4 @@
-"""Where tiles are filled: in this process, or by an executor's workers, which write them to the store they share.
+"""Tiles are filled in this process, or by an executor's workers, which write them to the store they share.
 
 What travels is small: to a worker how the objective is made, where the store is and which tiles; back which tiles are
 finished and how their points ended. A tile is the same whoever writes it, so a batch may be done twice and harms none.
@@ -37,7 +37,7 @@ LATE = 120.0  # seconds in which what a worker wrote must appear here: NFS remem
 
 
 class WorkersLostError(OSError):
-    """Say that an executor's workers, or what directs them, are gone."""
+    """The workers of an executor, or their scheduler, are gone."""
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from .memory import MemoryBound
 
 @dataclass(frozen=True)
 class Progress:
-    """Say how far a slice is.
+    """Hold how far a slice is.
 
     `done` of `total` points are finished, `resumed` of them before this run began; `statuses` counts the finished ones.
     `levels` coarse pictures are complete, each finer than the last, and `level_complete` says that one has just become

@@ -1,4 +1,4 @@
-"""An objective whose batches are halved when its device runs out of memory."""
+"""Memory of the device: batches are halved where it runs out."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class MemoryBound:
 
 
 def free_memory() -> None:
-    """Free what objects that are gone held, of a GPU's memory too."""
+    """Collect garbage and empty the cache of GPU memory."""
     gc.collect()  # some, such as a solver and its launches, refer to each other
     torch.cuda.empty_cache()
 
@@ -82,5 +82,5 @@ def _keep(rows: int) -> None:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Say whether an error is one of too little memory, of the host or of a GPU."""
+    """Whether an error says that the host or a GPU has too little memory."""
     return isinstance(error, MemoryError | torch.OutOfMemoryError) or bool(SAID.search(str(error)))

@@ -1,4 +1,4 @@
-"""The arrays of a slice, and what is written on them: plain strings and numbers, by the CF conventions."""
+"""The arrays of a slice and their attributes, by the CF conventions."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def axes_of(plane: Plane, parameters: list[str], units: list[str], *, ascending:
 
 
 def need_of(shape: tuple[int, ...], dim: int, *, grad: bool) -> Need:
-    """Return what sampling a slice takes, at most: in memory beside what the process holds, and on the disk.
+    """Return an upper bound of what sampling a slice takes: memory beside what the process holds, and disk.
 
     In memory there are four copies of the arrays when it is finished and sorted, and what a picture takes. On the disk
     there are the files of the tiles, and for a moment the finished slice beside them.
@@ -115,7 +115,7 @@ def write_finished(path: Path, dataset: xr.Dataset) -> None:
 
 
 def attributes_of(node: zarr.Group | zarr.Array[Any]) -> dict[str, Any]:
-    """Return what is written on a group or an array, but for what xarray takes as a hint and takes away."""
+    """Return the attributes of a group or an array, without the hints that xarray removes as it reads."""
     return {str(name): value for name, value in node.attrs.items() if name not in COORDINATES}
 
 

@@ -1,4 +1,4 @@
-"""A study kept piece by piece: arrays by name in a folder, each written whole, so that a study can be stopped."""
+"""The checkpoint of a study: its arrays by name in a folder, each written whole, so that it can be stopped."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .ownership import check_ours, refuse_others
 from .records import read_json, reading, text
 
 SETTINGS, PARTS = "settings.json", "pieces"
-NAME = "piece"  # the array that says which one it is, so that two that were swapped are not taken for right
+NAME = "piece"  # the array with a part's own name, which tells files that were swapped
 PART = re.compile(r"[^/]+\.npz")  # the name of one
 
 
@@ -51,7 +51,7 @@ class Checkpoint:
         return cls(folder)
 
     def load(self, name: str) -> dict[str, NDArray[Any]] | None:
-        """Return the arrays of a piece, None where it is not there, or damaged, which is said."""
+        """Return the arrays of a part, None where it is missing or, with a warning, damaged."""
         path = self._path(name)
         if not path.exists():
             return None
@@ -66,12 +66,12 @@ class Checkpoint:
             return None
 
     def save(self, name: str, **arrays: Any) -> None:
-        """Write a piece, whole or not at all."""
+        """Write the arrays of a part, whole or not at all."""
         with replacing(self._path(name)) as partial, partial.open("wb") as file:
             np.savez(file, **{NAME: np.array(name), **arrays})
 
     def count(self) -> int:
-        """Return how many pieces are there."""
+        """Count the parts."""
         return len(list((self.folder / PARTS).glob("[!.]*.npz")))
 
     def _path(self, name: str) -> Path:

@@ -1,4 +1,4 @@
-"""A disk that is full ends a job by saying what is kept, and how to go on."""
+"""Full disks: a job ends with a message that says what is kept and how to go on."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ WORDS = "No space left on device"  # of a program that writes for us, such as ff
 
 
 class DiskFullError(OSError):
-    """Say what is kept of a job that a full disk ended."""
+    """A disk is full; the message says what is kept of the job."""
 
     def __str__(self) -> str:
         return str(self.strerror)
@@ -24,7 +24,7 @@ def is_full(error: BaseException) -> TypeGuard[OSError]:
 
 
 def full(error: OSError, kept: str) -> DiskFullError:
-    """Return what to raise for a full disk, which keeps so much."""
+    """Return the error to raise for a full disk; `kept` says what of the job is."""
     said = f"the disk is full; {kept}: make room, and the same command goes on from there"
     return DiskFullError(error.errno or errno.ENOSPC, said)
 

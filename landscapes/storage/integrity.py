@@ -1,4 +1,4 @@
-"""Whether a slice on disk agrees with itself: its layout is there twice, its axes follow from its identity.
+"""Integrity of a slice on disk: its layout is stored twice, and its axes follow from its identity.
 
 A copy that xarray wrote (`Dataset.to_zarr`) has its layout once; its axes are held against its identity all the same.
 """

@@ -1,4 +1,4 @@
-"""Whether all that a folder holds is of ours: only then is it replaced or removed."""
+"""Ownership of a folder's files: a folder is replaced or removed only where all of them are of ours."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a slice lies: in its own place once it is finished, beside it while it is being filled."""
+"""Paths of a slice: slice.zarr once it is finished, slice.filling.zarr beside it until then."""
 
 from __future__ import annotations
 

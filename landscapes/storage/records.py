@@ -1,4 +1,4 @@
-"""Files that one verb leaves and another reads: whatever is wrong with one is said by its name."""
+"""JSON files that one verb writes and another reads; an error names the file that is damaged."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SHOWN = 160  # characters of what is wrong
 
 @contextmanager
 def reading(path: Path, todo: str) -> Iterator[None]:
-    """Read a file of ours and take from it what is needed, all within: what goes wrong then is the file's fault.
+    """Read a file within this context: any error that its content leads to says that the file is damaged.
 
     Raises DamagedError, which says what `todo`; that a file is missing or may not be read passes.
     """

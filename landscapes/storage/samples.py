@@ -1,4 +1,4 @@
-"""The samples of a slice as its arrays hold them: read and written tile by tile, and left out where they are torn."""
+"""The arrays of a slice that hold its samples: read and written tile by tile; what is damaged counts as missing."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Samples:
         for name in self.arrays:  # loss, grad, status
             self.arrays[name][self.place(tile)] = values[name]
 
-    def written(self, tiles: Sequence[Tile]) -> list[Tile]:
+    def find_written(self, tiles: Sequence[Tile]) -> list[Tile]:
         """Return those of the tiles that something was written of: their status is there, or torn."""
         try:
             status, begun = np.zeros(self.shape, np.int8), self._begun_corner(self.whole)

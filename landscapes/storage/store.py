@@ -212,7 +212,7 @@ class SliceStore:
 
         A tile that another process has finished in the meantime is none of them.
         """
-        return [tile for tile in self._samples.written(pending) if not self.statuses(tile)]
+        return [tile for tile in self._samples.find_written(pending) if not self.statuses(tile)]
 
     def read_tile(self, tile: Tile) -> dict[str, NDArray[Any]] | None:
         """Return the arrays of a tile that is finished, None of one that is not."""

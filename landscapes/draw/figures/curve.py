@@ -1,4 +1,4 @@
-"""One run against its episodes: every loss, and the best so far (matplotlib)."""
+"""The losses of one run by episode, and the best so far (matplotlib)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures for a page that is dark: greys turned over, colours as they are, so that a map keeps its bar."""
+"""Pictures for dark pages: greys are inverted, and colours stay, so that a map agrees with its colour bar."""
 
 from __future__ import annotations
 

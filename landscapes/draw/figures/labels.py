@@ -1,4 +1,4 @@
-"""Names beside what they name, where they cover nothing."""
+"""Labels of points, each placed where it covers nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs over a slice: the loss map with their points, and what the map shows against what they found (matplotlib)."""
+"""Runs over a slice: their points on the loss map, and their losses against those of the map (matplotlib)."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from . import contour, labels, page, panel
 
 Runs = Sequence[xr.Dataset]
 PITCH = 5.4  # room of a panel on a screen [inch]
+HEADING = "Marker size: distance from the plane; colour: the loss the point truly had"
 FEW = 24  # most improvements that are numbered, over all runs
 CROWD = 4  # runs from which on the lines that join them are thinner
 
@@ -31,12 +32,12 @@ CROWD = 4  # runs from which on the lines that join them are thinner
 def overlay_figure(dataset: xr.Dataset, runs: Runs, *, width: float | None = None) -> page.Picture:
     """Draw runs, as `overlay` lays them, over the loss map of their slice, and their losses against the map's.
 
-    A point is filled with the loss it truly had, on the map's own scale: where it differs from what is around it, the
-    plane does not show it. It is smaller, and a descent fainter, the farther it lies off the plane. A white line joins
-    what was a run's best so far, from one improvement to the next up to the star; of as many as there is room for, a
-    number says in which episode they came. Points beyond the map are hollow and at its border; failed episodes are
-    crosses. On the right, or below it on a narrow page, every point is held against the sample it lies over: it is on
-    the diagonal if the map tells its loss.
+    The colour of a marker is the loss that the point truly had, on the map's own scale: where it differs from the
+    colour around it, the plane does not show the point. Markers get smaller, and descents fainter, with the distance
+    from the plane. A white line joins the improvements of a run, up to the star at its best point; numbers say in which
+    episodes they came, as far as there is room. Points beyond the map are hollow and at its border; failed episodes are
+    crosses. The panel on the right, or below on a narrow page, compares each point with the sample beneath it: points
+    on the diagonal have the loss that the map shows.
 
     Raises ValueError where the page is too narrow or too wide.
     """
@@ -55,7 +56,7 @@ def overlay_figure(dataset: xr.Dataset, runs: Runs, *, width: float | None = Non
     page.head(picture, over, dataset, f"{page.title(dataset)} · {_describe_runs(runs)}")
     entries = [*_run_entries(sheet, runs), *_order_entries(sheet, runs), *_kind_entries(sheet, runs)]
     entries += [*_distance_entries(sheet, runs, reach), *_count_entries(sheet, runs)]
-    page.finish(picture, [*entries, *page.failure_key(dataset)])
+    page.finish(picture, [*entries, *page.failure_key(dataset)], heading=HEADING)
     _number_improvements(over, runs, plane)
     return picture
 
@@ -110,7 +111,7 @@ def _draw_run(ax: Axes, run: xr.Dataset, plane: Plane, scale: style.Scale, reach
 
 
 def _places(run: xr.Dataset, plane: Plane) -> NDArray[np.float64]:
-    """Return where a run's points are drawn, shape (point, 2): those beyond the window at its border."""
+    """Return where a run's points are drawn, shape (point, 2): those beyond the map at its border."""
     low, high = (side.numpy() for side in plane.cell_bounds())
     found: NDArray[np.float64] = np.clip(np.stack([run["u"], run["v"]], axis=1), low, high)
     return found
@@ -142,7 +143,7 @@ def _join_improvements(ax: Axes, run: xr.Dataset, plane: Plane, runs: int) -> No
 
 
 def _number_improvements(ax: Axes, runs: Runs, plane: Plane) -> None:
-    """Say of improvements, the last of each run first, in which episode they came, where there is room."""
+    """Write the episodes of improvements beside them, the last of each run first, as far as there is room."""
     places = [_places(run, plane) for run in runs]
     rows = [improvements(run)[::-1] for run in runs]
     turns = range(max(map(len, rows), default=0))
@@ -154,7 +155,7 @@ def _number_improvements(ax: Axes, runs: Runs, plane: Plane) -> None:
 
 
 def _draw_against(ax: Axes, dataset: xr.Dataset, runs: Runs, reach: float) -> None:
-    """Hold every loss against that of the sample beneath."""
+    """Draw the loss of every point against that of the sample beneath it."""
     panel.dress(ax)
     ax.set_box_aspect(1)
     sheet = page.sheet_of(ax)
@@ -222,12 +223,12 @@ def half_widths(distance: float) -> str:
 
 
 def _order_entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
-    """Say what the white lines are, where there is any."""
+    """Return the legend entry of the white lines, if there are any."""
     if not any(len(improvements(run)) > 1 for run in runs):
         return []
     effects = [withStroke(linewidth=sheet.weight * style.IMPROVEMENTS[0]["linewidth"], foreground=style.INK)]
     look = sheet.look(style.IMPROVEMENTS[1]) | {"path_effects": effects}
-    return [Line2D([], [], **look, label="the best so far, from one to the next; numbers are episodes")]
+    return [Line2D([], [], **look, label="white line: the best loss so far; numbers: episodes")]
 
 
 def _kind_entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:

@@ -1,4 +1,4 @@
-"""The page a matplotlib picture stands on: its sheet, title, provenance, legend, height and files."""
+"""The page of a matplotlib picture: its size, title, provenance, legend and files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every panel has: ticks, frame, names of its axes, a caption, a colour bar; in the sizes of its sheet."""
+"""Parts that panels share: ticks, frame, axis labels, a caption and a colour bar, in the sizes of the page."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def dress(ax: Axes) -> None:
 
 
 def name_axes(ax: Axes, x: str | None = None, y: str | None = None) -> None:
-    """Write what is along the axes, with its unit."""
+    """Label the axes."""
     for axis, said in ((ax.xaxis, x), (ax.yaxis, y)):
         if said is not None:
             _name(ax, axis, said, (lambda: title_room(ax)) if axis is ax.xaxis else (lambda: side_room(ax)))
 
 
 def name_outer(ax: Axes, x: str, y: str) -> None:
-    """Write what is along the axes of one of several panels over the same window, once for a row and a column."""
+    """Label the axes of one of several panels over the same plane, once for a row and once for a column."""
     spec = ax.get_subplotspec()
     assert spec is not None  # as `grid` made it
     ax.label_outer()

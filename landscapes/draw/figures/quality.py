@@ -1,4 +1,4 @@
-"""How good gradients are over a slice: their angle to the slope at several scales, first against zeroth order."""
+"""Gradient quality over a slice: cosines with finite differences by scale, and first against zeroth order."""
 
 from __future__ import annotations
 

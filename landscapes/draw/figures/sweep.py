@@ -1,4 +1,4 @@
-"""A slice as something else moves: frames on one colour scale, as a film (matplotlib)."""
+"""A sweep as a film: one frame for each of its slices, all on one colour scale (matplotlib)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A slice as a small picture without words, to recognise it by."""
+"""A slice as a small picture without text."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Accuracy against time: every rung of a trade-off, and the front of those that no other beats (matplotlib)."""
+"""Accuracy against time: the variants of a trade-off and their Pareto front (matplotlib)."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from .. import style
 from . import labels, page, panel
 
 PITCH, SHAPE, NARROW = 7.2, 0.58, 0.9  # room on a screen [inch]; the panel's height against its width, there and narrow
-GAPS = (7.0, 12.0, 18.0, 25.0, 34.0, 44.0)  # of a name from its rung, on a screen [pt]
+GAPS = (7.0, 12.0, 18.0, 25.0, 34.0, 44.0)  # of a name from its mark, on a screen [pt]
 INTERVAL = "interval"
-ROOM = 1.6  # what the axes reach beyond the outermost rungs, as a ratio
+ROOM = 1.6  # what the axes reach beyond the outermost variants, as a ratio
 
 Rows = Sequence[Mapping[str, Any]]
 
 
 def tradeoff_figure(report: Mapping[str, Any], *, width: float | None = None) -> page.Picture:
-    """Draw the 95th percentile of each rung's loss errors, with its interval, over seconds per episode with gradient.
+    """Draw the 95th percentile of each variant's loss errors, with its interval, over the time of an episode.
 
-    The reference is a line at its time: its own error is zero by definition. Rungs without a finite percentile stand on
-    the upper edge, counted in the legend, those that are exactly right on the lower one. Every rung is named, shortly:
-    its mark says what was turned, the name from which fidelity on and to what. Where it is crowded a line leads to the
-    name, or it stands in the legend, by number.
+    The reference is a line at its time: its own error is zero by definition. Variants without a finite percentile are
+    on the upper edge and counted in the legend; those without any error are on the lower edge. The mark of a variant
+    says which option was changed, its name from which fidelity and to what. Where there is little room a line leads to
+    the name, or the name is in the legend, by number.
 
     Raises ValueError where the page is too narrow or too wide.
     """
@@ -38,13 +38,13 @@ def tradeoff_figure(report: Mapping[str, Any], *, width: float | None = None) ->
     keyed: list[str] = []
     while True:
         picture, left = _draw(report, sheet, keyed)
-        if set(left) <= set(keyed):  # of numbers none is refused but among dozens of rungs in one place
+        if set(left) <= set(keyed):  # only among dozens of variants in one place a number finds no room
             return picture
         keyed += [name for name in left if name not in keyed]
 
 
 def _draw(report: Mapping[str, Any], sheet: style.Sheet, keyed: Sequence[str]) -> tuple[page.Picture, list[str]]:
-    """Draw the picture, those of the rungs that are `keyed` by number; return it and those there was no room for."""
+    """Draw the picture, with the `keyed` variants named by number; return it and the names that found no room."""
     report, time = _add_times(report)
     relative = report["spread"] is not None
     picture = page.Picture(sheet, sheet.width)
@@ -82,7 +82,7 @@ def _limits(ax: Axes, report: Mapping[str, Any], rows: Rows, relative: bool) -> 
 
 
 def _add_times(report: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
-    """Give each rung the `time` of an episode with gradient, in a unit that suits the reference; return that too."""
+    """Add the `time` of an episode with gradient to each variant, in a unit that suits the reference; return both."""
     long = _reference(report)["seconds"]["with_gradient"] >= 2.0
     factor, unit = (1.0, "s") if long else (1e3, "ms")
     rungs = [{**row, "time": factor * row["seconds"]["with_gradient"]} for row in report["rungs"]]
@@ -128,7 +128,7 @@ def _draw_variants(ax: Axes, rows: Rows, relative: bool, low: float, high: float
 
 
 def _draw_front(ax: Axes, report: Mapping[str, Any], rows: Rows, relative: bool) -> list[Artist]:
-    """Draw the front as steps: at any time, the least error that so much time buys, until it buys the reference."""
+    """Draw the Pareto front as steps: the least error that is to be had for at most so much time."""
     end = _reference(report)["time"]
     seconds = [row["time"] for row in rows]
     errors = [
@@ -159,7 +159,7 @@ def _draw_reference(ax: Axes, report: Mapping[str, Any], unit: str) -> Artist:
 
 
 def _number_entries(sheet: style.Sheet, rows: Rows, numbers: Mapping[str, str]) -> list[Artist]:
-    """Return what the numbers of rungs stand for, with their marks."""
+    """Return the legend entries of the variants that are named by number."""
     found = {row["name"]: row for row in rows}
     looks = {name: sheet.look(style.VARIANT_MARK | style.VARIANTS[found[name]["ladder"]]) for name in numbers}
     return [
@@ -168,9 +168,9 @@ def _number_entries(sheet: style.Sheet, rows: Rows, numbers: Mapping[str, str]) 
 
 
 def _name(ax: Axes, rows: Rows, numbers: Mapping[str, str], relative: bool, low: float, high: float) -> list[str]:
-    """Name the rungs where the name covers no mark, not the front, and rather no interval; return those without room.
+    """Name the variants where the name covers no mark, no front and if possible no interval; return those without room.
 
-    First come those whose number is in the legend, then the named fidelities.
+    Variants whose number is in the legend come first, then the named fidelities.
     """
     sheet = page.sheet_of(ax)
     lines = [line for line in ax.lines if line.get_gid()]
@@ -189,7 +189,7 @@ def _name(ax: Axes, rows: Rows, numbers: Mapping[str, str], relative: bool, low:
 
 
 def short_name(row: Mapping[str, Any]) -> str:
-    """Return a rung's name without what its mark says: of standard-dt-x0.5, standard \N{MULTIPLICATION SIGN}0.5."""
+    """Return a variant's name without what its mark says: of standard-dt-x0.5, standard \N{MULTIPLICATION SIGN}0.5."""
     base, *turned = str(row["name"]).replace(" on ", "-").split("-")
     if row["ladder"] == "named" or not turned:
         return str(row["name"])

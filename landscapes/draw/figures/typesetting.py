@@ -1,4 +1,4 @@
-"""How a picture fits its page: as high as what stands on it, and type wrapped to the room there is."""
+"""Typesetting of a picture: the page gets the height that its panels need, and text is wrapped to its room."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An episode as a scene to walk around in and to play back (rerun)."""
+"""An episode as a rerun recording, which plays it back in three dimensions."""
 
 from __future__ import annotations
 

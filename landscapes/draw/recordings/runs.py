@@ -1,4 +1,4 @@
-"""Runs over a slice as a scene to walk around in and to play back (rerun)."""
+"""Runs over a slice as a rerun recording, which plays the evaluations back in three dimensions."""
 
 from __future__ import annotations
 

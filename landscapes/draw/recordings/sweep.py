@@ -1,4 +1,4 @@
-"""A slice as something else moves, as surfaces on a timeline to walk around in (rerun)."""
+"""A sweep as a rerun recording: the surfaces of its slices on a timeline."""
 
 from __future__ import annotations
 

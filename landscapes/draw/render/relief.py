@@ -1,4 +1,4 @@
-"""A slice as a body in space: where its samples are, its flat cells, and the side from which its valley is seen."""
+"""The geometry of a slice as a surface: its cells, its frame, and the azimuth that shows its valley."""
 
 from __future__ import annotations
 
