@@ -98,12 +98,12 @@ class Slice(Part):
         """Look at the data without making an environment; who sampled it, and on what device, does not matter."""
         from ..jobs.slice import STORE
         from ..landscapes.storage.arrays import FILES
-        from ..landscapes.storage.ownership import lost_root
+        from ..landscapes.storage.ownership import has_lost_root
         from ..landscapes.storage.paths import is_slice
         from ..landscapes.storage.store import SliceStore
 
         points, store = self.figure.resolution ** len(self.figure.dims), self.folder / STORE
-        if not is_slice(store) and not lost_root(store, FILES):
+        if not is_slice(store) and not has_lost_root(store, FILES):
             return State(points, 0)
         kept = SliceStore.open(store)
         return State(points, int((kept.status() > 0).sum()) if _same(self.figure, kept.identity) else None)

@@ -15,7 +15,7 @@ from .space import ParameterSpace
 if TYPE_CHECKING:
     import xarray as xr
 
-SHOWN = 6
+LISTED_SETTINGS = 6  # settings that differ, in the refusal of a store
 
 
 class StoreError(ValueError):
@@ -89,9 +89,9 @@ def check_identity(
         return
     ours, theirs = dict(_leaves(wanted)), dict(_leaves(found))
     names = [name for name in ours | theirs if ours.get(name) != theirs.get(name)]
-    said = [f"{name}: wanted {_show(ours, name)}, found {_show(theirs, name)}" for name in names[:SHOWN]]
-    if len(names) > SHOWN:
-        said.append(f"and {len(names) - SHOWN} more")
+    said = [f"{name}: wanted {_show(ours, name)}, found {_show(theirs, name)}" for name in names[:LISTED_SETTINGS]]
+    if len(names) > LISTED_SETTINGS:
+        said.append(f"and {len(names) - LISTED_SETTINGS} more")
     raise StoreMismatchError(
         f"{path or 'the store'} holds a {what} made by other settings ({'; '.join(said)}); "
         "write elsewhere with --out, or replace it with --force"

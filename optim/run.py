@@ -35,7 +35,7 @@ from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
 from ..landscapes.storage.files import placing, resolve
 from ..landscapes.storage.layout import FILL, consolidate, open_group
-from ..landscapes.storage.ownership import check_ours, clear_halves, lost_root
+from ..landscapes.storage.ownership import check_ours, clear_halves, has_lost_root
 from .base import Kind
 from .kept import CHUNK, STATE, Kept, checksums, damaged, digest_of, first_wrong
 from .run_arrays import COLUMNS, FILES, FORMAT, Columns, attributes_of, dims_of, empty, lay_out, plain, read_rows
@@ -103,7 +103,7 @@ class Run:
         if not path.exists():
             raise StoreError(f"there is no run at {path}; make one with `landscape optimize`")
         if not is_run(path):
-            if lost_root(path, FILES):
+            if has_lost_root(path, FILES):
                 raise damaged(path / "zarr.json", "it cannot be read")
             raise StoreError(f"{path} is no run of format {FORMAT}; move it away or write elsewhere")
         return cls(open_group(path).attrs.asdict(), path)
@@ -365,7 +365,7 @@ def open_run(path: str | Path) -> xr.Dataset:
 
 def check_replaceable(path: Path) -> None:
     """Raise ValueError unless a folder is a run's, its root damaged or not, and everything in it is of that."""
-    if not is_run(path) and not lost_root(path, FILES):
+    if not is_run(path) and not has_lost_root(path, FILES):
         raise StoreError(f"{path} is no run, so it is not replaced; move it away or write elsewhere")
     check_ours(path, FILES, "a run")
 

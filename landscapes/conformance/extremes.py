@@ -17,7 +17,7 @@ from .finding import SKIP, Finding, verdict
 from .subject import Subject, difference
 
 CORNERS = 16  # a box of no more corners is checked at all of them
-BEYOND = (0.01, 0.1)  # how far outside the box, as shares of it
+OUTSIDE = (0.01, 0.1)  # how far outside the box, as shares of it
 ROWS = 2  # points that a variant is checked at
 RISE = 0.1  # of the energy there is at first: what semi-implicit steps may add for a while in a stiff contact
 KINDS = {"finite": Status.OK, "non-finite": Status.NONFINITE, "escaped": Status.ESCAPED, "error": Status.ERROR}
@@ -47,7 +47,7 @@ def checks(
     many = f"all {len(ends)} corners" if len(ends) == 2**space.dim else some
     yield "corners", lambda: _check_at("corners", objective, space.from_unit(ends), many)
     yield "centre", lambda: _check_at("centre", objective, space.center[None])
-    for share in BEYOND:
+    for share in OUTSIDE:
         name, beyond = f"{share:.0%} outside the box", space.from_unit(ends + share * (2 * ends - 1))
         yield name, partial(_check_beyond, name, objective, beyond)
     yield "float32 against float64", lambda: _check_precisions(subject, "float32 against float64", other)

@@ -68,7 +68,7 @@ def check(
 
 def episodes(dim: int, points: int) -> tuple[int, int]:
     """Return about how many episodes `check` takes without variants: losses alone, and with gradients."""
-    plain = 2 * points * gradient_checks.SLOPES * len(gradient_checks.LADDER) + points
+    plain = 2 * points * gradient_checks.SLOPES * len(gradient_checks.DIFFERENCE_STEPS) + points
     return plain, points * (REPEATS + 6) + 3 * len(extremes.corners(dim)) + 10
 
 

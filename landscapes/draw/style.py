@@ -22,7 +22,7 @@ DPI, PRINT_DPI = 150, 600  # of a picture for a screen, and of what is pixels in
 INK, QUIET, FAINT = "#1a1a1a", "#5f5f5f", "#c9c9c9"
 UNSAMPLED = "#ececec"  # MISSING: nothing there yet
 BAND = ("#dfe6ee", "#f6f8fa")  # alternating event counts
-LINE = "#31688e"  # the loss over a line: viridis' blue
+LOSS_LINE = "#31688e"  # the loss over a line: viridis' blue
 SLOPE_LINE = "#b5367a"  # the gradient along it: magma's pink
 
 NIGHT, NIGHT_INK = "#16181b", "#ececec"  # ground and ink of the gallery's pages where they are dark
@@ -45,11 +45,11 @@ STATUS_LOOKS: dict[Status, dict[str, Any]] = {  # of every sample that is not OK
 ARROWS = 32  # most arrows per axis
 LONGEST_ARROW = 0.055  # as a fraction of a side
 ARROW: dict[str, Any] = {"width": 0.0032, "headwidth": 4.0, "headlength": 4.5, "headaxislength": 4.0, "minlength": 0.0}
-LOWEST: dict[str, Any] = {
+LOWEST_MARK: dict[str, Any] = {
     "marker": "*", "markersize": 12, "markeredgewidth": 1.0, "markerfacecolor": "white", "markeredgecolor": INK,
     "linestyle": "none",
 }  # fmt: skip
-FLAT: dict[str, Any] = {"marker": "o", "markersize": 2.6, "color": QUIET, "linestyle": "none"}
+FLAT_MARK: dict[str, Any] = {"marker": "o", "markersize": 2.6, "color": QUIET, "linestyle": "none"}
 
 # Okabe & Ito 2008, told apart without colour by line style and marker
 METHODS: dict[str, dict[str, Any]] = {
@@ -74,14 +74,15 @@ POINT_MARKS: dict[str, dict[str, Any]] = {  # what a run evaluated a point for
 METHOD_BAND: dict[str, Any] = {"alpha": 0.12, "linewidth": 0.0}
 OVERLAID: dict[str, Any] = {"linewidths": 0.6, "zorder": 3, "rasterized": True}  # the points of a run over a map
 HALO: dict[str, Any] = OVERLAID | {"linewidths": 1.5, "zorder": 2.9, "facecolors": "none", "edgecolors": "white"}
-NEAR, FAR = (4.0, 34.0), 0.2  # area of a point on the plane [pt^2], fewest of many; share of it left at the farthest
+MARK_AREAS = (4.0, 34.0)  # of points on the plane [pt^2]: of one among many, and of one among few
+FARTHEST_SHARE = 0.2  # of that area, at the farthest from the plane
 DESCENT_LINE: dict[str, Any] = {"linewidths": 1.1, "zorder": 2.6, "capstyle": "round"}  # a descent
 IMPROVEMENTS: tuple[dict[str, Any], ...] = (  # the line through them: white with a dark edge, for any ground
     {"color": INK, "alpha": 0.6, "linewidth": 2.2, "zorder": 2.75},
     {"color": "white", "linewidth": 1.0, "zorder": 2.8},
 )
 FAINTEST = 0.25  # opacity of a descent at the farthest
-BEST: dict[str, Any] = {"marker": "*", "s": 190.0, "linewidths": 1.1, "zorder": 5}
+BEST_MARK: dict[str, Any] = {"marker": "*", "s": 190.0, "linewidths": 1.1, "zorder": 5}
 FAILED_MARK: dict[str, Any] = {"marker": "x", "s": 18.0, "linewidths": 0.9, "color": INK, "zorder": 3.5}
 BORDER: dict[str, Any] = {"s": 20.0, "facecolors": "none", "linewidths": 0.8, "zorder": 3.2, "clip_on": False}
 
@@ -109,7 +110,7 @@ VARIANT_MARK: dict[str, Any] = {
 INTERVAL_LINE: dict[str, Any] = {"color": FAINT, "linewidth": 1.0, "zorder": 1.5, "solid_capstyle": "butt"}
 FRONT: dict[str, Any] = {"color": QUIET, "linewidth": 1.2, "zorder": 2}
 REFERENCE_LINE: dict[str, Any] = {"color": INK, "linewidth": 0.9, "linestyle": (0, (4, 2)), "zorder": 1}
-NAME: dict[str, Any] = {"color": INK, "zorder": 6, "path_effects": [withStroke(linewidth=2.0, foreground="white")]}
+NAME_TEXT: dict[str, Any] = {"color": INK, "zorder": 6, "path_effects": [withStroke(linewidth=2.0, foreground="white")]}
 LEADER: dict[str, Any] = {"arrowstyle": "-", "color": QUIET, "linewidth": 0.5, "shrinkA": 0.0, "shrinkB": 2.0}
 
 EXTEND = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
@@ -271,9 +272,9 @@ def method(run: xr.Dataset) -> dict[str, Any]:
 
 def point_areas(distance: NDArray[np.float64], reach: float, points: int) -> NDArray[np.float64]:
     """Return marker areas of so many points [pt^2], which fall with the distance from the plane, at most `reach`."""
-    least, most = NEAR
+    least, most = MARK_AREAS
     area = max(least, min(most, most * (150 / max(points, 1)) ** 0.35))
-    share: NDArray[np.float64] = 1 - (1 - FAR) * distance / reach if reach else np.ones_like(distance)
+    share: NDArray[np.float64] = 1 - (1 - FARTHEST_SHARE) * distance / reach if reach else np.ones_like(distance)
     areas: NDArray[np.float64] = area * share
     return areas
 

@@ -56,7 +56,7 @@ class Jumps:
         return Estimate(found.value * part, found.low * part, found.high * part)
 
     @property
-    def explained(self) -> Estimate | None:
+    def share_explained(self) -> Estimate | None:
         """Share of the jumps across which an event is counted differently."""
         return None if self.counted is None else share(int(self.counted.sum()), len(self.counted))
 
@@ -68,7 +68,7 @@ class Jumps:
         numbers = {name: getattr(self, name) for name in ("least", "neighbours", "steep", "checked", "undecided")}
         return {
             "share": self.share.record(),
-            "explained_by_events": self.explained.record() if self.explained else None,
+            "explained_by_events": self.share_explained.record() if self.share_explained else None,
             **{name: plain(value) for name, value in numbers.items()},
             "found": [{"place": place, "height": height, "event": event} for place, height, event in rows],
         }

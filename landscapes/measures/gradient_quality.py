@@ -28,7 +28,7 @@ SCALES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 STRIDES = (1, 2, 4)  # of the slice's own samples
 WIDTHS = (0.01, 0.03)
 CHANCE = 0.001  # a bias is beyond chance where Student's test says that chance alone would show it this rarely,
-SMALL = 0.1  # and worth a word where first and zeroth order disagree by more than this
+NOTABLE_BIAS = 0.1  # and worth a word where first and zeroth order disagree by more than this
 
 
 def subgrid(plane: Plane, points: int) -> Float[Tensor, "count rank"]:
@@ -165,7 +165,9 @@ def find_bias(found: xr.Dataset) -> xr.DataArray:
     """Say at which points first order is biased along an axis, by more than a little and than chance would have it."""
     level = 1 - CHANCE / 2 / found.sizes["axis"]
     sure = xr.apply_ufunc(lambda count: stats.t.ppf(level, np.maximum(count - 1, 1)), found["count"])
-    flags: xr.DataArray = (abs(found["bias"]) > sure * found["bias_error"]).any("axis") & (disagreement(found) > SMALL)
+    flags: xr.DataArray = (abs(found["bias"]) > sure * found["bias_error"]).any("axis") & (
+        disagreement(found) > NOTABLE_BIAS
+    )
     return flags
 
 

@@ -22,10 +22,10 @@ from ..identity import plane_of
 from ..plain import plain
 from ..statistics import Estimate, Values, jackknife
 
-FLAT = 1e-3  # a slope is effectively zero that would change the loss by less, as a fraction of its range, over the box
+FLAT_SLOPE = 1e-3  # a slope below it is effectively zero [ranges of the losses per side of the box]
 NOTABLE = 0.01  # the least depth of a notable minimum, as a fraction of the range
 THRESHOLDS = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)  # depths that minima are counted by, as fractions of the range
-BEST = 0.05  # share of the samples that dispersion calls the best
+BEST_SHARE = 0.05  # share of the samples that dispersion calls the best
 PAIRED = 4096  # most samples whose pairs are gone through one by one, 8 million of them
 
 
@@ -170,7 +170,7 @@ def dispersion(loss: Values) -> float:
     places, losses = np.argwhere(np.isfinite(loss)), loss[np.isfinite(loss)]
     if len(losses) <= 2:
         return math.nan
-    best = places[np.argsort(losses, kind="stable")[: max(2, round(BEST * len(losses)))]]
+    best = places[np.argsort(losses, kind="stable")[: max(2, round(BEST_SHARE * len(losses)))]]
     return mean_distance(best, loss.shape) / mean_distance(places, loss.shape)
 
 
@@ -254,7 +254,7 @@ def ruggedness(dataset: xr.Dataset, *, floor: float) -> Ruggedness:
         largest_basin=float(shares.max()),
         lowest_basin=float(shares[0]),
         zero=None if slopes is None else jackknife(_mean, _below(slopes, 0.0), least=0.0, most=1.0),
-        flat=None if slopes is None else jackknife(_mean, _below(slopes, FLAT * whole), least=0.0, most=1.0),
+        flat=None if slopes is None else jackknife(_mean, _below(slopes, FLAT_SLOPE * whole), least=0.0, most=1.0),
         level=jackknife(_mean, level_samples(loss, floor), least=0.0, most=1.0),
         correlation_length=tuple(
             jackknife(lambda part, axis=axis: correlation_length(part, axis), loss, least=0.0, most=1.0)  # type: ignore[misc]

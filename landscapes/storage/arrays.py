@@ -18,7 +18,7 @@ from ..objective import Status
 from ..plane import Plane
 from ..space import ParameterSpace
 from .checksums import SUMS, lay_out_sums, text_sum, write_sums
-from .layout import CODECS, SMALL, analysis_chunks, consolidate, create_array, flags
+from .layout import CODECS, COMPACT_CODECS, analysis_chunks, consolidate, create_array, flags
 from .ownership import store_files
 from .tiles import coarse_to_fine, tile_side
 
@@ -105,7 +105,7 @@ def write_finished(path: Path, dataset: xr.Dataset) -> None:
         if values.dtype.kind in "fi" and dims != (name,):
             chunks = analysis_chunks(samples, *values.shape[len(samples) :])
             array = create_array(
-                group, str(name), values.shape, chunks, dims, values.dtype.name, codecs=SMALL, **values.attrs
+                group, str(name), values.shape, chunks, dims, values.dtype.name, codecs=COMPACT_CODECS, **values.attrs
             )
             array[...] = values.to_numpy()
         else:
@@ -135,7 +135,7 @@ def _keep(
 ) -> None:
     """Write a small array whole."""
     number = values.dtype.kind in "fi"
-    kind, codecs = (values.dtype.name, SMALL) if number else ("string", CODECS)
+    kind, codecs = (values.dtype.name, COMPACT_CODECS) if number else ("string", CODECS)
     array = create_array(group, name, values.shape, values.shape, dims, kind, codecs=codecs, **attributes)
     array[...] = values if number else values.astype(object)
 

@@ -19,7 +19,7 @@ from .ownership import check_ours, refuse_others
 from .records import read_json, reading, text
 
 SETTINGS, PARTS = "settings.json", "pieces"
-NAME = "piece"  # the array with a part's own name, which tells files that were swapped
+NAME_KEY = "piece"  # the array with a part's own name, which tells files that were swapped
 PART = re.compile(r"[^/]+\.npz")  # the name of one
 
 
@@ -58,7 +58,7 @@ class Checkpoint:
         try:
             with reading(path, "it is computed again"), np.load(path, allow_pickle=False) as arrays:
                 found = dict(arrays)
-                if str(found.pop(NAME, name)) != name:  # those of earlier versions do not say
+                if str(found.pop(NAME_KEY, name)) != name:  # those of earlier versions do not say
                     raise ValueError("it is another piece")
                 return found
         except DamagedError as error:
@@ -68,7 +68,7 @@ class Checkpoint:
     def save(self, name: str, **arrays: Any) -> None:
         """Write the arrays of a part, whole or not at all."""
         with replacing(self._path(name)) as partial, partial.open("wb") as file:
-            np.savez(file, **{NAME: np.array(name), **arrays})
+            np.savez(file, **{NAME_KEY: np.array(name), **arrays})
 
     def count(self) -> int:
         """Count the parts."""

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import TypeGuard
 
 CODES = (errno.ENOSPC, errno.EDQUOT)
-WORDS = "No space left on device"  # of a program that writes for us, such as ffmpeg
+FULL_DISK_WORDS = "No space left on device"  # of a program that writes for us, such as ffmpeg
 
 
 class DiskFullError(OSError):
@@ -20,7 +20,7 @@ class DiskFullError(OSError):
 
 def is_full(error: BaseException) -> TypeGuard[OSError]:
     """Whether an error comes of a disk or a quota that is full."""
-    return isinstance(error, OSError) and (error.errno in CODES or WORDS in str(error))
+    return isinstance(error, OSError) and (error.errno in CODES or FULL_DISK_WORDS in str(error))
 
 
 def full(error: OSError, kept: str) -> DiskFullError:

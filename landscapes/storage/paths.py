@@ -42,9 +42,9 @@ def check_replaceable(store: Path) -> None:
     """Raise ValueError unless a folder is a slice's, its root damaged or not, and everything in it is of that."""
     from ..identity import StoreError
     from .arrays import FILES
-    from .ownership import check_ours, lost_root
+    from .ownership import check_ours, has_lost_root
 
-    if not is_slice(store) and not lost_root(store, FILES):
+    if not is_slice(store) and not has_lost_root(store, FILES):
         raise StoreError(f"{store} is no slice store, so it is not replaced; move it away or write elsewhere")
     check_ours(store, FILES, "a slice")
 

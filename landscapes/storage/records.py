@@ -14,7 +14,7 @@ from ..identity import DamagedError
 from .files import write_json
 
 CHECKSUM = "checksum"  # of the rest of a record, which holds it under this name
-SHOWN = 160  # characters of what is wrong
+REASON_LENGTH = 160  # characters of what is wrong
 
 
 @contextmanager
@@ -29,7 +29,7 @@ def reading(path: Path, todo: str) -> Iterator[None]:
         raise
     except Exception as error:  # a file of any content makes libraries raise anything at all
         said = f"it has no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
-        raise DamagedError.of(path, said[:SHOWN] or type(error).__name__, todo) from error
+        raise DamagedError.of(path, said[:REASON_LENGTH] or type(error).__name__, todo) from error
 
 
 def write_record(path: Path, record: Mapping[str, Any]) -> None:

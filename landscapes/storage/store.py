@@ -42,7 +42,7 @@ from .checksums import text_sum
 from .files import placing, resolve
 from .integrity import check_integrity, check_layouts, damage
 from .layout import consolidate, open_group
-from .ownership import lost_root, remove
+from .ownership import has_lost_root, remove
 from .paths import SLICE, check_replaceable, filling_path, finished_path, is_slice, place_of, slice_exists
 from .samples import Arrays, Samples
 from .tiles import Tile
@@ -126,7 +126,7 @@ class SliceStore:
         if not place.exists():
             raise StoreError(f"there is no slice store at {path}; make one with `landscape slice`")
         if not is_slice(place):
-            if lost_root(place, FILES):
+            if has_lost_root(place, FILES):
                 raise damage(place / "zarr.json", "it does not say what it is of")
             raise StoreError(f"{place} is no slice store of format {FORMAT}; move it away or write elsewhere")
         try:

@@ -85,7 +85,7 @@ def loss_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) 
     if np.nanmin(loss) == np.nanmax(loss):
         return [Line2D([], [], linestyle="none", label=f"every sample: {style.number(np.nanmin(loss))}")]
     row, column = np.unravel_index(np.nanargmin(loss), loss.shape)
-    look = page.sheet_of(ax).look(style.LOWEST)
+    look = page.sheet_of(ax).look(style.LOWEST_MARK)
     (lowest,) = ax.plot(u[column], v[row], **look, label=f"lowest sample: {style.number(loss[row, column])}")
     return [lowest]
 
@@ -123,7 +123,7 @@ def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None)
     bar.ax.set_visible(bool(seen.any()))  # hidden rather than left out, so that both panels keep their width
     if not flat.any():
         return []
-    look = page.sheet_of(ax).look(style.FLAT)
+    look = page.sheet_of(ax).look(style.FLAT_MARK)
     ax.plot(u[flat[at]], v[flat[at]], **look, zorder=2.5)
     return [Line2D([], [], **look, label=f"gradient exactly zero: {int(flat.sum())} of {flat.size}")]
 

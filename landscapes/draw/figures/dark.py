@@ -26,7 +26,8 @@ COLOURS = ("color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolo
 PALE_GREY, GREY = (0.04, 0.12), (0.015, 0.04)  # up to which difference of its channels a colour is grey, and from which
 # on it is none, where it is pale and where it is not: cividis has colours that are nearly grey, and not pale
 MIDDLE = (0.40, 0.53)  # lightness of greys that stay: turned over they would hardly change, and cividis has them
-PAPER, PALE, NEAR = 0.975, 0.6, 3  # lightness of the page, of colours that it shines through; how near they are [pixel]
+PAPER, PALE = 0.975, 0.6  # lightness of the page, and of colours that it shines through
+NEIGHBOURHOOD = 3  # pixels within which such colours are near the page
 
 
 def darken(picture: Picture) -> None:
@@ -78,7 +79,7 @@ def save_dark(source: Path, target: Path) -> None:
         light = np.asarray(picture.convert("RGB"), dtype=np.float64) / 255
     level, chroma = light.mean(axis=-1), np.ptp(light, axis=-1)
     paper, pale = (level > PAPER) & (chroma < PALE_GREY[0]), (level > PALE) & (chroma > PALE_GREY[0])
-    edge = binary_dilation(paper, iterations=NEAR) & pale
+    edge = binary_dilation(paper, iterations=NEIGHBOURHOOD) & pale
     ground = to_rgba_array(style.NIGHT)[0, :3]
     dark = invert_greys(light)
     dark[edge] = light[edge] - light[edge].min(axis=-1, keepdims=True) * (1 - ground)

@@ -106,7 +106,7 @@ def _draw_run(ax: Axes, run: xr.Dataset, plane: Plane, scale: style.Scale, reach
         row = int(np.nanargmin(loss))
         inside = "none" if outside[row] else [style.LOSS_MAP(scale.norm(loss[row]))]
         u, v = place[row]
-        best = sheet.look(style.BEST)
+        best = sheet.look(style.BEST_MARK)
         ax.scatter([u], [v], facecolors=inside, edgecolors=color, clip_on=False, gid="best", **best)
 
 

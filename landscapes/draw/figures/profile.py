@@ -69,13 +69,13 @@ def _counts(name: str, values: ArrayLike, points: int) -> NDArray[np.int64]:
 def _draw_loss(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
     u, loss = dataset["u"].to_numpy(), dataset["loss"].to_numpy()
     sheet = page.sheet_of(ax)
-    ax.plot(u, loss, color=style.LINE, **sheet.look(style.stroke(len(u))))
+    ax.plot(u, loss, color=style.LOSS_LINE, **sheet.look(style.stroke(len(u))))
     panel.name_axes(ax, y=page.loss_name(dataset))
     if not np.isfinite(loss).any():
         return []
     lowest = int(np.nanargmin(loss))
     (star,) = ax.plot(
-        u[lowest], loss[lowest], **sheet.look(style.LOWEST), zorder=4,
+        u[lowest], loss[lowest], **sheet.look(style.LOWEST_MARK), zorder=4,
         label=f"lowest sample: {style.number(loss[lowest])}",
     )  # fmt: skip
     return [star]

@@ -108,7 +108,7 @@ def _slope_lines(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
     difference = np.full_like(loss, np.nan)
     difference[1:-1] = (loss[2:] - loss[:-2]) * (len(loss) - 1) / 2
     look = page.sheet_of(ax).look(style.stroke(len(u)))
-    lines = ax.plot(u, difference, color=style.LINE, **look, label="difference over two samples")
+    lines = ax.plot(u, difference, color=style.LOSS_LINE, **look, label="difference over two samples")
     lines += ax.plot(u, slope, color=style.SLOPE_LINE, **look, label="gradient", alpha=0.8)
     panel.dress(ax)
     ax.set_box_aspect(FLAT)
@@ -124,7 +124,7 @@ def _scales(ax: Axes, steps: xr.Dataset, samples: xr.Dataset) -> list[Artist]:
     for found, filled in ((steps, True), (samples, False)):
         rows = [row for row in scale_table(found) if row["points"]]
         scale = [row["scale"] for row in rows]
-        for name, colour, label in (("cosine", style.LINE, "mean cosine"), ("uphill", style.SLOPE_LINE, "uphill")):
+        for name, colour, label in (("cosine", style.LOSS_LINE, "mean cosine"), ("uphill", style.SLOPE_LINE, "uphill")):
             value = np.array([row[name]["value"] for row in rows], dtype=float)
             ends = np.array([[row[name][end] for end in ("low", "high")] for row in rows], dtype=float).reshape(-1, 2)
             reach = np.abs(np.nan_to_num(ends - value[:, None])).T
@@ -171,7 +171,7 @@ def _disagreement_map(ax: Axes, dataset: xr.Dataset, smooth: xr.Dataset, number:
 def _two_orders(ax: Axes, dataset: xr.Dataset, smooth: xr.Dataset, number: int) -> list[Artist]:
     plane, place, found = plane_of(dataset), smooth["place"].to_numpy()[:, 0], smooth.isel(width=number)
     sheet, entries = page.sheet_of(ax), list[Artist]()
-    for name, colour, marker in (("zeroth", style.LINE, "s"), ("first", style.SLOPE_LINE, "o")):
+    for name, colour, marker in (("zeroth", style.LOSS_LINE, "s"), ("first", style.SLOPE_LINE, "o")):
         error = found[f"{name}_error"].to_numpy()[:, 0]
         look = sheet.look({"color": colour, "marker": marker, "markersize": 4.0, "linewidth": 0.9, "capsize": 2.0})
         ax.errorbar(place, found[name].to_numpy()[:, 0], error, **look)

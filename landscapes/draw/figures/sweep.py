@@ -168,8 +168,8 @@ def _draw_range(picture: page.Picture, layout: Layout, sweep: Sweep, value: floa
     ax.set_ylim(-1, 1)
     bar = sheet.look({"linewidth": 3, "solid_capstyle": "round", "clip_on": False})
     ax.plot([low, high], [0, 0], color=style.FAINT, **bar)
-    ax.plot([low, value], [0, 0], color=style.LINE, **bar)
-    ax.plot([value], [0], marker="o", color=style.LINE, **sheet.look({"markersize": 8, "clip_on": False}))
+    ax.plot([low, value], [0, 0], color=style.LOSS_LINE, **bar)
+    ax.plot([value], [0], marker="o", color=style.LOSS_LINE, **sheet.look({"markersize": 8, "clip_on": False}))
     plain: dict[str, Any] = {"textcoords": "offset points", "parse_math": False, "annotation_clip": False}
     for end, at in ((low, "left"), (high, "right")):
         look: dict[str, Any] = {"size": sheet.tick, "color": style.QUIET, "ha": at, "va": "top"}

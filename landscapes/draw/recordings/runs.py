@@ -167,7 +167,7 @@ def _log_key(stream: rr.RecordingStream, scene: Scene, runs: Runs) -> None:
 def _log_run(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None:
     path, loss, outside = f"landscape/runs/{run.attrs['label']}", run["loss"].to_numpy(), run["outside"].to_numpy()
     places = scene.at(run["u"].to_numpy(), run["v"].to_numpy(), np.nan_to_num(loss, nan=-np.inf))
-    radii = RADIUS * np.sqrt(style.point_areas(run["distance"].to_numpy(), scene.reach, 1) / style.NEAR[1])
+    radii = RADIUS * np.sqrt(style.point_areas(run["distance"].to_numpy(), scene.reach, 1) / style.MARK_AREAS[1])
     failed = run["status"].to_numpy() != Status.OK
     groups = [(name, here & ~outside & ~failed, style.POINT_MARKS[name]["color"]) for name, here in by_kind(run)]
     groups += [("outside", outside & ~failed, style.BEYOND), ("failed", failed, style.LOST)]
@@ -255,7 +255,7 @@ def _about(dataset: xr.Dataset, runs: Runs, scene: Scene) -> str:
     unit = dataset["loss"].attrs.get("units", "")
     distance = (
         f"A point on the plane is largest; one {half_widths(scene.reach)} off it has "
-        f"{style.FAR**0.5:.0%} of that radius."
+        f"{style.FARTHEST_SHARE**0.5:.0%} of that radius."
         if scene.reach
         else "Every point lies on the plane."
     )

@@ -29,7 +29,7 @@ HEIGHT = 600  # of a frame [pixel]
 STRIP, STRIP_DPI = 0.4, 100  # height of what is over a film [inch], and how fine it is
 BAR = 0.25  # most of a frame's width that its scale takes
 LIKELY = (0.5, 1.6)  # narrowest and widest frame, its width per height
-APART = 2.0  # from where on a target's surface is away from a body's particles, in their distances
+AWAY_DISTANCE = 2.0  # from where on a target's surface is away from a body's particles, in their distances
 LONGEST, RATE = 100, 25  # most frames of a film, and how many of them a second
 EXTENT, CELLS = 3.0, 192  # of the ground in halves of the view's diagonal; of its shadow along each side
 SAMPLES = 40_000  # of the surfaces that throw it
@@ -198,8 +198,8 @@ def missed_surface(goal: pv.PolyData, bodies: Sequence[Part], frame: int) -> pv.
     """Return what of a target's surface bodies do not reach: what is away from their particles."""
     pitch = max(part.size[0] for part in bodies)
     every = np.concatenate([part.at[frame].numpy() for part in bodies])
-    away, _ = cKDTree(every).query(goal.points, distance_upper_bound=2 * APART * pitch)
-    return goal.extract_points(away > APART * pitch, adjacent_cells=False).extract_surface(algorithm=None)
+    away, _ = cKDTree(every).query(goal.points, distance_upper_bound=2 * AWAY_DISTANCE * pitch)
+    return goal.extract_points(away > AWAY_DISTANCE * pitch, adjacent_cells=False).extract_surface(algorithm=None)
 
 
 def _place(plotter: pv.Plotter, parts: Sequence[Part], surfaces: Sequence[pv.PolyData], label: str) -> None:
