@@ -154,7 +154,7 @@ def small() -> None:
 
     leave_blank(setattr)
     tradeoff.TIMING = tradeoff.PATIENCE = 0.002
-    cost.MOMENT = cost.LEAST_TIMING = cost.WARM_UP = 0.0
+    cost.MOMENT = cost.ENOUGH = cost.WARM_UP = 0.0
     gallery_parts.METHODS, gallery_parts.BUDGET = ("random",), 8
     gallery_parts.FRAMES, gallery_parts.COARSE = 2, 4
     gallery_episodes.LONGEST, gallery_episodes.HEIGHT = 2, 48

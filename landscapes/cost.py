@@ -12,7 +12,7 @@ from .objective import Objective
 
 MOMENT = 0.5  # seconds to spend on measuring what an episode alone costs
 LONG = 5.0  # seconds from which the first, which warms things up, must do
-LEAST_TIMING = 1.0  # seconds that a batch must take to be an estimate
+ENOUGH = 1.0  # seconds that a batch must take to be an estimate
 WARM_UP = 10.0  # seconds from which a first batch, which may compile, is not repeated
 
 
@@ -53,7 +53,7 @@ def seconds_per_episode(objective: Objective, points: Float[Tensor, "batch dim"]
     seconds = measure_seconds(objective, points[:rows], grad=grad)
     if seconds < WARM_UP:
         seconds = measure_seconds(objective, points[:rows], grad=grad)
-    while seconds < LEAST_TIMING and rows < len(points):
+    while seconds < ENOUGH and rows < len(points):
         rows = min(4 * rows, len(points))
         seconds = measure_seconds(objective, points[:rows], grad=grad)
     return seconds / rows

@@ -85,7 +85,7 @@ def _work(work: Callable[[], object], folder: Path, said: Path, changes: Any, st
                     os.kill(os.getpid(), stop.by)
 
     run.PAUSE, run.SHARE, cost.MOMENT = 0.0, math.inf, 0.0  # writes after every proposal, times two episodes
-    job.PAUSE, cost.LEAST_TIMING, cost.WARM_UP = math.inf, 0.0, 0.0  # draws no coarse picture
+    job.PAUSE, cost.ENOUGH, cost.WARM_UP = math.inf, 0.0, 0.0  # draws no coarse picture
     zarr.config.set({"threading.max_workers": 1})  # so that its threads never take turns
     leave_blank(setattr)
     sys.addaudithook(watch)
