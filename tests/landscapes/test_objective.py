@@ -109,3 +109,20 @@ def test_differences_of_a_function_stay_within_its_bounds():
     objective = from_numpy(strict, SPACE, differences=1e-4)
     x = torch.stack([SPACE.lower, SPACE.center, SPACE.upper])
     torch.testing.assert_close(objective.evaluate(x).grad, 2 * x, rtol=1e-3, atol=1e-3)
+
+
+def test_evaluations_of_several_batches_are_joined_in_order():
+    x = torch.tensor([[0.25, 0.5, 0.0], [9.0, 0.5, 0.0], [0.75, 0.5, 0.0]], dtype=torch.float64)
+    whole = evaluate(Strict(), x, grad=True)
+    parts = [evaluate(Strict(), rows, grad=True) for rows in x.split(2)]
+    joined = Evaluation.join(parts, dim=3, grad=True)
+    for name in ("loss", "grad", "status"):
+        assert torch.equal(getattr(joined, name).nan_to_num(-1.0), getattr(whole, name).nan_to_num(-1.0))
+    assert joined.rows(slice(1, 3)).status.tolist() == whole.status.tolist()[1:]
+    assert Evaluation.join(parts, dim=3, grad=False).grad is None
+    nothing = Evaluation.join([], dim=3, grad=True)
+    assert nothing.grad is not None
+    assert nothing.grad.shape == (0, 3)
+    blind = evaluate(Strict(), x, grad=False)
+    with pytest.raises(ValueError, match="1 of 3 evaluations to join have no gradients"):
+        Evaluation.join([*parts, blind], dim=3, grad=True)
