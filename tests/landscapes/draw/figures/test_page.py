@@ -102,8 +102,8 @@ EACH = [pytest.param(make, id=f"{name}-{number}") for name, all_ in FIGURES.item
 
 def test_every_figure_function_is_held_to_this() -> None:
     found = set()
-    for module in pkgutil.iter_modules(draw.__path__):
-        names = vars(import_module(f"{draw.__name__}.{module.name}"))
+    for module in pkgutil.walk_packages(draw.__path__, f"{draw.__name__}."):
+        names = vars(import_module(module.name))
         found |= {name for name in names if name.endswith("_figure") and not name.startswith("_")}
     assert found == set(FIGURES)
 
