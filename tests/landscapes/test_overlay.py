@@ -278,4 +278,5 @@ def test_what_was_the_best_so_far_is_joined_in_its_order_and_numbered_where_ther
         assert any(np.allclose(text.xy, place) for place in at)
     boxes = [text.get_window_extent() for text in numbers]
     assert not any(one.overlaps(other) for number, one in enumerate(boxes) for other in boxes[:number])
-    assert any("numbers are episodes" in text.get_text() for text in figure.legends[0].get_texts())
+    assert any("numbers: episodes" in text.get_text() for text in figure.legends[0].get_texts())
+    assert "colour: the loss the point truly had" in figure.legends[0].get_title().get_text().replace("\n", " ")
