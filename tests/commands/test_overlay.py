@@ -13,8 +13,8 @@ from benchmarks.results import leave_blank
 
 import gradscape
 from gradscape.cli import main
+from gradscape.landscapes.identity import plane_of
 from gradscape.landscapes.overlay import best_point, overlay
-from gradscape.landscapes.storage.store import plane_of
 from gradscape.optim.runs.store import RunStore
 
 

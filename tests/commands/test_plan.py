@@ -104,9 +104,8 @@ def test_pictures_come_with_finer_levels_batches_and_a_pause_between_them() -> N
     space = gradscape.ParameterSpace.box(["a", "b"], -1.0, 1.0)
     store = SliceStore.in_memory(gradscape.Plane.through(space, space.center, ("a", "b"), resolution=64), space)
     most = 1 + store.tiles()[-1].level
-    assert [count_pictures(most - 1, *now) for now in ((99, 1e6, 1.0), (99, 0.0, 1.0), (99, 44.0, 1.0), (3, 44.0, 1.0))] == [
-        most, 2, 6, 4
-    ]  # fmt: skip
+    cases = ((99, 1e6, 1.0), (99, 0.0, 1.0), (99, 44.0, 1.0), (3, 44.0, 1.0))
+    assert [count_pictures(most - 1, *now) for now in cases] == [most, 2, 6, 4]
 
 
 def test_no_more_than_a_tenth_of_the_time_goes_into_pictures_of_what_is_unfinished() -> None:
