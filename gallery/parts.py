@@ -5,7 +5,6 @@ from __future__ import annotations
 import abc
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from ..envs.base import Environment
     from ..jobs.scene import SceneSpec
     from ..jobs.slice import SliceJob
+    from ..jobs.sweep import SweepJob
 
 DRAFT = "draft"  # fidelity of sweeps and searches, of which there are many episodes; of functions their only one
 FRAMES, COARSE = 12, 24  # of a sweep: frames, and points along each axis
@@ -161,13 +161,13 @@ class SweepPart(Part):
 
     def seconds_each(self) -> float:
         """Time the film by its last slice."""
-        return float(self._open().cost()[0])
+        return self._open().cost().seconds
 
     def make(self, watch: Watch) -> str:
         """Sample the sweep's slices and film them."""
         from ..landscapes.draw.figures.sweep import save_films
 
-        drawn = self._open().sampled(console_of(watch))
+        drawn = self._open().sample(watch)
         save_films(drawn, self.folder / SWEEP_FILM, None, dpi=DPI, loss=LOSS)
         record = self._record(drawn.label, drawn.values[0], drawn.values[-1], self.label())
         record.write(self.folder / SWEEP_RECORD)
@@ -176,17 +176,15 @@ class SweepPart(Part):
     def _record(self, label: str, low: float, high: float, command: str) -> SweepRecord:
         return SweepRecord(self.figure.over, DRAFT, FRAMES, [COARSE, COARSE], label, low, high, command)
 
-    def _open(self) -> Any:
-        from ..commands.sweep_report import Job, sweep_folder
-        from ..jobs.swept import SMOOTHING, moved
+    def _open(self) -> SweepJob:
+        from ..jobs.motion import SMOOTHING, Motion
+        from ..jobs.sweep import SweepJob, sweep_folder
 
-        env = self._scene(DRAFT).make()
-        swept = moved(
-            self.figure.over, env, self.figure.plane(env, COARSE), FRAMES, partial(self._scene(DRAFT).make, None)
-        )
-        grad = self.figure.over != SMOOTHING
-        folder = sweep_folder(env, swept, self.figure.over, grad=grad)
-        return replace(Job.open(env, swept, folder, command=self.label(), grad=grad), executor=self.executor)
+        env, over = self._scene(DRAFT).make(), self.figure.over
+        motion = Motion.of(env, self.figure.plane(env, COARSE), over, FRAMES)
+        grad = over != SMOOTHING
+        folder = sweep_folder(env, motion, over, grad=grad)
+        return replace(SweepJob.open(env, motion, folder, command=self.label(), grad=grad), executor=self.executor)
 
 
 class SearchPart(Part):
