@@ -14,13 +14,19 @@ from typer.core import TyperGroup
 
 from . import __version__
 from .commands import verbs_gallery as gallery
-from .commands import verbs_look as look
 from .commands import verbs_measure as measure
 from .commands.dims import TakesDims
+from .commands.envs import envs
+from .commands.export import export
+from .commands.info import info
 from .commands.optimize import methods, optimize
 from .commands.overlay import overlay
 from .commands.race import race
+from .commands.replay import replay
 from .commands.slice import bounce, slice_
+from .commands.surface import surface
+from .commands.sweep import sweep
+from .commands.view import view
 
 
 class Verbs(TyperGroup):
@@ -47,9 +53,9 @@ app = typer.Typer(
 STOPPED = 130  # the exit code of what Ctrl-C has ended
 LONG = 200  # characters of a path that an error shows
 _VERBS = (
-    look.envs, look.info, slice_, look.sweep,
+    envs, info, slice_, sweep,
     methods, optimize, race, overlay,
-    look.surface, look.replay, look.export, look.view, bounce,
+    surface, replay, export, view, bounce,
     measure.plan, measure.bench, measure.check, measure.tradeoff, measure.pairs, measure.report_,
 )  # fmt: skip
 

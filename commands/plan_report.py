@@ -10,14 +10,13 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..envs.registry import environment_class, make
 from ..gallery.figures import Figure, read_figures
+from ..jobs.motion import refuse_too_large as refuse_sweep
 from ..jobs.planned import Plan, of_slice, of_sweep
-from ..jobs.swept import refuse_too_large as refuse_sweep
 from ..jobs.tolerance import kept_rung
 from ..landscapes.capacity import TooLargeError, size
 from ..landscapes.cost import duration
@@ -72,8 +71,7 @@ def plan(
         if over is None:
             found = of_slice(env, plane, Path(folder), grad=grad, began=began)
         else:
-            made = partial(make, what, device=env.device, **options)
-            found = of_sweep(env, plane, Path(folder), over, frames, made, grad=grad, began=began)
+            found = of_sweep(env, plane, Path(folder), over, frames, grad=grad, began=began)
     found = _there(found, env, where, grad=grad)
     about = {"over": over, "frames": frames if over else 1, "too_large": _too_large(plane, over, frames, grad=grad)}
     record = {**_subject(env, plane, where), **about, **found.record(workers)}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import abc
 import json
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
 
     from ..envs.base import Environment
     from ..jobs.slice import SliceJob
+    from ..jobs.sweep import SweepJob
     from ..landscapes.plane import Plane
 
 DRAFT = "draft"  # fidelity of sweeps and searches, of which there are many episodes; of functions their only one
@@ -162,7 +162,7 @@ class Sweep(Part):
 
     def seconds_each(self) -> float:
         """Time the film by its last slice."""
-        return float(self._job().cost()[0])
+        return self._job().cost().seconds
 
     def make(self, console: Console) -> str:
         """Sample the sweep's slices and film them."""
@@ -170,7 +170,9 @@ class Sweep(Part):
         from ..landscapes.storage.records import write_record
 
         job = self._job()
-        drawn = job.sampled(console)
+        from ..api.progress import Bars
+
+        drawn = job.sample(Bars(console))
         save_films(drawn, self.folder / FILM, None, dpi=DPI, loss=LOSS)
         about = {"label": drawn.label, "low": drawn.values[0], "high": drawn.values[-1], "command": self.label()}
         write_record(self.folder / ABOUT, {**self._settings, **about})
@@ -180,16 +182,15 @@ class Sweep(Part):
     def _settings(self) -> dict[str, Any]:
         return {"over": self.figure.over, "fidelity": DRAFT, "frames": FRAMES, "resolution": [COARSE, COARSE]}
 
-    def _job(self) -> Any:
-        from ..commands.sweep_report import Job, sweep_folder
-        from ..jobs.swept import SMOOTHING, moved
+    def _job(self) -> SweepJob:
+        from ..jobs.motion import SMOOTHING, Motion
+        from ..jobs.sweep import SweepJob, sweep_folder
 
-        env = self._env(DRAFT)
-        made = partial(make, self.figure.env, fidelity=DRAFT, device=self.device, **self.figure.options)
-        swept = moved(self.figure.over, env, plane_of_figure(self.figure, env, COARSE), FRAMES, made)
-        grad = self.figure.over != SMOOTHING
-        folder = sweep_folder(env, swept, self.figure.over, grad=grad)
-        return replace(Job.open(env, swept, folder, command=self.label(), grad=grad), executor=self.executor)
+        env, over = self._env(DRAFT), self.figure.over
+        motion = Motion.of(env, plane_of_figure(self.figure, env, COARSE), over, FRAMES)
+        grad = over != SMOOTHING
+        folder = sweep_folder(env, motion, over, grad=grad)
+        return replace(SweepJob.open(env, motion, folder, command=self.label(), grad=grad), executor=self.executor)
 
 
 class Searches(Part):

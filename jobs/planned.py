@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..commands.sweep_report import Job as SweepJob
+from .motion import SMOOTHING, Motion, need_of
 from .scene import provenance as provenance_of
 from .slice import picture_of
-from .swept import SMOOTHING, moved, need_of
+from .sweep import SweepJob
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
@@ -102,7 +101,6 @@ def of_sweep(
     folder: Path,
     over: str,
     frames: int,
-    made: Callable[..., Environment],
     *,
     grad: bool,
     began: float,
@@ -110,15 +108,16 @@ def of_sweep(
     """Plan a sweep; of a long one fewer frames are rehearsed, and of large slices smaller ones."""
     little, grad = _little(plane), grad and over != SMOOTHING
     grown, whole = Growth.of(little, plane, grad=grad), math.prod(plane.resolution)
-    swept = moved(over, env, little, min(frames, MOST_FRAMES), made)
-    job = SweepJob.open(env, swept, folder, command="", grad=grad)
-    seconds, memory = job.cost()
+    motion = Motion.of(env, little, over, min(frames, MOST_FRAMES))
+    job = SweepJob.open(env, motion, folder, command="", grad=grad)
+    cost = job.cost()
+    seconds, memory = cost.seconds, cost.memory
     start, last = time.perf_counter() - began, len(job.stores) - 1
     from .rehearsal import Alike, Room, stored
     from .slice import peak_memory
 
     memory -= peak_memory()
-    alike = Alike.of(swept.env_at(last), job.stores[last], seconds / job.total)
+    alike = Alike.of(motion.env_at(last), job.stores[last], seconds / job.total)
     kept = stored(alike, job.stores[last])
     drawing, films = _filming(job, seconds / job.total, folder / "films", frames)
     count = frames if len(job.stores) > 1 else 1
@@ -205,14 +204,14 @@ def _filming(job: SweepJob, seconds_each: float, folder: Path, frames: int) -> t
     folder.mkdir()
     most, last = min(MORE, max(frames, FEW + 1)), len(job.stores) - 1
     shown = [round(at * last / (most - 1)) for at in range(most)]
-    alike = {at: Alike.of(job.moved.env_at(at), job.stores[at], most * seconds_each) for at in set(shown)}
+    alike = {at: Alike.of(job.motion.env_at(at), job.stores[at], most * seconds_each) for at in set(shown)}
     datasets = [alike[at].dataset(job.stores[at]) for at in shown]
-    every = job.moved.values  # which may share a slice
+    every = job.motion.values  # which may share a slice
     values = [every[round(at * (len(every) - 1) / (most - 1))] for at in range(most)]
 
     def film(count: int) -> None:
         at = range(most) if count == most else (0, most - 1)  # a few of them are the first and the last
-        sweep = Sweep(job.moved.label, tuple(values[one] for one in at), [datasets[one] for one in at])
+        sweep = Sweep(job.motion.label, tuple(values[one] for one in at), [datasets[one] for one in at])
         save_films(sweep, folder / "sweep.mp4", folder / "sweep.gif")
         save_stream(sweep, folder / "sweep.rrd")
 

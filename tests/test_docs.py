@@ -14,7 +14,7 @@ import pytest
 import typer
 
 from gradscape.cli import app, main
-from gradscape.commands import overlay_report
+from gradscape.commands import view
 from gradscape.commands.measure_tables import environments_table
 from gradscape.gallery.figures import DATA, read_figures
 
@@ -141,7 +141,7 @@ def test_every_command_runs(
 
     monkeypatch.setenv("XDG_DATA_HOME", str(desk / "data"))
     monkeypatch.setattr("http.server.ThreadingHTTPServer.serve_forever", stop)
-    monkeypatch.setattr(overlay_report, "show", lambda console, path, serve: opened.append(path))
+    monkeypatch.setattr(view, "show_recording", lambda path, bars, *, serve: opened.append(path))
     for name, value in (("TIMING", 0.01), ("PATIENCE", 0.01), ("RESAMPLES", 9)):
         monkeypatch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", value)
     done = run(*small(command), cwd=desk)

@@ -33,7 +33,7 @@ EPISODE, TILE, PICTURE = 0.05, 0.035, 0.5  # seconds that it takes to simulate, 
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """Let what jobs are made of take its time on a clock of its own."""
     clock = Clock()
-    for module in ("jobs.slice", "jobs.rehearsal", "jobs.planned", "commands.plan_report", "commands.sweep_report"):
+    for module in ("landscapes.cost", "jobs.slice", "jobs.rehearsal", "jobs.planned", "commands.plan_report", "jobs.sweep"):
         monkeypatch.setattr(f"gradscape.{module}.time", clock)
 
     def slow(owner: Any, name: str, price: Callable[..., float]) -> None:
