@@ -67,7 +67,7 @@ def race(
     force: bool = False,
     **keywords: Unpack[SceneKeywords],
 ) -> Race:
-    """Let methods compete on an environment with the same budget of episodes, with several seeds each, and return the race.
+    """Let methods compete on an environment, with the same budget and several seeds each, and return the race.
 
     `methods` are by default all that can search it here, `method_options` are given by method. `workers` runs
     are filled at a time, each in a thread. The race lies in the folder `out`, by default one under out/ named after it:
@@ -108,13 +108,14 @@ def open_run(path: str | Path) -> Run:
 def _search_in_memory(
     objective: Objective, optimizer: Optimizer, budget: int, out: str | Path | None, watch: Watch
 ) -> Run:
-    """Search an objective of which nothing says what decides its numbers, so that no run of it could be gone on with."""
+    """Search an objective of which nothing says what decides its numbers, so that no run of it can be continued."""
     from ..jobs.search import one_torch_thread
     from ..landscapes.objective import name_of
     from ..optim.search import search
 
     if out is not None:
-        raise ValueError(f"runs of environments are kept on disk; {name_of(objective)} is none, so leave out the folder")
+        who = name_of(objective)
+        raise ValueError(f"runs of environments are kept on disk; {who} is none, so leave out the folder")
     with one_torch_thread(), watch.progress(budget) as advance:
         store = search(objective, optimizer, budget=budget, progress=lambda now: advance(now.done))
     return store.read()

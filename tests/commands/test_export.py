@@ -75,7 +75,7 @@ def test_a_run_has_a_row_for_each_episode(run: Callable[..., Said], results: Pat
 @pytest.mark.parametrize(("folder", "store"), [("cut", "slice"), ("line", "slice"), ("searched", "run")])
 def test_netcdf_keeps_arrays_names_and_units(run: Callable[..., Said], results: Path, folder: str, store: str) -> None:
     assert run("export", folder, "--to", "netcdf", cwd=results).returncode == 0
-    ours = {"slice": lambda path: gradscape.open_slice(path).data, "run": lambda path: gradscape.open_run(path).data}[store](results / folder)
+    ours = {"slice": gradscape.open_slice, "run": gradscape.open_run}[store](results / folder).data
     with xr.open_dataset(results / folder / f"{store}.nc") as back:
         for name in ours.data_vars:
             np.testing.assert_array_equal(back[name], ours[name])
