@@ -159,4 +159,5 @@ def _named_point(objective: Objective, text: str) -> Tensor:
         return objective.space.center
     if kind == "random" and seed.isdecimal():
         return objective.space.uniform(1, seed=int(seed))[0]
+
     raise ValueError(f"{name_of(objective)} can be cut through center, random:SEED or a tensor; got {text!r}")

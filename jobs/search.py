@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import torch
 
 from ..landscapes.cost import duration, episode_cost
-from ..landscapes.objective import Status
+from ..landscapes.objective import Objective, Status
 from ..landscapes.space import as_whole
 from ..landscapes.storage.files import clear, tidy, write_json
 from ..optim.base import Kind
@@ -233,9 +233,9 @@ def one_torch_thread() -> Iterator[None]:
 
 @one_torch_thread()
 def make_optimizer(
-    method: str, env: Environment, *, seed: int = 0, options: Mapping[str, Any] | None = None
+    method: str, objective: Objective, *, seed: int = 0, options: Mapping[str, Any] | None = None
 ) -> Optimizer:
-    """Make a method for an environment; values of its options may be text.
+    """Make a method for an objective; values of its options may be text.
 
     Raises ValueError for a method, an option or a value that is not there, and TooLargeError for one that would not fit
     this machine.
@@ -244,8 +244,8 @@ def make_optimizer(
 
     kind = optimizer_class(method)
     chosen = read_options(method, kind.Options, options or {})
-    require_method(kind, chosen, SearchSize(env.space.dim, env.decisions))
-    return kind.on(env, seed=seed, options=chosen)
+    require_method(kind, chosen, SearchSize(objective.space.dim, getattr(objective, "decisions", 1)))
+    return kind.on(objective, seed=seed, options=chosen)
 
 
 def open_run_store(
