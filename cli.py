@@ -10,22 +10,42 @@ from io import TextIOWrapper
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from . import __version__
-from .commands import verbs_gallery as gallery
-from .commands import verbs_look as look
+from .commands import gallery
 from .commands import verbs_search as search
 from .commands.bench import bench
 from .commands.check import check
 from .commands.dims import TakesDims
+from .commands.envs import envs
+from .commands.export import export
+from .commands.info import info
 from .commands.pairs import pairs
 from .commands.plan import plan
+from .commands.replay import replay
 from .commands.report import report_
 from .commands.slice import bounce, slice_
+from .commands.surface import surface
+from .commands.sweep import sweep
 from .commands.tradeoff import tradeoff
+from .commands.view import view
+
+
+class Verbs(TyperGroup):
+    """The verbs of the command, of which Ctrl-C ends as it is raised: the library would make an exit code of it."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a verb; return what Ctrl-C has raised, for `main` to raise it again."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as stop:
+            return stop
+
 
 app = typer.Typer(
     name="landscape",
+    cls=Verbs,
     help="See, measure and search the loss landscapes of differentiable simulators.",
     add_completion=False,
     rich_markup_mode=None,
@@ -36,9 +56,9 @@ app = typer.Typer(
 STOPPED = 130  # the exit code of what Ctrl-C has ended
 LONG = 200  # characters of a path that an error shows
 _VERBS = (
-    look.envs, look.info, slice_, look.sweep,
+    envs, info, slice_, sweep,
     search.methods, search.optimize, search.race, search.overlay,
-    look.surface, look.replay, look.export, look.view, bounce,
+    surface, replay, export, view, bounce,
     plan, bench, check, tradeoff, pairs, report_,
 )  # fmt: skip
 
@@ -78,7 +98,9 @@ def main(arguments: list[str] | None = None) -> Any:
             stream.reconfigure(errors="backslashreplace")  # a file's name need not be text
     try:
         code = app(args=arguments, prog_name="landscape", standalone_mode=False)
-        if code == 130:  # what typer makes of Ctrl-C where a verb has not said what is kept
+        if isinstance(code, KeyboardInterrupt):
+            raise code
+        if code == STOPPED:  # what the library makes of Ctrl-C where no verb has begun
             raise KeyboardInterrupt
     except TyperException as error:
         code = _fail(_usage(error), 2)

@@ -1,29 +1,25 @@
-"""What `landscape overlay` and `landscape view` do and print."""
+"""What `landscape overlay` does and prints."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
-import shlex
-import sys
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..envs.registry import environment_class
-from ..jobs.folder import RUN_STORE as RUN
 from ..jobs.folder import SLICE_STORE as SLICE
 from ..jobs.folder import run_tables
 from ..jobs.folder import store_in as inside
 from ..jobs.scene import environment_of
 from ..landscapes.identity import stored_identity
-from ..landscapes.storage.files import others, resolved, tidy
+from ..landscapes.storage.files import others, tidy
 from ..landscapes.storage.paths import there
 from .console import fill
-from .terminal import Console
+from .terminal import Bars, Console
+from .view import check_display, show_recording
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -32,12 +28,6 @@ if TYPE_CHECKING:
     from ..landscapes.plane import Plane
 
 PICTURE, STREAM = "overlay.png", "overlay.rrd"
-SITE = "index.html"
-SHOWN = (  # of a folder, the first that is there
-    *(SITE, "overlay.rrd", "race.png", "landscape.png", "progress.png", "sweep.mp4"),
-    *("surface.png", "episode.mp4", "episode.png", "sweep.rrd", "episode.rrd"),
-)
-PICTURES = (".png", ".html", ".mp4", ".gif")
 MUST, SHOULD = ("objective", "options"), ("fidelity", "settings", "engine", "code")  # agree between slice and runs
 
 
@@ -71,6 +61,8 @@ def overlay(
         _check(console, dataset, table)
     laid(dataset, tables)  # refuses what cannot be laid over it before anything is computed
     folder = _folder(out, dataset, tables, [through, plane, resolution])
+    if spawn and not serve:
+        check_display(folder / STREAM, "give --serve in the place of --spawn, and look at it in a browser")
     if through or plane:
         env = environment_of(dataset, device)
         cut = _plane(env, dataset, tables, through=through, principal=plane is not None, resolution=resolution)
@@ -82,27 +74,7 @@ def overlay(
     tidy(folder)
     console.print(f"{_outcome(placed)}\n{folder}: {', '.join(files)}", markup=False)
     if spawn or serve:
-        _show(console, folder / STREAM, serve=serve)
-
-
-def view(file: str, *, serve: bool) -> None:
-    """Open a file that one of the verbs left, or the picture of a folder."""
-    console = Console(stderr=True, soft_wrap=True, highlight=False)
-    path = _shown(Path(file), serve=serve)
-    if path.name == SITE and serve:
-        raise ValueError(f"a site is served by: landscape gallery serve --out {shlex.quote(str(path.parent))}")
-    if path.suffix != ".rrd" and serve:
-        raise ValueError(f"--serve shows recordings (.rrd) in a browser; {path} is none")
-    if path.suffix == ".rrd":
-        _show(console, path, serve=serve)
-        return
-    serving = f"landscape gallery serve --out {shlex.quote(str(path.parent))}"
-    _need_display(path, f"serve it to a browser: {serving}" if path.name == SITE else "copy it to where one is")
-    import typer
-
-    console.print(f"opening {path}", markup=False)
-    if typer.launch(str(resolved(path))):
-        raise OSError(f"no program of this system opens {path}; open it with one of your own")
+        show_recording(folder / STREAM, Bars(console), serve=serve)
 
 
 def _check(console: Console, dataset: xr.Dataset, table: xr.Dataset) -> None:
@@ -185,44 +157,3 @@ def _outcome(placed: Sequence[xr.Dataset]) -> str:
         f"{len(placed)} run{'s' if len(placed) > 1 else ''}, {points} points: {outside} beyond the map, {failed} failed"
     )
     return f"{said}; the farthest is {away:.2g} half-widths of the box off the plane"
-
-
-def _shown(path: Path, *, serve: bool) -> Path:
-    """Return what to open for a path; of a folder that is to be served, first a recording."""
-    folder = path.parent if path.name in (SLICE, RUN) else path
-    if folder.is_dir():
-        for name in sorted(SHOWN, key=lambda name: serve and not name.endswith(".rrd")):
-            if (folder / name).exists():
-                return folder / name
-        raise ValueError(
-            f"{path} holds none of {', '.join(SHOWN)}; what `landscape slice`, sweep, optimize, race, overlay, replay "
-            "and gallery build leave does"
-        )
-    if not path.exists():
-        raise ValueError(f"there is no file {path}")
-    if path.suffix not in (*PICTURES, ".rrd"):
-        raise ValueError(f"view opens {', '.join(PICTURES)}, .rrd and results folders; got {path}")
-    return path
-
-
-def _show(console: Console, path: Path, *, serve: bool) -> None:
-    from ..landscapes.draw.recordings.viewer import open_viewer, served
-
-    if not serve:
-        _need_display(path, f"look at it in a browser: landscape view {shlex.quote(str(path))} --serve")
-        console.print(f"opening {path} in rerun's viewer", markup=False)
-        open_viewer(path)
-        return
-    with served(path) as address:
-        try:
-            console.print(f"{path} is at {address} until Ctrl-C", markup=False)
-            while True:
-                time.sleep(3600)
-        except KeyboardInterrupt:
-            return
-
-
-def _need_display(path: Path, instead: str) -> None:
-    displays = ("DISPLAY", "WAYLAND_DISPLAY")
-    if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in displays):
-        raise ValueError(f"there is no display here to open {path} on; {instead}")

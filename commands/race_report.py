@@ -213,13 +213,14 @@ class Job:
 
     def save(self, prints: Sequence[float] = ()) -> dict[str, Any]:
         """Draw the race, also for pages so wide [mm], write its figures and return them."""
+        from ..gallery.paper import read_paper
         from ..landscapes.draw.figures.page import save, save_prints
         from ..landscapes.draw.figures.race import race_figure
         from ..optim.race import judged, picture, tables
         from ..optim.standings import targets
 
         runs = tables(self.entries, self.budget)
-        goals = targets(runs)
+        goals, paper, name = targets(runs), read_paper(), self.env.name
         figures: dict[str, Any] = _plain(
             {
                 "env": self.env.name,
@@ -232,7 +233,7 @@ class Job:
                 "method_options": {entry.method: entry.run.identity["method_options"] for entry in self.entries},
                 "budget": self.budget,
                 "seeds": self.seeds,
-                **judged(self.env.name, runs, goals),
+                **judged(runs, goals, paper.claims_about(name), paper.silence_about(name)),
                 "command": self.command,
             }
         )

@@ -44,8 +44,8 @@ def report_(
 
     Example: landscape report out/fluid-6-8-draft-24x24-4e5ab2
     """
-    from ..gallery.figures import data_folder
-    from ..gallery.words import paper_words
+    from ..gallery.files import data_folder
+    from ..gallery.paper import read_paper
     from ..jobs.report import ReportJob
     from .terminal import Bars, command_line
 
@@ -56,7 +56,7 @@ def report_(
     subjects = _figures(root) if what is None else _subjects(what, root, fidelity, device, points, bars)
     single = what is not None and len(subjects) == 1
     how: dict[str, Any] = {"points": points, "seed": seed, "out": Path(out) if out else None, "device": device}
-    how |= {"prints": print_ or [], "paper": paper_words(), "command": command_line()}
+    how |= {"prints": print_ or [], "paper": read_paper().words, "command": command_line()}
     job = ReportJob.open(subjects, what=Path(what or "all").name, single=single, **how)
     found = job.run(bars)
     if single:

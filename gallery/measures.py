@@ -1,30 +1,28 @@
-"""What `landscape gallery compute` measures: the report of a figure's slice, the trade-off of its environment."""
+"""What the gallery measures: the report of a figure's slice, the trade-off of its environment."""
 
 from __future__ import annotations
 
 import shutil
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from ..api.progress import Bars, Console
 from ..envs.registry import environment_class
-from ..jobs.folder import REPORT as FILES
-from ..jobs.folder import SLICE_STORE as SLICE
-from ..jobs.folder import TRADEOFF as STUDY
+from ..jobs.scene import SceneSpec
 from ..jobs.variants import SETTINGS
-from .parts import Part, read_record
-from .site.measured import DEVICES, TRADEOFF
+from ..jobs.watch import Watch
+from ..landscapes.storage.records import read_json
+from .files import DEVICES, MEASURES, QUALITY, QUALITY_ARRAYS, REPORT, STORE, TRADEOFF_PICTURE, TradeoffFiles
+from .parts import Part
+from .records import read_if_sound
 
 if TYPE_CHECKING:
     from ..jobs.tradeoff import TradeoffJob
 
-REPORT, MEASURES, PICTURE, ARRAYS = FILES.files
 SEED = 0
 REPORT_POINTS, TRADEOFF_POINTS = 6, 64  # those of `landscape report` and `landscape tradeoff`
 TURNED = [one for one in SETTINGS if one not in ("engine", "device")]  # those take hours on another device
 
 
-class Reports(Part):
+class ReportPart(Part):
     """What the slice is like, beside it."""
 
     def label(self) -> str:
@@ -36,10 +34,10 @@ class Reports(Part):
         from ..jobs.report import digest_of
         from ..landscapes.storage.store import is_slice, open_slice
 
-        kept, store = read_record(self.folder / REPORT), self.folder / SLICE
-        if not isinstance(kept, dict) or read_record(self.folder / MEASURES) is None or not is_slice(store):
+        record, store = read_if_sound(read_json, self.folder / REPORT), self.folder / STORE
+        if record is None or read_if_sound(read_json, self.folder / MEASURES) is None or not is_slice(store):
             return 1
-        key = kept.get("key")
+        key = record.get("key")
         return int(not isinstance(key, dict) or key.get("slice") != digest_of(open_slice(store)))
 
     def seconds_each(self) -> float:
@@ -47,27 +45,30 @@ class Reports(Part):
         from ..jobs.report import estimate_seconds
         from ..landscapes.measures.profile import effort
 
-        return estimate_seconds(self._env(self.figure.fidelity), *effort(len(self.figure.dims), REPORT_POINTS))
+        return estimate_seconds(self._scene().make(), *effort(len(self.figure.dims), REPORT_POINTS))
 
-    def make(self, console: Console) -> str:
+    def make(self, watch: Watch) -> str:
         """Measure the slice, in the place of a report of another one."""
-        from ..jobs.report import ReportJob, Subject
         from ..landscapes.draw.film import lighten
-        from .words import paper_words
 
-        files = [self.folder / name for name in (REPORT, MEASURES, PICTURE, ARRAYS)]
-        for file in files:
-            file.unlink(missing_ok=True)
-        subject = Subject(self.figure.id, self.folder / SLICE)
-        job = ReportJob(
-            [subject], self.folder, True, REPORT_POINTS, SEED, self.device, paper_words(), command=self.label()
-        )
-        report = job.report(subject, Bars(console))
-        lighten(self.folder / PICTURE)
-        return ", ".join(report.words)
+        for name in (REPORT, MEASURES, QUALITY, QUALITY_ARRAYS):
+            (self.folder / name).unlink(missing_ok=True)
+        words = self._measure(watch)
+        lighten(self.folder / QUALITY)
+        return ", ".join(words)
+
+    def _measure(self, watch: Watch) -> tuple[str, ...]:
+        """Report on the slice into its own folder, and return the words for it."""
+        from ..jobs.report import ReportJob, Subject
+        from .paper import read_paper
+
+        subject, words = Subject(self.figure.id, self.folder / STORE), read_paper().words
+        how: dict[str, Any] = {"points": REPORT_POINTS, "seed": SEED, "device": self.device, "paper": words}
+        job = ReportJob([subject], self.folder, single=True, **how, command=self.label())
+        return job.report(subject, watch).words
 
 
-class Tradeoffs(Part):
+class TradeoffPart(Part):
     """Accuracy against time of the figure's environment, which its other figures share."""
 
     def label(self) -> str:
@@ -78,37 +79,34 @@ class Tradeoffs(Part):
     def left(self) -> int:
         """Return 1 where there is none, of an environment that has fidelities to trade."""
         some = len(environment_class(self.figure.env).fidelities) > 1
-        return int(some and not any(read_record(record) and picture.is_file() for record, picture in self._places()))
+        devices = DEVICES if self.device == "auto" else (self.device,)
+        return int(some and not any(map(self._sound, devices)))
 
     def seconds_each(self) -> float:
         """Estimate all variants by the work of their episodes."""
-        return sum(self._job().estimate().values())
+        return sum(self._open().estimate().values())
 
-    def make(self, console: Console) -> str:
+    def make(self, watch: Watch) -> str:
         """Measure every variant; those that are measured stay in a folder of their own under out/ until the last is."""
         from ..landscapes.draw.film import lighten
         from ..landscapes.storage.files import make_folder
         from ..landscapes.storage.records import write_record
 
-        job = self._job()
-        found = job.run(Bars(console))
-        record, picture = self._files(job.env.device)
-        make_folder(record.parent)
-        shutil.copyfile(job.folder / STUDY.picture, picture)
-        lighten(picture)
-        write_record(record, found.record())
+        job = self._open()
+        found = job.run(watch)
+        files = TradeoffFiles.of(self.root, self.figure.env, job.env.device)
+        make_folder(files.record.parent)
+        shutil.copyfile(job.folder / TRADEOFF_PICTURE, files.picture)
+        lighten(files.picture)
+        write_record(files.record, found.record())
         return f"{len(found.variants)} variants at {found.points} points"
 
-    def _places(self) -> list[tuple[Path, Path]]:
-        """Return where a record may be: of the device asked for, of any where none is."""
-        return [self._files(device) for device in (DEVICES if self.device == "auto" else (self.device,))]
+    def _sound(self, device: str) -> bool:
+        """Whether there is one of a device."""
+        files = TradeoffFiles.of(self.root, self.figure.env, device)
+        return bool(read_if_sound(read_json, files.record)) and files.picture.is_file()
 
-    def _files(self, device: str) -> tuple[Path, Path]:
-        name = f"{self.figure.env}-{device}"
-        return self.root / TRADEOFF / f"{name}.json", self.root / TRADEOFF / f"{name}.png"
-
-    def _job(self) -> TradeoffJob:
-        from ..jobs.scene import SceneSpec
+    def _open(self) -> TradeoffJob:
         from ..jobs.tradeoff import TradeoffJob
 
         scene = SceneSpec(self.figure.env, device=self.device)

@@ -14,9 +14,7 @@ from ..landscapes.storage.files import replacing
 from ..landscapes.storage.layout import SMALL
 from ..landscapes.storage.records import reading
 from ..optim.run_arrays import COLUMNS
-from .site.page_data import REMAKE
-
-FOLDER, SUFFIX = "runs", ".zarr.zip"
+from .files import REMAKE
 
 
 def save_run(table: xr.Dataset, path: Path) -> None:
@@ -29,7 +27,7 @@ def save_run(table: xr.Dataset, path: Path) -> None:
 
 
 def open_run(path: Path) -> xr.Dataset:
-    """Read a run's table; raise ValueError, naming the file, where it is not what `save_run` wrote."""
+    """Read a run's table. Raises ValueError, naming the file, where it is not what `save_run` wrote."""
     plain: Any = {"mask_and_scale": False, "decode_times": False}
     with reading(path, REMAKE.format("searches")):
         with ZipFile(path) as packed:

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from ..commands.sweep_report import Job as SweepJob
 from ..envs.registry import environment_class
 from ..landscapes.capacity import TooLargeError
+from .motion import SMOOTHING, Motion, need_of
 from .scene import SceneSpec
 from .scene import provenance as provenance_of
 from .slice import picture_of
-from .swept import SMOOTHING, moved, need_of
+from .sweep import SweepJob
 from .watch import Watch
 
 if TYPE_CHECKING:
@@ -152,13 +152,12 @@ class PlanJob:
         with TemporaryDirectory() as folder:
             if self.over is None:
                 return plan_slice(env, plane, Path(folder), **how)
-            made = replace(self.scene, device=env.device).make
-            return plan_sweep(env, plane, Path(folder), self.over, self.frames, made, **how)
+            return plan_sweep(env, plane, Path(folder), self.over, self.frames, **how)
 
     def _too_large(self, plane: Plane) -> str | None:
         """Return why this machine would refuse what is planned, None where it would not."""
         from ..landscapes.storage.arrays import refuse_too_large as refuse_slice
-        from .swept import refuse_too_large as refuse_sweep
+        from .motion import refuse_too_large as refuse_sweep
 
         try:
             if self.over is None:
@@ -243,7 +242,6 @@ def plan_sweep(
     folder: Path,
     over: str,
     frames: int,
-    made: Callable[..., Environment],
     *,
     grad: bool,
     began: float,
@@ -251,15 +249,16 @@ def plan_sweep(
     """Plan a sweep; of a long one fewer frames are rehearsed, and of large slices smaller ones."""
     little, grad = _little(plane), grad and over != SMOOTHING
     grown, whole = Growth.of(little, plane, grad=grad), math.prod(plane.resolution)
-    swept = moved(over, env, little, min(frames, MOST_FRAMES), made)
-    job = SweepJob.open(env, swept, folder, command="", grad=grad)
-    seconds, memory = job.cost()
+    motion = Motion.of(env, little, over, min(frames, MOST_FRAMES))
+    job = SweepJob.open(env, motion, folder, command="", grad=grad)
+    cost = job.cost()
+    seconds, memory = cost.seconds, cost.memory
     start, last = time.perf_counter() - began, len(job.stores) - 1
     from .rehearsal import Replica, Room, store_replica
     from .slice import peak_memory
 
     memory -= peak_memory()
-    replica = Replica.of(swept.env_at(last), job.stores[last], seconds / job.total)
+    replica = Replica.of(motion.env_at(last), job.stores[last], seconds / job.total)
     kept = store_replica(replica, job.stores[last])
     drawing, films = _filming(job, seconds / job.total, folder / "films", frames)
     count = frames if len(job.stores) > 1 else 1
@@ -346,14 +345,14 @@ def _filming(job: SweepJob, seconds_each: float, folder: Path, frames: int) -> t
     folder.mkdir()
     most, last = min(MORE, max(frames, FEW + 1)), len(job.stores) - 1
     shown = [round(at * last / (most - 1)) for at in range(most)]
-    replicas = {at: Replica.of(job.moved.env_at(at), job.stores[at], most * seconds_each) for at in set(shown)}
+    replicas = {at: Replica.of(job.motion.env_at(at), job.stores[at], most * seconds_each) for at in set(shown)}
     datasets = [replicas[at].dataset(job.stores[at]) for at in shown]
-    every = job.moved.values  # which may share a slice
+    every = job.motion.values  # which may share a slice
     values = [every[round(at * (len(every) - 1) / (most - 1))] for at in range(most)]
 
     def film(count: int) -> None:
         at = range(most) if count == most else (0, most - 1)  # a few of them are the first and the last
-        sweep = Sweep(job.moved.label, tuple(values[one] for one in at), [datasets[one] for one in at])
+        sweep = Sweep(job.motion.label, tuple(values[one] for one in at), [datasets[one] for one in at])
         save_films(sweep, folder / "sweep.mp4", folder / "sweep.gif")
         save_stream(sweep, folder / "sweep.rrd")
 

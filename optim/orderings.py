@@ -1,26 +1,17 @@
-"""The paper's orderings of optimisers as data, and which of them hold in a race.
-
-"Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL 2022; arXiv:2207.00167v1),
-section 5. Its names: Rand is `random` here, CMA-ES `cma-es`, RandDescents `descents`, BO `bo-descents` (it descends
-from each proposal), BO-Leap `bo-leap`. Only what the text says of losses is here. What it says of single episodes (a
-cube lifted, a rope wrapped) is not, nor are the scenes we do not have: the one-link cartpole and the real robot.
-"""
+"""Orderings of optimisers that somebody claims, and which of them hold in a race."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
 from .standings import Difference
 
-GRADIENT_BASED = ("descents", "bo-descents")  # the paper's baselines that use gradients
-BASELINES = ("random", "cma-es", *GRADIENT_BASED)
-
 
 @dataclass(frozen=True)
 class Claim:
-    """Say that the paper has one method ahead of another, or neither ahead (`alike`), and where."""
+    """Say that one method is claimed to be ahead of another, or neither ahead (`alike`), and where."""
 
     first: str
     second: str
@@ -49,62 +40,10 @@ class Finding:
     difference: Difference | None
 
 
-def _ahead(first: str, seconds: Sequence[str], source: str) -> tuple[Claim, ...]:
-    return tuple(Claim(first, second, source) for second in seconds)
-
-
-def _alike(first: str, second: str, source: str) -> tuple[Claim, ...]:
-    return (Claim(first, second, source, alike=True),)
-
-
-_CARTPOLE = "Fig. 2, right: all gradient-based methods far below the gradient-free ones"
-_PLASTICINE = "Fig. 5: BO-Leap below the gradient-based methods in all tasks"
-_BY_FAR = "Fig. 5: significantly below CMA-ES in Assembly, Torus and TripleMove"
-_LEVEL = "Fig. 5: names Assembly, Torus and TripleMove as those where BO-Leap is below CMA-ES, so not this one"
-_SIX = _ahead("bo-leap", GRADIENT_BASED, _PLASTICINE)
-_CLEAR = _SIX + _ahead("bo-leap", ["cma-es"], _BY_FAR)
-_DRAWN = _SIX + _alike("bo-leap", "cma-es", _LEVEL)
-
-CLAIMS: Mapping[str, tuple[Claim, ...]] = {
-    "cartpole": (
-        *(
-            claim
-            for method in (*GRADIENT_BASED, "bo-leap")
-            for claim in _ahead(method, ("random", "cma-es"), _CARTPOLE)
-        ),
-        *_ahead("cma-es", ["random"], "Fig. 2, right: CMA-ES ahead of Rand, yet does not lift the tip"),
-    ),
-    "fluid": _ahead("bo-leap", BASELINES, "Fig. 3: BO-Leap best of all baselines"),
-    "rope": (
-        *_ahead("bo-leap", ("cma-es", "bo-descents"), "Fig. 4: BO-Leap wraps the rope, CMA-ES and BO do not"),
-        *_alike("descents", "random", "Fig. 4: RandDescents about as Rand"),
-    ),
-    "rolling-pin": _ahead("bo-leap", ("cma-es", *GRADIENT_BASED), "Fig. 5: BO-Leap ahead of CMA-ES and of gradients"),
-    "assembly": _CLEAR,
-    "torus": _CLEAR,
-    "triple-move": _CLEAR,
-    "pinch": _DRAWN,
-    "table": _DRAWN,
-    "writer": _DRAWN,
-}
-_LIMITATION = (
-    "The paper compares no optimisers here: it shows the scene among its limitations, its gradients wrong or absent."
-)
-SILENT: Mapping[str, str] = {
-    "bounce": "The paper compares no optimisers here: the scene serves to look at gradients through contact.",
-    **dict.fromkeys(("pinball-2", "pinball-16", "swing-velocity", "swing-stiffness", "flip"), _LIMITATION),
-}
-
-
-def findings(env: str, differences: Sequence[Difference]) -> list[Finding]:
-    """Return what a race on an environment makes of each of the paper's claims about it."""
+def findings(claims: Sequence[Claim], differences: Sequence[Difference]) -> list[Finding]:
+    """Return what a race makes of each of the claims about its environment."""
     measured = {(found.first, found.second): found for one in differences for found in (one, one.reversed)}
-    return [_finding(claim, measured.get((claim.first, claim.second))) for claim in CLAIMS.get(env, ())]
-
-
-def silence(env: str) -> str:
-    """Return why there is no claim about an environment."""
-    return SILENT.get(env, "The paper does not have this environment, so it claims nothing about it.")
+    return [_finding(claim, measured.get((claim.first, claim.second))) for claim in claims]
 
 
 def _finding(claim: Claim, found: Difference | None) -> Finding:

@@ -14,7 +14,7 @@ import xarray as xr
 from ..landscapes.objective import Objective
 from . import standings
 from .base import Optimizer
-from .orderings import findings, silence
+from .orderings import Claim, findings
 from .run import Run
 from .search import Progress, search
 
@@ -106,10 +106,15 @@ def picture(runs: standings.Tables, goals: standings.Targets) -> xr.Dataset:
     )
 
 
-def judged(env: str, runs: standings.Tables, goals: standings.Targets) -> dict[str, Any]:
-    """Return all figures of a race, the paper's claims about its environment included."""
+def judged(
+    runs: standings.Tables, goals: standings.Targets, claims: Sequence[Claim] = (), silence: str | None = None
+) -> dict[str, Any]:
+    """Return all figures of a race, what becomes of claims about its environment included.
+
+    `silence` says why there are none.
+    """
     differences = standings.differences(runs)
-    found = findings(env, differences)
+    found = findings(claims, differences)
     return {
         "ranks": [asdict(rank) for rank in standings.ranks(runs)],
         "differences": [asdict(one) | {"better": one.better} for one in differences],
@@ -117,7 +122,7 @@ def judged(env: str, runs: standings.Tables, goals: standings.Targets) -> dict[s
             asdict(one.claim) | {"claim": str(one.claim), "verdict": one.verdict, "difference": _record(one.difference)}
             for one in found
         ],
-        "silence": None if found else silence(env),
+        "silence": None if found else silence,
         "targets": {"loss": goals.loss.tolist(), "spacing": goals.spacing, "easiest": goals.easiest},
         "ecdf": {method: _shares(standings.hits(tables, goals)) for method, tables in runs.items()},
         "curves": {

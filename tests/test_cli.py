@@ -36,21 +36,6 @@ def test_a_word_too_few_or_too_many_says_where_to_read_on(run: Callable[..., Sai
     assert "(`landscape --help` says what it takes)" in run("plot", cwd=tmp_path).stderr
 
 
-def test_envs_lists_every_environment_with_units(
-    run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
-    said = run("envs", cwd=tmp_path).stdout
-    for shown in ("bounce", "initial velocity x, y, z [m/s]", "fluid", "draft, standard, reference", "branin"):
-        assert shown in said
-
-
-def test_envs_shows_one_in_full(run: Callable[..., Said], tmp_path: Path) -> None:
-    said = run("envs", "fluid", cwd=tmp_path).stdout
-    for shown in ("ladle x speed, segment 1", "goal=high|printed", "scoop", "reference", "m/s", "y - 0.2"):
-        assert shown in said
-
-
 @pytest.mark.drawn
 def test_slice_leaves_store_picture_and_summary(run: Callable[..., Said], tmp_path: Path) -> None:
     done = run("slice", "branin", "--dims", "x0", "1", "--resolution", "9", "--json", "--out", "cut", cwd=tmp_path)

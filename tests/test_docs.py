@@ -1,6 +1,5 @@
 """What README and docs say to type: every command and every block of Python is run, with small sizes."""
 
-import json
 import re
 import shlex
 import shutil
@@ -12,12 +11,13 @@ from pathlib import Path
 
 import pytest
 import typer
-from gradscape.jobs.report_record import Report
-from gradscape.jobs.report_tables import environments_markdown
 
 from gradscape.cli import app, main
-from gradscape.commands import overlay_report
-from gradscape.gallery.figures import DATA, read_figures
+from gradscape.commands import overlay_report, view
+from gradscape.gallery.figures import read_figures
+from gradscape.gallery.files import DATA
+from gradscape.jobs.report_record import Report
+from gradscape.jobs.report_tables import environments_markdown
 
 from .command import Said
 
@@ -32,7 +32,13 @@ PLACEHOLDER = re.compile(r"\.{3}|[\[\]|]|\b(?!CUDA)[A-Z]{1,}\b")  # in what a co
 
 # What makes them small: words in the place of others, the values of options, and options that are added.
 WORDS = {"SLICE": "cut", "RUN": "run", "best:RUN": "best:run", "ADDRESS": "local:1", "local": "local:1", "cuda": "cpu"}
-WORDS |= {"tls://10.0.0.5:8786": "local:1", "throw": "cut", "standard": "draft", "gallery/data/flip-0-1": str(DATA / "flip-0-1"), "triple-move": "bounce"}
+WORDS |= {
+    "tls://10.0.0.5:8786": "local:1",
+    "throw": "cut",
+    "standard": "draft",
+    "gallery/data/flip-0-1": str(DATA / "flip-0-1"),
+    "triple-move": "bounce",
+}
 VALUES = {"--resolution": "2", "--budget": "3", "--seeds": "1", "--frames": "2"}
 ADDED = {
     "race": ["--seeds", "1", "--budget", "3", "--device", "cpu"],
@@ -142,7 +148,8 @@ def test_every_command_runs(
 
     monkeypatch.setenv("XDG_DATA_HOME", str(desk / "data"))
     monkeypatch.setattr("http.server.ThreadingHTTPServer.serve_forever", stop)
-    monkeypatch.setattr(overlay_report, "_show", lambda console, path, serve: opened.append(path))
+    for module in (overlay_report, view):
+        monkeypatch.setattr(module, "show_recording", lambda path, bars, *, serve: opened.append(path))
     for name, value in (("REPETITION", 0.01), ("LARGEST", 0.01), ("RESAMPLES", 9)):
         monkeypatch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", value)
     done = run(*small(command), cwd=desk)

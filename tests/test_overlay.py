@@ -1,9 +1,8 @@
-"""`landscape overlay` and `landscape view`: what they leave, cut anew, and refuse."""
+"""`landscape overlay`: what it leaves, cuts anew, and refuses."""
 
 import shutil
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +13,6 @@ from benchmarks.results import leave_blank
 
 import gradscape
 from gradscape.cli import main
-from gradscape.landscapes.draw.recordings import viewer
 from gradscape.landscapes.overlay import best_point, overlay
 from gradscape.landscapes.storage.store import plane_of
 from gradscape.optim.run import Run
@@ -143,42 +141,10 @@ def test_another_fidelity_is_drawn_with_a_warning(run: Callable[..., Said]) -> N
         ("overlay cut race --resolution 4", "give --through or --plane too"),
         ("overlay cut race --through nowhere", "there is no run at"),
         ("overlay cut race --out cut", "cut holds other files"),
-        ("view nothing.png", "there is no file nothing.png"),
-        ("view cut/slice.zarr/zarr.json", "view opens .png, .html, .mp4, .gif, .rrd and results folders"),
-        ("view cut/landscape.png", "there is no display here to open cut/landscape.png"),
-        ("view cut/slice.zarr", "there is no display here to open cut/landscape.png"),
-        ("view race/cma-es-0", "there is no display here to open race/cma-es-0/progress.png"),
-        ("view race", "race holds none of index.html, overlay.rrd, race.png"),
-        ("view cut --serve", "--serve shows recordings (.rrd)"),
     ],
 )
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
-def test_what_does_not_belong_together_or_cannot_be_shown_is_refused(
-    run: Callable[..., Said], command: str, said: str
-) -> None:
+def test_what_does_not_belong_together_is_refused(run: Callable[..., Said], command: str, said: str) -> None:
     done = run(command)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert said in done.stderr
-
-
-def test_a_recording_needs_a_display_or_is_served_until_it_is_stopped(
-    run: Callable[..., Said], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    Path("some.rrd").write_bytes(b"RRF2")
-    assert "look at it in a browser: landscape view some.rrd --serve" in run("view some.rrd").stderr
-    served: list[str] = []
-
-    @contextmanager
-    def serve(path: Path) -> Iterator[str]:
-        served.append(path.name)
-        yield "http://127.0.0.1:1/?url=..."
-
-    def stopped(_: float) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(viewer, "served", serve)
-    monkeypatch.setattr("time.sleep", stopped)
-    done = run("view some.rrd --serve")
-    assert (done.returncode, served) == (0, ["some.rrd"])
-    assert "some.rrd is at http://127.0.0.1:1/?url=... until Ctrl-C" in done.stderr

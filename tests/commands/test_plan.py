@@ -145,7 +145,7 @@ def test_a_plan_leaves_nothing_behind_and_workers_share_what_can_be_shared(
 
 
 def test_figures_are_planned_by_kind_and_added_up(run: Callable[..., Said], tmp_path: Path) -> None:
-    figure = '[[figure]]\nid = "{}"\nenv = "bounce"\ndims = [{}]\nthrough = "example:aim"\nsays = ""\n'
+    figure = '[[figure]]\nid = "{}"\nenv = "bounce"\ndims = [{}]\nthrough = "example:aim"\n'
     (tmp_path / "f.toml").write_text(figure.format("x", 0) + figure.format("y", 1) + figure.format("xy", "0, 1"))
     found = plan(run, tmp_path, "f.toml", "--resolution", "16", "--fidelity", "draft")
     assert [(one["figure"], one["episodes"]) for one in found["figures"]] == [("x", 16), ("y", 16), ("xy", 256)]

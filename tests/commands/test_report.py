@@ -9,9 +9,7 @@ from typing import Any
 
 import pytest
 
-from gradscape.envs.registry import entries
-from gradscape.gallery.figures import read_figures
-from gradscape.gallery.words import paper_words
+from gradscape.gallery.paper import read_paper
 from gradscape.jobs import report as job
 from gradscape.jobs.report_record import Report
 from gradscape.jobs.report_tables import environments_markdown
@@ -71,7 +69,7 @@ def test_all_makes_a_table_with_the_papers_words(run: Run, tmp_path: Path) -> No
     summary = json.loads(done.stdout)
     assert [record["name"] for record in summary["reports"]] == ["bounce-x", "pinball-2-0-1"]
     assert summary["environments"]["pinball-2"]["slices"] == 1
-    assert set(summary["environments"]["pinball-2"]["paper"]) == set(paper_words()["pinball-2"].words)
+    assert set(summary["environments"]["pinball-2"]["paper"]) == set(read_paper().words["pinball-2"].words)
     table = (tmp_path / "all/report.md").read_text().splitlines()
     assert len({line.count("|") for line in table}) == 1
     assert table[2].startswith("| bounce-x |")
@@ -212,12 +210,6 @@ def test_a_folder_of_other_files_is_left_alone(run: Run, cut: Path, tmp_path: Pa
     done = run("report", "cut", "--out", "mine", cwd=tmp_path)
     assert done.returncode == 2
     assert "holds other files" in done.stderr
-
-
-def test_the_paper_is_quoted_on_every_environment_it_shows() -> None:
-    said = paper_words()
-    assert set(said) <= set(entries())
-    assert {figure.env for figure in read_figures()} <= set(said)
 
 
 @pytest.mark.parametrize("cut", [["rastrigin", "--set", "dim=5"], ["branin"]])

@@ -184,7 +184,9 @@ def test_kernels_are_launched_one_by_one_to_be_timed(monkeypatch):
 
 @GPU
 def test_a_gpu_holds_what_was_estimated_or_more_where_it_has_room():
-    found = BenchJob(lambda engine: Fluid(device="cuda", engine=engine), "warp", batches=[1], seconds=0.0).run().record()
+    found = (
+        BenchJob(lambda engine: Fluid(device="cuda", engine=engine), "warp", batches=[1], seconds=0.0).run().record()
+    )
     assert found["memory"]["measured"] / found["memory"]["estimated"] > 0.3
 
 

@@ -17,7 +17,9 @@ from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.checkpoint import Pieces
 
 
-def found_in(fn: Callable[[Tensor], Tensor], dim: int, folder: Path, *, samples: int = 64, half: float = 1.0) -> Responses:
+def found_in(
+    fn: Callable[[Tensor], Tensor], dim: int, folder: Path, *, samples: int = 64, half: float = 1.0
+) -> Responses:
     space = ParameterSpace.box([f"x{k}" for k in range(dim)], -half, half)
     return explored(from_torch(fn, space), folder, samples=samples)
 

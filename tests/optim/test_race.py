@@ -13,9 +13,9 @@ from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim import standings
 from gradscape.optim.base import Kind
-from gradscape.optim.orderings import CLAIMS, Verdict, findings, silence
+from gradscape.optim.orderings import Claim, Verdict, findings
 from gradscape.optim.race import Entry, judged, picture, race, tables
-from gradscape.optim.registry import METHODS, optimizer_class
+from gradscape.optim.registry import optimizer_class
 from gradscape.optim.run import Run
 from gradscape.optim.standings import difference
 
@@ -96,7 +96,7 @@ def test_the_ecdf_counts_each_target_from_the_episode_that_reached_it():
     goals = standings.Targets(np.array([1.0, 2.0, 4.5]), "linear", "")
     np.testing.assert_array_equal(standings.hits(RACE["a"], goals), [[3, 3, 1], [NAN, 4, 4]])
     np.testing.assert_array_equal(standings.hits(RACE["b"], goals), [[4, 4, 4], [NAN, NAN, 1]])
-    share = judged("branin", RACE, goals)["ecdf"]["a"]
+    share = judged(RACE, goals)["ecdf"]["a"]
     assert share["episodes"] == [1, 3, 3, 4, 4]
     assert share["share"] == [pytest.approx(n / 6) for n in range(1, 6)]
 
@@ -135,38 +135,41 @@ def synthetic(**centers: float) -> dict[str, list[xr.Dataset]]:
     return {name.replace("_", "-"): [table([c + random.normal()]) for _ in range(10)] for name, c in centers.items()}
 
 
-def verdicts(env: str, **centers: float) -> dict[str, Verdict]:
-    found = findings(env, standings.differences(synthetic(**centers)))
+AHEAD = [Claim("bo-leap", second, "Fig. 5") for second in ("cma-es", "descents", "bo-descents")]
+ALIKE = [Claim("bo-leap", "cma-es", "Fig. 5", alike=True)]
+
+
+def verdicts(claims: list[Claim], **centers: float) -> dict[str, Verdict]:
+    found = findings(claims, standings.differences(synthetic(**centers)))
     return {str(finding.claim): finding.verdict for finding in found}
 
 
 def test_a_claim_holds_fails_is_not_decided_or_not_run():
-    ours = verdicts("rolling-pin", bo_leap=0, cma_es=9, descents=-9)
+    ours = verdicts(AHEAD, bo_leap=0, cma_es=9, descents=-9)
     assert ours == {
         "bo-leap better than cma-es": Verdict.HOLDS,
         "bo-leap better than descents": Verdict.FAILS,
         "bo-leap better than bo-descents": Verdict.NOT_RUN,
     }
-    reverse = verdicts("rolling-pin", descents=9, cma_es=-9, bo_leap=0)  # whichever of a pair comes first
+    reverse = verdicts(AHEAD, descents=9, cma_es=-9, bo_leap=0)  # whichever of a pair comes first
     assert reverse["bo-leap better than cma-es"] == Verdict.FAILS
     assert reverse["bo-leap better than descents"] == Verdict.HOLDS
-    assert verdicts("rolling-pin", bo_leap=0, cma_es=0)["bo-leap better than cma-es"] == Verdict.UNDECIDED
+    assert verdicts(AHEAD, bo_leap=0, cma_es=0)["bo-leap better than cma-es"] == Verdict.UNDECIDED
 
 
 def test_that_two_are_alike_can_be_refuted_and_never_shown():
-    assert verdicts("pinch", bo_leap=0, cma_es=0)["bo-leap and cma-es alike"] == Verdict.UNDECIDED
-    assert verdicts("pinch", bo_leap=0, cma_es=9)["bo-leap and cma-es alike"] == Verdict.FAILS
+    assert verdicts(ALIKE, bo_leap=0, cma_es=0)["bo-leap and cma-es alike"] == Verdict.UNDECIDED
+    assert verdicts(ALIKE, bo_leap=0, cma_es=9)["bo-leap and cma-es alike"] == Verdict.FAILS
 
 
-def test_claims_are_about_methods_and_environments_that_exist():
-    from gradscape.envs.registry import entries
-
-    assert CLAIMS.keys() <= entries().keys()
-    assert {name for claims in CLAIMS.values() for claim in claims for name in (claim.first, claim.second)} < set(
-        METHODS
-    )
-    assert "limitations" in silence("flip")
-    assert not findings("branin", standings.differences(synthetic(bo_leap=0, cma_es=9)))
+def test_a_race_says_what_it_makes_of_claims_and_why_there_are_none():
+    runs = synthetic(bo_leap=0, cma_es=9)
+    goals = standings.targets(runs)
+    said = judged(runs, goals, ALIKE, "nobody says so")
+    assert [(one["claim"], one["verdict"]) for one in said["claims"]] == [("bo-leap and cma-es alike", "does not hold")]
+    assert said["silence"] is None
+    silent = judged(runs, goals, (), "nobody says so")
+    assert (silent["claims"], silent["silence"]) == ([], "nobody says so")
 
 
 def test_the_picture_holds_every_curve_and_every_pair_of_seed_and_target():

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 
-from ...episode import Episode
 from .. import style
 from ..render import replay
 from . import page, panel, typesetting
+
+if TYPE_CHECKING:
+    from ...episode import Episode
 
 KEYS = 5  # frames
 PITCH, LEAST = 2.5, 33.0  # room of a frame: on a screen [inch], and at least in print [mm]
@@ -69,7 +71,7 @@ def episode_figure(
         ax.set(xticks=[], yticks=[])
         ax.spines[:].set(color=style.FAINT, linewidth=0.6 * sheet.weight)
         panel.name_axes(ax, text)
-    shot = replay.Shot.of(episode.view or replay.around(episode), replay.HEIGHT)
+    shot = replay.Shot.of(episode.viewpoint(), replay.HEIGHT)
     _draw_scale(picture.axes[0], shot)
     _write(picture, caption, f"Scale: {style.number(shot.bar)} m at the middle of the view; what is nearer is larger.")
     page.finish(picture, [])

@@ -42,6 +42,10 @@ class Sweep:
         unit = self.label.partition(" [")[2].removesuffix("]")
         return f"{style.number(value, f'.{decimals}f')} {unit}".rstrip()
 
+    def plot(self, number: int = -1) -> page.Picture:
+        """Draw a frame, by default the last, on the scales that all frames share."""
+        return frame_figure(self, number, Scales.of(self))
+
 
 @dataclass(frozen=True, eq=False)
 class Scales:

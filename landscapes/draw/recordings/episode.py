@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyvista as pv
@@ -17,11 +17,13 @@ import torch
 from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 
-from ...episode import Episode, Part, View
 from ..render import materials
-from ..render.replay import LONGEST, around, rests
+from ..render.replay import LONGEST, rests
 from ..render.solids import mesh
 from .recording import recording
+
+if TYPE_CHECKING:
+    from ...episode import Episode, Part, View
 
 MOST = 600_000  # points of a lump in all frames: of more, every so many are shown, larger
 TIMELINE, SCENE = "time", "episode"
@@ -38,7 +40,7 @@ def save_episode(episode: Episode, path: str | Path, *, title: str, longest: int
     Solids, sheets and targets are surfaces, lumps their particles, which take a tenth of the room; sheets have no
     thickness. No clock is recorded, so that equal episodes give equal recordings.
     """
-    view = episode.view or around(episode)
+    view = episode.viewpoint()
     chosen = np.unique(np.linspace(0, len(episode.time) - 1, longest).round().astype(int)).tolist()
     blueprint = _blueprint(view, title, float(episode.time[-1]))
     with recording(_digest(episode, title), Path(path), blueprint) as stream:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ...episode import Part
+if TYPE_CHECKING:
+    from ...episode import Part
 
 BACKGROUND, GROUND, SHADOW = "#ffffff", "#f1efec", 0.34  # share of the light a full shadow takes
 STAMP: dict[str, Any] = {"color": "#3c3c3c", "font_size": 11, "font": "arial"}

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyvista as pv
@@ -15,13 +16,15 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
-from ...episode import Episode, Part, View
 from .. import style
 from ..figures import typesetting
 from ..film import picture as picture_of
 from ..film import save_film
 from . import materials
 from .solids import Grid, mesh, off_screen
+
+if TYPE_CHECKING:
+    from ...episode import Episode, Part, View
 
 Picture = NDArray[np.uint8]
 
@@ -77,7 +80,7 @@ def frames(episode: Episode, chosen: Sequence[int], *, height: int = HEIGHT, mar
     """
     if not episode.parts:
         raise ValueError("the episode says not what its parts look like; give Episode its `parts`")
-    view = episode.view or around(episode)
+    view = episode.viewpoint()
     shot = Shot.of(view, height)
     with _stage(view, shot) as plotter:
         parts = [part for part in episode.parts if part not in sought(episode)]
@@ -218,14 +221,6 @@ def rests(part: Part) -> bool:
     return part.shape != "trail" and all(
         bool((rows == rows[:1]).all()) for rows in (part.at, part.turn) if rows is not None
     )
-
-
-def around(episode: Episode) -> View:
-    """Return a view of all that the parts of an episode that has none take up."""
-    every = np.concatenate([part.at.reshape(-1, 3).numpy() for part in episode.parts])
-    low, high = every.min(axis=0), every.max(axis=0)
-    room = 0.1 * float((high - low).max() or 1.0)
-    return View(tuple((low - room).tolist()), tuple((high + room).tolist()), ground=None)
 
 
 def _lay_ground(plotter: pv.Plotter, view: View, solids: Sequence[pv.PolyData]) -> None:

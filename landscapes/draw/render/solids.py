@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from ...episode import Part
+if TYPE_CHECKING:
+    from ...episode import Part
 
 Grid = NDArray[np.float64]
 

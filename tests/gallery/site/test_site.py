@@ -10,9 +10,8 @@ from urllib.parse import urldefrag
 import numpy as np
 import pytest
 
-from gradscape.gallery.figures import HERE
 from gradscape.gallery.runs import open_run
-from gradscape.gallery.site.build import build_site
+from gradscape.gallery.site.build import HERE, build_site
 from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.storage.store import open_slice
 
@@ -128,14 +127,14 @@ def test_a_search_lies_where_its_parameters_say(site: Path, data: Path) -> None:
 
 
 def test_a_search_of_other_options_is_not_laid_over_a_slice(data: Path) -> None:
-    from gradscape.gallery.site.trajectories import read_runs, trajectories
+    from gradscape.gallery.site.trajectories import lay_runs, read_runs
 
-    tables, dataset = read_runs(data / "runs"), open_slice(data / "full/slice.zarr")
+    tables, dataset = read_runs(data), open_slice(data / "full/slice.zarr")
     assert len(tables) == 4
-    assert len(trajectories(dataset, tables)) == 2
+    assert len(lay_runs(dataset, tables)) == 2
     for one, goal in ((dataset, "high"), (tables[-1], "low")):
         one.attrs["identity"] = json.dumps({**stored_identity(one), "options": {"goal": goal}})
-    assert [run["method"] for run in trajectories(dataset, tables)] == ["descents"]
+    assert [run.method for run in lay_runs(dataset, tables)] == ["descents"]
 
 
 def test_counts_are_multiplied_and_axes_are_not(site: Path) -> None:
@@ -231,7 +230,7 @@ def test_a_site_is_built_anew_where_its_manifest_lists_all_that_is_there(
     with pytest.raises(ValueError, match="elsewhere; move"):
         build_site(FIGURES[:1], data, out)
     (out / "elsewhere").unlink()
-    files = build_site(FIGURES[:1], data, link)["files"]
+    files = build_site(FIGURES[:1], data, link).files
     assert sorted(path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()) == files
     assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "out"]
 

@@ -14,7 +14,7 @@ import gradscape
 from gradscape.cli import main
 from gradscape.landscapes.export import SUFFIXES
 
-from .command import Said
+from ..command import Said
 
 READ = {"csv": pd.read_csv, "parquet": pd.read_parquet}
 

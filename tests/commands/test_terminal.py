@@ -13,7 +13,7 @@ from gradscape.envs.registry import entries
 from gradscape.gallery.figures import read_figures
 from gradscape.optim.registry import METHODS
 
-from .command import Said
+from ..command import Said
 
 SOURCES = list(Path(gradscape.__path__[0]).glob("commands/*.py"))
 

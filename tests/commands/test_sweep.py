@@ -18,10 +18,10 @@ from gradscape.cli import main
 from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.smoothing import smoothed
-from gradscape.landscapes.storage.store import plane_of
+from gradscape.landscapes.storage.store import open_slice, plane_of
 
-from .command import Said
-from .processes import Instant, alone, landscape
+from ..command import Said
+from ..processes import Instant, alone, landscape
 
 SWEEP = "sweep bounce --dims 0 1 --over 2 --frames 3 --resolution 5 --through example:aim --device cpu --out moved"
 FILES = ["frames", "summary.json", "sweep.gif", "sweep.mp4", "sweep.rrd"]
@@ -60,8 +60,8 @@ def test_each_frame_is_the_slice_at_its_value(run: Command, tmp_path: Path) -> N
         (tmp_path / "at.json").write_text(json.dumps([*aim.tolist()[:2], frame["value"]]))
         cut = "slice bounce --dims 0 1 --resolution 5 --through at.json --device cpu --out"
         assert run(f"{cut} cut{number}").returncode == 0
-        alone = gradscape.open_slice(f"cut{number}/slice.zarr")
-        moved = gradscape.open_slice(f"moved/frames/{number:03d}.zarr")
+        alone = open_slice(f"cut{number}/slice.zarr")
+        moved = open_slice(f"moved/frames/{number:03d}.zarr")
         xr.testing.assert_identical(moved.drop_attrs(), alone.drop_attrs())
         assert moved.attrs["identity"] == alone.attrs["identity"]
         assert frame["loss"]["lowest"] == float(alone["loss"].min())
@@ -72,13 +72,13 @@ def test_each_frame_is_the_slice_at_its_value(run: Command, tmp_path: Path) -> N
 
 def test_nothing_is_computed_twice(run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run(SWEEP)
-    first = [gradscape.open_slice(f"moved/frames/{number:03d}.zarr") for number in range(3)]
+    first = [open_slice(f"moved/frames/{number:03d}.zarr") for number in range(3)]
     shutil.rmtree("moved/frames/001.zarr")
     again = run(f"{SWEEP} --json")
     assert (json.loads(again.stdout)["episodes"], json.loads(again.stdout)["resumed"]) == (25, 50)
     assert "25 episodes with gradients of 3 slices to compute, 50 are there already" in again.stderr
     for number, before in enumerate(first):
-        xr.testing.assert_equal(gradscape.open_slice(f"moved/frames/{number:03d}.zarr"), before)
+        xr.testing.assert_equal(open_slice(f"moved/frames/{number:03d}.zarr"), before)
     kind = type(gradscape.make("bounce", device="cpu"))
     monkeypatch.setattr(kind, "evaluate", lambda *_, **__: pytest.fail("evaluated again"))
     third = run(SWEEP)
@@ -102,7 +102,7 @@ def test_force_begins_anew_and_another_sweep_is_not_overwritten(run: Command) ->
 def test_smoothing_averages_one_slice(run: Command) -> None:
     done = run("sweep branin --dims 0 1 --over smoothing --frames 3 --resolution 9 --out soft --json")
     assert done.returncode == 0, done.stderr
-    summary, dataset = json.loads(done.stdout), gradscape.open_slice("soft/slice.zarr")
+    summary, dataset = json.loads(done.stdout), open_slice("soft/slice.zarr")
     assert [frame["value"] for frame in summary["frames"]] == [0.0, 12.5, 25.0]
     assert summary["episodes"] == 81
     for frame in summary["frames"]:
@@ -117,7 +117,7 @@ def test_over_the_horizon_each_frame_is_a_shorter_episode(run: Command) -> None:
     done = run(f"{sweep} --json")
     assert done.returncode == 0, done.stderr
     assert [frame["value"] for frame in json.loads(done.stdout)["frames"]] == [50.0, 100.0]
-    half, whole = (gradscape.open_slice(f"late/frames/{number:03d}.zarr") for number in range(2))
+    half, whole = (open_slice(f"late/frames/{number:03d}.zarr") for number in range(2))
     assert [stored_identity(one)["options"]["horizon"] for one in (half, whole)] == [0.5, 1.0]
     env = gradscape.make("bounce", device="cpu", horizon=0.5)
     points = plane_of(half).lift(torch.tensor([[float(half["u"][1]), float(half["v"][2])]]).double())
@@ -138,7 +138,7 @@ def test_without_out_each_sweep_has_a_folder_of_its_own(run: Command) -> None:
         done = run(f"{short} {over}")
         assert done.returncode == 0, done.stderr
     assert len(names(Path("out"))) == 3
-    dataset = gradscape.open_slice(next(Path("out").glob("*-over-3-*/frames/001.zarr")))
+    dataset = open_slice(next(Path("out").glob("*-over-3-*/frames/001.zarr")))
     assert "grad" not in dataset
     assert float(plane_of(dataset).origin[3]) == float(gradscape.make("ackley", dim=4).space.upper[3])
 
@@ -178,7 +178,7 @@ def test_a_sweep_that_is_stopped_goes_on_to_the_same_bits(run: Command, tmp_path
     assert (again["resumed"], again["episodes"]) == (kept, 256 - kept)
     env = gradscape.make("bounce", device="cpu")
     for number in range(4):
-        stopped = gradscape.open_slice(f"stopped/frames/{number:03d}.zarr")
+        stopped = open_slice(f"stopped/frames/{number:03d}.zarr")
         whole = sample(env, plane_of(stopped))
         for name in ("loss", "grad", "status"):
             np.testing.assert_array_equal(stopped[name], whole[name])

@@ -1,4 +1,4 @@
-"""`landscape replay` and `landscape surface`: what they leave and refuse."""
+"""`landscape replay`: what it leaves and refuses."""
 
 import json
 import sys
@@ -46,17 +46,3 @@ def test_what_cannot_be_replayed_is_refused(run: Callable[[str], tuple[int, str]
     Path("full/notes.txt").write_text("")
     code, said = run("replay bounce --out full --device cpu")
     assert (code, "full holds other files" in said) == (2, True)
-
-
-@pytest.mark.drawn
-def test_a_slice_with_a_run_becomes_a_surface(run: Callable[[str], tuple[int, str]]) -> None:
-    assert run("slice bounce --dims 0 1 --resolution 5 --out cut --device cpu")[0] == 0
-    assert run("optimize bounce --method random --budget 4 --out r --device cpu")[0] == 0
-    assert run("optimize ackley --method random --budget 4 --out other")[0] == 0
-    code, said = run("surface cut r --out s")
-    assert code == 0, said
-    assert sorted(file.name for file in Path("s").iterdir()) == ["surface.gltf", "surface.png"]
-    assert run("surface cut")[0] == 0
-    assert len(list(Path("out").glob("surface-bounce-*"))) == 1
-    code, said = run("surface cut other")
-    assert (code, "the slice is of bounce" in said) == (2, True)

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..landscapes.capacity import BLOCK, Need, require
-from ..landscapes.storage.paths import SLICE
+from .folder import SWEEP
+from .scene import SceneSpec
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -23,11 +24,11 @@ if TYPE_CHECKING:
 SMOOTHING, WIDEST = "smoothing", 0.25  # the widest Gaussian's standard deviation, as a fraction of the box's sides
 HORIZON = "horizon"  # a scene option: the episode's duration as a multiple of the scene's own
 STORE_MEMORY, STORE_FILES = 100e3, 25  # what a slice takes beside its samples: bytes of its arrays' records, and files
-FRAMES, ONLY = "frames", SLICE  # the folder of a sweep's slices, and the slice where there is one
+FRAMES, ONLY = SWEEP.files[:2]  # the folder of a sweep's slices, and the slice where there is one
 
 
 @dataclass(frozen=True)
-class Moved:
+class Motion:
     """Say what moves: frames show `slices` of what is sampled on `planes` at the `values` of what `label` names.
 
     `env_at` makes the environment of a plane, by its number.
@@ -39,6 +40,16 @@ class Moved:
     env_at: Callable[[int], Environment]
     slices: Callable[[Sequence[xr.Dataset]], Sequence[xr.Dataset]] = list
 
+    @classmethod
+    def of(cls, env: Environment, plane: Plane, over: int | str, frames: int) -> Motion:
+        """Return what `over` names: a parameter, horizon or smoothing.
+
+        Raises ValueError for a parameter that the plane varies, and for a horizon that the scene does not have.
+        """
+        if over == SMOOTHING:
+            return _smoothing(env, plane, frames)
+        return _horizon(env, plane, frames) if over == HORIZON else _parameter(over, env, plane, frames)
+
     @property
     def stores(self) -> tuple[str, ...]:
         """Where in the sweep's folder the slice of each plane is."""
@@ -47,8 +58,11 @@ class Moved:
         return tuple(f"{FRAMES}/{number:03d}.zarr" for number in range(len(self.planes)))
 
 
-def refuse_too_large(plane: Plane, frames: int, folder: Path, *, grad: bool, over: str) -> None:
-    """Refuse a sweep of which a single frame is larger than this machine, or all of them are."""
+def refuse_too_large(plane: Plane, frames: int, folder: Path, *, grad: bool, over: int | str) -> None:
+    """Refuse a sweep of which a single frame is larger than this machine, or all of them are.
+
+    Raises TooLargeError, which is a ValueError.
+    """
 
     def need(side: int, count: int) -> Need:
         return need_of((side,) * plane.rank, plane.dim, count, grad=grad, over=over)
@@ -58,8 +72,8 @@ def refuse_too_large(plane: Plane, frames: int, folder: Path, *, grad: bool, ove
     require("frames", frames, lambda count: need(side, count), folder)
 
 
-def need_of(shape: tuple[int, ...], dim: int, frames: int, *, grad: bool, over: str) -> Need:
-    """Return what sampling a sweep and filming it takes: every frame's slice is kept, of a smoothing's only one."""
+def need_of(shape: tuple[int, ...], dim: int, frames: int, *, grad: bool, over: int | str) -> Need:
+    """Return what sampling a sweep and filming it takes: every frame's slice is stored, of a smoothing's only one."""
     from ..landscapes.storage.arrays import need_of as slice_need
 
     slices, samples = 1 if over == SMOOTHING else frames, math.prod(shape)
@@ -68,14 +82,8 @@ def need_of(shape: tuple[int, ...], dim: int, frames: int, *, grad: bool, over: 
     return Need(memory, one.disk + slices * (STORE_FILES * BLOCK + float(array)))
 
 
-def moved(over: str, env: Environment, plane: Plane, frames: int, made: Callable[..., Environment]) -> Moved:
-    """Return what `over` names: a parameter, horizon or smoothing; `made` makes the environment with more options."""
-    if over == SMOOTHING:
-        return _smoothing(env, plane, frames)
-    return _horizon(env, plane, frames, made) if over == HORIZON else _parameter(over, env, plane, frames)
-
-
-def _parameter(name: str, env: Environment, plane: Plane, frames: int) -> Moved:
+def _parameter(name: int | str, env: Environment, plane: Plane, frames: int) -> Motion:
+    """Move a parameter from one of its bounds to the other."""
     import torch
 
     number = env.space.index(name)
@@ -86,22 +94,22 @@ def _parameter(name: str, env: Environment, plane: Plane, frames: int) -> Moved:
     low, high = float(env.space.lower[number]), float(env.space.upper[number])
     values = tuple(torch.linspace(low, high, frames, dtype=torch.float64).tolist())
     planes = tuple(replace(plane, origin=_with(plane.origin, number, value)) for value in values)
-    return Moved(env.space.labels[number], values, planes, lambda _: env)
+    return Motion(env.space.labels[number], values, planes, lambda _: env)
 
 
-def _horizon(env: Environment, plane: Plane, frames: int, made: Callable[..., Environment]) -> Moved:
+def _horizon(env: Environment, plane: Plane, frames: int) -> Motion:
     """End the episode later and later, up to the scene's own end."""
     if not hasattr(env.options, HORIZON):
         raise ValueError(f"{env.name} has no {HORIZON} to sweep over; sweep a third parameter or {SMOOTHING}")
     if env.options.horizon != 1:
         raise ValueError(f"--over {HORIZON} moves that option itself; leave out --set {HORIZON}=...")
     shares = [(frame + 1) / frames for frame in range(frames)]
-    label = "share of the scene's duration [%]"
+    label, scene = "share of the scene's duration [%]", SceneSpec.of(env)
     values = tuple(100 * share for share in shares)
-    return Moved(label, values, (plane,) * frames, lambda number: made(horizon=shares[number]))
+    return Motion(label, values, (plane,) * frames, lambda number: scene.make(horizon=shares[number]))
 
 
-def _smoothing(env: Environment, plane: Plane, frames: int) -> Moved:
+def _smoothing(env: Environment, plane: Plane, frames: int) -> Motion:
     """Average one slice over wider and wider Gaussians."""
     widths = np.linspace(0, WIDEST, frames).tolist()
 
@@ -111,7 +119,7 @@ def _smoothing(env: Environment, plane: Plane, frames: int) -> Moved:
         return [smoothed(sampled[0], width) for width in widths]
 
     label = "smoothing width [% of the box's sides]"
-    return Moved(label, tuple(100 * width for width in widths), (plane,), lambda _: env, slices)
+    return Motion(label, tuple(100 * width for width in widths), (plane,), lambda _: env, slices)
 
 
 def _with(origin: Tensor, number: int, value: float) -> Tensor:

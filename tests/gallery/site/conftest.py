@@ -12,7 +12,9 @@ import pytest
 import torch
 
 from gradscape.gallery.figures import Figure
-from gradscape.gallery.runs import FOLDER, SUFFIX, save_run
+from gradscape.gallery.files import RUN_SUFFIX, RUNS
+from gradscape.gallery.paper import Caption
+from gradscape.gallery.runs import save_run
 from gradscape.gallery.site.build import build_site
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.plane import Plane
@@ -22,16 +24,16 @@ from gradscape.landscapes.storage.store import SliceStore
 from gradscape.optim.run import Run
 from gradscape.optim.search import search
 
-from ..command import NO_BROWSER
+from ...command import NO_BROWSER
 
 SPACE = ParameterSpace(
     ("speed", "force", "mass"), torch.tensor([-1.0, 0, -10]).double(), torch.tensor([1.0, 20, 10]).double(),
     ("m/s", "N", ""),
 )  # fmt: skip
 FIGURES = [
-    Figure("line", "bounce", (0,), "A line.", number=8, resolution=33),
-    Figure("bare", "bounce", (0, 1), "Nothing but its slice.", resolution=9),
-    Figure("full", "fluid", (0, 1), "All of it <b>&</b> no network.", number=10, resolution=12),
+    Figure("line", "bounce", (0,), Caption("A line.", 8), resolution=33),
+    Figure("bare", "bounce", (0, 1), Caption("Nothing but its slice."), resolution=9),
+    Figure("full", "fluid", (0, 1), Caption("All of it <b>&</b> no network.", 10), resolution=12),
 ]
 EPISODES = [
     {"row": 6, "column": 5, "why": "lowest loss", "loss": 1.25, "status": "OK"},
@@ -134,9 +136,9 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
             run = Run.create(
                 folder / "runs.tmp" / env / method, SPACE, identity=identity, provenance=provenance, budget=24
             )
-            (folder / FOLDER / env).mkdir(parents=True, exist_ok=True)
+            (folder / RUNS / env).mkdir(parents=True, exist_ok=True)
             table = search(Bowl(env), method, run, budget=24, gradient_cost=2.0).table()
-            save_run(table, folder / FOLDER / env / f"{method}-0{SUFFIX}")
+            save_run(table, folder / RUNS / env / f"{method}-0{RUN_SUFFIX}")
     full = folder / "full"
     (full / "episodes.json").write_text(json.dumps(EPISODES))
     (full / "sweep.json").write_text(json.dumps(SWEEP))
@@ -157,7 +159,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def site(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site") / "deep" / "gallery"
-    build_site([*FIGURES, Figure("later", "rope", (0, 1), "Not yet.")], data, folder)
+    build_site([*FIGURES, Figure("later", "rope", (0, 1), Caption("Not yet."))], data, folder)
     return folder
 
 

@@ -17,18 +17,35 @@ import pytest
 from benchmarks.results import leave_blank
 
 from gradscape.cli import main
-from gradscape.commands import gallery_report
 from gradscape.envs.functions import Branin
 from gradscape.gallery import parts as gallery_parts
 from gradscape.gallery.figures import Figure
+from gradscape.gallery.paper import Caption
 from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.storage.store import open_slice
 
 FIGURES = [
-    Figure("bounce-y", "bounce", (1,), "It jumps.", number=8, through="example:aim", resolution=12, fidelity="draft"),
-    Figure("bounce-x-y", "bounce", (0, 1), "A plane of it.", through="example:aim", resolution=12, fidelity="draft"),
-    Figure("branin", "branin", (0, 1), "Three minima <b>&</b> no network.", resolution=12, fidelity="exact", over=""),
+    Figure("bounce-y", "bounce", (1,), Caption("It jumps.", 8), through="example:aim", resolution=12, fidelity="draft"),
+    Figure(
+        "bounce-x-y",
+        "bounce",
+        (0, 1),
+        Caption("A plane of it."),
+        through="example:aim",
+        resolution=12,
+        fidelity="draft",
+    ),
+    Figure(
+        "branin",
+        "branin",
+        (0, 1),
+        Caption("Three minima <b>&</b> no network."),
+        resolution=12,
+        fidelity="exact",
+        over="",
+    ),
 ]
+READ_FIGURES = "gradscape.gallery.figures.read_figures"
 
 
 def gallery(*arguments: str) -> int:
@@ -44,7 +61,7 @@ def compute(data: Path, *arguments: str) -> int:
 @pytest.fixture(scope="module")
 def listed() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gallery_report, "read_figures", lambda: list(FIGURES))
+        patch.setattr(READ_FIGURES, lambda: list(FIGURES))
         leave_blank(patch.setattr)
         yield
 
@@ -69,13 +86,13 @@ def test_compute_goes_on_where_it_stopped_and_computes_nothing_twice(
         points.append(len(x))
         return evaluate(env, x, grad=grad)
 
-    monkeypatch.setattr(gallery_parts.Slice, "seconds_each", lambda _: 0.5)  # that evaluates the first points too
+    monkeypatch.setattr(gallery_parts.SlicePart, "seconds_each", lambda _: 0.5)  # that evaluates the first points too
     monkeypatch.setattr(Branin, "_evaluate", stopping)
     command = ("--only", "branin", "--resolution", "40")
     assert compute(tmp_path, *command) == 130
     said = capsys.readouterr().err
     assert "about 13 min in all" in said
-    assert "stopped in branin" in said
+    assert re.search(r"stopped: in branin, \d+ of 1600 points are kept in .*; the same command goes on", said)
     kept = int((open_slice(tmp_path / "branin/slice.zarr")["status"] > 0).sum())
     assert 0 < kept <= sum(points)
     points.clear()
@@ -94,7 +111,7 @@ def test_a_figure_that_fails_does_not_stop_the_others(
     listed: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     broken = replace(FIGURES[1], id="broken", through="example:none")
-    monkeypatch.setattr(gallery_report, "read_figures", lambda: [broken, FIGURES[2]])
+    monkeypatch.setattr(READ_FIGURES, lambda: [broken, FIGURES[2]])
     assert compute(tmp_path) == 1
     said = capsys.readouterr().err
     assert "broken failed: ValueError" in said
@@ -110,7 +127,7 @@ def test_list_says_what_is_there_missing_and_other(data: Path, capsys: pytest.Ca
     }  # fmt: skip
     gallery("list", "--data", str(data / "none"), "--json")
     assert {one["done"] for one in json.loads(capsys.readouterr().out)} == {0}
-    assert gallery_parts.Slice(replace(FIGURES[2], resolution=6), data, "cpu").state().done is None
+    assert gallery_parts.SlicePart(replace(FIGURES[2], resolution=6), data, "cpu").state().done is None
 
 
 def test_build_refuses_an_empty_folder_of_data_and_foreign_files(listed: None, data: Path, tmp_path: Path) -> None:
@@ -125,11 +142,11 @@ def test_a_figure_of_which_nothing_is_sampled_begins_anew_by_other_code(
     listed: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gradscape.envs.base.code_digest", lambda *_: "other")
-    monkeypatch.setattr(gallery_parts, "follow", stop)
+    monkeypatch.setattr("gradscape.jobs.slice.SliceJob.run", stop)
     assert compute(tmp_path, "--only", "branin") == 1
     assert stored_identity(open_slice(tmp_path / "branin/slice.zarr"))["code"] == "other"
     monkeypatch.undo()
-    monkeypatch.setattr(gallery_report, "read_figures", lambda: list(FIGURES))
+    monkeypatch.setattr(READ_FIGURES, lambda: list(FIGURES))
     assert compute(tmp_path, "--only", "branin") == 0
     assert stored_identity(open_slice(tmp_path / "branin/slice.zarr"))["code"] != "other"
 
@@ -226,7 +243,7 @@ def test_without_a_checkout_s_data_results_go_to_the_folder_where_one_stands(
 ) -> None:
     installed = tmp_path / "site-packages" / "data"
     (installed / "tradeoff").mkdir(parents=True)
-    monkeypatch.setattr("gradscape.gallery.figures.DATA", installed)
+    monkeypatch.setattr("gradscape.gallery.files.DATA", installed)
     monkeypatch.chdir(tmp_path)
     how = ["--part", "slices", "--device", "cpu", "--only", "branin", "--resolution", "4"]
     assert gallery("compute", *how) == 0

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gradscape.commands.gallery_report import Site
+from gradscape.gallery.site.server import SiteHandler
 from gradscape.landscapes.draw.loopback import LoopbackServer
 from gradscape.landscapes.draw.render.relief import Relief, azimuth
 from gradscape.landscapes.draw.style import LOSS_MAP, Scale
@@ -28,7 +28,7 @@ Visit = Callable[..., Any]
 @pytest.fixture
 def served(site: Path) -> Iterator[str]:
     """Serve the folder above the site's: the site is in a subfolder of a server."""
-    with LoopbackServer(0, partial(Site, directory=str(site.parent))) as server:
+    with LoopbackServer(0, partial(SiteHandler, directory=str(site.parent))) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         yield f"{server.address}/{site.name}/"
