@@ -7,6 +7,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from .api.environments import list_envs
+    from .api.measure import check, pairs, report, tradeoff
     from .api.slice import open_slice, slice
     from .envs.base import Environment, Fidelity
     from .envs.registry import make, register
@@ -32,15 +33,19 @@ _HOMES = {
     "SceneSpec": "jobs.scene",
     "Slice": "landscapes.slice",
     "Status": "landscapes.objective",
+    "check": "api.measure",
     "from_numpy": "landscapes.adapters",
     "from_torch": "landscapes.adapters",
     "list_envs": "api.environments",
     "make": "envs.registry",
     "open_run": "optim.run",
     "open_slice": "api.slice",
+    "pairs": "api.measure",
     "register": "envs.registry",
+    "report": "api.measure",
     "sample": "landscapes.sampling.fill",
     "slice": "api.slice",
+    "tradeoff": "api.measure",
 }
 
 __all__ = [
@@ -55,15 +60,19 @@ __all__ = [
     "Slice",
     "Status",
     "__version__",
+    "check",
     "from_numpy",
     "from_torch",
     "list_envs",
     "make",
     "open_run",
     "open_slice",
+    "pairs",
     "register",
+    "report",
     "sample",
     "slice",
+    "tradeoff",
 ]
 
 
