@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 from rich import console as rich
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.status import Status
 from rich.text import Text
 
-from ..jobs.watch import Advance, Say, Watch
+from ..jobs.watch import Advance, AdvanceOne, Say, Watch
 
 
 class Console(rich.Console):
@@ -57,8 +65,7 @@ class Bars(Watch):
     @contextmanager
     def progress(self, total: int, what: str = "episodes") -> Iterator[Advance]:
         """Show a bar with counts and times; the first advance says where it begins."""
-        columns = (Described(), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"))
-        with Progress(*columns, TimeRemainingColumn(), console=self.console) as bar:
+        with Progress(*_columns(), console=self.console) as bar:
             task: Any = None
 
             def advance(done: int, said: str = "") -> None:
@@ -68,6 +75,19 @@ class Bars(Watch):
                 bar.update(task, completed=done, description=said or what)
 
             yield advance
+
+    @contextmanager
+    def progress_of(self, totals: Mapping[str, int]) -> Iterator[AdvanceOne]:
+        """Show a bar for each of several things, which is there from the beginning."""
+        with Progress(*_columns(), console=self.console) as bar:
+            tasks = {name: bar.add_task(name, total=total) for name, total in totals.items()}
+            yield lambda name, done, said: bar.update(tasks[name], completed=done, description=said)
+
+
+def _columns() -> tuple[ProgressColumn, ...]:
+    """Return what is shown of a bar: what it counts, counts, the time it took, the time that is left."""
+    begun = (Described(), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    return (*begun, TextColumn("left"), TimeRemainingColumn())
 
 
 def default_watch() -> Watch:

@@ -101,7 +101,7 @@ def run(command: str, folder: Path, patience: float | None = None, victim: str =
 def bits(folder: Path) -> tuple[int, str]:
     """Return how many points and records a folder holds, and a digest of all their values."""
     from gradscape.landscapes.storage.store import SliceStore, is_slice
-    from gradscape.optim.run import Run, is_run
+    from gradscape.optim.runs.store import RunStore, is_run
 
     digest, done = hashlib.sha256(), 0
     for path in sorted(folder.rglob("*.zarr")):
@@ -110,7 +110,7 @@ def bits(folder: Path) -> tuple[int, str]:
         if is_slice(path):
             dataset = SliceStore.open(path).dataset()
         elif is_run(path):
-            dataset = Run.open(path).table().drop_vars(["seconds", "forwards"])
+            dataset = RunStore.open(path).dataset().drop_vars(["seconds", "forwards"])
         else:
             continue
         digest.update(str(path.relative_to(folder)).encode())

@@ -51,18 +51,18 @@ def unfinished_slice() -> None:
 
 def unfinished_run() -> None:
     """Stop a search after some rows."""
-    from gradscape.optim import run
+    from gradscape.optim.runs import store
 
     small()
-    run.PAUSE, run.SHARE = 0.0, math.inf  # writes after every proposal
-    append = run.Run.append
+    store.PAUSE, store.SHARE = 0.0, math.inf  # writes after every proposal
+    append = store.RunStore.append
 
-    def stopped(filled: run.Run, *given: Any, **options: Any) -> None:
+    def stopped(filled: store.RunStore, *given: Any, **options: Any) -> None:
         if filled.count > 12:
             _interrupted()
         append(filled, *given, **options)
 
-    run.Run.append = stopped  # type: ignore[method-assign]
+    store.RunStore.append = stopped  # type: ignore[method-assign]
 
 
 def _interrupted(*_: object, **__: object) -> None:
@@ -224,9 +224,9 @@ def _readable(folder: Path) -> Iterator[tuple[Path, Callable[[Path], Numbers]]]:
 
 def _store(path: Path) -> Numbers:
     from gradscape.landscapes.storage.store import SliceStore, is_slice
-    from gradscape.optim.run import Run
+    from gradscape.optim.runs.store import RunStore
 
-    dataset = SliceStore.open(path).dataset() if is_slice(path) else Run.open(path).table()
+    dataset = SliceStore.open(path).dataset() if is_slice(path) else RunStore.open(path).dataset()
     return _of_dataset(dataset.drop_vars(["seconds", "forwards"], errors="ignore"))
 
 

@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..landscapes.space import sobol
+
 Point = tuple[float, float, float]
 
 
@@ -101,5 +103,4 @@ def shares(shapes: Sequence[Shape], total: int) -> list[int]:
 
 def fill(shape: Shape, count: int) -> np.ndarray:
     """Return particles that fill a shape evenly (a scrambled Sobol sequence) [m], shape (particle, 3)."""
-    engine = torch.quasirandom.SobolEngine(3, scramble=True, seed=0)  # type: ignore[no-untyped-call]
-    return np.asarray(shape.place(engine.draw(count, dtype=torch.float64)).numpy())
+    return np.asarray(shape.place(sobol(count, 3, seed=0)).numpy())

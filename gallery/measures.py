@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import shutil
+<<<<<<< HEAD
 from typing import TYPE_CHECKING, Any
+=======
+from typing import TYPE_CHECKING
+>>>>>>> main
 
 from ..envs.registry import environment_class
 from ..jobs.scene import SceneSpec
@@ -50,6 +54,7 @@ class ReportPart(Part):
     def make(self, watch: Watch) -> str:
         """Measure the slice, in the place of a report of another one."""
         from ..landscapes.draw.film import lighten
+<<<<<<< HEAD
 
         for name in (REPORT, MEASURES, QUALITY, QUALITY_ARRAYS):
             (self.folder / name).unlink(missing_ok=True)
@@ -66,6 +71,17 @@ class ReportPart(Part):
         how: dict[str, Any] = {"points": REPORT_POINTS, "seed": SEED, "device": self.device, "paper": words}
         job = ReportJob([subject], self.folder, single=True, **how, command=self.label())
         return job.report(subject, watch).words
+=======
+        from .paper import read_paper
+
+        for name in (REPORT, MEASURES, QUALITY, QUALITY_ARRAYS):
+            (self.folder / name).unlink(missing_ok=True)
+        subject, words = Subject(self.figure.id, self.folder / STORE), read_paper().words
+        job = ReportJob([subject], self.folder, True, REPORT_POINTS, SEED, self.device, words, command=self.label())
+        report = job.report(subject, watch)
+        lighten(self.folder / QUALITY)
+        return ", ".join(report.words)
+>>>>>>> main
 
 
 class TradeoffPart(Part):

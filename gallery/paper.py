@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NotRequired, TypedDict
 from .files import PAPER
 
 if TYPE_CHECKING:
-    from ..optim.orderings import Claim
+    from ..optim.claims import Claim, Claims
 
 ABSENT = "The paper does not have this environment, so it claims nothing about it."
 
@@ -43,13 +43,12 @@ class Paper:
     silences: Mapping[str, str]
     captions: Mapping[str, Caption]
 
-    def claims_about(self, env: str) -> tuple[Claim, ...]:
-        """Return which optimisers the paper has ahead of which others in an environment."""
-        return self.claims.get(env, ())
+    def claims_about(self, env: str) -> Claims:
+        """Return which optimisers the paper has ahead of which others in an environment, or why it claims nothing."""
+        from ..optim.claims import Claims
 
-    def silence_about(self, env: str) -> str:
-        """Return why the paper has no such claim about an environment."""
-        return self.silences.get(env, ABSENT)
+        claims = self.claims.get(env, ())
+        return Claims(claims, None if claims else self.silences.get(env, ABSENT))
 
     def caption_of(self, slice_: str) -> Caption:
         """Return what the paper says of a slice of the gallery."""
@@ -103,7 +102,7 @@ def _words(tables: Mapping[str, _Words], path: Path) -> dict[str, PaperWords]:
 
 
 def _claims(tables: Sequence[_Claim]) -> dict[str, tuple[Claim, ...]]:
-    from ..optim.orderings import Claim
+    from ..optim.claims import Claim
 
     claims: dict[str, tuple[Claim, ...]] = {}
     for table in tables:

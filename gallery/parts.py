@@ -213,15 +213,14 @@ class SearchPart(Part):
 
     def _search(self, env: Environment, method: str, watch: Watch) -> xr.Dataset:
         """Run a method, in a folder of its own under out/, and return the run's table."""
-        from ..commands.search_report import Job, give_torch_one_thread, made
+        from ..jobs.search import SearchJob, make_optimizer
 
         command = self.figure.search_command(
             method, budget=BUDGET, seed=SEED, fidelity=env.fidelity.name, device=self.device
         )
-        give_torch_one_thread()
-        job = Job.open(env, made(method, env, seed=SEED, options={}), budget=BUDGET, command=command)
-        job.run(console_of(watch))
-        return job.filled.table()
+        job = SearchJob.of(env, make_optimizer(method, env, seed=SEED), budget=BUDGET, command=command)
+        job.run(watch)
+        return job.store.dataset()
 
     @property
     def _where(self) -> Path:
@@ -250,10 +249,3 @@ def seconds_of_one(env: Environment) -> float:
     from ..landscapes.cost import episode_cost
 
     return episode_cost(env, grad=False).forward
-
-
-def console_of(watch: Watch) -> Any:
-    """Return a console for a job that does not take a watch yet."""
-    from ..api.progress import Bars
-
-    return watch.console if isinstance(watch, Bars) else Bars().console

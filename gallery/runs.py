@@ -13,7 +13,7 @@ from zarr.storage import ZipStore
 from ..landscapes.storage.files import replacing
 from ..landscapes.storage.layout import SMALL
 from ..landscapes.storage.records import reading
-from ..optim.run_arrays import COLUMNS
+from ..optim.runs.arrays import COLUMNS
 from .files import REMAKE
 
 

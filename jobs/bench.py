@@ -19,7 +19,6 @@ from ..envs.base import Environment, Work
 from ..envs.engines.runtime import compiled_modules, cores, device_names, free_memory, kernel_times
 from ..landscapes.capacity import Need, require
 from ..landscapes.cost import duration
-from ..landscapes.measures.fidelity import sobol_points
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.fill import sample
@@ -261,7 +260,7 @@ def _free(env: Environment) -> int:
 
 def _points(env: Environment, count: int) -> Float[Tensor, "count dim"]:
     """Return well-spread points of the box, the same for every engine."""
-    return sobol_points(env.space, count, seed=0)
+    return env.space.sobol(count, seed=0)
 
 
 def _time_batch(envs: Mapping[str, Environment], points: Tensor, seconds: float) -> list[BatchRate]:

@@ -13,12 +13,12 @@ from ..landscapes.storage import paths
 from ..landscapes.storage.files import others, visible
 from ..landscapes.storage.ownership import refuse_others
 from ..landscapes.storage.paths import there
-from ..optim import run
+from ..optim.runs import store
 
 if TYPE_CHECKING:
     import xarray as xr
 
-SLICE_STORE, RUN_STORE = paths.SLICE, run.RUN
+SLICE_STORE, RUN_STORE = paths.SLICE, store.RUN
 ROOT = Path("out")  # where results go that are given no folder
 
 
@@ -47,7 +47,8 @@ SUMMARY = "summary.json"
 SLICE = Results("slice", (SLICE_STORE, "landscape.png", SUMMARY), "landscape.png", SLICE_STORE)
 RUN = Results("run", (RUN_STORE, "progress.png", SUMMARY), "progress.png", RUN_STORE)
 SWEEP = Results("sweep", ("frames", SLICE_STORE, "sweep.mp4", "sweep.gif", "sweep.rrd", SUMMARY))
-RACE = Results("race", ("race.png", "race.json"), "race.png")
+RACE_FIGURES = "race.json"
+RACE = Results("race", ("race.png", RACE_FIGURES), "race.png")
 OVERLAY = Results("overlay", ("overlay.png", "overlay.rrd"), "overlay.png")
 SURFACE = Results("surface", ("surface.png", "surface.gltf"), "surface.png")
 EPISODE = Results(
@@ -83,14 +84,14 @@ def run_tables(paths: Sequence[str]) -> list[xr.Dataset]:
 
     Raises ValueError where a path holds no run, and where there is no episode at all.
     """
-    from ..optim.run import Run
+    from ..optim.runs.store import RunStore
 
     tables = []
     for path in paths:
         found = [store_in(Path(path), RUN_STORE)]
         if not Path(path, RUN_STORE).exists() and (members := sorted(Path(path).glob(f"*/{RUN_STORE}"))):
             found = members
-        tables += [Run.open(store).table() for store in found]
+        tables += [RunStore.open(store).dataset() for store in found]
     if not any(table.sizes["evaluation"] for table in tables):
         raise ValueError(f"{', '.join(paths)}: there are no episodes yet; `landscape optimize` evaluates them")
     return [table for table in tables if table.sizes["evaluation"]]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
 from ..landscapes.storage.disk import until_full
 
 Advance = Callable[..., None]  # advance(done, said=""): so much is done, and what is said beside the bar
+AdvanceOne = Callable[[str, int, str], None]  # advance(name, done, said): the same, of one of several
 Say = Callable[[str], None]  # say(text): what is being done now
 
 
@@ -56,8 +57,17 @@ class Watch:
         """Give a function that takes how many of `total` are done, and in words what to say beside that."""
         yield _ignore
 
+    @contextmanager
+    def progress_of(self, totals: Mapping[str, int]) -> Iterator[AdvanceOne]:
+        """Give a function that takes of which of several things how many of its total are done, and what to say."""
+        yield _ignore_one
+
 
 def _ignore(done: int, said: str = "") -> None:
+    """Take no notice."""
+
+
+def _ignore_one(name: str, done: int, said: str) -> None:
     """Take no notice."""
 
 

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from .measures.profile import Profile
 
 
-
 class HasData(Protocol):
     """A run, as far as a slice knows it: its table of evaluations."""
 

@@ -99,6 +99,10 @@ class ParameterSpace:
         count = whole(count, "a count of points")
         return self.from_unit(torch.rand(count, self.dim, generator=generator, dtype=torch.float64))
 
+    def sobol(self, count: int, *, seed: int) -> Float[Tensor, "count dim"]:
+        """Return points spread evenly over the box, of a scrambled Sobol sequence; the same seed gives the same."""
+        return self.from_unit(sobol(count, self.dim, seed=seed))
+
     def index(self, parameter: str | int) -> int:
         """Return the number of a parameter given by name or by number."""
         if isinstance(parameter, str) and parameter in self.names:
@@ -110,6 +114,13 @@ class ParameterSpace:
         if not 0 <= number < self.dim:
             raise ValueError(f"parameters are numbered 0 to {self.dim - 1}; got {number}")
         return number
+
+
+def sobol(count: int, dim: int, *, seed: int) -> Float[Tensor, "count dim"]:
+    """Return the first points of a scrambled Sobol sequence in the unit cube, float64."""
+    engine = torch.quasirandom.SobolEngine(dim, scramble=True, seed=seed)  # type: ignore[no-untyped-call]
+    points: Tensor = engine.draw(count, dtype=torch.float64)
+    return points
 
 
 def whole(value: object, what: str, *, least: int = 0) -> int:
@@ -128,12 +139,6 @@ def whole(value: object, what: str, *, least: int = 0) -> int:
 def tensor_of(x: object, who: str) -> Float[Tensor, "*shape"]:
     """Return a tensor as it is, and one of any other numbers."""
     return x if isinstance(x, Tensor) else as_tensor(x, who)
-
-
-def sobol(dim: int, count: int, *, seed: int) -> Float[Tensor, "count dim"]:
-    """Return well-spread points of the unit cube: Sobol's sequence, scrambled with the seed (Owen 1998)."""
-    engine = torch.quasirandom.SobolEngine(dim, scramble=True, seed=seed)  # type: ignore[no-untyped-call]
-    return engine.draw(count, dtype=torch.float64)
 
 
 def as_tensor(x: object, who: str) -> Float[Tensor, "*shape"]:

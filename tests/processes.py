@@ -23,7 +23,7 @@ from benchmarks.results import leave_blank
 from gradscape.cli import main
 from gradscape.jobs import slice as job
 from gradscape.landscapes import cost
-from gradscape.optim import run
+from gradscape.optim.runs import store
 
 from .command import Said
 
@@ -84,7 +84,7 @@ def _work(work: Callable[[], object], folder: Path, said: Path, changes: Any, st
                 if number == stop.number:
                     os.kill(os.getpid(), stop.by)
 
-    run.PAUSE, run.SHARE, cost.MOMENT = 0.0, math.inf, 0.0  # writes after every proposal, times two episodes
+    store.PAUSE, store.SHARE, cost.MOMENT = 0.0, math.inf, 0.0  # writes after every proposal, times two episodes
     job.PAUSE, cost.ENOUGH, cost.WARM_UP = math.inf, 0.0, 0.0  # draws no coarse picture
     zarr.config.set({"threading.max_workers": 1})  # so that its threads never take turns
     leave_blank(setattr)

@@ -13,7 +13,7 @@ import pytest
 import typer
 
 from gradscape.cli import app, main
-from gradscape.commands import overlay_report, view
+from gradscape.commands import view
 from gradscape.gallery.figures import read_figures
 from gradscape.gallery.files import DATA
 from gradscape.jobs.report_record import Report
@@ -148,8 +148,7 @@ def test_every_command_runs(
 
     monkeypatch.setenv("XDG_DATA_HOME", str(desk / "data"))
     monkeypatch.setattr("http.server.ThreadingHTTPServer.serve_forever", stop)
-    for module in (overlay_report, view):
-        monkeypatch.setattr(module, "show_recording", lambda path, bars, *, serve: opened.append(path))
+    monkeypatch.setattr(view, "show_recording", lambda path, bars, *, serve: opened.append(path))
     for name, value in (("REPETITION", 0.01), ("LARGEST", 0.01), ("RESAMPLES", 9)):
         monkeypatch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", value)
     done = run(*small(command), cwd=desk)

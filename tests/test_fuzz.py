@@ -19,8 +19,8 @@ from benchmarks.forked import Limits, last_words
 
 from gradscape import ParameterSpace, Plane, from_torch, open_run, sample
 from gradscape.landscapes.storage.store import SliceStore, open_slice
-from gradscape.optim.random import RandomSearch
-from gradscape.optim.run import Run
+from gradscape.optim.methods.random import RandomSearch
+from gradscape.optim.runs.store import RunStore
 from gradscape.optim.search import search
 
 from . import processes  # noqa: F401 -- which says what processes are forked from
@@ -63,7 +63,7 @@ def made_tiles(path: Path) -> None:
 
 
 def made_run(path: Path) -> None:
-    run = Run.create(path, SPACE, identity={"objective": "sines"}, budget=80)
+    run = RunStore.create(path, SPACE, identity={"objective": "sines"}, budget=80)
     search(SINES, RandomSearch.on(SINES, seed=0), run, budget=70)
 
 

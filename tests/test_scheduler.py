@@ -34,7 +34,7 @@ from gradscape.landscapes.sampling.distribution import WorkersLostError
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.store import SliceStore, open_slice
-from gradscape.optim.run import Run
+from gradscape.optim.runs.store import RunStore
 
 from .sockets import beyond_loopback, listening
 
@@ -249,7 +249,7 @@ def test_a_race_has_the_same_runs_whoever_searches(tmp_path, run, address):
     runs = sorted(path.relative_to(tmp_path / "alone") for path in (tmp_path / "alone").glob("*/run.zarr"))
     assert len(runs) == 4
     for path in runs:
-        one, other = (Run.open(tmp_path / where / path).table() for where in ("alone", "spread"))
+        one, other = (RunStore.open(tmp_path / where / path).dataset() for where in ("alone", "spread"))
         np.testing.assert_array_equal(one["x"], other["x"])
         np.testing.assert_array_equal(one["loss"], other["loss"])
 

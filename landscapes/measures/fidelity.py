@@ -15,7 +15,7 @@ from scipy.stats import linregress, rankdata
 from torch import Tensor
 
 from ..objective import Objective, Status, evaluated
-from ..space import ParameterSpace, sobol
+from ..space import ParameterSpace
 from ..statistics import LEVEL
 from ..storage.records import maybe, number
 
@@ -86,7 +86,7 @@ class Bootstrap:
 
 def sobol_points(space: ParameterSpace, count: int, *, seed: int) -> Float[Tensor, "count dim"]:
     """Return well-spread points of the box (Sobol, scrambled with the seed)."""
-    return space.from_unit(sobol(space.dim, count, seed=seed))
+    return space.sobol(count, seed=seed)
 
 
 def measure(

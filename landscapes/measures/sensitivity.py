@@ -40,7 +40,7 @@ class Design:
     @classmethod
     def sobol(cls, space: ParameterSpace, samples: int, *, seed: int) -> Design:
         """Return the design of so many base points."""
-        both = sobol(2 * space.dim, samples, seed=seed).numpy()
+        both = sobol(samples, 2 * space.dim, seed=seed).numpy()
         return cls(space, both[:, : space.dim], both[:, space.dim :])
 
     @property

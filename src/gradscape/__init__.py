@@ -7,7 +7,12 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from .api.environments import list_envs
+<<<<<<< HEAD
     from .api.measure import check, pairs, report, tradeoff
+=======
+    from .api.overlay import overlay
+    from .api.search import open_run, optimize, race
+>>>>>>> main
     from .api.slice import open_slice, slice
     from .envs.base import Environment, Fidelity
     from .envs.registry import make, register
@@ -19,7 +24,8 @@ if TYPE_CHECKING:
     from .landscapes.sampling.fill import sample
     from .landscapes.slice import Slice
     from .landscapes.space import ParameterSpace
-    from .optim.run import open_run
+    from .optim.race import Race
+    from .optim.runs.run import Run
 
 # Where `gradscape.<name>` is, imported when first used: nothing heavy loads before it is needed.
 _HOMES = {
@@ -30,6 +36,8 @@ _HOMES = {
     "Objective": "landscapes.objective",
     "ParameterSpace": "landscapes.space",
     "Plane": "landscapes.plane",
+    "Race": "optim.race",
+    "Run": "optim.runs.run",
     "SceneSpec": "jobs.scene",
     "Slice": "landscapes.slice",
     "Status": "landscapes.objective",
@@ -38,9 +46,15 @@ _HOMES = {
     "from_torch": "landscapes.adapters",
     "list_envs": "api.environments",
     "make": "envs.registry",
-    "open_run": "optim.run",
+    "open_run": "api.search",
     "open_slice": "api.slice",
+<<<<<<< HEAD
     "pairs": "api.measure",
+=======
+    "optimize": "api.search",
+    "overlay": "api.overlay",
+    "race": "api.search",
+>>>>>>> main
     "register": "envs.registry",
     "report": "api.measure",
     "sample": "landscapes.sampling.fill",
@@ -56,6 +70,8 @@ __all__ = [
     "Objective",
     "ParameterSpace",
     "Plane",
+    "Race",
+    "Run",
     "SceneSpec",
     "Slice",
     "Status",
@@ -67,7 +83,13 @@ __all__ = [
     "make",
     "open_run",
     "open_slice",
+<<<<<<< HEAD
     "pairs",
+=======
+    "optimize",
+    "overlay",
+    "race",
+>>>>>>> main
     "register",
     "report",
     "sample",

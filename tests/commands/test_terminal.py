@@ -11,7 +11,7 @@ import gradscape
 from gradscape.commands.terminal import Console, table
 from gradscape.envs.registry import entries
 from gradscape.gallery.figures import read_figures
-from gradscape.optim.registry import METHODS
+from gradscape.optim.registry import methods
 
 from ..command import Said
 
@@ -43,7 +43,7 @@ def test_every_table_is_made_that_way() -> None:
     ("command", "names"),
     [
         ("envs", list(entries())),
-        ("methods", list(METHODS)),
+        ("methods", list(methods())),
         ("gallery list", [figure.env for figure in read_figures()]),
     ],
 )

@@ -8,7 +8,7 @@ import pytest
 
 from gradscape.envs.options import EpisodeOptions, NoOptions, describe, in_full, read_options
 from gradscape.envs.registry import entries, environment_class
-from gradscape.optim.registry import METHODS, optimizer_class
+from gradscape.optim.registry import methods, optimizer_class
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def test_an_episodes_horizon_stands_last_and_is_explained():
 
 
 OPTIONS = {name: environment_class(name).Options for name in entries()} | {
-    name: optimizer_class(name).Options for name in METHODS
+    name: optimizer_class(name).Options for name in methods()
 }
 
 

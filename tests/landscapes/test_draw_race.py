@@ -7,7 +7,7 @@ from matplotlib.colors import to_rgba
 
 from gradscape.landscapes.draw import style
 from gradscape.landscapes.draw.figures.race import race_figure
-from gradscape.optim.registry import METHODS
+from gradscape.optim.registry import methods
 
 NAN = np.nan
 
@@ -121,8 +121,8 @@ def test_a_logarithmic_axis_has_numbers_however_many_decades_it_spans(scale):
 
 @pytest.mark.parametrize("failed", [0, 2])
 def test_nothing_overlaps_or_leaves_the_page_with_every_method(failed):
-    command = f"landscape race triple-move --methods {','.join(METHODS)} --fidelity reference --workers 2 --report"
-    dataset = race(tuple(METHODS), provenance=json.dumps({"created": "2026-11-21", "command": command}))
+    command = f"landscape race triple-move --methods {','.join(methods())} --fidelity reference --workers 2 --report"
+    dataset = race(tuple(methods()), provenance=json.dumps({"created": "2026-11-21", "command": command}))
     dataset["unsuccessful"][:] = failed
     figure = race_figure(dataset)
     figure.canvas.draw()
@@ -135,7 +135,7 @@ def test_nothing_overlaps_or_leaves_the_page_with_every_method(failed):
 
 
 def test_methods_differ_in_colour_and_without_it():
-    assert set(style.METHODS) == set(METHODS)
+    assert set(style.METHODS) == set(methods())
     looks = list(style.METHODS.values())
     assert len({look["color"] for look in looks}) == len({look["marker"] for look in looks}) == len(looks)
     colors = [np.array(to_rgba(look["color"])[:3]) for look in looks]

@@ -31,7 +31,7 @@ from gradscape.landscapes.episode import Episode, Part, View
 from gradscape.landscapes.measures import gradient_quality as gradients
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.storage.files import print_width
-from gradscape.optim.registry import METHODS
+from gradscape.optim.registry import methods
 
 from .test_curve import table
 from .test_draw import BOUNCES, DATASET, LINE, Bowl, plane
@@ -87,7 +87,7 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
         lambda width: overlay_figure(dated(SLICE), LAID, width=width),
         lambda width: overlay_figure(dated(SLICE), LAID[:1] * 12, width=width),
     ],
-    "race_figure": [lambda width: race_figure(race(tuple(METHODS)), width=width)],
+    "race_figure": [lambda width: race_figure(race(tuple(methods())), width=width)],
     "surface_figure": [
         lambda width: surface_figure(dated(SLICE), LAID, width=width),
         lambda width: surface_figure(PLANE, width=width),

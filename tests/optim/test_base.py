@@ -64,7 +64,7 @@ def test_a_failed_episode_is_infinite_without_slope_and_counts_as_the_worst_so_f
     optimizer = told([Status.OK, Status.ESCAPED, Status.OK], [-7.0, 1.0, -9.0], [[1.0, 1.0]] * 3)
     assert optimizer.loss.tolist() == [-7.0, np.inf, -9.0]
     assert optimizer.grad[1].tolist() == [0.0, 0.0]
-    assert optimizer.penalised(optimizer.loss).tolist() == [-7.0, -7.0, -9.0]
+    assert optimizer.penalise(optimizer.loss).tolist() == [-7.0, -7.0, -9.0]
 
 
 def test_a_method_whose_attributes_are_data_is_restored_without_more() -> None:
@@ -86,4 +86,4 @@ def test_what_is_no_data_is_named() -> None:
 def test_a_state_puts_nothing_in_the_place_of_a_method() -> None:
     state = told([Status.OK], [2.0]).state()
     with pytest.raises(ValueError, match="_ask is no attribute that recorder keeps"):
-        Recorder.restored(Bowl(), state | {"own": {"_ask": 3}})
+        Recorder.from_state(Bowl(), state | {"own": {"_ask": 3}})

@@ -11,7 +11,7 @@ pytest.importorskip("stable_baselines3", reason="the extra rl is not installed")
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
-from gradscape.optim.policy import PPO, SAC, PPOOptions, SACOptions
+from gradscape.optim.methods.policy import PPO, SAC, PPOOptions, SACOptions
 from gradscape.optim.registry import optimizer_class
 from gradscape.optim.search import search
 
@@ -94,14 +94,14 @@ def played(optimizer, objective, proposals):
 
 @pytest.mark.parametrize("method", ["ppo", "sac"])
 def test_it_learns_a_bandit_within_the_budget(method):
-    losses = search(Bowl(), optimizer_class(method).on(Bowl(), seed=1), budget=300).table()["loss"].values
+    losses = search(Bowl(), optimizer_class(method).on(Bowl(), seed=1), budget=300).dataset()["loss"].values
     random = Bowl().evaluate(Bowl.space.uniform(2000, seed=0)).loss.mean()
     assert losses[-60:].mean() < 0.6 * random
 
 
 def test_it_learns_to_use_what_it_sees():
     sighted, blind = (
-        search(objective, PPO.on(objective, seed=0), budget=400).table()["loss"].values[-100:].mean()
+        search(objective, PPO.on(objective, seed=0), budget=400).dataset()["loss"].values[-100:].mean()
         for objective in (Coin(), Coin(blind=True))
     )
     assert sighted < 0.5 * blind
@@ -194,7 +194,7 @@ def test_only_sacs_warm_up_is_called_random(small):
 
 
 def test_failed_episodes_teach_it_to_stay_away():
-    losses = search(Fragile(), PPO.on(Fragile(), seed=0), budget=400).table()["loss"].values
+    losses = search(Fragile(), PPO.on(Fragile(), seed=0), budget=400).dataset()["loss"].values
     assert np.isnan(losses[:60]).mean() > 0.3
     assert np.isnan(losses[-60:]).mean() < 0.2
 

@@ -21,7 +21,7 @@ from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.store import SliceStore
-from gradscape.optim.run import Run
+from gradscape.optim.runs.store import RunStore
 from gradscape.optim.search import search
 
 from ...command import NO_BROWSER
@@ -133,11 +133,11 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for method in ("random", "descents"):
             identity = {"objective": env, "options": {}, "method": method, "seed": 0, "fidelity": "draft"}
             provenance = {"command": f"landscape optimize {env} --method {method}"}
-            run = Run.create(
+            run = RunStore.create(
                 folder / "runs.tmp" / env / method, SPACE, identity=identity, provenance=provenance, budget=24
             )
             (folder / RUNS / env).mkdir(parents=True, exist_ok=True)
-            table = search(Bowl(env), method, run, budget=24, gradient_cost=2.0).table()
+            table = search(Bowl(env), method, run, budget=24, gradient_cost=2.0).dataset()
             save_run(table, folder / RUNS / env / f"{method}-0{RUN_SUFFIX}")
     full = folder / "full"
     (full / "episodes.json").write_text(json.dumps(EPISODES))

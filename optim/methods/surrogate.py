@@ -26,18 +26,22 @@ from linear_operator.utils.warnings import NumericalWarning
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .base import Points
-from .magnitude import tamed
-from .options import MANY, MethodOptions, number
+from ..base import Points
+from ..memory import FLOAT, SearchSize
+from ..options import MANY, MethodOptions, number
+from .magnitude import tame
 
 Rows = NDArray[np.intp]
 
+ARRAYS = 10  # of points x points, that a Gaussian process makes (measured with BoTorch 0.16)
+CANDIDATES = 600  # points from which the least value of its bound is looked for
 GROWTH = 1.1  # hyper-parameters are fitted anew when there are this many times more points than at the last fit
 FIT_STEPS = 30  # of L-BFGS, from where the last fit ended
 BOUND_STEPS = 30  # of L-BFGS on the bound, from each start
-FIT_MOST = 300  # points to fit them to, evenly spread over the run: each step's cost grows with their cube
+FIT_POINTS = 300  # points to fit them to, evenly spread over the run: each step's cost grows with their cube
 STARTS, SPREAD, NEAR, JITTER = 6, 512, 64, 0.02  # of the search for the bound's least value: see `_starts`
-ALONE = threading.RLock()  # GPyTorch's settings and Python's warning filters belong to the process, not to a thread
+# GPyTorch's settings and Python's warning filters belong to the process, not to a thread.
+ONE_AT_A_TIME = threading.RLock()
 
 
 @dataclass(frozen=True)
@@ -46,8 +50,8 @@ class SurrogateOptions(MethodOptions):
 
     `coefficient` is how many standard deviations the bound lies below the mean. `kernel` is squared-exponential or
     Matern-5/2, with a length-scale per parameter. Points are drawn at random until `initial` of them are known: fewer
-    say nothing about length-scales, and the search would settle on what they suggest. `most` points are modelled: of
-    more, the half with the least losses, and as many of the others, spread evenly over the run.
+    say nothing about length-scales, and the search would settle on what they suggest. `max_points` points are
+    modelled: of more, the half with the least losses, and as many of the others, spread evenly over the run.
     """
 
     method = "bo"
@@ -55,7 +59,7 @@ class SurrogateOptions(MethodOptions):
     coefficient: float = number(1.0, 0, 1e6)
     kernel: Literal["rbf", "matern"] = "rbf"
     initial: int = number(10, 1, MANY)
-    most: int = number(1000, 2, MANY)
+    max_points: int = number(1000, 2, MANY)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -99,11 +103,11 @@ class Surrogate:
         self.z, self.loss = state["z"].reshape(-1, self.z.shape[1]), state["loss"]
         self._fitted, self._hyper = int(state["fitted"]), dict(state["hyper"])
 
-    def lowest(self, random: np.random.Generator) -> Points:
+    def minimise(self, random: np.random.Generator) -> Points:
         """Return where mean - coefficient * standard deviation is least, shape (dim,); a random point before."""
         if not self.informed:
             return np.asarray(random.uniform(-1.0, 1.0, self.z.shape[1]))
-        with _alone():
+        with _exclusive():
             model = self.model()
             bound = NegativeBound(model, self.options.coefficient)
             best, _ = optimize_acqf(
@@ -119,24 +123,24 @@ class Surrogate:
 
     def model(self) -> SingleTaskGP:
         """Return the process over [0, 1]^dim given the points, its hyper-parameters fitted if that is due."""
-        with _alone():
+        with _exclusive():
             count = len(self.loss)
             if self._fitted == 0 or count >= GROWTH * self._fitted:
-                self._fit(_spread(np.arange(count), FIT_MOST))
+                self._fit(_thin(np.arange(count), FIT_POINTS))
                 self._fitted = count
-            return self._given(self._kept()).eval()
+            return self._condition(self._select()).eval()
 
     def _fit(self, rows: Rows) -> None:
-        model = self._given(rows)
+        model = self._condition(rows)
         fit_gpytorch_mll_scipy(
             ExactMarginalLogLikelihood(model.likelihood, model).train(), options={"maxiter": FIT_STEPS}
         )
         self._hyper = {name: value.detach().numpy().copy() for name, value in model.named_parameters()}
 
-    def _given(self, rows: Rows) -> SingleTaskGP:
+    def _condition(self, rows: Rows) -> SingleTaskGP:
         """Return the process given some of the points, with the hyper-parameters of the last fit."""
         finite = np.isfinite(self.loss)
-        loss = tamed(np.where(finite, self.loss, self.loss[finite].max()))  # a failure counts as the worst so far
+        loss = tame(np.where(finite, self.loss, self.loss[finite].max()))  # a failure counts as the worst so far
         dim = self.z.shape[1]
         model = SingleTaskGP(
             _unit(self.z[rows]),
@@ -150,13 +154,13 @@ class Surrogate:
                     value.copy_(torch.from_numpy(self._hyper[name]))
         return model
 
-    def _kept(self) -> Rows:
+    def _select(self) -> Rows:
         """Return which points are modelled."""
-        most = self.options.most
-        if len(self.loss) <= most:
+        count = self.options.max_points
+        if len(self.loss) <= count:
             return np.arange(len(self.loss))
-        best, others = np.split(np.argsort(self.loss, kind="stable"), [most // 2])
-        return np.sort(np.concatenate([best, _spread(np.sort(others), most - len(best))]))
+        best, others = np.split(np.argsort(self.loss, kind="stable"), [count // 2])
+        return np.sort(np.concatenate([best, _thin(np.sort(others), count - len(best))]))
 
     def _starts(self, bound: NegativeBound, random: np.random.Generator) -> Float[Tensor, "start dim"]:
         """Return where the search for the least bound starts: the best of many points all over, and near the best."""
@@ -167,6 +171,12 @@ class Surrogate:
         groups = (random.uniform(-1.0, 1.0, (SPREAD, dim)), near.clip(-1.0, 1.0))
         with torch.no_grad():
             return torch.cat([u[bound(u[:, None]).topk(STARTS // 2).indices] for u in map(_unit, groups)])
+
+
+def surrogate_memory(max_points: int, size: SearchSize) -> float:
+    """Return what the process takes at the end of a search [bytes]."""
+    points = min(max_points, size.budget)
+    return float(FLOAT * (ARRAYS * points**2 + 20 * (CANDIDATES + points) * size.dim))
 
 
 class NegativeBound(AcquisitionFunction):
@@ -187,9 +197,9 @@ class NegativeBound(AcquisitionFunction):
         return bound[:, 0]
 
 
-def _spread(rows: Rows, most: int) -> Rows:
+def _thin(rows: Rows, count: int) -> Rows:
     """Return at most so many of the rows, evenly spread."""
-    return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(int)]
+    return rows if len(rows) <= count else rows[np.linspace(0, len(rows) - 1, count).astype(int)]
 
 
 def _unit(z: Points) -> Float[Tensor, "count dim"]:
@@ -197,9 +207,9 @@ def _unit(z: Points) -> Float[Tensor, "count dim"]:
 
 
 @contextmanager
-def _alone() -> Iterator[None]:
+def _exclusive() -> Iterator[None]:
     """Keep other threads out, and quiet what is no news: iteration limits reached, jitter added to a covariance."""
-    with ALONE, warnings.catch_warnings():
+    with ONE_AT_A_TIME, warnings.catch_warnings():
         for category in (BotorchWarning, NumericalWarning, GPInputWarning):
             warnings.simplefilter("ignore", category)
         yield

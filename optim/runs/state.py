@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 ARRAY = "__array__"  # stands in the outline for the number of an array
 
 
-def encoded(state: Any) -> bytes:
+def encode(state: Any) -> bytes:
     """Return a state as the bytes of an `.npz` file: its arrays by number, and as `outline` the rest, which is JSON.
 
     Raises TypeError where something in it is no number, string, array, list or mapping.
@@ -34,8 +34,8 @@ def encoded(state: Any) -> bytes:
     return kept.getvalue()
 
 
-def decoded(kept: bytes) -> Any:
-    """Return the state that `encoded` wrote; tuples come back as lists."""
+def decode(kept: bytes) -> Any:
+    """Return the state that `encode` wrote; tuples come back as lists."""
     with np.load(io.BytesIO(kept), allow_pickle=False) as arrays:
 
         def put_back(found: dict[str, Any]) -> Any:

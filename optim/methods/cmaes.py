@@ -12,8 +12,12 @@ import numpy as np
 import torch
 from cma.sigma_adaptation import CMAAdaptSigmaCSA
 
-from .base import Kind, Optimizer, Points, Proposal
-from .options import MethodOptions, number
+from ..base import Kind, Optimizer, Points, Proposal
+from ..memory import FLOAT, SearchSize
+from ..options import MethodOptions, number
+
+MATRICES = 8  # of dim x dim, that CMA-ES holds while it is written to disk: C, its eigenvectors, a pickle of both
+POPULATION = 7000  # bytes for each member of a population, beside its numbers (measured with pycma 4)
 
 OTHERS = (
     "cma-es goes on with the points and losses that the run holds; cma or its linear algebra draws others here than "
@@ -52,6 +56,11 @@ class CMAES(Optimizer):
     name = "cma-es"
     Options: ClassVar[type[CMAESOptions]] = CMAESOptions
 
+    @classmethod
+    def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
+        """Estimate what the matrices of the distribution take, and its population [bytes]."""
+        return population_memory(options["population"], size.dim)
+
     def _setup(self) -> None:
         if self.space.dim < 2:
             raise ValueError(f"cma-es searches two parameters or more; this space has {self.space.dim}")
@@ -78,7 +87,7 @@ class CMAES(Optimizer):
         return Proposal(torch.from_numpy(np.stack(self._asked)), Kind.POPULATION)
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
-        self._take(self.penalised(loss))
+        self._take(self.penalise(loss))
         if self.strategy.stop():
             self._start()
 
@@ -101,6 +110,11 @@ class CMAES(Optimizer):
                 self._asked = list(points)
             self._take(loss)
             self.strategy.stop()
+
+
+def population_memory(population: int, dim: int) -> float:
+    """Return what a search by populations takes in so many dimensions [bytes]."""
+    return float(FLOAT * MATRICES * dim**2 + population * (POPULATION + 20 * FLOAT * dim))
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,10 @@ from typing import Any
 
 import torch
 
-from .base import Kind, Optimizer, Points, Proposal
+from ..base import Kind, Optimizer, Points, Proposal
+from ..memory import SearchSize
 from .descent import Descent, DescentOptions
-from .surrogate import Surrogate, SurrogateOptions
+from .surrogate import Surrogate, SurrogateOptions, surrogate_memory
 
 
 class BO(Optimizer):
@@ -23,12 +24,17 @@ class BO(Optimizer):
     name = "bo"
     Options = SurrogateOptions
 
+    @classmethod
+    def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
+        """Estimate what the process takes [bytes]."""
+        return surrogate_memory(options["max_points"], size)
+
     def _setup(self) -> None:
         self.surrogate = Surrogate(self.space.dim, self.options)
 
     def _ask(self) -> Proposal:
         kind = Kind.ACQUISITION if self.surrogate.informed else Kind.RANDOM
-        return Proposal(torch.from_numpy(self.surrogate.lowest(self.random)[None]), kind)
+        return Proposal(torch.from_numpy(self.surrogate.minimise(self.random)[None]), kind)
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
         self.surrogate.add(z, loss)
@@ -57,6 +63,11 @@ class BODescents(Optimizer):
     Options = BODescentsOptions
     needs_grad = True
 
+    @classmethod
+    def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
+        """Estimate what the process takes [bytes]."""
+        return surrogate_memory(options["max_points"], size)
+
     def _setup(self) -> None:
         self.surrogate = Surrogate(self.space.dim, self.options)
         self.descent: Descent | None = None
@@ -65,7 +76,7 @@ class BODescents(Optimizer):
         kind = Kind.DESCENT
         if self.descent is None:
             kind = Kind.ACQUISITION if self.surrogate.informed else Kind.RANDOM
-            self.descent = Descent(self.surrogate.lowest(self.random), self.options)
+            self.descent = Descent(self.surrogate.minimise(self.random), self.options)
         return Proposal(torch.from_numpy(self.descent.at[None]), kind, grad=True)
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
@@ -81,4 +92,4 @@ class BODescents(Optimizer):
 
     def _restore(self, own: Mapping[str, Any]) -> None:
         self.surrogate.restore(own["surrogate"])
-        self.descent = own["descent"] and Descent.restored(own["descent"], self.options)
+        self.descent = own["descent"] and Descent.from_state(own["descent"], self.options)

@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from .. import __version__
-from ..landscapes.identity import plain_json
-from ..landscapes.objective import Status
-from ..landscapes.space import ParameterSpace
-from ..landscapes.storage.layout import FILL, create_array, flags
-from ..landscapes.storage.ownership import store_files
-from .base import Kind
-from .kept import CHUNK, STATE, damaged
+from ... import __version__
+from ...landscapes.identity import plain_json
+from ...landscapes.objective import Status
+from ...landscapes.space import ParameterSpace
+from ...landscapes.storage.layout import FILL, create_array, flags
+from ...landscapes.storage.ownership import store_files
+from ..base import Kind
+from .journal import CHUNK, STATE, damage_error
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 FORMAT = 2
 DEEP = ("x", "grad")
+FORWARD_EQUIVALENTS = "forwards"  # what files have called it since the first run: a column, and a key of summaries
 COLUMNS: dict[str, tuple[str, dict[str, Any]]] = {  # status last: a row that has one is whole
     "x": ("float64", {"long_name": "parameters, each in its own unit"}),
     "loss": ("float64", {"long_name": "loss"}),
@@ -29,7 +34,7 @@ COLUMNS: dict[str, tuple[str, dict[str, Any]]] = {  # status last: a row that ha
     "slope": ("float64", {"long_name": "length of the gradient"}),
     "kind": ("int8", {"long_name": "what the point was evaluated for", **flags(Kind)}),
     "episodes": ("int64", {"long_name": "episodes so far"}),
-    "forwards": ("float64", {"long_name": "episodes so far, in episodes without gradient"}),
+    FORWARD_EQUIVALENTS: ("float64", {"long_name": "episodes so far, in episodes without gradient"}),
     "seconds": ("float64", {"long_name": "time so far", "units": "s"}),
     "status": ("int8", {"long_name": "how the evaluation ended", **flags(Status)}),
 }
@@ -56,10 +61,16 @@ def read_rows(path: Path, group: zarr.Group, name: str, rows: int, dim: int) -> 
             raise ValueError(f"it has room for {array.shape[0]} rows, and {rows} were written")
         return np.asarray(array[:rows])
     except Exception as error:  # whatever a missing array, a damaged layout or a codec raises
-        raise damaged(path / name, f"it cannot be read ({' '.join(str(error).split())})") from None
+        raise damage_error(path / name, f"it cannot be read ({' '.join(str(error).split())})") from None
 
 
-def plain(attributes: Mapping[str, Any]) -> dict[str, Any]:
+def stored_record(record: DataclassInstance) -> dict[str, Any]:
+    """Return a record as files have it, in which forward equivalents go by the name they have there."""
+    names = {"forward_equivalents": FORWARD_EQUIVALENTS}
+    return {names.get(key, key): value for key, value in asdict(record).items()}
+
+
+def plain_attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
     """Return a run's attributes as any format of files has them; what is not known yet is left out."""
     known = {name: value for name, value in attributes.items() if value is not None and name != "units"}
     return {name: json.dumps(value) if isinstance(value, dict) else value for name, value in known.items()}

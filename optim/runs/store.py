@@ -1,7 +1,7 @@
 """A run on disk: every point an optimiser evaluated, and what it goes on from.
 
 A run is a zarr group of columns along `evaluation`, as long as the budget; a row without a status is not there yet.
-Beside the columns lies the file `state` (see `kept`): it counts the rows and those the optimiser has been told, has
+Beside the columns lies the file `state` (see `journal`): it counts the rows and those the optimiser has been told, has
 their checksums, and then the optimiser itself, its random numbers included, as data that is read and never run. Rows
 are written first, that file at once after them, so rows it does not count do not exist: whatever is lost by stopping a
 run at any instant is computed again, to the same bits. Rows that are not what the file says are damage, which is
@@ -30,23 +30,36 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..landscapes.identity import StoreError, StoreExistsError, check_identity
-from ..landscapes.objective import Evaluation, Status
-from ..landscapes.space import ParameterSpace
-from ..landscapes.storage.files import placing, resolved
-from ..landscapes.storage.layout import FILL, consolidate, open_group
-from ..landscapes.storage.ownership import check_ours, clear_halves, lost_root
-from .base import Kind
-from .kept import CHUNK, STATE, Kept, checksums, damaged, digest_of, first_wrong
-from .run_arrays import COLUMNS, FILES, FORMAT, Columns, attributes_of, dims_of, empty, lay_out, plain, read_rows
-from .state import decoded, encoded
+from ...landscapes.identity import StoreError, StoreExistsError, check_identity
+from ...landscapes.objective import Evaluation, Status
+from ...landscapes.space import ParameterSpace
+from ...landscapes.storage.files import placing, resolved
+from ...landscapes.storage.layout import FILL, consolidate, open_group
+from ...landscapes.storage.ownership import check_ours, clear_halves, lost_root
+from ..base import Kind
+from .arrays import (
+    COLUMNS,
+    FILES,
+    FORMAT,
+    FORWARD_EQUIVALENTS,
+    Columns,
+    attributes_of,
+    dims_of,
+    empty,
+    lay_out,
+    plain_attributes,
+    read_rows,
+)
+from .journal import CHUNK, STATE, Journal, checksums, damage_error, digest_of, find_damage
+from .run import Run
+from .state import decode, encode
 
 PAUSE = 1.0  # least seconds between two writes, so that quick episodes are not held up
 SHARE = 0.05  # most of the time that may go into writing, so that a large state is not written too often
-RUN = "run.zarr"
+RUN = "run.zarr"  # what the store of a run is called in its folder
 
 
-class Run:
+class RunStore:
     """Keep what an optimiser evaluates, row by row, so that a run stopped at any instant can go on.
 
     Make one with `create`, `open`, `open_or_create` or `in_memory`; `search` fills it. `identity` holds what decides
@@ -79,8 +92,11 @@ class Run:
         provenance: Mapping[str, Any] | None = None,
         budget: int,
         overwrite: bool = False,
-    ) -> Run:
-        """Make an empty run at a path where there is none, all at once; `overwrite` replaces a run, nothing else."""
+    ) -> RunStore:
+        """Make an empty run at a path where there is none, all at once; `overwrite` replaces a run, nothing else.
+
+        Raises StoreExistsError where there is one, StoreError where something else is to be replaced.
+        """
         path = resolved(path)
         attributes = attributes_of(space, identity, provenance or {}, budget)
         if path.exists() and not overwrite:
@@ -91,20 +107,20 @@ class Run:
             with placing(path, overwrite=overwrite, check=partial(check_replaceable, path)) as new:
                 lay_out(zarr.create_group(new, zarr_format=3), attributes)
                 consolidate(new)
-                Kept(about=digest_of(attributes)).write(new)
+                Journal(about=digest_of(attributes)).write(new)
         except FileExistsError as error:
             raise StoreExistsError(str(error)) from None
         return cls.open(path)
 
     @classmethod
-    def open(cls, path: str | Path) -> Run:
-        """Open a run that exists."""
+    def open(cls, path: str | Path) -> RunStore:
+        """Open a run that exists. Raises StoreError where there is none, and where it is damaged."""
         path = resolved(path)
         if not path.exists():
             raise StoreError(f"there is no run at {path}; make one with `landscape optimize`")
         if not is_run(path):
             if lost_root(path, FILES):
-                raise damaged(path / "zarr.json", "it cannot be read")
+                raise damage_error(path / "zarr.json", "it cannot be read")
             raise StoreError(f"{path} is no run of format {FORMAT}; move it away or write elsewhere")
         return cls(open_group(path).attrs.asdict(), path)
 
@@ -117,7 +133,7 @@ class Run:
         identity: Mapping[str, Any],
         provenance: Mapping[str, Any] | None = None,
         budget: int,
-    ) -> Run:
+    ) -> RunStore:
         """Go on with the run at `path`, or make it; a run made by other settings raises `StoreMismatchError`."""
         with contextlib.suppress(StoreExistsError):
             return cls.create(path, space, identity=identity, provenance=provenance, budget=budget)
@@ -127,7 +143,7 @@ class Run:
         return run
 
     @classmethod
-    def in_memory(cls, space: ParameterSpace, *, identity: Mapping[str, Any] | None = None, budget: int) -> Run:
+    def in_memory(cls, space: ParameterSpace, *, identity: Mapping[str, Any] | None = None, budget: int) -> RunStore:
         """Make a run that lives as long as the object."""
         return cls(attributes_of(space, identity or {}, {}, budget))
 
@@ -154,7 +170,7 @@ class Run:
         return cost
 
     @property
-    def best(self) -> float:
+    def best_loss(self) -> float:
         """The least loss so far, NaN before there is one."""
         losses = self._columns["loss"][: self.count]
         return float(np.nanmin(losses)) if np.isfinite(losses).any() else float("nan")
@@ -165,14 +181,17 @@ class Run:
         return int((self._columns["status"][: self.count] != Status.OK).sum())
 
     def state(self) -> dict[str, Any] | None:
-        """Return the optimiser's state after `told` rows, None before the first."""
+        """Return the optimiser's state after `told` rows, None before the first.
+
+        Raises StoreError where the file holds none.
+        """
         try:
-            found: dict[str, Any] | None = decoded(self._state) if self._state else None
+            found: dict[str, Any] | None = decode(self._state) if self._state else None
         except Exception as error:  # whatever is read instead of arrays
-            raise damaged((self.path or Path()) / STATE, f"it holds no state ({error})") from None
+            raise damage_error((self.path or Path()) / STATE, f"it holds no state ({error})") from None
         return found
 
-    def table(self) -> xr.Dataset:
+    def dataset(self) -> xr.Dataset:
         """Return every row as a long table: shapes (evaluation,) or (evaluation, dim).
 
         Its attributes are plain numbers and strings, identity and provenance among them as JSON.
@@ -183,11 +202,18 @@ class Run:
             for name, (_, about) in COLUMNS.items()
         }
         names = {"dim": ("dim", self.identity["parameters"]), "unit": ("dim", self.attributes["units"])}
-        return xr.Dataset(columns, names, plain(self.attributes))
+        return xr.Dataset(columns, names, plain_attributes(self.attributes))
+
+    def read(self) -> Run:
+        """Return the run as one works with it, with the episodes that are there."""
+        return Run(self.dataset(), self.path.parent if self.path else None)
 
     @contextlib.contextmanager
-    def filling(self) -> Iterator[None]:
-        """Hold the run against every other process that would fill it, and drop what the kept state does not know."""
+    def lock(self) -> Iterator[None]:
+        """Hold the run against every other process that would fill it, and drop what the journal does not know.
+
+        Raises StoreError where another process holds it, and where it was replaced or removed.
+        """
         if self.path is None:
             yield
             return
@@ -204,10 +230,10 @@ class Run:
         finally:
             os.close(folder)
 
-    def begin(self, *, gradient_cost: float) -> None:
+    def set_gradient_cost(self, gradient_cost: float) -> None:
         """Keep what an episode with gradient costs, in episodes without."""
         self.attributes["gradient_cost"] = gradient_cost
-        self._keep()
+        self._write_journal()
         self._set(gradient_cost=gradient_cost)
 
     def extend(self, budget: int) -> None:
@@ -227,7 +253,7 @@ class Run:
         self._blank_rest()
         if self._written > self.told:
             self._written = self.told
-            self._keep()  # before other rows are in their place
+            self._write_journal()  # before other rows are in their place
 
     def append(
         self,
@@ -240,6 +266,7 @@ class Run:
         """Add the points of a proposal, which took so many seconds, and write them if that is due.
 
         `state` returns the optimiser once it has been told of them; without it they are rows that it does not know.
+        Raises ValueError where they are more than the budget has left.
         """
         rows = slice(self.count, self.count + len(x))
         if rows.stop > self.budget:
@@ -251,15 +278,15 @@ class Run:
         if state and self.path and time.monotonic() - self._saved_at >= self._next_save:
             self.save(state)
 
-    def hold(self, state: Callable[[], dict[str, Any]]) -> None:
+    def stage(self, state: Callable[[], dict[str, Any]]) -> None:
         """Take in the optimiser as it is once it has been told every row, to be written with the next `save`."""
-        self._state, self.told = encoded(state()), self.count
+        self._state, self.told = encode(state()), self.count
 
     def save(self, state: Callable[[], dict[str, Any]] | None = None) -> None:
         """Write what is not written yet, rows first; without a state the one held before stays."""
         began = time.monotonic()
         if state:
-            self.hold(state)
+            self.stage(state)
         if self.path:
             self._write()
         self._saved_at = time.monotonic()
@@ -278,7 +305,7 @@ class Run:
             "slope": grad.norm(dim=1).numpy(),
             "kind": int(kind),
             "episodes": self.count + number,
-            "forwards": self._last("forwards") + cost * number,
+            FORWARD_EQUIVALENTS: self._last(FORWARD_EQUIVALENTS) + cost * number,
             "seconds": self._last("seconds") + seconds,
             "status": evaluation.status.numpy(),
         }
@@ -292,35 +319,35 @@ class Run:
         if rows.stop > rows.start:
             for name, array in self._arrays().items():
                 array[rows] = self._columns[name][rows]
-        self._keep()
+        self._write_journal()
         self._written = self.count
 
-    def _keep(self) -> None:
+    def _write_journal(self) -> None:
         """Write which rows count, and the optimiser."""
         if self.path is None:
             return
         whole = self._sums[: min(self._written, self.count) // CHUNK]
         self._sums = checksums(self._columns, self.count, whole)
         about = digest_of(self.attributes)
-        Kept(self.count, self.told, self.gradient_cost, about, self._sums, self._state or b"").write(self.path)
+        Journal(self.count, self.told, self.gradient_cost, about, self._sums, self._state or b"").write(self.path)
 
     def _load(self, path: Path) -> None:
         """Read the rows that the state counts, and refuse what is not as it was written."""
-        kept, group = Kept.read(path), open_group(path)
+        journal, group = Journal.read(path), open_group(path)
         attributes = group.attrs.asdict()
-        if digest_of(attributes) != kept.about or not isinstance(attributes.get("budget"), int):
-            raise damaged(path / "zarr.json", "what the run says of itself is not what was written")
-        self.attributes = attributes | {"gradient_cost": kept.gradient_cost}
+        if digest_of(attributes) != journal.about or not isinstance(attributes.get("budget"), int):
+            raise damage_error(path / "zarr.json", "what the run says of itself is not what was written")
+        self.attributes = attributes | {"gradient_cost": journal.gradient_cost}
         self.count = self._written = 0
         self._columns = empty(CHUNK, self.dim)
-        self._make_room(kept.rows)
+        self._make_room(journal.rows)
         for name, values in self._columns.items():
-            values[: kept.rows] = read_rows(path, group, name, kept.rows, self.dim)
-        self._sums = checksums(self._columns, kept.rows, [])
-        if wrong := first_wrong(self._sums, kept):
-            raise damaged(path, f"rows {wrong[0] + 1} to {wrong[-1] + 1} are not what was written")
-        self.count = self._written = kept.rows
-        self.told, self._state = kept.told, kept.state or None
+            values[: journal.rows] = read_rows(path, group, name, journal.rows, self.dim)
+        self._sums = checksums(self._columns, journal.rows, [])
+        if wrong := find_damage(self._sums, journal):
+            raise damage_error(path, f"rows {wrong[0] + 1} to {wrong[-1] + 1} are not what was written")
+        self.count = self._written = journal.rows
+        self.told, self._state = journal.told, journal.state or None
 
     def _make_room(self, rows: int) -> None:
         """Let the columns in memory grow with the rows: a budget may be larger than what is ever used."""
@@ -352,15 +379,6 @@ class Run:
             if self.path is None or self.path.stat().st_ino == self._inode:
                 return
         raise StoreError(f"{self.path} was replaced or removed while it was being filled; run the command again")
-
-
-def open_run(path: str | Path) -> xr.Dataset:
-    """Read a run from disk as its `table`: a row for each episode that was evaluated so far.
-
-    `path` is the run, or the folder that `landscape optimize` left it in.
-    """
-    path = Path(path)
-    return Run.open(path / RUN if (path / RUN).exists() else path).table()
 
 
 def check_replaceable(path: Path) -> None:

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from gradscape.envs.base import Environment
 from gradscape.landscapes.objective import Evaluation
-from gradscape.optim.run import Run
+from gradscape.optim.runs.store import RunStore
 
-from .clock import Clock
-from .command import Said, modules
-from .processes import Instant, alone, landscape
+from ..clock import Clock
+from ..command import Said, modules
+from ..processes import Instant, alone, landscape
 
 QUICK = ["optimize", "branin", "--method", "cma-es", "--budget", "50"]
 
@@ -30,7 +30,7 @@ def test_optimize_leaves_run_picture_and_summary(run: Callable[..., Said], tmp_p
     assert (summary["env"], summary["method"], summary["seed"]) == ("branin", "cma-es", 0)
     assert summary["method_options"] == {"sigma": 0.5, "population": 7}
     assert summary["episodes"] == summary["status"]["ok"] == summary["kinds"]["population"] == 50
-    table = Run.open(tmp_path / "run/run.zarr").table()
+    table = RunStore.open(tmp_path / "run/run.zarr").dataset()
     row = summary["best"]["episode"] - 1
     assert summary["best"]["loss"] == float(table["loss"].min()) == float(table["loss"][row])
     assert summary["best"]["x"] == table["x"][row].values.tolist()
@@ -164,11 +164,11 @@ def test_sigkill_at_several_moments_changes_no_bit(run: Callable[..., Said], tmp
     assert run(*LONG, cwd=tmp_path / "whole").returncode == 0
     for instant in (Instant(1), Instant(1, "loss/c"), Instant(4, ".state"), Instant(5, "loss/c")):
         assert alone(search, tmp_path / "killed", instant).returncode == -signal.SIGKILL
-    kept = Run.open(tmp_path / "killed/run/run.zarr").count
+    kept = RunStore.open(tmp_path / "killed/run/run.zarr").count
     resumed = json.loads(run(*LONG, cwd=tmp_path / "killed").stdout)
     assert 0 < resumed["resumed"] == kept < BUDGET
     assert resumed["episodes"] + resumed["resumed"] == BUDGET
-    one, two = (Run.open(tmp_path / name / "run/run.zarr").table() for name in ("whole", "killed"))
+    one, two = (RunStore.open(tmp_path / name / "run/run.zarr").dataset() for name in ("whole", "killed"))
     xr.testing.assert_equal(one.drop_vars("seconds"), two.drop_vars("seconds"))
 
 
@@ -177,7 +177,7 @@ def test_interrupt_ends_cleanly_and_says_how_to_go_on(tmp_path: Path) -> None:
     assert done.returncode == 130
     assert done.stdout == ""
     assert "Traceback" not in done.stderr
-    kept = Run.open(tmp_path / "run/run.zarr").count
+    kept = RunStore.open(tmp_path / "run/run.zarr").count
     assert f"stopped: {kept} of {BUDGET} episodes are kept in run" in done.stderr
     assert "the same command goes on from there: landscape optimize rastrigin" in done.stderr
     assert 0 < kept < BUDGET

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gradscape.optim.run import Run
+from gradscape.optim.runs.store import RunStore
 
-from .command import Said
-from .processes import Instant, alone, landscape
+from ..command import Said
+from ..processes import Instant, alone, landscape
 
 RACE = ["race", "branin", "--methods", "random,cma-es", "--methods", "descents", "--budget", "40", "--seeds", "3"]
 
@@ -27,7 +27,7 @@ def test_race_leaves_runs_picture_and_figures(run: Callable[..., Said], tmp_path
     assert "360 episodes to compute" in done.stderr
     assert (tmp_path / "r/race.png").read_bytes().startswith(b"\x89PNG")
     for rank in kept["ranks"]:
-        runs = [Run.open(tmp_path / f"r/{rank['method']}-{seed}/run.zarr").table() for seed in range(3)]
+        runs = [RunStore.open(tmp_path / f"r/{rank['method']}-{seed}/run.zarr").dataset() for seed in range(3)]
         assert [table.sizes["evaluation"] for table in runs] == [40, 40, 40]
         assert rank["final"] == [float(table["loss"].min()) for table in runs]
         for cost in ("episodes", "forwards", "seconds"):

@@ -19,7 +19,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
-from operator import attrgetter
 from typing import Any, ClassVar
 
 import gymnasium
@@ -31,14 +30,19 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import Tensor
 
-from ..landscapes.objective import Objective
-from .base import Kind, Optimizer, Points, Proposal
+from ...landscapes.objective import Objective
+from ..base import Kind, Optimizer, Points, Proposal
+from ..memory import SearchSize
+from ..options import MethodOptions, number
 from .magnitude import LARGE
-from .options import MethodOptions, number
+from .weights import put_weights, read_weights
 
 LAYERS = (64, 64, 64)  # CoRL 2022, appendix C
-_GLOBAL = threading.Lock()  # held while the process's generators are an optimiser's own
+_GENERATORS = threading.Lock()  # held while the process's generators are an optimiser's own
 
+ROLLOUT = 40e3  # bytes for each episode of a rollout: an environment of Stable-Baselines3 2.7
+FEATURES = 64  # numbers that a policy sees, at most, in our scenes
+ROW = 10e3  # bytes of a policy's networks for each transition of a batch
 FAR = 1e18  # deviations: farther rewards are cut off, for their squares would be no float32
 Numbers = NDArray[np.float32]
 
@@ -115,7 +119,7 @@ class PolicySearch(Optimizer):
         self._model: Any = None
         self._objective: Any = None
         self._scale: tuple[float, float] | None = None  # mean and deviation of the first episodes' losses
-        self._generators = _seeded(int(self.random.integers(1 << 32)))
+        self._generators = _seed_generators(int(self.random.integers(1 << 32)))
 
     def attach(self, objective: Objective) -> None:
         """Take the objective that the policy plays in."""
@@ -127,7 +131,7 @@ class PolicySearch(Optimizer):
                 f"got {self.space.dim} parameters for {self.decisions} decisions"
             )
         if self._model is None:
-            features = self._seen(self.space.center[None], 0).shape[1]
+            features = self._observe(self.space.center[None], 0).shape[1]
             with self._own_randomness():
                 self._model = self._untrained(_Spaces(features, self.space.dim // self.decisions))
 
@@ -143,7 +147,7 @@ class PolicySearch(Optimizer):
     def _learn(self, rollout: Rollout, rewards: Numbers) -> None:
         """Train on episodes that ended with these rewards, shape (episode,)."""
 
-    def _played(self, episodes: int) -> Rollout:
+    def _play(self, episodes: int) -> Rollout:
         """Play episodes side by side."""
         if self._objective is None:
             raise ValueError(f"{self.name} plays in the objective itself; attach it before the first ask")
@@ -151,7 +155,7 @@ class PolicySearch(Optimizer):
         z = torch.zeros(episodes, self.decisions, self.space.dim // self.decisions, dtype=torch.float64)
         seen, actions = [], []
         for decision in range(self.decisions):
-            seen.append(self._seen(self.space.from_unit((z.flatten(start_dim=1) + 1) / 2), decision))
+            seen.append(self._observe(self.space.from_unit((z.flatten(start_dim=1) + 1) / 2), decision))
             with self._own_randomness(), torch.no_grad():
                 actions.append(self._act(torch.from_numpy(seen[-1])).numpy())
             self._refuse_diverged([torch.from_numpy(actions[-1])])
@@ -166,7 +170,7 @@ class PolicySearch(Optimizer):
             )
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
-        losses = self.penalised(loss)
+        losses = self.penalise(loss)
         if self._scale is None:
             self._scale = _mean_and_deviation(losses)
         mean, deviation = self._scale
@@ -177,7 +181,7 @@ class PolicySearch(Optimizer):
             self._learn(self._rollout, rewards.astype(np.float32))
         del self._rollout
 
-    def _seen(self, x: Tensor, decision: int) -> Numbers:
+    def _observe(self, x: Tensor, decision: int) -> Numbers:
         """Return what is seen before a decision, shape (episode, feature); a zero where there is only one."""
         if self.decisions == 1:
             return np.zeros((len(x), 1), dtype=np.float32)
@@ -185,12 +189,12 @@ class PolicySearch(Optimizer):
 
     @contextmanager
     def _own_randomness(self) -> Iterator[None]:
-        with _GLOBAL:
-            others = _exchanged(self._generators)
+        with _GENERATORS:
+            others = _exchange(self._generators)
             try:
                 yield
             finally:
-                self._generators = _exchanged(others)
+                self._generators = _exchange(others)
 
     def _state(self) -> dict[str, Any]:
         torchs, numpys = self._generators
@@ -198,14 +202,14 @@ class PolicySearch(Optimizer):
             "scale": self._scale,
             "torch": torchs.numpy(),
             "numpy": numpys,
-            "weights": None if self._model is None else _weights(self._model),
+            "weights": None if self._model is None else read_weights(self._model),
         }
 
     def _restore(self, own: Mapping[str, Any]) -> None:
         self._scale = own["scale"] and tuple(own["scale"])
         self._generators = torch.from_numpy(own["torch"]), dict(own["numpy"])
         if own["weights"] is not None:
-            _put_weights(self._model, own["weights"])
+            put_weights(self._model, own["weights"])
 
 
 class PPO(PolicySearch):
@@ -214,6 +218,12 @@ class PPO(PolicySearch):
     name: ClassVar[str] = "ppo"
     Options: ClassVar[type[Any]] = PPOOptions
     algorithm: ClassVar[Any] = sb3.PPO
+
+    @classmethod
+    def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
+        """Estimate what a rollout and the networks take [bytes]."""
+        each = ROLLOUT + size.decisions * _transition_memory(size)
+        return float(options["episodes"] * each + _network_memory(size))
 
     def _untrained(self, spaces: gymnasium.Env[Any, Any]) -> sb3.PPO:
         o = self.options
@@ -230,7 +240,7 @@ class PPO(PolicySearch):
         )
 
     def _ask(self) -> Proposal:
-        self._rollout = self._played(self.options.episodes)
+        self._rollout = self._play(self.options.episodes)
         return Proposal(torch.from_numpy(self._rollout.executed()), Kind.POLICY)
 
     def _act(self, seen: Tensor) -> Tensor:
@@ -256,6 +266,12 @@ class SAC(PolicySearch):
     Options: ClassVar[type[Any]] = SACOptions
     algorithm: ClassVar[Any] = sb3.SAC
 
+    @classmethod
+    def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
+        """Estimate what the replay buffer, a batch and the networks take [bytes]."""
+        transitions = options["memory"] + options["warmup"] * size.decisions
+        return float(transitions * _transition_memory(size) + options["batch"] * ROW + _network_memory(size))
+
     def _setup(self) -> None:
         super()._setup()
         self._remembered: list[tuple[Rollout, Numbers]] = []
@@ -274,7 +290,7 @@ class SAC(PolicySearch):
         )
 
     def _ask(self) -> Proposal:
-        self._rollout = self._played(1 if self._remembered else self.options.warmup)
+        self._rollout = self._play(1 if self._remembered else self.options.warmup)
         kind = Kind.POLICY if self._remembered else Kind.RANDOM
         return Proposal(torch.from_numpy(self._rollout.executed()), kind)
 
@@ -316,6 +332,16 @@ class SAC(PolicySearch):
             self._remember(*self._remembered[0])
 
 
+def _transition_memory(size: SearchSize) -> float:
+    """Return the bytes of what is seen before and after an action, and of the action, in float32."""
+    return 4 * (2 * FEATURES + size.dim // size.decisions + 10)
+
+
+def _network_memory(size: SearchSize) -> float:
+    """Return the bytes of a policy, its critics and their optimisers' moments."""
+    return 4 * 64 * 20 * (FEATURES + size.dim // size.decisions)
+
+
 class _Spaces(gymnasium.Env[Any, Any]):
     """Say what is seen and done; the episodes themselves are played by the optimiser."""
 
@@ -330,55 +356,15 @@ def _mean_and_deviation(losses: Points) -> tuple[float, float]:
     return float((losses / large).mean() * large), float((losses / large).std() * large) or 1.0
 
 
-def _seeded(seed: int) -> tuple[Tensor, dict[str, Any]]:
+def _seed_generators(seed: int) -> tuple[Tensor, dict[str, Any]]:
     """Return the states of torch's and of numpy's global generator after seeding them."""
     numbers: dict[str, Any] = np.random.RandomState(seed).get_state(legacy=False)
     return torch.Generator().manual_seed(seed).get_state(), numbers
 
 
-def _exchanged(states: tuple[Tensor, dict[str, Any]]) -> tuple[Tensor, dict[str, Any]]:
+def _exchange(states: tuple[Tensor, dict[str, Any]]) -> tuple[Tensor, dict[str, Any]]:
     """Put the global generators into other states, and return those they were in."""
     before = torch.get_rng_state(), np.random.get_state(legacy=False)
     torch.set_rng_state(states[0])
     np.random.set_state(states[1])
     return before
-
-
-def _weights(model: Any) -> dict[str, Any]:
-    """Return the weights of a model's networks and what its optimisers have gathered about them, as arrays."""
-    return {name: _arrays(_inner(part)) for name, part in _parts(model).items()}
-
-
-def _put_weights(model: Any, weights: Mapping[str, Any]) -> None:
-    """Put what `_weights` returned into a model that was made by the same options."""
-    for name, part in _parts(model).items():
-        if isinstance(part, Tensor):
-            part.data.copy_(torch.from_numpy(weights[name]))
-        elif isinstance(part, torch.optim.Optimizer):
-            gathered = {int(number): _tensors(of) for number, of in weights[name].items()}
-            part.load_state_dict({**part.state_dict(), "state": gathered})
-        else:
-            part.load_state_dict(_tensors(weights[name]))
-
-
-def _parts(model: Any) -> dict[str, Any]:
-    """Return the networks, optimisers and single tensors of a model by SB3's names of them."""
-    names, tensors = model._get_torch_save_params()
-    return {name: attrgetter(name)(model) for name in (*names, *tensors)}
-
-
-def _inner(part: Any) -> Any:
-    if isinstance(part, Tensor):
-        return part
-    return part.state_dict()["state"] if isinstance(part, torch.optim.Optimizer) else part.state_dict()
-
-
-def _arrays(value: Any) -> Any:
-    """Return tensors, and mappings of them, as arrays under names."""
-    if isinstance(value, Mapping):
-        return {str(name): _arrays(inner) for name, inner in value.items()}
-    return value.detach().numpy()
-
-
-def _tensors(arrays: Mapping[str, Any]) -> dict[str, Tensor]:
-    return {name: torch.from_numpy(array) for name, array in arrays.items()}

@@ -15,7 +15,7 @@ import gradscape
 from gradscape.cli import main
 from gradscape.landscapes.overlay import best_point, overlay
 from gradscape.landscapes.storage.store import plane_of
-from gradscape.optim.run import Run
+from gradscape.optim.runs.store import RunStore
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def test_a_race_is_laid_over_a_slice(run: Callable[..., Said], tmp_path: Path) -
     assert done.returncode == 0, done.stderr
     assert sorted(file.name for file in Path("over").iterdir()) == ["overlay.png", "overlay.rrd"]
     assert (tmp_path / "over/overlay.png").read_bytes().startswith(b"\x89PNG")
-    tables = [Run.open(path / "run.zarr").table() for path in sorted(Path("race").iterdir())]
+    tables = [RunStore.open(path / "run.zarr").dataset() for path in sorted(Path("race").iterdir())]
     away = max(float(laid["distance"].max()) for laid in overlay(gradscape.open_slice("cut/slice.zarr"), tables))
     assert f"2 runs, 40 points: 0 beyond the map, 0 failed; the farthest is {away:.2g} half-widths" in done.stderr
     assert run("overlay cut race").returncode == 0
@@ -86,7 +86,7 @@ def test_a_slice_cut_through_the_best_point_shows_its_loss(run: Callable[..., Sa
     assert done.returncode == 0, done.stderr
     (folder,) = (path for path in Path("over").iterdir() if path.is_dir())
     dataset = gradscape.open_slice(folder / "slice.zarr")
-    tables = [Run.open(path / "run.zarr").table() for path in sorted(Path("race").iterdir())]
+    tables = [RunStore.open(path / "run.zarr").dataset() for path in sorted(Path("race").iterdir())]
     x, loss = best_point(tables)
     plane, before = plane_of(dataset), plane_of(gradscape.open_slice("cut/slice.zarr"))
     assert float(plane.distance(x)) < 1e-12
@@ -103,7 +103,7 @@ def test_a_principal_plane_lies_nearer_to_the_run_than_the_slice_did(run: Callab
     done = run("overlay cut race/cma-es-0 --plane pca --resolution 4 --out over --device cpu")
     assert done.returncode == 0, done.stderr
     (folder,) = (path for path in Path("over").iterdir() if path.is_dir())
-    table = Run.open("race/cma-es-0/run.zarr").table()
+    table = RunStore.open("race/cma-es-0/run.zarr").dataset()
     slices = (gradscape.open_slice(path) for path in (folder / "slice.zarr", "cut/slice.zarr"))
     principal, before = (overlay(dataset, [table])[0] for dataset in slices)
     assert float((principal["distance"] ** 2).sum()) < float((before["distance"] ** 2).sum())

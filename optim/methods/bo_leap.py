@@ -11,13 +11,14 @@ import numpy as np
 import torch
 from cma.sigma_adaptation import CMAAdaptSigmaCSA
 
-from .base import Kind, Optimizer, Points, Proposal
-from .cmaes import Normal
+from ..base import Kind, Optimizer, Points, Proposal
+from ..memory import SearchSize
+from ..options import MANY, number
+from .cmaes import Normal, population_memory
 from .descent import Descent, DescentOptions
-from .options import MANY, number
-from .surrogate import Surrogate, SurrogateOptions
+from .surrogate import Surrogate, SurrogateOptions, surrogate_memory
 
-MOST = np.finfo(float).max / 4  # what a failure counts as: pycma adds two of them
+LARGEST_LOSS = np.finfo(float).max / 4  # what a failure counts as: pycma adds two of them
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,11 @@ class BOLeap(Optimizer):
     Options = BOLeapOptions
     needs_grad = True
 
+    @classmethod
+    def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
+        """Estimate what process and populations take [bytes]."""
+        return surrogate_memory(options["max_points"], size) + population_memory(options["population"], size.dim)
+
     def _setup(self) -> None:
         if self.space.dim < 2:
             raise ValueError(f"bo-leap searches two parameters or more; this space has {self.space.dim}")
@@ -71,8 +77,8 @@ class BOLeap(Optimizer):
         if self.descent is not None:
             return Proposal(torch.from_numpy(self.descent.at[None]), Kind.DESCENT, grad=True)
         if self.local is None or self.spent >= self.options.local_budget:
-            self.local, self.spent = SemiLocal(self.surrogate.lowest(self.random), self.options, self.random), 0
-        return Proposal(torch.from_numpy(self.local.population()), Kind.POPULATION)
+            self.local, self.spent = SemiLocal(self.surrogate.minimise(self.random), self.options, self.random), 0
+        return Proposal(torch.from_numpy(self.local.draw()), Kind.POPULATION)
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
         assert self.local is not None  # as asked
@@ -97,8 +103,8 @@ class BOLeap(Optimizer):
 
     def _restore(self, own: Mapping[str, Any]) -> None:
         self.surrogate.restore(own["surrogate"])
-        self.local = own["local"] and SemiLocal.restored(own["local"], self.options, self.random)
-        self.descent = own["descent"] and Descent.restored(own["descent"], self.options)
+        self.local = own["local"] and SemiLocal.from_state(own["local"], self.options, self.random)
+        self.descent = own["descent"] and Descent.from_state(own["descent"], self.options)
         self.spent = int(own["spent"])
 
 
@@ -138,14 +144,14 @@ class SemiLocal:
         weights = self.es.sp.weights
         self.es.sm.parameters(weights.mueff, weights.lambda_)["c1"] = 2.0 / (dim + np.sqrt(2.0)) ** 2
 
-    def population(self) -> Points:
+    def draw(self) -> Points:
         """Draw x_k ~ N(mu, sigma^2 C), shape (population, dim)."""
         return np.stack(self.es.ask())
 
     def tell(self, x: Points, loss: Points) -> Points:
         """Adapt sigma and C to a population, and return the mean of its best points."""
         self._told.append((x, loss))
-        self.es.tell(list(x), list(loss.clip(-MOST, MOST)), check_points=False)
+        self.es.tell(list(x), list(loss.clip(-LARGEST_LOSS, LARGEST_LOSS)), check_points=False)
         return np.array(self.es.mean)
 
     def leap(self, mu: Points) -> None:
@@ -165,16 +171,16 @@ class SemiLocal:
         }
 
     @classmethod
-    def restored(cls, state: Mapping[str, Any], options: BOLeapOptions, random: np.random.Generator) -> SemiLocal:
+    def from_state(cls, state: Mapping[str, Any], options: BOLeapOptions, random: np.random.Generator) -> SemiLocal:
         """Return the search that had this state, by telling it all again."""
         random.bit_generator.state = state["began"]
-        made = cls(state["start"], options, random)
+        local = cls(state["start"], options, random)
         for turn, (points, loss) in enumerate(zip(state["points"], state["losses"], strict=True)):
-            made.population()
-            made.tell(points, loss)
+            local.draw()
+            local.tell(points, loss)
             if turn < len(state["leaps"]):
-                made.leap(state["leaps"][turn])
-        return made
+                local.leap(state["leaps"][turn])
+        return local
 
 
 class PathLength(CMAAdaptSigmaCSA):  # type: ignore[misc]

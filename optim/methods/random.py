@@ -6,9 +6,9 @@ from typing import ClassVar
 
 import torch
 
-from .base import Kind, NoOptions, Optimizer, Points, Proposal
+from ..base import Kind, NoOptions, Optimizer, Points, Proposal
 
-TOGETHER = 16  # points of a proposal: a simulator is quicker at several at once
+BATCH_SIZE = 16  # points of a proposal: a simulator is quicker at several at once
 
 
 class RandomSearch(Optimizer):
@@ -18,7 +18,7 @@ class RandomSearch(Optimizer):
     Options: ClassVar[type[NoOptions]] = NoOptions
 
     def _ask(self) -> Proposal:
-        return Proposal(torch.from_numpy(self.random.uniform(-1.0, 1.0, (TOGETHER, self.space.dim))), Kind.RANDOM)
+        return Proposal(torch.from_numpy(self.random.uniform(-1.0, 1.0, (BATCH_SIZE, self.space.dim))), Kind.RANDOM)
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
         pass

@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -22,13 +23,14 @@ from numpy.typing import NDArray
 from scipy.stats import rankdata
 
 from .base import Kind
+from .runs.arrays import FORWARD_EQUIVALENTS, stored_record
 
-COSTS = ("episodes", "forwards", "seconds")
+COSTS = ("episodes", FORWARD_EQUIVALENTS, "seconds")
 RESAMPLES = 10_000
-LEVEL = (2.5, 97.5)  # percentiles
+PERCENTILES = (2.5, 97.5)  # of the resampled means, where an interval ends
 TARGETS = 50
 DECADE = 10.0  # targets and axes are logarithmic where losses are positive and span at least this factor
-AT_ONCE = 128  # columns resampled together, to bound memory
+COLUMNS_AT_ONCE = 128  # columns resampled together, to bound memory
 
 Array = NDArray[np.float64]
 Tables = Mapping[str, Sequence[xr.Dataset]]  # method -> one run's table per seed, all of the same length
@@ -58,7 +60,7 @@ class Rank:
     """How a method came off in the end: ranks are 1 for the best, ties share theirs; NaN where there is none.
 
     `wins` counts the seeds in which no method was better; `unsuccessful` those without one successful episode; `failed`
-    the episodes that failed; `forwards` and `seconds` are the mean cost of a run.
+    the episodes that failed; `forward_equivalents` and `seconds` are the mean cost of a run.
     """
 
     method: str
@@ -72,7 +74,7 @@ class Rank:
     high: float
     unsuccessful: int
     failed: int
-    forwards: float
+    forward_equivalents: float
     seconds: float
 
 
@@ -95,6 +97,57 @@ class Difference:
     def reversed(self) -> Difference:
         """The same difference, seen from the second method."""
         return Difference(self.second, self.first, -self.mean, -self.high, -self.low)
+
+
+@dataclass(frozen=True)
+class Shares:
+    """The share of targets reached as a step function of episodes: `share[i]` from `episodes[i]` on."""
+
+    episodes: list[float]
+    share: list[float]
+
+    @classmethod
+    def of(cls, hits: Array) -> Shares:
+        """Return the share of hits, NaN where there is none, that had come by each episode."""
+        reached = np.sort(hits[np.isfinite(hits)])
+        return cls(reached.tolist(), (np.arange(1, len(reached) + 1) / hits.size).tolist())
+
+
+@dataclass(frozen=True, eq=False)
+class RaceStatistics:
+    """All figures of a race: ranks, the best first, differences of every two methods, targets, and by method curves.
+
+    `ecdf` is the share of pairs of target and seed reached, `curves` the mean best loss against each of `COSTS`.
+    """
+
+    ranks: list[Rank]
+    differences: list[Difference]
+    targets: Targets
+    ecdf: dict[str, Shares]
+    curves: dict[str, dict[str, Curve]]
+
+    @classmethod
+    def of(cls, tables: Tables) -> RaceStatistics:
+        """Compute the figures of runs."""
+        goals = targets(tables)
+        curves = {cost: {method: curve(runs, cost) for method, runs in tables.items()} for cost in COSTS}
+        ecdf = {method: Shares.of(hits(runs, goals)) for method, runs in tables.items()}
+        return cls(ranks(tables), differences(tables), goals, ecdf, curves)
+
+    def record(self) -> dict[str, Any]:
+        """Return the figures as JSON has them."""
+        return {
+            "ranks": [stored_record(rank) for rank in self.ranks],
+            "differences": [asdict(one) | {"better": one.better} for one in self.differences],
+            "targets": asdict(self.targets) | {"loss": self.targets.loss.tolist()},
+            "ecdf": {method: asdict(shares) for method, shares in self.ecdf.items()},
+            "curves": {
+                cost: {
+                    method: {key: values.tolist() for key, values in asdict(one).items()} for method, one in by.items()
+                }
+                for cost, by in self.curves.items()
+            },
+        }
 
 
 def best_so_far(loss: Array) -> Array:
@@ -179,7 +232,7 @@ def _rank(method: str, runs: Sequence[xr.Dataset], places: Array, won: NDArray[n
         high=float(high),
         unsuccessful=int(np.isnan(final).sum()),
         failed=sum(int(np.isnan(run["loss"]).sum()) for run in runs),
-        forwards=float(np.mean([run["forwards"][-1] for run in runs])),
+        forward_equivalents=float(np.mean([run[FORWARD_EQUIVALENTS][-1] for run in runs])),
         seconds=float(np.mean([run["seconds"][-1] for run in runs])),
     )
 
@@ -209,9 +262,9 @@ def _percentiles(values: Array, weights: Array) -> tuple[Array, Array]:
     columns = values.reshape(len(values), -1)
     ends = np.full((2, columns.shape[1]), np.nan)
     known = np.flatnonzero(np.isfinite(columns).all(axis=0)) if len(values) > 1 else np.empty(0, int)
-    for start in range(0, len(known), AT_ONCE):
-        some = known[start : start + AT_ONCE]
-        ends[:, some] = np.percentile(weights @ columns[:, some], LEVEL, axis=0)
+    for start in range(0, len(known), COLUMNS_AT_ONCE):
+        some = known[start : start + COLUMNS_AT_ONCE]
+        ends[:, some] = np.percentile(weights @ columns[:, some], PERCENTILES, axis=0)
     return ends[0].reshape(values.shape[1:]), ends[1].reshape(values.shape[1:])
 
 

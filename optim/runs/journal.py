@@ -1,6 +1,6 @@
-"""The file `state` of a run: which rows count and what they are to be, and what the optimiser goes on from.
+"""The journal of a run, its file `state`: which rows count, their checksums, and what the optimiser goes on from.
 
-Its first line is the SHA-256 digest of all that follows, its second a JSON object, and the rest what `state.encoded`
+Its first line is the SHA-256 digest of all that follows, its second a JSON object, and the rest what `state.encode`
 wrote. A file that is not what was written is refused, whatever became of it.
 """
 
@@ -17,8 +17,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from ..landscapes.identity import StoreError
-from ..landscapes.storage.files import replacing
+from ...landscapes.identity import StoreError
+from ...landscapes.storage.files import replacing
 
 STATE = "state"
 CHUNK = 64  # rows
@@ -26,7 +26,7 @@ CHANGING = {"budget", "gradient_cost"}  # attributes of a run that are not what 
 
 
 @dataclass(frozen=True)
-class Kept:
+class Journal:
     """What the file holds.
 
     `rows` are there, `told` of them the optimiser has been told; `sums` are the checksums of every 64 of them.
@@ -48,22 +48,22 @@ class Kept:
             partial.write_bytes(hashlib.sha256(content).hexdigest().encode() + b"\n" + content)
 
     @classmethod
-    def read(cls, run: Path) -> Kept:
+    def read(cls, run: Path) -> Journal:
         """Read the file of a run; StoreError, which names it, where it is missing or not what was written."""
         try:
             digest, _, content = (run / STATE).read_bytes().partition(b"\n")
         except OSError as error:
-            raise damaged(run / STATE, f"it cannot be read ({error.strerror})") from None
+            raise damage_error(run / STATE, f"it cannot be read ({error.strerror})") from None
         if digest.decode(errors="replace") != hashlib.sha256(content).hexdigest():
-            raise damaged(run / STATE, "it is not what was written")
+            raise damage_error(run / STATE, "it is not what was written")
         head, _, state = content.partition(b"\n")
         try:
             return cls(**(json.loads(head) | {"state": state}))
         except (TypeError, ValueError) as error:
-            raise damaged(run / STATE, str(error)) from None
+            raise damage_error(run / STATE, str(error)) from None
 
 
-def damaged(path: Path, why: str) -> StoreError:
+def damage_error(path: Path, why: str) -> StoreError:
     """Return the error that says of a run, or of a file in it, that it is not what was written."""
     return StoreError(f"{path} is damaged: {why}; restore it, or begin the run anew in another folder")
 
@@ -88,9 +88,9 @@ def checksums(columns: Mapping[str, NDArray[Any]], count: int, known: list[int])
     return found
 
 
-def first_wrong(sums: list[int], kept: Kept) -> range | None:
-    """Return the first rows whose checksum is not the one that was kept, None where all are right."""
-    for low, pair in zip(range(0, kept.rows, CHUNK), zip_longest(sums, kept.sums), strict=False):
+def find_damage(sums: list[int], journal: Journal) -> range | None:
+    """Return the first rows whose checksum is not the journal's, None where all are right."""
+    for low, pair in zip(range(0, journal.rows, CHUNK), zip_longest(sums, journal.sums), strict=False):
         if len({*pair}) > 1:
-            return range(low, min(low + CHUNK, kept.rows))
+            return range(low, min(low + CHUNK, journal.rows))
     return None

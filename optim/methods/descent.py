@@ -10,8 +10,9 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from .base import Kind, Optimizer, Points, Proposal
-from .options import MANY, MethodOptions, number
+from ..base import Kind, Optimizer, Points, Proposal
+from ..memory import FLOAT, SearchSize
+from ..options import MANY, MethodOptions, number
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,7 @@ class DescentOptions(MethodOptions):
     """How a descent moves in the box scaled to [-1, 1], and when it ends.
 
     `step` [scaled parameter^2 / loss unit] is what gradients are multiplied by. A move whose largest component exceeds
-    `longest` is shortened to it; below that the step is plain. Both shrink by the factor `shrink` wherever the loss
+    `max_step` is shortened to it; below that the step is plain. Both shrink by the factor `shrink` wherever the loss
     has risen (1: never), or one step could not do for scenes whose gradients differ by a factor of a thousand. A
     descent ends after `steps` iterates, or when the loss has failed more than `patience` times in a row to fall below
     the best so far by `tolerance`, a fraction of it.
@@ -28,7 +29,7 @@ class DescentOptions(MethodOptions):
     method = "a descent"
 
     step: float = number(1.0, 1e-300, 1e300)
-    longest: float = number(0.2, 1e-12, 1000)
+    max_step: float = number(0.2, 1e-12, 1000)
     shrink: float = number(0.5, 1e-12, 1)
     steps: int = number(20, 1, MANY)
     patience: int = number(3, 0, MANY)
@@ -61,7 +62,7 @@ class Descent:
         self._stalled = 0 if improved else self._stalled + 1
         self._scale *= self.options.shrink if loss > self._last_loss else 1.0
         self.best = min(self.best, loss)
-        moved = self._moved(grad)
+        moved = self._move(grad)
         self.done = (
             self._stalled > self.options.patience
             or self._evaluated >= self.options.steps
@@ -75,31 +76,31 @@ class Descent:
         return {name: value for name, value in vars(self).items() if name != "options"}
 
     @classmethod
-    def restored(cls, state: Mapping[str, Any], options: DescentOptions) -> Self:
+    def from_state(cls, state: Mapping[str, Any], options: DescentOptions) -> Self:
         """Return the descent that had this state."""
-        made = cls(state["at"], options)
-        for name in made.state():
-            setattr(made, name, state[name])
-        return made
+        descent = cls(state["at"], options)
+        for name in descent.state():
+            setattr(descent, name, state[name])
+        return descent
 
-    def _moved(self, grad: Points) -> Points:
+    def _move(self, grad: Points) -> Points:
         """Return z - step * gradient, kept inside the box."""
         with np.errstate(over="ignore"):
             move = -self.options.step * grad
-            excess = float(np.abs(move).max()) / self.options.longest
+            excess = float(np.abs(move).max()) / self.options.max_step
         if not math.isfinite(excess):  # too long to be counted: its direction is all that matters
             finite = np.nan_to_num(grad)
-            move, excess = -self.options.longest * (finite / np.abs(finite).max()), 1.0
+            move, excess = -self.options.max_step * (finite / np.abs(finite).max()), 1.0
         return np.clip(self.at + self._scale * move / max(excess, 1.0), -1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class DescentsOptions(DescentOptions):
-    """`together` descents are evaluated as one batch, 1 for one after the other."""
+    """`batch_size` descents are evaluated as one batch, 1 for one after the other."""
 
     method = "descents"
 
-    together: int = number(4, 1, 10_000)
+    batch_size: int = number(4, 1, 10_000)
 
 
 class Descents(Optimizer):
@@ -109,8 +110,13 @@ class Descents(Optimizer):
     Options = DescentsOptions
     needs_grad = True
 
+    @classmethod
+    def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
+        """Estimate what the descents of a batch take [bytes]."""
+        return float(options["batch_size"] * (1000 + 20 * FLOAT * size.dim))
+
     def _setup(self) -> None:
-        self.descents = [self._begun() for _ in range(self.options.together)]
+        self.descents = [self._begin() for _ in range(self.options.batch_size)]
 
     def _ask(self) -> Proposal:
         return Proposal(torch.from_numpy(np.stack([one.at for one in self.descents])), Kind.DESCENT, grad=True)
@@ -119,13 +125,13 @@ class Descents(Optimizer):
         assert grad is not None  # as asked
         for descent, one_loss, one_grad in zip(self.descents, loss, grad, strict=True):
             descent.tell(float(one_loss), one_grad)
-        self.descents = [self._begun() if one.done else one for one in self.descents]
+        self.descents = [self._begin() if one.done else one for one in self.descents]
 
     def _state(self) -> dict[str, Any]:
         return {"descents": [one.state() for one in self.descents]}
 
     def _restore(self, own: Mapping[str, Any]) -> None:
-        self.descents = [Descent.restored(one, self.options) for one in own["descents"]]
+        self.descents = [Descent.from_state(one, self.options) for one in own["descents"]]
 
-    def _begun(self) -> Descent:
+    def _begin(self) -> Descent:
         return Descent(self.random.uniform(-1.0, 1.0, self.space.dim), self.options)
