@@ -7,12 +7,9 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from .api.environments import list_envs
-<<<<<<< HEAD
     from .api.measure import check, pairs, report, tradeoff
-=======
     from .api.overlay import overlay
     from .api.search import open_run, optimize, race
->>>>>>> main
     from .api.slice import open_slice, slice
     from .envs.base import Environment, Fidelity
     from .envs.registry import make, register
@@ -48,13 +45,10 @@ _HOMES = {
     "make": "envs.registry",
     "open_run": "api.search",
     "open_slice": "api.slice",
-<<<<<<< HEAD
-    "pairs": "api.measure",
-=======
     "optimize": "api.search",
     "overlay": "api.overlay",
+    "pairs": "api.measure",
     "race": "api.search",
->>>>>>> main
     "register": "envs.registry",
     "report": "api.measure",
     "sample": "landscapes.sampling.fill",
@@ -83,13 +77,10 @@ __all__ = [
     "make",
     "open_run",
     "open_slice",
-<<<<<<< HEAD
-    "pairs",
-=======
     "optimize",
     "overlay",
+    "pairs",
     "race",
->>>>>>> main
     "register",
     "report",
     "sample",
