@@ -14,26 +14,17 @@ from typer.core import TyperGroup
 
 from . import __version__
 from .commands import gallery
-<<<<<<< HEAD
-from .commands import verbs_search as search
-=======
->>>>>>> main
 from .commands.bench import bench
 from .commands.check import check
 from .commands.dims import TakesDims
 from .commands.envs import envs
 from .commands.export import export
 from .commands.info import info
-<<<<<<< HEAD
-from .commands.pairs import pairs
-from .commands.plan import plan
-=======
 from .commands.optimize import methods, optimize
 from .commands.overlay import overlay
 from .commands.pairs import pairs
 from .commands.plan import plan
 from .commands.race import race
->>>>>>> main
 from .commands.replay import replay
 from .commands.report import report_
 from .commands.slice import bounce, slice_
@@ -68,11 +59,7 @@ STOPPED = 130  # the exit code of what Ctrl-C has ended
 LONG = 200  # characters of a path that an error shows
 _VERBS = (
     envs, info, slice_, sweep,
-<<<<<<< HEAD
-    search.methods, search.optimize, search.race, search.overlay,
-=======
     methods, optimize, race, overlay,
->>>>>>> main
     surface, replay, export, view, bounce,
     plan, bench, check, tradeoff, pairs, report_,
 )  # fmt: skip

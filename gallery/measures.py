@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import shutil
-<<<<<<< HEAD
-from typing import TYPE_CHECKING, Any
-=======
 from typing import TYPE_CHECKING
->>>>>>> main
 
 from ..envs.registry import environment_class
 from ..jobs.scene import SceneSpec
@@ -53,25 +49,8 @@ class ReportPart(Part):
 
     def make(self, watch: Watch) -> str:
         """Measure the slice, in the place of a report of another one."""
-        from ..landscapes.draw.film import lighten
-<<<<<<< HEAD
-
-        for name in (REPORT, MEASURES, QUALITY, QUALITY_ARRAYS):
-            (self.folder / name).unlink(missing_ok=True)
-        words = self._measure(watch)
-        lighten(self.folder / QUALITY)
-        return ", ".join(words)
-
-    def _measure(self, watch: Watch) -> tuple[str, ...]:
-        """Report on the slice into its own folder, and return the words for it."""
         from ..jobs.report import ReportJob, Subject
-        from .paper import read_paper
-
-        subject, words = Subject(self.figure.id, self.folder / STORE), read_paper().words
-        how: dict[str, Any] = {"points": REPORT_POINTS, "seed": SEED, "device": self.device, "paper": words}
-        job = ReportJob([subject], self.folder, single=True, **how, command=self.label())
-        return job.report(subject, watch).words
-=======
+        from ..landscapes.draw.film import lighten
         from .paper import read_paper
 
         for name in (REPORT, MEASURES, QUALITY, QUALITY_ARRAYS):
@@ -81,7 +60,6 @@ class ReportPart(Part):
         report = job.report(subject, watch)
         lighten(self.folder / QUALITY)
         return ", ".join(report.words)
->>>>>>> main
 
 
 class TradeoffPart(Part):
