@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated
 
@@ -48,7 +49,7 @@ def check(
     _conclude(found, report.passed, console)
     if json_:
         print_json(report.record())
-    raise typer.Exit(0 if report.passed else 1)
+    sys.exit(0 if report.passed else 1)
 
 
 def _show(finding: Finding, console: Console) -> None:

@@ -52,8 +52,7 @@ def plan(
 
     bars, scene = Bars(), replace(scene, name=what)
     if what.endswith(".toml"):
-        if over or extent or scene.options or through != "center":
-            raise ValueError("figures say what they are; leave out --over, --extent, --through and --set")
+        _refuse_more(bool(over or extent or scene.options or through != "center"))
         jobs = _figure_jobs(what, resolution, scene, grad=not no_gradients)
         _print_figures(list(_figures(jobs, bars, began, workers)), as_json=json_)
         return
@@ -64,6 +63,12 @@ def plan(
         print_json(found.record(workers), command=command_line())
     else:
         _print(found, workers)
+
+
+def _refuse_more(said: bool) -> None:
+    """Raise ValueError where more is said of figures than they say themselves."""
+    if said:
+        raise ValueError("figures say what they are; leave out --over, --extent, --through and --set")
 
 
 def _figure_jobs(path: str, resolution: int | None, scene: SceneSpec, *, grad: bool) -> list[tuple[Figure, PlanJob]]:

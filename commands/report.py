@@ -49,8 +49,7 @@ def report_(
     from ..jobs.report import ReportJob
     from .terminal import Bars, command_line
 
-    if (what is None) != everything:
-        raise ValueError("report takes a slice's folder, an environment, or --all for every figure of the gallery")
+    _refuse_both(what, everything)
     _register(env)
     bars, root = Bars(), data_folder(data)
     subjects = _figures(root) if what is None else _subjects(what, root, fidelity, device, points, bars)
@@ -63,6 +62,12 @@ def report_(
         _show(found.reports[0], job.folder, as_json=json_)
     else:
         _show_several(found, job.folder, bars, as_json=json_)
+
+
+def _refuse_both(what: str | None, everything: bool) -> None:
+    """Raise ValueError unless it is said what to report on, once."""
+    if (what is None) != everything:
+        raise ValueError("report takes a slice's folder, an environment, or --all for every figure of the gallery")
 
 
 def _register(source: str | None) -> None:

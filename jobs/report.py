@@ -23,7 +23,7 @@ from ..landscapes.storage.disk import is_full
 from ..landscapes.storage.files import make_folder, other_files, replacing, tidy, write_json
 from ..landscapes.storage.records import read_json, write_record
 from .folder import REPORT, REPORTS, ROOT, SLICE_STORE, folder_named, store_in
-from .report_record import ARRAYS, MEASURES, PICTURE, RECORD, PaperRecord, PaperWords, Report, ReportKey, Reports
+from .report_record import ARRAYS, MEASURES, PICTURE, RECORD, PaperRecord, Quoted, Report, ReportKey, Reports
 from .report_tables import slices_markdown
 from .scene import environment_of
 from .watch import PREPARING, Watch, resumable
@@ -87,7 +87,7 @@ class ReportJob:
     points: int = POINTS
     seed: int = 0
     device: str = "auto"
-    paper: Mapping[str, PaperWords] = field(default_factory=dict)
+    paper: Mapping[str, Quoted] = field(default_factory=dict)
     prints: Sequence[float] = ()
     command: str = ""
 
@@ -298,7 +298,7 @@ def _warn(subject: Subject, dataset: xr.Dataset, env: Environment, watch: Watch)
         watch.note(f"warning: {subject.name} was sampled otherwise ({said}), so losses may differ")
 
 
-def _beside(profile: Profile, said: PaperWords | None) -> PaperRecord | None:
+def _beside(profile: Profile, said: Quoted | None) -> PaperRecord | None:
     if said is None:
         return None
     return {"words": profile.verdict.beside(said.words), "where": said.where}

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 RECORD, MEASURES, PICTURE, ARRAYS = REPORT.files  # the arrays are what the picture is drawn from, but for the slice
 
 
-class PaperWords(Protocol):
+class Quoted(Protocol):
     """What the paper says of an environment's landscape: words of `classify.WORDS`, and where it says them."""
 
     @property

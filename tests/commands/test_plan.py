@@ -13,7 +13,10 @@ import gradscape
 from gradscape.envs.base import Environment
 from gradscape.jobs.rehearsal import Replica, count_pictures, room_of, time_drawing
 from gradscape.jobs.slice import pause_after
+from gradscape.jobs.tolerance import keep
 from gradscape.landscapes.draw.figures import page, sweep
+from gradscape.landscapes.measures.fidelity import Bootstrap, Comparison, GradientError, LossError, Seconds
+from gradscape.landscapes.measures.tradeoff import MeasuredVariant, Tradeoff
 from gradscape.landscapes.storage.arrays import need_of
 from gradscape.landscapes.storage.store import SliceStore
 
@@ -165,14 +168,12 @@ def test_a_device_that_is_not_here_has_the_rate_that_tradeoff_kept(
     assert refused.returncode == 2
     assert "`landscape tradeoff flip --device cuda` measures it" in refused.stderr
     env = gradscape.make("flip", fidelity="draft", device="cpu", horizon=0.5)
-    rung = {"name": "draft", "engine": "warp", "device": "cuda", "options": asdict(env.options), "batch": 8}
-    rung |= {"fidelity": asdict(env.fidelity), "seconds": {"forward": 1.0, "with_gradient": 2.5}, "memory": 10}
-    rung |= {"loss_error": {"p95": {"value": None}, "p95_relative": {"value": None}}, "compared": 4}
-    identity = {"options": asdict(env.options), "device": "cuda", "code": env.code, "engine": "warp"}
-    report = {"env": "flip", "identity": identity, "rungs": [rung], "reference": "draft", "loss_unit": env.loss_unit}
-    from gradscape.jobs.tolerance import keep
-
-    path = keep(report)
+    none = Bootstrap(None, None, None)
+    errors = LossError(none, none, none, none)
+    measured = Comparison(errors, none, GradientError(none, none), None, 4, Seconds(1.0, 2.5), 8)
+    options, identity = asdict(env.options), {**env.identity(), "device": "cuda"}
+    draft = MeasuredVariant("draft", "named", asdict(env.fidelity), "warp", "cuda", options, 10, measured)
+    path = keep(Tradeoff("flip", "draft", 4, 0, env.loss_unit, None, 0, (draft,), (), (), identity, {}, ""))
     done = run(*command, "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)

@@ -16,7 +16,6 @@ from gradscape.envs.base import Environment, Fidelity, Work
 from gradscape.jobs import variants
 from gradscape.jobs.tolerance import read_tolerance
 from gradscape.landscapes import cost
-from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.measures import fidelity as tradeoff
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.space import ParameterSpace
@@ -256,8 +255,7 @@ def test_a_tolerance_takes_the_quickest_fidelity_within_it(run: Command, tmp_pat
     cut = run("slice", *how, "--dims", "0", "1", "--resolution", "3", "--out", "cut", cwd=tmp_path)
     assert cut.returncode == 0, cut.stderr
     assert f"{wanted['name']}: the quickest of" in cut.stderr
-    dataset = gradscape.open_slice(tmp_path / "cut/slice.zarr")
-    assert stored_identity(dataset)["settings"] == wanted["fidelity"]
+    assert gradscape.open_slice(tmp_path / "cut").identity["settings"] == wanted["fidelity"]
     searched = run("optimize", *how, "--method", "random", "--budget", "3", "--json", cwd=tmp_path)
     assert searched.returncode == 0, searched.stderr
     assert json.loads(searched.stdout)["fidelity"] == wanted["fidelity"]["name"]
