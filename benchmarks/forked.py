@@ -30,7 +30,7 @@ LOADED = (
         "gradscape.tolerance",
         "gradscape.swept",
         "gradscape.envs.bounce",
-        "gradscape.envs.engines.rigid",
+        "gradscape.envs.engines.balls.rigid",
         "gradscape.envs.functions",
     ),
     *("gradscape.envs.points", "gradscape.optim.race", "gradscape.optim.random", "gradscape.optim.descent"),

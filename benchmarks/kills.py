@@ -50,7 +50,7 @@ JOBS = {
 }
 VICTIMS = ("parent", "worker", "all")  # of a job with workers
 LOADED = (  # by all jobs together
-    *("search_report", "race_report", "sweep_report", "gallery_report", "envs.bounce", "envs.engines.rigid"),
+    *("search_report", "race_report", "sweep_report", "gallery_report", "envs.bounce", "envs.engines.balls.rigid"),
     *("pairs_report", "tradeoff_report", "measure_report", "landscapes.pairs", "landscapes.tradeoff"),
     *("envs.points", "optim.race", "optim.random", "optim.descent", "landscapes.adapters", "landscapes.job"),
     *(f"landscapes.draw.{name}" for name in ("contour", "profile", "sweep", "sweep_stream", "race")),

@@ -21,7 +21,7 @@ from matplotlib.ticker import NullFormatter
 
 from gradscape.envs.base import Environment, Fidelity
 from gradscape.envs.engines.runtime import kernel_times
-from gradscape.envs.fluid import SPAN
+from gradscape.envs.mpm.fluid import SPAN
 from gradscape.envs.registry import make
 
 ON_GRID = ("velocity_kernel", "transfers.wipe")

@@ -15,7 +15,7 @@ from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
 from .base import Environment, Episode, Fidelity, Work
-from .engines.rigid import Ball, Solver
+from .engines.balls.rigid import Ball, Solver
 from .engines.runtime import Pool
 from .options import EpisodeOptions
 

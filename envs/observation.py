@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from .engines.mpm import Solver
+    from .engines.mpm.solver import Solver
 
 SEEN = 32  # points of each body
 

@@ -16,8 +16,8 @@ from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
 from .base import Environment, Episode, Fidelity, Work
-from .engines.board import Board
-from .engines.impacts import Solver
+from .engines.balls.board import Board
+from .engines.balls.impacts import Solver
 from .engines.runtime import Pool
 from .options import EpisodeOptions
 

@@ -50,7 +50,7 @@ def _function(name: str, target: str, model: str, dim: str = "2") -> Entry:
 def _plasticine(name: str, target: str, dim: str, tools: str, task: str) -> Entry:
     parameters = f"5 x ({tools}{'' if ':' in tools else ': x, y, z'}), shares (no unit)"
     model = f"MLS-MPM: von Mises plasticine, tools; {task}"
-    return Entry(name, f"gradscape.envs.plasticine_scenes:{target}", dim, parameters, model, SCENE)
+    return Entry(name, f"gradscape.envs.mpm.plasticine_scenes:{target}", dim, parameters, model, SCENE)
 
 
 BUILTIN = (
@@ -72,7 +72,7 @@ BUILTIN = (
     ),
     Entry(
         "fluid",
-        "gradscape.envs.fluid:Fluid",
+        "gradscape.envs.mpm.fluid:Fluid",
         "10",
         "5 x (ladle speed x, ladle speed y) [m/s]",
         "MLS-MPM: viscous fluid, elastic cube, moving ladle",
@@ -96,7 +96,7 @@ BUILTIN = (
     ),
     Entry(
         "swing-velocity",
-        "gradscape.envs.swing:SwingVelocity",
+        "gradscape.envs.sheets.swing:SwingVelocity",
         "3",
         "initial velocity x, y, z [m/s]",
         "mass-spring cloth, held at two corners, over a floor",
@@ -104,7 +104,7 @@ BUILTIN = (
     ),
     Entry(
         "swing-stiffness",
-        "gradscape.envs.swing:SwingStiffness",
+        "gradscape.envs.sheets.swing:SwingStiffness",
         "16",
         "stiffness of 4 x 4 patches [N/m]",
         "mass-spring cloth, held at two corners, over a floor",
@@ -112,7 +112,7 @@ BUILTIN = (
     ),
     Entry(
         "flip",
-        "gradscape.envs.flip:Flip",
+        "gradscape.envs.sheets.flip:Flip",
         "15",
         "5 x (pan x [m], pan y [m], tilt [rad])",
         "mass-spring disc, moving pan",

@@ -165,7 +165,7 @@ def _cpu_launches(times: dict[str, KernelTime]) -> Iterator[None]:
 
 @contextmanager
 def _cuda_kernels(times: dict[str, KernelTime]) -> Iterator[None]:
-    from .replay import Replay
+    from .launches import Replay
 
     graph = Replay._graph
     Replay._graph = lambda self, key, known: known.run()  # type: ignore[method-assign]  # a graph hides its kernels

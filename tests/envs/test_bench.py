@@ -9,10 +9,10 @@ import warp as wp
 from gradscape.envs.base import Environment, Fidelity, Work
 from gradscape.envs.bench import alternated, bench
 from gradscape.envs.bounce import Bounce
-from gradscape.envs.engines.model import Box
-from gradscape.envs.engines.replay import Replay
+from gradscape.envs.engines.mpm.model import Box
+from gradscape.envs.engines.launches import Replay
 from gradscape.envs.engines.runtime import KernelTime, cuda_available, kernel_times
-from gradscape.envs.fluid import Fluid
+from gradscape.envs.mpm.fluid import Fluid
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.space import ParameterSpace

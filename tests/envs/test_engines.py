@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from gradscape.envs.base import Fidelity
-from gradscape.envs.fluid import SPAN
-from gradscape.envs.plasticine_model import SPAN as SOFT_SPAN
+from gradscape.envs.mpm.fluid import SPAN
+from gradscape.envs.mpm.plasticine_model import SPAN as SOFT_SPAN
 from gradscape.envs.registry import entries, environment_class, make
 from gradscape.landscapes.objective import Status
 

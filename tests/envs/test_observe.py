@@ -4,10 +4,10 @@ import torch
 from gradscape.envs.base import Fidelity
 from gradscape.envs.cartpole import SPAN as CONTROL_SPAN
 from gradscape.envs.cartpole import TEMPO
-from gradscape.envs.fluid import SPAN, STEPS
-from gradscape.envs.fluid import Fluid as FluidScene
+from gradscape.envs.mpm.fluid import SPAN, STEPS
+from gradscape.envs.mpm.fluid import Fluid as FluidScene
 from gradscape.envs.observation import watched
-from gradscape.envs.plasticine_model import SPAN as SOFT_SPAN
+from gradscape.envs.mpm.plasticine_model import SPAN as SOFT_SPAN
 from gradscape.envs.registry import entries, environment_class, make
 
 SOFT = {"fidelity": Fidelity("tiny", dt=SOFT_SPAN / 5, resolution=16, particles=100)}

@@ -12,7 +12,7 @@ import torch
 from matplotlib.image import imread
 
 from gradscape.envs.base import Environment
-from gradscape.envs.fluid import TANK_HEIGHT, TANK_WIDTH
+from gradscape.envs.mpm.fluid import TANK_HEIGHT, TANK_WIDTH
 from gradscape.envs.outlines import about, skin, triangles
 from gradscape.envs.registry import BUILTIN, make
 from gradscape.landscapes.draw import materials
