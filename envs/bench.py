@@ -21,7 +21,9 @@ from ..landscapes.plane import Plane
 from ..landscapes.sampling import sample
 from ..landscapes.store import SliceStore
 from .base import Environment
-from .engines.runtime import compiled_modules, cores, device_names, free_memory, kernel_times
+from .engines import find_engine
+from .engines.profiling import count_compiled_modules, time_kernels
+from .engines.runtime import cores, device_names, free_memory
 
 K = TypeVar("K")
 WAYS = {"forward": False, "with_gradient": True}
@@ -80,7 +82,7 @@ def bench(
         follow(f"timing batches of {batch}")
         rates += _rates(envs, _points(env, batch), seconds)
     follow("timing kernels")
-    kernels = _kernels(env) if engine == "warp" else None
+    kernels = _kernels(env) if find_engine(engine).profiled else None
     follow("timing the sampler")
     quickest = max(row["with_gradient"]["episodes_per_second"] for row in rates if row["engine"] == engine)
     return {
@@ -97,7 +99,7 @@ def bench(
 
 def _need(env: Environment, batch: int) -> Need:
     """Return what a batch takes: its points and gradients, some copies of them, and the episodes that run at once."""
-    return Need(8.0 * 8 * batch * env.space.dim + env.memory() * min(batch, env._share(batch) * env.threads))
+    return Need(8.0 * 8 * batch * env.space.dim + env.memory() * min(batch, env._rows_per_part(batch) * env.threads))
 
 
 def _ratio(rates: Sequence[Mapping[str, Any]], way: str) -> float | None:
@@ -114,7 +116,7 @@ def _started(
         raise ValueError(f"two engines are compared; got {engine} against {against}")
     envs, starts = {engine: make(engine)}, {}
     if against is not None:
-        envs[engine].known_engine(against)
+        envs[engine].check_engine(against)
     for name in (engine,) if against is None else (engine, against):
         follow(f"starting {name}")
         if name not in envs:
@@ -138,12 +140,12 @@ def _subject(env: Environment) -> dict[str, Any]:
 
 def _start(env: Environment) -> Start:
     """Make an environment's first gradient, then on CUDA a full batch of them, and say what that took."""
-    cached, began = compiled_modules(), time.perf_counter()
+    cached, began = count_compiled_modules(), time.perf_counter()
     free = _free(env)
     env.prepare()
     env.evaluate(_points(env, 1))
     seconds = time.perf_counter() - began
-    compiled = compiled_modules() - cached if env.engine == "warp" else None
+    compiled = count_compiled_modules() - cached if env.capabilities.profiled else None
     if env.device != "cuda":
         return Start(seconds, compiled, None)
     env.evaluate(_points(env, env.preferred_batch))
@@ -199,11 +201,11 @@ def _kernels(env: Environment) -> dict[str, Any]:
 
     They run on one thread: what several launch at a time adds up to more than the time that passes.
     """
-    points = _points(env, env._share(env.preferred_batch))
+    points = _points(env, env._rows_per_part(env.preferred_batch))
     env._simulate(points, grad=True)
     found = {}
     for way, grad in WAYS.items():
-        with kernel_times(env.device) as times:
+        with time_kernels(env.device) as times:
             began = time.perf_counter()
             env._simulate(points, grad=grad)
             wall = time.perf_counter() - began

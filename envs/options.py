@@ -26,7 +26,7 @@ class EpisodeOptions:
 
     horizon: float = dataclasses.field(default=1.0, kw_only=True, metadata={"most": 8.0})
 
-    def lasting(self, steps: int) -> int:
+    def count_steps(self, steps: int) -> int:
         """Return how many steps an episode has where the scene's own duration takes so many."""
         return max(1, round(self.horizon * steps))
 

@@ -17,10 +17,12 @@ from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..landscapes.files import resolved
-from .importing import IN_FILE, module_of
+from .importing import IN_FILE, import_named
 
 if TYPE_CHECKING:
     from .base import Environment, Fidelity
+
+COMPUTES_LOSSES = False  # for `code`
 
 Kind = TypeVar("Kind", bound="Environment")
 GROUP = "gradscape.environments"
@@ -32,7 +34,7 @@ class Entry:
     """Say what an environment is without importing it.
 
     `target` is "module:Class", "FILE.py:Class" or the class itself. What another package's entry point cannot say is
-    empty; `completed` asks the class.
+    empty; `complete_entry` asks the class.
     """
 
     name: str
@@ -172,7 +174,7 @@ def register(kind: type[Kind]) -> type[Kind]:
     return kind
 
 
-def completed(entry: Entry) -> Entry:
+def complete_entry(entry: Entry) -> Entry:
     """Return an entry with what its class says of itself, which is imported for that."""
     if entry.dim:
         return entry
@@ -205,7 +207,7 @@ def environment_class(name: str) -> type[Environment]:
         return target
     module, _, attribute = target.rpartition(":")
     try:
-        found: type[Environment] = getattr(module_of(module), attribute)
+        found: type[Environment] = getattr(import_named(module), attribute)
     except (ImportError, AttributeError) as error:
         raise ValueError(f"{name} is registered as {target}, which cannot be imported: {error}") from error
     return found
@@ -227,10 +229,10 @@ def _of_file(text: str) -> type[Environment]:
     file = resolved(path)
     if not file.is_file():
         raise ValueError(f"there is no file {path} to take {attribute} from")
-    module = module_of(str(file))
+    module = import_named(str(file))
     kind = getattr(module, attribute, None)
     if not (isinstance(kind, type) and issubclass(kind, Environment)):
-        there = [one.__name__ for one in vars(module).values() if _own(one, module.__name__)]
+        there = [one.__name__ for one in vars(module).values() if _is_scene_of(one, module.__name__)]
         raise ValueError(f"{path} holds no environment {attribute}; it has {', '.join(there) or 'none'}")
     taken = entries().get(kind.name)
     target = f"{file}:{attribute}"
@@ -240,7 +242,7 @@ def _of_file(text: str) -> type[Environment]:
     return kind
 
 
-def _own(value: object, module: str) -> bool:
+def _is_scene_of(value: object, module: str) -> bool:
     from .base import Environment
 
     return isinstance(value, type) and issubclass(value, Environment) and value.__module__ == module

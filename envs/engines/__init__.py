@@ -3,7 +3,7 @@
 from . import taichi, warp
 from .engine import Engine
 
-ENGINES = {engine.name: engine for engine in (warp.ENGINE, taichi.ENGINE)}  # a new engine: its folder, and its name here
+ENGINES = {engine.name: engine for engine in (warp.ENGINE, taichi.ENGINE)}
 
 
 def find_engine(name: str) -> Engine:

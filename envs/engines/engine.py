@@ -10,9 +10,10 @@ from dataclasses import dataclass, field
 class Engine:
     """Describe an engine without loading it.
 
-    `solvers` maps what is simulated (mpm, springs) to the module with its solver, from this folder on. A `deterministic`
-    engine can give the same bits every time on a GPU. Solvers of a `concurrent` engine run beside each other in the
-    threads of one process; a solver of any other has all cores to itself. A `profiled` engine tells the time by kernel.
+    `solvers` maps what is simulated (mpm, springs) to the module with its solver, from this folder on. An engine that
+    is `deterministic` can give the same bits every time on a GPU. Solvers of a `concurrent` engine run beside each
+    other in the threads of one process; a solver of any other has all cores to itself. A `profiled` engine tells the
+    time by kernel.
     """
 
     name: str

@@ -1,18 +1,19 @@
-"""Kernel launches that come again: what Warp makes of their arguments is kept, and on a GPU whole graphs of them.
+"""Kernel launches that come again: what Warp makes of their arguments is stored, and on a GPU whole graphs of them.
 
-A launch that is made anew costs Python more than most kernels take; one that is kept costs a tenth of that, and one in
-a CUDA graph next to nothing.
+A launch that is made anew costs Python more than most kernels take; one that is stored costs a tenth of that, and one
+in a CUDA graph next to nothing.
 """
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import warp as wp
 
 from .mpm.model import Box
 
-GRAPHS, LISTS = 512, 1024  # that are kept; more are not worth their memory
+MAX_GRAPHS, MAX_SEQUENCES = 512, 1024  # that are stored; more are not worth their memory
 
 BLOCK = 128  # threads of a GPU that share registers; scatters and gathers like few
 
@@ -23,16 +24,16 @@ class _Call:
 
 
 @dataclass
-class _List:
+class _Sequence:
     """Launches in their order, as they were made for a box of nodes.
 
-    `placed` are those whose first argument says where that lies, `on_nodes` those that run over its nodes in so many
+    `located` are those whose first argument says where that lies, `on_nodes` those that run over its nodes in so many
     environments.
     """
 
     box: Box
     launches: list[Any] = field(default_factory=list)
-    placed: list[Any] = field(default_factory=list)
+    located: list[Any] = field(default_factory=list)
     on_nodes: list[tuple[Any, int]] = field(default_factory=list)
 
     def run(self) -> None:
@@ -42,41 +43,43 @@ class _List:
     def move(self, box: Box, lattice: Any) -> None:
         """Make the launches run on another box."""
         if box != self.box:
-            for command in self.placed:
+            for command in self.located:
                 command.set_param_at_index(0, lattice)
             for command, batch in self.on_nodes:
                 command.set_dim((batch, box.cells))
             self.box = box
 
 
-class Replay:
-    """Run the launches of a piece of work: made when it first comes, kept from then on.
+class Launches:
+    """Run the launches of a piece of work: made when it first comes, stored from then on.
 
     What is launched under one key must be the same every time, arrays and numbers: only the box of nodes may be
-    another. Where an array is replaced by another, `forget` must be called.
+    another. Where an array is replaced by another, `clear` must be called.
     """
+
+    use_graphs: ClassVar[bool] = True
 
     def __init__(self, device: str) -> None:
         self.device = device
-        self.lists: dict[Hashable, _List] = {}
+        self.sequences: dict[Hashable, _Sequence] = {}
         self.seen: set[Hashable] = set()
         self.graphs: dict[Hashable, Any] = {}
 
-    def __call__(self, key: Hashable, box: Box, lattice: Any, work: Callable[[], None], *, small: bool) -> None:
+    def run(self, key: Hashable, box: Box, lattice: Any, work: Callable[[], None], *, small: bool) -> None:
         """Do `work` on a box of nodes; where it is `small`, a GPU records it when it comes again on the same box."""
-        known = self.lists.get(key)
+        known = self.sequences.get(key)
         if known is None:
-            if len(self.lists) == LISTS:
-                self.forget()
-            self.lists[key] = self._making = _List(box)
+            if len(self.sequences) == MAX_SEQUENCES:
+                self.clear()
+            self.sequences[key] = self._recording = _Sequence(box)
             self._lattice = lattice
             work()
             return
         known.move(box, lattice)
-        if self.device == "cpu" or not small:
+        if self.device == "cpu" or not small or not self.use_graphs:
             known.run()
         else:
-            self._graph((key, box), known)
+            self._run_graph((key, box), known)
 
     def launch(
         self, kernel: Any, dim: tuple[int, int], inputs: list[Any], *, nodes: bool = False, **adjoint: Any
@@ -85,33 +88,43 @@ class Replay:
         how: dict[str, Any] = {"record_tape": False, "record_cmd": True, "block_dim": BLOCK}
         command = wp.launch(kernel, dim, inputs, device=self.device, **how, **adjoint)
         if inputs[0] is self._lattice:
-            self._making.placed.append(command)
+            self._recording.located.append(command)
         if nodes:
-            self._making.on_nodes.append((command, dim[0]))
-        self._making.launches.append(command)
+            self._recording.on_nodes.append((command, dim[0]))
+        self._recording.launches.append(command)
         command.launch()
 
     def call(self, work: Callable[[], None]) -> None:
         """Do anything else as part of the work under way."""
-        self._making.launches.append(_Call(work))
+        self._recording.launches.append(_Call(work))
         work()
 
-    def forget(self) -> None:
-        """Drop all that is kept."""
-        self.lists.clear()
+    def clear(self) -> None:
+        """Drop all that is stored."""
+        self.sequences.clear()
         self.seen.clear()
         self.graphs.clear()
 
-    def _graph(self, key: Hashable, known: _List) -> None:
+    def _run_graph(self, key: Hashable, known: _Sequence) -> None:
         if key not in self.seen:
             self.seen.add(key)
             known.run()
             return
         if key not in self.graphs:
-            if len(self.graphs) == GRAPHS:
+            if len(self.graphs) == MAX_GRAPHS:
                 self.seen.clear()
                 self.graphs.clear()
             with wp.ScopedCapture(device=self.device) as capture:
                 known.run()
             self.graphs[key] = capture.graph
         wp.capture_launch(self.graphs[key])
+
+
+@contextmanager
+def suspend_graphs() -> Iterator[None]:
+    """Launch kernels one by one within a with block, not as graphs."""
+    Launches.use_graphs = False
+    try:
+        yield
+    finally:
+        Launches.use_graphs = True

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -12,19 +12,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...landscapes.episode import Part, View
-from ...landscapes.objective import Evaluation, Status
 from ...landscapes.space import ParameterSpace
-from ..base import Environment, Episode, Fidelity, Work
-from ..controls import hold, lasting, travel
+from ..base import Fidelity, MaterialRange
+from ..controls import extend, hold, integrate_velocity
 from ..engines.mpm.boundaries import LadleInTank
 from ..engines.mpm.materials import Elastic
 from ..engines.mpm.materials import Fluid as Liquid
 from ..engines.mpm.model import Body, Model
-from ..engines.mpm.solver import Solver, capacity, memory
-from ..engines.runtime import Pool
-from ..observation import followed, motion
 from ..options import EpisodeOptions
 from ..outlines import skin
+from .scene import SEGMENTS, STEPS, MpmScene, Stage
 
 TANK_WIDTH, TANK_HEIGHT, FILL = 0.4, 0.2, 0.15  # the tank, and the depth of the syrup [m]
 HEADROOM = 0.6  # what the grid covers above the floor [m]
@@ -34,7 +31,7 @@ RIM = (0.0, 0.09, 0.0)  # centre of the bowl's rim at the start [m]
 LOWEST, HIGHEST = 0.085, 0.3  # how far the rim can go [m]
 SYRUP_DENSITY, SPEED_OF_SOUND = 1330.0, 5.0  # [kg/m^3], [m/s]
 GRAVITY = 9.81  # [m/s^2]
-SEGMENTS, STEPS, SPAN = 5, 50, 0.01  # control segments, control steps, length of a step [s]
+SPAN = 0.01  # length of a control step [s]
 MARGIN = 2  # nodes outside the walls
 VIEW = View((-0.2, 0.0, -0.2), (0.2, 0.42, 0.2), eye=(0.4, 0.55, 1.0))
 
@@ -52,7 +49,7 @@ class FluidOptions(EpisodeOptions):
     friction: float = 0.1
 
 
-class Fluid(Environment):
+class Fluid(MpmScene):
     """Scoop a sugar cube out of a tank of syrup with a ladle.
 
     Model: MLS-MPM. Syrup (1330 kg/m^3, 4 Pa s, a little lighter than the cube) as a viscous, weakly compressible fluid
@@ -73,9 +70,6 @@ class Fluid(Environment):
     """
 
     name: ClassVar[str] = "fluid"
-    devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
-    beyond_box: ClassVar[bool] = True
-    engines: ClassVar[tuple[str, ...]] = ("warp", "taichi")
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=SPAN / 3, resolution=12, sampling=1.4),
         "standard": Fidelity("standard", dt=SPAN / 20, resolution=22),
@@ -85,10 +79,9 @@ class Fluid(Environment):
         "scoop": (1.41, -0.77, 0.15, 0.74, 0.08, 1.13, -1.3, 1.41, 0.17, 0.27)
     }
     loss_unit: ClassVar[str] = "m"
-    decisions: ClassVar[int] = SEGMENTS
     control_step: ClassVar[float] = SPAN
     Options: ClassVar[type[Any]] = FluidOptions
-    _solvers: Pool[Solver]
+    material_range: ClassVar[MaterialRange] = MaterialRange("viscosity", 0.4, 40.0)  # a tenth and ten times the default
     space = ParameterSpace.box(
         [f"ladle {axis} speed, segment {segment}" for segment in range(1, SEGMENTS + 1) for axis in "xy"],
         -2.0,
@@ -96,75 +89,50 @@ class Fluid(Environment):
         "m/s",
     )
 
-    def memory(self) -> int:
-        """Estimate the bytes one episode takes while it runs."""
-        return memory(self.model, self.device)
-
-    def work(self) -> Work:
-        """Count substeps of particles."""
-        return Work(self.model.particle_substeps, "particle-substep")
-
-    def ladle(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 1 3"]:
+    def tools(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 1 3"]:
         """Return where the centre of the ladle's rim is at the ends of control steps [m]."""
         velocity = hold(x.view(len(x), SEGMENTS, 2), STEPS)
-        velocity = lasting(velocity, self.model.steps, then=x.new_zeros(len(x), 1, 2))
+        velocity = extend(velocity, self.model.steps, then=x.new_zeros(len(x), 1, 2))
         reach = TANK_WIDTH / 2 - BOWL - SHELL
         start, lower, upper = (x.new_tensor(p) for p in (RIM[:2], (-reach, LOWEST), (reach, HIGHEST)))
-        path = travel(start, velocity, SPAN, lower=lower, upper=upper)
+        path = integrate_velocity(start, velocity, SPAN, lower=lower, upper=upper)
         depth = path.new_full((*path.shape[:2], 1), RIM[2])
         return torch.cat([path, depth], dim=2)[:, :, None]
 
     def cube(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch 3"]:
         """Return where the cube's centre is at the end of the episode [m]."""
-        with self._solvers.lend() as solver:
-            parts = torch.split(self._checked(x), self._capacity)
-            return torch.cat([self._center(solver.run(self.ladle(part)).double().cpu()) for part in parts])
+        with self._solvers.lend() as stage:
+            parts = torch.split(self._check(x), self._capacity)
+            return torch.cat([self._center(stage.solver.run(self.tools(part)).double().cpu()) for part in parts])
 
-    def episode(self, x: Float[Tensor, " dim"]) -> Episode:
-        """Return syrup, cube and ladle at the ends of control steps."""
-        tools = self.ladle(self._row(x))
-        with self._solvers.lend() as solver:
-            solver.run(tools)
-            frames = solver.positions(0)
-        first = len(self.model.bodies[0].x)
-        time = SPAN * torch.arange(self.model.steps + 1, dtype=torch.float64)
-        points = {"syrup": frames[:, :first], "cube": frames[:, first:]}
-        parts = self._parts(points["syrup"], points["cube"], tools[0])
-        return Episode(time, points, {"ladle": tools[0, :, 0]}, parts, VIEW)
+    def _model(self) -> Model:
+        return _model(self.fidelity, self.options)
 
-    def _parts(self, syrup: Tensor, cube: Tensor, ladle: Tensor) -> tuple[Part, ...]:
+    def _losses(self, stage: Stage, step: int, end: Tensor, paths: Tensor) -> Float[Tensor, " batch"]:
+        return self._loss(self._center(end.double().cpu()), paths[:, step, 0].cpu())
+
+    def _length_scale(self, tools: Float[Tensor, "batch step_plus_1 1 3"], points: int) -> float:
+        return TANK_WIDTH / 2
+
+    def _body_names(self) -> tuple[str, str]:
+        return "syrup", "cube"
+
+    def _surroundings(self, tools: Float[Tensor, "frame 1 3"]) -> dict[str, Tensor]:
+        return {"ladle": tools[:, 0]}
+
+    def _view(self) -> View:
+        return VIEW
+
+    def _parts(self, bodies: Sequence[Tensor], tools: Float[Tensor, "frame 1 3"]) -> tuple[Part, ...]:
+        syrup, cube = bodies
         block, faces = skin(cube)
-        tank = torch.zeros(len(ladle), 1, 3, dtype=ladle.dtype)
+        tank = torch.zeros(len(tools), 1, 3, dtype=tools.dtype)
         return (
             Part("sheet", "sugar", block, faces=faces),
-            Part("ladle", "steel", ladle, (BOWL, SHELL, HANDLE)),
+            Part("ladle", "steel", tools, (BOWL, SHELL, HANDLE)),
             Part("lump", "syrup", syrup, (self.model.dx / self.fidelity.sampling,)),
             Part("tank", "glass", tank, (TANK_WIDTH, TANK_HEIGHT, TANK_WIDTH)),
         )
-
-    def _setup(self) -> None:
-        self.model = _model(self.fidelity, self.options)
-        self._capacity = self._rows_at_once(capacity(self.model, self.device))
-        settings: dict[str, Any] = {"capacity": self._capacity, "device": self.device, "stop": self._stop}
-        settings |= {"deterministic": True} if self.deterministic else {}
-        make = partial(self._engine("mpm").Solver, self.model, **settings)
-        self._solvers = Pool(make, most=self._solvers_at_most)
-
-    def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
-        x = x.clone().requires_grad_(grad)
-        tools = self.ladle(x)
-        with self._solvers.lend() as solver:
-            end = solver.run(tools.detach()).double().cpu().requires_grad_(grad)
-            escaped = solver.left_grid(len(x)).cpu()
-            loss = self._loss(self._center(end), tools[:, -1, 0])
-            slope = _pull_back(solver, loss, end, tools, x) if grad else None
-        return Evaluation(loss.detach(), slope, torch.where(escaped, int(Status.ESCAPED), int(Status.OK)))
-
-    def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
-        """Watch syrup, cube and ladle, in halves of the tank's width."""
-        with self._solvers.lend() as solver:
-            seen = followed(solver, self.ladle(x), decision * STEPS // SEGMENTS)
-        return motion(*seen, scale=TANK_WIDTH / 2, intervals=STEPS // SEGMENTS)
 
     def _center(self, end: Float[Tensor, "batch particle 3"]) -> Float[Tensor, "batch 3"]:
         return end[:, len(self.model.bodies[0].x) :].mean(dim=1)
@@ -174,14 +142,6 @@ class Fluid(Environment):
         to_ladle, to_axis = (cube - ladle)[:, ::2], cube[:, ::2]
         loss: Tensor = depth.clamp_min(0) + 3 * to_ladle.norm(dim=1) + to_axis.norm(dim=1)
         return loss
-
-
-def _pull_back(solver: Solver, loss: Tensor, end: Tensor, tools: Tensor, x: Tensor) -> Tensor:
-    """Return the gradient by x of a loss that depends on where particles end and on the ladle's path."""
-    adj_end, adj_tools = torch.autograd.grad(loss.sum(), (end, tools), retain_graph=True)
-    adj_tools = adj_tools + solver.gradient({solver.model.steps: adj_end}).to(adj_tools)
-    (slope,) = torch.autograd.grad(tools, x, adj_tools)
-    return slope
 
 
 def _model(fidelity: Fidelity, options: FluidOptions) -> Model:
@@ -197,7 +157,7 @@ def _model(fidelity: Fidelity, options: FluidOptions) -> Model:
         nodes=(across, int(np.ceil(HEADROOM / dx)) + 1 + 2 * MARGIN, across),
         dt=fidelity.dt,
         substeps=round(SPAN / fidelity.dt),
-        steps=options.lasting(STEPS),
+        steps=options.count_steps(STEPS),
         gravity=GRAVITY,
     )
 

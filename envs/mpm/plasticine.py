@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -12,23 +13,22 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ...landscapes.objective import Evaluation, Status
+from ...landscapes.episode import Part, View
 from ...landscapes.space import ParameterSpace
-from ..base import Environment, Episode, Fidelity, Work
+from ..base import Fidelity
+from ..batching import Pool
 from ..code import code_digest
-from ..controls import hold, lasting, roll, travel
-from ..engines.mpm.tools import Kind
+from ..controls import extend, hold, integrate_velocity, roll
 from ..engines.mpm.model import Model
-from ..engines.mpm.solver import Solver, capacity, memory
 from ..engines.mpm.raster import Raster
-from ..engines.runtime import Pool
-from ..observation import followed, motion
+from ..engines.mpm.solver import Solver
+from ..engines.mpm.tools import Kind
 from ..options import EpisodeOptions
 from .plasticine_look import parts, view
-from .plasticine_model import SPAN, STEPS, Scene, model, target
-from .targets import Target, cached, contact
+from .plasticine_model import SPAN, Scene, model, target
+from .scene import SEGMENTS, STEPS, MpmScene, Stage
+from .targets import Target, contact, load_or_make
 
-SEGMENTS = 5  # of the controls
 DEMONSTRATION = "demonstration"  # the example that solves a scene
 TERMS = ("density", "sdf", "contact")
 REACH = 0.1  # what a policy measures lengths by [m]
@@ -49,14 +49,13 @@ class PlasticineOptions(EpisodeOptions):
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
+class JudgedStage(Stage):
     """What one thread simulates and judges with."""
 
-    solver: Solver
     raster: Raster
 
 
-class Plasticine(Environment):
+class Plasticine(MpmScene):
     """Model: MLS-MPM, fixed-corotated elasticity, von Mises plasticity in log strain; x right, y up, z to the front.
 
     Young's modulus 5000 Pa at a density of 1 kg/m^3; gravity 30 m/s^2; 0.1 s. Tools are signed distances that move as
@@ -79,32 +78,24 @@ class Plasticine(Environment):
     from a Global Perspective" (CoRL 2022).
     """
 
-    devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
-    beyond_box: ClassVar[bool] = True
-    engines: ClassVar[tuple[str, ...]] = ("warp", "taichi")
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=SPAN / 9, resolution=32, particles=800),
         "standard": Fidelity("standard", dt=SPAN / 20, resolution=64, particles=10_000),
         "reference": Fidelity("reference", dt=SPAN / 40, resolution=64, particles=10_000, precision="float64"),
     }
     Options: ClassVar[type[Any]] = PlasticineOptions
-    decisions: ClassVar[int] = SEGMENTS
     control_step: ClassVar[float] = SPAN
     scene: ClassVar[Scene]
-    _solvers: Pool[Stage]
+    _solvers: Pool[JudgedStage]
 
     def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
-        return memory(self.model, self.device) + Raster.bytes_per_row(self.model)
-
-    def work(self) -> Work:
-        """Count substeps of particles."""
-        return Work(self.model.particle_substeps, "particle-substep")
+        return super().memory() + Raster.bytes_per_row(self.model)
 
     def tools(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 slot 3"]:
         """Return where tools are at the ends of control steps [m]; a roller's second slot is (spin, yaw, 0) [rad]."""
         shares, count = hold(x.view(len(x), SEGMENTS, -1), STEPS), self.model.steps
-        steps = lasting(shares, count, then=torch.zeros_like(shares[:, :1])).view(len(x), count, -1, 3)
+        steps = extend(shares, count, then=torch.zeros_like(shares[:, :1])).view(len(x), count, -1, 3)
         slots: list[Tensor] = []
         for anchor, share in zip(self.scene.anchors, steps.unbind(dim=2), strict=True):
             step, start, lower, upper = (
@@ -113,7 +104,7 @@ class Plasticine(Environment):
             if anchor.tool.kind is Kind.ROLLER:
                 slots += roll(start, share * step, anchor.tool.size[1], lower=lower, upper=upper)
             else:
-                slots.append(travel(start, share * step, 1.0, lower=lower, upper=upper))
+                slots.append(integrate_velocity(start, share * step, 1.0, lower=lower, upper=upper))
         slots += [x.new_tensor(place).expand(len(x), count + 1, 3) for _, place in self.scene.posts]
         return torch.stack(slots, dim=2)
 
@@ -121,32 +112,13 @@ class Plasticine(Environment):
         """Return the loss's terms (density, sdf and contact), each alone and unweighted."""
         found = []
         with self._solvers.lend() as stage:
-            for part in torch.split(self._checked(x), self._capacity):
+            for part in torch.split(self._check(x), self._capacity):
                 paths = self.tools(part).to(self.device)
                 stage.solver.run(paths)
-                found.append(torch.stack([self._judge(stage, step, paths)[1] for step in self._judged]).sum(dim=0))
+                ends = {step: stage.solver.reached(step, len(part)) for step in self._loss_steps()}
+                terms = [self._terms(stage, end, paths[:, step]) for step, end in ends.items()]
+                found.append(torch.stack(terms).sum(dim=0))
         return dict(zip(TERMS, torch.cat(found).cpu().unbind(1), strict=True))
-
-    def end(self, x: Float[Tensor, " dim"]) -> Float[Tensor, "particle 3"]:
-        """Return where particles are at the end of the episode at one point [m]."""
-        with self._solvers.lend() as stage:
-            end: Tensor = stage.solver.run(self.tools(self._row(x)))[0].double().cpu()
-        return end
-
-    def episode(self, x: Float[Tensor, " dim"]) -> Episode:
-        """Return plasticine and tools at the ends of control steps."""
-        tools = self.tools(self._row(x))
-        with self._solvers.lend() as stage:
-            stage.solver.run(tools)
-            frames = stage.solver.positions(0)
-        bodies = torch.split(frames, [len(body.x) for body in self.model.bodies], dim=1)
-        return Episode(
-            SPAN * torch.arange(self.model.steps + 1, dtype=torch.float64),
-            {f"plasticine {number}": body for number, body in enumerate(bodies, start=1)},
-            {f"tool {number}": path for number, path in enumerate(tools[0].unbind(1), start=1)},
-            parts(self.scene, bodies, tools[0], self._wanted()),
-            view(self.scene),
-        )
 
     def _setup(self) -> None:
         self.space = ParameterSpace.box(
@@ -159,79 +131,70 @@ class Plasticine(Environment):
             -1.0,
             1.0,
         )
-        steps = self.options.lasting(STEPS)
-        self.model = model(self.scene, self.fidelity, steps)
-        self._judged = (steps,) if self.options.loss == "final" else tuple(range(1, steps + 1))
-        self._capacity = self._rows_at_once(capacity(self.model, self.device))
-        settings: dict[str, Any] = {"capacity": self._capacity, "device": self.device}
-        settings |= {"deterministic": True} if self.deterministic else {}
-        make = partial(_stage, self._engine("mpm").Solver, self.model, self._stop, settings)
-        self._solvers = Pool(make, most=self._solvers_at_most)
+        super()._setup()
         self._making = threading.Lock()
+
+    def _model(self) -> Model:
+        return model(self.scene, self.fidelity, self.options.count_steps(STEPS))
+
+    @staticmethod
+    def _make_stage(
+        make_solver: Callable[..., Solver], model: Model, stop: threading.Event, settings: Mapping[str, Any]
+    ) -> JudgedStage:
+        return JudgedStage(make_solver(model, stop=stop, **settings), Raster(model, model.mass, **settings))
 
     def _prepare(self) -> None:
         _ = self._target
 
-    def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
-        x = x.clone().requires_grad_(grad)
-        tools = self.tools(x)
-        paths = tools.detach().to(self.device).requires_grad_(grad)
-        loss, adj_paths = paths.new_zeros(len(x)), torch.zeros_like(paths)
-        adj_x: dict[int, Tensor] = {}
+    def _loss_steps(self) -> Sequence[int]:
+        return (self.model.steps,) if self.options.loss == "final" else range(1, self.model.steps + 1)
+
+    def _losses(self, stage: JudgedStage, step: int, end: Tensor, paths: Tensor) -> Float[Tensor, " batch"]:
         weights = paths.new_tensor([getattr(self.options, term) for term in TERMS])
-        with self._solvers.lend() as stage:
-            stage.solver.run(paths.detach())
-            escaped = stage.solver.left_grid(len(x)).cpu()
-            for step in self._judged:
-                end, terms = self._judge(stage, step, paths)
-                losses = (terms * weights).sum(dim=1)
-                loss += losses.detach()
-                if grad:
-                    adj_x[step], part = torch.autograd.grad(losses.sum(), (end, paths))
-                    adj_paths += part
-            if grad:
-                adj_paths += stage.solver.gradient(adj_x)
-        slope = torch.autograd.grad(tools, x, adj_paths.cpu())[0] if grad else None
-        return Evaluation(loss.cpu(), slope, torch.where(escaped, int(Status.ESCAPED), int(Status.OK)))
+        return (self._terms(stage, end, paths[:, step]) * weights).sum(dim=1)
 
-    def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
-        """Watch plasticine and tools, in tenths of a metre; a roller's angles in radians."""
-        tools = self.tools(x)
-        with self._solvers.lend() as stage:
-            seen = followed(stage.solver, tools.to(self.device), decision * STEPS // SEGMENTS)
-        scale = tools.new_full((seen[0].shape[1], 1), REACH)
-        if any(anchor.tool.kind is Kind.ROLLER for anchor in self.scene.anchors):
-            scale[-tools.shape[2] + 1] = 1.0
-        return motion(*seen, scale=scale, intervals=STEPS // SEGMENTS)
-
-    def _judge(
-        self, stage: Stage, step: int, paths: Float[Tensor, "batch step_plus_1 slot 3"]
-    ) -> tuple[Tensor, Tensor]:
-        """Return where particles are before a control step, and the loss's terms there, shape (batch, term)."""
-        end = stage.solver.reached(step, len(paths)).detach().requires_grad_(paths.requires_grad)
+    def _terms(
+        self, stage: JudgedStage, end: Float[Tensor, "batch particle 3"], tools: Float[Tensor, "batch slot 3"]
+    ) -> Float[Tensor, "batch term"]:
+        """Return the loss's terms where particles and tools are."""
         rows = stage.raster(end).double().unbind(0)  # one by one: a batched sum rounds as its batch is large
         density = torch.stack([(row - self._target.mass).abs().sum() for row in rows])
         distance = torch.stack([(row * self._target.distance).sum() for row in rows])
-        touch = contact(end.double(), paths[:, step], [anchor.tool for anchor in self.scene.anchors])
-        return end, torch.stack([density, distance, touch], dim=1)
+        touch = contact(end.double(), tools, [anchor.tool for anchor in self.scene.anchors])
+        return torch.stack([density, distance, touch], dim=1)
+
+    def _length_scale(self, tools: Float[Tensor, "batch step_plus_1 slot 3"], points: int) -> Float[Tensor, "point 1"]:
+        """Return tenths of a metre; radians for a roller's angles."""
+        scale = tools.new_full((points, 1), REACH)
+        if any(anchor.tool.kind is Kind.ROLLER for anchor in self.scene.anchors):
+            scale[-tools.shape[2] + 1] = 1.0
+        return scale
+
+    def _body_names(self) -> list[str]:
+        return [f"plasticine {number}" for number in range(1, len(self.model.bodies) + 1)]
+
+    def _surroundings(self, tools: Float[Tensor, "frame slot 3"]) -> dict[str, Tensor]:
+        return {f"tool {number}": path for number, path in enumerate(tools.unbind(1), start=1)}
+
+    def _parts(self, bodies: Sequence[Tensor], tools: Float[Tensor, "frame slot 3"]) -> tuple[Part, ...]:
+        return parts(self.scene, bodies, tools, self._target_particles())
+
+    def _view(self) -> View:
+        return view(self.scene)
 
     @cached_property
     def _target(self) -> Target:
         """What a shape is compared with, on this model's grid."""
         with self._making:
-            return Target.of(self.model, self._wanted(), self.device)
+            return Target.of(self.model, self._target_particles(), self.device)
 
-    def _wanted(self) -> np.ndarray:
+    def _target_particles(self) -> np.ndarray:
         """Return where the target's particles are [m]."""
         if self.scene.target:
             return target(self.scene, self.model.particles)
         content = f"{self.scene} {self.fidelity} {self.examples[DEMONSTRATION]} {code_digest(type(self))}"
-        return cached(f"{self.name}-{self.fidelity.name}", content, self._demonstrated)
+        return load_or_make(f"{self.name}-{self.fidelity.name}", content, self._demonstrate)
 
-    def _demonstrated(self) -> np.ndarray:
+    def _demonstrate(self) -> np.ndarray:
         demonstration = type(self)(fidelity=self.fidelity, device="cpu").end(self.example(DEMONSTRATION))
         return np.asarray(demonstration)
-
-
-def _stage(kind: type[Solver], model: Model, stop: threading.Event, settings: dict[str, Any]) -> Stage:
-    return Stage(kind(model, stop=stop, **settings), Raster(model, model.mass, **settings))

@@ -12,9 +12,11 @@ from torch import Tensor
 from ...landscapes import episode
 from ...landscapes.episode import Part, View
 from ..engines.mpm.tools import Kind, Tool
-from ..outlines import about
+from ..outlines import rotate_about
 from .plasticine_model import FLOOR, Scene
 from .shapes import Ball, Box, Shape
+
+COMPUTES_LOSSES = False  # for `code`
 
 SHAPES: dict[Kind, episode.Shape] = {
     Kind.SPHERE: "sphere",
@@ -32,8 +34,8 @@ def parts(
     target: np.ndarray,
 ) -> tuple[Part, ...]:
     """Return bodies, tools at their slots' poses, and targets: shapes, or the bodies' particles where they belong."""
-    pitches = [(lump.shape.volume / x.shape[1]) ** (1 / 3) for lump, x in zip(scene.lumps, bodies, strict=True)]
-    lumps = [
+    pitches = [(piece.shape.volume / x.shape[1]) ** (1 / 3) for piece, x in zip(scene.pieces, bodies, strict=True)]
+    pieces = [
         Part("lump", "plasticine", x, (pitch,), tint=number)
         for number, (x, pitch) in enumerate(zip(bodies, pitches, strict=True))
     ]
@@ -42,17 +44,17 @@ def parts(
         movers.append(_tool(tool, tools[:, slot : slot + tool.slots]))
         slot += tool.slots
     if scene.target:
-        return (*lumps, *movers, *(_target(shape, len(tools)) for shape in scene.target))
+        return (*pieces, *movers, *(_target(shape, len(tools)) for shape in scene.target))
     wanted = torch.split(torch.from_numpy(target), [x.shape[1] for x in bodies])
     goals = [
         Part("lump", "target", x.expand(len(tools), -1, 3), (pitch,)) for x, pitch in zip(wanted, pitches, strict=True)
     ]
-    return (*lumps, *movers, *goals)
+    return (*pieces, *movers, *goals)
 
 
 def view(scene: Scene) -> View:
     """Return the view of what bodies, tools at their starts and targets take up."""
-    corners = [shape.bounds for shape in (*(lump.shape for lump in scene.lumps), *scene.target)]
+    corners = [shape.bounds for shape in (*(piece.shape for piece in scene.pieces), *scene.target)]
     placed = [(anchor.tool, anchor.start) for anchor in scene.anchors] + list(scene.posts)
     corners += [(np.subtract(at, tool.radius), np.add(at, tool.radius)) for tool, at in placed]
     lower, upper = np.min([low for low, _ in corners], axis=0), np.max([high for _, high in corners], axis=0)
@@ -64,7 +66,7 @@ def _tool(tool: Tool, pose: Float[Tensor, "frame slot 3"]) -> Part:
     turn = None
     if tool.kind is Kind.ROLLER:  # its axis starts along z; a capsule's is y
         spin, yaw, _ = pose[:, 1].unbind(1)
-        turn = about(1, yaw) @ about(2, spin) @ about(0, torch.full_like(yaw, torch.pi / 2))
+        turn = rotate_about(1, yaw) @ rotate_about(2, spin) @ rotate_about(0, torch.full_like(yaw, torch.pi / 2))
     material: episode.Material = "wood" if tool.kind in (Kind.ROLLER, Kind.CYLINDER) else "steel"
     return Part(SHAPES[tool.kind], material, pose[:, :1], tool.size, turn)
 

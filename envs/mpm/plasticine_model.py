@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..base import Fidelity
-from ..engines.mpm.tools import Kind, Manipulators, Tool
 from ..engines.mpm.materials import Plasticine
 from ..engines.mpm.model import Body, Model
+from ..engines.mpm.tools import Kind, Tool, ToolsInRoom
+from .scene import STEPS
 from .shapes import Point, Shape, fill, shares
 
-STEPS, SPAN = 50, 2e-3  # control steps, length of one [s]
+SPAN = 2e-3  # length of a control step [s]
 YOUNG, GRAVITY, SOFTNESS = 5000.0, 30.0, 666.0  # [Pa] at a density of 1 kg/m^3; [m/s^2]; [1/m]
 PARTICLE = (1 / 128) ** 2  # PlasticineLab's particle mass [kg], which sets the scale of its losses
 FLOOR, WALLS = 2.5 / 64, (2.5 / 64, 61.5 / 64)  # nodes outside belong to floor and walls [m]
@@ -21,7 +22,7 @@ MARGIN = 2  # nodes outside the walls
 
 
 @dataclass(frozen=True)
-class Lump:
+class Piece:
     """A piece of plasticine that weighs as much as so many of PlasticineLab's `particles`."""
 
     shape: Shape
@@ -54,7 +55,7 @@ class Anchor:
 class Scene:
     """All that makes one scene; `posts` are tools that stay, `target` is empty where a demonstration makes it."""
 
-    lumps: tuple[Lump, ...]
+    pieces: tuple[Piece, ...]
     anchors: tuple[Anchor, ...]
     yield_stress: float
     floor_friction: float
@@ -69,7 +70,7 @@ class Scene:
 
     def room(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the corners of what tools can push bodies through [m]: where walls stand."""
-        corners = [shape.bounds for shape in (*(lump.shape for lump in self.lumps), *self.target)]
+        corners = [shape.bounds for shape in (*(piece.shape for piece in self.pieces), *self.target)]
         reach = np.clip(STEPS * np.max([anchor.reach for anchor in self.anchors], axis=0), *ROOM)
         lower = np.min([low for low, _ in corners], axis=0) - reach
         upper = np.max([high for _, high in corners], axis=0) + reach
@@ -85,7 +86,7 @@ def model(scene: Scene, fidelity: Fidelity, steps: int = STEPS) -> Model:
     return Model(
         precision=fidelity.precision,
         bodies=_bodies(scene, fidelity.particles, dx),
-        boundary=Manipulators(
+        boundary=ToolsInRoom(
             scene.tools, tuple(lower.tolist()), tuple(upper.tolist()), FLOOR, scene.floor_friction, SOFTNESS
         ),
         origin=tuple((first * dx).tolist()),
@@ -100,20 +101,21 @@ def model(scene: Scene, fidelity: Fidelity, steps: int = STEPS) -> Model:
 
 def target(scene: Scene, particles: int) -> np.ndarray:
     """Return the particles of a target that is made of shapes [m], shape (particle, 3)."""
-    counts = shares([lump.shape for lump in scene.lumps], particles)
+    counts = shares([piece.shape for piece in scene.pieces], particles)
     return np.concatenate([fill(shape, count) for shape, count in zip(scene.target, counts, strict=True)])
 
 
 def _bodies(scene: Scene, particles: int, dx: float) -> tuple[Body, ...]:
     material = Plasticine(1.0, YOUNG, scene.poisson, scene.yield_stress)
-    counts = shares([lump.shape for lump in scene.lumps], particles)
-    masses = [np.full(n, lump.particles * PARTICLE / n) for lump, n in zip(scene.lumps, counts, strict=True)]
+    counts = shares([piece.shape for piece in scene.pieces], particles)
+    # at density 1 the volume is the mass
+    masses = [np.full(n, piece.particles * PARTICLE / n) for piece, n in zip(scene.pieces, counts, strict=True)]
     return tuple(
-        Body(material, _by_cell(fill(lump.shape, len(mass)), dx), mass, np.ones(len(mass)))  # density 1: volume is mass
-        for lump, mass in zip(scene.lumps, masses, strict=True)
+        Body(material, _sort_by_cell(fill(piece.shape, len(mass)), dx), volume=mass, ratio=np.ones(len(mass)))
+        for piece, mass in zip(scene.pieces, masses, strict=True)
     )
 
 
-def _by_cell(x: np.ndarray, dx: float) -> np.ndarray:
+def _sort_by_cell(x: np.ndarray, dx: float) -> np.ndarray:
     """Return particles cell by cell, so that those that meet the same nodes are neighbours in memory."""
     return np.asarray(x[np.lexsort(np.floor(x / dx).T[::-1])])

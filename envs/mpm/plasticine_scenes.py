@@ -6,10 +6,10 @@ from typing import ClassVar
 
 from ..engines.mpm.tools import STICKY, Kind, Tool
 from .plasticine import DEMONSTRATION, Plasticine
-from .plasticine_model import Anchor, Lump, Scene
+from .plasticine_model import Anchor, Piece, Scene
 from .shapes import Ball, Box, Point, Ring
 
-SLAB = Lump(Box((0.5, 0.05, 0.5), (0.3, 0.1, 0.3)), 10_000)
+SLAB = Piece(Box((0.5, 0.05, 0.5), (0.3, 0.1, 0.3)), 10_000)
 
 
 def _finger(x: float, y: float, z: float, radius: float, step: Point) -> Anchor:
@@ -39,7 +39,7 @@ class Assembly(Plasticine):
         """
     )
     scene: ClassVar[Scene] = Scene(
-        lumps=(Lump(Box((0.6, 0.08, 0.5), (0.16, 0.16, 0.16)), 6000), Lump(Ball((0.3, 0.06, 0.5), 0.06), 4000)),
+        pieces=(Piece(Box((0.6, 0.08, 0.5), (0.16, 0.16, 0.16)), 6000), Piece(Ball((0.3, 0.06, 0.5), 0.06), 4000)),
         anchors=tuple(_finger(x, 0.06, 0.5, 0.04, (0.009, 0.009, 0.009)) for x in (0.38, 0.22)),
         yield_stress=100.0,
         floor_friction=STICKY,
@@ -65,7 +65,7 @@ class Pinch(Plasticine):
         """
     )
     scene: ClassVar[Scene] = Scene(
-        lumps=(Lump(Box((0.5, 0.1, 0.5), (0.2, 0.2, 0.2)), 10_000),),
+        pieces=(Piece(Box((0.5, 0.1, 0.5), (0.2, 0.2, 0.2)), 10_000),),
         anchors=(
             Anchor(
                 Tool(Kind.SPHERE, (0.04,), 0.9),
@@ -98,7 +98,7 @@ class RollingPin(Plasticine):
         """
     )
     scene: ClassVar[Scene] = Scene(
-        lumps=(SLAB,),
+        pieces=(SLAB,),
         anchors=(Anchor(Tool(Kind.ROLLER, (0.15, 0.03), 0.9), (0.5, 0.123, 0.5), (2 / 3, 1 / 15, 0.001)),),
         yield_stress=50.0,
         floor_friction=1.5,
@@ -123,7 +123,7 @@ class Rope(Plasticine):
         """
     )
     scene: ClassVar[Scene] = Scene(
-        lumps=(Lump(Box((0.5, 0.03, 0.73), (0.6, 0.06, 0.06)), 10_000),),
+        pieces=(Piece(Box((0.5, 0.03, 0.73), (0.6, 0.06, 0.06)), 10_000),),
         anchors=tuple(_finger(x, 0.015, 0.82, 0.03, (0.01, 0.01, 0.01)) for x in (0.22, 0.78)),
         yield_stress=50.0,
         floor_friction=0.3,
@@ -150,9 +150,9 @@ class Table(Plasticine):
         """
     )
     scene: ClassVar[Scene] = Scene(
-        lumps=(
-            *(Lump(Box((x, 0.1, z), (0.04, 0.1, 0.04)), 2000) for x in (0.425, 0.575) for z in (0.425, 0.575)),
-            Lump(Box((0.5, 0.18, 0.5), (0.2, 0.05, 0.2)), 2000),
+        pieces=(
+            *(Piece(Box((x, 0.1, z), (0.04, 0.1, 0.04)), 2000) for x in (0.425, 0.575) for z in (0.425, 0.575)),
+            Piece(Box((0.5, 0.18, 0.5), (0.2, 0.05, 0.2)), 2000),
         ),
         anchors=(_finger(0.5, 0.06, 0.5, 0.04, (0.03, 0.0, 0.03)),),
         yield_stress=50.0,
@@ -178,7 +178,7 @@ class Torus(Plasticine):
         """
     )
     scene: ClassVar[Scene] = Scene(
-        lumps=(SLAB,),
+        pieces=(SLAB,),
         anchors=(
             Anchor(Tool(Kind.TORUS, (0.05, 0.03), 0.9), (0.5, 0.2, 0.5), (0.004, 0.004, 0.004), lower=(0.0, 0.05, 0.0)),
         ),
@@ -210,7 +210,7 @@ class TripleMove(Plasticine):
         """
     )
     scene: ClassVar[Scene] = Scene(
-        lumps=tuple(Lump(Box((x, 0.05, 0.5), (0.1, 0.1, 0.1)), 3333) for x in (0.3, 0.5, 0.7)),
+        pieces=tuple(Piece(Box((x, 0.05, 0.5), (0.1, 0.1, 0.1)), 3333) for x in (0.3, 0.5, 0.7)),
         anchors=tuple(_finger(x, 0.05, 0.5, 0.03, (0.01, 0.01, 0.01)) for x in (0.23, 0.37, 0.43, 0.57, 0.63, 0.77)),
         yield_stress=200.0,
         floor_friction=1.5,
@@ -238,7 +238,7 @@ class Writer(Plasticine):
         """
     )
     scene: ClassVar[Scene] = Scene(
-        lumps=(SLAB,),
+        pieces=(SLAB,),
         anchors=(
             Anchor(Tool(Kind.CAPSULE, (0.03, 0.03), 0.0), (0.5, 0.13, 0.5), (0.01, 0.01, 0.01), lower=(0.0, 0.05, 0.0)),
         ),

@@ -16,9 +16,9 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from ...landscapes.files import replacing
-from ..engines.mpm.tools import Kind, Tool
 from ..engines.mpm.model import Model
 from ..engines.mpm.raster import Raster
+from ..engines.mpm.tools import Kind, Tool
 
 SOLID = 1e-4  # mass at a node of a grid 1/64 m wide from which it is the target's [kg]; PlasticineLab's
 log = logging.getLogger(__name__)
@@ -56,14 +56,16 @@ def contact(
     slot = 0
     for tool in movable:
         with torch.no_grad():
-            closest = outside(tool, x, tools[:, None, slot : slot + tool.slots]).argmin(dim=1)
+            closest = distance_outside(tool, x, tools[:, None, slot : slot + tool.slots]).argmin(dim=1)
         nearest = x[torch.arange(len(x), device=x.device), closest]
-        total = total + outside(tool, nearest, tools[:, slot : slot + tool.slots]) ** 2
+        total = total + distance_outside(tool, nearest, tools[:, slot : slot + tool.slots]) ** 2
         slot += tool.slots
     return total
 
 
-def outside(tool: Tool, x: Float[Tensor, "*batch 3"], pose: Float[Tensor, "*batch slot 3"]) -> Float[Tensor, "*batch"]:
+def distance_outside(
+    tool: Tool, x: Float[Tensor, "*batch 3"], pose: Float[Tensor, "*batch slot 3"]
+) -> Float[Tensor, "*batch"]:
     """Return how far points are from a tool [m], 0 inside; `pose` is its position, for a roller then its angles."""
     p = x - pose[..., 0, :]
     size = tool.size
@@ -86,7 +88,7 @@ def outside(tool: Tool, x: Float[Tensor, "*batch 3"], pose: Float[Tensor, "*batc
     return outer
 
 
-def cached(name: str, content: str, make: Callable[[], np.ndarray]) -> np.ndarray:
+def load_or_make(name: str, content: str, make: Callable[[], np.ndarray]) -> np.ndarray:
     """Return what `make` returns, from the user's cache if it was made from the same `content` before."""
     digest = hashlib.sha256(content.encode()).hexdigest()[:16]
     path = user_cache_path("gradscape") / "targets" / f"{name}-{digest}.npy"

@@ -13,12 +13,12 @@ from torch import Tensor
 
 from ...landscapes.episode import Part, View
 from ...landscapes.space import ParameterSpace
-from . import lattice
 from ..base import Fidelity
-from ..controls import lasting, ramp
+from ..controls import extend, ramp
 from ..engines.sheets.contact import Pan
 from ..engines.sheets.springs import Sheet
-from ..outlines import about, triangles
+from ..outlines import rotate_about, triangles
+from . import lattice
 from .sheets import Drive, SheetScene
 
 ACROSS = 0.2  # the pancake's diameter [m]
@@ -80,7 +80,7 @@ class Flip(SheetScene):
 
     def _drive(self, x: Float[Tensor, "batch dim"]) -> Drive:
         course = ramp(x.new_zeros(3), x.view(len(x), SEGMENTS, 3), self.own_steps)
-        poses = lasting(course, self.steps + 1, then=course[:, -1:])
+        poses = extend(course, self.steps + 1, then=course[:, -1:])
         return Drive(x.new_zeros(len(x), 3), x.new_full((len(x), len(self.sheet.x)), STIFFNESS), poses)
 
     def _extremes(self) -> list[int]:
@@ -90,14 +90,14 @@ class Flip(SheetScene):
 
     def _loss(self, end: Float[Tensor, "vertex 3"]) -> Float[Tensor, ""]:
         extremes = self._extremes()
-        loss: Tensor = (end[extremes] - self._flipped().to(end)).norm(dim=1).mean()
+        loss: Tensor = (end[extremes] - self._goal().to(end)).norm(dim=1).mean()
         return loss
 
-    def _flipped(self) -> Float[Tensor, "vertex 3"]:
+    def _goal(self) -> Float[Tensor, "vertex 3"]:
         """Return where those vertices are wanted [m]."""
         return torch.from_numpy(self.sheet.x[self._extremes()] * (-1.0, 1.0, 1.0))
 
-    def _tools(self, poses: Float[Tensor, "frame 3"]) -> Mapping[str, Float[Tensor, "frame 3"]]:
+    def _surroundings(self, poses: Float[Tensor, "frame 3"]) -> Mapping[str, Float[Tensor, "frame 3"]]:
         return {"pan": poses}
 
     def _parts(self, frames: Float[Tensor, "frame vertex 3"], poses: Float[Tensor, "frame 3"]) -> tuple[Part, ...]:
@@ -106,7 +106,7 @@ class Flip(SheetScene):
         size = (self.surface.flat, self.surface.bend, self.surface.sweep)
         return (
             Part("sheet", "dough", frames, (THICK,), faces=faces),
-            Part("pan", "iron", place, size, about(2, poses[:, 2])),
+            Part("pan", "iron", place, size, rotate_about(2, poses[:, 2])),
             Part("sphere", "rubber", frames[:, self._extremes()[:1]], (MARK,)),  # one of the four, to tell its sides
-            Part("sphere", "target", self._flipped()[:1].expand(len(frames), 1, 3), (1.5 * MARK,)),
+            Part("sphere", "target", self._goal()[:1].expand(len(frames), 1, 3), (1.5 * MARK,)),
         )

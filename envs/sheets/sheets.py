@@ -15,10 +15,10 @@ from torch import Tensor
 from ...landscapes.episode import Part, View
 from ...landscapes.objective import Evaluation, Status
 from ..base import Environment, Episode, Work
+from ..batching import Pool
 from ..engines.sheets.contact import Surface
-from ..engines.runtime import Pool
 from ..engines.sheets.springs import Sheet, Solver, capacity
-from ..observation import motion, watched
+from ..observation import describe_motion, watch
 from ..options import EpisodeOptions
 
 FRAME = 0.01  # between the frames of an episode [s]
@@ -33,7 +33,7 @@ class Drive:
     stiffness: Float[Tensor, "batch vertex"]
     poses: Float[Tensor, "batch step_plus_1 3"]
 
-    def detached(self) -> tuple[Tensor, Tensor, Tensor]:
+    def detach(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return all three without their history."""
         return self.velocity.detach(), self.stiffness.detach(), self.poses.detach()
 
@@ -65,7 +65,7 @@ class SheetScene(Environment):
     @property
     def steps(self) -> int:
         """Number of time steps of an episode."""
-        steps: int = self.options.lasting(self.own_steps)
+        steps: int = self.options.count_steps(self.own_steps)
         return steps
 
     def memory(self) -> int:
@@ -84,15 +84,15 @@ class SheetScene(Environment):
         if shown[-1] != self.steps:
             shown = torch.cat([shown, shown.new_tensor([self.steps])])
         with self._solvers.lend() as solver:
-            frames = solver.run(*drive.detached())[:, 0].double().cpu()[shown]
+            frames = solver.run(*drive.detach())[:, 0].double().cpu()[shown]
         poses = drive.poses[0, shown].detach()
         parts = self._parts(frames, poses)
-        return Episode(self.fidelity.dt * shown, {"sheet": frames}, self._tools(poses), parts, self.view)
+        return Episode(self.fidelity.dt * shown, {"sheet": frames}, self._surroundings(poses), parts, self.view)
 
     def end(self, x: Float[Tensor, " dim"]) -> Float[Tensor, "vertex 3"]:
         """Return where vertices are at the end of the episode at one point [m]."""
         with self._solvers.lend() as solver:
-            end: Tensor = solver.run(*self._drive(self._row(x)).detached())[-1, 0].double().cpu()
+            end: Tensor = solver.run(*self._drive(self._row(x)).detach())[-1, 0].double().cpu()
         return end
 
     @abc.abstractmethod
@@ -108,7 +108,7 @@ class SheetScene(Environment):
         """Return the loss of one episode by where its vertices end."""
 
     @abc.abstractmethod
-    def _tools(self, poses: Float[Tensor, "frame 3"]) -> Mapping[str, Float[Tensor, "frame 3"]]:
+    def _surroundings(self, poses: Float[Tensor, "frame 3"]) -> Mapping[str, Float[Tensor, "frame 3"]]:
         """Return what stands around the sheet, from the surface's poses."""
 
     @abc.abstractmethod
@@ -117,7 +117,7 @@ class SheetScene(Environment):
 
     def _setup(self) -> None:
         self.sheet = self._sheet()
-        self._capacity = self._rows_at_once(capacity(self.memory(), self.device))
+        self._capacity = self._limit_rows(capacity(self.memory(), self.device))
         self._solvers = Pool(
             partial(
                 self._engine("springs").Solver,
@@ -136,7 +136,7 @@ class SheetScene(Environment):
         x = x.clone().requires_grad_(grad)
         drive = self._drive(x)
         with self._solvers.lend() as solver:
-            end = solver.run(*drive.detached())[-1].double().cpu().requires_grad_(grad)
+            end = solver.run(*drive.detach())[-1].double().cpu().requires_grad_(grad)
             loss = torch.stack([self._loss(row) for row in end])  # by row: batched sums round as the batch is split
             slope = self._pull_back(solver, loss, end, drive, x) if grad else None
         return Evaluation(loss.detach(), slope, torch.full((len(x),), Status.OK, dtype=torch.int8))
@@ -147,12 +147,12 @@ class SheetScene(Environment):
             return super()._observe(x, decision)
         drive, step = self._drive(x), decision * self.steps // self.decisions
         with self._solvers.lend() as solver:
-            frames = solver.run(*drive.detached()).double().cpu()
+            frames = solver.run(*drive.detach()).double().cpu()
         seen = [
-            torch.cat([watched(frames[k], [frames.shape[2]]), drive.poses[:, k, None]], dim=1)
+            torch.cat([watch(frames[k], [frames.shape[2]]), drive.poses[:, k, None]], dim=1)
             for k in (0, max(0, step - 1), step)
         ]
-        return motion(*seen, scale=REACH, intervals=self.steps // self.decisions)
+        return describe_motion(*seen, scale=REACH, intervals=self.steps // self.decisions)
 
     def _pull_back(self, solver: Solver, loss: Tensor, end: Tensor, drive: Drive, x: Tensor) -> Tensor:
         (adj_end,) = torch.autograd.grad(loss.sum(), end)

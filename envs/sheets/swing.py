@@ -14,12 +14,12 @@ from torch import Tensor
 
 from ...landscapes.episode import Part, View
 from ...landscapes.space import ParameterSpace
-from . import lattice
 from ..base import Fidelity
 from ..engines.sheets.contact import Floor
 from ..engines.sheets.springs import Sheet
 from ..options import EpisodeOptions
 from ..outlines import triangles
+from . import lattice
 from .sheets import Drive, SheetScene
 
 SIDE, HEIGHT = 0.2, 0.1  # the cloth's edge, and how far above the floor it is held [m]
@@ -75,7 +75,7 @@ class Swing(SheetScene):
         """Return kinetic energy, that of height above the floor, and that of the springs."""
         drive, sheet = self._drive(x), self.sheet
         with self._solvers.lend() as solver:
-            frames = solver.run(*drive.detached()).double().cpu()
+            frames = solver.run(*drive.detach()).double().cpu()
         kinetic = (frames.diff(dim=0) / self.fidelity.dt).square().sum(dim=(2, 3)) / 2  # the step's own velocities
         ends = torch.from_numpy(sheet.pairs).T.long()
         stretch = (frames[1:, :, ends[0]] - frames[1:, :, ends[1]]).norm(dim=3) - torch.from_numpy(sheet.rest)
@@ -100,7 +100,7 @@ class Swing(SheetScene):
         loss: Tensor = miss.norm(dim=1).mean()
         return loss
 
-    def _tools(self, poses: Float[Tensor, "frame 3"]) -> Mapping[str, Float[Tensor, "frame 3"]]:
+    def _surroundings(self, poses: Float[Tensor, "frame 3"]) -> Mapping[str, Float[Tensor, "frame 3"]]:
         held = torch.from_numpy(self.sheet.x[list(self.sheet.held)])
         return {f"anchor {number}": place.expand(len(poses), 3) for number, place in enumerate(held, start=1)}
 
@@ -113,7 +113,7 @@ class Swing(SheetScene):
             Part("sheet", "target", self._target.expand_as(frames), faces=faces),
         )
 
-    def _still(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 3"]:
+    def _rest_poses(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 3"]:
         return x.new_zeros(len(x), self.steps + 1, 3)
 
     def _prepare(self) -> None:
@@ -136,7 +136,7 @@ class SwingVelocity(Swing):
     space = ParameterSpace.box([f"velocity {axis}" for axis in "xyz"], -2.0, 2.0, "m/s")
 
     def _drive(self, x: Float[Tensor, "batch dim"]) -> Drive:
-        return Drive(x, torch.full((len(x), len(self.sheet.x)), STIFFNESS, dtype=x.dtype), self._still(x))
+        return Drive(x, torch.full((len(x), len(self.sheet.x)), STIFFNESS, dtype=x.dtype), self._rest_poses(x))
 
 
 class SwingStiffness(Swing):
@@ -161,4 +161,4 @@ class SwingStiffness(Swing):
         across = self.fidelity.resolution + 1
         patch = torch.arange(across) * PATCHES // across
         stiffness = x[:, (patch[:, None] * PATCHES + patch).flatten()]
-        return Drive(x.new_tensor(SWING).expand(len(x), 3), stiffness, self._still(x))
+        return Drive(x.new_tensor(SWING).expand(len(x), 3), stiffness, self._rest_poses(x))

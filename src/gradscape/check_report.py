@@ -31,16 +31,6 @@ if TYPE_CHECKING:
 FACTORS = (1, 2, 4, 8)  # of the fidelity's time step, and of the scene's horizon
 STYLES = {"pass": "green", "fail": "bold red", "skip": "dim", "known": "yellow", "unexpected": "bold red"}
 
-# Options that make a scene's material soft and stiff: the least and the most to try.
-MATERIALS: dict[str, tuple[str, float, float]] = {
-    "bounce": ("ke", 1e3, 1e5),  # contact stiffness [N/m], a tenth and ten times the default
-    "fluid": ("viscosity", 0.4, 40.0),  # [Pa s], the same
-    "pinball-2": ("restitution", 0.0, 1.0),
-    "pinball-16": ("restitution", 0.0, 1.0),
-}
-# Checks that scenes of ours are known to fail, and why: environment -> fidelity -> check -> reason.
-EXPECTED: dict[str, dict[str, dict[str, str]]] = {}
-
 
 def check(
     name: str,
@@ -101,7 +91,6 @@ def _findings(scene: Scene, points: int, seed: int, follow: Callable[[str], None
         precision=scene.env.fidelity.precision,
         twin=_twin(scene),
         variants=[*_time_steps(scene), *_materials(scene), *_horizons(scene)],
-        expected=EXPECTED.get(scene.name, {}).get(scene.env.fidelity.name),
         follow=follow,
     )
 
@@ -185,11 +174,11 @@ def _materials(scene: Scene) -> list[Variant]:
     """Return the softest and the stiffest of what a scene is made of, by its options or its parameters."""
     from .landscapes.extremes import Variant
 
-    if scene.name in MATERIALS:
-        option, *ends = MATERIALS[scene.name]
-        return [Variant(f"{option} {end:g}", partial(scene.remade, **{option: end})) for end in ends]
+    if (ends := scene.env.material_range) is not None:
+        values = (ends.softest, ends.stiffest)
+        return [Variant(f"{ends.option} {value:g}", partial(scene.remade, **{ends.option: value})) for value in values]
     space = scene.env.space
-    stiff = [number for number, name in enumerate(space.names) if "stiffness" in name]
+    stiff = [space.names.index(name) for name in scene.env.stiffness_parameters]
     if not stiff:
         return [Variant("softest and stiffest", why="it offers no stiffness to set")]
     found = []

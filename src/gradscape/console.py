@@ -26,7 +26,7 @@ from rich.progress import (
 )
 
 from . import __version__
-from .envs.registry import completed, entries, make
+from .envs.registry import complete_entry, entries, make
 from .landscapes.capacity import size as size
 from .tables import table
 from .terminal import Console, Described
@@ -54,7 +54,7 @@ TAKEN = {one.name for one in signature(make).parameters.values() if one.kind is 
 def list_environments() -> None:
     """Print every registered environment as a table; of ours none is imported for that."""
     found = table("name", "dim", "parameters", "model", "fidelities", title="environments")
-    for entry in map(completed, entries().values()):
+    for entry in map(complete_entry, entries().values()):
         row = (entry.name, entry.dim, entry.parameters, entry.model, ", ".join(entry.fidelities))
         found.add_row(*row)
     console = Console()

@@ -59,8 +59,8 @@ def race(
     options = _options(method_settings, chosen)
     how: dict[str, Any] = {"fidelity": fidelity, "device": device, "engine": engine, "deterministic": deterministic}
     env = make(name, **how, **read_settings(settings))
-    if workers > 1 and env.engine == "taichi":
-        raise ValueError(f"engine taichi runs in one thread only, so --workers is 1; got {workers}")
+    if workers > 1 and not env.capabilities.concurrent:
+        raise ValueError(f"engine {env.engine} runs in one thread only, so --workers is 1; got {workers}")
     if workers > 1 and scheduler:
         raise ValueError(f"--scheduler has workers of its own, so --workers is 1; got {workers}")
     give_torch_one_thread()

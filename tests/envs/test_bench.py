@@ -9,8 +9,8 @@ import warp as wp
 from gradscape.envs.base import Environment, Fidelity, Work
 from gradscape.envs.bench import alternated, bench
 from gradscape.envs.bounce import Bounce
-from gradscape.envs.engines.mpm.model import Box
 from gradscape.envs.engines.launches import Replay
+from gradscape.envs.engines.mpm.model import Box
 from gradscape.envs.engines.runtime import KernelTime, cuda_available, kernel_times
 from gradscape.envs.mpm.fluid import Fluid
 from gradscape.landscapes.objective import Evaluation, Status

@@ -9,8 +9,8 @@ from gradscape.envs.base import Fidelity
 from gradscape.envs.bounce import Bounce
 from gradscape.envs.cartpole import Cartpole
 from gradscape.envs.mpm.fluid import SPAN
-from gradscape.envs.pinball import Pinball2, Pinball16
 from gradscape.envs.mpm.plasticine_model import SPAN as SOFT_SPAN
+from gradscape.envs.pinball import Pinball2, Pinball16
 from gradscape.envs.registry import entries, environment_class, make
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 

@@ -69,7 +69,7 @@ class Surfaces(NamedTuple):
     nearest: Any
     coulomb: Any
     rebound: Any
-    deflected: Any
+    deflect: Any
 
 
 @cache
@@ -162,7 +162,7 @@ def surfaces(name: str) -> Surfaces:
         return data.restitution * wp.min(real(1.0), approach / data.crawl) * approach
 
     @wp.func(module=module)
-    def deflected(data: Data, n: vec2, v: vec2, spin: real, after: real):
+    def deflect(data: Data, n: vec2, v: vec2, spin: real, after: real):
         """Return velocity and spin after an impact that leaves the normal speed `after`."""
         t = vec2(-n[1], n[0])
         push = after - wp.dot(v, n)
@@ -171,4 +171,4 @@ def surfaces(name: str) -> Surfaces:
         rub = coulomb(stick, data.friction * wp.max(push, real(0.0)))
         return v + push * n + rub * t, spin - rub / (data.inertia * data.radius)
 
-    return Surfaces(Data, along, anchor, outward, distance, nearest, coulomb, rebound, deflected)
+    return Surfaces(Data, along, anchor, outward, distance, nearest, coulomb, rebound, deflect)

@@ -14,9 +14,9 @@ from typing import Any, no_type_check
 import torch
 import warp as wp
 
+from ..runtime import load, precision, to_torch
 from .board import DONE, FREE, Board, Kernels, constants, surfaces
 from .overlaps import step_kernels
-from ..runtime import load, precision, to_torch
 
 JAM = wp.constant(8)  # impacts in one step after which its rest is dropped: the ball is stuck between surfaces
 ASK = 32  # iterations between two questions whether all rows are done
@@ -105,7 +105,7 @@ class Solver:
     def gradient(self, adj_x: torch.Tensor) -> Slopes:
         """Return what the adjoint of the last positions, shape (batch, 2), is for the beginning of the latest run."""
         batch = len(adj_x)
-        adjoint = self._cleared_adjoint()
+        adjoint = self._clear_adjoint()
         adjoint.tensor("x")[self.taken, self._rows()] = adj_x.to(adjoint.tensor("x"))
         settings: dict[str, Any] = {"device": self.device, "adjoint": True, "record_tape": False}
         nothing = [None] * len(Flight.COUNTS)
@@ -131,7 +131,7 @@ class Solver:
         i = 0
         while bool((self.flight.tensor("step")[i, :batch] < self.steps).any()):
             if i + ASK >= self.flight.length:
-                self._lengthen()
+                self._double_length()
             for k in range(i, i + ASK):
                 for kernel in self.kernels:
                     wp.launch(kernel, batch, self._inputs(k), device=self.device, record_tape=False)
@@ -139,12 +139,12 @@ class Solver:
         taken: torch.Tensor = (self.flight.tensor("pick")[:i, :batch] != DONE).sum(dim=0)
         return taken
 
-    def _lengthen(self) -> None:
+    def _double_length(self) -> None:
         old, self.flight = self.flight, Flight(2 * self.flight.length, self.capacity, self.name, self.device)
         for field in (*Flight.NUMBERS, *Flight.COUNTS):
             self.flight.tensor(field)[: old.length] = old.tensor(field)
 
-    def _cleared_adjoint(self) -> Flight:
+    def _clear_adjoint(self) -> Flight:
         if self.adjoint is None or self.adjoint.length != self.flight.length:
             self.adjoint = Flight(self.flight.length, self.capacity, self.name, self.device, counts=False)
         used = int(self.taken.max()) + 1
@@ -171,7 +171,7 @@ def impact_kernels(name: str) -> Kernels:
     vec2 = wp.types.vector(2, real)
     Reals, Vecs, Ints = wp.array2d[real], wp.array2d[vec2], wp.array2d[int]
     module = f"gradscape.impacts.{name}"
-    Data, along, anchor, outward, distance, nearest, coulomb, rebound, deflected = surfaces(name)
+    Data, along, anchor, outward, distance, nearest, coulomb, rebound, deflect = surfaces(name)
 
     @wp.func(module=module)
     def kick(data: Data, support: int, angle: Reals, e: int, here: vec2, v: vec2, spin: real, rest: real):
@@ -203,7 +203,7 @@ def impact_kernels(name: str) -> Kernels:
         return c / (wp.sqrt(root) - b)
 
     @wp.func(module=module)
-    def bar_met(data: Data, p: vec2, q: vec2, soonest: real):
+    def hit_bar(data: Data, p: vec2, q: vec2, soonest: real):
         """Return when and where, before `soonest`, a chord from p along q enters a bar, in the bar's frame."""
         met = int(FREE)
         L, R = data.half_length, data.reach
@@ -263,7 +263,7 @@ def impact_kernels(name: str) -> Kernels:
                 axis = along(angle[e, k])
                 across = vec2(-axis[1], axis[0])
                 p = vec2(wp.dot(to, axis), wp.dot(to, across))
-                t, met = bar_met(data, p, vec2(wp.dot(w, axis), wp.dot(w, across)), soonest)
+                t, met = hit_bar(data, p, vec2(wp.dot(w, axis), wp.dot(w, across)), soonest)
                 if met != FREE:
                     first = 4 * k + met
                     soonest = t
@@ -277,7 +277,7 @@ def impact_kernels(name: str) -> Kernels:
         pick[i, e] = first
 
     @wp.func(module=module)
-    def meeting(data: Data, surface: int, angle: Reals, e: int, here: vec2, w: vec2) -> real:
+    def time_of_impact(data: Data, surface: int, angle: Reals, e: int, here: vec2, w: vec2) -> real:
         """Return when the chord from `here` along w meets a surface."""
         if surface // 4 < data.pivot.shape[0] and surface % 4 >= 2:
             return time_to_end(data, here - anchor(data, surface, angle, e), w)
@@ -285,7 +285,7 @@ def impact_kernels(name: str) -> Kernels:
         return -distance(data, surface, angle, e, here) / wp.dot(n, w)
 
     @wp.func(module=module)
-    def parting(data: Data, n: vec2, u: real, left: real):
+    def separate(data: Data, n: vec2, u: real, left: real):
         """Return the normal speed after a meeting at u, and whether the surface carries the ball from there on."""
         pull = -data.gravity * n[1]
         after = u  # where its parabola turned before the chord met: it leaves already
@@ -328,7 +328,7 @@ def impact_kernels(name: str) -> Kernels:
             rest[i + 1, e] = data.dt
             step[i + 1, e] = step[i, e] + 1
             return
-        t = wp.clamp(meeting(data, surface, angle, e, here, w), real(0.0), span)
+        t = wp.clamp(time_of_impact(data, surface, angle, e, here, w), real(0.0), span)
         there = here + t * w
         share = t / span
         arriving = speed + share * gain
@@ -336,8 +336,8 @@ def impact_kernels(name: str) -> Kernels:
         u = wp.dot(arriving, n)
         if u < -data.crawl:
             hits[i + 1, e] = hits[i, e] + 1
-        after, carried = parting(data, n, u, span - t)
-        leaving, turning = deflected(data, n, arriving, turn + share * twist, after)
+        after, carried = separate(data, n, u, span - t)
+        leaving, turning = deflect(data, n, arriving, turn + share * twist, after)
         x[i + 1, e] = there
         v[i + 1, e] = leaving
         spin[i + 1, e] = turning

@@ -9,8 +9,8 @@ from typing import no_type_check
 
 import warp as wp
 
-from .board import DONE, FREE, Kernels, surfaces
 from ..runtime import precision
+from .board import DONE, FREE, Kernels, surfaces
 
 
 @cache
@@ -21,7 +21,7 @@ def step_kernels(name: str) -> Kernels:
     vec2 = wp.types.vector(2, real)
     Reals, Vecs, Ints = wp.array2d[real], wp.array2d[vec2], wp.array2d[int]
     module = f"gradscape.overlaps.{name}"
-    Data, along, _, outward, distance, nearest, _, rebound, deflected = surfaces(name)
+    Data, along, _, outward, distance, nearest, _, rebound, deflect = surfaces(name)
 
     @wp.kernel(module=module, enable_backward=False)
     def find(
@@ -86,7 +86,7 @@ def step_kernels(name: str) -> Kernels:
         if surface != FREE:
             n = outward(data, surface, angle, e, here)
             approach = -wp.dot(n, w)
-            w, turn = deflected(data, n, w, turn, rebound(data, approach))
+            w, turn = deflect(data, n, w, turn, rebound(data, approach))
             if approach > data.crawl:
                 hits[i + 1, e] = hits[i, e] + 1
         x[i + 1, e] = here + data.dt * w

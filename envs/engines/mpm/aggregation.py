@@ -11,7 +11,7 @@ import warp as wp
 
 from ..runtime import precision
 
-TOGETHER = """
+FIND_RUN = """
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
     const unsigned lanes = __activemask();
     const int lane = threadIdx.x & 31;
@@ -26,7 +26,7 @@ TOGETHER = """
     return wp::vec_t<4, wp::int32>();
 #endif
 """
-ADD = """
+ADD_RUN = """
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
     for (int step = 1; step <= run[2]; step *= 2) {
         #pragma unroll
@@ -47,22 +47,22 @@ ADD = """
 
 
 @no_type_check
-def adding(name: str, module: str, *, native: bool) -> tuple[Any, Any]:
-    """Return the functions (together, add) that scatters call, with instructions of a GPU's own if `native`.
+def aggregation(name: str, module: str, *, native: bool) -> tuple[Any, Any]:
+    """Return the functions (find_run, add) that scatters call, with instructions of a GPU's own if `native`.
 
-    together(e, i) tells a lane about its run, the lanes with the same environment e and node i: how many follow, if it
+    find_run(e, i) tells a lane about its run, the lanes with the same environment e and node i: how many follow, if it
     is the first, the most that follow any, which lanes are there. add(grid, e, i, value, run, parts) adds the first
     `parts` numbers of `value` to node i; the others are zero. All lanes must come by, each with the same offset from
-    the node that `together` was told.
+    the node that `find_run` was told.
     """
     vec4 = precision(name).vec4
 
-    def together(e: int, i: int) -> wp.vec4i:
+    def find_run(e: int, i: int) -> wp.vec4i:
         return wp.vec4i()
 
     def add(grid: wp.array2d[vec4], e: int, i: int, value: vec4, run: wp.vec4i, parts: int):
         wp.atomic_add(grid, e, i, value)
 
     if native:
-        return wp.func_native(TOGETHER)(together), wp.func_native(ADD)(add)
-    return wp.func(together, module=module), wp.func(add, module=module)
+        return wp.func_native(FIND_RUN)(find_run), wp.func_native(ADD_RUN)(add)
+    return wp.func(find_run, module=module), wp.func(add, module=module)

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Protocol, no_type_check
 
 import warp as wp
 
-from ..runtime import filled, precision
+from ..runtime import fill_struct, precision
 from .sdf import bowl, rod
 
 
@@ -73,7 +73,7 @@ class LadleInTank:
 
     def data(self, name: str, device: str) -> Any:
         """Return the function's data."""
-        return filled(self.function(name)[1](), self)
+        return fill_struct(self.function(name)[1](), self)
 
 
 @cache

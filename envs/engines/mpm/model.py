@@ -7,12 +7,13 @@ import numpy as np
 import torch
 import warp as wp
 
+from ..runtime import precision
 from .boundaries import Boundary
 from .materials import Fluid, Material
-from ..runtime import precision
 from .transfers import lattice
 
 MARGIN = 1  # cells around the particles that a control step begins with
+EMPTY = 1e-8  # nodes lighter than this part of the lightest particle carry no velocity
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,16 +71,16 @@ class Model:
         """Number of nodes of the grid."""
         return int(np.prod(self.nodes))
 
-    def bytes_per_environment(self, windows: int) -> int:
-        """Return about what one environment of a solver that keeps so many control steps takes, adjoints included.
+    def bytes_per_environment(self, tapes: int) -> int:
+        """Return about what an environment takes of a solver that stores so many control steps whole, with adjoints.
 
         Grids are counted as large as they are around the bodies at rest, and as large again.
         """
         state = sum(len(body.x) * (1 if isinstance(body.material, Fluid) else 9) for body in self.bodies)
         frame = 15 * self.particles + state  # x, v, C and each material's own
-        grid = 8 * min(self.cells, around(self, *self.corners, MARGIN).cells * 2)
+        grid = 8 * min(self.cells, nodes_around(self, *self.corners, MARGIN).cells * 2)
         substep = frame + 9 * self.particles + grid
-        return self.real_bytes * ((self.steps + 3) * frame + (windows * self.substeps + 1) * substep)
+        return self.real_bytes * ((self.steps + 3) * frame + (tapes * self.substeps + 1) * substep)
 
     @property
     def corners(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -106,7 +107,7 @@ class Box:
         return int(np.prod(self.nodes))
 
 
-def place(model: Model, box: Box | None = None) -> Any:
+def place_grid(model: Model, box: Box | None = None) -> Any:
     """Return where a model's grid lies, for the transfer kernels: the nodes in `box`, or all."""
     first, nodes = (box.first, box.nodes) if box else ((0, 0, 0), model.nodes)
     placed = lattice(model.precision)()
@@ -117,8 +118,8 @@ def place(model: Model, box: Box | None = None) -> Any:
     return placed
 
 
-def around(model: Model, low: torch.Tensor, high: torch.Tensor, margin: int, grain: int = 1) -> Box:
-    """Return the nodes that particles between two corners [m], shape (3,), meet while none moves `margin` cells.
+def nodes_around(model: Model, low: torch.Tensor, high: torch.Tensor, margin: int, grain: int = 1) -> Box:
+    """Return the nodes that particles between two corners [m], shape (3,), touch while none moves `margin` cells.
 
     It begins and ends at multiples of `grain`, or with the grid.
     """

@@ -13,14 +13,14 @@ import numpy as np
 import torch
 import warp as wp
 
-from .model import Model, place
 from ..runtime import load, precision, to_torch
+from .model import Model, place_grid
 from .transfers import lattice
 
 
 @cache
 @no_type_check
-def sorting(name: str) -> SimpleNamespace:
+def sorting_kernels(name: str) -> SimpleNamespace:
     """Return the kernels `label, take, give`, and `take_state, give_state` by a state's type."""
     types = precision(name)
     real, vec3, mat33 = types.real, types.vec3, types.mat33
@@ -89,12 +89,12 @@ def sorting(name: str) -> SimpleNamespace:
         old_v[e, q] = v[e, p]
         old_C[e, q] = C[e, p]
 
-    states = {kind: _of_state(kind, f"{module}.{tail}") for tail, kind in (("number", real), ("matrix", mat33))}
+    states = {kind: _state_kernels(kind, f"{module}.{tail}") for tail, kind in (("number", real), ("matrix", mat33))}
     return SimpleNamespace(label=label, take=take, give=give, states=states)
 
 
 @no_type_check
-def _of_state(kind: Any, module: str) -> tuple[Any, Any]:
+def _state_kernels(kind: Any, module: str) -> tuple[Any, Any]:
     @wp.kernel(module=module, enable_backward=False)
     def take_state(first: int, place: wp.array2d[wp.int32], before: wp.array2d[kind], after: wp.array2d[kind]):
         e, p = wp.tid()
@@ -140,13 +140,13 @@ class Sorter:
     """Sort the particles of up to `capacity` environments between control steps, and bring adjoints back."""
 
     def __init__(self, model: Model, capacity: int, device: str) -> None:
-        self.model, self.device, self.lattice = model, device, place(model)
+        self.model, self.device, self.lattice = model, device, place_grid(model)
         sizes = [len(body.x) for body in model.bodies]
         self.body: wp.array = wp.array(np.repeat(np.arange(len(sizes), dtype=np.int32), sizes), device=device)
         room = 2 * capacity * model.particles
         self.keys, self.places = (wp.zeros(room, dtype=kind, device=device) for kind in (wp.int64, wp.int32))
         self.bits = int(capacity * len(sizes) * model.cells).bit_length()
-        self.kernels = sorting(model.precision)
+        self.kernels = sorting_kernels(model.precision)
         states = (self.kernels.states[body.material.state(model.precision)] for body in model.bodies)
         load([self.kernels.label, *chain.from_iterable(states)], device)
         self.first = np.cumsum([0, *sizes])[:-1].tolist()

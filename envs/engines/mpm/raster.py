@@ -6,8 +6,8 @@ import numpy as np
 import torch
 import warp as wp
 
-from .model import Model, place
 from ..runtime import load, precision, to_torch
+from .model import Model, place_grid
 from .transfers import transfers
 
 
@@ -19,7 +19,7 @@ class Raster:
     ) -> None:
         types = precision(model.precision)
         self.kernels = transfers(model.precision, deterministic=deterministic)
-        self.lattice, self.device = place(model), device
+        self.lattice, self.device = place_grid(model), device
         load([self.kernels.p2g, self.kernels.adjoint_p2g], device)
         self.mass: wp.array = wp.array(np.tile(mass, (capacity, 1)), dtype=types.real, device=device)
         kinds = types.vec3, types.vec3, types.mat33, types.vec3, types.vec3, types.mat33

@@ -22,20 +22,17 @@ import numpy as np
 import torch
 import warp as wp
 
+from ..launches import Launches
+from ..runtime import free_memory, load, to_torch
+from .checkpoints import Allocator, Frame, Tape
 from .grid import velocity_kernel
-from .model import MARGIN, Box, Model, around
+from .model import EMPTY, MARGIN, Box, Model, nodes_around
 from .order import Order, Sorter
-from ..launches import Replay
-from ..runtime import free_memory, load, precision, to_torch
 from .transfers import lattice, transfers
-from .checkpoints import Frame, Grid, Window
-
-EMPTY = 1e-8  # nodes lighter than this part of the lightest particle carry no velocity
-
 
 CROWD = 8_000  # particles that hide what a launch costs on one core
 BUSY, FULL_CARD = 400_000, 1_000_000  # particles that keep a GPU busy; more than which gain nothing
-KEPT = 192e6  # bytes up to which a CPU keeps an episode whole
+WHOLE_EPISODE = 192e6  # bytes up to which a CPU stores an episode whole
 LAUNCHES = 200_000  # particles up to which launches cost a GPU more than what they launch
 SPARE = 0.85  # part of a GPU's free memory that control steps are kept in
 GRAIN = 4  # nodes to which the boxes of so few are rounded, so that the same ones come again
@@ -54,7 +51,7 @@ def capacity(model: Model, device: str) -> int:
 def memory(model: Model, device: str) -> int:
     """Return about how many bytes an environment takes; a GPU's spare memory is used beyond that."""
     whole = model.bytes_per_environment(model.steps)
-    return whole if device == "cpu" and whole <= KEPT else model.bytes_per_environment(1)
+    return whole if device == "cpu" and whole <= WHOLE_EPISODE else model.bytes_per_environment(1)
 
 
 class Solver:
@@ -75,7 +72,8 @@ class Solver:
     ) -> None:
         self.model, self.capacity, self.device = model, capacity, device
         self.stop = stop or threading.Event()
-        self.types = precision(model.precision)
+        self.allocator = Allocator(model, capacity, device)
+        self.types = self.allocator.types
         self.kernels = transfers(model.precision, deterministic=deterministic)
         boundary = model.boundary.function(model.precision)
         self.velocity = velocity_kernel(model.precision, *boundary, deterministic=deterministic)
@@ -87,17 +85,17 @@ class Solver:
         self.empty = EMPTY * float(model.mass.min())
         self.boxes = [Box((0, 0, 0), model.nodes)] * model.steps
         self.margins = [MARGIN] * model.steps  # cells around the particles, as each step has needed so far
-        self.checkpoints = [self.frame() for _ in range(model.steps + 1)]
+        self.checkpoints = [self.allocator.frame() for _ in range(model.steps + 1)]
         self.orders = [Order(model, capacity, device) for _ in self.checkpoints]
-        self.end = self.frame()  # of a control step, before its particles are sorted
+        self.end = self.allocator.frame()  # of a control step, before its particles are sorted
         self.sorter = Sorter(model, capacity, device)
-        self.replay = Replay(device)
+        self.launches = Launches(device)
         whole = device == "cpu" and memory(model, device) > model.bytes_per_environment(1)
-        self.windows = [Window(self) for _ in range(model.steps if whole else 1)]
-        self.spacious = device == "cpu"  # whether spare memory has been put to use
+        self.tapes = [Tape(self.allocator) for _ in range(model.steps if whole else 1)]
+        self.spare_used = device == "cpu"  # whether spare memory has been put to use
         self.lanes = 1 if device == "cpu" else LANES
-        self.tools = self.paths()
-        self.strayed, self.escaped = (wp.zeros(capacity, dtype=wp.int32, device=device) for _ in range(2))
+        self.tools = self.allocator.paths(self.lanes)
+        self.left_box, self.escaped = (wp.zeros(capacity, dtype=wp.int32, device=device) for _ in range(2))
         self.adjoint: _Adjoint | None = None
         self._start()
 
@@ -108,19 +106,19 @@ class Solver:
         self.by_lane(self.tools)[:batch, :, : steps + 1] = tools[:, None].to(self.types.torch)
         corners = self.model.corners
         for step in range(steps):
-            corners = self._explore(step, batch, *corners)
-        if not self.spacious:
-            self._keep_more()
+            corners = self._advance_on_box(step, batch, *corners)
+        if not self.spare_used:
+            self._add_tapes()
         return self.reached(steps, batch)
 
-    def _keep_more(self) -> None:
-        """Keep more control steps whole from the next run on, in most of a GPU's memory that is free after a first."""
-        self.spacious = True
-        more = min(self.model.steps - 1, int(SPARE * free_memory()) // self.windows[0].bytes)
-        cells = self.windows[0].grids[0].m.shape[1]
-        self.windows += [Window(self, cells) for _ in range(more)]
-        self.windows[0].step = -1  # it keeps other steps now
-        self.replay.forget()
+    def _add_tapes(self) -> None:
+        """Store more control steps whole from the next run on, in most of a GPU's memory that is free after a first."""
+        self.spare_used = True
+        more = min(self.model.steps - 1, int(SPARE * free_memory()) // self.tapes[0].bytes)
+        cells = self.tapes[0].grids[0].m.shape[1]
+        self.tapes += [Tape(self.allocator, cells) for _ in range(more)]
+        self.tapes[0].step = -1  # it keeps other steps now
+        self.launches.clear()
 
     def reached(self, step: int, batch: int) -> torch.Tensor:
         """Return x [m] before control step `step` of the last run, shape (batch, particle, 3)."""
@@ -143,13 +141,13 @@ class Solver:
 
     def frames(self, step: int) -> list[Frame]:
         """Return the frames of one control step, both ends included."""
-        return [self.checkpoints[step], *self.window(step).frames, self.end]
+        return [self.checkpoints[step], *self.tape(step).frames, self.end]
 
-    def window(self, step: int) -> Window:
-        """Return where a control step is kept whole, or another one at the moment."""
-        return self.windows[step % len(self.windows)]
+    def tape(self, step: int) -> Tape:
+        """Return where a control step is stored whole, or another one at the moment."""
+        return self.tapes[step % len(self.tapes)]
 
-    def _explore(
+    def _advance_on_box(
         self, step: int, batch: int, low: torch.Tensor, high: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Simulate a control step on the nodes around the particles, or on more where one leaves them.
@@ -159,80 +157,82 @@ class Solver:
         whole = Box((0, 0, 0), self.model.nodes)
         grain = GRAIN if self.device != "cpu" and self._small(batch) else 1
         while True:
-            self.boxes[step] = around(self.model, low, high, self.margins[step], grain)
-            self.strayed.zero_()
+            self.boxes[step] = nodes_around(self.model, low, high, self.margins[step], grain)
+            self.left_box.zero_()
             self._advance(step, batch)
-            *corners, strayed = self._seen(batch)
-            if self.boxes[step] == whole or not bool(strayed.any()):
+            *corners, left = self._read_extent(batch)
+            if self.boxes[step] == whole or not bool(left.any()):
                 break
             self.margins[step] *= 2
-        to_torch(self.escaped)[:batch] += to_torch(self.strayed)[:batch]
+        to_torch(self.escaped)[:batch] += to_torch(self.left_box)[:batch]
         orders = self.orders[step], self.orders[step + 1]
         self.sorter.sort(self.end, self.checkpoints[step + 1], *orders, batch)
         return corners[0], corners[1]
 
-    def _seen(self, batch: int) -> tuple[torch.Tensor, ...]:
-        """Return the corners of all particles [m] and whether one strayed, by one transfer."""
-        x, strayed = to_torch(self.end.x)[:batch], to_torch(self.strayed)[:batch]
-        seen = torch.cat([x.amin(dim=(0, 1)), x.amax(dim=(0, 1)), strayed.amax()[None].to(x)])
+    def _read_extent(self, batch: int) -> tuple[torch.Tensor, ...]:
+        """Return the corners of all particles [m] and whether one left its box, by one transfer."""
+        x, left = to_torch(self.end.x)[:batch], to_torch(self.left_box)[:batch]
+        seen = torch.cat([x.amin(dim=(0, 1)), x.amax(dim=(0, 1)), left.amax()[None].to(x)])
         return torch.split(seen.double().cpu(), 3)
 
     def _advance(self, step: int, batch: int) -> None:
         if self.stop.is_set():
             raise InterruptedError("the simulation was stopped")
-        self._hold(step)
-        self.again(("forward", step, batch), step, batch, lambda: self._substeps(step, batch))
+        self._make_room(step)
+        self.launch_again(("forward", step, batch), step, batch, lambda: self._substeps(step, batch))
 
-    def _hold(self, step: int) -> None:
+    def _make_room(self, step: int) -> None:
         """Make room for a control step, at the cost of others where memory runs out."""
-        while len(self.windows) > 1 and not self._fits(step):
-            self._keep_fewer()
+        while len(self.tapes) > 1 and not self._fits(step):
+            self._drop_tapes()
+        if self.tape(step).growth(self.boxes[step].cells):
+            self.launches.clear()
         try:
-            self.window(step).hold(step, self)
+            self.tape(step).make_room(step, self.boxes[step])
         except RuntimeError:  # what is free need not be of one piece
-            if len(self.windows) == 1:
+            if len(self.tapes) == 1:
                 raise
-            self._keep_fewer()
-            self._hold(step)
+            self._drop_tapes()
+            self._make_room(step)
 
     def _fits(self, step: int) -> bool:
-        """Say whether a window can grow to what a control step needs and leave a GPU as much memory as it takes.
+        """Say whether a tape can grow to what a control step needs and leave a GPU as much memory as it takes.
 
         Torch, and Warp's sorting, want some, and of an allocation that fails Warp says so on standard error.
         """
         if self.device == "cpu":
             return True
-        growth = self.window(step).growth(self.boxes[step].cells, self)
+        growth = self.tape(step).growth(self.boxes[step].cells)
         return not growth or growth <= free_memory() // 2
 
-    def _keep_fewer(self) -> None:
-        self.replay.forget()
-        del self.windows[len(self.windows) // 2 :]
+    def _drop_tapes(self) -> None:
+        self.launches.clear()
+        del self.tapes[len(self.tapes) // 2 :]
 
-    def again(self, key: tuple[Any, ...], step: int, batch: int, work: Callable[[], None]) -> None:
+    def launch_again(self, key: tuple[Any, ...], step: int, batch: int, work: Callable[[], None]) -> None:
         """Do a control step's work, by the launches kept from the last time if there was one."""
-        self.replay(key, self.boxes[step], self.window(step).lattice, work, small=self._small(batch))
+        self.launches.run(key, self.boxes[step], self.tape(step).lattice, work, small=self._small(batch))
 
     def _small(self, batch: int) -> bool:
         return batch * self.model.particles <= LAUNCHES
 
     def _substeps(self, step: int, batch: int) -> None:
-        window, frames = self.window(step), self.frames(step)
+        tape, frames = self.tape(step), self.frames(step)
         for s in range(self.model.substeps):
-            self._update(step, frames[s], frames[s + 1], window.A[s], batch)
-            self._scatter(frames[s], step, s, batch)
-            self._gather(frames[s], frames[s + 1], step, s, batch)
+            self._update(step, frames[s], frames[s + 1], tape.A[s], batch)
+            self._fill_grid(frames[s], step, s, batch)
+            self._move_particles(frames[s], frames[s + 1], step, s, batch)
 
     def _update(self, step: int, frame: Frame, new: Frame, A: wp.array, batch: int) -> None:
         for b, (update, _) in enumerate(self.materials):
             self.launch(update, self.size(b), batch, [*self.material_inputs(b, step, frame), new.S[b], A])
 
-    def _scatter(self, frame: Frame, step: int, substep: int, batch: int) -> None:
+    def _fill_grid(self, frame: Frame, step: int, substep: int, batch: int) -> None:
         """Fill the substep's grid: momentum and mass from particles, then velocity."""
-        window = self.window(step)
-        self.clear(window.grids[substep].m, step, batch)
-        particles = [self.orders[step].mass, frame.x, frame.v, window.A[substep]]
-        inputs = [window.lattice, *particles, window.grids[substep].m]
+        tape = self.tape(step)
+        self.clear(tape.grids[substep].m, step, batch)
+        particles = [self.orders[step].mass, frame.x, frame.v, tape.A[substep]]
+        inputs = [tape.lattice, *particles, tape.grids[substep].m]
         self.launch(self.kernels.p2g, self.model.particles, batch, inputs)
         inputs = self.velocity_inputs(step, substep)
         self.launch(self.velocity, self.boxes[step].cells, batch, inputs, nodes=True)
@@ -241,14 +241,14 @@ class Solver:
         """Zero what a control step uses of a grid."""
         if self.device == "cpu":  # where numpy is quicker, and torch would spread it over threads that others want
             values = grid.numpy()[:batch]
-            self.replay.call(lambda: values[:, : self.boxes[step].cells].fill(0.0))
+            self.launches.call(lambda: values[:, : self.boxes[step].cells].fill(0.0))
         else:
-            self.launch(self.kernels.wipe, self.boxes[step].cells, batch, [grid], nodes=True)
+            self.launch(self.kernels.clear, self.boxes[step].cells, batch, [grid], nodes=True)
 
-    def _gather(self, frame: Frame, new: Frame, step: int, substep: int, batch: int) -> None:
-        window = self.window(step)
-        grid_v = window.grids[substep].v
-        inputs = [window.lattice, self.model.dt, frame.x, grid_v, new.x, new.v, new.C, self.strayed]
+    def _move_particles(self, frame: Frame, new: Frame, step: int, substep: int, batch: int) -> None:
+        tape = self.tape(step)
+        grid_v = tape.grids[substep].v
+        inputs = [tape.lattice, self.model.dt, frame.x, grid_v, new.x, new.v, new.C, self.left_box]
         self.launch(self.kernels.g2p, self.model.particles, batch, inputs)
 
     def material_inputs(self, b: int, step: int, frame: Frame) -> list[Any]:
@@ -260,11 +260,11 @@ class Solver:
 
     def velocity_inputs(self, step: int, substep: int) -> list[Any]:
         """Return the arguments of the grid's velocity kernel."""
-        model, window = self.model, self.window(step)
+        model, tape = self.model, self.tape(step)
         time = [self.lanes, step, substep / model.substeps, 1.0 / (model.substeps * model.dt)]
-        grid = window.grids[substep]
+        grid = tape.grids[substep]
         return [
-            window.lattice,
+            tape.lattice,
             self.boundary,
             model.dt,
             model.gravity,
@@ -282,27 +282,7 @@ class Solver:
 
     def launch(self, kernel: Any, size: int, batch: int, inputs: list[Any], **how: Any) -> None:
         """Launch a kernel over [environment, element]."""
-        self.replay.launch(kernel, (batch, size), inputs, **how)
-
-    def array(self, dtype: Any, size: int) -> wp.array:
-        """Return zeros [environment, element]."""
-        return wp.zeros((self.capacity, size), dtype=dtype, device=self.device)
-
-    def frame(self) -> Frame:
-        """Return a frame of zeros."""
-        types, count = self.types, self.model.particles
-        x, v, C = (self.array(kind, count) for kind in (types.vec3, types.vec3, types.mat33))
-        states = (self.array(b.material.state(self.model.precision), len(b.x)) for b in self.model.bodies)
-        return Frame(x, v, C, tuple(states))
-
-    def grid(self, cells: int) -> Grid:
-        """Return a grid of zeros."""
-        return Grid(*(self.array(self.types.vec4, cells) for _ in range(2)))
-
-    def paths(self) -> wp.array:
-        """Return zeros [environment and lane, step, slot]."""
-        shape = self.capacity * self.lanes, self.model.steps + 1, self.model.boundary.slots
-        return wp.zeros(shape, dtype=self.types.vec3, device=self.device)
+        self.launches.launch(kernel, (batch, size), inputs, **how)
 
     def by_lane(self, paths: wp.array) -> torch.Tensor:
         """View paths as [environment, lane, step, slot, axis]."""
@@ -321,10 +301,10 @@ class _Adjoint:
 
     def __init__(self, solver: Solver) -> None:
         self.solver = weakref.proxy(solver)  # which holds this: a cycle would keep a GPU's memory until it is collected
-        self.new, self.old = solver.frame(), solver.frame()
-        self.A = solver.array(solver.types.mat33, solver.model.particles)
-        self.grid = solver.grid(max(box.cells for box in solver.boxes))
-        self.tools = solver.paths()
+        self.new, self.old = solver.allocator.frame(), solver.allocator.frame()
+        self.A = solver.allocator.affine_momentum()
+        self.grid = solver.allocator.grid(max(box.cells for box in solver.boxes))
+        self.tools = solver.allocator.paths(solver.lanes)
         self.structs = (
             lattice(solver.model.precision)(),
             type(solver.boundary)(),
@@ -341,7 +321,7 @@ class _Adjoint:
                 x += solver.orders[step + 1].from_model(adj_x[step + 1].to(x))
             solver.sorter.unsort(self.new, self.old, solver.orders[step + 1], batch)
             self.new, self.old = self.old, self.new
-            if solver.window(step).step != step:
+            if solver.tape(step).step != step:
                 solver._advance(step, batch)
             self._retreat(step, batch)
         by_lane: torch.Tensor = solver.by_lane(self.tools)[:batch]
@@ -350,44 +330,44 @@ class _Adjoint:
     def _retreat(self, step: int, batch: int) -> None:
         solver = self.solver
         if self.grid.m.shape[1] < solver.boxes[step].cells:
-            self.grid = solver.grid(solver.boxes[step].cells)
-            solver.replay.forget()
+            self.grid = solver.allocator.grid(solver.boxes[step].cells)
+            solver.launches.clear()
         ends = (self.old, self.new) if solver.model.substeps % 2 else (self.new, self.old)
         key = "backward", step, batch, id(self.new)
-        solver.again(key, step, batch, lambda: self._substeps(step, batch))
+        solver.launch_again(key, step, batch, lambda: self._substeps(step, batch))
         self.new, self.old = ends  # launches that are kept exchange nothing here
 
     def _substeps(self, step: int, batch: int) -> None:
         solver = self.solver
-        window, frames = solver.window(step), solver.frames(step)
+        tape, frames = solver.tape(step), solver.frames(step)
         for s in reversed(range(solver.model.substeps)):
             solver.clear(self.grid.v, step, batch)
-            self._gather(frames[s], window, s, batch)
-            self._velocity(step, s, batch)
-            self._scatter(step, frames[s], window, s, batch)
-            self._update(step, frames[s], batch)
+            self._adjoint_g2p(frames[s], tape, s, batch)
+            self._adjoint_velocity(step, s, batch)
+            self._adjoint_p2g(step, frames[s], tape, s, batch)
+            self._adjoint_update(step, frames[s], batch)
             self.new, self.old = self.old, self.new
 
-    def _gather(self, frame: Frame, window: Window, substep: int, batch: int) -> None:
+    def _adjoint_g2p(self, frame: Frame, tape: Tape, substep: int, batch: int) -> None:
         solver = self.solver
-        inputs = [window.lattice, solver.model.dt, frame.x, window.grids[substep].v]
+        inputs = [tape.lattice, solver.model.dt, frame.x, tape.grids[substep].v]
         inputs += [self.new.x, self.new.v, self.new.C, self.grid.v, self.old.x]
         solver.launch(solver.kernels.adjoint_g2p, solver.model.particles, batch, inputs)
 
-    def _velocity(self, step: int, substep: int, batch: int) -> None:
+    def _adjoint_velocity(self, step: int, substep: int, batch: int) -> None:
         solver = self.solver
         inputs = solver.velocity_inputs(step, substep)
         adjoints = [*self.structs, *[None] * (len(inputs) - 6), self.tools, None, self.grid.m, self.grid.v]
         how = {"adj_inputs": adjoints, "adj_outputs": [], "adjoint": True}
         solver.launch(solver.velocity, solver.boxes[step].cells, batch, inputs, nodes=True, **how)
 
-    def _scatter(self, step: int, frame: Frame, window: Window, substep: int, batch: int) -> None:
+    def _adjoint_p2g(self, step: int, frame: Frame, tape: Tape, substep: int, batch: int) -> None:
         solver = self.solver
-        inputs = [window.lattice, solver.orders[step].mass, frame.x, frame.v, window.A[substep], self.grid.m]
+        inputs = [tape.lattice, solver.orders[step].mass, frame.x, frame.v, tape.A[substep], self.grid.m]
         inputs += [self.old.x, self.old.v, self.A]
         solver.launch(solver.kernels.adjoint_p2g, solver.model.particles, batch, inputs)
 
-    def _update(self, step: int, frame: Frame, batch: int) -> None:
+    def _adjoint_update(self, step: int, frame: Frame, batch: int) -> None:
         solver = self.solver
         for b, (_, adjoint) in enumerate(solver.materials):
             inputs = [*solver.material_inputs(b, step, frame), self.new.S[b], self.A, self.old.S[b], self.old.C]

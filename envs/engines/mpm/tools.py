@@ -55,7 +55,7 @@ class Tool:
 
 
 @dataclass(frozen=True)
-class Manipulators:
+class ToolsInRoom:
     """Tools in a room with slippery walls and a floor.
 
     `lower`, `upper` [m]: walls stand there; nodes at or below `floor` [m] belong to the floor, whose Coulomb `friction`
@@ -76,7 +76,7 @@ class Manipulators:
 
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the boundary's Warp function and its struct."""
-        boundary, Data = _manipulators(name, len(self.tools))
+        boundary, Data = _tools_in_room(name, len(self.tools))
         return boundary, Data
 
     def data(self, name: str, device: str) -> Any:
@@ -98,16 +98,16 @@ class Manipulators:
 
 @cache
 @no_type_check
-def _manipulators(name: str, count: int) -> tuple[Any, Any]:
+def _tools_in_room(name: str, count: int) -> tuple[Any, Any]:
     types = precision(name)
     real, vec3, vec4 = types.real, types.vec3, types.vec4
-    module = f"gradscape.manipulators.{name}.{count}"
+    module = f"gradscape.tools.{name}.{count}"
     ball, stick, ring, post = sphere(name), capsule(name), torus(name), cylinder(name)
     up = wp.constant(vec3(0.0, 1.0, 0.0))
 
     @partial(wp.struct, module=module)
     class Scene:
-        """The fields of Manipulators; for each tool (size, size, friction)."""
+        """The fields of ToolsInRoom; for each tool (size, size, friction)."""
 
         lower: vec3
         upper: vec3
@@ -130,7 +130,7 @@ def _manipulators(name: str, count: int) -> tuple[Any, Any]:
         return stick(p, axis, shape[0], shape[1])
 
     @wp.func(module=module)
-    def rubbed(t: vec3, normal: real, friction: real) -> vec3:
+    def rub(t: vec3, normal: real, friction: real) -> vec3:
         """Return the tangential velocity after a contact that stopped the `normal` velocity (Coulomb)."""
         speed = wp.sqrt(wp.dot(t, t) + real(1e-8))
         return t * (wp.max(real(0.0), speed + friction * normal) / speed)
@@ -145,11 +145,11 @@ def _manipulators(name: str, count: int) -> tuple[Any, Any]:
         normal = wp.dot(u, n)
         if influence <= real(0.0) or normal >= real(0.0):
             return v
-        t = rubbed(u - normal * n, normal, friction)
+        t = rub(u - normal * n, normal, friction)
         return body + (real(1.0) - influence) * u + influence * t
 
     @wp.func(module=module)
-    def meet(
+    def apply_tool(
         scene: Scene,
         j: int,
         p: vec3,
@@ -169,9 +169,9 @@ def _manipulators(name: str, count: int) -> tuple[Any, Any]:
         kind = scene.kind[j]
         shape = scene.shape[j]
         start = tools[e, step, slot]
-        travel = tools[e, step + 1, slot] - start
-        local = p - (start + fraction * travel)
-        body = rate * travel
+        change = tools[e, step + 1, slot] - start
+        local = p - (start + fraction * change)
+        body = rate * change
         axis = up
         if kind == Kind.ROLLER:
             angles = tools[e, step, slot + 1]
@@ -182,12 +182,12 @@ def _manipulators(name: str, count: int) -> tuple[Any, Any]:
         return contact(distance(kind, local, axis, shape), v, body, shape[2], scene.softness)
 
     @wp.func(module=module)
-    def floored(v: vec3, friction: real) -> vec3:
+    def apply_floor(v: vec3, friction: real) -> vec3:
         if friction >= real(STICKY):
             return vec3(real(0.0), wp.max(v[1], real(0.0)), real(0.0))
         if v[1] >= real(0.0):
             return v
-        return rubbed(vec3(v[0], real(0.0), v[2]), v[1], friction)
+        return rub(vec3(v[0], real(0.0), v[2]), v[1], friction)
 
     @wp.func(module=module)
     def boundary(
@@ -202,9 +202,9 @@ def _manipulators(name: str, count: int) -> tuple[Any, Any]:
         rate: real,
     ) -> vec3:
         for j in range(wp.static(count)):  # unrolled: a loop that AD replays would lose v
-            v = meet(scene, j, p, v, e, tools, still, step, fraction, rate)
+            v = apply_tool(scene, j, p, v, e, tools, still, step, fraction, rate)
         if p[1] <= scene.floor:
-            v = floored(v, scene.floor_friction)
+            v = apply_floor(v, scene.floor_friction)
         vx, vy, vz = v[0], v[1], v[2]
         if p[0] <= scene.lower[0]:
             vx = wp.max(vx, real(0.0))

@@ -14,8 +14,8 @@ from typing import no_type_check
 
 import warp as wp
 
-from ..runtime import precision, promise
-from .aggregation import adding
+from ..runtime import determinism, precision
+from .aggregation import aggregation
 
 
 @cache
@@ -46,18 +46,18 @@ def lattice(name: str) -> type:
 @cache
 @no_type_check
 def transfers(name: str, *, deterministic: bool = False) -> SimpleNamespace:
-    """Return the transfer kernels `wipe, p2g, g2p, adjoint_p2g, adjoint_g2p` of one precision."""
+    """Return the transfer kernels `clear, p2g, g2p, adjoint_p2g, adjoint_g2p` of one precision."""
     types = precision(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
     module = f"gradscape.transfers.{name}{'.deterministic' if deterministic else ''}"
-    wp.set_module_options({"deterministic": promise(deterministic)}, module)
+    wp.set_module_options({"deterministic": determinism(deterministic)}, module)
     Lattice = lattice(name)
-    together, add = adding(name, module, native=name == "float32" and not deterministic)
+    find_run, add = aggregation(name, module, native=name == "float32" and not deterministic)
     offset = wp.constant(vec3(0.0, 1.0, 2.0))  # real(i) on an unrolled index breaks the code generator in float64
 
     @wp.func(module=module)
     def base_node(s: vec3, lattice: Lattice):
-        # Clamped, so that a particle out of the grid (its episode is reported as strayed) touches no foreign memory.
+        # Clamped, so that a particle out of the grid (its episode is reported as escaped) touches no foreign memory.
         return wp.vec3i(
             wp.clamp(int(wp.floor(s[0] - real(0.5))), lattice.first[0], lattice.first[0] + lattice.nx - 3),
             wp.clamp(int(wp.floor(s[1] - real(0.5))), lattice.first[1], lattice.first[1] + lattice.ny - 3),
@@ -85,7 +85,7 @@ def transfers(name: str, *, deterministic: bool = False) -> SimpleNamespace:
         return vec3(g[0], g[1], g[2])
 
     @wp.kernel(module=module, enable_backward=False)
-    def wipe(grid: wp.array2d[vec4]):
+    def clear(grid: wp.array2d[vec4]):
         e, i = wp.tid()
         grid[e, i] = vec4()
 
@@ -109,7 +109,7 @@ def transfers(name: str, *, deterministic: bool = False) -> SimpleNamespace:
         a = A[e, p] * (real(1.0) / lattice.inv_dx)
         ax, ay, az = column(a, 0), column(a, 1), column(a, 2)
         q0 = m * v[e, p] - a * f
-        run = together(e, (corner[0] * lattice.ny + corner[1]) * lattice.nz + corner[2])
+        run = find_run(e, (corner[0] * lattice.ny + corner[1]) * lattice.nz + corner[2])
         for i in range(3):
             for j in range(3):
                 row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
@@ -182,7 +182,7 @@ def transfers(name: str, *, deterministic: bool = False) -> SimpleNamespace:
         x_new: wp.array2d[vec3],
         v_new: wp.array2d[vec3],
         C_new: wp.array2d[mat33],
-        strayed: wp.array[wp.int32],
+        left_box: wp.array[wp.int32],
     ):
         """Gather v' = sum w v_i and C' = 4/dx^2 sum w v_i (x_i - x)^T; move x' = x + dt v'."""
         e, p = wp.tid()
@@ -211,7 +211,7 @@ def transfers(name: str, *, deterministic: bool = False) -> SimpleNamespace:
         C_new[e, p] = (real(4.0) * lattice.inv_dx) * wp.matrix_from_cols(sx - f[0] * s0, sy - f[1] * s0, sz - f[2] * s0)
         x_new[e, p] = x[e, p] + dt * s0
         if wp.min(wp.min(f[0], f[1]), f[2]) < real(0.49) or wp.max(wp.max(f[0], f[1]), f[2]) > real(1.51):
-            strayed[e] = 1
+            left_box[e] = 1
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint_g2p(
@@ -238,7 +238,7 @@ def transfers(name: str, *, deterministic: bool = False) -> SimpleNamespace:
         q0 = adj_v_new[e, p] + dt * adj_x_new[e, p] - c * f
         slope = vec3()
         s0 = vec3()
-        run = together(e, (corner[0] * lattice.ny + corner[1]) * lattice.nz + corner[2])
+        run = find_run(e, (corner[0] * lattice.ny + corner[1]) * lattice.nz + corner[2])
         for i in range(3):
             for j in range(3):
                 row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
@@ -256,4 +256,4 @@ def transfers(name: str, *, deterministic: bool = False) -> SimpleNamespace:
                     add(adj_grid_v, e, row + k, vec4(w * q[0], w * q[1], w * q[2], real(0.0)), run, 3)
         adj_x[e, p] = adj_x_new[e, p] + lattice.inv_dx * (slope - wp.transpose(c) * s0)
 
-    return SimpleNamespace(wipe=wipe, p2g=p2g, g2p=g2p, adjoint_p2g=adjoint_p2g, adjoint_g2p=adjoint_g2p)
+    return SimpleNamespace(clear=clear, p2g=p2g, g2p=g2p, adjoint_p2g=adjoint_p2g, adjoint_g2p=adjoint_g2p)

@@ -11,7 +11,7 @@ from typing import Any, Protocol, no_type_check
 
 import warp as wp
 
-from ..runtime import filled, precision
+from ..runtime import fill_struct, precision
 
 
 class Surface(Protocol):
@@ -37,7 +37,7 @@ class Floor:
 
     def data(self, name: str) -> Any:
         """Return the function's data."""
-        return filled(self.function(name)[1](), self)
+        return fill_struct(self.function(name)[1](), self)
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Pan:
 
     def data(self, name: str) -> Any:
         """Return the function's data."""
-        return filled(self.function(name)[1](), self)
+        return fill_struct(self.function(name)[1](), self)
 
 
 @cache

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 import warp as wp
 
-from .contact import Surface, contact_kernel
 from ..runtime import free_memory, load, precision, to_torch
+from .contact import Surface, contact_kernel
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +94,8 @@ class Solver:
         to_torch(self.stiffness)[:batch] = stiffness.to(self.x_all)
         to_torch(self.poses)[:, :batch] = 0.0 if poses is None else poses.transpose(0, 1).to(self.x_all)
         for step in range(self.steps):
-            self._launch(self.springs.pull, batch, self._pulling(step), [self.pulled[step]])
-            self._launch(self.touch, batch, self._touching(step), [self.x[step + 1], self.v[step + 1]])
+            self._launch(self.springs.pull, batch, self._pull_inputs(step), [self.pulled[step]])
+            self._launch(self.touch, batch, self._touch_inputs(step), [self.x[step + 1], self.v[step + 1]])
         return self.x_all[:, :batch]
 
     def gradient(self, adj_x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -135,7 +135,7 @@ class Solver:
         wp.launch(
             self.touch,
             (batch, len(self.sheet.x)),
-            self._touching(step),
+            self._touch_inputs(step),
             [self.x[step + 1], self.v[step + 1]],
             adj_inputs=[None, None, type(self.surface)(), None, self.adj_poses, self.adj_here, self.adj_pulled],
             adj_outputs=[self.adj_x, self.adj_v],
@@ -145,13 +145,16 @@ class Solver:
         )
         seeds = [self.adj_here, self.adj_pulled]
         self._launch(
-            self.springs.adjoint, batch, [*self._pulling(step), *seeds], [self.adj_x, self.adj_v, self.adj_stiffness]
+            self.springs.adjoint,
+            batch,
+            [*self._pull_inputs(step), *seeds],
+            [self.adj_x, self.adj_v, self.adj_stiffness],
         )
 
-    def _pulling(self, step: int) -> list[Any]:
+    def _pull_inputs(self, step: int) -> list[Any]:
         return [self.network, self.dt, self.stiffness, self.x[step], self.v[step]]
 
-    def _touching(self, step: int) -> list[Any]:
+    def _touch_inputs(self, step: int) -> list[Any]:
         return [step, self.dt, self.surface, self.held, self.poses, self.x[step], self.pulled[step]]
 
     def _launch(self, kernel: Any, batch: int, inputs: list[Any], outputs: list[Any]) -> None:

@@ -13,8 +13,8 @@ from types import SimpleNamespace
 from typing import Any, no_type_check
 
 from ..mpm.boundaries import Boundary, LadleInTank, Open
-from ..mpm.tools import FAINTEST, STICKY, Kind, Manipulators, Tool
 from ..mpm.sdf import TINY
+from ..mpm.tools import FAINTEST, STICKY, Kind, Tool, ToolsInRoom
 from .runtime import real as real_type
 from .runtime import ti
 
@@ -23,7 +23,7 @@ ON_WALL = 1e-6  # a wall's own nodes belong to it [m]
 
 
 @cache
-def meet(boundary: Boundary, name: str) -> Any:
+def boundary_contact(boundary: Boundary, name: str) -> Any:
     """Return all of a boundary's contacts as one, in the precision `name`."""
     if isinstance(boundary, Open):
         return _free()
@@ -31,15 +31,15 @@ def meet(boundary: Boundary, name: str) -> Any:
         contacts = [_bowl(boundary, name), _handle(boundary, name)]
         edge = boundary.half_width - ON_WALL
         lower, upper = (-edge, ON_WALL, -edge), (edge, boundary.lid, edge)
-        return reduce(_then, [*contacts, _walls(lower, upper, name)])
-    if isinstance(boundary, Manipulators):
+        return reduce(_apply_both, [*contacts, _walls(lower, upper, name)])
+    if isinstance(boundary, ToolsInRoom):
         slots = [sum(tool.slots for tool in boundary.tools[:j]) for j in range(len(boundary.tools))]
         contacts = [
             _tool(tool, slot, boundary.softness, name) for tool, slot in zip(boundary.tools, slots, strict=True)
         ]
         lower = (boundary.lower[0], -1e9, boundary.lower[2])  # below it has a floor
-        return reduce(_then, [*contacts, _floor(boundary, name), _walls(lower, boundary.upper, name)])
-    raise ValueError(f"the Taichi engine knows Open, LadleInTank and Manipulators; got boundary {boundary!r}")
+        return reduce(_apply_both, [*contacts, _floor(boundary, name), _walls(lower, boundary.upper, name)])
+    raise ValueError(f"the Taichi engine knows Open, LadleInTank and ToolsInRoom; got boundary {boundary!r}")
 
 
 @no_type_check
@@ -52,7 +52,7 @@ def _free() -> Any:
 
 
 @no_type_check
-def _then(first: Any, second: Any) -> Any:
+def _apply_both(first: Any, second: Any) -> Any:
     @ti.func
     def contact(p, v, e, tools: ti.template(), step, fraction, rate):
         return second(p, first(p, v, e, tools, step, fraction, rate), e, tools, step, fraction, rate)
@@ -117,8 +117,8 @@ def _laws(name: str) -> SimpleNamespace:
     @ti.func
     def motion(tools: ti.template(), e, step, slot: ti.template(), fraction, rate):
         start = tools[e, step, slot]
-        travel = tools[e, step + 1, slot] - start
-        return start + fraction * travel, rate * travel
+        change = tools[e, step + 1, slot] - start
+        return start + fraction * change, rate * change
 
     @ti.func
     def rub(t, normal, friction, slip: ti.template()):
@@ -229,7 +229,7 @@ def _distance(tool: Tool, name: str) -> Any:
 
 
 @no_type_check
-def _floor(room: Manipulators, name: str) -> Any:
+def _floor(room: ToolsInRoom, name: str) -> Any:
     """Return the contact with the floor's nodes: nothing sinks, what presses is rubbed, or sticks."""
     real, laws = real_type(name), _laws(name)
     sticky = room.friction >= STICKY

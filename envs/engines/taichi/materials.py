@@ -78,9 +78,9 @@ def _elastic(name: str) -> tuple[Any, Any]:
 @cache
 @no_type_check
 def _plasticine(name: str) -> tuple[Any, Any]:
-    """F' = U diag(f) V^T, tau = U diag(t) U^T of (I + dt C) F = U diag(s) V^T; see `_yielding`."""
+    """F' = U diag(f) V^T, tau = U diag(t) U^T of (I + dt C) F = U diag(s) V^T; see `_yield_functions`."""
     real, array = types(name)
-    svd, (flow, pull) = _svd(name), _yielding(name)
+    svd, (flow, pull) = _svd(name), _yield_functions(name)
 
     @ti.kernel
     def update(
@@ -147,7 +147,7 @@ def _svd(name: str) -> Any:
         return ti.Vector([M[0, i], M[1, i], M[2, i]])
 
     @ti.func
-    def turned(M, i: ti.template(), j: ti.template(), c, s):
+    def rotate(M, i: ti.template(), j: ti.template(), c, s):
         new = M
         for row in ti.static(range(3)):
             new[row, i] = c * M[row, i] - s * M[row, j]
@@ -164,7 +164,7 @@ def _svd(name: str) -> Any:
                 span = ti.abs(gap) + ti.sqrt(gap * gap + twice * twice)
                 t = ti.select(gap < real(0.0), -twice, twice) / ti.max(span, real(VANISHED))
                 c = real(1.0) / ti.sqrt(real(1.0) + t * t)
-                B, V = turned(B, i, j, c, t * c), turned(V, i, j, c, t * c)
+                B, V = rotate(B, i, j, c, t * c), rotate(V, i, j, c, t * c)
         s = ti.Vector([column(B, i).norm() for i in ti.static(range(3))])
         U = B
         for i in ti.static(range(3)):
@@ -183,7 +183,7 @@ def _svd(name: str) -> Any:
 
 
 @no_type_check
-def _yielding(name: str) -> tuple[Any, Any]:
+def _yield_functions(name: str) -> tuple[Any, Any]:
     """Return the von Mises flow s -> f, and the transpose of the differential of F' and tau.
 
     With e = log max(s, SMALLEST), d = e - mean(e), n = sqrt(d.d + ROUNDED): f = s where n <= kappa, else

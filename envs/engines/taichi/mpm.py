@@ -23,10 +23,9 @@ from typing import Any, no_type_check
 import numpy as np
 import torch
 
-from ..mpm.model import Model
-from ..mpm.solver import EMPTY
+from ..mpm.model import EMPTY, Model
 from ..runtime import precision
-from .boundaries import meet
+from .boundaries import boundary_contact
 from .materials import kernels, types
 from .runtime import one_torch_thread, start, ti
 
@@ -71,7 +70,7 @@ class Solver:
         self.dtype = precision(model.precision).torch
         self.transfers = transfers(model.precision)
         boundary: Any = model.boundary
-        self.grid_op = grid_kernel(model.precision, meet(boundary, model.precision))
+        self.grid_op = grid_kernel(model.precision, boundary_contact(boundary, model.precision))
         self.materials = [kernels(body.material, model.precision) for body in model.bodies]
         self.first = np.cumsum([0, *(len(body.x) for body in model.bodies)]).tolist()
         self.mass = self._constant(model.mass)

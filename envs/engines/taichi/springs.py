@@ -19,8 +19,8 @@ from typing import Any, no_type_check
 import numpy as np
 import torch
 
-from ..sheets.contact import Floor, Pan, Surface
 from ..runtime import precision
+from ..sheets.contact import Floor, Pan, Surface
 from ..sheets.springs import Sheet
 from .runtime import real, start
 
@@ -72,13 +72,13 @@ class Solver:
             raise ValueError(f"this solver takes up to {self.capacity} rows; got {batch}")
         poses = torch.zeros(batch, frames, 3) if poses is None else poses
         self.given = (
-            self._taken("velocity", velocity, batch, 3),
-            self._taken("stiffness", stiffness, batch, count),
-            self._taken("poses", poses, batch, frames, 3),
+            self._convert("velocity", velocity, batch, 3),
+            self._convert("stiffness", stiffness, batch, count),
+            self._convert("poses", poses, batch, frames, 3),
         )
         self.borders.begin(*self.given)
         for step in range(self.steps):
-            self._go_on()
+            self._refuse_if_stopped()
             self.physics.pull(step, batch)
             self.physics.advance(step, batch)
         x = torch.empty(frames, batch, count, 3, **self.kind)
@@ -88,9 +88,9 @@ class Solver:
     def gradient(self, adj_x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return the adjoints of `run`'s velocity, stiffness and poses from that of the last positions."""
         batch = len(self.given[0])
-        self.borders.seed(self._taken("adj_x", adj_x, batch, self.count, 3))
+        self.borders.seed(self._convert("adj_x", adj_x, batch, self.count, 3))
         for step in reversed(range(self.steps)):
-            self._go_on()
+            self._refuse_if_stopped()
             self.physics.advance.grad(step, batch)
             self.physics.pull.grad(step, batch)
         adjoints = [torch.zeros_like(part) for part in self.given]
@@ -100,7 +100,7 @@ class Solver:
         velocity, stiffness, poses = (adjoint.cpu() for adjoint in adjoints)
         return velocity, stiffness, poses
 
-    def _taken(self, name: str, part: torch.Tensor, *shape: int) -> torch.Tensor:
+    def _convert(self, name: str, part: torch.Tensor, *shape: int) -> torch.Tensor:
         """Return a tensor as the kernels read it, which check no index."""
         if tuple(part.shape) != shape:
             raise ValueError(f"this solver takes {name} of shape {shape}; got {tuple(part.shape)}")
@@ -123,7 +123,7 @@ class Solver:
         self.borders.seed(torch.zeros(0, self.count, 3, **self.kind))
         self.borders.read(torch.zeros(self.steps + 1, 0, self.count, 3, **self.kind))
 
-    def _go_on(self) -> None:
+    def _refuse_if_stopped(self) -> None:
         if self.stop.is_set():
             raise InterruptedError("the simulation was stopped")
 

@@ -7,9 +7,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gradscape.envs.mpm import fluid
 from gradscape.envs.base import Fidelity
 from gradscape.envs.engines.mpm.boundaries import LadleInTank
+from gradscape.envs.mpm import fluid
 from gradscape.envs.mpm.fluid import (
     BOWL,
     CUBE_CENTER,

@@ -46,7 +46,7 @@ def test_bodies_weigh_what_upstream_has_them_weigh(kind):
     for fidelity in ("draft", "standard"):
         model = kind(fidelity=fidelity, device="cpu").model
         weights = [body.mass.sum() / PARTICLE for body in model.bodies]
-        assert np.allclose(weights, [lump.particles for lump in kind.scene.lumps])
+        assert np.allclose(weights, [piece.particles for piece in kind.scene.pieces])
 
 
 @pytest.mark.parametrize("kind", SCENES, ids=scene_id)
@@ -115,7 +115,7 @@ def test_the_sums_gradient_is_its_slope(kind):
 def test_a_body_that_is_its_own_target_costs_nothing():
     """Density and distance at t = 0: for geometric targets made of the very shapes the bodies start as."""
     for kind in (TripleMove, Assembly):
-        own = replace(kind.scene, target=tuple(lump.shape for lump in kind.scene.lumps))
+        own = replace(kind.scene, target=tuple(piece.shape for piece in kind.scene.pieces))
         still = type("Own", (kind,), {"scene": own})(fidelity=TINY, device="cpu")
         paths = still.tools(torch.zeros(1, still.space.dim, dtype=torch.float64))
         with still._solvers.lend() as stage:

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from gradscape.envs.mpm import targets
 from gradscape.envs.engines.mpm.tools import Kind, Tool
+from gradscape.envs.mpm import targets
 from gradscape.envs.mpm.plasticine import Fidelity
 from gradscape.envs.mpm.plasticine_model import SPAN, model
 from gradscape.envs.mpm.plasticine_scenes import Torus
-from gradscape.envs.mpm.targets import Target, cached, contact, outside
+from gradscape.envs.mpm.targets import Target, contact, distance_outside, load_or_make
 
 PEN = Tool(Kind.CAPSULE, (0.03, 0.02), 0.0)
 BALL = Tool(Kind.SPHERE, (0.05,), 0.9)
@@ -38,9 +38,9 @@ def rows(*values):
 def test_a_tools_distance_is_that_of_its_shape(tool, angles, point, gap):
     place = (0.2, 0.3, -0.1)
     pose = rows(place, angles) if angles else rows(place)
-    assert float(outside(tool, rows(point) + rows(place), pose[None])) == pytest.approx(gap, abs=1e-12)
+    assert float(distance_outside(tool, rows(point) + rows(place), pose[None])) == pytest.approx(gap, abs=1e-12)
     middle = rows((0.05, 0.0, 0.0)) if tool is RING else rows((0.0, 0.0, 0.0))
-    assert float(outside(tool, middle + rows(place), pose[None])) == 0
+    assert float(distance_outside(tool, middle + rows(place), pose[None])) == 0
 
 
 def test_the_contacts_gradient_is_the_closest_particles_only():
@@ -51,7 +51,8 @@ def test_the_contacts_gradient_is_the_closest_particles_only():
     movable = [BALL, PEN]
     contact(x, tools, movable).sum().backward()
     for row in range(2):
-        near = {int((x[row] - tools[row, 0]).norm(dim=1).argmin()), int(outside(PEN, x[row], tools[row, 1:]).argmin())}
+        to_sphere, to_pen = (x[row] - tools[row, 0]).norm(dim=1), distance_outside(PEN, x[row], tools[row, 1:])
+        near = {int(to_sphere.argmin()), int(to_pen.argmin())}
         assert set(x.grad[row].abs().sum(dim=1).nonzero().flatten().tolist()) == near
     assert torch.autograd.gradcheck(lambda x, tools: contact(x, tools, movable), (x, tools))
 
@@ -81,9 +82,9 @@ def test_a_target_is_made_once_and_again_when_its_content_changes(tmp_path, monk
         made.append(len(made))
         return np.full((3, 3), float(len(made)))
 
-    first = cached("clay", "one", make)
-    assert np.array_equal(cached("clay", "one", make), first)
+    first = load_or_make("clay", "one", make)
+    assert np.array_equal(load_or_make("clay", "one", make), first)
     assert made == [0]
-    assert not np.array_equal(cached("clay", "two", make), first)
+    assert not np.array_equal(load_or_make("clay", "two", make), first)
     next(path for path in tmp_path.rglob("*.npy") if np.array_equal(np.load(path), first)).write_bytes(b"torn")
-    assert np.array_equal(cached("clay", "one", make), np.full((3, 3), 3.0))  # unreadable: made anew
+    assert np.array_equal(load_or_make("clay", "one", make), np.full((3, 3), 3.0))  # unreadable: made anew

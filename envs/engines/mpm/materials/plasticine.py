@@ -49,7 +49,7 @@ def kernels(name: str) -> tuple[Any, Any]:
         return wp.sqrt(wp.dot(d, d) + real(ROUNDED))
 
     @wp.func(module=module)
-    def returned(s: vec3, kappa: real) -> vec3:
+    def map_to_yield(s: vec3, kappa: real) -> vec3:
         """Return f, the singular values after the return map."""
         e = log_strain(s)
         d = e - mean(e)
@@ -111,7 +111,7 @@ def kernels(name: str) -> tuple[Any, Any]:
         c = C[e, first + p]
         trial = F[e, p] + dt * c * F[e, p]
         U, s, V = decompose(trial)
-        f = returned(s, kappa)
+        f = map_to_yield(s, kappa)
         J = f[0] * f[1] * f[2]
         t = real(2.0) * mu * wp.cw_mul(f, f - one) + lam * J * (J - real(1.0)) * one
         F_new[e, p] = U * wp.diag(f) * wp.transpose(V)

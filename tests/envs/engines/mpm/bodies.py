@@ -6,10 +6,10 @@ import numpy as np
 import torch
 
 from gradscape.envs.engines.mpm.boundaries import LadleInTank, Open
-from gradscape.envs.engines.mpm.tools import Kind, Manipulators, Tool
 from gradscape.envs.engines.mpm.materials import Elastic, Fluid, Plasticine
 from gradscape.envs.engines.mpm.model import Body, Model
 from gradscape.envs.engines.mpm.solver import Solver
+from gradscape.envs.engines.mpm.tools import Kind, Tool, ToolsInRoom
 from gradscape.envs.engines.runtime import to_torch
 
 DENSITY, SPEED, GRAVITY = 1330.0, 6.0, 9.81  # [kg/m^3], of sound [m/s], [m/s^2]
@@ -99,7 +99,7 @@ def masses(model):
 
 def kneading(**changes):
     """Return a model of two lumps of clay on a floor, with a ball and a roller, and paths that press and drag them."""
-    room = Manipulators(
+    room = ToolsInRoom(
         (Tool(Kind.SPHERE, (0.06,), 0.3), Tool(Kind.ROLLER, (0.05, 0.04), 0.9)),
         lower=(-0.6, 0.0, -0.3),
         upper=(0.6, 0.7, 0.3),

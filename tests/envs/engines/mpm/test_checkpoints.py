@@ -7,10 +7,10 @@ import torch
 import warp as wp
 
 from gradscape.envs.engines.mpm import solver as mpm
+from gradscape.envs.engines.mpm.checkpoints import Window
 from gradscape.envs.engines.mpm.model import Box, around
 from gradscape.envs.engines.mpm.solver import Solver
 from gradscape.envs.engines.runtime import cuda_available, to_torch
-from gradscape.envs.engines.mpm.checkpoints import Window
 from gradscape.envs.mpm.fluid import Fluid
 
 from .bodies import free_model, kneaded, kneading, over_time, solved, stirred, weights

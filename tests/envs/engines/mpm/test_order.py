@@ -4,8 +4,8 @@ import pytest
 import torch
 import warp as wp
 
-from gradscape.envs.engines.mpm.solver import Solver
 from gradscape.envs.engines.mpm.order import Order, Sorter
+from gradscape.envs.engines.mpm.solver import Solver
 from gradscape.envs.engines.runtime import to_torch
 
 from .bodies import free_model

@@ -7,9 +7,9 @@ import torch
 import warp as wp
 
 from gradscape.envs.controls import roll
-from gradscape.envs.engines.mpm.tools import FAINTEST, STICKY, Kind, Manipulators, Tool
-from gradscape.envs.engines.runtime import precision
 from gradscape.envs.engines.mpm.sdf import capsule, cylinder, sphere, torus
+from gradscape.envs.engines.mpm.tools import FAINTEST, STICKY, Kind, Tool, ToolsInRoom
+from gradscape.envs.engines.runtime import precision
 
 from ..bench import BoundaryBench, draw, vectors
 
@@ -29,7 +29,7 @@ KINDS = pytest.mark.parametrize("kind", SIZES, ids=lambda kind: kind.name.lower(
 
 
 def room(*tools, friction=0.0, floor=0.1):
-    scene = Manipulators(tools, LOWER, UPPER, floor, friction, SOFTNESS)
+    scene = ToolsInRoom(tools, LOWER, UPPER, floor, friction, SOFTNESS)
     return BoundaryBench(scene, rate=RATE)
 
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 import warp as wp
 
-from gradscape.envs.engines.runtime import precision, to_torch
 from gradscape.envs.engines.mpm.transfers import lattice, transfers
+from gradscape.envs.engines.runtime import precision, to_torch
 
 ORIGIN, DX, NODES, DT = (-0.3, 0.2, 1.1), 0.05, (9, 8, 10), 2e-3
 BATCH, COUNT = 2, 40

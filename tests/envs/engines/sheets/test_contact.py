@@ -9,8 +9,8 @@ import torch
 import warp as wp
 from scipy.spatial import cKDTree
 
-from gradscape.envs.engines.sheets.contact import Floor, Pan
 from gradscape.envs.engines.runtime import precision, to_torch
+from gradscape.envs.engines.sheets.contact import Floor, Pan
 from gradscape.envs.engines.sheets.springs import Sheet, Solver
 
 DT = 1e-3

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from gradscape.envs.sheets import lattice
-from gradscape.envs.engines.sheets.contact import Floor, Pan
 from gradscape.envs.engines.runtime import to_torch
+from gradscape.envs.engines.sheets.contact import Floor, Pan
 from gradscape.envs.engines.sheets.springs import Sheet, Solver
+from gradscape.envs.sheets import lattice
 
 NOWHERE = Floor(height=-1e6)
 K, MASS = 30.0, 0.2  # [N/m], [kg]

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 import torch
 
-from gradscape.envs.mpm import fluid, plasticine_model
 from gradscape.envs.base import Fidelity
 from gradscape.envs.engines.mpm import solver as mpm
-from gradscape.envs.engines.taichi import mpm as taichi_mpm
 from gradscape.envs.engines.mpm.boundaries import Open
-from gradscape.envs.engines.mpm.tools import STICKY, Kind, Manipulators, Tool
 from gradscape.envs.engines.mpm.materials import Elastic, Fluid, Plasticine
 from gradscape.envs.engines.mpm.model import Body, Model
-from gradscape.envs.engines.taichi.boundaries import meet
+from gradscape.envs.engines.mpm.tools import STICKY, Kind, Tool, ToolsInRoom
+from gradscape.envs.engines.taichi import mpm as taichi_mpm
+from gradscape.envs.engines.taichi.boundaries import boundary_contact
 from gradscape.envs.engines.taichi.materials import kernels
 from gradscape.envs.engines.taichi.runtime import real, start
+from gradscape.envs.mpm import fluid, plasticine_model
 from gradscape.envs.mpm.plasticine_scenes import RollingPin
 
 from ..bench import DT, IDENTITY, MASS, SCALE, VOLUME, MaterialBench, draw, rotations, vectors
@@ -65,7 +65,7 @@ def crowded(friction=0.5, **changes):
         Tool(Kind.CYLINDER, (0.05, 0.05), 0.2),
         Tool(Kind.ROLLER, (0.05, 0.04), 0.9),
     )
-    room = Manipulators(tools, (-0.4, 0.0, -0.15), (0.4, 0.6, 0.15), 0.1, friction, 60.0)
+    room = ToolsInRoom(tools, (-0.4, 0.0, -0.15), (0.4, 0.6, 0.15), 0.1, friction, 60.0)
     bodies = tuple(block(material, x) for material, x in ((SYRUP, -0.2), (CLAY, 0.0), (SPONGE, 0.2)))
     model = Model("float64", bodies, room, (-0.5, 0.0, -0.25), 0.05, (21, 15, 11), 2e-3, 5, 4)
     places = vectors((-0.2, 0.22, 0), (0.2, 0.22, 0), (0, 0.2, 0), (0, 0.12, 0.1), (0.1, 0.2, 0), (0, 0, 0)) + 0.013
@@ -221,5 +221,5 @@ def test_taichi_refuses_what_it_cannot_do():
         start("cuda")
     with pytest.raises(ValueError, match="float32 or float64; got 'float16'"):
         real("float16")
-    with pytest.raises(ValueError, match="knows Open, LadleInTank and Manipulators; got boundary 'sea'"):
-        meet("sea", "float64")
+    with pytest.raises(ValueError, match="knows Open, LadleInTank and ToolsInRoom; got boundary 'sea'"):
+        boundary_contact("sea", "float64")

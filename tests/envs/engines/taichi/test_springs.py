@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from gradscape.envs.sheets import lattice
 from gradscape.envs.engines.sheets import springs
-from gradscape.envs.engines.taichi import springs as taichi_springs
 from gradscape.envs.engines.sheets.contact import Floor, Pan
 from gradscape.envs.engines.sheets.springs import Sheet
+from gradscape.envs.engines.taichi import springs as taichi_springs
 from gradscape.envs.engines.taichi.runtime import start
+from gradscape.envs.sheets import lattice
 from gradscape.envs.sheets.swing import SwingVelocity
 
 PAN = Pan(flat=0.14, bend=0.07, sweep=math.asin(6 / 7), thickness=0.03)
