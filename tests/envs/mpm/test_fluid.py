@@ -40,7 +40,7 @@ def draft():
 
 def test_ladle_lifts_the_cube(draft):
     x = draft.example("scoop")[None]
-    cube, ladle = draft.cube(x)[0], draft.ladle(x)[0, -1, 0]
+    cube, ladle = draft.cube(x)[0], draft.tools(x)[0, -1, 0]
     assert cube[1] > TANK_HEIGHT
     assert (cube - ladle).norm() < BOWL - SHELL
     still, scooped = (draft.evaluate(points, grad=False).loss for points in (STILL, x))
@@ -74,7 +74,7 @@ def test_the_printed_goal_turns_the_sign_of_the_height(draft):
 
 def test_the_loss_is_height_missing_plus_distances_to_ladle_and_axis(tiny):
     x = tiny.space.uniform(4, seed=1)
-    cube, ladle = tiny.cube(x), tiny.ladle(x)[:, -1, 0]
+    cube, ladle = tiny.cube(x), tiny.tools(x)[:, -1, 0]
     aside, from_axis = (cube - ladle)[:, [0, 2]].norm(dim=1), cube[:, [0, 2]].norm(dim=1)
     wanted = (TANK_HEIGHT - cube[:, 1]).clamp_min(0) + 3 * aside + from_axis
     torch.testing.assert_close(tiny.evaluate(x, grad=False).loss, wanted, rtol=0, atol=1e-14)
@@ -83,7 +83,7 @@ def test_the_loss_is_height_missing_plus_distances_to_ladle_and_axis(tiny):
 @settings(max_examples=50)
 @given(st.lists(st.floats(-1e3, 1e3), min_size=2 * SEGMENTS, max_size=2 * SEGMENTS))
 def test_the_ladle_stays_in_the_tank(tiny, speeds):
-    path = tiny.ladle(torch.tensor([speeds], dtype=torch.float64))
+    path = tiny.tools(torch.tensor([speeds], dtype=torch.float64))
     assert path.shape == (1, STEPS + 1, 1, 3)
     x, y, z = path[0, :, 0].unbind(-1)
     assert (x.abs() + BOWL + SHELL <= TANK_WIDTH / 2 + 1e-12).all()
@@ -96,7 +96,7 @@ def test_away_from_its_limits_the_ladle_goes_speed_times_time(tiny):
     speeds = torch.tensor([[0.2, 0.1] * SEGMENTS], dtype=torch.float64)
     time = SPAN * torch.arange(STEPS + 1, dtype=torch.float64)
     wanted = torch.tensor(RIM, dtype=torch.float64) + time[:, None] * torch.tensor([0.2, 0.1, 0.0])
-    torch.testing.assert_close(tiny.ladle(speeds)[0, :, 0], wanted)
+    torch.testing.assert_close(tiny.tools(speeds)[0, :, 0], wanted)
 
 
 def test_single_precision_gives_the_same_landscape(draft):
@@ -131,7 +131,7 @@ def test_an_episode_shows_what_the_loss_measures(tiny):
     assert syrup.shape[0] == cube.shape[0] == len(ladle) == len(episode.time) == STEPS + 1
     torch.testing.assert_close(cube[0].mean(dim=0), torch.tensor(CUBE_CENTER, dtype=torch.float64))
     torch.testing.assert_close(cube[-1].mean(dim=0), tiny.cube(x)[0])
-    torch.testing.assert_close(ladle, tiny.ladle(x)[0, :, 0])
+    torch.testing.assert_close(ladle, tiny.tools(x)[0, :, 0])
     for points in (syrup, cube):
         assert points[:, :, [0, 2]].abs().max() < TANK_WIDTH / 2
         assert points[:, :, 1].min() > 0

@@ -1,4 +1,4 @@
-"""The eight plasticine scenes: tools, loss terms, targets, demonstrations, memory, gradients of what is undeformed."""
+"""The plasticine scenes: tools, loss terms, targets, demonstrations, memory, gradients of what is undeformed."""
 
 from dataclasses import replace
 
@@ -6,15 +6,18 @@ import numpy as np
 import pytest
 import torch
 
-from gradscape.envs.base import Fidelity
 from gradscape.envs.engines.mpm.tools import Kind
 from gradscape.envs.mpm.plasticine import DEMONSTRATION, SEGMENTS, TERMS, Plasticine
-from gradscape.envs.mpm.plasticine_model import PARTICLE, SPAN, STEPS
-from gradscape.envs.mpm.plasticine_scenes import Assembly, Pinch, RollingPin, Rope, Table, Torus, TripleMove, Writer
+from gradscape.envs.mpm.plasticine_model import PARTICLE
+from gradscape.envs.mpm.plasticine_scenes import Assembly, RollingPin, Rope, Torus, TripleMove, Writer
+from gradscape.envs.mpm.scene import STEPS
 from gradscape.envs.mpm.targets import Target
+from gradscape.envs.registry import environment_class
 
-SCENES = [Assembly, Pinch, RollingPin, Rope, Table, Torus, TripleMove, Writer]
-TINY = Fidelity("tiny", dt=SPAN / 5, precision="float64", resolution=16, particles=100)
+from ..scenes import SOFT, cheap
+
+SCENES = [environment_class(name) for name in SOFT]
+TINY = cheap(Plasticine)
 
 
 def made(kind, **options):
@@ -99,7 +102,8 @@ def test_the_sum_over_control_steps_ends_with_the_final_frame():
     frames, tools = env.episode(x[0]), env.tools(x)
     with env._solvers.lend() as stage:
         stage.solver.run(tools)
-        each = torch.cat([env._judge(stage, step, tools)[1] for step in range(1, STEPS + 1)])
+        ends = [stage.solver.reached(step, 1) for step in range(STEPS + 1)]
+        each = torch.cat([env._terms(stage, ends[step], tools[:, step]) for step in range(1, STEPS + 1)])
     assert len(frames.time) == STEPS + 1
     torch.testing.assert_close(torch.stack(list(summed.terms(x).values()), dim=1), each.sum(dim=0, keepdim=True))
     torch.testing.assert_close(torch.stack(list(env.terms(x).values()), dim=1), each[-1:])
@@ -120,7 +124,9 @@ def test_a_body_that_is_its_own_target_costs_nothing():
         paths = still.tools(torch.zeros(1, still.space.dim, dtype=torch.float64))
         with still._solvers.lend() as stage:
             stage.solver.run(paths)
-            terms = dict(zip(TERMS, still._judge(stage, 0, paths)[1][0].tolist(), strict=True))
+            terms = dict(
+                zip(TERMS, still._terms(stage, stage.solver.reached(0, 1), paths[:, 0])[0].tolist(), strict=True)
+            )
         assert terms["density"] == pytest.approx(0, abs=1e-12)  # its particles are in another order
         assert terms["sdf"] == 0
 
@@ -128,7 +134,7 @@ def test_a_body_that_is_its_own_target_costs_nothing():
 def test_triple_moves_targets_are_at_the_listed_centres():
     env = TripleMove(fidelity="standard", device="cpu")
     ends = np.cumsum([len(body.x) for body in env.model.bodies])
-    x = np.split(env._wanted(), ends[:-1])
+    x = np.split(env._target_particles(), ends[:-1])
     centers = [(0.2, 0.2, 0.5029), (0.8, 0.2, 0.2), (0.6254, 0.3436, 0.2002)]
     for block, center in zip(x, centers, strict=True):
         assert np.allclose(block.mean(axis=0), center, atol=2e-3)

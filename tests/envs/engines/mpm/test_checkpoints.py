@@ -7,8 +7,8 @@ import torch
 import warp as wp
 
 from gradscape.envs.engines.mpm import solver as mpm
-from gradscape.envs.engines.mpm.checkpoints import Window
-from gradscape.envs.engines.mpm.model import Box, around
+from gradscape.envs.engines.mpm.checkpoints import Allocator, Tape
+from gradscape.envs.engines.mpm.model import Box, nodes_around
 from gradscape.envs.engines.mpm.solver import Solver
 from gradscape.envs.engines.runtime import cuda_available, to_torch
 from gradscape.envs.mpm.fluid import Fluid
@@ -48,9 +48,9 @@ def test_an_episode_kept_whole_and_one_repeated_step_by_step_give_the_same_bits(
     model, paths = kneading()
     adj_x = {2: weights(model, 3, 5), model.steps: weights(model, 3, 6)}
     kept = kneaded(model, paths, adj_x)
-    monkeypatch.setattr(mpm, "KEPT", 0)
+    monkeypatch.setattr(mpm, "WHOLE_EPISODE", 0)
     repeated = kneaded(model, paths, adj_x)
-    assert len(kept[0].windows) == model.steps > len(repeated[0].windows) == 1
+    assert len(kept[0].tapes) == model.steps > len(repeated[0].tapes) == 1
     assert torch.equal(kept[1], repeated[1])
     assert torch.equal(kept[2], repeated[2])
 
@@ -61,7 +61,7 @@ def test_the_grid_grows_where_a_particle_leaves_its_part(monkeypatch, speed):
     model, velocity = free_model(steps=1), torch.zeros(1, 192, 3, dtype=torch.float64)
     velocity[:, :64, 1], velocity[:, 64:128, 1] = speed, -speed
     cropped = solved(model, 1, velocity)
-    assert (cropped.boxes[0] == around(model, *model.corners, mpm.MARGIN)) == (speed < 10)
+    assert (cropped.boxes[0] == nodes_around(model, *model.corners, mpm.MARGIN)) == (speed < 10)
     monkeypatch.setattr(mpm, "MARGIN", 1000)
     whole = solved(model, 1, velocity)
     for solver in (cropped, whole):
@@ -70,38 +70,45 @@ def test_the_grid_grows_where_a_particle_leaves_its_part(monkeypatch, speed):
         assert torch.equal(over_time(cropped, name), over_time(whole, name))
 
 
-def test_a_window_grows_by_the_bytes_it_says():
+def test_a_tape_grows_by_the_bytes_it_says():
     model, paths = kneading()
     solver = Solver(model, capacity=len(paths), device="cpu")
-    solver.boxes[0] = around(model, *model.corners, mpm.MARGIN)
-    window = Window(solver)
+    solver.boxes[0] = nodes_around(model, *model.corners, mpm.MARGIN)
+    tape = Tape(solver.allocator)
     for margin in (0, 3):  # the second time it has something to lose
-        box = solver.boxes[0] = around(model, *model.corners, mpm.MARGIN + margin)
-        before, growth = window.bytes, window.growth(box.cells, solver)
-        window.hold(0, solver)
-        assert window.bytes - before == growth > 0
-    assert window.growth(box.cells, solver) == 0
+        box = solver.boxes[0] = nodes_around(model, *model.corners, mpm.MARGIN + margin)
+        before, growth = tape.bytes, tape.growth(box.cells)
+        tape.make_room(0, box)
+        assert tape.bytes - before == growth > 0
+    assert tape.growth(box.cells) == 0
 
 
 @pytest.mark.parametrize("warned", [True, False])
 def test_control_steps_are_given_up_for_memory_and_no_bit_is_lost(monkeypatch, warned):
-    """Either it is foreseen that a window does not fit, or the allocation fails."""
+    """Either it is foreseen that a tape does not fit, or the allocation fails."""
     model, paths = kneading()
     adj_x = {2: weights(model, 3, 5), model.steps: weights(model, 3, 6)}
     kept = kneaded(model, paths, adj_x)
-    grid = Solver.grid
+    grid, solvers = Allocator.grid, []
 
-    def scarce(solver, cells):
-        if cells > 1 and len(solver.windows) > 2:
+    def scarce(allocator, cells):
+        if cells > 1 and any(len(solver.tapes) > 2 for solver in solvers if solver.allocator is allocator):
             raise RuntimeError("Failed to allocate 1 bytes on device 'cuda:0'")
-        return grid(solver, cells)
+        return grid(allocator, cells)
+
+    def remember(solver):
+        solvers.append(solver)
+        start(solver)
+
+    start = Solver._start
 
     if warned:
-        monkeypatch.setattr(Solver, "_fits", lambda solver, step: len(solver.windows) <= 2)
+        monkeypatch.setattr(Solver, "_fits", lambda solver, step: len(solver.tapes) <= 2)
     else:
-        monkeypatch.setattr(Solver, "grid", scarce)
+        monkeypatch.setattr(Solver, "_start", remember)
+        monkeypatch.setattr(Allocator, "grid", scarce)
     fewer = kneaded(model, paths, adj_x)
-    assert (len(kept[0].windows), len(fewer[0].windows)) == (model.steps, 2)
+    assert (len(kept[0].tapes), len(fewer[0].tapes)) == (model.steps, 2)
     assert torch.equal(kept[1], fewer[1])
     assert torch.equal(kept[2], fewer[2])
 
@@ -142,6 +149,6 @@ def test_the_memory_estimate_is_what_a_solver_takes():
     solver.gradient({solver.model.steps: torch.ones((2, solver.model.particles, 3), dtype=torch.float64)})
     seen = set()
     held = [*vars(solver).values(), *vars(solver.adjoint).values()]
-    held += [part for window in solver.windows for part in vars(window).values()]
+    held += [part for tape in solver.tapes for part in vars(tape).values()]
     taken = sum(array.capacity for thing in held for array in arrays(thing, seen))
     assert taken / solver.capacity == pytest.approx(mpm.memory(solver.model, "cpu"), rel=0.25)  # grids as they come

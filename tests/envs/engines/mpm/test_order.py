@@ -18,7 +18,7 @@ def sorted_once():
     """Return a model, a frame of scattered particles, and that frame sorted, with its order."""
     model = free_model()
     solver = Solver(model, capacity=BATCH, device="cpu")
-    old, new = solver.frame(), solver.frame()
+    old, new = solver.allocator.frame(), solver.allocator.frame()
     generator = torch.Generator().manual_seed(0)
     for array in old.arrays():
         view = to_torch(array)

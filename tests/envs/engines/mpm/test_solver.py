@@ -37,7 +37,7 @@ def test_mass_and_momentum_are_conserved_away_from_walls():
     m = masses(model)
     momentum = (m[:, None] * over_time(solver, "v")).sum(dim=2)
     torch.testing.assert_close(momentum, momentum[:1].expand_as(momentum), rtol=0, atol=1e-7 * float(m.sum()))
-    on_grid = to_torch(solver.windows[-1].grids[-1].m)[:, :, 3].sum(dim=1)
+    on_grid = to_torch(solver.tapes[-1].grids[-1].m)[:, :, 3].sum(dim=1)
     torch.testing.assert_close(on_grid, m.sum().expand(2), rtol=1e-12, atol=0)
     J, F = (to_torch(state) for state in solver.checkpoints[-1].S[:2])
     assert (J - 1).abs().max() > 1e-3  # and this was no rigid motion

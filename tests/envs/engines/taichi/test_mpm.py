@@ -36,7 +36,7 @@ def scene():
     tiny = Fidelity("tiny", dt=fluid.SPAN / 2, precision="float64", resolution=6, sampling=1.5)
     environment = fluid.Fluid(fidelity=tiny, device="cpu")
     x = torch.stack([environment.example("scoop"), 2 * draw(10, seed=1)])
-    return shortened(environment.model, environment.ladle(x))
+    return shortened(environment.model, environment.tools(x))
 
 
 def rolling():
