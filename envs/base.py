@@ -7,7 +7,7 @@ import inspect
 import re
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from importlib import import_module
 from types import ModuleType
@@ -26,45 +26,14 @@ from .code import code_digest
 from .engines import find_engine
 from .engines.engine import Engine
 from .options import NoOptions, read_options
+from .records import Fidelity as Fidelity
+from .records import MaterialRange as MaterialRange
+from .records import Work as Work
 
 COMPUTES_LOSSES = False  # for `code`
 
 T = TypeVar("T")
 FLOAT32 = torch.finfo(torch.float32).max
-
-
-@dataclass(frozen=True)
-class Fidelity:
-    """Say how accurately a scene is simulated.
-
-    `dt` is the time step [s], `resolution` the number of grid cells (or mesh edges) across the scene, 0 where it has
-    none, `sampling` the particles per cell along each axis, `precision` that of the engine: float32 or float64.
-    `particles` is how many there are, in scenes that count them instead.
-    """
-
-    name: str
-    dt: float
-    precision: str = "float32"
-    resolution: int = 0
-    sampling: float = 2.0
-    particles: int = 0
-
-
-@dataclass(frozen=True)
-class Work:
-    """Say how much an episode computes: `count` of a `unit`, such as one particle in one substep."""
-
-    count: int
-    unit: str
-
-
-@dataclass(frozen=True)
-class MaterialRange:
-    """Name the option that makes a scene's material soft or stiff, and the values at both ends to try."""
-
-    option: str
-    softest: float
-    stiffest: float
 
 
 class Environment(abc.ABC):
@@ -151,17 +120,17 @@ class Environment(abc.ABC):
         Rows do not depend on each other. A row whose simulation fails says so in its status. Raises ValueError where x
         has another shape, another type or values that are not finite.
         """
-        x = self._check(x)
+        x = self._check_points(x)
         if len(x) == 0:
             return Evaluation.empty(self.space.dim, grad=grad)
-        results = self._map(partial(self._simulate, grad=grad), x)
+        results = self._map_parts(partial(self._simulate, grad=grad), x)
         loss = torch.cat([r.loss.to(x) for r in results])
         slope = torch.cat([r.grad.to(x) for r in results if r.grad is not None]) if grad else None
         return Evaluation.judged(loss, slope, torch.cat([r.status.cpu() for r in results]))
 
     @final
     def __call__(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"]:
-        """Return losses that torch can differentiate."""
+        """Return losses that torch can differentiate. Raises ValueError for x that holds no floating-point numbers."""
         if not isinstance(x, Tensor) or not x.is_floating_point():
             kind = f"a tensor of {x.dtype}" if isinstance(x, Tensor) else type(x).__name__
             raise ValueError(f"{self.name}(x) takes a floating-point tensor, and evaluate(x) any numbers; got {kind}")
@@ -176,11 +145,11 @@ class Environment(abc.ABC):
     @classmethod
     def about(cls) -> str:
         """Return what a scene says of itself, and after it what its family says."""
-        return "\n\n".join(inspect.cleandoc(kind.__doc__) for kind in cls.family() if kind.__doc__)
+        return "\n\n".join(inspect.cleandoc(kind.__doc__) for kind in cls.own_classes() if kind.__doc__)
 
     @final
     @classmethod
-    def family(cls) -> tuple[type, ...]:
+    def own_classes(cls) -> tuple[type, ...]:
         """Return the scene's class and those it is derived from, up to this one."""
         return cls.__mro__[: cls.__mro__.index(Environment)]
 
@@ -193,20 +162,20 @@ class Environment(abc.ABC):
     @final
     @classmethod
     def check_engine(cls, engine: str) -> str:
-        """Return the name of one of the scene's engines, and refuse any other."""
+        """Return the name of one of the scene's engines. Raises ValueError where the scene has no such engine."""
         if engine not in cls.engines:
             raise ValueError(f"{cls.name} has engine {' and '.join(cls.engines)}; got engine {engine!r}")
         return engine
 
     @final
     def example(self, name: str) -> Float[Tensor, " dim"]:
-        """Return a parameter vector this scene is known for."""
+        """Return a parameter vector this scene is known for. Raises ValueError where it has no such example."""
         if name not in self.examples:
             raise ValueError(f"{self.name} has no example {name!r}; it has {', '.join(self.examples) or 'none'}")
         return torch.tensor(self.examples[name], dtype=torch.float64)
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
-        """Return the frames of the episode at one point."""
+        """Return the frames of the episode at one point. Raises ValueError where a scene has nothing to draw."""
         raise ValueError(f"{self.name} has no episode to draw")
 
     def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Int[Tensor, " batch"]]:
@@ -220,7 +189,7 @@ class Environment(abc.ABC):
         Counted from rest at the lowest place, so that what there is at first is its scale: it may fall, never rise.
         None where a scene has no such motion.
         """
-        parts = [self._energy(part) for part in torch.split(self._check(x), self._capacity)]
+        parts = [self._energy(part) for part in torch.split(self._check_points(x), self._capacity)]
         known = [part for part in parts if part is not None]
         return torch.cat(known) if known else None
 
@@ -230,9 +199,10 @@ class Environment(abc.ABC):
 
         Parameters that this decision and later ones set do not matter. The last feature is the share of the episode
         that is over. It is all there is to see where parameters say how an episode begins or what it is made of: such
-        a scene is a bandit, with a single decision. Decisions share an episode of horizon 1; others have none to see.
+        a scene is a bandit, with a single decision. Raises ValueError where there is no such decision, and at a horizon
+        other than 1, where episodes are not shared by decisions.
         """
-        x = self._check(x)
+        x = self._check_points(x)
         horizon = getattr(self.options, "horizon", 1.0)
         if self.decisions > 1 and horizon != 1.0:
             raise ValueError(f"{self.name} is decided step by step at horizon 1 only; got horizon {horizon:g}")
@@ -240,7 +210,7 @@ class Environment(abc.ABC):
             raise ValueError(f"{self.name} numbers its decisions 0 to {self.decisions - 1}; got {decision}")
         ahead = self.space.center[self.space.dim * decision // self.decisions :]
         x = torch.cat([x[:, : self.space.dim - len(ahead)], ahead.expand(len(x), -1)], dim=1)
-        seen = torch.cat(self._map(partial(self._observe, decision=decision), x))
+        seen = torch.cat(self._map_parts(partial(self._observe, decision=decision), x))
         return torch.cat([seen, seen.new_full((len(x), 1), decision / self.decisions)], dim=1)
 
     @final
@@ -323,8 +293,13 @@ class Environment(abc.ABC):
     @final
     def _engine(self, kind: str) -> ModuleType:
         """Return the engine's module for `kind` (mpm, springs), imported only when asked for."""
+        module = self.capabilities.solvers.get(kind)
+        if module is None:
+            raise ValueError(
+                f"{self.name} needs an engine that simulates {kind}; got engine {self.engine}, which has none"
+            )
         try:
-            return import_module(f".engines.{self.capabilities.solvers[kind]}", __package__)
+            return import_module(f".engines.{module}", __package__)
         except ImportError as error:
             raise ValueError(f"{self.name} cannot run on engine {self.engine} here: {error}") from error
 
@@ -345,11 +320,11 @@ class Environment(abc.ABC):
     def _rows_per_part(self, rows: int) -> int:
         return max(1, min(-(-rows // self.threads), self._capacity))
 
-    def _map(self, work: Callable[[Tensor], T], x: Float[Tensor, "batch dim"]) -> list[T]:
+    def _map_parts(self, work: Callable[[Tensor], T], x: Float[Tensor, "batch dim"]) -> list[T]:
         parts = torch.split(x, self._rows_per_part(len(x)))
         return map_parts(work, parts, threads=self.threads, stop=self._stop)
 
-    def _check(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch dim"]:
+    def _check_points(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch dim"]:
         x = as_tensor(x, self.name)
         if x.ndim != 2 or x.shape[1] != self.space.dim:
             raise ValueError(
@@ -368,7 +343,7 @@ class Environment(abc.ABC):
 
     def _row(self, x: Float[Tensor, " dim"]) -> Float[Tensor, "one dim"]:
         """Return a single point, as `episode` takes it, as a batch of one row."""
-        return self._check(as_tensor(x, self.name)[None])
+        return self._check_points(as_tensor(x, self.name)[None])
 
     def _find_fidelity(self, fidelity: str | Fidelity | None) -> Fidelity:
         if isinstance(fidelity, Fidelity):

@@ -101,7 +101,7 @@ class Bounce(Environment):
     def bounces(self, x: Float[Tensor, "batch 3"]) -> Int[Tensor, " batch"]:
         """Count how often each ball leaves the ground."""
         counts = []
-        for part in torch.split(self._check(x), self._capacity):
+        for part in torch.split(self._check_points(x), self._capacity):
             with self._solvers.lend() as solver:
                 height = solver.run(torch.tensor(START), part)[:, :, 1].cpu()
             inside = height < self.ball.radius

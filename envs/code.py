@@ -29,7 +29,7 @@ DRAWING = frozenset({"_parts", "_surroundings", "_body_names", "_view", "_watch"
 @cache
 def code_digest(kind: type, engine: str = "warp") -> str:
     """Return a digest of the code that the numbers of an environment's class come from, on an engine."""
-    family = kind.family() if hasattr(kind, "family") else (kind,)
+    family = kind.own_classes() if hasattr(kind, "own_classes") else (kind,)
     own = dict.fromkeys(file for one in family if (file := _file(one)))
     ours = [file for file in own if file.is_relative_to(HERE)]
     others = [file for file in own if not file.is_relative_to(HERE)]

@@ -8,7 +8,10 @@ from torch import Tensor
 
 
 def hold(segments: Float[Tensor, "batch segment axis"], steps: int) -> Float[Tensor, "batch step axis"]:
-    """Hold each of the equally long segments' values over its control steps."""
+    """Hold each of the equally long segments' values over its control steps.
+
+    Raises ValueError where control steps cannot be shared equally.
+    """
     count = segments.shape[1]
     if steps % count:
         raise ValueError(f"{steps} control steps cannot be shared equally by {count} segments")

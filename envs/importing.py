@@ -16,7 +16,7 @@ IN_FILE = re.compile(r".+\.py:\w+", re.DOTALL)  # FILE.py:Class
 def import_named(name: str) -> ModuleType:
     """Import a module by its name, or a file by its path, once; what a file raises is said with its name.
 
-    A file finds modules beside it, as a program does.
+    A file finds modules beside it, as a program does. Raises ImportError for a module and ValueError for a file.
     """
     if not name.endswith(".py"):
         return import_module(name)

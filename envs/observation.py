@@ -15,7 +15,7 @@ SEEN = 32  # points of each body
 
 def watch(x: Float[Tensor, "batch point 3"], sizes: Sequence[int]) -> Float[Tensor, "batch seen 3"]:
     """Return the centre and up to 32 points, spread evenly over their numbers, of each body of so many points."""
-    return torch.stack([torch.cat([_of_body(body) for body in row.split(list(sizes))]) for row in x])
+    return torch.stack([torch.cat([_watch_body(body) for body in row.split(list(sizes))]) for row in x])
 
 
 def describe_motion(
@@ -34,6 +34,6 @@ def describe_motion(
     return features.flatten(start_dim=1)
 
 
-def _of_body(x: Float[Tensor, "point 3"]) -> Float[Tensor, "seen 3"]:
+def _watch_body(x: Float[Tensor, "point 3"]) -> Float[Tensor, "seen 3"]:
     chosen = torch.linspace(0, len(x) - 1, min(SEEN, len(x))).round().long()
     return torch.cat([x.mean(dim=0, keepdim=True), x[chosen]])

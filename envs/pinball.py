@@ -24,7 +24,7 @@ from .options import EpisodeOptions
 WIDTH, HEIGHT = 8.0, 10.0  # the board [m]
 BALL, BAR = 0.25, 0.1  # radius of the ball, half the thickness of a bar [m]
 DURATION = 4.0  # [s]
-MEMORY = 1 << 28  # bytes a solver may take
+SOLVER_BYTES = 1 << 28  # bytes a solver may take
 VIEW = View((0.0, -0.8, -0.5), (WIDTH, HEIGHT, 0.5), eye=(0.08, 0.1, 1.0), ground=None)
 
 
@@ -102,7 +102,7 @@ class Pinball(Environment):
     def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Int[Tensor, " batch"]]:
         """Count the impacts of each episode that are faster than crawling."""
         counts = [torch.zeros(0, dtype=torch.int64)]
-        for part in torch.split(self._check(x), self._capacity):
+        for part in torch.split(self._check_points(x), self._capacity):
             with self._solvers.lend() as solver:
                 solver.run(part, self._start)
                 counts.append(solver.at_end("hits").cpu().long())
@@ -113,13 +113,13 @@ class Pinball(Environment):
         (row,) = self._row(x)
         with self._solvers.lend() as solver:
             solver.run(row[None], self._start)
-            flight = _in_space(solver.at_steps("x", 0).double().cpu())
+            flight = _embed(solver.at_steps("x", 0).double().cpu())
         time = self.fidelity.dt * torch.arange(self.steps + 1, dtype=torch.float64)
         along = self.half_length * torch.stack([row.cos(), row.sin()], dim=1)
         pivots = torch.tensor(self.pivots, dtype=torch.float64)
-        bars = _in_space(torch.stack([pivots - along, pivots + along], dim=1).view(-1, 2))
+        bars = _embed(torch.stack([pivots - along, pivots + along], dim=1).view(-1, 2))
         points = {"ball": flight[:, None], "bars": bars.expand(len(time), -1, 3)}
-        goal = _in_space(self.goal).expand(len(time), 3)
+        goal = _embed(self.goal).expand(len(time), 3)
         parts = (
             *_draw_case(len(time)),
             *_draw_movers(points["ball"], points["bars"]),
@@ -131,7 +131,7 @@ class Pinball(Environment):
         o = self.options
         self._start = torch.tensor(self.start, dtype=torch.float64)
         board = Board(WIDTH, HEIGHT, self.pivots, self.half_length, BAR, BALL, o.restitution, o.friction)
-        self._capacity = max(1, min(256 if self.device == "cpu" else 1 << 14, MEMORY // self.memory()))
+        self._capacity = max(1, min(256 if self.device == "cpu" else 1 << 14, SOLVER_BYTES // self.memory()))
         settings: dict[str, Any] = {"dt": self.fidelity.dt, "steps": self.steps, "name": self.fidelity.precision}
         settings |= {"capacity": self._capacity, "device": self.device, "contacts": o.contacts}
         self._solvers = Pool(partial(Solver, board, **settings))
@@ -210,5 +210,5 @@ def _draw_case(frames: int) -> list[Part]:
     return [Part("box", material, still + still.new_tensor(at), size) for at, size, material in pieces]  # type: ignore[arg-type]
 
 
-def _in_space(p: Float[Tensor, "*frame 2"]) -> Float[Tensor, "*frame 3"]:
+def _embed(p: Float[Tensor, "*frame 2"]) -> Float[Tensor, "*frame 3"]:
     return pad(p, (0, 1))

@@ -142,7 +142,10 @@ BUILTIN = (
 
 @cache
 def entries() -> dict[str, Entry]:
-    """Return every registered environment by name, ours before other packages'."""
+    """Return every registered environment by name, ours before other packages'.
+
+    Raises ValueError where two packages register the same name.
+    """
     found = {entry.name: entry for entry in BUILTIN}
     for point in entry_points(group=GROUP):
         if point.name in found:
@@ -194,9 +197,12 @@ def complete_entry(entry: Entry) -> Entry:
 
 
 def environment_class(name: str) -> type[Environment]:
-    """Import and return the class of a registered environment, or of `FILE.py:Class`, which is registered by that."""
+    """Import and return the class of a registered environment, or of `FILE.py:Class`, which is registered by that.
+
+    Raises ValueError where no environment has that name, or its module or file cannot be imported.
+    """
     if IN_FILE.fullmatch(name):
-        return _of_file(name)
+        return _import_from_file(name)
     known = entries()
     if name not in known:
         close = get_close_matches(name, known, n=1)
@@ -221,7 +227,7 @@ def source_of(env: Environment) -> str | type[Environment]:
     return entry.target if IN_FILE.fullmatch(entry.target) else env.name
 
 
-def _of_file(text: str) -> type[Environment]:
+def _import_from_file(text: str) -> type[Environment]:
     """Import a class from a file and register it under its name."""
     from .base import Environment
 
@@ -260,7 +266,8 @@ def make(
 ) -> Environment:
     """Make an environment by its registered name, by FILE.py:Class, or of a class.
 
-    `fidelity` defaults to its cheapest, `device` is auto, cpu or cuda.
+    `fidelity` defaults to its cheapest, `device` is auto, cpu or cuda. Raises ValueError where the environment does not
+    exist, or has no such fidelity, device, engine or option.
     """
     kind = name if isinstance(name, type) else environment_class(name)
     settings: dict[str, Any] = {"fidelity": fidelity, "device": device, "engine": engine}

@@ -45,7 +45,7 @@ class Precision:
 
 @cache
 def precision(name: str) -> Precision:
-    """Return the types of `float32` or `float64`."""
+    """Return the types of `float32` or `float64`. Raises ValueError for any other name."""
     reals = {"float32": (wp.float32, torch.float32), "float64": (wp.float64, torch.float64)}
     if name not in reals:
         raise ValueError(f"precision must be float32 or float64; got {name!r}")

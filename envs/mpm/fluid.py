@@ -102,7 +102,7 @@ class Fluid(MpmScene):
     def cube(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch 3"]:
         """Return where the cube's centre is at the end of the episode [m]."""
         with self._solvers.lend() as stage:
-            parts = torch.split(self._check(x), self._capacity)
+            parts = torch.split(self._check_points(x), self._capacity)
             return torch.cat([self._center(stage.solver.run(self.tools(part)).double().cpu()) for part in parts])
 
     def _model(self) -> Model:
@@ -167,8 +167,8 @@ def _bodies(pitch: float, options: FluidOptions) -> tuple[Body, Body]:
     counts = round(TANK_WIDTH / pitch), round(FILL / pitch), round(TANK_WIDTH / pitch)
     sides = (TANK_WIDTH, FILL, TANK_WIDTH)
     grid = _lattice(counts, sides) + np.array([0.0, FILL / 2, 0.0])
-    volume = _outside_cube(grid, np.divide(sides, counts))
-    free = (np.abs(grid - CUBE_CENTER).max(axis=1) >= CUBE_EDGE / 2) & (_to_bowl(grid - RIM) >= SHELL)
+    volume = _volume_outside_cube(grid, np.divide(sides, counts))
+    free = (np.abs(grid - CUBE_CENTER).max(axis=1) >= CUBE_EDGE / 2) & (_distance_to_bowl(grid - RIM) >= SHELL)
     edge = max(3, round(CUBE_EDGE / pitch))
     syrup = Liquid(SYRUP_DENSITY, SYRUP_DENSITY * SPEED_OF_SOUND**2, options.viscosity)
     sugar = Elastic.with_wave_speed(options.cube_density, SPEED_OF_SOUND, poisson=0.3)
@@ -183,7 +183,7 @@ def _body(material: Liquid | Elastic, x: np.ndarray, volume: np.ndarray) -> Body
     return Body(material, x, volume, material.volume_ratio(pressure))
 
 
-def _outside_cube(grid: np.ndarray, cell: np.ndarray) -> np.ndarray:
+def _volume_outside_cube(grid: np.ndarray, cell: np.ndarray) -> np.ndarray:
     """Return what each particle's cell has outside the cube [m^3], so that the cube displaces just its own volume.
 
     What cells with their centre in the cube (they get no particle) have outside goes to those its surface cuts.
@@ -203,7 +203,7 @@ def _lattice(counts: tuple[int, ...], sides: tuple[float, ...]) -> np.ndarray:
     return np.asarray(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
 
 
-def _to_bowl(p: np.ndarray) -> np.ndarray:
+def _distance_to_bowl(p: np.ndarray) -> np.ndarray:
     """Return the distance of points to the bowl's mid-surface, whose rim's centre is 0 [m]."""
     below = np.abs(np.linalg.norm(p, axis=1) - BOWL)
     above = np.hypot(np.hypot(p[:, 0], p[:, 2]) - BOWL, p[:, 1])

@@ -112,10 +112,10 @@ class Plasticine(MpmScene):
         """Return the loss's terms (density, sdf and contact), each alone and unweighted."""
         found = []
         with self._solvers.lend() as stage:
-            for part in torch.split(self._check(x), self._capacity):
+            for part in torch.split(self._check_points(x), self._capacity):
                 paths = self.tools(part).to(self.device)
                 stage.solver.run(paths)
-                ends = {step: stage.solver.reached(step, len(part)) for step in self._loss_steps()}
+                ends = {step: stage.solver.read_positions(step, len(part)) for step in self._loss_steps()}
                 terms = [self._terms(stage, end, paths[:, step]) for step, end in ends.items()]
                 found.append(torch.stack(terms).sum(dim=0))
         return dict(zip(TERMS, torch.cat(found).cpu().unbind(1), strict=True))

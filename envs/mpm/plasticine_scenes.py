@@ -16,7 +16,7 @@ def _finger(x: float, y: float, z: float, radius: float, step: Point) -> Anchor:
     return Anchor(Tool(Kind.SPHERE, (radius,), 0.9), (x, y, z), step)
 
 
-def _demonstration(text: str) -> dict[str, tuple[float, ...]]:
+def _parse_demonstration(text: str) -> dict[str, tuple[float, ...]]:
     """Read the parameters that solve a scene."""
     return {DEMONSTRATION: tuple(map(float, text.split()))}
 
@@ -29,7 +29,7 @@ class Assembly(Plasticine):
     """
 
     name: ClassVar[str] = "assembly"
-    examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
+    examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
         0.017 0.806 0.02 0.313 0.871 -0.114
         0.431 1 -0.077 0.469 0.888 -0.008
@@ -55,7 +55,7 @@ class Pinch(Plasticine):
     """
 
     name: ClassVar[str] = "pinch"
-    examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
+    examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
         0 0 1
         0 -1 0
@@ -88,7 +88,7 @@ class RollingPin(Plasticine):
     """
 
     name: ClassVar[str] = "rolling-pin"
-    examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
+    examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
         0.6 0 -1
         -1 0 -1
@@ -113,7 +113,7 @@ class Rope(Plasticine):
     """
 
     name: ClassVar[str] = "rope"
-    examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
+    examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
         0.514 0.292 -0.463 -0.277 0.257 -0.624
         -0.386 -0.065 -1 -0.291 -0.006 -1
@@ -140,7 +140,7 @@ class Table(Plasticine):
     """
 
     name: ClassVar[str] = "table"
-    examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
+    examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
         0.07 0 -0.07
         0.06 0 -0.06
@@ -168,7 +168,7 @@ class Torus(Plasticine):
     """
 
     name: ClassVar[str] = "torus"
-    examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
+    examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
         -1 -1 -0.6
         -0.925 -1 -0.475
@@ -195,7 +195,7 @@ class TripleMove(Plasticine):
     """
 
     name: ClassVar[str] = "triple-move"
-    examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
+    examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
         0.123 0.083 0.002 -0.071 0.103 0.018 0.221 0.078 -0.161
         -0.152 0.124 -0.06 0.218 0.534 0.011 -0.161 0.4 0.008
@@ -228,7 +228,7 @@ class Writer(Plasticine):
     """
 
     name: ClassVar[str] = "writer"
-    examples: ClassVar[dict[str, tuple[float, ...]]] = _demonstration(
+    examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
         -0.9 -0.2 0
         0.3 -0.2 0.8

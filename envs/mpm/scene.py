@@ -62,7 +62,7 @@ class MpmScene(Environment):  # noqa: D101 -- `about` prints the docstrings of a
         tools = self.tools(self._row(x))
         with self._solvers.lend() as stage:
             stage.solver.run(tools)
-            frames = stage.solver.positions(0)
+            frames = stage.solver.read_trajectory(0)
         bodies = torch.split(frames, self._sizes, dim=1)
         return Episode(
             self.control_step * torch.arange(self.model.steps + 1, dtype=torch.float64),
@@ -126,9 +126,9 @@ class MpmScene(Environment):  # noqa: D101 -- `about` prints the docstrings of a
         found, adj_x, adj_paths = [], dict[int, Tensor](), torch.zeros_like(paths)
         with self._solvers.lend() as stage:
             stage.solver.run(paths.detach())
-            escaped = stage.solver.left_grid(len(x)).cpu()
+            escaped = stage.solver.read_escaped(len(x)).cpu()
             for step in self._loss_steps():
-                end = stage.solver.reached(step, len(x)).detach().requires_grad_(grad)
+                end = stage.solver.read_positions(step, len(x)).detach().requires_grad_(grad)
                 losses = self._losses(stage, step, end, paths)
                 found.append(losses.detach())
                 if grad:
@@ -154,7 +154,7 @@ class MpmScene(Environment):  # noqa: D101 -- `about` prints the docstrings of a
         return describe_motion(*seen, scale=scale, intervals=STEPS // SEGMENTS)
 
     def _watch(self, solver: Solver, step: int, rows: int) -> Float[Tensor, "batch seen 3"]:
-        return watch(solver.reached(step, rows).double().cpu(), self._sizes)
+        return watch(solver.read_positions(step, rows).double().cpu(), self._sizes)
 
     @property
     def _sizes(self) -> list[int]:

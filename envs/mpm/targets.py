@@ -66,7 +66,10 @@ def contact(
 def distance_outside(
     tool: Tool, x: Float[Tensor, "*batch 3"], pose: Float[Tensor, "*batch slot 3"]
 ) -> Float[Tensor, "*batch"]:
-    """Return how far points are from a tool [m], 0 inside; `pose` is its position, for a roller then its angles."""
+    """Return how far points are from a tool [m], 0 inside; `pose` is its position, for a roller then its angles.
+
+    Raises ValueError for a cylinder, which does not move.
+    """
     p = x - pose[..., 0, :]
     size = tool.size
     match tool.kind:

@@ -11,7 +11,10 @@ def square(cells: int) -> np.ndarray:
 
 
 def disc(cells: int) -> np.ndarray:
-    """Return the lattice points of a disc that is `cells` cells across, an even number, around 0; shape (vertex, 2)."""
+    """Return the lattice points of a disc that is `cells` cells across, around 0, shape (vertex, 2).
+
+    Raises ValueError where `cells` is odd.
+    """
     if cells % 2:
         raise ValueError(f"a disc is an even number of cells across; got {cells}")
     points = square(cells) - cells // 2

@@ -65,7 +65,7 @@ def files_of(name: str, engine: str = "warp", folder: Path = code.HERE) -> set[s
 
 # What scenes import, or lies beside them, and computes no loss: it says so itself.
 SILENT = {"base.py", "batching.py", "code.py", "registry.py", "observation.py", "outlines.py", "engines/runtime.py"}
-SILENT |= {"mpm/plasticine_look.py"}
+SILENT |= {"records.py", "mpm/plasticine_look.py"}
 # What no scene imports.
 ELSEWHERE = {"bench.py", "importing.py", "points.py", "engines/profiling.py", "engines/engine.py", "engines/warp.py"}
 

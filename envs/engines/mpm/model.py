@@ -12,7 +12,7 @@ from .boundaries import Boundary
 from .materials import Fluid, Material
 from .transfers import lattice
 
-MARGIN = 1  # cells around the particles that a control step begins with
+BOX_MARGIN = 1  # cells around the particles that a control step begins with
 EMPTY = 1e-8  # nodes lighter than this part of the lightest particle carry no velocity
 
 
@@ -78,7 +78,7 @@ class Model:
         """
         state = sum(len(body.x) * (1 if isinstance(body.material, Fluid) else 9) for body in self.bodies)
         frame = 15 * self.particles + state  # x, v, C and each material's own
-        grid = 8 * min(self.cells, nodes_around(self, *self.corners, MARGIN).cells * 2)
+        grid = 8 * min(self.cells, nodes_around(self, *self.corners, BOX_MARGIN).cells * 2)
         substep = frame + 9 * self.particles + grid
         return self.real_bytes * ((self.steps + 3) * frame + (tapes * self.substeps + 1) * substep)
 

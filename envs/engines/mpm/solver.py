@@ -26,7 +26,7 @@ from ..launches import Launches
 from ..runtime import free_memory, load, to_torch
 from .checkpoints import Allocator, Frame, Tape
 from .grid import velocity_kernel
-from .model import EMPTY, MARGIN, Box, Model, nodes_around
+from .model import BOX_MARGIN, EMPTY, Box, Model, nodes_around
 from .order import Order, Sorter
 from .transfers import lattice, transfers
 
@@ -84,7 +84,7 @@ class Solver:
         self.first = np.concatenate([[0], np.cumsum([len(body.x) for body in model.bodies])]).tolist()
         self.empty = EMPTY * float(model.mass.min())
         self.boxes = [Box((0, 0, 0), model.nodes)] * model.steps
-        self.margins = [MARGIN] * model.steps  # cells around the particles, as each step has needed so far
+        self.margins = [BOX_MARGIN] * model.steps  # cells around the particles, as each step has needed so far
         self.checkpoints = [self.allocator.frame() for _ in range(model.steps + 1)]
         self.orders = [Order(model, capacity, device) for _ in self.checkpoints]
         self.end = self.allocator.frame()  # of a control step, before its particles are sorted
@@ -109,7 +109,7 @@ class Solver:
             corners = self._advance_on_box(step, batch, *corners)
         if not self.spare_used:
             self._add_tapes()
-        return self.reached(steps, batch)
+        return self.read_positions(steps, batch)
 
     def _add_tapes(self) -> None:
         """Store more control steps whole from the next run on, in most of a GPU's memory that is free after a first."""
@@ -120,16 +120,16 @@ class Solver:
         self.tapes[0].step = -1  # it keeps other steps now
         self.launches.clear()
 
-    def reached(self, step: int, batch: int) -> torch.Tensor:
+    def read_positions(self, step: int, batch: int) -> torch.Tensor:
         """Return x [m] before control step `step` of the last run, shape (batch, particle, 3)."""
         return self.orders[step].to_model(to_torch(self.checkpoints[step].x)[:batch])
 
-    def positions(self, environment: int) -> torch.Tensor:
+    def read_trajectory(self, environment: int) -> torch.Tensor:
         """Return x [m] of one environment of the last run at the ends of control steps, (step + 1, particle, 3)."""
-        rows = [self.reached(step, environment + 1)[environment] for step in range(len(self.checkpoints))]
+        rows = [self.read_positions(step, environment + 1)[environment] for step in range(len(self.checkpoints))]
         return torch.stack(rows).double().cpu()
 
-    def left_grid(self, batch: int) -> torch.Tensor:
+    def read_escaped(self, batch: int) -> torch.Tensor:
         """Say for each environment whether a particle has left the grid, shape (batch,)."""
         return to_torch(self.escaped)[:batch] > 0
 

@@ -24,7 +24,7 @@ ON_WALL = 1e-6  # a wall's own nodes belong to it [m]
 
 @cache
 def boundary_contact(boundary: Boundary, name: str) -> Any:
-    """Return all of a boundary's contacts as one, in the precision `name`."""
+    """Return all of a boundary's contacts as one, in the precision `name`. Raises ValueError for an unknown one."""
     if isinstance(boundary, Open):
         return _free()
     if isinstance(boundary, LadleInTank):

@@ -77,18 +77,18 @@ class Solver:
         self.volume = self._constant(np.concatenate([body.volume for body in model.bodies]))
         self.origin = ti.Vector(model.origin)
         self.empty = EMPTY * float(model.mass.min())
-        self.kept = self._states(model.steps + 1)
-        self.window = self._states(model.substeps + 1)
+        self.checkpoints = self._states(model.steps + 1)
+        self.tape = self._states(model.substeps + 1)
         self.A = self._zeros(model.substeps, capacity, model.particles, 3, 3)
         nodes = capacity, *model.nodes
         self.grid = Grid(self._zeros(*nodes, 3), self._zeros(*nodes), self._zeros(*nodes, 3))
         self.tools = self._zeros(capacity, model.steps + 1, model.boundary.slots, 3)
-        self.differentiated = (*self.window.arrays(), self.A, *self.grid.arrays(), self.tools)
+        self.differentiated = (*self.tape.arrays(), self.A, *self.grid.arrays(), self.tools)
         for array in self.differentiated:
             array.requires_grad_()
             array.grad = torch.zeros_like(array)
         self.escaped = torch.zeros(capacity, dtype=torch.bool, device=device)
-        self.held = -1  # the control step in the window
+        self.tape_step = -1  # the control step in the tape
         self._start()
 
     @one_torch_thread()
@@ -100,19 +100,19 @@ class Solver:
         for step in range(steps):
             self._advance(step, batch)
             self.escaped |= self._outside()
-            for kept, array in zip(self.kept.arrays(), self.window.arrays(), strict=True):
-                kept[step + 1] = array.detach()[-1]
-        return self.reached(steps, batch)
+            for checkpoint, array in zip(self.checkpoints.arrays(), self.tape.arrays(), strict=True):
+                checkpoint[step + 1] = array.detach()[-1]
+        return self.read_positions(steps, batch)
 
-    def reached(self, step: int, batch: int) -> torch.Tensor:
+    def read_positions(self, step: int, batch: int) -> torch.Tensor:
         """Return x [m] before control step `step` of the last run, shape (batch, particle, 3)."""
-        return self.kept.x[step, :batch]
+        return self.checkpoints.x[step, :batch]
 
-    def positions(self, environment: int) -> torch.Tensor:
+    def read_trajectory(self, environment: int) -> torch.Tensor:
         """Return x [m] of one environment of the last run at the ends of control steps, (step + 1, particle, 3)."""
-        return self.kept.x[:, environment].double().cpu()
+        return self.checkpoints.x[:, environment].double().cpu()
 
-    def left_grid(self, batch: int) -> torch.Tensor:
+    def read_escaped(self, batch: int) -> torch.Tensor:
         """Say for each environment whether a particle has left the grid, shape (batch,)."""
         return self.escaped[:batch].clone()
 
@@ -124,8 +124,8 @@ class Solver:
             _grad(array).zero_()
         for step in reversed(range(max(adj_x))):
             if step + 1 in adj_x:
-                _grad(self.window.x)[-1, :batch] += adj_x[step + 1].to(self.window.x)
-            if self.held != step:
+                _grad(self.tape.x)[-1, :batch] += adj_x[step + 1].to(self.tape.x)
+            if self.tape_step != step:
                 self._advance(step, batch)
             self._retreat(step, batch)
         return _grad(self.tools)[:batch].clone()
@@ -133,9 +133,9 @@ class Solver:
     def _advance(self, step: int, batch: int) -> None:
         if self.stop.is_set():
             raise InterruptedError("the simulation was stopped")
-        self.held = step
-        for kept, array in zip(self.kept.arrays(), self.window.arrays(), strict=True):
-            array.detach()[0] = kept[step]
+        self.tape_step = step
+        for checkpoint, array in zip(self.checkpoints.arrays(), self.tape.arrays(), strict=True):
+            array.detach()[0] = checkpoint[step]
             array.detach()[1:] = 0.0  # what g2p adds to
         for s in range(self.model.substeps):
             for (update, _), inputs in zip(self.materials, self._material_inputs(s, batch), strict=True):
@@ -151,7 +151,7 @@ class Solver:
         self.grid_op(*self._grid_inputs(step, s, batch))
 
     def _retreat(self, step: int, batch: int) -> None:
-        """Take gradients from the window's last state to its first, then to the last of the step before."""
+        """Take gradients from the tape's last state to its first, then to the last of the step before."""
         _grad(self.A).zero_()
         for s in reversed(range(self.model.substeps)):
             self._fill_grid(step, s, batch)
@@ -163,22 +163,22 @@ class Solver:
             self.transfers.p2g.grad(*self._p2g_inputs(s, batch))
             for (_, adjoint), inputs in zip(self.materials, self._material_inputs(s, batch), strict=True):
                 adjoint(*inputs)
-        for array in self.window.arrays():
+        for array in self.tape.arrays():
             grad = _grad(array)
             grad[-1] = grad[0]
             grad[:-1] = 0.0
 
     def _material_inputs(self, s: int, batch: int) -> list[tuple[Any, ...]]:
-        model, window = self.model, self.window
+        model, tape = self.model, self.tape
         scale = -model.dt * 4.0 / model.dx**2
         return [
-            (s, batch, first, model.dt, scale, *body.material.constants(), self.mass, self.volume, window.C, S, self.A)
-            for body, first, S in zip(model.bodies, self.first[:-1], window.S, strict=True)
+            (s, batch, first, model.dt, scale, *body.material.constants(), self.mass, self.volume, tape.C, S, self.A)
+            for body, first, S in zip(model.bodies, self.first[:-1], tape.S, strict=True)
         ]
 
     def _p2g_inputs(self, s: int, batch: int) -> tuple[Any, ...]:
-        window, grid = self.window, self.grid
-        return s, batch, self.origin, self.model.dx, self.mass, window.x, window.v, self.A, grid.q, grid.m
+        tape, grid = self.tape, self.grid
+        return s, batch, self.origin, self.model.dx, self.mass, tape.x, tape.v, self.A, grid.q, grid.m
 
     def _grid_inputs(self, step: int, s: int, batch: int) -> tuple[Any, ...]:
         model, fall = self.model, self.model.dt * self.model.gravity
@@ -186,16 +186,16 @@ class Solver:
         return batch, self.origin, model.dx, fall, self.empty, *time, self.tools, *self.grid.arrays()
 
     def _g2p_inputs(self, s: int, batch: int) -> tuple[Any, ...]:
-        window = self.window
-        return s, batch, self.origin, self.model.dx, window.x, self.grid.v, window.v, window.C
+        tape = self.tape
+        return s, batch, self.origin, self.model.dx, tape.x, self.grid.v, tape.v, tape.C
 
     def _move_inputs(self, s: int, batch: int) -> tuple[Any, ...]:
-        return s, batch, self.model.dt, self.window.v, self.window.x
+        return s, batch, self.model.dt, self.tape.v, self.tape.x
 
     def _outside(self) -> torch.Tensor:
-        """Say for each environment whether particles in the window had nodes that the grid has not."""
+        """Say for each environment whether particles in the tape had nodes that the grid has not."""
         origin, last = (self._constant(np.array(values)) for values in (self.model.origin, self.model.nodes))
-        node = ((self.window.x.detach()[:-1] - origin) / self.model.dx - 0.5).floor()
+        node = ((self.tape.x.detach()[:-1] - origin) / self.model.dx - 0.5).floor()
         return ~((node >= 0) & (node <= last - 3)).all(dim=3).all(dim=2).all(dim=0)
 
     def _states(self, times: int) -> States:
@@ -211,8 +211,8 @@ class Solver:
         return torch.from_numpy(values).to(self.device, self.dtype)
 
     def _start(self) -> None:
-        self.kept.x[0] = self._constant(np.concatenate([body.x for body in self.model.bodies]))
-        for body, S in zip(self.model.bodies, self.kept.S, strict=True):
+        self.checkpoints.x[0] = self._constant(np.concatenate([body.x for body in self.model.bodies]))
+        for body, S in zip(self.model.bodies, self.checkpoints.S, strict=True):
             S[0] = self._constant(body.material.initial(body.ratio))
 
 

@@ -25,6 +25,7 @@ _started: list[str] = []  # the device
 def start(device: str) -> Any:
     """Start Taichi on cpu or cuda, unless it runs there already, and return its module.
 
+    Raises ValueError where Taichi cannot run on that device, or runs on the other one already in this process.
     Fields must name their types and kernels cast their literals: a float that does neither is a float64.
     """
     if device not in ("cpu", "cuda"):
@@ -40,7 +41,7 @@ def start(device: str) -> Any:
 
 @cache
 def real(name: str) -> Any:
-    """Return Taichi's type of `float32` or `float64`."""
+    """Return Taichi's type of `float32` or `float64`. Raises ValueError for any other name."""
     types = {"float32": ti.f32, "float64": ti.f64}
     if name not in types:
         raise ValueError(f"precision must be float32 or float64; got {name!r}")

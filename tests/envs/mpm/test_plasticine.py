@@ -102,7 +102,7 @@ def test_the_sum_over_control_steps_ends_with_the_final_frame():
     frames, tools = env.episode(x[0]), env.tools(x)
     with env._solvers.lend() as stage:
         stage.solver.run(tools)
-        ends = [stage.solver.reached(step, 1) for step in range(STEPS + 1)]
+        ends = [stage.solver.read_positions(step, 1) for step in range(STEPS + 1)]
         each = torch.cat([env._terms(stage, ends[step], tools[:, step]) for step in range(1, STEPS + 1)])
     assert len(frames.time) == STEPS + 1
     torch.testing.assert_close(torch.stack(list(summed.terms(x).values()), dim=1), each.sum(dim=0, keepdim=True))
@@ -125,7 +125,7 @@ def test_a_body_that_is_its_own_target_costs_nothing():
         with still._solvers.lend() as stage:
             stage.solver.run(paths)
             terms = dict(
-                zip(TERMS, still._terms(stage, stage.solver.reached(0, 1), paths[:, 0])[0].tolist(), strict=True)
+                zip(TERMS, still._terms(stage, stage.solver.read_positions(0, 1), paths[:, 0])[0].tolist(), strict=True)
             )
         assert terms["density"] == pytest.approx(0, abs=1e-12)  # its particles are in another order
         assert terms["sdf"] == 0

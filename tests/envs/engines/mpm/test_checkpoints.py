@@ -37,7 +37,7 @@ def test_the_whole_grid_and_its_parts_give_the_same_bits(monkeypatch):
     adj_x = {model.steps: weights(model, 3, 4)}
     cropped = kneaded(model, paths, adj_x)
     assert all(box.cells < model.cells / 2 for box in cropped[0].boxes)
-    monkeypatch.setattr(mpm, "MARGIN", 1000)
+    monkeypatch.setattr(mpm, "BOX_MARGIN", 1000)
     whole = kneaded(model, paths, adj_x)
     assert whole[0].boxes == [Box((0, 0, 0), model.nodes)] * model.steps
     assert torch.equal(whole[1], cropped[1])
@@ -61,11 +61,11 @@ def test_the_grid_grows_where_a_particle_leaves_its_part(monkeypatch, speed):
     model, velocity = free_model(steps=1), torch.zeros(1, 192, 3, dtype=torch.float64)
     velocity[:, :64, 1], velocity[:, 64:128, 1] = speed, -speed
     cropped = solved(model, 1, velocity)
-    assert (cropped.boxes[0] == nodes_around(model, *model.corners, mpm.MARGIN)) == (speed < 10)
-    monkeypatch.setattr(mpm, "MARGIN", 1000)
+    assert (cropped.boxes[0] == nodes_around(model, *model.corners, mpm.BOX_MARGIN)) == (speed < 10)
+    monkeypatch.setattr(mpm, "BOX_MARGIN", 1000)
     whole = solved(model, 1, velocity)
     for solver in (cropped, whole):
-        assert not solver.left_grid(1).any()
+        assert not solver.read_escaped(1).any()
     for name in "xvC":
         assert torch.equal(over_time(cropped, name), over_time(whole, name))
 
@@ -73,10 +73,10 @@ def test_the_grid_grows_where_a_particle_leaves_its_part(monkeypatch, speed):
 def test_a_tape_grows_by_the_bytes_it_says():
     model, paths = kneading()
     solver = Solver(model, capacity=len(paths), device="cpu")
-    solver.boxes[0] = nodes_around(model, *model.corners, mpm.MARGIN)
+    solver.boxes[0] = nodes_around(model, *model.corners, mpm.BOX_MARGIN)
     tape = Tape(solver.allocator)
     for margin in (0, 3):  # the second time it has something to lose
-        box = solver.boxes[0] = nodes_around(model, *model.corners, mpm.MARGIN + margin)
+        box = solver.boxes[0] = nodes_around(model, *model.corners, mpm.BOX_MARGIN + margin)
         before, growth = tape.bytes, tape.growth(box.cells)
         tape.make_room(0, box)
         assert tape.bytes - before == growth > 0

@@ -91,8 +91,8 @@ def test_a_particle_out_of_the_grid_is_reported_and_harms_no_neighbour():
     wild[1, -1, 1] += 200.0
     wild[1, : len(model.bodies[0].x), 1] += 8.0
     lone, together = solved(model, 3, calm), solved(model, 3, wild)
-    assert lone.left_grid(3).tolist() == [False, False, False]
-    assert together.left_grid(3).tolist() == [False, True, False]
+    assert lone.read_escaped(3).tolist() == [False, False, False]
+    assert together.read_escaped(3).tolist() == [False, True, False]
     ends = [over_time(solver, "x")[-1] for solver in (lone, together)]
     assert torch.equal(ends[0][[0, 2]], ends[1][[0, 2]])
     assert not torch.equal(ends[0][1], ends[1][1])
@@ -109,7 +109,7 @@ def test_a_run_forgets_the_one_before():
         random_velocities(model, 2, 0.5),
     ):
         start[:] = velocity
-        ends.append((solver.run(parked(model, 2)).clone(), solver.left_grid(2).tolist()))
+        ends.append((solver.run(parked(model, 2)).clone(), solver.read_escaped(2).tolist()))
     assert torch.equal(ends[0][0], ends[2][0])
     assert [left for _, left in ends] == [[False, False], [True, True], [False, False]]
 

@@ -91,8 +91,8 @@ def solved(engine, model, tools):
     solver = engine.Solver(model, capacity=len(tools) + 1, device="cpu")
     ends = solver.run(tools).clone()
     adj_x = {step: draw(*ends.shape, seed=step) for step in (2, model.steps)}
-    way = solver.reached(2, len(tools)).clone()
-    return Result(ends, way, solver.gradient(adj_x), solver.left_grid(len(tools)))
+    way = solver.read_positions(2, len(tools)).clone()
+    return Result(ends, way, solver.gradient(adj_x), solver.read_escaped(len(tools)))
 
 
 def relative(a, b):
@@ -161,10 +161,10 @@ def test_positions_are_those_at_the_ends_of_control_steps():
     model, tools = crowded()
     solver = taichi_mpm.Solver(model, capacity=2, device="cpu")
     solver.run(tools)
-    frames = solver.positions(1)
+    frames = solver.read_trajectory(1)
     assert frames.shape == (model.steps + 1, model.particles, 3)
     for step in range(model.steps + 1):
-        assert torch.equal(frames[step], solver.reached(step, 2)[1])
+        assert torch.equal(frames[step], solver.read_positions(step, 2)[1])
 
 
 def test_a_stopped_solver_says_so():
