@@ -44,8 +44,8 @@ def size(what: str, env: Environment) -> float:
     """Return how much of `what` an episode has: grid points are those it runs over, near its particles."""
     model = env.model  # type: ignore[attr-defined]
     if what == "grid points":
-        with env._solvers.lend() as solver:  # type: ignore[union-attr]
-            return float(np.mean([box.cells for box in solver.boxes]))
+        with env._solvers.lend() as stage:  # type: ignore[union-attr]
+            return float(np.mean([box.cells for box in stage.solver.boxes]))
     return {"particles": model.particles, "substeps": model.steps * model.substeps}[what]
 
 

@@ -45,11 +45,11 @@ class Entry:
     fidelities: tuple[str, ...] = ()
 
 
-def _function(name: str, target: str, model: str, dim: str = "2") -> Entry:
+def _function_entry(name: str, target: str, model: str, dim: str = "2") -> Entry:
     return Entry(name, f"gradscape.envs.functions:{target}", dim, "x0, x1, ... (no unit)", model, ("exact",))
 
 
-def _plasticine(name: str, target: str, dim: str, tools: str, task: str) -> Entry:
+def _plasticine_entry(name: str, target: str, dim: str, tools: str, task: str) -> Entry:
     parameters = f"5 x ({tools}{'' if ':' in tools else ': x, y, z'}), shares (no unit)"
     model = f"MLS-MPM: von Mises plasticine, tools; {task}"
     return Entry(name, f"gradscape.envs.mpm.plasticine_scenes:{target}", dim, parameters, model, SCENE)
@@ -120,23 +120,23 @@ BUILTIN = (
         "mass-spring disc, moving pan",
         SCENE,
     ),
-    _plasticine("assembly", "Assembly", "30", "2 spheres", "lift a ball onto a box"),
-    _plasticine("pinch", "Pinch", "15", "sphere", "dent a cube"),
-    _plasticine("rolling-pin", "RollingPin", "15", "pin: roll, turn, height", "roll a slab flat"),
-    _plasticine("rope", "Rope", "30", "2 spheres", "bend a rope around a post"),
-    _plasticine("table", "Table", "15", "sphere", "bend a table's leg"),
-    _plasticine("torus", "Torus", "15", "ring", "press a ring into a slab"),
-    _plasticine("triple-move", "TripleMove", "90", "6 spheres", "carry three blocks"),
-    _plasticine("writer", "Writer", "15", "pen", "write into a slab"),
-    _function("ackley", "Ackley", "many shallow minima around a funnel", "any"),
-    _function("beale", "Beale", "flat plain with sharp corner peaks"),
-    _function("branin", "Branin", "three equal minima in a smooth valley"),
-    _function("griewank", "Griewank", "regular ripples on a bowl", "any"),
-    _function("levy", "Levy", "wavy steps", "any"),
-    _function("rastrigin", "Rastrigin", "a lattice of minima on a bowl", "any"),
-    _function("rosenbrock", "Rosenbrock", "a bent, narrow valley", "any"),
-    _function("six-hump-camel", "SixHumpCamel", "six minima, two of them global"),
-    _function("styblinski-tang", "StyblinskiTang", "two minima along each axis", "any"),
+    _plasticine_entry("assembly", "Assembly", "30", "2 spheres", "lift a ball onto a box"),
+    _plasticine_entry("pinch", "Pinch", "15", "sphere", "dent a cube"),
+    _plasticine_entry("rolling-pin", "RollingPin", "15", "pin: roll, turn, height", "roll a slab flat"),
+    _plasticine_entry("rope", "Rope", "30", "2 spheres", "bend a rope around a post"),
+    _plasticine_entry("table", "Table", "15", "sphere", "bend a table's leg"),
+    _plasticine_entry("torus", "Torus", "15", "ring", "press a ring into a slab"),
+    _plasticine_entry("triple-move", "TripleMove", "90", "6 spheres", "carry three blocks"),
+    _plasticine_entry("writer", "Writer", "15", "pen", "write into a slab"),
+    _function_entry("ackley", "Ackley", "many shallow minima around a funnel", "any"),
+    _function_entry("beale", "Beale", "flat plain with sharp corner peaks"),
+    _function_entry("branin", "Branin", "three equal minima in a smooth valley"),
+    _function_entry("griewank", "Griewank", "regular ripples on a bowl", "any"),
+    _function_entry("levy", "Levy", "wavy steps", "any"),
+    _function_entry("rastrigin", "Rastrigin", "a lattice of minima on a bowl", "any"),
+    _function_entry("rosenbrock", "Rosenbrock", "a bent, narrow valley", "any"),
+    _function_entry("six-hump-camel", "SixHumpCamel", "six minima, two of them global"),
+    _function_entry("styblinski-tang", "StyblinskiTang", "two minima along each axis", "any"),
 )
 
 

@@ -158,7 +158,7 @@ def cloth(name, steps, engines):
     unit = torch.rand(4, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     given = dict(dt=env.fidelity.dt, steps=steps, name=name, capacity=4, device="cpu")
     solvers = [engine.Solver(env.sheet, env.surface, **given) for engine in engines]
-    return *solvers, env._drive(env.space.from_unit(unit)).detached()[:2]
+    return *solvers, env._drive(env.space.from_unit(unit)).detach()[:2]
 
 
 @pytest.mark.parametrize(
