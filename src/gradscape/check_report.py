@@ -91,6 +91,7 @@ def _findings(scene: Scene, points: int, seed: int, follow: Callable[[str], None
         precision=scene.env.fidelity.precision,
         twin=_twin(scene),
         variants=[*_time_steps(scene), *_materials(scene), *_horizons(scene)],
+        expected=scene.env.known_failures.get(scene.env.fidelity.name),
         follow=follow,
     )
 
