@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ..envs.base import Environment
     from ..jobs.check import CheckReport
     from ..jobs.pairs import PairRanking
-    from ..jobs.report import Subject
+    from ..jobs.report import ReportedSlice
     from ..jobs.report_record import Report
     from ..landscapes.measures.tradeoff import Tradeoff
     from ..landscapes.slice import Slice
@@ -125,16 +125,16 @@ def pairs(
     return job.run(watch)
 
 
-def _subject(what: Slice | Path | Scene, points: int, watch: Watch, keywords: SceneKeywords) -> Subject:
-    from ..jobs.report import Subject, sample_subject
+def _subject(what: Slice | Path | Scene, points: int, watch: Watch, keywords: SceneKeywords) -> ReportedSlice:
+    from ..jobs.report import ReportedSlice, sample_subject
     from ..landscapes.slice import Slice
 
     if isinstance(what, Slice):
         if what.folder is None:
             raise ValueError("report takes a slice on disk; this one is in memory alone, so use its own report()")
-        return Subject.of(what.folder)
+        return ReportedSlice.of(what.folder)
     if isinstance(what, Path) or (isinstance(what, str) and Path(what).exists()):
-        return Subject.of(Path(what))
+        return ReportedSlice.of(Path(what))
     env = environment(what, keywords, watch)
     return sample_subject(env, points, say_call("report", what, **keywords), watch)
 

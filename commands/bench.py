@@ -104,14 +104,14 @@ def _kernels(forward: KernelTable, sloped: KernelTable) -> Table:
     shown = table(f"kernel, batch {forward.batch}", "forward", "", "with gradient", "")
     found = [{row.name: row for row in way.kernels} for way in (forward, sloped)]
     for name in dict.fromkeys([*found[1], *found[0]]):
-        cells = [_spent(rows[name].seconds, rows[name].share) if name in rows else ("", "") for rows in found]
+        cells = [_format_time(rows[name].seconds, rows[name].share) if name in rows else ("", "") for rows in found]
         shown.add_row(name, *cells[0], *cells[1])
     shown.add_section()
     rest = [way.seconds - sum(row.seconds for row in way.kernels) for way in (forward, sloped)]
-    cells = [_spent(left, left / way.seconds) for left, way in zip(rest, (forward, sloped), strict=True)]
+    cells = [_format_time(left, left / way.seconds) for left, way in zip(rest, (forward, sloped), strict=True)]
     shown.add_row("outside kernels", *cells[0], *cells[1])
     return shown
 
 
-def _spent(seconds: float, share: float) -> tuple[str, str]:
+def _format_time(seconds: float, share: float) -> tuple[str, str]:
     return f"{1e3 * seconds:,.1f} ms", f"{share:.1%}"

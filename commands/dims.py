@@ -16,7 +16,7 @@ class TakesDims(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Read the second word as a dimension, and as the verb's argument where that would be missing else."""
-        two, one = repeated(args, 2), repeated(args, 1)
+        two, one = repeat_option(args, 2), repeat_option(args, 1)
         try:
             return super().parse_args(ctx, two)
         except TyperException:
@@ -29,7 +29,7 @@ class TakesDims(TyperCommand):
             raise
 
 
-def repeated(args: Sequence[str], most: int) -> list[str]:
+def repeat_option(args: Sequence[str], most: int) -> list[str]:
     """Return a command's words with an option of its own for each of the first words after `--dims`."""
     found, left = list[str](), list(args)
     while left:

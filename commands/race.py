@@ -123,9 +123,9 @@ def _ranks(summary: RaceSummary) -> Table:
         none = f"; none with {name_seeds(rank.unsuccessful)}" if rank.unsuccessful else ""
         shown.add_row(
             rank.method,
-            _ranged(rank.rank, rank.rank_low, rank.rank_high, 2),
+            _format_interval(rank.rank, rank.rank_low, rank.rank_high, 2),
             str(rank.wins),
-            _ranged(rank.mean, rank.low, rank.high, 3) + none,
+            _format_interval(rank.mean, rank.low, rank.high, 3) + none,
             str(rank.failed),
             f"{rank.forward_equivalents:.0f}",
             f"{rank.seconds:.3g}",
@@ -163,7 +163,7 @@ def _claims(summary: RaceSummary) -> Table:
     shown = table(*headings, title="what the paper claims, and this race")
     for finding in summary.claims:
         one = finding.difference
-        numbers = _ranged(one.mean, one.low, one.high, 3) if one else ""
+        numbers = _format_interval(one.mean, one.low, one.high, 3) if one else ""
         shown.add_row(str(finding.claim), finding.verdict, numbers, finding.claim.source)
     return shown
 
@@ -172,7 +172,7 @@ def _unit(summary: RaceSummary) -> str:
     return f" [{summary.loss_unit}]" if summary.loss_unit else ""
 
 
-def _ranged(value: float, low: float, high: float, digits: int) -> str:
+def _format_interval(value: float, low: float, high: float, digits: int) -> str:
     """Write a number and its interval, as far as they are finite."""
     from math import isfinite
 

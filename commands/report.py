@@ -10,7 +10,7 @@ import typer
 from .arguments import Data, Device, Fidelity, Json, Of, Print, Seed
 
 if TYPE_CHECKING:
-    from ..jobs.report import Subject
+    from ..jobs.report import ReportedSlice
     from ..jobs.report_record import Report, Reports
     from .terminal import Bars
 
@@ -78,29 +78,29 @@ def _register(source: str | None) -> None:
         environment_class(source)
 
 
-def _figures(root: Path) -> list[Subject]:
+def _figures(root: Path) -> list[ReportedSlice]:
     """Return the gallery's slices that are sampled. Raises ValueError where none is."""
     from ..gallery.figures import read_figures
-    from ..jobs.report import Subject
+    from ..jobs.report import ReportedSlice
 
-    there = [Subject.of(root / figure.id) for figure in read_figures() if _is_finished(root / figure.id)]
+    there = [ReportedSlice.of(root / figure.id) for figure in read_figures() if _is_finished(root / figure.id)]
     if not there:
         raise ValueError(f"{root} holds no figures yet; `landscape gallery compute` samples them")
     return there
 
 
-def _subjects(what: str, root: Path, fidelity: str | None, device: str, points: int, bars: Bars) -> list[Subject]:
+def _subjects(what: str, root: Path, fidelity: str | None, device: str, points: int, bars: Bars) -> list[ReportedSlice]:
     """Return a slice, or an environment's figures, or a slice sampled now for want of any."""
     from ..envs.registry import environment_class, make
     from ..gallery.figures import read_figures
-    from ..jobs.report import Subject, sample_subject
+    from ..jobs.report import ReportedSlice, sample_subject
     from .terminal import command_line
 
     if Path(what).exists():
-        return [Subject.of(Path(what))]
+        return [ReportedSlice.of(Path(what))]
     environment_class(what)  # refuses a name that does not exist, with those that come close
     figures = [figure for figure in read_figures() if figure.env == what and fidelity in (None, figure.fidelity)]
-    if found := [Subject.of(root / figure.id) for figure in figures if _is_finished(root / figure.id)]:
+    if found := [ReportedSlice.of(root / figure.id) for figure in figures if _is_finished(root / figure.id)]:
         return found
     return [sample_subject(make(what, fidelity=fidelity, device=device), points, command_line(), bars)]
 

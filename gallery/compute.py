@@ -19,10 +19,10 @@ from ..landscapes.storage.files import tidy
 from .episodes import EpisodePart
 from .figures import Figure
 from .measures import ReportPart, TradeoffPart
-from .parts import Part, SearchPart, SlicePart, SweepPart
+from .parts import FigurePart, SearchPart, SlicePart, SweepPart
 
 T = TypeVar("T")
-PARTS: dict[str, type[Part]] = {
+PARTS: dict[str, type[FigurePart]] = {
     "slices": SlicePart,
     "sweeps": SweepPart,
     "episodes": EpisodePart,
@@ -91,7 +91,7 @@ class _Work:
     watch: Watch
     failed: set[str] = field(default_factory=set)
 
-    def make(self, name: str, parts: Sequence[Part]) -> None:
+    def make(self, name: str, parts: Sequence[FigurePart]) -> None:
         """Make what is missing of one kind of part, its cost announced."""
         left = [part for part in parts if not self._try(part, part.there)]
         left = self._sound(left)
@@ -103,7 +103,7 @@ class _Work:
                 if outcome := self._try(part, partial(part.make, self.watch)):
                     self.watch.note(outcome)
 
-    def _announce(self, name: str, parts: Sequence[Part]) -> None:
+    def _announce(self, name: str, parts: Sequence[FigurePart]) -> None:
         """Say what all of it should take, from the first figure of each scene."""
         rates: dict[str, float] = {}
         total = 0.0
@@ -114,14 +114,14 @@ class _Work:
                 if rate is None:
                     continue
                 rates[kind] = rate
-            total += rates[kind] * part.left()
+            total += rates[kind] * part.count_left()
         if left := self._sound(parts):
             self.watch.note(f"{name}: {len(left)} to make, about {duration(total)} in all")
 
-    def _sound(self, parts: Sequence[Part]) -> list[Part]:
+    def _sound(self, parts: Sequence[FigurePart]) -> list[FigurePart]:
         return [part for part in parts if part.figure.id not in self.failed]
 
-    def _try(self, part: Part, work: Callable[[], T]) -> T | None:
+    def _try(self, part: FigurePart, work: Callable[[], T]) -> T | None:
         """Return what a part's work returns, None where it failed, which is said."""
         try:
             return work()

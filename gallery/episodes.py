@@ -10,7 +10,7 @@ import numpy as np
 from ..envs.registry import environment_class, make
 from ..jobs.watch import Watch
 from .files import EPISODE_KINDS, EPISODES, STORE, is_of_episode
-from .parts import LOSS, Part, seconds_of_one
+from .parts import LOSS, FigurePart, seconds_of_one
 from .records import Node, read_if_sound, read_nodes, write_nodes
 
 if TYPE_CHECKING:
@@ -25,19 +25,19 @@ HEIGHT, LONGEST = 480, 60  # of a film: pixels and most frames
 DRAWING = 0.15  # seconds per frame, about
 
 
-class EpisodePart(Part):
+class EpisodePart(FigurePart):
     """Films of the episodes at a few nodes, at the figure's fidelity."""
 
     def label(self) -> str:
         """Count the nodes."""
         return f"the episodes at {len(self._nodes)} nodes"
 
-    def left(self) -> int:
+    def count_left(self) -> int:
         """Count the nodes without a film, none in an environment that has no episodes to draw."""
         from ..envs.base import Environment
 
         drawn = environment_class(self.figure.env).episode is not Environment.episode
-        return len(self._nodes) - len(self._filmed()) if drawn else 0
+        return len(self._nodes) - len(self._find_films()) if drawn else 0
 
     def seconds_each(self) -> float:
         """Time an episode, and assume what drawing it takes."""
@@ -47,7 +47,7 @@ class EpisodePart(Part):
         """Film every episode that is not there, and clear away those of other nodes."""
         from ..landscapes.identity import plane_of
 
-        env, plane, filmed = self._scene().make(), plane_of(self._dataset), self._filmed()
+        env, plane, filmed = self._scene().make(), plane_of(self._dataset), self._find_films()
         for node in self._nodes:
             if node not in filmed:
                 with watch.busy(f"{self.figure.id}: the episode of {node.why}"):
@@ -87,7 +87,7 @@ class EpisodePart(Part):
 
         return choose_nodes(self._dataset, point(make(self.figure.env, device="cpu"), self.figure.through))
 
-    def _filmed(self) -> list[Node]:
+    def _find_films(self) -> list[Node]:
         """Return the nodes whose films are there."""
         listed = read_if_sound(read_nodes, self.folder / EPISODES) or []
         return [

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..jobs.scene import SceneSpec
 from .files import FIGURES
-from .paper import Caption, read_paper
+from .paper import PaperCaption, read_paper
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
@@ -35,7 +35,7 @@ class Figure:
     id: str
     env: str
     dims: tuple[int, ...]
-    caption: Caption = field(default_factory=Caption)
+    caption: PaperCaption = field(default_factory=PaperCaption)
     through: str = "center"
     resolution: int = 48
     fidelity: str = "standard"

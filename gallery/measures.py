@@ -11,7 +11,7 @@ from ..jobs.variants import SETTINGS
 from ..jobs.watch import Watch
 from ..landscapes.storage.records import read_json
 from .files import DEVICES, MEASURES, QUALITY, QUALITY_ARRAYS, REPORT, STORE, TRADEOFF_PICTURE, TradeoffFiles
-from .parts import Part
+from .parts import FigurePart
 from .records import read_if_sound
 
 if TYPE_CHECKING:
@@ -22,14 +22,14 @@ REPORT_POINTS, TRADEOFF_POINTS = 6, 64  # those of `landscape report` and `lands
 TURNED = [one for one in SETTINGS if one not in ("engine", "device")]  # those take hours on another device
 
 
-class ReportPart(Part):
+class ReportPart(FigurePart):
     """What the slice is like, beside it."""
 
     def label(self) -> str:
         """Return the command that measures it elsewhere."""
         return f"landscape report {self.folder} --device {self.device}"
 
-    def left(self) -> int:
+    def count_left(self) -> int:
         """Return 1 where there is no report of this slice."""
         from ..jobs.report import digest_of
         from ..landscapes.storage.paths import is_slice
@@ -50,20 +50,20 @@ class ReportPart(Part):
 
     def make(self, watch: Watch) -> str:
         """Measure the slice, in the place of a report of another one."""
-        from ..jobs.report import ReportJob, Subject
+        from ..jobs.report import ReportedSlice, ReportJob
         from ..landscapes.draw.film import lighten
         from .paper import read_paper
 
         for name in (REPORT, MEASURES, QUALITY, QUALITY_ARRAYS):
             (self.folder / name).unlink(missing_ok=True)
-        subject, words = Subject(self.figure.id, self.folder / STORE), read_paper().words
+        subject, words = ReportedSlice(self.figure.id, self.folder / STORE), read_paper().words
         job = ReportJob([subject], self.folder, True, REPORT_POINTS, SEED, self.device, words, command=self.label())
         report = job.report(subject, watch)
         lighten(self.folder / QUALITY)
         return ", ".join(report.words)
 
 
-class TradeoffPart(Part):
+class TradeoffPart(FigurePart):
     """Accuracy against time of the figure's environment, which its other figures share."""
 
     def label(self) -> str:
@@ -71,7 +71,7 @@ class TradeoffPart(Part):
         turned = ",".join(TURNED)
         return f"landscape tradeoff {self.figure.env} --device {self.device} --variants {turned}"
 
-    def left(self) -> int:
+    def count_left(self) -> int:
         """Return 1 where there is none, of an environment that has fidelities to trade."""
         some = len(environment_class(self.figure.env).fidelities) > 1
         devices = DEVICES if self.device == "auto" else (self.device,)

@@ -27,7 +27,7 @@ class PaperWords:
 
 
 @dataclass(frozen=True)
-class Caption:
+class PaperCaption:
     """Hold what the paper says, in our words, of what a slice shows, and the number of its figure, None in ours."""
 
     says: str = "It does not show this slice."
@@ -41,7 +41,7 @@ class Paper:
     words: Mapping[str, PaperWords]
     claims: Mapping[str, tuple[Claim, ...]]
     silences: Mapping[str, str]
-    captions: Mapping[str, Caption]
+    captions: Mapping[str, PaperCaption]
 
     def claims_about(self, env: str) -> Claims:
         """Return which optimisers the paper has ahead of which others in an environment, or why it claims nothing."""
@@ -50,9 +50,9 @@ class Paper:
         claims = self.claims.get(env, ())
         return Claims(claims, None if claims else self.silences.get(env, ABSENT))
 
-    def caption_of(self, slice_: str) -> Caption:
+    def caption_of(self, slice_: str) -> PaperCaption:
         """Return what the paper says of a slice of the gallery."""
-        return self.captions.get(slice_, Caption())
+        return self.captions.get(slice_, PaperCaption())
 
 
 class _Words(TypedDict):
@@ -118,5 +118,5 @@ def _silences(tables: Sequence[_Silence]) -> dict[str, str]:
     return {env: table["why"] for table in tables for env in table["environments"]}
 
 
-def _captions(tables: Sequence[_Caption]) -> dict[str, Caption]:
-    return {name: Caption(table["says"], table.get("number")) for table in tables for name in table["slices"]}
+def _captions(tables: Sequence[_Caption]) -> dict[str, PaperCaption]:
+    return {name: PaperCaption(table["says"], table.get("number")) for table in tables for name in table["slices"]}

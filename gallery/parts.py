@@ -51,7 +51,7 @@ class State:
 
 
 @dataclass(frozen=True)
-class Part(abc.ABC):
+class FigurePart(abc.ABC):
     """Something to make of a figure, in the gallery's data at `root`."""
 
     figure: Figure
@@ -70,10 +70,10 @@ class Part(abc.ABC):
 
     def there(self) -> bool:
         """Say whether nothing is left to make."""
-        return self.left() == 0
+        return self.count_left() == 0
 
     @abc.abstractmethod
-    def left(self) -> int:
+    def count_left(self) -> int:
         """Count what is left to make: points, films or runs."""
 
     @abc.abstractmethod
@@ -91,14 +91,14 @@ class Part(abc.ABC):
         return scene if known else replace(scene, fidelity=None)
 
 
-class SlicePart(Part):
+class SlicePart(FigurePart):
     """The slice itself, at the figure's fidelity."""
 
     def label(self) -> str:
         """Return the command that samples it."""
         return self.figure.command(self.device)
 
-    def left(self) -> int:
+    def count_left(self) -> int:
         """Count the points not sampled."""
         state = self.state()
         return state.points - (state.done or 0)
@@ -144,14 +144,14 @@ class SlicePart(Part):
         )
 
 
-class SweepPart(Part):
+class SweepPart(FigurePart):
     """The slice as something else moves: a film, of slices that stay in the sweep's own folder under out/."""
 
     def label(self) -> str:
         """Return the command that makes it."""
         return self.figure.sweep_command(frames=FRAMES, resolution=COARSE, fidelity=DRAFT, device=self.device)
 
-    def left(self) -> int:
+    def count_left(self) -> int:
         """Return 1 where there is no film of these settings yet."""
         if not self.figure.over or len(self.figure.dims) != 2:
             return 0
@@ -188,14 +188,14 @@ class SweepPart(Part):
         return replace(SweepJob.open(env, motion, folder, command=self.label(), grad=grad), executor=self.executor)
 
 
-class SearchPart(Part):
+class SearchPart(FigurePart):
     """A run of each method in the figure's environment, which its other figures share."""
 
     def label(self) -> str:
         """Name methods, budget and scene."""
         return f"{', '.join(METHODS)}: {BUDGET} episodes each in {self._where.name}"
 
-    def left(self) -> int:
+    def count_left(self) -> int:
         """Count the runs not made."""
         return len(self._missing())
 

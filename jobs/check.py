@@ -21,27 +21,27 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ..envs.base import Environment
-    from ..landscapes.conformance.extremes import Variant
+    from ..landscapes.conformance.extremes import ExtremeCase
 
 FACTORS = (1, 2, 4, 8)  # of the fidelity's time step, and of the scene's horizon
 
 
-def _materials(job: CheckJob) -> list[Variant]:
+def _materials(job: CheckJob) -> list[ExtremeCase]:
     """Return the softest and the stiffest of what a scene is made of, by its options or its parameters."""
-    from ..landscapes.conformance.extremes import Variant
+    from ..landscapes.conformance.extremes import ExtremeCase
 
     if (ends := job.env.material_range) is not None:
         values = (ends.softest, ends.stiffest)
-        return [Variant(f"{ends.option} {value:g}", _with_option(job.spec, ends.option, value)) for value in values]
+        return [ExtremeCase(f"{ends.option} {value:g}", _with_option(job.spec, ends.option, value)) for value in values]
     space = job.env.space
     stiff = [space.names.index(name) for name in job.env.stiffness_parameters]
     if not stiff:
-        return [Variant("softest and stiffest", why="it offers no stiffness to set")]
+        return [ExtremeCase("softest and stiffest", why="it offers no stiffness to set")]
     found = []
     for name, bound in (("softest", space.lower), ("stiffest", space.upper)):
         x = space.center[None].clone()
         x[0, stiff] = bound[stiff]
-        found.append(Variant(name, lambda: job.env, x=x))
+        found.append(ExtremeCase(name, lambda: job.env, x=x))
     return found
 
 
@@ -197,29 +197,29 @@ def _twin(job: CheckJob) -> Callable[[], Environment] | None:
     return None
 
 
-def _time_steps(job: CheckJob) -> list[Variant]:
-    from ..landscapes.conformance.extremes import Variant
+def _time_steps(job: CheckJob) -> list[ExtremeCase]:
+    from ..landscapes.conformance.extremes import ExtremeCase
 
     if not job.env.fidelity.dt:
-        return [Variant("dt 1x to 8x", why="it has no time step")]
-    found: list[Variant] = []
+        return [ExtremeCase("dt 1x to 8x", why="it has no time step")]
+    found: list[ExtremeCase] = []
     taken: dict[float, int] = {}
     for factor in FACTORS:
         dt = job.env.nearest_dt(factor * job.env.fidelity.dt)
         if dt in taken:
             why = f"the nearest step that fits into a control step is that of dt {taken[dt]}x"
-            found.append(Variant(f"dt {factor}x", why=why))
+            found.append(ExtremeCase(f"dt {factor}x", why=why))
         else:
             found.append(_time_step(job, factor, dt))
             taken[dt] = factor
     return found
 
 
-def _time_step(job: CheckJob, factor: int, dt: float) -> Variant:
-    from ..landscapes.conformance.extremes import Variant
+def _time_step(job: CheckJob, factor: int, dt: float) -> ExtremeCase:
+    from ..landscapes.conformance.extremes import ExtremeCase
 
     if factor == 1:
-        return Variant("dt 1x", lambda: job.env)
+        return ExtremeCase("dt 1x", lambda: job.env)
     own = job.env.fidelity
     longer_steps = replace(job.spec, fidelity=replace(own, name=f"{own.name}, dt {factor}x", dt=dt))
     note = ""
@@ -230,17 +230,19 @@ def _time_step(job: CheckJob, factor: int, dt: float) -> Variant:
         longer = dt / own.dt * work / before
         if work != before and abs(longer - 1) > 1e-3:
             note = f"its steps are rounded: an episode is {longer:.3g} times as long"
-    return Variant(f"dt {factor}x", longer_steps.make, why=note)
+    return ExtremeCase(f"dt {factor}x", longer_steps.make, why=note)
 
 
-def _horizons(job: CheckJob) -> list[Variant]:
-    from ..landscapes.conformance.extremes import Variant
+def _horizons(job: CheckJob) -> list[ExtremeCase]:
+    from ..landscapes.conformance.extremes import ExtremeCase
 
     if "horizon" not in {field.name for field in fields(job.env.options)}:
-        return [Variant("horizon 1x to 8x", why="it has no option `horizon`")]
+        return [ExtremeCase("horizon 1x to 8x", why="it has no option `horizon`")]
     own = job.env.options.horizon
-    longer = [Variant(f"horizon {factor}x", _with_option(job.spec, "horizon", factor * own)) for factor in FACTORS[1:]]
-    return [Variant("horizon 1x", lambda: job.env), *longer]
+    longer = [
+        ExtremeCase(f"horizon {factor}x", _with_option(job.spec, "horizon", factor * own)) for factor in FACTORS[1:]
+    ]
+    return [ExtremeCase("horizon 1x", lambda: job.env), *longer]
 
 
 def _record(finding: Finding) -> dict[str, Any]:

@@ -130,7 +130,7 @@ class PairsJob:
         Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
         """
         watch = watch or Watch()
-        with resumable(self.kept):
+        with resumable(self.say_kept):
             self._announce(watch)
             with watch.progress(self.design.episodes) as advance:
                 found = explore(self.env, self.design, self.pieces, follow=advance)
@@ -150,7 +150,7 @@ class PairsJob:
         tidy(self.folder)
         return ranking
 
-    def kept(self) -> str:
+    def say_kept(self) -> str:
         """Say how much of it is on disk."""
         return f"{self.pieces.count()} batches are kept in {self.folder}"
 
@@ -158,7 +158,7 @@ class PairsJob:
         env, design = self.env, self.design
         with watch.busy(f"{env.name}: {PREPARING}"):
             env.prepare()
-            each = seconds_per_episode(env, design.moved(range(1))[: env.preferred_batch], grad=False)
+            each = seconds_per_episode(env, design.move_one(range(1))[: env.preferred_batch], grad=False)
         samples, dim = len(design.base), env.space.dim
         watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {self.folder}")
         watch.note(

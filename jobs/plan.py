@@ -232,7 +232,7 @@ def plan_slice(env: Environment, plane: Plane, folder: Path, *, grad: bool, bega
     extra = Room(SUMMARY + sum(file.stat().st_size for file in folder.iterdir() if file.is_file()), 2)
     return Plan(
         episodes, batches, start, simulating, writing, loading + count * once, memory + peak_memory(), _gpu(env),
-        grown.finished(kept, 1, extra), grown.filling(kept), _rate(little, plane),
+        grown.finished_room(kept, 1, extra), grown.filling_room(kept), _rate(little, plane),
     )  # fmt: skip
 
 
@@ -267,7 +267,8 @@ def plan_sweep(
     return Plan(
         count * whole, count * -(-whole // env.preferred_batch), start, seconds * count * whole / job.total,
         count * grown.points * kept.seconds, drawing, round(memory + held) + peak_memory(), _gpu(env),
-        grown.finished(kept, count, Room(films + SUMMARY + 250 * frames, 5)), grown.filling(kept), _rate(little, plane),
+        grown.finished_room(kept, count, Room(films + SUMMARY + 250 * frames, 5)), grown.filling_room(kept),
+        _rate(little, plane),
     )  # fmt: skip
 
 
@@ -297,12 +298,12 @@ class Growth:
         chunks = _chunks(plane, grad=grad) - _chunks(little, grad=grad)
         return cls(points, tiles, chunks, round(more - less), max(_tiles(plane)) - 1)
 
-    def finished(self, kept: Stored, slices: int, extra: Room) -> Room:
+    def finished_room(self, kept: Stored, slices: int, extra: Room) -> Room:
         """Return the room of so many slices, and of what else there is."""
         one = round(self.points * kept.finished.bytes), kept.finished.files + self.chunks
         return replace(extra, bytes=slices * one[0] + extra.bytes, files=slices * one[1] + extra.files)
 
-    def filling(self, kept: Stored) -> Room:
+    def filling_room(self, kept: Stored) -> Room:
         """Return the room of a slice's tiles."""
         room = kept.filling
         return replace(room, bytes=round(self.points * room.bytes), files=round(self.tiles * room.files))

@@ -18,7 +18,7 @@ from ..landscapes.sampling.distribution import run_tasks, workers_of
 from ..landscapes.space import as_whole
 from ..landscapes.storage.files import clear, tidy, visible_files, write_json
 from ..landscapes.storage.ownership import refuse_others
-from ..optim.claims import Claims, Finding, check_claims
+from ..optim.claims import ClaimFinding, Claims, check_claims
 from ..optim.memory import SearchSize, require_method, require_runs
 from ..optim.race import Competitor, Race, name_seeds, race
 from ..optim.registry import find_method, methods, optimizer_class
@@ -58,7 +58,7 @@ class RaceSummary:
     budget: int
     seeds: int
     race: Race
-    claims: list[Finding]
+    claims: list[ClaimFinding]
     silence: str | None
     command: str
     files: list[str]
@@ -158,7 +158,7 @@ class RaceJob:
         Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
         """
         watch = watch or Watch()
-        with resumable(self.kept), one_torch_thread():
+        with resumable(self.say_kept), one_torch_thread():
             self._search(watch)
             with watch.busy("resampling seeds"):
                 return self._save()
@@ -168,7 +168,7 @@ class RaceJob:
         runs = {method: [one.run.read() for one in self.competitors if one.method == method] for method in self.methods}
         return Race(runs, self.budget, self.folder, provenance(self.env, self.command))
 
-    def kept(self) -> str:
+    def say_kept(self) -> str:
         """Say how much of it is on disk."""
         stores = (RunStore.open(one.run.path) for one in self.competitors if one.run.path)
         done = sum(min(store.count, self.budget) for store in stores)
@@ -194,7 +194,7 @@ class RaceJob:
         self, executor: Executor, ratio: float | None, follow: Callable[[Competitor, SearchProgress], None]
     ) -> None:
         """Let workers search, and read what they wrote."""
-        left = [one for one in self.competitors if self._left(one)]
+        left = [one for one in self.competitors if self._count_left(one)]
         for one, now in search_by_workers(executor, self.env, left, budget=self.budget, gradient_cost=ratio):
             with one.run.lock():  # reads it
                 follow(one, now)
@@ -234,7 +234,9 @@ class RaceJob:
         env = self.env
         watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {self.folder}")
         needs = {method: optimizer_class(method).needs_grad for method in self.methods}
-        left = {way: sum(self._left(one) for one in self.competitors if needs[one.method] == way) for way in (0, 1)}
+        left = {
+            way: sum(self._count_left(one) for one in self.competitors if needs[one.method] == way) for way in (0, 1)
+        }
         whole = self.budget * len(self.competitors)
         racers = f"{', '.join(self.methods)}, {name_seeds(self.seeds)} each"
         if not any(left.values()):
@@ -259,7 +261,7 @@ class RaceJob:
         (cost,) = run_tasks(self.executor, _cost_there, [(cloudpickle.dumps(recipe(self.env)), grad)])
         return cost
 
-    def _left(self, one: Competitor) -> int:
+    def _count_left(self, one: Competitor) -> int:
         return max(0, self.budget - one.run.count)
 
 
@@ -377,7 +379,7 @@ def _open_competitor(
     return Competitor(method, seed, store, make)
 
 
-def _claim_record(finding: Finding) -> dict[str, Any]:
+def _claim_record(finding: ClaimFinding) -> dict[str, Any]:
     difference = None if finding.difference is None else asdict(finding.difference)
     said = {"claim": str(finding.claim), "verdict": finding.verdict, "difference": difference}
     return asdict(finding.claim) | said

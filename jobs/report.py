@@ -43,20 +43,20 @@ RESOLUTION = 24  # points per axis of a slice that is sampled for its report
 
 
 @dataclass(frozen=True)
-class Subject:
+class ReportedSlice:
     """A slice to report on: what it is called, and where its store is."""
 
     name: str
     store: Path
 
     @classmethod
-    def of(cls, path: Path) -> Subject:
+    def of(cls, path: Path) -> ReportedSlice:
         """Return the slice in a folder, or at the path itself."""
         name = path.resolve().parent.name if path.name == SLICE_STORE else path.name or path.resolve().name
         return cls(name, store_in(path, SLICE_STORE))
 
 
-def sample_subject(env: Environment, points: int, command: str, watch: Watch) -> Subject:
+def sample_subject(env: Environment, points: int, command: str, watch: Watch) -> ReportedSlice:
     """Sample the slice that a scene without any is reported on by: its first two parameters, through the centre.
 
     Raises TooLargeError for more points than a report has memory for, and as `SliceJob.run` does.
@@ -70,7 +70,7 @@ def sample_subject(env: Environment, points: int, command: str, watch: Watch) ->
     job = SliceJob.of(env, plane, command=command)
     summary = job.run(watch)
     watch.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
-    return Subject.of(job.folder)
+    return ReportedSlice.of(job.folder)
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class ReportJob:
     environment, and `prints` the widths of pages [mm] that a report is also drawn for.
     """
 
-    subjects: Sequence[Subject]
+    subjects: Sequence[ReportedSlice]
     folder: Path
     single: bool
     points: int = POINTS
@@ -94,7 +94,7 @@ class ReportJob:
     @classmethod
     def open(
         cls,
-        subjects: Sequence[Subject],
+        subjects: Sequence[ReportedSlice],
         *,
         what: str,
         single: bool,
@@ -123,10 +123,10 @@ class ReportJob:
         """
         watch, done, failed = watch or Watch(), list[Report](), dict[str, str]()
 
-        def kept() -> str:
+        def say_kept() -> str:
             return f"{len(done)} of {len(self.subjects)} reports are kept in {self._place(self.subjects[0]).parent}"
 
-        with resumable(kept):
+        with resumable(say_kept):
             for number, subject in enumerate(self.subjects):
                 if len(self.subjects) > 1:
                     watch.note(f"slice {number + 1} of {len(self.subjects)}: {subject.name}")
@@ -144,7 +144,7 @@ class ReportJob:
                     partial.write_text(slices_markdown(found.reports))
         return found
 
-    def report(self, subject: Subject, watch: Watch) -> Report:
+    def report(self, subject: ReportedSlice, watch: Watch) -> Report:
         """Return the report of a slice that is there, or else measure it now and leave it there."""
         folder = self._place(subject)
         report = replace(self._find(subject, folder, watch), folder=folder, store=subject.store)
@@ -152,10 +152,10 @@ class ReportJob:
         tidy(folder)
         return report
 
-    def _place(self, subject: Subject) -> Path:
+    def _place(self, subject: ReportedSlice) -> Path:
         return self.folder if self.single else self.folder / subject.name
 
-    def _find(self, subject: Subject, folder: Path, watch: Watch) -> Report:
+    def _find(self, subject: ReportedSlice, folder: Path, watch: Watch) -> Report:
         """Return a report that is there, or beside its slice, or else measure it.
 
         One that is to be drawn for print is not taken from beside the slice without what it is drawn from.
@@ -173,7 +173,7 @@ class ReportJob:
         return self._measure(subject, dataset, env, key, folder, watch)
 
     def _measure(
-        self, subject: Subject, dataset: xr.Dataset, env: Environment, key: ReportKey, folder: Path, watch: Watch
+        self, subject: ReportedSlice, dataset: xr.Dataset, env: Environment, key: ReportKey, folder: Path, watch: Watch
     ) -> Report:
         from ..landscapes.measures.profile import own_cost
 
@@ -275,7 +275,7 @@ def _announce(env: Environment, dataset: xr.Dataset, points: int, watch: Watch) 
     )
 
 
-def _open(subject: Subject) -> xr.Dataset:
+def _open(subject: ReportedSlice) -> xr.Dataset:
     """Read a slice that can be reported on; raise ValueError for one that cannot."""
     from ..landscapes.storage.store import open_slice
 
@@ -290,7 +290,7 @@ def _open(subject: Subject) -> xr.Dataset:
     return dataset
 
 
-def _warn(subject: Subject, dataset: xr.Dataset, env: Environment, watch: Watch) -> None:
+def _warn(subject: ReportedSlice, dataset: xr.Dataset, env: Environment, watch: Watch) -> None:
     theirs, ours = stored_identity(dataset), env.identity()
     differ = [name for name in ("code", "device") if theirs.get(name) != ours[name]]
     if differ:

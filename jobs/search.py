@@ -123,7 +123,7 @@ class SearchJob:
         Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
         """
         watch, start, resumed = watch or Watch(), time.monotonic(), self.store.count
-        with resumable(self.kept, lambda: self._on_disk().picture()), one_torch_thread():
+        with resumable(self.say_kept, lambda: self._on_disk().picture()), one_torch_thread():
             if resumed < self.budget:
                 resumed = self._search(watch)
             else:
@@ -139,7 +139,7 @@ class SearchJob:
         """Return the run as one works with it."""
         return replace(self.store.read(), folder=self.folder)
 
-    def kept(self) -> str:
+    def say_kept(self) -> str:
         """Say how much of it is on disk."""
         return f"{self._on_disk().store.count} of {self.budget} episodes are kept in {self.folder}"
 

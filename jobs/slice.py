@@ -186,7 +186,7 @@ class SliceJob:
         Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
         """
         watch = watch or Watch()
-        with resumable(self.kept, self.picture):
+        with resumable(self.say_kept, self.picture):
             self._announce(watch)
             start = time.monotonic()
             dataset, computed = self._sample(watch)
@@ -197,7 +197,7 @@ class SliceJob:
             tidy(self.folder)
         return summary
 
-    def kept(self) -> str:
+    def say_kept(self) -> str:
         """Say how much of it is on disk."""
         status = self.store.status()
         return f"{int((status > 0).sum())} of {status.size} points are kept in {self.folder}"

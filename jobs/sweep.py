@@ -165,7 +165,7 @@ class SweepJob:
         Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
         """
         watch = watch or Watch()
-        with resumable(self.kept):
+        with resumable(self.say_kept):
             self._announce(watch)
             start, resumed = time.monotonic(), self.done()
             drawn = self.sample(watch)
@@ -185,7 +185,7 @@ class SweepJob:
 
         return Sweep(self.motion.label, self.motion.values, self.motion.slices(slices))
 
-    def kept(self) -> str:
+    def say_kept(self) -> str:
         """Say how much of it is on disk."""
         return f"{self.done()} of {self.total} points are kept in {self.folder}"
 

@@ -95,7 +95,7 @@ class TradeoffJob:
         from ..landscapes.draw.figures.page import save
 
         watch = watch or Watch()
-        with resumable(self.kept):
+        with resumable(self.say_kept):
             self._announce(watch)
             found = self._conclude(self._measure(watch))
             save(found.plot(), self.folder / PICTURE)
@@ -103,11 +103,11 @@ class TradeoffJob:
             tidy(self.folder)
         return found
 
-    def kept(self) -> str:
+    def say_kept(self) -> str:
         """Say how much of it is on disk."""
         return f"{self.pieces.count()} of {len(self.variants)} variants are kept in {self.folder}"
 
-    def left(self) -> list[Variant]:
+    def variants_left(self) -> list[Variant]:
         """Return the variants that are not measured yet."""
         return [variant for variant in self.variants if self.pieces.load(variant.name) is None]
 
@@ -119,7 +119,7 @@ class TradeoffJob:
         from ..landscapes.measures.fidelity import REPETITION
         from .variants import expected_work
 
-        left = self.left()
+        left = self.variants_left()
         base = self._cheapest()
         batch = self.x[: base.preferred_batch]
         rate = seconds_per_episode(base, batch, grad=True) / base.work().count
@@ -142,7 +142,7 @@ class TradeoffJob:
 
     def _announce(self, watch: Watch) -> None:
         """Say what is left to measure and about how long that takes."""
-        left = self.left()
+        left = self.variants_left()
         kept = f", {len(self.variants) - len(left)} are there already" if len(left) < len(self.variants) else ""
         watch.note(f"{self.env.name} · {self.env.device} · {self.env.engine} · {self.folder}")
         watch.note(f"{len(left)} variants to measure at {len(self.x)} points{kept}")
@@ -249,5 +249,5 @@ class TradeoffJob:
         """Draw it for pages, too, and return the names of the files. Raises DiskFullError."""
         from ..landscapes.draw.figures.page import save_prints
 
-        with resumable(self.kept):
+        with resumable(self.say_kept):
             return save_prints(lambda width: found.plot(width), self.folder / PICTURE, self.prints)

@@ -102,14 +102,14 @@ def _length(env: Environment) -> float:
 def _dts(base: Variant, env: Environment) -> Iterator[Variant]:
     for factor in STEPS:
         dt = env.nearest_dt(base.fidelity.dt * factor)
-        fidelity = _changed(base, f"dt-x{dt / base.fidelity.dt:.3g}", dt=dt)
+        fidelity = _change_fidelity(base, f"dt-x{dt / base.fidelity.dt:.3g}", dt=dt)
         yield base.change(fidelity.name, "dt", fidelity=fidelity)
 
 
 def _resolutions(base: Variant, env: Environment) -> Iterator[Variant]:
     for factor in CELLS if base.fidelity.resolution else ():
         cells = 2 * round(base.fidelity.resolution * factor / 2)  # some scenes take even numbers only
-        fidelity = _changed(base, f"resolution-{cells}", resolution=cells)
+        fidelity = _change_fidelity(base, f"resolution-{cells}", resolution=cells)
         yield base.change(fidelity.name, "resolution", fidelity=fidelity)
 
 
@@ -119,13 +119,13 @@ def _particles(base: Variant, env: Environment) -> Iterator[Variant]:
     for factor in PARTICLES:
         count, sampling = round(base.fidelity.particles * factor), base.fidelity.sampling * math.cbrt(factor)
         changes = {"particles": count} if count else {"sampling": round(sampling, 3)}
-        fidelity = _changed(base, f"particles-x{factor:g}", **changes)
+        fidelity = _change_fidelity(base, f"particles-x{factor:g}", **changes)
         yield base.change(fidelity.name, "particles", fidelity=fidelity)
 
 
 def _precisions(base: Variant, env: Environment) -> Iterator[Variant]:
     other = "float64" if base.fidelity.precision == "float32" else "float32"
-    fidelity = _changed(base, other, precision=other)
+    fidelity = _change_fidelity(base, other, precision=other)
     yield base.change(fidelity.name, "precision", fidelity=fidelity)
 
 
@@ -148,7 +148,7 @@ def _devices(base: Variant, env: Environment) -> Iterator[Variant]:
             yield base.change(f"{base.name} on {device}", "device", device=device)
 
 
-def _changed(base: Variant, what: str, **changes: Any) -> Fidelity:
+def _change_fidelity(base: Variant, what: str, **changes: Any) -> Fidelity:
     return replace(base.fidelity, name=f"{base.fidelity.name}-{what}", **changes)
 
 

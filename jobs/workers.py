@@ -42,6 +42,9 @@ def workers(scheduler: str | None, device: str) -> Iterator[Executor | None]:
 
     `scheduler` is the address of a running scheduler, or local[:N] for N workers here that end with the block; `device`
     is what they compute on: cpu, cuda, or auto for CUDA where it is.
+
+    Raises ValueError where Dask is not installed or the workers cannot be as said, ConnectionError where no scheduler
+    answers, and WorkersLostError where every worker died of the same work.
     """
     if scheduler is None:
         yield None
@@ -116,10 +119,10 @@ def recipe(objective: Objective) -> partial[Environment] | None:
         return None
     env = objective
     how = {"fidelity": env.fidelity, "device": env.device, "engine": env.engine, "deterministic": env.deterministic}
-    return partial(_made, source_of(env), env.code, how | asdict(env.options))
+    return partial(_make_checked, source_of(env), env.code, how | asdict(env.options))
 
 
-def _made(source: str | type[Environment], code: str, settings: dict[str, Any]) -> Environment:
+def _make_checked(source: str | type[Environment], code: str, settings: dict[str, Any]) -> Environment:
     env = make(source, **settings)
     if env.code != code:
         raise ValueError(f"worker {platform.node()} has other code of {env.name}; install the same version of it there")

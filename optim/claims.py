@@ -30,7 +30,7 @@ class Claims:
     silence: str | None = None
 
 
-class Verdict(StrEnum):
+class ClaimVerdict(StrEnum):
     """Say what a race makes of a claim."""
 
     HOLDS = "holds"
@@ -40,25 +40,25 @@ class Verdict(StrEnum):
 
 
 @dataclass(frozen=True)
-class Finding:
+class ClaimFinding:
     """A claim, what the race makes of it, and the difference it was measured by, None where it was not run."""
 
     claim: Claim
-    verdict: Verdict
+    verdict: ClaimVerdict
     difference: Difference | None
 
 
-def check_claims(claims: Sequence[Claim], differences: Sequence[Difference]) -> list[Finding]:
+def check_claims(claims: Sequence[Claim], differences: Sequence[Difference]) -> list[ClaimFinding]:
     """Return what a race, by the differences of its methods, makes of each claim."""
     measured = {(found.first, found.second): found for one in differences for found in (one, one.reversed)}
     return [_check(claim, measured.get((claim.first, claim.second))) for claim in claims]
 
 
-def _check(claim: Claim, difference: Difference | None) -> Finding:
+def _check(claim: Claim, difference: Difference | None) -> ClaimFinding:
     """Check a claim; that two are alike can be refuted by an interval, never shown."""
     if difference is None:
-        return Finding(claim, Verdict.NOT_RUN, None)
+        return ClaimFinding(claim, ClaimVerdict.NOT_RUN, None)
     if difference.better is None:
-        return Finding(claim, Verdict.UNDECIDED, difference)
+        return ClaimFinding(claim, ClaimVerdict.UNDECIDED, difference)
     holds = not claim.alike and difference.better == claim.first
-    return Finding(claim, Verdict.HOLDS if holds else Verdict.FAILS, difference)
+    return ClaimFinding(claim, ClaimVerdict.HOLDS if holds else ClaimVerdict.FAILS, difference)

@@ -34,10 +34,11 @@ def test_tests_stand_in_folders_that_there_are() -> None:
 
 @pytest.mark.parametrize("folder", [*FOLDERS, "cli.py"])
 def test_public_functions_that_raise_say_so(folder: str) -> None:
+    """Those of commands/ are the verbs, whose docstrings are their help."""
     silent = [
         f"{file.relative_to(ROOT)}:{node.lineno} {node.name}"
         for file in SOURCES
-        if file.relative_to(ROOT).parts[0] == folder
+        if file.relative_to(ROOT).parts[0] == folder != "commands"
         for node in _public_functions(ast.parse(file.read_text()))
         if _raises(node) and "aise" not in (ast.get_docstring(node) or "") and "efuse" not in _docstring(node)
     ]

@@ -33,7 +33,7 @@ from ...landscapes.storage.records import reading
 from ...landscapes.storage.store import SliceStore, open_slice
 from ..figures import Figure
 from ..files import MEASURES, PICTURE, QUALITY, REMAKE, REPORT, STORE, SURFACES, SWEEP_FILM
-from .manifest import SCHEMA, Entry, Manifest, TradeoffEntry, as_json
+from .manifest import SCHEMA, FigureEntry, Manifest, TradeoffEntry, as_json
 from .measured import dark_name, place_tradeoffs, read_report
 from .page_data import count_numbers, read_episodes, read_measures, read_off_nodes, read_sweep
 from .trajectories import lay_runs, read_runs
@@ -53,7 +53,7 @@ def build_site(
     """
     out = resolve(out)
     _check(out)
-    there = [figure for figure in figures if _sampled(data / figure.id / STORE)]
+    there = [figure for figure in figures if _has_samples(data / figure.id / STORE)]
     if not there:
         raise ValueError(f"{data} holds no slice of a figure; `landscape gallery compute` samples them")
     tables = read_runs(data)
@@ -79,7 +79,7 @@ def _check(out: Path) -> None:
     check_ours(out, ours.__contains__, f"a gallery by its {MANIFEST}")
 
 
-def _sampled(store: Path) -> bool:
+def _has_samples(store: Path) -> bool:
     return is_slice(store) and bool((SliceStore.open(store).status() > 0).any())
 
 
@@ -117,7 +117,7 @@ class _Site:
     tables: Sequence[xr.Dataset]
     tradeoffs: Mapping[str, Sequence[TradeoffEntry]]
 
-    def write_page(self, figure: Figure, source: Path) -> Entry:
+    def write_page(self, figure: Figure, source: Path) -> FigureEntry:
         """Write a slice's page and all it shows, and return its entry in the manifest."""
         folder = self.folder / figure.id
         folder.mkdir()
@@ -136,11 +136,11 @@ class _Site:
             runs=[run.search() for run in runs],
             tradeoffs=self.tradeoffs.get(figure.env, []),
         )
-        about = {"entry": entry, "held": list(_held(dataset)), "scene": entries().get(figure.env)}
+        about = {"entry": entry, "held": list(_held_parameters(dataset)), "scene": entries().get(figure.env)}
         (folder / "index.html").write_text(self.pages.get_template("slice.html").render(**about))
         return entry
 
-    def write_index(self, shown: Sequence[Entry], missing: Sequence[str]) -> Manifest:
+    def write_index(self, shown: Sequence[FigureEntry], missing: Sequence[str]) -> Manifest:
         """Write the page of all pages and the manifest, and return that."""
         manifest = Manifest(SCHEMA, __version__, shown, missing, [])
         groups = [(env, list(group)) for env, group in groupby(shown, key=lambda entry: entry.env)]
@@ -167,10 +167,10 @@ def _place(given: Sequence[str], source: Path, folder: Path) -> list[str]:
     return [*copied, *(name for one in pictures for name in (one, dark_name(one)))]
 
 
-def _entry(figure: Figure, dataset: xr.Dataset, source: Path) -> Entry:
+def _entry(figure: Figure, dataset: xr.Dataset, source: Path) -> FigureEntry:
     """Return what the manifest says of a slice, but for what other files of the site it goes with."""
     identity, provenance = stored_identity(dataset), stored_provenance(dataset)
-    return Entry(
+    return FigureEntry(
         id=figure.id,
         env=figure.env,
         paper_figure=figure.caption.number,
@@ -214,7 +214,7 @@ def _draw(dataset: xr.Dataset, source: Path, folder: Path) -> None:
         save(picture, folder / dark_name(name))
 
 
-def _held(dataset: xr.Dataset) -> Iterator[Held]:
+def _held_parameters(dataset: xr.Dataset) -> Iterator[Held]:
     """Yield the parameters that the slice holds."""
     plane = plane_of(dataset)
     varied = plane.basis.any(dim=0).tolist()

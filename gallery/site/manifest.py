@@ -38,7 +38,7 @@ class Numbers:
 
 
 @dataclass(frozen=True)
-class Episode:
+class EpisodeEntry:
     """A node whose episode is shown: where it lies, in numbers of nodes and `at` which parameters, and its files."""
 
     row: int
@@ -131,7 +131,7 @@ class Nodes:
     status: Sequence[str]
     scale: ColourScale
     palette: Sequence[str]
-    episodes: Sequence[Episode]
+    episodes: Sequence[EpisodeEntry]
     runs: Sequence[Trajectory]
     azimuth: float | None = field(default=None, metadata=LEFT_OUT)
     slope: Sequence[Column] | None = field(default=None, metadata=LEFT_OUT)
@@ -170,7 +170,7 @@ class Interval:
 
 
 @dataclass(frozen=True)
-class Seconds:
+class SecondsEntry:
     """What an episode takes [s]."""
 
     forward: float
@@ -187,7 +187,7 @@ class Rung:
     spearman: float | None
     cosine: float | None
     diverged: float | None
-    seconds: Seconds
+    seconds: SecondsEntry
     memory: float
 
 
@@ -211,7 +211,7 @@ class TradeoffEntry:
 
 
 @dataclass(frozen=True)
-class Entry:
+class FigureEntry:
     """A slice of the gallery, and all that its page shows."""
 
     id: str
@@ -229,7 +229,7 @@ class Entry:
     identity: Mapping[str, Any]
     provenance: Mapping[str, Any]
     files: Sequence[str]
-    episodes: Sequence[Episode]
+    episodes: Sequence[EpisodeEntry]
     sweep: SweepRecord | None
     runs: Sequence[Search]
     measures: Mapping[str, str | float]
@@ -243,6 +243,6 @@ class Manifest:
 
     schema: int
     gradscape: str
-    figures: Sequence[Entry]
+    figures: Sequence[FigureEntry]
     missing: Sequence[str]
     files: Sequence[str]

@@ -13,7 +13,7 @@ from ...landscapes.measures.fidelity import cheapest, p95, pareto_front
 from ...landscapes.plain import number, optional, text
 from ...landscapes.storage.records import read_json, reading
 from ..files import DEVICES, REMAKE, REPORT, TRADEOFFS, TradeoffFiles
-from .manifest import Interval, ReportEntry, Rung, Seconds, TradeoffEntry, Word
+from .manifest import Interval, ReportEntry, Rung, SecondsEntry, TradeoffEntry, Word
 
 Record = Mapping[str, Any]
 TOLERANCE = 0.05  # of the loss error that a picture's description names the quickest rung for
@@ -50,7 +50,8 @@ def _words(record: Record) -> list[Word]:
 def _describe_quality(record: Record) -> str:
     """Say what the picture of gradient quality shows."""
     parts = [
-        f"mean cosine of gradient and difference {_signed(row['cosine']['value'])} over {row['scale']:.2g} of the box"
+        f"mean cosine of gradient and difference {_format_signed(row['cosine']['value'])} "
+        f"over {row['scale']:.2g} of the box"
         for row in [_small(record["differences"]), *record["differences_of_samples"]]
         if row and row["cosine"]["value"] is not None
     ]
@@ -67,7 +68,7 @@ def _small(rows: Sequence[Record]) -> Record | None:
     return next((row for row in rows if row["points"] >= row["of"] / 2), None)
 
 
-def _signed(value: float) -> str:
+def _format_signed(value: float) -> str:
     return f"{value:z.2f}".replace("-", "\N{MINUS SIGN}")
 
 
@@ -123,7 +124,7 @@ def _rung(row: Record, record: Record, best: set[str]) -> Rung:
         spearman=optional(number, row["spearman"]["value"]),
         cosine=optional(number, row["gradient"]["cosine"]["value"]),
         diverged=optional(number, row["diverged"]),
-        seconds=Seconds(**{way: number(row["seconds"][way]) for way in ("forward", "with_gradient")}),
+        seconds=SecondsEntry(**{way: number(row["seconds"][way]) for way in ("forward", "with_gradient")}),
         memory=number(row["memory"]),
     )
 

@@ -19,7 +19,7 @@ from ...landscapes.plane import Plane
 from ...landscapes.storage.records import read_json, reading
 from ..files import EPISODE_KINDS, EPISODES, MEASURES, REMAKE, SWEEP_FILM, SWEEP_RECORD
 from ..records import Node, SweepRecord, read_nodes
-from .manifest import Axis, ColourScale, Episode, Nodes, Numbers, Trajectory
+from .manifest import Axis, ColourScale, EpisodeEntry, Nodes, Numbers, Trajectory
 
 
 def count_numbers(dataset: xr.Dataset) -> Numbers:
@@ -35,7 +35,7 @@ def count_numbers(dataset: xr.Dataset) -> Numbers:
     )
 
 
-def read_off_nodes(dataset: xr.Dataset, episodes: Sequence[Episode], runs: Sequence[Trajectory]) -> Nodes:
+def read_off_nodes(dataset: xr.Dataset, episodes: Sequence[EpisodeEntry], runs: Sequence[Trajectory]) -> Nodes:
     """Read off a slice what the map draws and says of its nodes."""
     from ...landscapes.draw.render.relief import Relief, azimuth
     from ...landscapes.draw.style import LOSS_MAP, Scale
@@ -79,14 +79,14 @@ def _scale(loss: np.ndarray[Any, Any], below: Sequence[float]) -> ColourScale:
     return ColourScale(*ends, scale.logarithmic, scale.extend, scale.ticks())
 
 
-def read_episodes(folder: Path, dataset: xr.Dataset) -> list[Episode]:
+def read_episodes(folder: Path, dataset: xr.Dataset) -> list[EpisodeEntry]:
     """Return the episodes that `episodes.json` lists and that have a film or a picture, one a node."""
     listed = folder / EPISODES
     if not listed.exists():
         return []
     nodes = read_nodes(listed)
     with reading(listed, REMAKE.format("episodes")):  # a node may lie beyond the slice
-        shown: dict[tuple[int, int], Episode] = {}
+        shown: dict[tuple[int, int], EpisodeEntry] = {}
         for node in nodes:
             place = (node.row, node.column)
             if place in shown:
@@ -96,12 +96,12 @@ def read_episodes(folder: Path, dataset: xr.Dataset) -> list[Episode]:
     return [episode for episode in shown.values() if episode.files]
 
 
-def _episode(node: Node, folder: Path, plane: Plane) -> Episode:
+def _episode(node: Node, folder: Path, plane: Plane) -> EpisodeEntry:
     places = zip(plane.labels, plane.axes(), (node.column, node.row), strict=False)
     at = {label: float(axis[place]) for label, axis, place in places}
     files = {kind: f"{node.name}.{kind}" for kind in EPISODE_KINDS}
     there = {kind: name for kind, name in files.items() if (folder / name).exists()}
-    return Episode(node.row, node.column, node.why, node.loss, node.status, at, **there)
+    return EpisodeEntry(node.row, node.column, node.why, node.loss, node.status, at, **there)
 
 
 def read_sweep(folder: Path) -> SweepRecord | None:

@@ -24,7 +24,7 @@ KINDS = {"finite": Status.OK, "non-finite": Status.NONFINITE, "escaped": Status.
 
 
 @dataclass(frozen=True)
-class Variant:
+class ExtremeCase:
     """Push an objective another way: `make` returns it, or raises ValueError where it refuses that.
 
     It is evaluated at `x`, or else at the first few of the points, and what was made has to answer there. `why` is
@@ -38,7 +38,7 @@ class Variant:
 
 
 def checks(
-    subject: Subject, other: Callable[[], Subject] | None, variants: Sequence[Variant]
+    subject: Subject, other: Callable[[], Subject] | None, variants: Sequence[ExtremeCase]
 ) -> Iterator[tuple[str, Callable[[], Finding]]]:
     """Yield the name of each extreme and what checks it."""
     space, objective = subject.objective.space, subject.objective
@@ -119,7 +119,7 @@ def _judge(name: str, found: Evaluation, what: str = "") -> Finding:
     return replace(verdict(name, not wrong, figure, wrong), numbers=counts)
 
 
-def _check_variant(subject: Subject, variant: Variant) -> Finding:
+def _check_variant(subject: Subject, variant: ExtremeCase) -> Finding:
     if variant.make is None:
         return Finding(variant.name, SKIP, "n/a", variant.why)
     try:

@@ -14,7 +14,7 @@ from torch import Tensor
 from ..objective import Evaluation, Objective, Status, evaluate
 from . import extremes
 from . import gradients as gradient_checks
-from .extremes import Variant
+from .extremes import ExtremeCase
 from .finding import FAIL, SKIP, UNEXPECTED, Finding, verdict
 from .subject import Subject, difference
 
@@ -28,7 +28,7 @@ def check(
     seed: int = 0,
     precision: str = "float64",
     twin: Callable[[], Objective] | None = None,
-    variants: Sequence[Variant] = (),
+    variants: Sequence[ExtremeCase] = (),
     expected: Mapping[str, str] | None = None,
     follow: Callable[[str], None] | None = None,
 ) -> Iterator[Finding]:
@@ -81,7 +81,7 @@ def _other(subject: Subject, twin: Callable[[], Objective] | None) -> Callable[[
 
 
 def _checks(
-    subject: Subject, other: Callable[[], Subject] | None, variants: Sequence[Variant]
+    subject: Subject, other: Callable[[], Subject] | None, variants: Sequence[ExtremeCase]
 ) -> Iterator[tuple[str, Callable[[], Finding]]]:
     for name, run in PROMISES.items():
         yield name, partial(run, subject, name)

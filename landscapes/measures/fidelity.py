@@ -109,7 +109,7 @@ def measure(
         parts.append(evaluate(objective, part, grad=True))
         seconds.append(time.perf_counter() - began)
         follow(done := done + len(part))
-    batch = _filled(objective, x, full, at_once, seconds[0])
+    batch = _repeat_points(objective, x, full, at_once, seconds[0])
     taken = min(seconds[: len(x) // full]) if len(batch) == full else np.inf
     forward = _best(objective, batch, grad=False, known=np.inf)
     with_gradient = _best(objective, batch, grad=True, known=taken)
@@ -119,7 +119,7 @@ def measure(
     return Sample(whole.loss.numpy(), grad.numpy(), whole.status.numpy(), forward, with_gradient, len(batch))
 
 
-def _filled(objective: Objective, x: Tensor, rows: int, at_once: int, took: float) -> Float[Tensor, "batch dim"]:
+def _repeat_points(objective: Objective, x: Tensor, rows: int, at_once: int, took: float) -> Float[Tensor, "batch dim"]:
     """Return the points repeated to as many as are worth evaluating at once, or to what takes `LARGEST` seconds."""
     while rows < at_once and took * (more := min(4 * rows, at_once)) / rows < LARGEST:
         began = time.perf_counter()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations, pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -64,7 +65,7 @@ class Design:
         others: Array = STEP * steps[steps != 0].reshape(*self.base.shape, LINE - 1)
         return others
 
-    def moved(self, rows: range) -> Float[Tensor, "point dim"]:
+    def move_one(self, rows: range) -> Float[Tensor, "point dim"]:
         """Return lines and far moves of some base points, shape (row * dim * 5, dim), in the parameters' units."""
         dim = self.space.dim
         points = np.tile(self.base[rows, None, None, :], (1, dim, LINE, 1))
@@ -73,7 +74,7 @@ class Design:
             points[:, axis, -1, axis] = self.far[rows, axis]
         return self._native(points)
 
-    def crossed(self, rows: range, pairs: list[tuple[int, int]]) -> Float[Tensor, "point dim"]:
+    def move_pairs(self, rows: range, pairs: list[tuple[int, int]]) -> Float[Tensor, "point dim"]:
         """Return base points with two parameters moved far, shape (row * pair, dim)."""
         points = np.tile(self.base[rows, None, :], (1, len(pairs), 1))
         for number, pair in enumerate(pairs):
@@ -165,7 +166,7 @@ def explore(
     done = 0
     first: list[dict[str, Any]] = []
     for number, rows in enumerate(groups):
-        first.append(_piece(pieces, f"moved-{number}", lambda rows=rows: _moved(objective, design, rows)))  # type: ignore[misc]
+        first.append(_piece(pieces, f"moved-{number}", lambda rows=rows: _evaluate_moves(objective, design, rows)))  # type: ignore[misc]
         follow(done := done + len(rows) * (1 + LINE * design.space.dim))
     loss, grad, line, far = (np.concatenate([part[name] for part in first]) for name in ("loss", "grad", "line", "far"))
     alone = Responses(loss, grad, line, design.offsets, far, np.empty((len(loss), 0)), [])
@@ -173,9 +174,8 @@ def explore(
     pairs = list(combinations(sorted(int(axis) for axis in sensitive), 2))
     cross = []
     for number, rows in enumerate(groups):
-        cross.append(
-            _piece(pieces, f"crossed-{number}", lambda rows=rows: _crossed(objective, design, rows, pairs))["loss"]  # type: ignore[misc]
-        )
+        evaluate_pairs = partial(_evaluate_pairs, objective, design, rows, pairs)
+        cross.append(_piece(pieces, f"crossed-{number}", evaluate_pairs)["loss"])
         follow(done := done + len(rows) * len(pairs))
     return Responses(loss, grad, line, design.offsets, far, np.concatenate(cross), pairs)
 
@@ -232,16 +232,18 @@ def _piece(pieces: Checkpoint, name: str, compute: Callable[[], dict[str, Array]
     return found
 
 
-def _moved(objective: Objective, design: Design, rows: range) -> dict[str, Array]:
+def _evaluate_moves(objective: Objective, design: Design, rows: range) -> dict[str, Array]:
     start = evaluate(objective, design.starts(rows), grad=True)
     widths = design.space.upper - design.space.lower
     grad = start.grad * widths if start.grad is not None else torch.empty(0)
-    moved = _losses(objective, design.moved(rows)).reshape(len(rows), design.space.dim, -1)
+    moved = _losses(objective, design.move_one(rows)).reshape(len(rows), design.space.dim, -1)
     return {"loss": start.loss.numpy(), "grad": grad.numpy(), "line": moved[:, :, :-1], "far": moved[:, :, -1]}
 
 
-def _crossed(objective: Objective, design: Design, rows: range, pairs: list[tuple[int, int]]) -> dict[str, Array]:
-    return {"loss": _losses(objective, design.crossed(rows, pairs)).reshape(len(rows), len(pairs))}
+def _evaluate_pairs(
+    objective: Objective, design: Design, rows: range, pairs: list[tuple[int, int]]
+) -> dict[str, Array]:
+    return {"loss": _losses(objective, design.move_pairs(rows, pairs)).reshape(len(rows), len(pairs))}
 
 
 def _losses(objective: Objective, x: Float[Tensor, "point dim"]) -> Array:

@@ -187,7 +187,7 @@ class ReadBack:
             self._values[tile] = values
 
     def values(self) -> Mapping[Tile, dict[str, NDArray[Any]]]:
-        """Return the arrays of all tiles looked for, when they have appeared; StoreError where they do not."""
+        """Return the arrays of all tiles looked for, when they have appeared; raises StoreError where they do not."""
         since = time.monotonic()
         while self._late:
             late, self._late = self._late, []

@@ -51,7 +51,7 @@ class Checkpoint:
         return cls(folder)
 
     def load(self, name: str) -> dict[str, NDArray[Any]] | None:
-        """Return the arrays of a part, None where it is missing or, with a warning, damaged."""
+        """Return the arrays of a part, None where it is missing or damaged; the latter raises a warning, too."""
         path = self._path(name)
         if not path.exists():
             return None
@@ -59,7 +59,7 @@ class Checkpoint:
             with reading(path, "it is computed again"), np.load(path, allow_pickle=False) as arrays:
                 found = dict(arrays)
                 if str(found.pop(NAME_KEY, name)) != name:  # those of earlier versions do not say
-                    raise ValueError("it is another piece")
+                    raise ValueError("it is another part")
                 return found
         except DamagedError as error:
             warnings.warn(str(error), RuntimeWarning, stacklevel=2)

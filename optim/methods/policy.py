@@ -99,7 +99,7 @@ class Rollout:
     seen: Numbers
     actions: Numbers
 
-    def executed(self) -> Points:
+    def to_points(self) -> Points:
         """Return the episodes as points of the scaled box, shape (episode, dim)."""
         by_episode = self.actions.astype(np.float64).clip(-1.0, 1.0).swapaxes(0, 1)
         return by_episode.reshape(len(by_episode), -1)
@@ -122,7 +122,10 @@ class PolicySearch(Optimizer):
         self._generators = _seed_generators(int(self.random.integers(1 << 32)))
 
     def attach(self, objective: Objective) -> None:
-        """Take the objective that the policy plays in."""
+        """Take the objective that the policy plays in.
+
+        Raises ValueError where the parameters are not shared out equally among the decisions.
+        """
         self._objective = objective
         self.decisions = int(getattr(objective, "decisions", 1))
         if self.space.dim % self.decisions:
@@ -133,10 +136,10 @@ class PolicySearch(Optimizer):
         if self._model is None:
             features = self._observe(self.space.center[None], 0).shape[1]
             with self._own_randomness():
-                self._model = self._untrained(_Spaces(features, self.space.dim // self.decisions))
+                self._model = self._make_model(_Spaces(features, self.space.dim // self.decisions))
 
     @abc.abstractmethod
-    def _untrained(self, spaces: gymnasium.Env[Any, Any]) -> Any:
+    def _make_model(self, spaces: gymnasium.Env[Any, Any]) -> Any:
         """Return the algorithm's model as it begins."""
 
     @abc.abstractmethod
@@ -225,7 +228,7 @@ class PPO(PolicySearch):
         each = ROLLOUT + size.decisions * _transition_memory(size)
         return float(options["episodes"] * each + _network_memory(size))
 
-    def _untrained(self, spaces: gymnasium.Env[Any, Any]) -> sb3.PPO:
+    def _make_model(self, spaces: gymnasium.Env[Any, Any]) -> sb3.PPO:
         o = self.options
         return sb3.PPO(
             "MlpPolicy",
@@ -241,7 +244,7 @@ class PPO(PolicySearch):
 
     def _ask(self) -> Proposal:
         self._rollout = self._play(self.options.episodes)
-        return Proposal(torch.from_numpy(self._rollout.executed()), Kind.POLICY)
+        return Proposal(torch.from_numpy(self._rollout.to_points()), Kind.POLICY)
 
     def _act(self, seen: Tensor) -> Tensor:
         action: Tensor = self._model.policy(seen)[0]
@@ -276,7 +279,7 @@ class SAC(PolicySearch):
         super()._setup()
         self._remembered: list[tuple[Rollout, Numbers]] = []
 
-    def _untrained(self, spaces: gymnasium.Env[Any, Any]) -> sb3.SAC:
+    def _make_model(self, spaces: gymnasium.Env[Any, Any]) -> sb3.SAC:
         o = self.options
         return sb3.SAC(
             "MlpPolicy",
@@ -292,7 +295,7 @@ class SAC(PolicySearch):
     def _ask(self) -> Proposal:
         self._rollout = self._play(1 if self._remembered else self.options.warmup)
         kind = Kind.POLICY if self._remembered else Kind.RANDOM
-        return Proposal(torch.from_numpy(self._rollout.executed()), kind)
+        return Proposal(torch.from_numpy(self._rollout.to_points()), kind)
 
     def _act(self, seen: Tensor) -> Tensor:
         if not self._remembered:

@@ -20,18 +20,20 @@ from gradscape.cli import main
 from gradscape.envs.functions import Branin
 from gradscape.gallery import parts as gallery_parts
 from gradscape.gallery.figures import Figure
-from gradscape.gallery.paper import Caption
+from gradscape.gallery.paper import PaperCaption
 from gradscape.jobs.slice import SliceCost, SliceJob
 from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.storage.store import open_slice
 
 FIGURES = [
-    Figure("bounce-y", "bounce", (1,), Caption("It jumps.", 8), through="example:aim", resolution=12, fidelity="draft"),
+    Figure(
+        "bounce-y", "bounce", (1,), PaperCaption("It jumps.", 8), through="example:aim", resolution=12, fidelity="draft"
+    ),
     Figure(
         "bounce-x-y",
         "bounce",
         (0, 1),
-        Caption("A plane of it."),
+        PaperCaption("A plane of it."),
         through="example:aim",
         resolution=12,
         fidelity="draft",
@@ -40,7 +42,7 @@ FIGURES = [
         "branin",
         "branin",
         (0, 1),
-        Caption("Three minima <b>&</b> no network."),
+        PaperCaption("Three minima <b>&</b> no network."),
         resolution=12,
         fidelity="exact",
         over="",

@@ -13,12 +13,12 @@ from gradscape.gallery import measures as gallery_measures
 from gradscape.gallery import parts as gallery_parts
 from gradscape.gallery.compute import PARTS
 from gradscape.gallery.figures import Figure
-from gradscape.gallery.paper import Caption
+from gradscape.gallery.paper import PaperCaption
 
 FIGURES = [
-    Figure("ball", "bounce", (0, 1), Caption("It jumps."), through="example:aim", resolution=8, fidelity="draft"),
-    Figure("ball-y", "bounce", (1,), Caption("It jumps."), through="example:aim", resolution=8, fidelity="draft"),
-    Figure("branin", "branin", (0, 1), Caption("Three minima."), resolution=8, fidelity="exact", over=""),
+    Figure("ball", "bounce", (0, 1), PaperCaption("It jumps."), through="example:aim", resolution=8, fidelity="draft"),
+    Figure("ball-y", "bounce", (1,), PaperCaption("It jumps."), through="example:aim", resolution=8, fidelity="draft"),
+    Figure("branin", "branin", (0, 1), PaperCaption("Three minima."), resolution=8, fidelity="exact", over=""),
 ]
 
 

@@ -7,7 +7,7 @@ import pytest
 from gradscape.envs.registry import entries
 from gradscape.gallery.figures import read_figures
 from gradscape.gallery.files import PAPER
-from gradscape.gallery.paper import ABSENT, Caption, read_paper
+from gradscape.gallery.paper import ABSENT, PaperCaption, read_paper
 from gradscape.optim.claims import Claims
 from gradscape.optim.registry import methods
 
@@ -43,7 +43,7 @@ def test_claims_of_several_entries_stand_in_their_order() -> None:
 def test_captions_are_of_slices_that_the_gallery_shows_and_all_of_them() -> None:
     assert set(WHOLE.captions) == {figure.id for figure in read_figures()}
     assert WHOLE.caption_of("fluid-0-1").number == 10
-    assert WHOLE.caption_of("mine") == Caption()
+    assert WHOLE.caption_of("mine") == PaperCaption()
 
 
 def test_a_word_that_no_landscape_is_described_in_is_refused(tmp_path: Path) -> None:

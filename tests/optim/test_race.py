@@ -14,7 +14,7 @@ from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim import statistics
 from gradscape.optim.base import Kind
-from gradscape.optim.claims import Verdict, check_claims
+from gradscape.optim.claims import ClaimVerdict, check_claims
 from gradscape.optim.race import Competitor, picture, race
 from gradscape.optim.registry import optimizer_class
 from gradscape.optim.runs.store import RunStore
@@ -137,7 +137,7 @@ def synthetic(**centers: float) -> dict[str, list[xr.Dataset]]:
     return {name.replace("_", "-"): [table([c + random.normal()]) for _ in range(10)] for name, c in centers.items()}
 
 
-def verdicts(env: str, **centers: float) -> dict[str, Verdict]:
+def verdicts(env: str, **centers: float) -> dict[str, ClaimVerdict]:
     found = check_claims(read_paper().claims_about(env).claims, statistics.differences(synthetic(**centers)))
     return {str(finding.claim): finding.verdict for finding in found}
 
@@ -145,19 +145,19 @@ def verdicts(env: str, **centers: float) -> dict[str, Verdict]:
 def test_a_claim_holds_fails_is_not_decided_or_not_run():
     ours = verdicts("rolling-pin", bo_leap=0, cma_es=9, descents=-9)
     assert ours == {
-        "bo-leap better than cma-es": Verdict.HOLDS,
-        "bo-leap better than descents": Verdict.FAILS,
-        "bo-leap better than bo-descents": Verdict.NOT_RUN,
+        "bo-leap better than cma-es": ClaimVerdict.HOLDS,
+        "bo-leap better than descents": ClaimVerdict.FAILS,
+        "bo-leap better than bo-descents": ClaimVerdict.NOT_RUN,
     }
     reverse = verdicts("rolling-pin", descents=9, cma_es=-9, bo_leap=0)  # whichever of a pair comes first
-    assert reverse["bo-leap better than cma-es"] == Verdict.FAILS
-    assert reverse["bo-leap better than descents"] == Verdict.HOLDS
-    assert verdicts("rolling-pin", bo_leap=0, cma_es=0)["bo-leap better than cma-es"] == Verdict.UNDECIDED
+    assert reverse["bo-leap better than cma-es"] == ClaimVerdict.FAILS
+    assert reverse["bo-leap better than descents"] == ClaimVerdict.HOLDS
+    assert verdicts("rolling-pin", bo_leap=0, cma_es=0)["bo-leap better than cma-es"] == ClaimVerdict.UNDECIDED
 
 
 def test_that_two_are_alike_can_be_refuted_and_never_shown():
-    assert verdicts("pinch", bo_leap=0, cma_es=0)["bo-leap and cma-es alike"] == Verdict.UNDECIDED
-    assert verdicts("pinch", bo_leap=0, cma_es=9)["bo-leap and cma-es alike"] == Verdict.FAILS
+    assert verdicts("pinch", bo_leap=0, cma_es=0)["bo-leap and cma-es alike"] == ClaimVerdict.UNDECIDED
+    assert verdicts("pinch", bo_leap=0, cma_es=9)["bo-leap and cma-es alike"] == ClaimVerdict.FAILS
 
 
 def test_the_picture_holds_every_curve_and_every_pair_of_seed_and_target():

@@ -13,7 +13,7 @@ import torch
 
 from gradscape.gallery.figures import Figure
 from gradscape.gallery.files import RUN_SUFFIX, RUNS
-from gradscape.gallery.paper import Caption
+from gradscape.gallery.paper import PaperCaption
 from gradscape.gallery.runs import save_run
 from gradscape.gallery.site.build import build_site
 from gradscape.landscapes.objective import Evaluation
@@ -31,9 +31,9 @@ SPACE = ParameterSpace(
     ("m/s", "N", ""),
 )  # fmt: skip
 FIGURES = [
-    Figure("line", "bounce", (0,), Caption("A line.", 8), resolution=33),
-    Figure("bare", "bounce", (0, 1), Caption("Nothing but its slice."), resolution=9),
-    Figure("full", "fluid", (0, 1), Caption("All of it <b>&</b> no network.", 10), resolution=12),
+    Figure("line", "bounce", (0,), PaperCaption("A line.", 8), resolution=33),
+    Figure("bare", "bounce", (0, 1), PaperCaption("Nothing but its slice."), resolution=9),
+    Figure("full", "fluid", (0, 1), PaperCaption("All of it <b>&</b> no network.", 10), resolution=12),
 ]
 EPISODES = [
     {"row": 6, "column": 5, "why": "lowest loss", "loss": 1.25, "status": "OK"},
@@ -159,7 +159,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def site(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site") / "deep" / "gallery"
-    build_site([*FIGURES, Figure("later", "rope", (0, 1), Caption("Not yet."))], data, folder)
+    build_site([*FIGURES, Figure("later", "rope", (0, 1), PaperCaption("Not yet."))], data, folder)
     return folder
 
 

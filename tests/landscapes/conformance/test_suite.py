@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gradscape.landscapes.adapters import from_torch
-from gradscape.landscapes.conformance.extremes import CORNERS, Variant, corners
+from gradscape.landscapes.conformance.extremes import CORNERS, ExtremeCase, corners
 from gradscape.landscapes.conformance.suite import check
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.space import ParameterSpace
@@ -297,7 +297,7 @@ class HalfFailed(Sound):
     ],
 )
 def test_a_variant_answers_with_a_number_a_status_or_a_refusal(make, outcome, figure):
-    found = outcomes(Sound(), variants=[Variant("dt 8x", make)])["dt 8x"]
+    found = outcomes(Sound(), variants=[ExtremeCase("dt 8x", make)])["dt 8x"]
     assert found.outcome == outcome
     assert found.figure.startswith(figure)
 
