@@ -122,7 +122,10 @@ class PolicySearch(Optimizer):
         self._generators = _seed_generators(int(self.random.integers(1 << 32)))
 
     def attach(self, objective: Objective) -> None:
-        """Take the objective that the policy plays in."""
+        """Take the objective that the policy plays in.
+
+        Raises ValueError where its decisions have not equally many controls.
+        """
         self._objective = objective
         self.decisions = int(getattr(objective, "decisions", 1))
         if self.space.dim % self.decisions:
