@@ -13,19 +13,24 @@ import typer
 from typer.core import TyperGroup
 
 from . import __version__
-from .commands import verbs_gallery as gallery
-from .commands import verbs_measure as measure
+from .commands import gallery
+from .commands.bench import bench
+from .commands.check import check
 from .commands.dims import TakesDims
 from .commands.envs import envs
 from .commands.export import export
 from .commands.info import info
 from .commands.optimize import methods, optimize
 from .commands.overlay import overlay
+from .commands.pairs import pairs
+from .commands.plan import plan
 from .commands.race import race
 from .commands.replay import replay
+from .commands.report import report_
 from .commands.slice import bounce, slice_
 from .commands.surface import surface
 from .commands.sweep import sweep
+from .commands.tradeoff import tradeoff
 from .commands.view import view
 
 
@@ -56,7 +61,7 @@ _VERBS = (
     envs, info, slice_, sweep,
     methods, optimize, race, overlay,
     surface, replay, export, view, bounce,
-    measure.plan, measure.bench, measure.check, measure.tradeoff, measure.pairs, measure.report_,
+    plan, bench, check, tradeoff, pairs, report_,
 )  # fmt: skip
 
 for _verb in _VERBS:
@@ -94,11 +99,7 @@ def main(arguments: list[str] | None = None) -> Any:
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a file's name need not be text
     try:
-        code = app(args=arguments, prog_name="landscape", standalone_mode=False)
-        if isinstance(code, KeyboardInterrupt):
-            raise code
-        if code == STOPPED:  # what the library makes of Ctrl-C where no verb has begun
-            raise KeyboardInterrupt
+        code = _run(arguments)
     except TyperException as error:
         code = _fail(_usage(error), 2)
     except ValueError as error:
@@ -110,6 +111,16 @@ def main(arguments: list[str] | None = None) -> Any:
     sys.exit(code)
 
 
+def _run(arguments: list[str] | None) -> Any:
+    """Run the command, and raise what Ctrl-C has raised in a verb again."""
+    code = app(args=arguments, prog_name="landscape", standalone_mode=False)
+    if isinstance(code, KeyboardInterrupt):
+        raise code
+    if code == STOPPED:  # what the library makes of Ctrl-C where no verb has begun
+        raise KeyboardInterrupt
+    return code
+
+
 def _stop(stop: BaseException) -> int:
     """Say what is kept of a job that was stopped; return 0 where nothing was begun."""
     from .jobs.watch import Stopped
@@ -117,7 +128,8 @@ def _stop(stop: BaseException) -> int:
     if not isinstance(stop, Stopped):
         return 0
     again = shlex.join(["landscape", *sys.argv[1:]])
-    typer.echo(f"stopped: {stop}; the same command goes on from there: {again}", err=True)
+    then = "goes on from there" if stop.kept else "begins again"
+    typer.echo(f"stopped: {stop}; the same command {then}: {again}", err=True)
     return STOPPED
 
 

@@ -20,7 +20,7 @@ from rich.progress import (
 from rich.status import Status
 from rich.text import Text
 
-from ..jobs.watch import Advance, AdvanceOne, Watch
+from ..jobs.watch import Advance, AdvanceOne, Say, Watch
 
 
 class Console(rich.Console):
@@ -57,10 +57,10 @@ class Bars(Watch):
         self.console.print(text)
 
     @contextmanager
-    def busy(self, text: str) -> Iterator[None]:
-        """Turn a wheel beside a text."""
-        with self.console.status(text):
-            yield
+    def busy(self, text: str) -> Iterator[Say]:
+        """Turn a wheel beside a text, which may change."""
+        with self.console.status(text) as status:
+            yield status.update
 
     @contextmanager
     def progress(self, total: int, what: str = "episodes") -> Iterator[Advance]:

@@ -26,6 +26,13 @@ class SceneKeywords(TypedDict, total=False):
     options: Mapping[str, Any]
 
 
+def spec_of(scene: str | type[Environment] | Environment | SceneSpec, keywords: SceneKeywords) -> SceneSpec:
+    """Return the spec of a name, a class, an environment, or of itself; raises ValueError as `objective_of` does."""
+    if isinstance(scene, str | type | SceneSpec):
+        return replace(scene if isinstance(scene, SceneSpec) else SceneSpec(scene), **keywords)
+    return SceneSpec.of(environment(scene, keywords, Watch()))
+
+
 def objective_of(
     scene: str | type[Environment] | Objective | SceneSpec, keywords: SceneKeywords, watch: Watch
 ) -> Objective:
@@ -35,8 +42,7 @@ def objective_of(
     objective, which is made already.
     """
     if isinstance(scene, str | type | SceneSpec):
-        spec = scene if isinstance(scene, SceneSpec) else SceneSpec(scene)
-        return replace(spec, **keywords).make(watch)
+        return spec_of(scene, keywords).make(watch)
     if keywords:
         raise ValueError(f"{name_of(scene)} is made already; got {', '.join(keywords)} too, so make it with them")
     return scene

@@ -44,7 +44,7 @@ JOBS = {
     "race": "race bounce --methods random,descents --seeds 2 --budget 40 --fidelity draft --out made",
     "gallery": "gallery compute --only bounce --part slices --resolution 96 --fidelity draft --device cpu --data made",
     "pairs": "pairs bounce --samples 32 --fidelity draft --device cpu --out made",
-    "tradeoff": "tradeoff bounce --points 8 --ladder precision --device cpu --out made",
+    "tradeoff": "tradeoff bounce --points 8 --variants precision --device cpu --out made",
     "report": "report branin --points 3 --out made",
     "workers": "slice bounce --dims 0 1 --resolution 48 --fidelity draft --device cpu --scheduler local:2 --out made",
 }
@@ -71,7 +71,7 @@ def work(command: str, folder: Path) -> None:
     os.setsid()  # a group of its own
     os.chdir(folder)
     at_home(folder)
-    tradeoff.TIMING = 0.02
+    tradeoff.REPETITION = 0.02
     with open(os.devnull, "w") as nowhere:
         for stream in (1, 2):
             os.dup2(nowhere.fileno(), stream)
@@ -100,7 +100,8 @@ def run(command: str, folder: Path, patience: float | None = None, victim: str =
 
 def bits(folder: Path) -> tuple[int, str]:
     """Return how many points and records a folder holds, and a digest of all their values."""
-    from gradscape.landscapes.storage.store import SliceStore, is_slice
+    from gradscape.landscapes.storage.paths import is_slice
+    from gradscape.landscapes.storage.store import SliceStore
     from gradscape.optim.runs.store import RunStore, is_run
 
     digest, done = hashlib.sha256(), 0

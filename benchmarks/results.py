@@ -95,9 +95,9 @@ KINDS = {
         needs=(f"{CUT} cut",),
     ),
     "pairs": Kind(f"pairs ackley --set dim=3 --samples 2 --out {MADE} --json"),
-    "tradeoff": Kind(f"tradeoff bounce --device cpu --points 2 --ladder precision --out {MADE} --json"),
+    "tradeoff": Kind(f"tradeoff bounce --device cpu --points 2 --variants precision --out {MADE} --json"),
     "kept tradeoff": Kind(
-        f"tradeoff bounce --device cpu --set horizon=0.5 --points 2 --ladder precision --out {MADE}",
+        f"tradeoff bounce --device cpu --set horizon=0.5 --points 2 --variants precision --out {MADE}",
         (f"slice bounce --device cpu --tolerance 20% --set horizon=0.5 --dims 0 1 --resolution 3 --out {READ}",),
         where="home/gradscape",
     ),
@@ -153,7 +153,7 @@ def small() -> None:
     from gradscape.landscapes.measures import fidelity as tradeoff
 
     leave_blank(setattr)
-    tradeoff.TIMING = tradeoff.PATIENCE = 0.002
+    tradeoff.REPETITION = tradeoff.LARGEST = 0.002
     cost.MOMENT = cost.ENOUGH = cost.WARM_UP = 0.0
     gallery_parts.METHODS, gallery_parts.BUDGET = ("random",), 8
     gallery_parts.FRAMES, gallery_parts.COARSE = 2, 4
@@ -223,7 +223,8 @@ def _readable(folder: Path) -> Iterator[tuple[Path, Callable[[Path], Numbers]]]:
 
 
 def _store(path: Path) -> Numbers:
-    from gradscape.landscapes.storage.store import SliceStore, is_slice
+    from gradscape.landscapes.storage.paths import is_slice
+    from gradscape.landscapes.storage.store import SliceStore
     from gradscape.optim.runs.store import RunStore
 
     dataset = SliceStore.open(path).dataset() if is_slice(path) else RunStore.open(path).dataset()
@@ -250,10 +251,10 @@ def _of_dataset(dataset: Any) -> Numbers:
 
 
 def _json(path: Path) -> Numbers:
-    from gradscape.landscapes.storage.records import unsigned
+    from gradscape.landscapes.storage.records import verify
 
     found = json.loads(path.read_text())
-    said = [unsigned(one) for one in found] if isinstance(found, list) else unsigned(found)
+    said = [verify(one) for one in found] if isinstance(found, list) else verify(found)
     return Numbers({}, _digest(json.dumps(plain(said), sort_keys=True).encode()))
 
 

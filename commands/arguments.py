@@ -39,8 +39,9 @@ Tolerance = Annotated[
 ]
 Device = Annotated[str, typer.Option(help="auto, cpu or cuda; auto takes CUDA where it is.")]
 Deterministic = Annotated[
-    bool, typer.Option("--deterministic", help="Add up in the same order every time on a GPU, some ten times slower.")
+    bool, typer.Option("--deterministic", help="Bitwise reproducible GPU results (about 10x slower).")
 ]
+Seed = Annotated[int, typer.Option(min=0, help="Random seed.")]
 Engine = Annotated[str, typer.Option(help="warp, or taichi where a scene has it: the reference, to hold Warp against.")]
 Set = Annotated[list[str] | None, typer.Option("--set", help="A scene option, name=value; may be repeated.")]
 Out = Annotated[

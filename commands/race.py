@@ -52,9 +52,9 @@ def race(
 
     Example: landscape race fluid --methods random,bo-leap --budget 200 --seeds 3
     """
+    from ..gallery.paper import read_paper
     from ..jobs.race import RaceJob, check_methods
     from ..jobs.workers import workers as cluster
-    from ..optim.orderings import claims_about
     from .terminal import Bars, command_line, print_json
 
     if workers > 1 and scheduler:
@@ -63,7 +63,12 @@ def race(
     bars, options = Bars(), _read_options(option or [], chosen)
     env = scene.make(bars)
     how: dict[str, Any] = {"out": Path(out) if out else None, "force": force, "prints": print_ or [], "watch": bars}
-    how |= {"claims": claims_about(env.name), "command": command_line(), "options": options, "workers": workers}
+    how |= {
+        "claims": read_paper().claims_about(env.name),
+        "command": command_line(),
+        "options": options,
+        "workers": workers,
+    }
     job = RaceJob.of(env, chosen, budget=budget, seeds=seeds, **how)
     with cluster(scheduler, env.device) as executor:
         summary = replace(job, executor=executor).run(bars)

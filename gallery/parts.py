@@ -1,32 +1,32 @@
-"""What `landscape gallery compute` makes for a figure: its slice, its sweep, searches of its environment."""
+"""What the gallery makes of a figure: its slice, its sweep, searches of its environment."""
 
 from __future__ import annotations
 
 import abc
-import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..commands.terminal import Console
-from ..envs.registry import environment_class, make
-from ..jobs.scene import provenance as provenance_of
-from ..jobs.slice import picture_of
-from ..jobs.workers import recipe
+from ..envs.registry import environment_class
+from ..jobs.watch import Watch
 from .figures import Figure
+from .files import PICTURE, RUN_SUFFIX, RUNS, STORE, SWEEP_FILM, SWEEP_RECORD
+from .records import SweepRecord, read_if_sound
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
+    import xarray as xr
+
     from ..envs.base import Environment
+    from ..jobs.scene import SceneSpec
     from ..jobs.slice import SliceJob
     from ..jobs.sweep import SweepJob
-    from ..landscapes.plane import Plane
 
 DRAFT = "draft"  # fidelity of sweeps and searches, of which there are many episodes; of functions their only one
 FRAMES, COARSE = 12, 24  # of a sweep: frames, and points along each axis
 DPI, LOSS = 80, 28  # of its film
-FILM, ABOUT = "sweep.mp4", "sweep.json"
 METHODS, BUDGET, SEED = ("random", "cma-es", "descents", "bo", "bo-leap"), 100, 0
 
 
@@ -41,6 +41,13 @@ class State:
     def finished(self) -> bool:
         """Whether nothing is left to compute."""
         return self.done == self.points
+
+    def __str__(self) -> str:
+        if self.finished:
+            return "there"
+        if self.done is None:
+            return "other settings"
+        return f"{self.done} of {self.points} points" if self.done else "missing"
 
 
 @dataclass(frozen=True)
@@ -74,15 +81,17 @@ class Part(abc.ABC):
         """Estimate what one of them takes, from a first episode or more."""
 
     @abc.abstractmethod
-    def make(self, console: Console) -> str:
+    def make(self, watch: Watch) -> str:
         """Make what is left and say in a line what came out."""
 
-    def _env(self, fidelity: str) -> Environment:
-        known = fidelity if fidelity in environment_class(self.figure.env).fidelities else None
-        return make(self.figure.env, fidelity=known, device=self.device, **self.figure.options)
+    def _scene(self, fidelity: str | None = None) -> SceneSpec:
+        """Return the scene at the figure's fidelity or another; at its default where it does not have that one."""
+        scene = self.figure.scene(self.device, fidelity)
+        known = scene.fidelity in environment_class(self.figure.env).fidelities
+        return scene if known else replace(scene, fidelity=None)
 
 
-class Slice(Part):
+class SlicePart(Part):
     """The slice itself, at the figure's fidelity."""
 
     def label(self) -> str:
@@ -96,56 +105,46 @@ class Slice(Part):
 
     def state(self) -> State:
         """Look at the data without making an environment; who sampled it, and on what device, does not matter."""
-        from ..jobs.slice import STORE
         from ..landscapes.storage.arrays import FILES
-        from ..landscapes.storage.ownership import lost_root
-        from ..landscapes.storage.store import SliceStore, is_slice
+        from ..landscapes.storage.ownership import has_lost_root
+        from ..landscapes.storage.paths import is_slice
+        from ..landscapes.storage.store import SliceStore
 
         points, store = self.figure.resolution ** len(self.figure.dims), self.folder / STORE
-        if not is_slice(store) and not lost_root(store, FILES):
+        if not is_slice(store) and not has_lost_root(store, FILES):
             return State(points, 0)
-        kept = SliceStore.open(store)
-        return State(points, int((kept.status() > 0).sum()) if _same(self.figure, kept.identity) else None)
+        stored = SliceStore.open(store)
+        return State(points, int((stored.status() > 0).sum()) if _same(self.figure, stored.identity) else None)
 
     def seconds_each(self) -> float:
         """Time a point."""
         cost = self._open().cost()
         return cost.seconds / max(cost.episodes, 1)
 
-    def make(self, console: Console) -> str:
+    def make(self, watch: Watch) -> str:
         """Sample the slice."""
-        from ..jobs.slice import PICTURE
-
-        job = self._open()
-        from ..api.progress import Bars
-
-        said = job.run(Bars(console)).outcome()
+        outcome = self._open().run(watch).outcome()
         if len(self.figure.dims) == 2:
             (self.folder / PICTURE).unlink()  # `landscape gallery build` draws planes; a line's events need episodes
-        return said
+        return outcome
 
     def _open(self) -> SliceJob:
-        from ..jobs.slice import STORE, SliceJob
-        from ..landscapes.storage.store import is_slice
+        from ..jobs.slice import SliceJob
+        from ..landscapes.storage.paths import is_slice
 
-        env = self._env(self.figure.fidelity)
-        plane = plane_of_figure(self.figure, env, self.figure.resolution)
-        empty = is_slice(self.folder / STORE) and self.state().done == 0
-        return SliceJob.open(
+        env = self._scene().make()
+        return SliceJob.of(
             env,
-            plane,
-            self.folder,
-            picture_of(env, plane),
-            identity=env.identity(),
-            provenance=provenance_of(env, self.figure.command(self.device)),
+            self.figure.plane(env),
             command=self.figure.command(self.device),
-            force=empty,  # nothing is lost of a store made by other code or for another device
+            out=self.folder,
+            # nothing is lost of a store made by other code or for another device
+            force=is_slice(self.folder / STORE) and self.state().done == 0,
             executor=self.executor,
-            remake=recipe(env),
         )
 
 
-class Sweep(Part):
+class SweepPart(Part):
     """The slice as something else moves: a film, of slices that stay in the sweep's own folder under out/."""
 
     def label(self) -> str:
@@ -156,44 +155,40 @@ class Sweep(Part):
         """Return 1 where there is no film of these settings yet."""
         if not self.figure.over or len(self.figure.dims) != 2:
             return 0
-        kept = read_record(self.folder / ABOUT)
-        there = (self.folder / FILM).exists() and isinstance(kept, dict)
-        return 0 if there and all(kept.get(name) == value for name, value in self._settings.items()) else 1
+        record = read_if_sound(SweepRecord.read, self.folder / SWEEP_RECORD)
+        if record is None or not (self.folder / SWEEP_FILM).exists():
+            return 1
+        return int(record != self._record(record.label, record.low, record.high, record.command))
 
     def seconds_each(self) -> float:
         """Time the film by its last slice."""
-        return self._job().cost().seconds
+        return self._open().cost().seconds
 
-    def make(self, console: Console) -> str:
+    def make(self, watch: Watch) -> str:
         """Sample the sweep's slices and film them."""
         from ..landscapes.draw.figures.sweep import save_films
-        from ..landscapes.storage.records import write_record
 
-        job = self._job()
-        from ..api.progress import Bars
-
-        drawn = job.sample(Bars(console))
-        save_films(drawn, self.folder / FILM, None, dpi=DPI, loss=LOSS)
-        about = {"label": drawn.label, "low": drawn.values[0], "high": drawn.values[-1], "command": self.label()}
-        write_record(self.folder / ABOUT, {**self._settings, **about})
+        drawn = self._open().sample(watch)
+        save_films(drawn, self.folder / SWEEP_FILM, None, dpi=DPI, loss=LOSS)
+        record = self._record(drawn.label, drawn.values[0], drawn.values[-1], self.label())
+        record.write(self.folder / SWEEP_RECORD)
         return f"{FRAMES} frames of {COARSE} x {COARSE} points over {drawn.label}"
 
-    @property
-    def _settings(self) -> dict[str, Any]:
-        return {"over": self.figure.over, "fidelity": DRAFT, "frames": FRAMES, "resolution": [COARSE, COARSE]}
+    def _record(self, label: str, low: float, high: float, command: str) -> SweepRecord:
+        return SweepRecord(self.figure.over, DRAFT, FRAMES, [COARSE, COARSE], label, low, high, command)
 
-    def _job(self) -> SweepJob:
+    def _open(self) -> SweepJob:
         from ..jobs.motion import SMOOTHING, Motion
         from ..jobs.sweep import SweepJob, sweep_folder
 
-        env, over = self._env(DRAFT), self.figure.over
-        motion = Motion.of(env, plane_of_figure(self.figure, env, COARSE), over, FRAMES)
+        env, over = self._scene(DRAFT).make(), self.figure.over
+        motion = Motion.of(env, self.figure.plane(env, COARSE), over, FRAMES)
         grad = over != SMOOTHING
         folder = sweep_folder(env, motion, over, grad=grad)
         return replace(SweepJob.open(env, motion, folder, command=self.label(), grad=grad), executor=self.executor)
 
 
-class Searches(Part):
+class SearchPart(Part):
     """A run of each method in the figure's environment, which its other figures share."""
 
     def label(self) -> str:
@@ -202,61 +197,46 @@ class Searches(Part):
 
     def left(self) -> int:
         """Count the runs not made."""
-        return len(self._missing)
+        return len(self._missing())
 
     def seconds_each(self) -> float:
         """Time a run by one of its episodes; what a method takes itself comes on top."""
-        return BUDGET * 2 * seconds_of_one(self._env(DRAFT))
+        return BUDGET * 2 * seconds_of_one(self._scene(DRAFT).make())
 
-    def make(self, console: Console) -> str:
+    def make(self, watch: Watch) -> str:
         """Run every method that has not run."""
-        from ..api.progress import Bars
-        from ..jobs.search import SearchJob, make_optimizer
         from .runs import save_run
 
-        env = self._env(DRAFT)
-        for method in self._missing:
-            command = self.figure.search_command(
-                method, budget=BUDGET, seed=SEED, fidelity=env.fidelity.name, device=self.device
-            )
-            job = SearchJob.of(env, make_optimizer(method, env, seed=SEED), budget=BUDGET, command=command)
-            job.run(Bars(console))
-            save_run(job.store.dataset(), self._file(method))
+        env = self._scene(DRAFT).make()
+        for method in self._missing():
+            save_run(self._search(env, method, watch), self._file(method))
         return f"{len(METHODS)} runs of {BUDGET} episodes"
+
+    def _search(self, env: Environment, method: str, watch: Watch) -> xr.Dataset:
+        """Run a method, in a folder of its own under out/, and return the run's table."""
+        from ..jobs.search import SearchJob, make_optimizer
+
+        command = self.figure.search_command(
+            method, budget=BUDGET, seed=SEED, fidelity=env.fidelity.name, device=self.device
+        )
+        job = SearchJob.of(env, make_optimizer(method, env, seed=SEED), budget=BUDGET, command=command)
+        job.run(watch)
+        return job.store.dataset()
 
     @property
     def _where(self) -> Path:
-        from .runs import FOLDER
-
-        return self.root / FOLDER / "-".join([self.figure.env, *map(str, self.figure.options.values())])
+        return self.root / RUNS / "-".join([self.figure.env, *map(str, self.figure.options.values())])
 
     def _file(self, method: str) -> Path:
-        from .runs import SUFFIX
+        return self._where / f"{method}-{SEED}{RUN_SUFFIX}"
 
-        return self._where / f"{method}-{SEED}{SUFFIX}"
-
-    @property
     def _missing(self) -> list[str]:
         from .runs import open_run
 
-        missing = []
-        for method in METHODS:
-            try:
-                open_run(self._file(method))
-            except (OSError, ValueError):  # not there, or damaged
-                missing.append(method)
-        return missing
+        return [method for method in METHODS if read_if_sound(open_run, self._file(method)) is None]
 
 
-def plane_of_figure(figure: Figure, env: Environment, resolution: int) -> Plane:
-    """Return the plane of a figure's slice."""
-    from ..envs.points import point
-    from ..landscapes.plane import Plane
-
-    return Plane.through(env.space, point(env, figure.through), figure.dims, resolution=resolution)
-
-
-def _same(figure: Figure, identity: dict[str, Any]) -> bool:
+def _same(figure: Figure, identity: Mapping[str, Any]) -> bool:
     """Whether a slice has the figure's environment, fidelity, options, resolution and dimensions."""
     plane = identity["plane"]
     dims = tuple(row.index(1.0) for row in plane["basis"] if row.count(1.0) == 1)
@@ -270,14 +250,3 @@ def seconds_of_one(env: Environment) -> float:
     from ..landscapes.cost import episode_cost
 
     return episode_cost(env, grad=False).forward
-
-
-def read_record(path: Path) -> Any:
-    """Return the record or the list of records that a JSON file holds, None if there is none that can be read."""
-    from ..landscapes.storage.records import unsigned
-
-    try:
-        found = json.loads(path.read_text())
-        return [unsigned(one) for one in found] if isinstance(found, list) else unsigned(found)
-    except (OSError, TypeError, ValueError):
-        return None

@@ -6,7 +6,7 @@ import math
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,13 +15,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..envs.base import Environment
+from ..envs.base import Environment, Work
 from ..envs.engines.runtime import compiled_modules, cores, device_names, free_memory, kernel_times
 from ..landscapes.capacity import Need, require
+from ..landscapes.cost import duration
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.fill import sample
 from ..landscapes.storage.store import SliceStore
+from .scene import SceneSpec
+from .watch import Watch
 
 K = TypeVar("K")
 WAYS = {"forward": False, "with_gradient": True}
@@ -31,7 +34,7 @@ SMALL = 64  # points along each axis of the sampler's slice, at most
 
 @dataclass(frozen=True)
 class Start:
-    """How an engine began: `seconds` until its first gradient was there, Warp modules `compiled` on the way.
+    """Say how an engine began: `seconds` until its first gradient was there, Warp modules `compiled` on the way.
 
     What was not compiled came from the cache; Taichi does not say. `bytes_per_episode` is what its CUDA device says was
     taken, by rows that a full batch has.
@@ -44,7 +47,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Rate:
-    """The best of some repetitions: `seconds` for a whole batch, and what that is per second."""
+    """Hold the best of some repetitions: `seconds` for a whole batch, and what that is per second."""
 
     seconds: float
     episodes_per_second: float
@@ -56,43 +59,160 @@ class Rate:
         return cls(seconds, batch / seconds, batch * env.work().count / seconds)
 
 
-def bench(
-    make: Callable[[str], Environment],
-    engine: str,
-    *,
-    against: str | None = None,
-    batches: Sequence[int] = (),
-    seconds: float = 10.0,
-    follow: Callable[[str], None] = lambda stage: None,
-) -> dict[str, Any]:
-    """Measure the environment that `make` returns for an engine, in turn with another engine if `against` names one.
+@dataclass(frozen=True)
+class BatchRate:
+    """Hold the rates of an engine in batches of one size, `failed` episodes among them.
 
-    Each of `batches` (default: 1 and the preferred one) is timed for about so many `seconds`; `follow` hears what is
-    done. `ratio_forward` and `ratio_with_gradient` say how many times as fast as the other the engine is in this run:
-    in each row of `rates` that batch's, on top the largest batch's (None without another engine).
+    `gradient_costs` is the time of an episode with gradient in those of one without. Ratios say how many times as fast
+    as the other engine this one is; None without another, and of the other itself.
     """
-    envs, starts = _started(make, engine, against, follow)
-    env = envs[engine]
-    rates = []
-    for batch in batches:
-        require("batch", batch, partial(_need, env))
-    for batch in batches or sorted({1, env.preferred_batch}):
-        follow(f"timing batches of {batch}")
-        rates += _rates(envs, _points(env, batch), seconds)
-    follow("timing kernels")
-    kernels = _kernels(env) if engine == "warp" else None
-    follow("timing the sampler")
-    quickest = max(row["with_gradient"]["episodes_per_second"] for row in rates if row["engine"] == engine)
-    return {
-        **_subject(env),
-        "against": against,
-        "start": {name: asdict(start) for name, start in starts.items()},
-        "memory": {"estimated": env.memory(), "measured": starts[engine].bytes_per_episode},
-        **{f"ratio_{way}": _ratio(rates, way) for way in WAYS},
-        "rates": rates,
-        "kernels": kernels,
-        "sampler": _sampler(env, quickest * seconds / 2),
-    }
+
+    engine: str
+    batch: int
+    failed: int
+    repetitions: int
+    forward: Rate
+    with_gradient: Rate
+    gradient_costs: float
+    ratio_forward: float | None = None
+    ratio_with_gradient: float | None = None
+
+    def record(self) -> dict[str, Any]:
+        """Return it as plain JSON, which has ratios only where there are any."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+
+@dataclass(frozen=True)
+class KernelSeconds:
+    """Say how often a kernel was launched, the seconds it took altogether, and their share of the time that passed."""
+
+    name: str
+    calls: int
+    seconds: float
+    share: float
+
+
+@dataclass(frozen=True)
+class KernelTable:
+    """Hold the kernels of one batch, slowest first, which took so many `seconds` altogether."""
+
+    batch: int
+    seconds: float
+    kernels: tuple[KernelSeconds, ...]
+
+
+@dataclass(frozen=True)
+class MemoryUse:
+    """Hold what an episode takes [bytes]: as the scene estimates it, and as measured on CUDA, None elsewhere."""
+
+    estimated: int
+    measured: int | None
+
+
+@dataclass(frozen=True)
+class SamplerShare:
+    """Say what share of the seconds of sampling so many points to disk is not simulation."""
+
+    points: int
+    seconds: float
+    share: float
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Hold what was measured of an environment; fields are called as `landscape bench --json` has them.
+
+    `start` is by engine, `kernels` by way (forward, with_gradient), None of other engines than Warp. Ratios are of the
+    largest batch, None without another engine.
+    """
+
+    env: str
+    fidelity: str
+    options: dict[str, Any]
+    device: str
+    hardware: str
+    engine: str
+    deterministic: bool
+    work: Work
+    against: str | None
+    start: dict[str, Start]
+    memory: MemoryUse
+    ratio_forward: float | None
+    ratio_with_gradient: float | None
+    rates: tuple[BatchRate, ...]
+    kernels: dict[str, KernelTable] | None
+    sampler: SamplerShare
+
+    def record(self) -> dict[str, Any]:
+        """Return it as plain JSON."""
+        return {**asdict(self), "rates": [rate.record() for rate in self.rates]}
+
+
+@dataclass(frozen=True)
+class BenchJob:
+    """An environment to measure on an engine, in turn with another one if `against` names it.
+
+    `make` returns the environment for an engine. Each of `batches` (1 and the preferred one by default) is timed for
+    about so many `seconds`.
+    """
+
+    make: Callable[[str], Environment]
+    engine: str
+    against: str | None = None
+    batches: Sequence[int] = ()
+    seconds: float = 10.0
+
+    @classmethod
+    def of(cls, scene: SceneSpec, **how: Any) -> BenchJob:
+        """Measure a scene on its engine; another one is never asked to be deterministic, which Taichi cannot be."""
+        against = how.get("against")
+
+        def make(engine: str) -> Environment:
+            return replace(scene, engine=engine, deterministic=scene.deterministic and engine != against).make()
+
+        return cls(make, scene.engine, **how)
+
+    def run(self, watch: Watch | None = None) -> Bench:
+        """Measure it, and return what was found.
+
+        Raises ValueError for an engine that the scene does not have, TooLargeError for a batch that does not fit.
+        """
+        watch = watch or Watch()
+        with watch.busy("preparing") as say:
+            envs, starts = _start_engines(self.make, self.engine, self.against, say)
+            env = envs[self.engine]
+            for batch in self.batches:
+                require("batch", batch, partial(_need, env))
+            takes = f"each rate is timed for {duration(self.seconds)} or more, without and with gradients"
+            watch.note(f"{env.name}: {takes}")
+            rates = list[BatchRate]()
+            for batch in self.batches or sorted({1, env.preferred_batch}):
+                say(f"timing batches of {batch}")
+                rates += _time_batch(envs, _points(env, batch), self.seconds)
+            say("timing kernels")
+            kernels = _time_kernels(env) if self.engine == "warp" else None
+            say("timing the sampler")
+            own = [rate.with_gradient.episodes_per_second for rate in rates if rate.engine == self.engine]
+            sampler = _time_sampler(env, max(own) * self.seconds / 2)
+        largest = max((rate for rate in rates if rate.ratio_forward), key=lambda rate: rate.batch, default=None)
+        return Bench(
+            env=env.name,
+            fidelity=env.fidelity.name,
+            options=asdict(env.options),
+            device=env.device,
+            hardware=device_names()[0] if env.device == "cuda" else f"{cores()} cores",
+            engine=env.engine,
+            deterministic=env.deterministic,
+            work=env.work(),
+            against=self.against,
+            start=starts,
+            memory=MemoryUse(env.memory(), starts[self.engine].bytes_per_episode),
+            ratio_forward=largest.ratio_forward if largest else None,
+            ratio_with_gradient=largest.ratio_with_gradient if largest else None,
+            rates=tuple(rates),
+            kernels=kernels,
+            sampler=sampler,
+        )
 
 
 def _need(env: Environment, batch: int) -> Need:
@@ -100,13 +220,7 @@ def _need(env: Environment, batch: int) -> Need:
     return Need(8.0 * 8 * batch * env.space.dim + env.memory() * min(batch, env._share(batch) * env.threads))
 
 
-def _ratio(rates: Sequence[Mapping[str, Any]], way: str) -> float | None:
-    """Return the ratio of the largest batch."""
-    compared = [row for row in rates if f"ratio_{way}" in row]
-    return max(compared, key=lambda row: row["batch"])[f"ratio_{way}"] if compared else None
-
-
-def _started(
+def _start_engines(
     make: Callable[[str], Environment], engine: str, against: str | None, follow: Callable[[str], None]
 ) -> tuple[dict[str, Environment], dict[str, Start]]:
     """Return environments by engine, each made when the one before has taken what it takes of a GPU."""
@@ -121,19 +235,6 @@ def _started(
             envs[name] = make(name)
         starts[name] = _start(envs[name])
     return envs, starts
-
-
-def _subject(env: Environment) -> dict[str, Any]:
-    return {
-        "env": env.name,
-        "fidelity": env.fidelity.name,
-        "options": asdict(env.options),
-        "device": env.device,
-        "hardware": device_names()[0] if env.device == "cuda" else f"{cores()} cores",
-        "engine": env.engine,
-        "deterministic": env.deterministic,
-        "work": asdict(env.work()),
-    }
 
 
 def _start(env: Environment) -> Start:
@@ -162,25 +263,28 @@ def _points(env: Environment, count: int) -> Float[Tensor, "count dim"]:
     return env.space.sobol(count, seed=0)
 
 
-def _rates(envs: Mapping[str, Environment], points: Tensor, seconds: float) -> list[dict[str, Any]]:
-    """Time one batch on every engine in turn, forward and with gradient; the first engine's row holds the ratios."""
+def _time_batch(envs: Mapping[str, Environment], points: Tensor, seconds: float) -> list[BatchRate]:
+    """Time one batch on every engine in turn, forward and with gradient; the first engine's rate holds the ratios."""
     failed = {name: int((env.evaluate(points).status != Status.OK).sum()) for name, env in envs.items()}  # warms up too
     calls = {
         (name, grad): partial(env.evaluate, points, grad=grad) for grad in WAYS.values() for name, env in envs.items()
     }
-    times = alternated(calls, seconds)
-    rows: list[dict[str, Any]] = []
+    times = alternate(calls, seconds)
+    found = []
     for name, env in envs.items():
-        rates = {way: Rate.of(env, len(points), min(times[name, grad])) for way, grad in WAYS.items()}
-        row = {"engine": name, "batch": len(points), "failed": failed[name], "repetitions": len(times[name, True])}
-        row |= {way: asdict(rate) for way, rate in rates.items()}
-        rows.append({**row, "gradient_costs": rates["with_gradient"].seconds / rates["forward"].seconds})
-    for other in rows[1:]:
-        rows[0] |= {f"ratio_{way}": other[way]["seconds"] / rows[0][way]["seconds"] for way in WAYS}
-    return rows
+        forward, sloped = (Rate.of(env, len(points), min(times[name, grad])) for grad in WAYS.values())
+        costs = sloped.seconds / forward.seconds
+        found.append(BatchRate(name, len(points), failed[name], len(times[name, True]), forward, sloped, costs))
+    for other in found[1:]:
+        found[0] = replace(
+            found[0],
+            ratio_forward=other.forward.seconds / found[0].forward.seconds,
+            ratio_with_gradient=other.with_gradient.seconds / found[0].with_gradient.seconds,
+        )
+    return found
 
 
-def alternated(calls: Mapping[K, Callable[[], object]], seconds: float) -> dict[K, list[float]]:
+def alternate(calls: Mapping[K, Callable[[], object]], seconds: float) -> dict[K, list[float]]:
     """Return the seconds that calls took, made in turn (a, b, a, b, ...) until the next round would end too late."""
     times: dict[K, list[float]] = {key: [] for key in calls}
     start, rounds = time.perf_counter(), 0
@@ -193,7 +297,7 @@ def alternated(calls: Mapping[K, Callable[[], object]], seconds: float) -> dict[
     return times
 
 
-def _kernels(env: Environment) -> dict[str, Any]:
+def _time_kernels(env: Environment) -> dict[str, KernelTable]:
     """Return the time by kernel, forward and with gradient, of the rows that one solver takes at once.
 
     They run on one thread: what several launch at a time adds up to more than the time that passes.
@@ -207,8 +311,8 @@ def _kernels(env: Environment) -> dict[str, Any]:
             env._simulate(points, grad=grad)
             wall = time.perf_counter() - began
         slowest = sorted(times.items(), key=lambda item: -item[1].seconds)
-        rows = [{"name": name, **asdict(spent), "share": spent.seconds / wall} for name, spent in slowest]
-        found[way] = {"batch": len(points), "seconds": wall, "kernels": rows}
+        rows = (KernelSeconds(name, one.calls, one.seconds, one.seconds / wall) for name, one in slowest)
+        found[way] = KernelTable(len(points), wall, tuple(rows))
     return found
 
 
@@ -227,7 +331,7 @@ class _Clocked:
         return result
 
 
-def _sampler(env: Environment, points: float) -> dict[str, Any]:
+def _time_sampler(env: Environment, points: float) -> SamplerShare:
     """Return what share of the time of sampling a slice to disk, of about so many points, is not simulation."""
     dims = env.space.names[:2]
     resolution = max(2, min(SMALL, int(points ** (1 / len(dims)))))
@@ -238,4 +342,4 @@ def _sampler(env: Environment, points: float) -> dict[str, Any]:
         began = time.perf_counter()
         sample(clocked, plane, store)
         wall = time.perf_counter() - began
-    return {"points": math.prod(plane.resolution), "seconds": wall, "share": 1.0 - clocked.seconds / wall}
+    return SamplerShare(math.prod(plane.resolution), wall, 1.0 - clocked.seconds / wall)

@@ -28,17 +28,17 @@ from ..landscapes.storage.arrays import write_finished
 from ..landscapes.storage.store import SliceStore
 from .slice import first_points, pause_after
 
-PATIENCE = 2.0  # seconds that a rehearsal goes on writing tiles
+WRITING = 2.0  # seconds that a rehearsal goes on writing tiles
 SEEN = 1.0  # seconds for the evaluations that are repeated
 JITTER = 1e-3  # by how much, relatively, a repeated value differs from the true one
 BLOCK = 1024  # points that are made up at a time
 
 
-class Alike:
+class Replica:
     """An objective that repeats the evaluations of another, each where it is nearest, slightly altered.
 
     `rows` true evaluations are made, at the first points of `store`, which spread over all of it. `seconds` were spent
-    on repeating them, which a job does not spend.
+    on repeating them while tiles were written, which a job does not spend.
     """
 
     seconds = 0.0
@@ -55,7 +55,7 @@ class Alike:
         self._random = torch.Generator().manual_seed(0)
 
     @classmethod
-    def of(cls, objective: Objective, store: SliceStore, seconds_each: float) -> Alike:
+    def of(cls, objective: Objective, store: SliceStore, seconds_each: float) -> Replica:
         """Make as many true evaluations as fit into a moment and a batch, at least one."""
         rows = min(int(SEEN / max(seconds_each, 1e-9)), getattr(objective, "preferred_batch", 1))
         return cls(objective, store, max(1, rows))
@@ -63,37 +63,35 @@ class Alike:
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
         """Return for each row of `x` what was found nearest to it."""
         began = time.perf_counter()
-        repeated = self._repeated(x, grad=grad)
+        repeated = self._repeat(x, grad=grad)
         self.seconds += time.perf_counter() - began
         return repeated
 
     def dataset(self, store: SliceStore) -> xr.Dataset:
         """Return a slice of the shape of `store` without a gap."""
         blank = store.dataset()
-        began = time.perf_counter()
         grid = np.meshgrid(*(blank[name].to_numpy() for name in store.dims), indexing="ij")[::-1]
         nodes = torch.from_numpy(np.stack([axis.ravel() for axis in grid], axis=1))
         filled = {name: np.empty(one.shape, one.dtype) for name, one in blank.items()}
         for start in range(0, len(nodes), BLOCK):
             rows = slice(start, start + BLOCK)
-            said = self._repeated(store.plane.lift(nodes[rows]), grad=store.grad)
+            said = self._repeat(store.plane.lift(nodes[rows]), grad=store.grad)
             for name, values in filled.items():
                 flat = values.reshape(len(nodes), -1)
                 flat[rows] = getattr(said, str(name)).reshape(-1, flat.shape[1])
-        self.seconds += time.perf_counter() - began
         return blank.copy(data=filled)
 
-    def _repeated(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+    def _repeat(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         rows = torch.from_numpy(self._tree.query(self._place(x))[1])
-        slopes = None if self._seen.grad is None or not grad else self._altered(self._seen.grad[rows])
-        return Evaluation(self._altered(self._seen.loss[rows]), slopes, self._seen.status[rows])
+        slopes = None if self._seen.grad is None or not grad else self._alter(self._seen.grad[rows])
+        return Evaluation(self._alter(self._seen.loss[rows]), slopes, self._seen.status[rows])
 
     def _place(self, x: Float[Tensor, "batch dim"]) -> NDArray[np.float64]:
         """Return where points are on the plane, which has sides of length 1."""
         plane = self._plane
         return ((plane.project(x) - plane.lower) / (plane.upper - plane.lower)).numpy()
 
-    def _altered(self, values: Tensor) -> Tensor:
+    def _alter(self, values: Tensor) -> Tensor:
         """Return other values; in place, since the memory of a rehearsal is to be that of the job."""
         noise = torch.rand(values.shape, generator=self._random, dtype=torch.float64)
         altered = noise.mul_(JITTER).add_(1).mul_(values.detach().cpu())
@@ -108,61 +106,65 @@ class Room:
     files: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Stored:
-    """Say what writing a slice takes [s], its room once it is finished, and that of its tiles until then."""
+    """Say what writing a slice takes [s], its room once it is finished, and that of its tiles until then.
+
+    `dataset` is what was written.
+    """
 
     seconds: float
     finished: Room
     filling: Room
+    dataset: xr.Dataset
 
 
 class _Enough(Exception):  # noqa: N818 -- nothing went wrong
     """Stop a rehearsal."""
 
 
-def stored(alike: Alike, store: SliceStore) -> Stored:
-    """Fill an empty slice store on disk with what is `alike`, or as much of it as patience allows."""
+def store_replica(replica: Replica, store: SliceStore) -> Stored:
+    """Fill an empty slice store on disk with a replica's evaluations, or as much of it as `WRITING` seconds allow.
+
+    Raises ValueError for a store in memory.
+    """
     path = store.path
     if path is None:
         raise ValueError("a rehearsal needs a store on disk; got one in memory")
-    tiles, began = len(store.tiles()), time.perf_counter() - alike.seconds
+    tiles, began = len(store.tiles()), time.perf_counter() - replica.seconds
     before, done, took, total = room_of(store.place or path), 0, 0.0, math.prod(store.shape)
 
     def follow(now: Progress) -> None:
         nonlocal done, took
-        done, took = now.done, time.perf_counter() - alike.seconds - began
-        if done == total or (done and took > PATIENCE):
+        done, took = now.done, time.perf_counter() - replica.seconds - began
+        if done == total or (done and took > WRITING):
             raise _Enough
 
     with contextlib.suppress(_Enough):
-        sample(alike, store.plane, store, grad=store.grad, progress=follow)
+        sample(replica, store.plane, store, grad=store.grad, progress=follow)
     after = room_of(store.place or path)
     size, files = (
         round(old + (new - old) * total / done)
         for old, new in ((before.bytes, after.bytes), (before.files, after.files))
     )
-    whole, began = alike.dataset(store), time.perf_counter()
+    whole, began = replica.dataset(store), time.perf_counter()
     write_finished(path, whole)
     seconds = took * total / done + time.perf_counter() - began
-    return Stored(seconds, room_of(path), Room(size, min(files, before.files + 8 * tiles)))
+    return Stored(seconds, room_of(path), Room(size, min(files, before.files + 8 * tiles)), whole)
 
 
-def drawn(draw: Callable[[], object], alike: Alike | None = None) -> tuple[float, float]:
-    """Return seconds of a first drawing beyond those of any other (what it loads), and those of another.
-
-    What `alike` spends on making up what is drawn does not count.
-    """
+def time_drawing(draw: Callable[[], object]) -> tuple[float, float]:
+    """Return seconds of a first drawing beyond those of any other (what it loads), and those of another."""
     took = []
     for _ in range(2):
-        before, began = alike.seconds if alike else 0.0, time.perf_counter()
+        began = time.perf_counter()
         draw()
-        took.append(time.perf_counter() - began - (alike.seconds - before if alike else 0.0))
+        took.append(time.perf_counter() - began)
     return max(0.0, took[0] - took[1]), took[1]
 
 
-def pictures(levels: int, batches: int, seconds: float, once: float) -> int:
-    """Return how often `Job.run` should draw: at the end, and of so many coarse pictures before some now and then."""
+def count_pictures(levels: int, batches: int, seconds: float, once: float) -> int:
+    """Return how often `SliceJob.run` should draw: at the end, and of so many coarse pictures before some."""
     return 1 + min(levels, batches, 1 + int(seconds / (pause_after(once) + once)))
 
 

@@ -150,6 +150,7 @@ def plane_through(
 
 def _named_point(objective: Objective, text: str) -> Tensor:
     from ..envs.base import Environment
+    from ..landscapes.objective import name_of
 
     if isinstance(objective, Environment):
         return point_of(objective, text)
@@ -158,6 +159,5 @@ def _named_point(objective: Objective, text: str) -> Tensor:
         return objective.space.center
     if kind == "random" and seed.isdecimal():
         return objective.space.uniform(1, seed=int(seed))[0]
-    from ..landscapes.objective import name_of
 
     raise ValueError(f"{name_of(objective)} can be cut through center, random:SEED or a tensor; got {text!r}")

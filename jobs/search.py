@@ -13,7 +13,7 @@ import torch
 
 from ..landscapes.cost import duration, episode_cost
 from ..landscapes.objective import Objective, Status
-from ..landscapes.space import whole
+from ..landscapes.space import as_whole
 from ..landscapes.storage.files import clear, tidy, write_json
 from ..optim.base import Kind
 from ..optim.memory import SearchSize, require_method, require_runs
@@ -106,7 +106,7 @@ class SearchJob:
         Raises ValueError where the folder holds something else, StoreMismatchError where it holds another run, and
         TooLargeError where the run would not fit this machine.
         """
-        budget, identity = whole(budget, "a budget", least=1), run_identity(env, optimizer)
+        budget, identity = as_whole(budget, "a budget", least=1), run_identity(env, optimizer)
         folder = out or run_folder(identity)
         require_runs(env.space.dim, budget, 1, folder)
         require_method(type(optimizer), optimizer.options, SearchSize(env.space.dim, env.decisions, budget))

@@ -9,13 +9,21 @@ from ..landscapes.storage.disk import until_full
 
 Advance = Callable[..., None]  # advance(done, said=""): so much is done, and what is said beside the bar
 AdvanceOne = Callable[[str, int, str], None]  # advance(name, done, said): the same, of one of several
+Say = Callable[[str], None]  # say(text): what is being done now
 
 
 PREPARING = "preparing (kernels are compiled once, then kept)"
 
 
 class Stopped(KeyboardInterrupt):
-    """Say what is kept of a job that Ctrl-C has stopped; the same call, or the same command, goes on from there."""
+    """Say what is kept of a job that Ctrl-C has stopped; the same call, or the same command, goes on from there.
+
+    Where nothing is `kept`, it begins again.
+    """
+
+    def __init__(self, said: str, *, kept: bool = True) -> None:
+        super().__init__(said)
+        self.kept = kept
 
 
 @contextmanager
@@ -40,9 +48,9 @@ class Watch:
         """Take a line that is worth keeping: what a job will cost, a warning, what it has left out."""
 
     @contextmanager
-    def busy(self, text: str) -> Iterator[None]:
-        """Take what a job does that nothing can be counted of, as long as it does it."""
-        yield
+    def busy(self, text: str) -> Iterator[Say]:
+        """Take what a job does that nothing can be counted of, as long as it does it; give what says it otherwise."""
+        yield _ignore_text
 
     @contextmanager
     def progress(self, total: int, what: str = "episodes") -> Iterator[Advance]:
@@ -60,4 +68,8 @@ def _ignore(done: int, said: str = "") -> None:
 
 
 def _ignore_one(name: str, done: int, said: str) -> None:
+    """Take no notice."""
+
+
+def _ignore_text(text: str) -> None:
     """Take no notice."""

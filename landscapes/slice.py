@@ -21,9 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from .draw.figures.page import Picture
-    from .measures.profile import Character
-
-ROUNDING = {"float32": 2.0**-23, "float64": 2.0**-52}  # relative precision of an engine's numbers
+    from .measures.profile import Profile
 
 
 class HasData(Protocol):
@@ -110,14 +108,14 @@ class Slice:
 
         return profile_figure(self.data, events=self._events(), width=width)
 
-    def report(self, points: int = 6, seed: int = 0) -> Character:
+    def report(self, points: int = 6, seed: int = 0) -> Profile:
         """Measure what the landscape is like here: ruggedness, noise, jumps, gradients at several scales, in words.
 
         `points` x `points` places of the slice are evaluated anew, with points near them. Raises ValueError for a slice
         without gradients, for one that is not finished, and for one whose objective cannot be made again.
         """
         from .adapters import within_box
-        from .measures.profile import characterise
+        from .measures.profile import PRECISION, measure_profile
 
         if missing := int((self.data["status"] == Status.MISSING).sum()):
             raise ValueError(f"{missing} samples of this slice are missing; let what samples it go on first")
@@ -125,8 +123,8 @@ class Slice:
             lacking = "the objective it was sampled from" if "grad" in self.data else "gradients"
             raise ValueError(f"a report needs {lacking}, which this slice is without; sample it by gradscape.slice")
         objective = self.remake()
-        rounding = ROUNDING[self.identity.get("settings", {}).get("precision", "float64")]
-        return characterise(
+        rounding = PRECISION[self.identity.get("settings", {}).get("precision", "float64")]
+        return measure_profile(
             within_box(objective) if self.identity.get("boxed") else objective,
             self.data, rounding=rounding, points=points, seed=seed, events=getattr(objective, "events", None),
         )  # fmt: skip

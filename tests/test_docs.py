@@ -1,6 +1,5 @@
 """What README and docs say to type: every command and every block of Python is run, with small sizes."""
 
-import json
 import re
 import shlex
 import shutil
@@ -15,8 +14,10 @@ import typer
 
 from gradscape.cli import app, main
 from gradscape.commands import view
-from gradscape.commands.measure_tables import environments_table
-from gradscape.gallery.figures import DATA, read_figures
+from gradscape.gallery.figures import read_figures
+from gradscape.gallery.files import DATA
+from gradscape.jobs.report_record import Report
+from gradscape.jobs.report_tables import environments_markdown
 
 from .command import Said
 
@@ -31,11 +32,17 @@ PLACEHOLDER = re.compile(r"\.{3}|[\[\]|]|\b(?!CUDA)[A-Z]{1,}\b")  # in what a co
 
 # What makes them small: words in the place of others, the values of options, and options that are added.
 WORDS = {"SLICE": "cut", "RUN": "run", "best:RUN": "best:run", "ADDRESS": "local:1", "local": "local:1", "cuda": "cpu"}
-WORDS |= {"tls://10.0.0.5:8786": "local:1", "throw": "cut", "standard": "draft", "gallery/data/flip-0-1": str(DATA / "flip-0-1"), "triple-move": "bounce"}
+WORDS |= {
+    "tls://10.0.0.5:8786": "local:1",
+    "throw": "cut",
+    "standard": "draft",
+    "gallery/data/flip-0-1": str(DATA / "flip-0-1"),
+    "triple-move": "bounce",
+}
 VALUES = {"--resolution": "2", "--budget": "3", "--seeds": "1", "--frames": "2"}
 ADDED = {
     "race": ["--seeds", "1", "--budget", "3", "--device", "cpu"],
-    "tradeoff": ["--points", "2", "--ladder", "precision"],
+    "tradeoff": ["--points", "2", "--variants", "precision"],
     "replay": ["--no-film"],
     "bounce": ["--resolution", "3"],
     "slice": ["--resolution", "2"],
@@ -142,7 +149,7 @@ def test_every_command_runs(
     monkeypatch.setenv("XDG_DATA_HOME", str(desk / "data"))
     monkeypatch.setattr("http.server.ThreadingHTTPServer.serve_forever", stop)
     monkeypatch.setattr(view, "show_recording", lambda path, bars, *, serve: opened.append(path))
-    for name, value in (("TIMING", 0.01), ("PATIENCE", 0.01), ("RESAMPLES", 9)):
+    for name, value in (("REPETITION", 0.01), ("LARGEST", 0.01), ("RESAMPLES", 9)):
         monkeypatch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", value)
     done = run(*small(command), cwd=desk)
     assert done.returncode == 0, (small(command), done.stderr)
@@ -218,7 +225,7 @@ def _headings(file: Path) -> set[str]:
 def test_the_table_of_environments_is_what_the_reports_say() -> None:
     """It stands between two marks, and nowhere without reports; a failure prints what has to stand there."""
     files = [DATA / figure.id / "report.json" for figure in read_figures()]
-    records = [json.loads(file.read_text()) for file in files if file.exists()]
+    reports = [Report.read(file) for file in files if file.exists()]
     found = re.findall(r"<!-- measured -->\n\n(.*?)\n<!-- /measured -->", TEXT, flags=re.DOTALL)
-    wanted = [environments_table(records)] if records else []
+    wanted = [environments_markdown(reports)] if reports else []
     assert found == wanted, "between <!-- measured --> and <!-- /measured --> has to stand:\n\n" + "\n".join(wanted)

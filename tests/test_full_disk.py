@@ -30,7 +30,7 @@ WRITING = {  # the command, the file for which there is no room any more, what i
         "race branin --methods random --seeds 1 --budget 4 --out made", "race.json", "4 of 4 episodes are kept in made"
     ),
     "tradeoff": (
-        "tradeoff bounce --set horizon=0.05 --points 2 --ladder precision --device cpu --out made", "tradeoff.json",
+        "tradeoff bounce --set horizon=0.05 --points 2 --variants precision --device cpu --out made", "tradeoff.json",
         "rungs are kept in made",
     ),
     "pairs": ("pairs branin --samples 2 --out made", "pairs.json", "2 batches are kept in made"),
@@ -57,7 +57,7 @@ def test_a_full_disk_says_what_is_kept_and_the_same_command_goes_on(
     run: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, verb: str
 ) -> None:
     monkeypatch.setattr("gradscape.jobs.tolerance.user_data_path", lambda name: tmp_path / "data" / name)
-    for name in ("TIMING", "PATIENCE"):
+    for name in ("REPETITION", "LARGEST"):
         monkeypatch.setattr(tradeoff, name, 0.002)
     monkeypatch.setattr(tradeoff, "RESAMPLES", 9)
     command, last, kept = WRITING[verb]

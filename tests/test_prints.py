@@ -93,7 +93,7 @@ def test_a_report_is_printed_from_what_it_kept(run: Run, tmp_path: Path, monkeyp
     def compute(*_: object) -> None:
         raise AssertionError("it is measured again")
 
-    monkeypatch.setattr("gradscape.commands.measure_report._character", compute)
+    monkeypatch.setattr("gradscape.jobs.report.measure", compute)
     again = run(*command, "--print", "85", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     assert (tmp_path / "told" / name).read_bytes() == before

@@ -12,7 +12,7 @@ import typer
 
 from gradscape.cli import app
 from gradscape.envs.registry import make
-from gradscape.jobs import planned
+from gradscape.jobs import plan
 from gradscape.landscapes.capacity import TooLargeError
 from gradscape.optim.memory import SearchSize, require_method
 from gradscape.optim.registry import methods, optimizer_class
@@ -88,7 +88,7 @@ def test_a_plan_answers_at_any_size(desk: Path, said: list[str]) -> None:
 
 
 def small_rehearsal(*arguments: str) -> None:
-    planned.MOST_POINTS, planned.MOST_FRAMES = 8, planned.MORE
+    plan.MOST_POINTS, plan.MOST_FRAMES = 8, plan.MORE
     landscape(*arguments)
 
 

@@ -39,7 +39,7 @@ bounce --axis y --resolution 3 --fidelity draft --device cpu
 plan bounce --resolution 2 --fidelity draft --device cpu
 bench bounce --batch 2 --seconds 0 --fidelity draft --device cpu
 check branin --points 2
-tradeoff cartpole --points 2 --ladder precision --device cpu
+tradeoff cartpole --points 2 --variants precision --device cpu
 pairs bounce --samples 2 --fidelity draft --device cpu
 report cut --device cpu
 gallery compute --only bounce-y --part slices --resolution 4 --fidelity draft --device cpu --data data
@@ -124,7 +124,7 @@ def walk(folder: Path) -> None:
     os.environ |= {"DISPLAY": ":none", "XDG_DATA_HOME": str(folder)}
     patch = pytest.MonkeyPatch()
     leave_blank(patch.setattr)
-    for name, value in (("TIMING", 0.002), ("PATIENCE", 0.002), ("RESAMPLES", 9)):
+    for name, value in (("REPETITION", 0.002), ("LARGEST", 0.002), ("RESAMPLES", 9)):
         patch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", value)
     patch.setattr(viewer, "_rerun", windowless)
     sys.addaudithook(watch)

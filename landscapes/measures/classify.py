@@ -1,6 +1,6 @@
 """A landscape in words: rules with stated thresholds, from measures to what one says of a landscape.
 
-The thresholds were set on functions whose character is known, and on nothing else: the sphere, Rosenbrock's valley,
+The thresholds were set on functions whose landscape is known, and on nothing else: the sphere, Rosenbrock's valley,
 Himmelblau's function, Branin's, Rastrigin's, Ackley's and Levy's, white noise, a step, a plateau, and a bowl with fine
 ripples, at 48 x 48 samples.
 """
@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from ..statistics import Values, plain
+from ..plain import finite
+from ..statistics import Values
 from .discontinuities import Jumps
+from .records import WordRecord
 from .ruggedness import Ruggedness
 
 VERY_SMOOTH, SMOOTH, RUGGED, EXTREME = "very smooth", "smooth with local minima", "rugged", "extremely rugged"
@@ -41,12 +42,12 @@ class Verdict:
         """The words, in the order of `WORDS`."""
         return tuple(word for word in WORDS if word in self.reasons)
 
-    def beside(self, said: Sequence[str]) -> list[dict[str, Any]]:
+    def beside(self, said: Sequence[str]) -> list[WordRecord]:
         """Return each word of somebody else's, and whether it was measured."""
         return [{"word": word, "measured": word in self.reasons} for word in said]
 
 
-def judge(found: Ruggedness, jumps: Jumps | None, cosine: Values) -> Verdict:
+def classify(found: Ruggedness, jumps: Jumps | None, cosine: Values) -> Verdict:
     """Put a landscape into words.
 
     `cosine` is that of its gradients with differences over two samples, NaN where neither shows a slope. A gradient
@@ -90,10 +91,10 @@ def _gradients(found: Ruggedness, cosine: Values) -> dict[str, str]:
 def thresholds() -> dict[str, float | None]:
     """Return the thresholds by name, to be stated with results."""
     return {
-        "few turns": plain(FEW_TURNS),
-        "many turns": plain(MANY_TURNS),
-        "few minima": plain(FEW_MINIMA),
-        "large share": plain(MUCH),
-        "good cosine": plain(AGREE),
-        "often uphill": plain(OFTEN),
+        "few turns": finite(FEW_TURNS),
+        "many turns": finite(MANY_TURNS),
+        "few minima": finite(FEW_MINIMA),
+        "large share": finite(MUCH),
+        "good cosine": finite(AGREE),
+        "often uphill": finite(OFTEN),
     }

@@ -1,10 +1,9 @@
-"""All that is measured of one slice, and what it comes to in words."""
+"""The profile of a slice: all that is measured of it, and what that comes to in words."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,23 +12,24 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..capacity import Need
-from ..objective import Evaluation, Objective, evaluated, in_box, name_of
-from ..statistics import plain
-from ..storage.store import plane_of
-from . import classify as verdict
+from ..identity import plane_of
+from ..objective import Evaluation, Objective, evaluate, in_box, name_of
+from ..statistics import EstimateRecord
 from . import gradient_quality as gradients
-from .classify import Verdict, judge
+from .classify import Verdict, classify, thresholds
 from .discontinuities import Count, Jumps, find_jumps
 from .noise import Noise, noise
+from .records import ProfileRecord
 from .ruggedness import Ruggedness, ruggedness
 
+PRECISION = {"float32": 2.0**-23, "float64": 2.0**-52}  # relative, of an engine that computes in it
 NOISE_POINTS, REPEATS, PAIRS = 16, 4, 12
 SECONDS, BYTES = (1.0, 4e-5), (80_000_000, 300)  # that a slice takes, and each of its samples (2026-11, one core)
 PAIRS_PER_POINT = 8  # steep pairs of samples that are looked into, for each point of a side of the subgrid
 
 
 @dataclass(frozen=True, eq=False)
-class Character:
+class Profile:
     """Hold the measures of a slice: of its losses, of its noise, of its jumps and of its gradients at several scales.
 
     `steps`, `samples` and `smooth` are what `gradients.ladder`, `of_samples` and `smoothed_slopes` return. `cut` of
@@ -46,23 +46,28 @@ class Character:
     asked: int
     cut: int
 
-    def record(self) -> dict[str, Any]:
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The words for the landscape, in the order of `classify.WORDS`."""
+        return self.verdict.words
+
+    def record(self) -> ProfileRecord:
         """Return it as plain JSON."""
         return {
             "losses": self.losses.record(),
-            "noise": {name: plain(value) for name, value in vars(self.noise).items()},
+            "noise": self.noise.record(),
             "jumps": self.jumps.record(),
             "differences": gradients.scale_table(self.steps),
             "differences_of_samples": gradients.scale_table(self.samples),
             "smoothing": gradients.width_table(self.smooth),
             "verdict": {"words": list(self.verdict.words), "reasons": self.verdict.reasons},
-            "thresholds": verdict.thresholds(),
+            "thresholds": thresholds(),
             "beyond_the_box": {"asked": self.asked, "cut": self.cut},
         }
 
 
 def effort(rank: int, points: int) -> tuple[int, int]:
-    """Return how many losses, at most, and how many gradients `characterise` evaluates."""
+    """Return how many losses, at most, and how many gradients `measure_profile` evaluates."""
     places = points**2
     losses = NOISE_POINTS * (2 + 2 * REPEATS) + PAIRS_PER_POINT * points * 14
     losses += places * rank * 2 * len(gradients.SCALES)
@@ -70,16 +75,16 @@ def effort(rank: int, points: int) -> tuple[int, int]:
 
 
 def need_of(rank: int, dim: int, points: int) -> Need:
-    """Return what the points and gradients of `characterise` take, some copies of them included."""
+    """Return what the points and gradients of `measure_profile` take, some copies of them included."""
     return Need(8.0 * (4 * rank + 6 * dim) * 2 * PAIRS * float(points) ** 2)
 
 
 def own_cost(samples: int) -> tuple[float, int]:
-    """Return about how many seconds and bytes `characterise` takes itself for a slice of so many samples."""
+    """Return about how many seconds and bytes `measure_profile` takes itself for a slice of so many samples."""
     return SECONDS[0] + SECONDS[1] * samples, BYTES[0] + BYTES[1] * samples
 
 
-def characterise(
+def measure_profile(
     objective: Objective,
     dataset: xr.Dataset,
     *,
@@ -87,11 +92,12 @@ def characterise(
     points: int = 6,
     seed: int = 0,
     events: Count | None = None,
-) -> Character:
+) -> Profile:
     """Measure a slice, with new evaluations of its objective at points x points places of it.
 
-    `rounding` is the engine's relative precision, 1.2e-7 of float32 and 2.2e-16 of float64. Jumps are looked for from
-    half the step on, from sample to sample, of a ramp through the range of the losses.
+    `rounding` is the engine's relative precision: `PRECISION` has that of float32 and of float64. `events` counts what
+    happens in episodes, which explains jumps. Jumps are looked for from half the step on, from sample to sample, of a
+    ramp through the range of the losses.
     """
     plane, objective = plane_of(dataset), _Within(objective)
     generator = torch.Generator().manual_seed(seed)
@@ -104,12 +110,12 @@ def characterise(
     least = max(floor, float(np.nan_to_num(found.range)) / (max(plane.resolution) - 1) / 2)
     jumps = find_jumps(objective, dataset, least=least, most=PAIRS_PER_POINT * points, seed=seed, events=events)
     deviation = float(np.nan_to_num(fuzz.deviation))
-    steps = gradients.ladder(objective, plane, places, deviation=deviation)
+    steps = gradients.compare_differences(objective, plane, places, deviation=deviation)
     smooth = gradients.smoothed_slopes(objective, plane, places, pairs=PAIRS, seed=seed)
-    samples = gradients.of_samples(dataset, deviation=deviation)
+    samples = gradients.compare_samples(dataset, deviation=deviation)
     cosine = samples["cosine"].isel(scale=0).to_numpy()
-    words = judge(found, jumps, cosine)
-    return Character(found, fuzz, jumps, steps, samples, smooth, words, objective.asked, objective.cut)
+    words = classify(found, jumps, cosine)
+    return Profile(found, fuzz, jumps, steps, samples, smooth, words, objective.asked, objective.cut)
 
 
 class _Within:
@@ -125,11 +131,11 @@ class _Within:
         self.asked += len(x)
         if not getattr(self.objective, "beyond_box", False):
             self.cut += int((~in_box(self.space, x)).sum())
-        return evaluated(self.objective, x, grad=grad)
+        return evaluate(self.objective, x, grad=grad)
 
 
-def named_measures(record: Mapping[str, Any]) -> dict[str, str]:
-    """Return the chief numbers of a character's `record`, by short names, as a page shows them."""
+def named_measures(record: ProfileRecord) -> dict[str, str]:
+    """Return the chief numbers of a profile's `record`, by short names, as a page shows them."""
     losses, jumps = record["losses"], record["jumps"]
     near, smooth = record["differences_of_samples"][0], record["smoothing"]
     fewest, most = losses["minima_halved"]
@@ -157,15 +163,15 @@ def named_measures(record: Mapping[str, Any]) -> dict[str, str]:
     return {name: text for name, text in named.items() if text}
 
 
-def _shares(estimate: Mapping[str, float | None] | None) -> str:
+def _shares(estimate: EstimateRecord | None) -> str:
     return _with_interval(estimate, _percent)
 
 
-def _number(estimate: Mapping[str, float | None] | None) -> str:
+def _number(estimate: EstimateRecord | None) -> str:
     return _with_interval(estimate, lambda value: f"{value:z.2f}".replace("-", "\N{MINUS SIGN}"))
 
 
-def _with_interval(estimate: Mapping[str, float | None] | None, write: Any) -> str:
+def _with_interval(estimate: EstimateRecord | None, write: Callable[[float], str]) -> str:
     if estimate is None or estimate["value"] is None:
         return ""
     said, low, high = write(estimate["value"]), estimate["low"], estimate["high"]

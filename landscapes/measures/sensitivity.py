@@ -13,9 +13,10 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..objective import Objective, Status, evaluated
+from ..objective import Objective, Status, evaluate
+from ..plain import finite
 from ..space import ParameterSpace, sobol
-from ..storage.checkpoint import Pieces
+from ..storage.checkpoint import Checkpoint
 
 STEP, LINE = 0.025, 5  # of a short line: distance of its points in widths of the box, how many they are
 MOST, LEAST, AFFORDED = 16, 4, 2000  # base points by default, and the episodes up to which they are the most
@@ -86,7 +87,7 @@ class Design:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class Responses:
     """Losses and gradients at a design's points; NaN where an episode failed.
 
     `loss`, shape (sample,); `grad` [loss unit / width of the box], shape (sample, dim); `line`, shape
@@ -152,8 +153,8 @@ def default_samples(dim: int) -> int:
 
 
 def explore(
-    objective: Objective, design: Design, pieces: Pieces, *, follow: Callable[[int], None] = lambda done: None
-) -> Found:
+    objective: Objective, design: Design, pieces: Checkpoint, *, follow: Callable[[int], None] = lambda done: None
+) -> Responses:
     """Evaluate a design, pieces of it at a time; what `pieces` holds already is not evaluated again.
 
     `follow` hears how many episodes are done. Pairs are crossed of the parameters whose total indices are largest.
@@ -165,7 +166,7 @@ def explore(
         first.append(_piece(pieces, f"moved-{number}", lambda rows=rows: _moved(objective, design, rows)))  # type: ignore[misc]
         follow(done := done + len(rows) * (1 + LINE * design.space.dim))
     loss, grad, line, far = (np.concatenate([part[name] for part in first]) for name in ("loss", "grad", "line", "far"))
-    alone = Found(loss, grad, line, design.offsets, far, np.empty((len(loss), 0)), [])
+    alone = Responses(loss, grad, line, design.offsets, far, np.empty((len(loss), 0)), [])
     sensitive = np.argsort(-alone.total(), kind="stable")[:CROSSED]
     pairs = list(combinations(sorted(int(axis) for axis in sensitive), 2))
     cross = []
@@ -174,33 +175,42 @@ def explore(
             _piece(pieces, f"crossed-{number}", lambda rows=rows: _crossed(objective, design, rows, pairs))["loss"]  # type: ignore[misc]
         )
         follow(done := done + len(rows) * len(pairs))
-    return Found(loss, grad, line, design.offsets, far, np.concatenate(cross), pairs)
+    return Responses(loss, grad, line, design.offsets, far, np.concatenate(cross), pairs)
 
 
-def rank(found: Found) -> list[dict[str, Any]]:
-    """Return all pairs of parameters, those with the largest score first: sensitivity x (1 + all others).
+@dataclass(frozen=True)
+class Pair:
+    """Hold what makes a pair of parameters, by their numbers `dims`, worth a look; None where it was not measured.
 
     `sensitivity`: total index of the pair, the sum of both less their `interaction` where that was measured: the share
-    of the variance that a slice shows on average; `interaction` is None elsewhere, which counts as 0; `ruggedness`: sum
-    of both; `disagreement`: |gradient - slope| by |gradient| + |slope|, summed over both, 0 where gradients tell the
-    slope that is seen, 1 where they are zero or opposite.
+    of the variance that a slice shows on average; `ruggedness`: sum of both; `disagreement`: |gradient - slope| by
+    |gradient| + |slope|, summed over both, 0 where gradients tell the slope that is seen, 1 where they are zero or
+    opposite. `score`: sensitivity x (1 + all others), where an interaction that was not measured counts as 0. Fields
+    are called as files have them.
     """
+
+    dims: tuple[int, int]
+    score: float
+    sensitivity: float | None
+    interaction: float | None
+    ruggedness: float | None
+    disagreement: float | None
+
+
+def rank(found: Responses) -> list[Pair]:
+    """Return all pairs of parameters, those with the largest score first."""
     dim = found.far.shape[1]
     i, j = np.triu_indices(dim, 1)
     total, rugged, (apart, size) = found.total(), found.ruggedness(), found.slopes()
     crossed = dict(zip(found.pairs, found.interaction(), strict=True))
     interaction = np.array([crossed.get((int(a), int(b)), np.nan) for a, b in zip(i, j, strict=True)])
     weight = size[i] + size[j]
-    columns = {
-        "sensitivity": total[i] + total[j] - np.nan_to_num(interaction),
-        "interaction": interaction,
-        "ruggedness": rugged[i] + rugged[j],
-        "disagreement": np.divide(apart[i] + apart[j], weight, out=np.zeros(len(i)), where=weight > 0),
-    }
-    score = columns["sensitivity"] * (1 + np.nan_to_num(interaction) + columns["ruggedness"] + columns["disagreement"])
+    sensitivity, rugged_pair = total[i] + total[j] - np.nan_to_num(interaction), rugged[i] + rugged[j]
+    disagreement = np.divide(apart[i] + apart[j], weight, out=np.zeros(len(i)), where=weight > 0)
+    score = sensitivity * (1 + np.nan_to_num(interaction) + rugged_pair + disagreement)
+    columns = (sensitivity, interaction, rugged_pair, disagreement)
     return [
-        {"dims": [int(i[k]), int(j[k])], "score": float(score[k])}
-        | {name: float(values[k]) if np.isfinite(values[k]) else None for name, values in columns.items()}
+        Pair((int(i[k]), int(j[k])), float(score[k]), *(finite(float(values[k])) for values in columns))
         for k in np.argsort(-np.nan_to_num(score), kind="stable")
     ]
 
@@ -212,7 +222,7 @@ def _groups(objective: Objective, design: Design) -> list[range]:
     return [range(low, high) for low, high in pairwise(edges)]
 
 
-def _piece(pieces: Pieces, name: str, compute: Callable[[], dict[str, Array]]) -> dict[str, Array]:
+def _piece(pieces: Checkpoint, name: str, compute: Callable[[], dict[str, Array]]) -> dict[str, Array]:
     found = pieces.load(name)
     if found is None:
         found = compute()
@@ -221,7 +231,7 @@ def _piece(pieces: Pieces, name: str, compute: Callable[[], dict[str, Array]]) -
 
 
 def _moved(objective: Objective, design: Design, rows: range) -> dict[str, Array]:
-    start = evaluated(objective, design.starts(rows), grad=True)
+    start = evaluate(objective, design.starts(rows), grad=True)
     widths = design.space.upper - design.space.lower
     grad = start.grad * widths if start.grad is not None else torch.empty(0)
     moved = _losses(objective, design.moved(rows)).reshape(len(rows), design.space.dim, -1)
@@ -234,7 +244,7 @@ def _crossed(objective: Objective, design: Design, rows: range, pairs: list[tupl
 
 def _losses(objective: Objective, x: Float[Tensor, "point dim"]) -> Array:
     at_once = getattr(objective, "preferred_batch", BATCH)
-    parts = [evaluated(objective, part, grad=False) for part in torch.split(x, at_once)]
+    parts = [evaluate(objective, part, grad=False) for part in torch.split(x, at_once)]
     return np.concatenate([part.loss.masked_fill(part.status != Status.OK, torch.nan).numpy() for part in parts])
 
 

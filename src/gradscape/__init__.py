@@ -7,6 +7,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from .api.environments import list_envs
+    from .api.measure import check, pairs, report, tradeoff
     from .api.overlay import overlay
     from .api.search import open_run, optimize, race
     from .api.slice import open_slice, slice
@@ -37,6 +38,7 @@ _HOMES = {
     "SceneSpec": "jobs.scene",
     "Slice": "landscapes.slice",
     "Status": "landscapes.objective",
+    "check": "api.measure",
     "from_numpy": "landscapes.adapters",
     "from_torch": "landscapes.adapters",
     "list_envs": "api.environments",
@@ -45,10 +47,13 @@ _HOMES = {
     "open_slice": "api.slice",
     "optimize": "api.search",
     "overlay": "api.overlay",
+    "pairs": "api.measure",
     "race": "api.search",
     "register": "envs.registry",
+    "report": "api.measure",
     "sample": "landscapes.sampling.fill",
     "slice": "api.slice",
+    "tradeoff": "api.measure",
 }
 
 __all__ = [
@@ -65,6 +70,7 @@ __all__ = [
     "Slice",
     "Status",
     "__version__",
+    "check",
     "from_numpy",
     "from_torch",
     "list_envs",
@@ -73,10 +79,13 @@ __all__ = [
     "open_slice",
     "optimize",
     "overlay",
+    "pairs",
     "race",
     "register",
+    "report",
     "sample",
     "slice",
+    "tradeoff",
 ]
 
 

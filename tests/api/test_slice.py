@@ -74,7 +74,7 @@ def test_a_picture_shows_in_a_notebook_with_events_along_a_line(tmp_path: Path) 
     cut = gs.slice("branin", (0, 1), resolution=4, out=tmp_path / "cut")
     assert cut.plot()._repr_png_().startswith(b"\x89PNG")
     line = gs.slice("bounce", ("velocity y",), resolution=4, through="example:aim", out=tmp_path / "line")
-    assert any("bounces" in text.get_text() for ax in line.plot().axes for text in ax.texts + [ax.yaxis.label])
+    assert any("bounces" in text.get_text() for ax in line.plot().axes for text in [*ax.texts, ax.yaxis.label])
 
 
 def test_a_stored_slice_knows_its_environment(tmp_path: Path) -> None:

@@ -13,8 +13,9 @@ from benchmarks.results import leave_blank
 
 import gradscape
 from gradscape.cli import main
+from gradscape.landscapes.identity import plane_of
 from gradscape.landscapes.overlay import best_point, overlay
-from gradscape.landscapes.storage.store import open_slice, plane_of
+from gradscape.landscapes.storage.store import open_slice
 from gradscape.optim.runs.store import RunStore
 
 
