@@ -48,7 +48,7 @@ def race(
 
     The folder then holds race.png, race.json (ranks, differences, curves) and each run in a folder of its own. Stop it
     at any moment: the same command goes on where it stopped. More methods, seeds or episodes go on from there too; runs
-    that are finished are not repeated.
+    that are finished are not repeated. Refuses --workers beside --scheduler.
 
     Example: landscape race fluid --methods random,bo-leap --budget 200 --seeds 3
     """

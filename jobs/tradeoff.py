@@ -67,7 +67,6 @@ class TradeoffJob:
         fidelity only, TooLargeError for more points than there is memory for, StoreMismatchError where the folder
         holds another study.
         """
-        from ..landscapes.measures.fidelity import sobol_points
         from ..landscapes.storage.checkpoint import Checkpoint
         from .variants import SETTINGS, refuse_single, variants
 
@@ -79,7 +78,7 @@ class TradeoffJob:
         identity = {**env.identity(), "points": points, "seed": seed}
         folder = out or folder_named(["tradeoff", env.name, points], identity, root)
         pieces = Checkpoint.open(folder, identity, what="tradeoff", force=force)
-        return cls(env, found, sobol_points(env.space, points, seed=seed), seed, pieces, {}, command, prints)
+        return cls(env, found, env.space.sobol(points, seed=seed), seed, pieces, {}, command, prints)
 
     @property
     def folder(self) -> Path:

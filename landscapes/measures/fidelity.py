@@ -16,7 +16,6 @@ from torch import Tensor
 
 from ..objective import Evaluation, Objective, Status, evaluate
 from ..plain import finite, number, optional
-from ..space import ParameterSpace
 from ..statistics import CONFIDENCE
 
 REPETITION = 4.0  # least seconds that repetitions of a quick batch take, each way
@@ -82,11 +81,6 @@ class Bootstrap:
         """Return it as a share of a whole, None where there is none."""
         ends = (self.value, self.low, self.high)
         return Bootstrap(*(value / whole if value is not None and whole else None for value in ends))
-
-
-def sobol_points(space: ParameterSpace, count: int, *, seed: int) -> Float[Tensor, "count dim"]:
-    """Return well-spread points of the box (Sobol, scrambled with the seed)."""
-    return space.sobol(count, seed=seed)
 
 
 def measure(

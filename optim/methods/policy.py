@@ -124,7 +124,7 @@ class PolicySearch(Optimizer):
     def attach(self, objective: Objective) -> None:
         """Take the objective that the policy plays in.
 
-        Raises ValueError where the parameters are not shared out equally among the decisions.
+        Raises ValueError where its decisions have not equally many controls.
         """
         self._objective = objective
         self.decisions = int(getattr(objective, "decisions", 1))

@@ -51,7 +51,10 @@ def empty(rows: int, dim: int) -> Columns:
 
 
 def read_rows(path: Path, group: zarr.Group, name: str, rows: int, dim: int) -> NDArray[Any]:
-    """Return the first rows of a column of the run at `path`; raises StoreError, which names it, where it cannot."""
+    """Return the first rows of a column of the run at `path`.
+
+    Raises StoreError, which names the column, where they cannot be read.
+    """
     wanted = empty(0, dim)[name]
     try:
         array: Any = group[name]

@@ -49,7 +49,7 @@ class Journal:
 
     @classmethod
     def read(cls, run: Path) -> Journal:
-        """Read the file of a run; raises StoreError, which names it, where it is missing or not what was written."""
+        """Read the file of a run. Raises StoreError, which names it, where it is missing or not what was written."""
         try:
             digest, _, content = (run / STATE).read_bytes().partition(b"\n")
         except OSError as error:

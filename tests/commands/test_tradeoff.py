@@ -91,7 +91,7 @@ def test_errors_and_order_of_convergence_are_those_of_the_scene(run: Command, tm
     assert {**read_json(tmp_path / "trade/tradeoff.json"), "folder": "trade"} == report
     assert (tmp_path / "trade/tradeoff.png").read_bytes().startswith(b"\x89PNG")
     rungs = by_name(report)
-    x = tradeoff.sobol_points(Converging.space, 16, seed=0)
+    x = Converging.space.sobol(16, seed=0)
     for name, dt in (("draft", 0.1), ("standard", 0.05), ("standard-dt-x0.5", 0.025)):
         off = (1 + x[:, 0]) * (dt**2 - 1e-8) + 1e-7
         assert rungs[name]["loss_error"]["median"]["value"] == pytest.approx(float(off.quantile(0.5)))
@@ -120,7 +120,7 @@ def test_rungs_that_are_refused_are_listed_and_those_that_diverge_are_counted(ru
     assert report["refused"] == [{"name": "draft-dt-x4", "why": "converging takes dt below 0.4; got 0.4"}]
     assert "refused: draft-dt-x4: converging takes dt below 0.4; got 0.4" in done.stderr
     coarse = by_name(report)["draft-dt-x2"]
-    x = tradeoff.sobol_points(Converging.space, 16, seed=0)
+    x = Converging.space.sobol(16, seed=0)
     assert coarse["diverged"] == pytest.approx(float((x[:, 0] > 0.5).double().mean()))
     assert coarse["loss_error"]["p95"]["value"] is None
 

@@ -7,7 +7,7 @@ import torch
 from gradscape import Evaluation, ParameterSpace, Plane, Status, from_numpy, sample
 from gradscape.landscapes.adapters import within_box
 from gradscape.landscapes.conformance.suite import check
-from gradscape.landscapes.measures.fidelity import measure, sobol_points
+from gradscape.landscapes.measures.fidelity import measure
 from gradscape.landscapes.measures.gradient_quality import compare_differences, subgrid
 from gradscape.landscapes.measures.profile import measure_profile, named_measures
 from gradscape.landscapes.measures.sensitivity import Design, explore
@@ -92,7 +92,7 @@ def test_pairs_checks_and_trade_offs_ask_nothing_beyond(tmp_path):
     design = Design.sobol(SPACE, 4, seed=0)
     found = explore(Strict(), design, Checkpoint.open(tmp_path / "p", {}, what="pairs"))
     assert found.failed == 0
-    assert (measure(Strict(), sobol_points(SPACE, 4, seed=0)).status == Status.OK).all()
+    assert (measure(Strict(), SPACE.sobol(4, seed=0)).status == Status.OK).all()
     outcomes = {finding.check: finding for finding in check(Strict(), points=2)}
     assert {finding.outcome for finding in outcomes.values()} <= {"pass", "skip"}
     assert "it does not invite points beyond its box" in outcomes["10% outside the box"].why

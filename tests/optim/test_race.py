@@ -250,7 +250,7 @@ def test_a_finished_race_computes_nothing_and_touches_no_file(tmp_path):
     race(Bowl(), field(tmp_path), budget=BUDGET, gradient_cost=2.0)
     before = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*")}
     objective, made = Bowl(), []
-    again = [dataclasses.replace(entry, made=partial(made.append, entry)) for entry in field(tmp_path)]
+    again = [dataclasses.replace(entry, make=partial(made.append, entry)) for entry in field(tmp_path)]
     race(objective, again, budget=BUDGET, workers=2, gradient_cost=2.0)
     assert (objective.asked, made) == (0, [])
     assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*")} == before

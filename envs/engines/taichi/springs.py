@@ -65,8 +65,9 @@ class Solver:
         """Return where vertices are after each step [m], shape (step + 1, batch, vertex, 3).
 
         All but held vertices start at `velocity` [m/s], shape (batch, 3); `stiffness` [N/m] has shape (batch, vertex);
-        `poses` of the surface have shape (batch, step + 1, 3), and are zeros unless given. Raises ValueError for more rows
-        than the solver takes.
+        `poses` of the surface have shape (batch, step + 1, 3), and are zeros unless given.
+
+        Raises ValueError for more rows than the solver takes.
         """
         batch, count, frames = len(velocity), self.count, self.steps + 1
         if batch > self.capacity:

@@ -115,13 +115,13 @@ def test_gradients_are_per_width_of_the_box_and_points_are_evaluated_once_in_ord
 ) -> None:
     monkeypatch.setattr(tradeoff, "REPETITION", 0.01)
     space = ParameterSpace(("a", "b"), torch.tensor([0.0, 0.0]), torch.tensor([1.0, 10.0]), ("", ""))
-    x = tradeoff.sobol_points(space, 8, seed=3)
+    x = space.sobol(8, seed=3)
     heard: list[int] = []
     found = tradeoff.measure(from_torch(lambda x: 2 * x[:, 0] + x[:, 1], space), x, follow=heard.append)
     np.testing.assert_allclose(found.grad, np.tile([2.0, 10.0], (8, 1)))
     np.testing.assert_allclose(found.loss, 2 * x[:, 0] + x[:, 1])
     assert heard == list(range(1, 9))
-    assert bool((tradeoff.sobol_points(space, 8, seed=4) != x).any())
+    assert bool((space.sobol(8, seed=4) != x).any())
     again = Sample.of_arrays({name: np.asarray(value) for name, value in found.arrays().items()})
     assert (again.forward, again.batch) == (found.forward, found.batch)
 
@@ -140,7 +140,7 @@ def test_seconds_are_those_of_an_episode_in_a_batch(monkeypatch: pytest.MonkeyPa
             clock[0] += 0.01 + len(x) * (0.003 if grad else 0.001)
             return from_torch(lambda x: x[:, 0], space).evaluate(x, grad=grad)
 
-    found = tradeoff.measure(Slow(), tradeoff.sobol_points(space, 10, seed=0))
+    found = tradeoff.measure(Slow(), space.sobol(10, seed=0))
     assert found.batch == 4
     assert found.forward == pytest.approx(0.014 / 4)
     assert found.with_gradient == pytest.approx(0.022 / 4)
