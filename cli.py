@@ -99,11 +99,7 @@ def main(arguments: list[str] | None = None) -> Any:
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a file's name need not be text
     try:
-        code = app(args=arguments, prog_name="landscape", standalone_mode=False)
-        if isinstance(code, KeyboardInterrupt):
-            raise code
-        if code == STOPPED:  # what the library makes of Ctrl-C where no verb has begun
-            raise KeyboardInterrupt
+        code = _run(arguments)
     except TyperException as error:
         code = _fail(_usage(error), 2)
     except ValueError as error:
@@ -113,6 +109,16 @@ def main(arguments: list[str] | None = None) -> Any:
     except (KeyboardInterrupt, typer.Abort) as stop:
         code = _stop(stop) or _fail("stopped before anything was computed; the same command begins again", 130)
     sys.exit(code)
+
+
+def _run(arguments: list[str] | None) -> Any:
+    """Run the command, and raise what Ctrl-C has raised in a verb again."""
+    code = app(args=arguments, prog_name="landscape", standalone_mode=False)
+    if isinstance(code, KeyboardInterrupt):
+        raise code
+    if code == STOPPED:  # what the library makes of Ctrl-C where no verb has begun
+        raise KeyboardInterrupt
+    return code
 
 
 def _stop(stop: BaseException) -> int:

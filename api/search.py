@@ -7,17 +7,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 from ..jobs.scene import SceneSpec
+from ..jobs.watch import Watch
 from .progress import default_watch
-from .scene import SceneKeywords, environment, say_call
+from .scene import SceneKeywords, environment, is_environment, objective_of, say_call
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
+    from ..landscapes.objective import Objective
+    from ..optim.base import Optimizer
     from ..optim.race import Race
     from ..optim.runs.run import Run
 
 
 def optimize(
-    scene: str | type[Environment] | Environment | SceneSpec,
+    scene: str | type[Environment] | Objective | SceneSpec,
     method: str,
     *,
     budget: int = 1000,
@@ -31,17 +34,20 @@ def optimize(
 
     `budget` episodes are evaluated, not one more; `seed` decides the method's random numbers, and `method_options` are
     its own. The run lies in the folder `out`, by default one under out/ named after it: the same call goes on there
-    where it stopped, and a larger budget goes on from its end.
+    where it stopped, and a larger budget goes on from its end. An objective that is no environment is searched in
+    memory.
 
     Raises ValueError for what the scene or the method does not have, and where the folder holds something else or
     another run, which `force` replaces; Stopped where it is interrupted.
     """
     watch = default_watch()
-    env = environment(scene, keywords, watch)
+    env = objective_of(scene, keywords, watch)
     from ..jobs.search import SearchJob, make_optimizer
 
-    command = say_call("optimize", scene, method, budget=budget, seed=seed, **keywords)
     optimizer = make_optimizer(method, env, seed=seed, options=method_options)
+    if not is_environment(env):
+        return _search_in_memory(env, optimizer, budget, out, watch)
+    command = say_call("optimize", scene, method, budget=budget, seed=seed, **keywords)
     job = SearchJob.of(
         env, optimizer, budget=budget, command=command, out=Path(out) if out is not None else None, force=force
     )
@@ -61,9 +67,9 @@ def race(
     force: bool = False,
     **keywords: Unpack[SceneKeywords],
 ) -> Race:
-    """Let methods compete on a scene with the same budget of episodes, with several seeds each, and return the race.
+    """Let methods compete on an environment, with the same budget and several seeds each, and return the race.
 
-    `methods` are by default all that can search the scene here, `method_options` are given by method. `workers` runs
+    `methods` are by default all that can search it here, `method_options` are given by method. `workers` runs
     are filled at a time, each in a thread. The race lies in the folder `out`, by default one under out/ named after it:
     the same call goes on there where it stopped, and so do more methods, seeds or episodes.
 
@@ -97,3 +103,19 @@ def open_run(path: str | Path) -> Run:
     from ..optim.runs.store import RunStore
 
     return RunStore.open(store_in(Path(path), RUN_STORE)).read()
+
+
+def _search_in_memory(
+    objective: Objective, optimizer: Optimizer, budget: int, out: str | Path | None, watch: Watch
+) -> Run:
+    """Search an objective of which nothing says what decides its numbers, so that no run of it can be continued."""
+    from ..jobs.search import one_torch_thread
+    from ..landscapes.objective import name_of
+    from ..optim.search import search
+
+    if out is not None:
+        who = name_of(objective)
+        raise ValueError(f"runs of environments are kept on disk; {who} is none, so leave out the folder")
+    with one_torch_thread(), watch.progress(budget) as advance:
+        store = search(objective, optimizer, budget=budget, progress=lambda now: advance(now.done))
+    return store.read()

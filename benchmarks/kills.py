@@ -100,7 +100,8 @@ def run(command: str, folder: Path, patience: float | None = None, victim: str =
 
 def bits(folder: Path) -> tuple[int, str]:
     """Return how many points and records a folder holds, and a digest of all their values."""
-    from gradscape.landscapes.storage.store import SliceStore, is_slice
+    from gradscape.landscapes.storage.paths import is_slice
+    from gradscape.landscapes.storage.store import SliceStore
     from gradscape.optim.runs.store import RunStore, is_run
 
     digest, done = hashlib.sha256(), 0

@@ -223,7 +223,8 @@ def _readable(folder: Path) -> Iterator[tuple[Path, Callable[[Path], Numbers]]]:
 
 
 def _store(path: Path) -> Numbers:
-    from gradscape.landscapes.storage.store import SliceStore, is_slice
+    from gradscape.landscapes.storage.paths import is_slice
+    from gradscape.landscapes.storage.store import SliceStore
     from gradscape.optim.runs.store import RunStore
 
     dataset = SliceStore.open(path).dataset() if is_slice(path) else RunStore.open(path).dataset()
@@ -250,10 +251,10 @@ def _of_dataset(dataset: Any) -> Numbers:
 
 
 def _json(path: Path) -> Numbers:
-    from gradscape.landscapes.storage.records import unsigned
+    from gradscape.landscapes.storage.records import verify
 
     found = json.loads(path.read_text())
-    said = [unsigned(one) for one in found] if isinstance(found, list) else unsigned(found)
+    said = [verify(one) for one in found] if isinstance(found, list) else verify(found)
     return Numbers({}, _digest(json.dumps(plain(said), sort_keys=True).encode()))
 
 

@@ -38,18 +38,19 @@ def overlay(
     from ..api.slice import open_slice
     from ..envs.registry import environment_class
     from ..jobs.folder import run_tables
-    from ..jobs.overlay import Cut, OverlayJob
+    from ..jobs.overlay import STREAM, Cut, OverlayJob
     from .terminal import Bars, command_line
     from .view import check_display, show_recording
 
     if env:
         environment_class(env)  # which registers it
-    if spawn and not serve:
-        check_display(Path(out or "the overlay"), "leave out --spawn, or take --serve to look at it in a browser")
     bars, cut = Bars(), Cut.of(through, plane, resolution)
     how: dict[str, Any] = {"out": Path(out) if out else None, "prints": print_ or [], "watch": bars, "device": device}
     job = OverlayJob.of(open_slice(slice_), run_tables(runs), command=command_line(), cut=cut, **how)
+    recording = job.folder / STREAM
+    if spawn and not serve:
+        check_display(recording, "leave out --spawn, or take --serve to look at it in a browser")
     drawn = job.run(bars)
     bars.note(f"{drawn.summary.outcome()}\n{drawn.folder}: {', '.join(drawn.files)}")
     if spawn or serve:
-        show_recording(drawn.folder / "overlay.rrd", bars, serve=serve)
+        show_recording(recording, bars, serve=serve)

@@ -107,7 +107,8 @@ def _subjects(what: str, root: Path, fidelity: str | None, device: str, points: 
 
 def _is_finished(folder: Path) -> bool:
     from ..jobs.folder import SLICE_STORE
-    from ..landscapes.storage.store import SliceStore, is_slice
+    from ..landscapes.storage.paths import is_slice
+    from ..landscapes.storage.store import SliceStore
 
     return is_slice(folder / SLICE_STORE) and not SliceStore.open(folder / SLICE_STORE).pending()
 

@@ -48,14 +48,14 @@ def show_recording(path: Path, bars: Bars, *, serve: bool) -> None:
 
     Raises ValueError where a window is wanted and there is no display, OSError where the viewer does not come up.
     """
-    from ..landscapes.draw.recordings.viewer import open_viewer, served
+    from ..landscapes.draw.recordings.viewer import open_viewer, serve_recording
 
     if not serve:
         check_display(path, f"look at it in a browser: landscape view {shlex.quote(str(path))} --serve")
         bars.note(f"opening {path} in rerun's viewer")
         open_viewer(path)
         return
-    with served(path) as address:
+    with serve_recording(path) as address:
         try:
             bars.note(f"{path} is at {address} until Ctrl-C")
             while True:
@@ -72,7 +72,7 @@ def check_display(path: Path, instead: str) -> None:
 
 def _open(path: Path, bars: Bars, *, serve: bool) -> None:
     """Open a picture, a film or a page with this system's program for it."""
-    from ..landscapes.storage.files import resolved
+    from ..landscapes.storage.files import resolve
 
     serving = f"landscape gallery serve --out {shlex.quote(str(path.parent))}"
     if serve and path.name == SITE:
@@ -81,7 +81,7 @@ def _open(path: Path, bars: Bars, *, serve: bool) -> None:
         raise ValueError(f"--serve shows recordings (.rrd) in a browser; {path} is none")
     check_display(path, f"serve it to a browser: {serving}" if path.name == SITE else "copy it to where one is")
     bars.note(f"opening {path}")
-    if typer.launch(str(resolved(path))):
+    if typer.launch(str(resolve(path))):
         raise OSError(f"no program of this system opens {path}; open it with one of your own")
 
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from ..landscapes.episode import Episode as Episode
 from ..landscapes.objective import Evaluation
-from ..landscapes.sampling.memory import collect
+from ..landscapes.sampling.memory import free_memory
 from ..landscapes.space import ParameterSpace, as_tensor
 from .code import code_digest
 from .options import NoOptions, read_options
@@ -146,7 +146,7 @@ class Environment(abc.ABC):
             results = list(each(lambda part: self._simulate(part, grad=grad), parts))
         loss = torch.cat([r.loss.to(x) for r in results])
         slope = torch.cat([r.grad.to(x) for r in results if r.grad is not None]) if grad else None
-        return Evaluation.judged(loss, slope, torch.cat([r.status.cpu() for r in results]))
+        return Evaluation.from_results(loss, slope, torch.cat([r.status.cpu() for r in results]))
 
     @final
     def __call__(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"]:
@@ -241,7 +241,7 @@ class Environment(abc.ABC):
     def shrink(self, rows: int) -> None:
         """Take at most `rows` rows at once from now on: solvers hold room for all they take, and it was too much."""
         self._most_rows, self._solvers = rows, None
-        collect()
+        free_memory()
         self._setup()
 
     def memory(self) -> int:

@@ -16,7 +16,7 @@ from functools import cache
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ..landscapes.storage.files import resolved
+from ..landscapes.storage.files import resolve
 from .importing import IN_FILE, module_of
 
 if TYPE_CHECKING:
@@ -224,7 +224,7 @@ def _of_file(text: str) -> type[Environment]:
     from .base import Environment
 
     path, _, attribute = text.rpartition(":")
-    file = resolved(path)
+    file = resolve(path)
     if not file.is_file():
         raise ValueError(f"there is no file {path} to take {attribute} from")
     module = module_of(str(file))

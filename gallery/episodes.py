@@ -45,7 +45,7 @@ class EpisodePart(Part):
 
     def make(self, watch: Watch) -> str:
         """Film every episode that is not there, and clear away those of other nodes."""
-        from ..landscapes.storage.store import plane_of
+        from ..landscapes.identity import plane_of
 
         env, plane, filmed = self._scene().make(), plane_of(self._dataset), self._filmed()
         for node in self._nodes:
@@ -119,7 +119,7 @@ def choose_nodes(dataset: xr.Dataset, through: Float[Tensor, " dim"]) -> list[No
 
 def _nearest(dataset: xr.Dataset, through: Float[Tensor, " dim"]) -> tuple[int, int]:
     """Return row and column of the node nearest a point."""
-    from ..landscapes.storage.store import plane_of
+    from ..landscapes.identity import plane_of
 
     plane = plane_of(dataset)
     here = plane.project(through[None])[0].tolist()

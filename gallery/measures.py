@@ -32,7 +32,8 @@ class ReportPart(Part):
     def left(self) -> int:
         """Return 1 where there is no report of this slice."""
         from ..jobs.report import digest_of
-        from ..landscapes.storage.store import is_slice, open_slice
+        from ..landscapes.storage.paths import is_slice
+        from ..landscapes.storage.store import open_slice
 
         record, store = read_if_sound(read_json, self.folder / REPORT), self.folder / STORE
         if record is None or read_if_sound(read_json, self.folder / MEASURES) is None or not is_slice(store):

@@ -106,11 +106,12 @@ class SlicePart(Part):
     def state(self) -> State:
         """Look at the data without making an environment; who sampled it, and on what device, does not matter."""
         from ..landscapes.storage.arrays import FILES
-        from ..landscapes.storage.ownership import lost_root
-        from ..landscapes.storage.store import SliceStore, is_slice
+        from ..landscapes.storage.ownership import has_lost_root
+        from ..landscapes.storage.paths import is_slice
+        from ..landscapes.storage.store import SliceStore
 
         points, store = self.figure.resolution ** len(self.figure.dims), self.folder / STORE
-        if not is_slice(store) and not lost_root(store, FILES):
+        if not is_slice(store) and not has_lost_root(store, FILES):
             return State(points, 0)
         stored = SliceStore.open(store)
         return State(points, int((stored.status() > 0).sum()) if _same(self.figure, stored.identity) else None)
@@ -129,7 +130,7 @@ class SlicePart(Part):
 
     def _open(self) -> SliceJob:
         from ..jobs.slice import SliceJob
-        from ..landscapes.storage.store import is_slice
+        from ..landscapes.storage.paths import is_slice
 
         env = self._scene().make()
         return SliceJob.of(

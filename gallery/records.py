@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from ..landscapes.objective import Status
 from ..landscapes.storage.files import write_json
-from ..landscapes.storage.records import maybe, number, read_json, reading, signed, text, unsigned, write_record
+from ..landscapes.storage.records import number, optional, read_json, reading, sign, text, verify, write_record
 from .files import REMAKE, episode_name
 
 T = TypeVar("T")
@@ -70,7 +70,7 @@ class Node:
 
 def write_nodes(path: Path, nodes: Sequence[Node]) -> None:
     """Write which nodes' episodes are shown."""
-    write_json(path, [signed(asdict(node)) for node in nodes])
+    write_json(path, [sign(asdict(node)) for node in nodes])
 
 
 def read_nodes(path: Path) -> list[Node]:
@@ -83,11 +83,11 @@ def read_nodes(path: Path) -> list[Node]:
 
 
 def _node(found: object) -> Node:
-    record = unsigned(found)
+    record = verify(found)
     row, column = int(record["row"]), int(record["column"])
     if min(row, column) < 0:
         raise ValueError(f"a place is counted from 0; got {min(row, column)}")
-    return Node(row, column, text(record["why"]), maybe(number, record["loss"]), Status[record["status"]].name)
+    return Node(row, column, text(record["why"]), optional(number, record["loss"]), Status[record["status"]].name)
 
 
 def read_if_sound(read: Callable[[Path], T], path: Path) -> T | None:

@@ -11,7 +11,7 @@ import xarray as xr
 from zarr.storage import ZipStore
 
 from ..landscapes.storage.files import replacing
-from ..landscapes.storage.layout import SMALL
+from ..landscapes.storage.layout import COMPACT_CODECS
 from ..landscapes.storage.records import reading
 from ..optim.runs.arrays import COLUMNS
 from .files import REMAKE
@@ -20,7 +20,7 @@ from .files import REMAKE
 def save_run(table: xr.Dataset, path: Path) -> None:
     """Write a run's table as one file, whole or not at all."""
     numbers = [str(name) for name, column in table.variables.items() if column.dtype.kind in "fi"]
-    encoding = {name: {"compressors": SMALL, "chunks": table[name].shape} for name in numbers}
+    encoding = {name: {"compressors": COMPACT_CODECS, "chunks": table[name].shape} for name in numbers}
     with replacing(path) as partial, ZipStore(partial, mode="w") as store, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # zarr's specification has no strings yet
         table.to_zarr(store, encoding=encoding, zarr_format=3, consolidated=False)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from ..landscapes.capacity import Need, require
 from ..landscapes.conformance.finding import Finding
 from ..landscapes.cost import duration, episode_cost
+from ..landscapes.plain import plain
 from .scene import SceneSpec
 from .watch import PREPARING, Say, Stopped, Watch
 
@@ -258,8 +258,5 @@ def _horizons(job: CheckJob) -> list[Variant]:
 
 
 def _record(finding: Finding) -> dict[str, Any]:
-    def plain(numbers: Mapping[str, float | None]) -> dict[str, float | None]:
-        return {name: value if value is not None and math.isfinite(value) else None for name, value in numbers.items()}
-
     record = {name: getattr(finding, name) for name in ("check", "outcome", "figure", "why")}
-    return {**record, "numbers": plain(finding.numbers or {}), "table": [plain(row) for row in finding.table]}
+    return {**record, "numbers": plain(finding.numbers or {}), "table": plain(finding.table)}

@@ -51,13 +51,13 @@ def open_results(path: Path) -> tuple[xr.Dataset, Path]:
 
     Raises ValueError where that is no slice and no run, and StoreError where it is damaged.
     """
-    from ..landscapes.storage.paths import finished, is_slice
+    from ..landscapes.storage.paths import finished_path, is_slice
     from ..landscapes.storage.store import open_slice
     from ..optim.runs.store import RunStore, is_run
 
     slice_, run = store_in(path, SLICE_STORE), store_in(path, RUN_STORE)
     if is_slice(slice_) or slice_ != path:  # one that is damaged is refused by what opens it
-        return open_slice(slice_), finished(slice_)
+        return open_slice(slice_), finished_path(slice_)
     if is_run(run) or run != path:
         return RunStore.open(run).dataset(), run
     raise ValueError(f"{path} is no slice and no run; give the folder that `landscape slice` or `optimize` left")

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..landscapes.storage import paths
-from ..landscapes.storage.files import others, visible
+from ..landscapes.storage.files import other_files, visible_files
 from ..landscapes.storage.ownership import refuse_others
-from ..landscapes.storage.paths import there
+from ..landscapes.storage.paths import slice_exists
 from ..optim.runs import store
 
 if TYPE_CHECKING:
@@ -37,9 +37,9 @@ class Results:
 
     def check(self, folder: Path, allowed: Iterable[Path] = ()) -> None:
         """Raise ValueError where a folder holds other files than those of such a result, or than those `allowed`."""
-        if self.store and there(folder / self.store):
+        if self.store and slice_exists(folder / self.store):
             return
-        held = visible(folder) if self.store else others(folder, self.files, self.picture)
+        held = visible_files(folder) if self.store else other_files(folder, self.files, self.picture)
         refuse_others(folder, set(held) - set(allowed), self.kind)
 
 
@@ -76,7 +76,7 @@ def folder_named(parts: Iterable[object], settings: Any, root: Path = ROOT) -> P
 
 def store_in(path: Path, store: str) -> Path:
     """Return the store in a results folder, finished or not, or the path itself."""
-    return path / store if there(path / store) else path
+    return path / store if slice_exists(path / store) else path
 
 
 def run_tables(paths: Sequence[str]) -> list[xr.Dataset]:

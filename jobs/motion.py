@@ -114,9 +114,9 @@ def _smoothing(env: Environment, plane: Plane, frames: int) -> Motion:
     widths = np.linspace(0, WIDEST, frames).tolist()
 
     def slices(sampled: Sequence[xr.Dataset]) -> list[xr.Dataset]:
-        from ..landscapes.smoothing import smoothed
+        from ..landscapes.smoothing import smooth
 
-        return [smoothed(sampled[0], width) for width in widths]
+        return [smooth(sampled[0], width) for width in widths]
 
     label = "smoothing width [% of the box's sides]"
     return Motion(label, tuple(100 * width for width in widths), (plane,), lambda _: env, slices)

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
-from ..landscapes.identity import stored_identity
+from ..landscapes.identity import plane_of, stored_identity
 from ..landscapes.objective import Objective, Status
 from ..landscapes.overlay import best_point, overlay, principal_plane
 from ..landscapes.plane import Plane
 from ..landscapes.slice import Slice
-from ..landscapes.storage.files import tidy, visible
-from ..landscapes.storage.paths import there
-from ..landscapes.storage.store import open_slice, plane_of
+from ..landscapes.storage.files import tidy, visible_files
+from ..landscapes.storage.paths import slice_exists
+from ..landscapes.storage.store import open_slice
 from .folder import OVERLAY, ROOT, SLICE_STORE, folder_named, run_tables
 from .scene import environment_of
 from .slice import SliceJob
@@ -69,7 +69,7 @@ class Cut:
         if self.principal:
             return principal_plane(tables, resolution=shape, through=point)
         assert point is not None  # as one of the two is asked for
-        return replace(present.moved(point), resolution=shape)
+        return replace(present.shift_to(point), resolution=shape)
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class OverlayJob:
             check_run(slice.data, run, watch or Watch())
         overlay(slice.data, runs)
         folder = out or overlay_folder(slice.data, runs, cut)
-        OVERLAY.check(folder, allowed=[file for file in visible(folder) if there(file / SLICE_STORE)])
+        OVERLAY.check(folder, allowed=[file for file in visible_files(folder) if slice_exists(file / SLICE_STORE)])
         return cls(slice, runs, folder, command, cut, device, prints)
 
     def run(self, watch: Watch | None = None) -> Overlay:

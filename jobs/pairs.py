@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ..landscapes.capacity import Need, require
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.measures.sensitivity import Design, Pair, default_samples, explore, rank
-from ..landscapes.storage.checkpoint import Pieces
+from ..landscapes.storage.checkpoint import Checkpoint
 from ..landscapes.storage.files import tidy, write_json
 from .folder import PAIRS, ROOT, folder_named
 from .scene import SceneSpec, provenance
@@ -86,7 +86,7 @@ class PairsJob:
     env: Environment
     design: Design
     identity: dict[str, Any]
-    pieces: Pieces
+    pieces: Checkpoint
     options: Mapping[str, Any] = field(default_factory=dict)
     command: str = ""
 
@@ -116,7 +116,7 @@ class PairsJob:
         require("samples", samples, lambda count: Need(8.0 * NUMBERS * dim * count))
         identity = {**env.identity(), "samples": samples, "seed": seed}
         folder = out or folder_named(["pairs", identity["objective"], identity["fidelity"], samples], identity, root)
-        pieces = Pieces.open(folder, identity, what="pairs", force=force)
+        pieces = Checkpoint.open(folder, identity, what="pairs", force=force)
         return cls(env, Design.sobol(env.space, samples, seed=seed), identity, pieces, scene.options, command)
 
     @property

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 import cloudpickle
 
 from ..landscapes.cost import EpisodeCost, duration, episode_cost
-from ..landscapes.sampling.distribution import kept as objective_of
-from ..landscapes.sampling.distribution import results, workers_of
-from ..landscapes.space import whole
-from ..landscapes.storage.files import clear, tidy, visible, write_json
+from ..landscapes.plain import plain
+from ..landscapes.sampling.distribution import make_objective as objective_of
+from ..landscapes.sampling.distribution import run_tasks, workers_of
+from ..landscapes.space import as_whole
+from ..landscapes.storage.files import clear, tidy, visible_files, write_json
 from ..landscapes.storage.ownership import refuse_others
 from ..optim.claims import Claims, Finding, check_claims
 from ..optim.memory import SearchSize, require_method, require_runs
@@ -75,7 +76,7 @@ class RaceSummary:
             "command": self.command,
             "files": self.files,
         }
-        return {name: _finite(value) for name, value in whole.items()}
+        return {name: plain(value) for name, value in whole.items()}
 
 
 @dataclass(frozen=True)
@@ -121,12 +122,14 @@ class RaceJob:
         machine.
         """
         watch, options = watch or Watch(), options or {}
-        budget, seeds = whole(budget, "a budget", least=1), whole(seeds, "a number of seeds", least=1)
-        check_threads(env, whole(workers, "a number of workers", least=1))
+        budget, seeds = as_whole(budget, "a budget", least=1), as_whole(seeds, "a number of seeds", least=1)
+        check_threads(env, as_whole(workers, "a number of workers", least=1))
         methods = check_methods(methods) or able_methods(env, watch)
         folder = out or race_folder(env, options)
         if not any(folder.glob(f"*-*/{RUN_STORE}")):
-            refuse_others(folder, (one for one in visible(folder) if not one.is_dir() or visible(one)), RACE.kind)
+            refuse_others(
+                folder, (one for one in visible_files(folder) if not one.is_dir() or visible_files(one)), RACE.kind
+            )
         _require_room(env, methods, options, seeds=seeds, budget=budget, folder=folder)
         how: dict[str, Any] = {"budget": budget, "command": command, "force": force}
         with watch.busy(f"opening {len(methods) * seeds} runs"):
@@ -253,7 +256,7 @@ class RaceJob:
     def _cost(self, *, grad: bool) -> EpisodeCost:
         if self.executor is None:
             return episode_cost(self.env, grad=grad)
-        (cost,) = results(self.executor, _cost_there, [(cloudpickle.dumps(recipe(self.env)), grad)])
+        (cost,) = run_tasks(self.executor, _cost_there, [(cloudpickle.dumps(recipe(self.env)), grad)])
         return cost
 
     def _left(self, one: Competitor) -> int:
@@ -322,7 +325,7 @@ def search_by_workers(
     """Let workers fill runs, and yield each with how far it came as it ends."""
     there = cloudpickle.dumps(recipe(env))
     tasks = [(number, there, *_recipe_of(one), budget, gradient_cost) for number, one in enumerate(competitors)]
-    for number, now in results(executor, _search_there, tasks):
+    for number, now in run_tasks(executor, _search_there, tasks):
         yield competitors[number], now
 
 
@@ -382,12 +385,3 @@ def _claim_record(finding: Finding) -> dict[str, Any]:
 
 def _least(losses: Sequence[float]) -> float:
     return min((loss for loss in losses if not math.isnan(loss)), default=math.nan)
-
-
-def _finite(value: Any) -> Any:
-    """Return a value as JSON has it: what is not finite is null."""
-    if isinstance(value, Mapping):
-        return {key: _finite(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -20,7 +20,7 @@ from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.identity import stored_identity
 from ..landscapes.objective import Evaluation
 from ..landscapes.storage.disk import is_full
-from ..landscapes.storage.files import make_folder, others, replacing, tidy, write_json
+from ..landscapes.storage.files import make_folder, other_files, replacing, tidy, write_json
 from ..landscapes.storage.records import read_json, write_record
 from .folder import REPORT, REPORTS, ROOT, SLICE_STORE, folder_named, store_in
 from .report_record import ARRAYS, MEASURES, PICTURE, RECORD, PaperRecord, Quoted, Report, ReportKey, Reports
@@ -238,10 +238,7 @@ class _Counted:
             parts.append(self.objective.evaluate(rows, grad=grad))
             self.done += len(rows)
             self.advance(self.done)
-        if not parts:
-            return Evaluation.empty(self.space.dim, grad=grad)
-        slopes = torch.cat([part.grad for part in parts if part.grad is not None]) if grad else None
-        return Evaluation(torch.cat([p.loss for p in parts]), slopes, torch.cat([p.status for p in parts]))
+        return Evaluation.join(parts, dim=self.space.dim, grad=grad)
 
 
 def refuse_too_many(points: int, rank: int, dim: int) -> None:
@@ -378,7 +375,7 @@ def _check(folder: Path, single: bool) -> None:
         REPORT.check(folder)
         return
     _check_summary(folder)
-    REPORTS.check(folder, (file for file in others(folder, REPORTS.files, "") if (file / PICTURE).exists()))
+    REPORTS.check(folder, (file for file in other_files(folder, REPORTS.files, "") if (file / PICTURE).exists()))
 
 
 def _check_summary(folder: Path) -> None:

@@ -145,7 +145,7 @@ class Report:
         import numpy as np
 
         from ..landscapes.draw.figures.quality import quality_figure
-        from ..landscapes.measures.gradient_quality import of_samples
+        from ..landscapes.measures.gradient_quality import compare_samples
         from ..landscapes.storage.bundle import open_bundle
         from ..landscapes.storage.store import open_slice
 
@@ -154,7 +154,7 @@ class Report:
                 f"{self.folder} is a report from before {ARRAYS} was kept to draw from; delete it to measure it anew"
             )
         dataset, kept = open_slice(self.store), open_bundle(self.folder / ARRAYS)
-        samples = of_samples(dataset, deviation=float(np.nan_to_num(kept["noise"]["deviation"])))
+        samples = compare_samples(dataset, deviation=float(np.nan_to_num(kept["noise"]["deviation"])))
         return partial(quality_figure, dataset, kept["steps"], samples, kept["smooth"])
 
     def _repr_html_(self) -> str:

@@ -9,7 +9,6 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from ..envs.registry import environment_class, make
-from ..landscapes.objective import name_of
 from .watch import Watch
 
 if TYPE_CHECKING:
@@ -151,6 +150,7 @@ def plane_through(
 
 def _named_point(objective: Objective, text: str) -> Tensor:
     from ..envs.base import Environment
+    from ..landscapes.objective import name_of
 
     if isinstance(objective, Environment):
         return point_of(objective, text)
@@ -159,4 +159,5 @@ def _named_point(objective: Objective, text: str) -> Tensor:
         return objective.space.center
     if kind == "random" and seed.isdecimal():
         return objective.space.uniform(1, seed=int(seed))[0]
+
     raise ValueError(f"{name_of(objective)} can be cut through center, random:SEED or a tensor; got {text!r}")

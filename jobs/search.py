@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import torch
 
 from ..landscapes.cost import duration, episode_cost
-from ..landscapes.objective import Status
-from ..landscapes.space import whole
+from ..landscapes.objective import Objective, Status
+from ..landscapes.space import as_whole
 from ..landscapes.storage.files import clear, tidy, write_json
 from ..optim.base import Kind
 from ..optim.memory import SearchSize, require_method, require_runs
@@ -106,7 +106,7 @@ class SearchJob:
         Raises ValueError where the folder holds something else, StoreMismatchError where it holds another run, and
         TooLargeError where the run would not fit this machine.
         """
-        budget, identity = whole(budget, "a budget", least=1), run_identity(env, optimizer)
+        budget, identity = as_whole(budget, "a budget", least=1), run_identity(env, optimizer)
         folder = out or run_folder(identity)
         require_runs(env.space.dim, budget, 1, folder)
         require_method(type(optimizer), optimizer.options, SearchSize(env.space.dim, env.decisions, budget))
@@ -233,9 +233,9 @@ def one_torch_thread() -> Iterator[None]:
 
 @one_torch_thread()
 def make_optimizer(
-    method: str, env: Environment, *, seed: int = 0, options: Mapping[str, Any] | None = None
+    method: str, objective: Objective, *, seed: int = 0, options: Mapping[str, Any] | None = None
 ) -> Optimizer:
-    """Make a method for an environment; values of its options may be text.
+    """Make a method for an objective; values of its options may be text.
 
     Raises ValueError for a method, an option or a value that is not there, and TooLargeError for one that would not fit
     this machine.
@@ -244,8 +244,8 @@ def make_optimizer(
 
     kind = optimizer_class(method)
     chosen = read_options(method, kind.Options, options or {})
-    require_method(kind, chosen, SearchSize(env.space.dim, env.decisions))
-    return kind.on(env, seed=seed, options=chosen)
+    require_method(kind, chosen, SearchSize(objective.space.dim, getattr(objective, "decisions", 1)))
+    return kind.on(objective, seed=seed, options=chosen)
 
 
 def open_run_store(

@@ -21,15 +21,16 @@ from torch import Tensor
 from ..landscapes.adapters import within_box
 from ..landscapes.capacity import size
 from ..landscapes.cost import duration, seconds_per_episode
+from ..landscapes.identity import plane_of
 from ..landscapes.objective import Objective, Status, name_of
 from ..landscapes.plane import Plane
-from ..landscapes.sampling.distribution import RemoteSite, Site, results, workers_of
+from ..landscapes.sampling.distribution import RemoteSite, Site, run_tasks, workers_of
 from ..landscapes.sampling.fill import Progress, sample
-from ..landscapes.sampling.memory import Halving
+from ..landscapes.sampling.memory import MemoryBound
 from ..landscapes.storage.arrays import need_of
 from ..landscapes.storage.files import clear, tidy, write_json
-from ..landscapes.storage.paths import there
-from ..landscapes.storage.store import SliceStore, plane_of
+from ..landscapes.storage.paths import slice_exists
+from ..landscapes.storage.store import SliceStore
 from ..landscapes.storage.tiles import Tile
 from .folder import ROOT, SLICE, SUMMARY, folder_named
 from .scene import provenance
@@ -125,7 +126,7 @@ class SliceJob:
         SLICE.check(folder)
         path = folder / STORE
         settings: dict[str, Any] = {"identity": identity, "provenance": provenance, "grad": grad}
-        if force and there(path):
+        if force and slice_exists(path):
             store = SliceStore.create(path, plane, objective.space, overwrite=True, **settings)
             clear(folder, (PICTURE, SUMMARY), PICTURE)
         else:
@@ -174,8 +175,8 @@ class SliceJob:
         """Estimate what is left; workers that compute it do, which warms them, and leaves a GPU of theirs alone."""
         if self.executor is None:
             return cost_of(self.objective, self.store)
-        site = Site(Halving(self.objective), self.store, self.remake)
-        costs = list(results(self.executor, _cost_there, [(site,)] * workers_of(self.executor)))
+        site = Site(MemoryBound(self.objective), self.store, self.remake)
+        costs = list(run_tasks(self.executor, _cost_there, [(site,)] * workers_of(self.executor)))
         shares = [1 / cost.seconds for cost in costs if cost.seconds]
         return replace(costs[0], seconds=1 / sum(shares) if shares else 0.0)
 

@@ -17,9 +17,9 @@ from ..landscapes.capacity import size
 from ..landscapes.cost import duration
 from ..landscapes.objective import Status
 from ..landscapes.sampling.fill import Progress, sample
-from ..landscapes.storage.files import discard, tidy, visible, write_json
+from ..landscapes.storage.files import discard, tidy, visible_files, write_json
 from ..landscapes.storage.ownership import refuse_others
-from ..landscapes.storage.paths import check_replaceable, filling
+from ..landscapes.storage.paths import check_replaceable, filling_path
 from ..landscapes.storage.store import SliceStore
 from .folder import ROOT, SWEEP, folder_named
 from .motion import HORIZON, SMOOTHING, Motion, refuse_too_large
@@ -279,16 +279,16 @@ def sweep_folder(env: Environment, motion: Motion, over: int | str, *, grad: boo
 
 def check_folder(folder: Path) -> None:
     """Raise ValueError where a folder holds anything but a sweep: its films without any slice are somebody else's."""
-    held = visible(folder)
-    begun = [file for file in held if file.name in (FRAMES, ONLY, filling(Path(ONLY)).name)]
-    strange = [file for file in visible(folder / FRAMES) if not FRAME.fullmatch(file.name)]
+    held = visible_files(folder)
+    begun = [file for file in held if file.name in (FRAMES, ONLY, filling_path(Path(ONLY)).name)]
+    strange = [file for file in visible_files(folder / FRAMES) if not FRAME.fullmatch(file.name)]
     refuse_others(folder, strange if begun else held, SWEEP.kind)
     SWEEP.check(folder, begun)
 
 
 def _clear(folder: Path) -> None:
     """Remove the slices of a sweep, and what was made of them."""
-    places = [*visible(folder / FRAMES), folder / ONLY, filling(folder / ONLY)]
+    places = [*visible_files(folder / FRAMES), folder / ONLY, filling_path(folder / ONLY)]
     stores = [store for store in places if store.exists()]
     for store in stores:
         check_replaceable(store)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..envs.base import Environment
     from ..landscapes.measures.fidelity import Sample
     from ..landscapes.measures.tradeoff import MeasuredVariant, Tradeoff
-    from ..landscapes.storage.checkpoint import Pieces
+    from ..landscapes.storage.checkpoint import Checkpoint
     from .variants import Variant
 
 COPIES = 50  # of the points: a loss and a gradient there by every variant
@@ -41,7 +41,7 @@ class TradeoffJob:
     variants: list[Variant]
     x: Tensor
     seed: int
-    pieces: Pieces
+    pieces: Checkpoint
     refused: dict[str, str]
     command: str
     prints: Sequence[float] = ()
@@ -68,7 +68,7 @@ class TradeoffJob:
         holds another study.
         """
         from ..landscapes.measures.fidelity import sobol_points
-        from ..landscapes.storage.checkpoint import Pieces
+        from ..landscapes.storage.checkpoint import Checkpoint
         from .variants import SETTINGS, refuse_single, variants
 
         kind = environment_class(scene.name) if isinstance(scene.name, str) else scene.name
@@ -78,7 +78,7 @@ class TradeoffJob:
         found = variants(env, settings or SETTINGS)
         identity = {**env.identity(), "points": points, "seed": seed}
         folder = out or folder_named(["tradeoff", env.name, points], identity, root)
-        pieces = Pieces.open(folder, identity, what="tradeoff", force=force)
+        pieces = Checkpoint.open(folder, identity, what="tradeoff", force=force)
         return cls(env, found, sobol_points(env.space, points, seed=seed), seed, pieces, {}, command, prints)
 
     @property
@@ -194,9 +194,9 @@ class TradeoffJob:
         seem slow.
         """
         from ..landscapes.measures.fidelity import measure
-        from ..landscapes.sampling.memory import collect
+        from ..landscapes.sampling.memory import free_memory
 
-        collect()
+        free_memory()
         for _, env in self._make([variant]):
             try:
                 return measure(env, self.x, follow=follow)

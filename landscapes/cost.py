@@ -1,4 +1,4 @@
-"""What an episode costs in seconds, measured on the objective itself: the one estimator of every announcement."""
+"""The seconds that an episode takes, measured on the objective itself; everything that is announced uses it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What there is to draw of an episode: frames over time, and the things they show."""
+"""An episode as it is drawn: its frames over time, and the look of the things in them."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ Material = Literal[
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Say what one thing of an episode looks like.
+    """Hold the shape, material and motion of one thing in an episode.
 
     `at` [m], shape (frame, point, 3), is where it is: the vertices of a sheet, the particles of a lump, the points of a
     path, else the places of so many copies of a solid of `size` [m]. `turn`, shape (frame, 3, 3), rotates solids about

@@ -1,4 +1,4 @@
-"""A measured number with the interval that its sampling leaves open."""
+"""Estimates: a measured number with its confidence interval."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from .plain import finite
+
 Values = NDArray[np.float64]
-LEVEL = 0.95
+CONFIDENCE = 0.95
 BLOCKS = {1: (16,), 2: (4, 4)}  # parts of a line, or of a plane, that are left out one at a time
 
 
@@ -34,12 +36,7 @@ class Estimate:
 
     def record(self) -> EstimateRecord:
         """Return it as plain JSON."""
-        return {"value": plain(self.value), "low": plain(self.low), "high": plain(self.high)}
-
-
-def plain(value: float) -> float | None:
-    """Return a number as JSON has it: None where it is not finite."""
-    return float(value) if math.isfinite(value) else None
+        return {"value": finite(self.value), "low": finite(self.low), "high": finite(self.high)}
 
 
 def jackknife(
@@ -61,7 +58,7 @@ def jackknife(
     if len(known) < 2 or not math.isfinite(value):
         return Estimate(value, math.nan, math.nan)
     deviation = math.sqrt((len(known) - 1) * float(np.mean((known - known.mean()) ** 2)))
-    reach = deviation * float(stats.t.ppf((1 + LEVEL) / 2, len(known) - 1))
+    reach = deviation * float(stats.t.ppf((1 + CONFIDENCE) / 2, len(known) - 1))
     return Estimate(value, max(least, value - reach), min(most, value + reach))
 
 
@@ -69,7 +66,7 @@ def share(hits: int, tries: int) -> Estimate:
     """Return a share with its exact binomial interval (Clopper & Pearson 1934)."""
     if not tries:
         return Estimate(math.nan, math.nan, math.nan)
-    interval = stats.binomtest(hits, tries).proportion_ci(LEVEL)
+    interval = stats.binomtest(hits, tries).proportion_ci(CONFIDENCE)
     return Estimate(hits / tries, float(interval.low), float(interval.high))
 
 
@@ -81,5 +78,5 @@ def mean(values: Values, *, least: float = -np.inf, most: float = np.inf) -> Est
     value = float(known.mean())
     if len(known) == 1:
         return Estimate(value, math.nan, math.nan)
-    reach = float(stats.sem(known) * stats.t.ppf((1 + LEVEL) / 2, len(known) - 1))
+    reach = float(stats.sem(known) * stats.t.ppf((1 + CONFIDENCE) / 2, len(known) - 1))
     return Estimate(value, max(least, value - reach), min(most, value + reach))

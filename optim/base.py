@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..landscapes.objective import Evaluation, Objective, Status
-from ..landscapes.space import ParameterSpace, whole
+from ..landscapes.space import ParameterSpace, as_whole
 from .memory import FLOAT, SearchSize
 
 Points = NDArray[np.float64]
@@ -65,7 +65,7 @@ class Optimizer(abc.ABC):
     needs_grad: ClassVar[bool] = False
 
     def __init__(self, space: ParameterSpace, *, seed: int = 0, options: Any = None) -> None:
-        self.space, self.seed = space, whole(seed, f"the seed of {self.name}")
+        self.space, self.seed = space, as_whole(seed, f"the seed of {self.name}")
         self.options = self.Options() if options is None else options
         self.random = np.random.default_rng(seed)
         self.worst = 0.0  # the largest finite loss so far

@@ -167,10 +167,10 @@ class Race:
     @cached_property
     def _picture(self) -> xr.Dataset:
         about, goals = self._about, self.statistics.targets
-        counted = f"{self.budget} episodes · {name_seeds(self.seeds)}"
+        title = (about["env"], about["fidelity"], f"{self.budget} episodes", name_seeds(self.seeds))
         provenance = about["provenance"] if self.provenance is None else json.dumps(self.provenance)
         return picture(self._tables, self.statistics).assign_attrs(
-            title=f"{about['env']} · {about['fidelity']} · {counted}",
+            title=" · ".join(part for part in title if part),
             budget=self.budget,
             seeds=self.seeds,
             loss_unit=self.loss_unit,

@@ -10,8 +10,8 @@ from typing import Any
 
 from ..landscapes.cost import episode_cost
 from ..landscapes.identity import StoreError
-from ..landscapes.objective import Objective, evaluated, name_of
-from ..landscapes.space import whole
+from ..landscapes.objective import Objective, evaluate, name_of
+from ..landscapes.space import as_whole
 from .base import Optimizer
 from .registry import optimizer_class
 from .runs.store import RunStore
@@ -47,7 +47,7 @@ def search(
     Raises ValueError for a budget, a method or a gradient cost that cannot be, and StoreError where the run on disk
     cannot be gone on from.
     """
-    budget = whole(budget, "a budget", least=1)
+    budget = as_whole(budget, "a budget", least=1)
     if gradient_cost is not None and not 0 < gradient_cost < math.inf:
         raise ValueError(f"search takes a gradient_cost above 0 and finite; got {gradient_cost}")
     if run is None:
@@ -84,7 +84,7 @@ def _fill(objective: Objective, optimizer: Optimizer, run: RunStore, budget: int
         largest = max(largest, len(proposal.x))
         x = proposal.x[: budget - run.count]
         complete = len(x) == len(proposal.x)
-        evaluation = evaluated(objective, x, grad=proposal.grad)
+        evaluation = evaluate(objective, x, grad=proposal.grad)
         seconds, mark = time.perf_counter() - mark, time.perf_counter()
         if complete:
             optimizer.tell(x, evaluation)

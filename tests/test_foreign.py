@@ -151,7 +151,7 @@ class Spring(gs.Environment):
     space = gs.ParameterSpace({"pull": (0, 1, "m")})
 
     def _evaluate(self, x, *, grad):  # type: ignore[no-untyped-def]
-        return gs.Evaluation.judged(x[:, 0] ** 2, 2 * x if grad else None)
+        return gs.Evaluation.from_results(x[:, 0] ** 2, 2 * x if grad else None)
 
 
 def test_a_program_registers_a_class_and_the_command_finds_it(run: Callable[..., Said], tmp_path: Path) -> None:
@@ -179,7 +179,7 @@ def short_of(**what: object) -> gs.Environment:
         ({"_evaluate": lambda self, x, *, grad: x[:, 0]}, "must return an Evaluation; got Tensor. Evaluation.judged"),
         ({"_evaluate": lambda self, x, *, grad: None}, "must return an Evaluation; got NoneType"),
         (
-            {"_evaluate": lambda self, x, *, grad: gs.Evaluation.judged(x[:, 0], None)},
+            {"_evaluate": lambda self, x, *, grad: gs.Evaluation.from_results(x[:, 0], None)},
             r"was asked for gradients \(grad=True\) and returned none",
         ),
         ({"space": None}, "needs its parameters: give the class a ParameterSpace as `space`"),

@@ -68,7 +68,7 @@ def made_run(path: Path) -> None:
 
 
 STORES = {"tiles": made_tiles, "finished": made_slice, "run": made_run}
-OPENED = {"tiles": open_slice, "finished": open_slice, "run": open_run}
+OPENED = {"tiles": open_slice, "finished": open_slice, "run": lambda path: open_run(path).data}
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from gradscape import Environment
 from gradscape.cli import app
 from gradscape.commands.terminal import Console, Described
 from gradscape.envs.registry import make
-from gradscape.landscapes.storage.files import make_folder, resolved
+from gradscape.landscapes.storage.files import make_folder, resolve
 
 from .command import Said
 
@@ -165,8 +165,8 @@ def test_a_folder_is_made_however_deep(tmp_path: Path) -> None:
 def test_a_loop_of_links_is_no_path(desk: Path) -> None:
     for path in (desk / "loop", desk / "loop/x"):
         with pytest.raises(ValueError, match=r"loop.* leads in a circle, by symbolic links; give another path"):
-            resolved(path)
-    assert resolved(desk / "not/there") == Path(os.path.realpath(desk)) / "not/there"
+            resolve(path)
+    assert resolve(desk / "not/there") == Path(os.path.realpath(desk)) / "not/there"
 
 
 def test_a_path_too_long_for_the_system_ends_in_a_line(run: Callable[..., Said], desk: Path) -> None:

@@ -24,9 +24,9 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from ... import __version__
 from ...envs.registry import entries
-from ...landscapes.identity import stored_identity, stored_provenance
-from ...landscapes.storage.arrays import parameters_of, plane_of
-from ...landscapes.storage.files import placing, resolved
+from ...landscapes.identity import plane_of, stored_identity, stored_provenance
+from ...landscapes.storage.arrays import parameters_of
+from ...landscapes.storage.files import placing, resolve
 from ...landscapes.storage.ownership import check_ours
 from ...landscapes.storage.paths import is_slice
 from ...landscapes.storage.records import reading
@@ -51,7 +51,7 @@ def build_site(
     drawn, before the first is. Raises ValueError where `out` holds anything else, where `data` holds no figure, and,
     naming it, for a file of it that is damaged.
     """
-    out = resolved(out)
+    out = resolve(out)
     _check(out)
     there = [figure for figure in figures if _sampled(data / figure.id / STORE)]
     if not there:

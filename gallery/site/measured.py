@@ -10,7 +10,7 @@ from typing import Any
 
 from ...landscapes.measures.classify import WORDS
 from ...landscapes.measures.fidelity import cheapest, p95, pareto_front
-from ...landscapes.storage.records import maybe, number, read_json, reading, text
+from ...landscapes.storage.records import number, optional, read_json, reading, text
 from ..files import DEVICES, REMAKE, REPORT, TRADEOFFS, TradeoffFiles
 from .manifest import Interval, ReportEntry, Rung, Seconds, TradeoffEntry, Word
 
@@ -102,7 +102,7 @@ def _tradeoff(record: Record, files: TradeoffFiles) -> TradeoffEntry:
     return TradeoffEntry(
         **{name: text(record[name]) for name in ("env", "reference", "loss_unit", "command")},
         points=number(record["points"]),
-        spread=maybe(number, record["spread"]),
+        spread=optional(number, record["spread"]),
         refused=record["refused"],
         options=dict(record["identity"]["options"]),
         device=text(record["identity"]["device"]),
@@ -118,10 +118,10 @@ def _rung(row: Record, record: Record, best: set[str]) -> Rung:
     return Rung(
         name=text(row["name"]),
         front=row["name"] in best,
-        error=Interval(**{end: maybe(number, error[end]) for end in ("value", "low", "high")}),
-        spearman=maybe(number, row["spearman"]["value"]),
-        cosine=maybe(number, row["gradient"]["cosine"]["value"]),
-        diverged=maybe(number, row["diverged"]),
+        error=Interval(**{end: optional(number, error[end]) for end in ("value", "low", "high")}),
+        spearman=optional(number, row["spearman"]["value"]),
+        cosine=optional(number, row["gradient"]["cosine"]["value"]),
+        diverged=optional(number, row["diverged"]),
         seconds=Seconds(**{way: number(row["seconds"][way]) for way in ("forward", "with_gradient")}),
         memory=number(row["memory"]),
     )

@@ -27,11 +27,11 @@ def read_runs(data: Path) -> list[xr.Dataset]:
 
 def lay_runs(dataset: xr.Dataset, tables: Sequence[xr.Dataset]) -> list[Trajectory]:
     """Lay the runs of a slice's environment and options over it, the least loss first."""
-    from ...landscapes.draw.figures.overlay import farthest
+    from ...landscapes.draw.figures.overlay import farthest_distance
 
     own = [table for table in tables if _same(stored_identity(table), stored_identity(dataset))]
     runs = [lay(dataset, table, f"{table.attrs['method']}, seed {table.attrs['seed']}") for table in own]
-    reach = farthest(runs)
+    reach = farthest_distance(runs)
     points = sum(run.sizes["evaluation"] for run in runs)
     top = math.inf if "v" in dataset.dims else float(dataset["loss"].max())  # of what a line's map shows
     laid = [_trajectory(run, reach, points, top) for run in runs]

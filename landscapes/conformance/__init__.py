@@ -1,1 +1,1 @@
-"""What every objective owes, one file for each family of checks."""
+"""Checks that every objective has to pass, one file for each family of them."""

@@ -1,4 +1,4 @@
-"""What an objective says at the edge of what it is made for: a number or a status, never a silent NaN."""
+"""Checks at the edges of an objective's domain: it returns a number or a status, never a silent NaN."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .finding import SKIP, Finding, verdict
 from .subject import Subject, difference
 
 CORNERS = 16  # a box of no more corners is checked at all of them
-BEYOND = (0.01, 0.1)  # how far outside the box, as shares of it
+OUTSIDE = (0.01, 0.1)  # how far outside the box, as shares of it
 ROWS = 2  # points that a variant is checked at
 RISE = 0.1  # of the energy there is at first: what semi-implicit steps may add for a while in a stiff contact
 KINDS = {"finite": Status.OK, "non-finite": Status.NONFINITE, "escaped": Status.ESCAPED, "error": Status.ERROR}
@@ -45,15 +45,15 @@ def checks(
     ends = corners(space.dim)
     some = f"{len(ends)} of 2^{space.dim} corners, every two parameters in all four combinations"
     many = f"all {len(ends)} corners" if len(ends) == 2**space.dim else some
-    yield "corners", lambda: _at("corners", objective, space.from_unit(ends), many)
-    yield "centre", lambda: _at("centre", objective, space.center[None])
-    for share in BEYOND:
+    yield "corners", lambda: _check_at("corners", objective, space.from_unit(ends), many)
+    yield "centre", lambda: _check_at("centre", objective, space.center[None])
+    for share in OUTSIDE:
         name, beyond = f"{share:.0%} outside the box", space.from_unit(ends + share * (2 * ends - 1))
-        yield name, partial(_beyond, name, objective, beyond)
-    yield "float32 against float64", lambda: _precisions(subject, "float32 against float64", other)
+        yield name, partial(_check_beyond, name, objective, beyond)
+    yield "float32 against float64", lambda: _check_precisions(subject, "float32 against float64", other)
     for variant in variants:
-        yield variant.name, partial(_variant, subject, variant)
-    yield "energy drift", lambda: _energy(subject, "energy drift")
+        yield variant.name, partial(_check_variant, subject, variant)
+    yield "energy drift", lambda: _check_energy(subject, "energy drift")
 
 
 def corners(dim: int) -> Float[Tensor, "corner dim"]:
@@ -71,7 +71,7 @@ def corners(dim: int) -> Float[Tensor, "corner dim"]:
     return found
 
 
-def answers(found: Evaluation) -> tuple[dict[str, float | None], str]:
+def count_endings(found: Evaluation) -> tuple[dict[str, float | None], str]:
     """Count how rows ended, and say what is wrong with them: loss and gradient are finite exactly where OK."""
     status = found.status
     counts: dict[str, float | None] = {kind: float((status == code).sum()) for kind, code in KINDS.items()}
@@ -88,14 +88,14 @@ def answers(found: Evaluation) -> tuple[dict[str, float | None], str]:
     return counts, "; ".join(what for what, so in wrong.items() if so)
 
 
-def said(counts: Mapping[str, float | None]) -> str:
+def describe_counts(counts: Mapping[str, float | None]) -> str:
     """Say in a line how rows ended."""
     ends = ", ".join(f"{counts[kind]:.0f} {kind}" for kind in KINDS if counts[kind])
     largest = counts.get("largest_gradient")
     return ends + ("" if largest is None else f"; largest |grad| {largest:.1e}")
 
 
-def _at(
+def _check_at(
     name: str, objective: Objective, x: Float[Tensor, "batch dim"], what: str = "", *, may_refuse: bool = False
 ) -> Finding:
     try:
@@ -104,22 +104,22 @@ def _at(
         if not may_refuse:
             raise
         return verdict(name, True, f"refused: {' '.join(str(refusal).split())}")
-    return _judged(name, found, what)
+    return _judge(name, found, what)
 
 
-def _beyond(name: str, objective: Objective, x: Float[Tensor, "batch dim"]) -> Finding:
+def _check_beyond(name: str, objective: Objective, x: Float[Tensor, "batch dim"]) -> Finding:
     if not getattr(objective, "beyond_box", False):
         return Finding(name, SKIP, "not asked", "it does not invite points beyond its box (beyond_box = True does)")
-    return _at(name, objective, x, may_refuse=True)
+    return _check_at(name, objective, x, may_refuse=True)
 
 
-def _judged(name: str, found: Evaluation, what: str = "") -> Finding:
-    counts, wrong = answers(found)
-    figure = f"{what}: {said(counts)}" if what else said(counts)
+def _judge(name: str, found: Evaluation, what: str = "") -> Finding:
+    counts, wrong = count_endings(found)
+    figure = f"{what}: {describe_counts(counts)}" if what else describe_counts(counts)
     return replace(verdict(name, not wrong, figure, wrong), numbers=counts)
 
 
-def _variant(subject: Subject, variant: Variant) -> Finding:
+def _check_variant(subject: Subject, variant: Variant) -> Finding:
     if variant.make is None:
         return Finding(variant.name, SKIP, "n/a", variant.why)
     try:
@@ -127,14 +127,14 @@ def _variant(subject: Subject, variant: Variant) -> Finding:
     except ValueError as refusal:
         return verdict(variant.name, True, f"refused: {' '.join(str(refusal).split())}")
     if objective is subject.objective and variant.x is None:
-        found = _judged(variant.name, subject.rows(torch.arange(ROWS)))
+        found = _judge(variant.name, subject.rows(torch.arange(ROWS)))
     else:
-        found = _at(variant.name, objective, subject.x[:ROWS] if variant.x is None else variant.x)
+        found = _check_at(variant.name, objective, subject.x[:ROWS] if variant.x is None else variant.x)
     return replace(found, why="; ".join(filter(None, (found.why, variant.why))))
 
 
-def _energy(subject: Subject, name: str) -> Finding:
-    """Want the energy of motions that nothing drives to stay or to fall, where the objective offers it.
+def _check_energy(subject: Subject, name: str) -> Finding:
+    """Check that the energy of undriven motions does not rise, where the objective offers `energy`.
 
     `energy(x)` returns it over time, shape (batch, step), counted from rest at the lowest place, or None.
     """
@@ -150,7 +150,7 @@ def _energy(subject: Subject, name: str) -> Finding:
     return replace(judged, numbers={"rise": rise, "left": left, "limit": RISE})
 
 
-def _precisions(subject: Subject, name: str, other: Callable[[], Subject] | None) -> Finding:
+def _check_precisions(subject: Subject, name: str, other: Callable[[], Subject] | None) -> Finding:
     """Hold an objective against itself in the other precision: gradients agree as a third of float32's digits."""
     if other is None:
         return Finding(name, SKIP, "n/a", f"it computes in {subject.precision} only")

@@ -1,4 +1,4 @@
-"""What a check of an objective found."""
+"""The result of one check of an objective."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class Finding:
         """Whether this makes the whole fail."""
         return self.outcome in (FAIL, UNEXPECTED)
 
-    def against(self, expected: Mapping[str, str]) -> Finding:
-        """Return the finding judged by the failures that are `expected`, check -> reason."""
+    def excuse(self, expected: Mapping[str, str]) -> Finding:
+        """Return the finding with an expected failure excused; `expected` maps names of checks to reasons."""
         if self.check not in expected or self.outcome == SKIP:
             return self
         reason = expected[self.check]

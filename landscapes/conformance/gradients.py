@@ -1,4 +1,4 @@
-"""Whether a gradient is that of the loss: against differences on a ladder of steps, by gradcheck, and twice."""
+"""Checks of gradients: against central differences over several steps, by gradcheck, and by two backward passes."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.gradcheck import GradcheckError
 
-from ..objective import Objective, Status, evaluated
+from ..objective import Objective, Status, evaluate
 from .finding import SKIP, Finding, verdict
 from .subject import Subject, difference, size
 
-LADDER = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)  # steps, as shares of the box
-FINER = (1e-8, 1e-7)  # in float64, where no other agrees: a loss that jumps often needs a step between its jumps
-STEPS = (1e-6, 1e-7, 1e-8, 1e-9, 1e-10)  # of gradcheck, which has to agree at every point at once
-RANDOM, AXES = 2, 1  # directions at each point
-SLOPES = RANDOM + AXES
+DIFFERENCE_STEPS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)  # steps, as shares of the box
+FINER_STEPS = (1e-8, 1e-7)  # in float64, where no other agrees: a loss that jumps often needs a step between its jumps
+GRADCHECK_STEPS = (1e-6, 1e-7, 1e-8, 1e-9, 1e-10)  # of gradcheck, which has to agree at every point at once
+ALONG_RANDOM, ALONG_AXES = 2, 1  # directions at each point
+SLOPES = ALONG_RANDOM + ALONG_AXES
 SIGNS = 0.75  # share of slopes whose sign has to agree
 CLEAR = 10  # times the noise is what a slope has to be, to be compared
-ENOUGH = 0.25  # share of slopes to compare for a step to be judged by
+LEAST_SHARE = 0.25  # share of slopes to compare for a step to be judged by
 Function = Callable[[Tensor], Tensor]
 Row = dict[str, float | None]
 
 
-def ladder(subject: Subject, name: str) -> Finding:
-    """Hold slopes along random directions and axes against central differences, one row of the table for each step.
+def check_slopes(subject: Subject, name: str) -> Finding:
+    """Compare slopes along random directions and axes with central differences, one row of the table for each step.
 
     What passes is the agreement at the best step: a median relative error of at most ten times the third root of the
     precision, where central differences are exact to its two thirds. A slope that its loss's noise hides is left out.
@@ -42,9 +42,9 @@ def ladder(subject: Subject, name: str) -> Finding:
     slopes = here.grad * (space.upper - space.lower)
     exact = (slopes.repeat_interleave(SLOPES, dim=0) * direction).sum(dim=1)
     limit = 10 * subject.eps ** (1 / 3)
-    table = [_step(subject, base, direction, exact, step) for step in LADDER]
+    table = [_step(subject, base, direction, exact, step) for step in DIFFERENCE_STEPS]
     if subject.precision == "float64" and _best(table, limit, len(base))[1] is False:
-        table = [_step(subject, base, direction, exact, step) for step in FINER] + table
+        table = [_step(subject, base, direction, exact, step) for step in FINER_STEPS] + table
     best, agrees = _best(table, limit, len(base))
     if best is None:
         return Finding(name, SKIP, "no slope to compare", "all are flat, lost in noise, or failed", table=tuple(table))
@@ -58,7 +58,7 @@ def ladder(subject: Subject, name: str) -> Finding:
 
 def _best(table: Sequence[Row], limit: float, slopes: int) -> tuple[Row | None, bool]:
     """Return the row that agrees best among those that see enough slopes, if any, and whether that is enough."""
-    judged = [row for row in table if (row["compared"] or 0) >= ENOUGH * slopes]
+    judged = [row for row in table if (row["compared"] or 0) >= LEAST_SHARE * slopes]
     agreeing = [row for row in judged if _number(row["error"]) <= limit and _number(row["sign"]) >= SIGNS]
     best = min(agreeing or judged, key=lambda row: _number(row["error"]), default=None)
     return best, bool(agreeing)
@@ -75,7 +75,7 @@ def _slopes(points: Float[Tensor, "batch dim"], seed: int) -> tuple[Tensor, Tens
     base = points.repeat_interleave(SLOPES, dim=0)
     direction = torch.randn(base.shape, generator=generator, dtype=torch.float64)
     direction = direction / direction.norm(dim=1, keepdim=True)
-    rows = torch.arange(len(base)).view(count, -1)[:, RANDOM:].flatten()
+    rows = torch.arange(len(base)).view(count, -1)[:, ALONG_RANDOM:].flatten()
     axes = torch.randperm(dim, generator=generator).repeat(-(-len(rows) // dim))[: len(rows)]
     direction[rows] = torch.eye(dim, dtype=torch.float64)[axes]
     return base, direction
@@ -87,7 +87,7 @@ def _step(subject: Subject, base: Tensor, direction: Tensor, exact: Tensor, step
     What the noise between repeats explains of a difference is no error.
     """
     ends = torch.cat([base + step * direction, base - step * direction])
-    loss = evaluated(subject.objective, subject.objective.space.from_unit(ends), grad=False).loss
+    loss = evaluate(subject.objective, subject.objective.space.from_unit(ends), grad=False).loss
     ahead, behind = loss.chunk(2)
     slope = (ahead - behind) / (2 * step)
     noise = subject.noise[0] * subject.scale / step
@@ -115,10 +115,10 @@ def gradcheck(double: Subject, name: str) -> Finding:
     rows = (double.first.status == Status.OK).nonzero().flatten()[:2]
     if not len(rows):
         return Finding(name, SKIP, "not checked", "no point has a loss")
-    room = 2 * STEPS[0]  # so that the longest step stays within the box
+    room = 2 * GRADCHECK_STEPS[0]  # so that the longest step stays within the box
     function, u = _unit(double), double.objective.space.to_unit(double.x[rows]).clamp(room, 1 - room)
     said = ""
-    for step in STEPS:
+    for step in GRADCHECK_STEPS:
         agreement: dict[str, Any] = {"eps": step, "atol": 1e-4, "rtol": 1e-3, "nondet_tol": torch.inf}
         try:
             torch.autograd.gradcheck(function, (u.clone().requires_grad_(),), fast_mode=True, **agreement)
@@ -126,7 +126,9 @@ def gradcheck(double: Subject, name: str) -> Finding:
             said = said or " ".join(str(error).split())[:160]
         else:
             return verdict(name, True, f"agrees at {len(rows)} points in float64 over {step:.0e} of the box")
-    return verdict(name, False, f"disagrees over {', '.join(f'{step:.0e}' for step in STEPS)} of the box", said)
+    return verdict(
+        name, False, f"disagrees over {', '.join(f'{step:.0e}' for step in GRADCHECK_STEPS)} of the box", said
+    )
 
 
 def second_backward(subject: Subject, name: str) -> Finding:
@@ -158,12 +160,12 @@ class _Bridge(torch.autograd.Function):
         ctx.objective = objective
         ctx.save_for_backward(x)
         with torch.enable_grad():  # torch switches it off around `forward` and `backward`
-            return evaluated(objective, x.detach(), grad=False).loss
+            return evaluate(objective, x.detach(), grad=False).loss
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_loss: Float[Tensor, " batch"]) -> tuple[Tensor, None]:
         (x,) = ctx.saved_tensors
         with torch.enable_grad():
-            grad = evaluated(ctx.objective, x.detach(), grad=True).grad
+            grad = evaluate(ctx.objective, x.detach(), grad=True).grad
         return grad_loss[:, None] * (x.new_zeros(x.shape) if grad is None else grad), None

@@ -1,4 +1,4 @@
-"""What the checks of an objective share: its points, their evaluation, and the noise between repeats."""
+"""The subject of a conformance check: an objective, its evaluation at some points, and the noise between repeats."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..objective import Evaluation, Objective, evaluated
+from ..objective import Evaluation, Objective, evaluate
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,9 +32,9 @@ class Subject:
         cls, objective: Objective, x: Float[Tensor, "batch dim"], *, precision: str, seed: int, repeats: int
     ) -> Subject:
         """Evaluate the points as often as `repeats` says."""
-        first = evaluated(objective, x, grad=True)
+        first = evaluate(objective, x, grad=True)
         still = cls(objective, x, first, precision, seed)
-        again = [still.apart(evaluated(objective, x, grad=True), first) for _ in range(repeats - 1)]
+        again = [still.differences(evaluate(objective, x, grad=True), first) for _ in range(repeats - 1)]
         losses, grads = zip(*again, strict=True)
         return cls(objective, x, first, precision, seed, (max(losses), max(grads)))
 
@@ -70,14 +70,13 @@ class Subject:
 
     def evaluate(self, x: Float[Tensor, "batch dim"]) -> Evaluation:
         """Return losses and gradients at other points, held against the protocol."""
-        return evaluated(self.objective, x, grad=True)
+        return evaluate(self.objective, x, grad=True)
 
     def rows(self, rows: Int[Tensor, " some"]) -> Evaluation:
         """Return the evaluation of some of the points."""
-        grad = None if self.first.grad is None else self.first.grad[rows]
-        return Evaluation(self.first.loss[rows], grad, self.first.status[rows])
+        return self.first.rows(rows)
 
-    def apart(self, found: Evaluation, wanted: Evaluation) -> tuple[float, float]:
+    def differences(self, found: Evaluation, wanted: Evaluation) -> tuple[float, float]:
         """Return the largest differences between losses and between gradients, as shares."""
         if not torch.equal(found.status, wanted.status):
             return torch.inf, torch.inf
@@ -86,9 +85,9 @@ class Subject:
             return loss, 0.0
         return loss, difference(found.grad, wanted.grad) / self.steepness
 
-    def same(self, found: Evaluation, wanted: Evaluation) -> bool:
+    def agree(self, found: Evaluation, wanted: Evaluation) -> bool:
         """Say whether two evaluations agree within what is tolerated."""
-        return all(gap <= limit for gap, limit in zip(self.apart(found, wanted), self.tolerances, strict=True))
+        return all(gap <= limit for gap, limit in zip(self.differences(found, wanted), self.tolerances, strict=True))
 
 
 def difference(a: Tensor, b: Tensor) -> float:

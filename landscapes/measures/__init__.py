@@ -1,1 +1,1 @@
-"""What is measured of a landscape: ruggedness, noise, discontinuities, gradients, sensitivity, fidelity."""
+"""Measures of a landscape: ruggedness, noise, discontinuities, gradients, sensitivity, fidelity."""

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..statistics import Values, plain
+from ..plain import finite
+from ..statistics import Values
 from .discontinuities import Jumps
 from .records import WordRecord
 from .ruggedness import Ruggedness
@@ -90,10 +91,10 @@ def _gradients(found: Ruggedness, cosine: Values) -> dict[str, str]:
 def thresholds() -> dict[str, float | None]:
     """Return the thresholds by name, to be stated with results."""
     return {
-        "few turns": plain(FEW_TURNS),
-        "many turns": plain(MANY_TURNS),
-        "few minima": plain(FEW_MINIMA),
-        "large share": plain(MUCH),
-        "good cosine": plain(AGREE),
-        "often uphill": plain(OFTEN),
+        "few turns": finite(FEW_TURNS),
+        "many turns": finite(MANY_TURNS),
+        "few minima": finite(FEW_MINIMA),
+        "large share": finite(MUCH),
+        "good cosine": finite(AGREE),
+        "often uphill": finite(OFTEN),
     }

@@ -1,4 +1,4 @@
-"""Where a loss jumps: neighbouring samples that differ however close one looks."""
+"""Discontinuities of a loss: differences between neighbouring samples that do not vanish on a finer look."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..objective import Objective, evaluated
+from ..identity import plane_of
+from ..objective import Objective, evaluate
+from ..plain import finite
 from ..plane import Plane
-from ..statistics import Estimate, plain, share
-from ..storage.store import plane_of
+from ..statistics import Estimate, share
 from .records import JumpRecord, JumpsRecord
 
 HALVINGS = 12  # a gap between samples is looked into down to 1/4096 of it
@@ -55,7 +56,7 @@ class Jumps:
         return Estimate(found.value * part, found.low * part, found.high * part)
 
     @property
-    def explained(self) -> Estimate | None:
+    def share_explained(self) -> Estimate | None:
         """Share of the jumps across which an event is counted differently."""
         return None if self.counted is None else share(int(self.counted.sum()), len(self.counted))
 
@@ -67,8 +68,8 @@ class Jumps:
         found: list[JumpRecord] = [{"place": place, "height": height, "event": event} for place, height, event in rows]
         return {
             "share": self.share.record(),
-            "explained_by_events": self.explained.record() if self.explained else None,
-            "least": plain(self.least),
+            "explained_by_events": self.share_explained.record() if self.share_explained else None,
+            "least": finite(self.least),
             "neighbours": self.neighbours,
             "steep": self.steep,
             "checked": self.checked,
@@ -92,10 +93,10 @@ def find_jumps(
     jump keeps its height, a slope loses half of it every time.
     """
     plane = plane_of(dataset)
-    ends, neighbours = _steep(dataset, plane, least)
+    ends, neighbours = _steep_pairs(dataset, plane, least)
     drawn = np.sort(np.random.default_rng(seed).permutation(len(ends))[:most])
     low, high = (torch.from_numpy(ends[drawn][:, side]) for side in (0, 1))
-    low, high, gaps = _bisected(objective, plane, low, high)
+    low, high, gaps = _bisect(objective, plane, low, high)
     decided = gaps.isfinite().all(dim=0)
     last, earlier = gaps[-1], gaps[-1 - PERSISTS]
     found = decided & (last >= least) & (last > earlier / 2)
@@ -106,7 +107,7 @@ def find_jumps(
     )  # fmt: skip
 
 
-def _steep(dataset: xr.Dataset, plane: Plane, least: float) -> tuple[NDArray[np.float64], int]:
+def _steep_pairs(dataset: xr.Dataset, plane: Plane, least: float) -> tuple[NDArray[np.float64], int]:
     """Return the ends of pairs that differ so much, shape (pairs, 2, rank), and how many pairs there are."""
     loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
     axes = [axis.numpy() for axis in plane.axes()]
@@ -121,13 +122,13 @@ def _steep(dataset: xr.Dataset, plane: Plane, least: float) -> tuple[NDArray[np.
     return np.concatenate(pairs), neighbours
 
 
-def _bisected(
+def _bisect(
     objective: Objective, plane: Plane, low: Float[Tensor, "pairs rank"], high: Float[Tensor, "pairs rank"]
 ) -> tuple[Tensor, Tensor, Float[Tensor, "halvings pairs"]]:
     """Halve every pair towards the larger difference; return its last ends and the difference after each halving."""
 
     def losses(u: Float[Tensor, "pairs rank"]) -> Float[Tensor, " pairs"]:
-        return evaluated(objective, plane.lift(u), grad=False).loss
+        return evaluate(objective, plane.lift(u), grad=False).loss
 
     below, above = losses(low), losses(high)  # anew: a slice may come from another device
     gaps = [(above - below).abs()]

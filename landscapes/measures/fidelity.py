@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from scipy.stats import linregress, rankdata
 from torch import Tensor
 
-from ..objective import Objective, Status, evaluated
+from ..objective import Evaluation, Objective, Status, evaluate
+from ..plain import finite
 from ..space import ParameterSpace
-from ..statistics import LEVEL
-from ..storage.records import maybe, number
+from ..statistics import CONFIDENCE
+from ..storage.records import number, optional
 
 REPETITION = 4.0  # least seconds that repetitions of a quick batch take, each way
 LARGEST = 60.0  # most seconds that a batch larger than the study's points may take
@@ -70,13 +71,13 @@ class Bootstrap:
         rows = np.random.default_rng(seed).integers(samples[0].size, size=(RESAMPLES, samples[0].size))
         again = statistic(*(sample[rows] for sample in samples))
         again = np.append(again[~np.isnan(again)], np.inf if np.isnan(again).all() else [])
-        ends = np.quantile(again, ((1 - LEVEL) / 2, (1 + LEVEL) / 2), method="nearest")
-        return cls(*(_finite(float(value)) for value in (statistic(*samples), *ends)))
+        ends = np.quantile(again, ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2), method="nearest")
+        return cls(*(finite(float(value)) for value in (statistic(*samples), *ends)))
 
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> Bootstrap:
         """Read it from plain JSON."""
-        return cls(*(maybe(number, record[end]) for end in ("value", "low", "high")))
+        return cls(*(optional(number, record[end]) for end in ("value", "low", "high")))
 
     def share(self, whole: float | None) -> Bootstrap:
         """Return it as a share of a whole, None where there is none."""
@@ -100,13 +101,13 @@ def measure(
     full = min(at_once, len(x))
     getattr(objective, "prepare", lambda: None)()
     began = time.perf_counter()
-    evaluated(objective, x[:1], grad=True)  # what is made at first use is made now, a batch's threads too if quick
+    evaluate(objective, x[:1], grad=True)  # what is made at first use is made now, a batch's threads too if quick
     if (time.perf_counter() - began) * full < REPETITION:
-        evaluated(objective, x[:full], grad=True)
+        evaluate(objective, x[:full], grad=True)
     parts, seconds, done = [], [], 0
     for part in torch.split(x, at_once):
         began = time.perf_counter()
-        parts.append(evaluated(objective, part, grad=True))
+        parts.append(evaluate(objective, part, grad=True))
         seconds.append(time.perf_counter() - began)
         follow(done := done + len(part))
     batch = _filled(objective, x, full, at_once, seconds[0])
@@ -114,9 +115,9 @@ def measure(
     forward = _best(objective, batch, grad=False, known=np.inf)
     with_gradient = _best(objective, batch, grad=True, known=taken)
     widths = objective.space.upper - objective.space.lower
-    grad = torch.cat([cast("Tensor", part.grad) for part in parts]) * widths
-    loss, status = (torch.cat([getattr(part, name) for part in parts]).numpy() for name in ("loss", "status"))
-    return Sample(loss, grad.numpy(), status, forward, with_gradient, len(batch))
+    whole = Evaluation.join(parts, dim=objective.space.dim, grad=True)
+    grad = cast("Tensor", whole.grad) * widths
+    return Sample(whole.loss.numpy(), grad.numpy(), whole.status.numpy(), forward, with_gradient, len(batch))
 
 
 def _filled(objective: Objective, x: Tensor, rows: int, at_once: int, took: float) -> Float[Tensor, "batch dim"]:
@@ -189,7 +190,7 @@ class Comparison:
             LossError(**{name: Bootstrap.of_record(error[name]) for name in LossError.__dataclass_fields__}),
             Bootstrap.of_record(record["spearman"]),
             GradientError(**{name: Bootstrap.of_record(gradient[name]) for name in GradientError.__dataclass_fields__}),
-            maybe(number, record["diverged"]),
+            optional(number, record["diverged"]),
             record["compared"],
             Seconds(number(record["seconds"]["forward"]), number(record["seconds"]["with_gradient"])),
             record["batch"],
@@ -251,9 +252,9 @@ def spearman(a: Array, b: Array) -> Array:
 
 def pareto_front(seconds: Sequence[float], error: Sequence[float]) -> list[int]:
     """Return the numbers of those that no other beats in both, by time; one that is not finite is beaten."""
-    finite = [k for k in range(len(seconds)) if np.isfinite(seconds[k]) and np.isfinite(error[k])]
+    known = [k for k in range(len(seconds)) if np.isfinite(seconds[k]) and np.isfinite(error[k])]
     best, kept = np.inf, []
-    for k in sorted(finite, key=lambda k: (seconds[k], error[k])):
+    for k in sorted(known, key=lambda k: (seconds[k], error[k])):
         if error[k] < best:
             best = error[k]
             kept.append(k)
@@ -301,7 +302,3 @@ def _median(values: Array) -> Array:
 
 def _p95(values: Array) -> Array:
     return np.asarray(np.quantile(values, 0.95, axis=-1, method="higher"))
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None

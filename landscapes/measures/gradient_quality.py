@@ -1,4 +1,4 @@
-"""How good gradients are, and at what scale: against finite differences, and first order against zeroth order.
+"""Gradient quality by scale: against finite differences, and first order against zeroth order.
 
 Slopes are taken along the plane's axes, per side of its box, as a picture shows them; scales and widths are fractions
 of the box.
@@ -16,10 +16,11 @@ from jaxtyping import Float
 from scipy import stats
 from torch import Tensor
 
-from ..objective import Objective, evaluated
+from ..identity import plane_of
+from ..objective import Objective, evaluate
+from ..plain import finite
 from ..plane import Plane
-from ..statistics import Values, mean, plain, share
-from ..storage.store import plane_of
+from ..statistics import Values, mean, share
 from .records import ScaleRecord, WidthRecord
 from .ruggedness import box_slopes
 
@@ -27,7 +28,7 @@ SCALES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 STRIDES = (1, 2, 4)  # of the slice's own samples
 WIDTHS = (0.01, 0.03)
 CHANCE = 0.001  # a bias is beyond chance where Student's test says that chance alone would show it this rarely,
-SMALL = 0.1  # and worth a word where first and zeroth order disagree by more than this
+NOTABLE_BIAS = 0.1  # and worth a word where first and zeroth order disagree by more than this
 
 
 def subgrid(plane: Plane, points: int) -> Float[Tensor, "count rank"]:
@@ -37,7 +38,7 @@ def subgrid(plane: Plane, points: int) -> Float[Tensor, "count rank"]:
     return plane.lower + grid * (plane.upper - plane.lower)
 
 
-def ladder(
+def compare_differences(
     objective: Objective,
     plane: Plane,
     u: Float[Tensor, "count rank"],
@@ -50,32 +51,32 @@ def ladder(
     Returns `cosine`, `sign` and `error`, dims (scale, point), as in `agreement`, and `place`, dims (point, axis).
     """
     sides = plane.upper - plane.lower
-    exact = evaluated(objective, plane.lift(u), grad=True)
+    exact = evaluate(objective, plane.lift(u), grad=True)
     assert exact.grad is not None  # as it was asked for
     slope = plane.slope(exact.grad) * sides
     steps = torch.eye(plane.rank, dtype=torch.float64) * sides
     parts = []
     for scale in scales:
         ends = torch.stack([u[:, None] + way * scale / 2 * steps for way in (-1, 1)])
-        loss = evaluated(objective, plane.lift(ends.reshape(-1, plane.rank)), grad=False).loss
+        loss = evaluate(objective, plane.lift(ends.reshape(-1, plane.rank)), grad=False).loss
         below, above = loss.reshape(2, len(u), plane.rank)
         parts.append(agreement(slope.numpy(), ((above - below) / scale).numpy(), math.sqrt(2) * deviation / scale))
     found = {name: (("scale", "point"), np.stack([part[name] for part in parts])) for name in parts[0]}
     return xr.Dataset(found, {"scale": list(scales), "place": (("point", "axis"), u.numpy())})
 
 
-def of_samples(dataset: xr.Dataset, *, deviation: float = 0.0) -> xr.Dataset:
+def compare_samples(dataset: xr.Dataset, *, deviation: float = 0.0) -> xr.Dataset:
     """Hold a slice's gradients against differences of its own losses, over 2, 4 and 8 of its steps: no evaluation.
 
-    Returns what `ladder` does, dims (scale, v, u); scales are by the longer axis's samples. Samples too close to the
-    border for a central difference have none.
+    Returns what `compare_differences` does, dims (scale, v, u); scales are by the longer axis's samples. Samples too
+    close to the border for a central difference have none.
     """
     plane = plane_of(dataset)
     loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
     strides = [stride for stride in STRIDES if 2 * stride < min(loss.shape)]
     parts = []
     for stride in strides:
-        axes = [_central(loss, axis, stride) for axis in range(loss.ndim)][::-1]  # u first
+        axes = [_central_differences(loss, axis, stride) for axis in range(loss.ndim)][::-1]  # u first
         widths = np.array([2 * stride / (size - 1) for size in plane.resolution])
         fuzz = math.sqrt(2) * deviation / widths.min()
         parts.append(agreement(box_slopes(dataset), np.stack(axes, axis=-1), fuzz))
@@ -116,7 +117,7 @@ def scale_table(found: xr.Dataset) -> list[ScaleRecord]:
                 "cosine": mean(cosine[seen], least=-1, most=1).record(),
                 "sign": mean(sign[seen], least=0, most=1).record(),
                 "uphill": share(int((cosine[seen] < 0).sum()), int(seen.sum())).record(),
-                "error": plain(float(np.median(error[seen]))) if seen.any() else None,
+                "error": finite(float(np.median(error[seen]))) if seen.any() else None,
             }
         )
     return rows
@@ -149,22 +150,24 @@ def smoothed_slopes(
     for width in widths:
         w = torch.randn(len(u), pairs, plane.rank, generator=generator, dtype=torch.float64)
         ends = u[:, None] + torch.stack([w, -w]) * width * sides
-        found = evaluated(objective, plane.lift(ends.reshape(-1, plane.rank)), grad=True)
+        found = evaluate(objective, plane.lift(ends.reshape(-1, plane.rank)), grad=True)
         assert found.grad is not None  # as it was asked for
         slopes = (plane.slope(found.grad) * sides).reshape(2, len(u), pairs, plane.rank)
         above, below = found.loss.reshape(2, len(u), pairs)
-        parts.append(_orders(slopes.mean(dim=0), (above - below) / (2 * width), w))
+        parts.append(_compare_orders(slopes.mean(dim=0), (above - below) / (2 * width), w))
     dims = ("width", "point", "axis")
     stacked = {name: np.stack([part[name] for part in parts]) for name in parts[0]}
     shaped = {name: (dims[: values.ndim], values) for name, values in stacked.items()}
     return xr.Dataset(shaped, {"width": list(widths), "place": (("point", "axis"), u.numpy())})
 
 
-def biased(found: xr.Dataset) -> xr.DataArray:
+def find_bias(found: xr.Dataset) -> xr.DataArray:
     """Say at which points first order is biased along an axis, by more than a little and than chance would have it."""
     level = 1 - CHANCE / 2 / found.sizes["axis"]
     sure = xr.apply_ufunc(lambda count: stats.t.ppf(level, np.maximum(count - 1, 1)), found["count"])
-    flags: xr.DataArray = (abs(found["bias"]) > sure * found["bias_error"]).any("axis") & (disagreement(found) > SMALL)
+    flags: xr.DataArray = (abs(found["bias"]) > sure * found["bias_error"]).any("axis") & (
+        disagreement(found) > NOTABLE_BIAS
+    )
     return flags
 
 
@@ -185,7 +188,7 @@ def width_table(found: xr.Dataset) -> list[WidthRecord]:
         first, zeroth = (part[f"{name}_variance"].sum("axis").to_numpy()[known] for name in ("first", "zeroth"))
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = zeroth / first
-        flags = biased(found).sel(width=width).to_numpy()[known]
+        flags = find_bias(found).sel(width=width).to_numpy()[known]
         rows.append(
             {
                 "width": float(width),
@@ -193,13 +196,13 @@ def width_table(found: xr.Dataset) -> list[WidthRecord]:
                 "of": len(known),
                 "biased": share(int(flags.sum()), int(known.sum())).record(),
                 "disagreement": mean(disagreement(found).sel(width=width).to_numpy()[known], least=0, most=1).record(),
-                "variance_ratio": plain(float(np.nanmedian(ratio))) if np.isfinite(ratio).any() else None,
+                "variance_ratio": finite(float(np.nanmedian(ratio))) if np.isfinite(ratio).any() else None,
             }
         )
     return rows
 
 
-def _central(loss: Values, axis: int, stride: int) -> Values:
+def _central_differences(loss: Values, axis: int, stride: int) -> Values:
     """Return central differences over 2 * stride samples [loss unit per side of the box]."""
     size = loss.shape[axis]
     moved = np.moveaxis(loss, axis, 0)
@@ -208,7 +211,7 @@ def _central(loss: Values, axis: int, stride: int) -> Values:
     return np.moveaxis(difference, 0, axis)
 
 
-def _orders(
+def _compare_orders(
     first: Float[Tensor, "point pair axis"], half: Float[Tensor, "point pair"], w: Float[Tensor, "point pair axis"]
 ) -> dict[str, Values]:
     """Return means, errors and variances over the pairs that succeed; NaN with too few to fit a line without one."""
@@ -221,7 +224,7 @@ def _orders(
         spread = torch.where(seen, values - total[:, None], 0.0).square().sum(dim=1) / (count - 1)
         return torch.where(enough, total, torch.nan), torch.where(enough, spread, torch.nan)
 
-    steady = _steadied(torch.where(known, half, 0.0), torch.where(seen, w, 0.0))
+    steady = _reduce_variance(torch.where(known, half, 0.0), torch.where(seen, w, 0.0))
     values = {"first": first, "zeroth": steady, "bias": first - steady}
     found = {"count": count[:, 0], "zeroth_variance": moments(half[..., None] * w)[1]}
     for name, sample in values.items():
@@ -232,7 +235,7 @@ def _orders(
     return {name: part.numpy() for name, part in found.items()}
 
 
-def _steadied(half: Float[Tensor, "point pair"], w: Float[Tensor, "point pair axis"]) -> Tensor:
+def _reduce_variance(half: Float[Tensor, "point pair"], w: Float[Tensor, "point pair axis"]) -> Tensor:
     """Return each pair's zeroth-order sample with the fit of the others as its control variate."""
     gram, moment = w[..., :, None] * w[..., None, :], w * half[..., None]
     gram, moment = (part.sum(dim=1, keepdim=True) - part for part in (gram, moment))

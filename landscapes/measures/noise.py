@@ -1,4 +1,4 @@
-"""What noise alone does to a loss: a difference below it is no feature."""
+"""The noise of a loss, below which a difference is no feature of the landscape."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..objective import Objective, evaluated
-from ..statistics import plain
+from ..objective import Objective, evaluate
+from ..plain import finite
 from .records import NoiseRecord
 
 
@@ -35,10 +35,10 @@ class Noise:
     def record(self) -> NoiseRecord:
         """Return it as plain JSON."""
         return {
-            "again": plain(self.again),
-            "batch": plain(self.batch),
-            "rounding": plain(self.rounding),
-            "points": plain(self.points),
+            "again": finite(self.again),
+            "batch": finite(self.batch),
+            "rounding": finite(self.rounding),
+            "points": finite(self.points),
         }
 
     def floor(self, samples: int) -> float:
@@ -57,15 +57,15 @@ def noise(
     Root mean squares over points that succeed. `rounding` draws are uniform, as fractions of the parameters' ranges.
     """
     generator = torch.Generator().manual_seed(seed)
-    first = evaluated(objective, x, grad=False).loss
-    again = torch.stack([evaluated(objective, x, grad=False).loss for _ in range(repeats)])
+    first = evaluate(objective, x, grad=False).loss
+    again = torch.stack([evaluate(objective, x, grad=False).loss for _ in range(repeats)])
     order = torch.randperm(len(x), generator=generator)
     shuffled = torch.full_like(first, torch.nan)
     for part in torch.split(order, max(1, len(x) // 3)):
-        shuffled[part] = evaluated(objective, x[part], grad=False).loss
+        shuffled[part] = evaluate(objective, x[part], grad=False).loss
     reach = rounding * (objective.space.upper - objective.space.lower)
     moves = 2 * torch.rand(repeats, *x.shape, generator=generator, dtype=torch.float64) - 1
-    moved = torch.stack([evaluated(objective, x + move * reach, grad=False).loss for move in moves])
+    moved = torch.stack([evaluate(objective, x + move * reach, grad=False).loss for move in moves])
     return Noise(_deviation(first, again), _deviation(first, shuffled[None]), _deviation(first, moved), len(x))
 
 

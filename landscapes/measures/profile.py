@@ -12,9 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..capacity import Need
-from ..objective import Evaluation, Objective, evaluated, in_box, name_of
+from ..identity import plane_of
+from ..objective import Evaluation, Objective, evaluate, in_box, name_of
 from ..statistics import EstimateRecord
-from ..storage.store import plane_of
 from . import gradient_quality as gradients
 from .classify import Verdict, classify, thresholds
 from .discontinuities import Count, Jumps, find_jumps
@@ -110,9 +110,9 @@ def measure_profile(
     least = max(floor, float(np.nan_to_num(found.range)) / (max(plane.resolution) - 1) / 2)
     jumps = find_jumps(objective, dataset, least=least, most=PAIRS_PER_POINT * points, seed=seed, events=events)
     deviation = float(np.nan_to_num(fuzz.deviation))
-    steps = gradients.ladder(objective, plane, places, deviation=deviation)
+    steps = gradients.compare_differences(objective, plane, places, deviation=deviation)
     smooth = gradients.smoothed_slopes(objective, plane, places, pairs=PAIRS, seed=seed)
-    samples = gradients.of_samples(dataset, deviation=deviation)
+    samples = gradients.compare_samples(dataset, deviation=deviation)
     cosine = samples["cosine"].isel(scale=0).to_numpy()
     words = classify(found, jumps, cosine)
     return Profile(found, fuzz, jumps, steps, samples, smooth, words, objective.asked, objective.cut)
@@ -131,7 +131,7 @@ class _Within:
         self.asked += len(x)
         if not getattr(self.objective, "beyond_box", False):
             self.cut += int((~in_box(self.space, x)).sum())
-        return evaluated(self.objective, x, grad=grad)
+        return evaluate(self.objective, x, grad=grad)
 
 
 def named_measures(record: ProfileRecord) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""What the losses of a slice are like: minima and basins, flatness, correlation, variation, information.
+"""Ruggedness of the losses of a slice: minima and basins, flatness, correlation, variation, information.
 
 Every measure takes losses, shape (u,) or (v, u), at evenly spaced samples of a box whose sides count as 1, NaN where an
 evaluation failed; what is missing is left out, never filled in.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -18,14 +18,15 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.spatial.distance import pdist
 
-from ..statistics import Estimate, Values, jackknife, plain
-from ..storage.store import plane_of
+from ..identity import plane_of
+from ..plain import finite
+from ..statistics import Estimate, Values, jackknife
 from .records import LossesRecord
 
-FLAT = 1e-3  # a slope is effectively zero that would change the loss by less, as a fraction of its range, over the box
+FLAT_SLOPE = 1e-3  # a slope below it is effectively zero [ranges of the losses per side of the box]
 NOTABLE = 0.01  # the least depth of a notable minimum, as a fraction of the range
 THRESHOLDS = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)  # depths that minima are counted by, as fractions of the range
-BEST = 0.05  # share of the samples that dispersion calls the best
+BEST_SHARE = 0.05  # share of the samples that dispersion calls the best
 PAIRED = 4096  # most samples whose pairs are gone through one by one, 8 million of them
 
 
@@ -79,7 +80,7 @@ def basins(loss: Values, sample: NDArray[np.intp]) -> Values:
     return shares
 
 
-def halved(loss: Values, depth: float) -> tuple[int, int]:
+def minima_of_halves(loss: Values, depth: float) -> tuple[int, int]:
     """Return the fewest and the most minima deeper than `depth` that every second sample would have shown."""
     starts = np.ndindex((2,) * loss.ndim)
     counts = [minima(loss[tuple(slice(at, None, 2) for at in start)]).count(depth) for start in starts]
@@ -92,7 +93,7 @@ def span(loss: Values) -> float:
     return float(known.max() - known.min()) if known.size else math.nan
 
 
-def level(loss: Values, depth: float) -> Values:
+def level_samples(loss: Values, depth: float) -> Values:
     """Return 1 for each sample that no neighbour along an axis differs from by more than `depth`, 0 for others."""
     most = np.zeros_like(loss)
     for axis in range(loss.ndim):
@@ -170,7 +171,7 @@ def dispersion(loss: Values) -> float:
     places, losses = np.argwhere(np.isfinite(loss)), loss[np.isfinite(loss)]
     if len(losses) <= 2:
         return math.nan
-    best = places[np.argsort(losses, kind="stable")[: max(2, round(BEST * len(losses)))]]
+    best = places[np.argsort(losses, kind="stable")[: max(2, round(BEST_SHARE * len(losses)))]]
     return mean_distance(best, loss.shape) / mean_distance(places, loss.shape)
 
 
@@ -201,7 +202,7 @@ def fitness_distance(loss: Values) -> float:
 
 @dataclass(frozen=True)
 class Ruggedness:
-    """Hold what a slice's losses are like; `floor` [loss unit] is the span of what noise alone would do to them.
+    """Hold the measures of a slice's losses; `floor` [loss unit] is the range that noise alone would give them.
 
     `minima` counts those deeper than the floor, `minima_halved` what every second sample shows of them; `curve` counts
     by depths in fractions of the range. `zero` and `flat` are shares of samples whose gradient along the plane is
@@ -231,11 +232,11 @@ class Ruggedness:
 
     def record(self) -> LossesRecord:
         """Return it as plain JSON."""
-        return cast("LossesRecord", {name: _plain(value) for name, value in vars(self).items()})
+        return cast("LossesRecord", {name: finite(value) for name, value in vars(self).items()})
 
 
 def ruggedness(dataset: xr.Dataset, *, floor: float) -> Ruggedness:
-    """Measure a slice's losses, and how much of it is flat."""
+    """Measure the ruggedness of a slice."""
     loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
     found, whole = minima(loss), span(loss)
     notable = found.sample[found.depth > max(floor, NOTABLE * whole)]
@@ -248,14 +249,14 @@ def ruggedness(dataset: xr.Dataset, *, floor: float) -> Ruggedness:
         range=whole,
         floor=floor,
         minima=found.count(floor),
-        minima_halved=halved(loss, floor),
+        minima_halved=minima_of_halves(loss, floor),
         notable=len(notable),
         curve={part: found.count(part * whole) for part in THRESHOLDS},
         largest_basin=float(shares.max()),
         lowest_basin=float(shares[0]),
         zero=None if slopes is None else jackknife(_mean, _below(slopes, 0.0), least=0.0, most=1.0),
-        flat=None if slopes is None else jackknife(_mean, _below(slopes, FLAT * whole), least=0.0, most=1.0),
-        level=jackknife(_mean, level(loss, floor), least=0.0, most=1.0),
+        flat=None if slopes is None else jackknife(_mean, _below(slopes, FLAT_SLOPE * whole), least=0.0, most=1.0),
+        level=jackknife(_mean, level_samples(loss, floor), least=0.0, most=1.0),
         correlation_length=tuple(
             jackknife(lambda part, axis=axis: correlation_length(part, axis), loss, least=0.0, most=1.0)  # type: ignore[misc]
             for axis in axes
@@ -334,11 +335,3 @@ def _entropy(counts: Values) -> float:
 def _sides(shape: tuple[int, ...]) -> NDArray[np.intp]:
     """Return how many steps between samples make each side of the box."""
     return np.array([max(points - 1, 1) for points in shape])
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Estimate):
-        return value.record()
-    if isinstance(value, tuple):
-        return [_plain(part) for part in value]
-    return plain(value) if isinstance(value, float) else value

@@ -13,10 +13,10 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..objective import Objective, Status, evaluated
+from ..objective import Objective, Status, evaluate
+from ..plain import finite
 from ..space import ParameterSpace, sobol
-from ..statistics import plain
-from ..storage.checkpoint import Pieces
+from ..storage.checkpoint import Checkpoint
 
 STEP, LINE = 0.025, 5  # of a short line: distance of its points in widths of the box, how many they are
 MOST, LEAST, AFFORDED = 16, 4, 2000  # base points by default, and the episodes up to which they are the most
@@ -153,7 +153,7 @@ def default_samples(dim: int) -> int:
 
 
 def explore(
-    objective: Objective, design: Design, pieces: Pieces, *, follow: Callable[[int], None] = lambda done: None
+    objective: Objective, design: Design, pieces: Checkpoint, *, follow: Callable[[int], None] = lambda done: None
 ) -> Responses:
     """Evaluate a design, pieces of it at a time; what `pieces` holds already is not evaluated again.
 
@@ -210,7 +210,7 @@ def rank(found: Responses) -> list[Pair]:
     score = sensitivity * (1 + np.nan_to_num(interaction) + rugged_pair + disagreement)
     columns = (sensitivity, interaction, rugged_pair, disagreement)
     return [
-        Pair((int(i[k]), int(j[k])), float(score[k]), *(plain(float(values[k])) for values in columns))
+        Pair((int(i[k]), int(j[k])), float(score[k]), *(finite(float(values[k])) for values in columns))
         for k in np.argsort(-np.nan_to_num(score), kind="stable")
     ]
 
@@ -222,7 +222,7 @@ def _groups(objective: Objective, design: Design) -> list[range]:
     return [range(low, high) for low, high in pairwise(edges)]
 
 
-def _piece(pieces: Pieces, name: str, compute: Callable[[], dict[str, Array]]) -> dict[str, Array]:
+def _piece(pieces: Checkpoint, name: str, compute: Callable[[], dict[str, Array]]) -> dict[str, Array]:
     found = pieces.load(name)
     if found is None:
         found = compute()
@@ -231,7 +231,7 @@ def _piece(pieces: Pieces, name: str, compute: Callable[[], dict[str, Array]]) -
 
 
 def _moved(objective: Objective, design: Design, rows: range) -> dict[str, Array]:
-    start = evaluated(objective, design.starts(rows), grad=True)
+    start = evaluate(objective, design.starts(rows), grad=True)
     widths = design.space.upper - design.space.lower
     grad = start.grad * widths if start.grad is not None else torch.empty(0)
     moved = _losses(objective, design.moved(rows)).reshape(len(rows), design.space.dim, -1)
@@ -244,7 +244,7 @@ def _crossed(objective: Objective, design: Design, rows: range, pairs: list[tupl
 
 def _losses(objective: Objective, x: Float[Tensor, "point dim"]) -> Array:
     at_once = getattr(objective, "preferred_batch", BATCH)
-    parts = [evaluated(objective, part, grad=False) for part in torch.split(x, at_once)]
+    parts = [evaluate(objective, part, grad=False) for part in torch.split(x, at_once)]
     return np.concatenate([part.loss.masked_fill(part.status != Status.OK, torch.nan).numpy() for part in parts])
 
 

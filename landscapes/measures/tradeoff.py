@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..storage.records import maybe, number, read_json, reading, text
+from ..storage.records import number, optional, read_json, reading, text
 from .fidelity import Comparison, ConvergenceOrder, convergence_order, pareto_front
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ class Tradeoff:
             record["points"],
             record["seed"],
             text(record["loss_unit"]),
-            maybe(number, record["spread"]),
+            optional(number, record["spread"]),
             record["reference_failed"],
             tuple(map(MeasuredVariant.of_record, record["rungs"])),
             tuple(RefusedVariant(text(one["name"]), text(one["why"])) for one in record["refused"]),

@@ -1,4 +1,4 @@
-"""Where tiles are filled: in this process, or by an executor's workers, which write them to the store they share.
+"""Tiles are filled in this process, or by an executor's workers, which write them to the store they share.
 
 What travels is small: to a worker how the objective is made, where the store is and which tiles; back which tiles are
 finished and how their points ended. A tile is the same whoever writes it, so a batch may be done twice and harms none.
@@ -24,23 +24,24 @@ import torch
 from numpy.typing import NDArray
 
 from ..identity import StoreError, check_identity
-from ..objective import Evaluation, Objective, Status, name_of
+from ..objective import Objective, Status, name_of
 from ..storage.paths import place_of
 from ..storage.store import SliceStore
 from ..storage.tiles import Tile
-from .memory import Halving, collect
+from .memory import MemoryBound, free_memory
 
 T = TypeVar("T")
-POLL, PATIENCE = 1.0, 60.0  # seconds between looks at the workers, and without any worker before they are given up
+POLL = 1.0  # seconds between looks at the workers
+WITHOUT_WORKERS = 60.0  # seconds without any worker after which they are given up
 LATE = 120.0  # seconds in which what a worker wrote must appear here: NFS remembers for up to 60 what was not there
 
 
 class WorkersLostError(OSError):
-    """Say that an executor's workers, or what directs them, are gone."""
+    """The workers of an executor, or their scheduler, are gone."""
 
 
 @dataclass(frozen=True)
-class Filled:
+class FilledTile:
     """A finished tile: how its points ended, and what to warn of."""
 
     tile: Tile
@@ -56,7 +57,7 @@ class Site:
     there. Without `made` the objective itself is pickled.
     """
 
-    objective: Halving
+    objective: MemoryBound
     store: SliceStore
     made: Callable[[], Objective] | None = None
 
@@ -64,7 +65,7 @@ class Site:
         """Return the site as it is in this process."""
         return self
 
-    def fill(self, tiles: Sequence[Tile]) -> Iterator[Filled]:
+    def fill(self, tiles: Sequence[Tile]) -> Iterator[FilledTile]:
         """Evaluate tiles in one batch, and write them one by one."""
         if not tiles:
             return
@@ -73,11 +74,9 @@ class Site:
         notes = self.objective.take_notes()
         start = 0
         for tile, part in zip(tiles, parts, strict=True):
-            rows = slice(start, start := start + len(part))
-            gradient = None if evaluation.grad is None else evaluation.grad[rows]
-            status = evaluation.status[rows]
-            self.store.write(tile, Evaluation(evaluation.loss[rows], gradient, status))
-            yield Filled(tile, Counter(map(Status, status.tolist())), notes)
+            rows = evaluation.rows(slice(start, start := start + len(part)))
+            self.store.write(tile, rows)
+            yield FilledTile(tile, Counter(map(Status, rows.status.tolist())), notes)
             notes = ()
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -102,20 +101,23 @@ class RemoteSite:
     identity: Mapping[str, Any]
 
     def here(self) -> Site:
-        """Return the site with its objective, made where this process has not made it yet, and its store."""
+        """Return the site with its objective, made where this process has not made it yet, and its store.
+
+        Raises StoreError where this process does not see the store, StoreMismatchError where it is another one.
+        """
         try:
             at = place_of(Path(self.path)).stat()
         except FileNotFoundError:
             raise StoreError(f"a worker finds no {self.path}; workers need a file system that they share") from None
-        store = opened(self.path, at.st_ino, at.st_mtime_ns)
+        store = open_store(self.path, at.st_ino, at.st_mtime_ns)
         check_identity(store.path, wanted=self.identity, found=store.identity)
-        return Site(kept(self.recipe), store)
+        return Site(make_objective(self.recipe), store)
 
-    def fill(self, tiles: Sequence[Tile]) -> Iterator[Filled]:
+    def fill(self, tiles: Sequence[Tile]) -> Iterator[FilledTile]:
         """Do what `Site.fill` does, but for tiles that a worker finished before it died."""
         site = self.here()
         found = {tile: site.store.statuses(tile) for tile in tiles}
-        yield from (Filled(tile, statuses) for tile, statuses in found.items() if statuses)
+        yield from (FilledTile(tile, statuses) for tile, statuses in found.items() if statuses)
         yield from site.fill([tile for tile, statuses in found.items() if not statuses])
 
 
@@ -130,16 +132,16 @@ class _Itself:
 
 
 @lru_cache(maxsize=1)
-def opened(path: str, inode: int, changed: int) -> SliceStore:
+def open_store(path: str, inode: int, changed: int) -> SliceStore:
     """Return an open store, the last one as it is; `inode` and `changed` [ns] tell it from one that replaced it."""
     return SliceStore.open(path)
 
 
-_objectives: dict[bytes, Halving] = {}
+_objectives: dict[bytes, MemoryBound] = {}
 _making = threading.Lock()
 
 
-def kept(recipe: bytes) -> Halving:
+def make_objective(recipe: bytes) -> MemoryBound:
     """Return the objective that a pickled function makes, once in this process; only the last one is kept.
 
     It may hold all of a GPU's memory.
@@ -147,8 +149,8 @@ def kept(recipe: bytes) -> Halving:
     with _making:
         if recipe not in _objectives:
             _objectives.clear()
-            collect()
-            _objectives[recipe] = Halving(pickle.loads(recipe)())
+            free_memory()
+            _objectives[recipe] = MemoryBound(pickle.loads(recipe)())
         return _objectives[recipe]
 
 
@@ -178,7 +180,7 @@ class ReadBack:
 
     def look(self, tile: Tile) -> None:
         """Read a tile if it is to be seen already: a file system that machines share may show it later."""
-        values = self._store.finished(tile)
+        values = self._store.read_tile(tile)
         if values is None:
             self._late.append(tile)
         else:
@@ -209,17 +211,20 @@ def workers_of(executor: Executor) -> int:
     return int(getattr(executor, "_max_workers", 1))
 
 
-def spread(site: Site, groups: Sequence[Sequence[Tile]], executor: Executor) -> Iterator[Filled]:
+def distribute(site: Site, groups: Sequence[Sequence[Tile]], executor: Executor) -> Iterator[FilledTile]:
     """Let an executor's workers fill batches of tiles, and yield each tile when its batch is done."""
-    yield from chain.from_iterable(results(executor, _filled, [(site, group) for group in groups]))
+    yield from chain.from_iterable(run_tasks(executor, _fill, [(site, group) for group in groups]))
 
 
-def results(executor: Executor, work: Callable[..., T], tasks: Iterable[Sequence[Any]]) -> Iterator[T]:
-    """Let workers do tasks, and yield each result when it is there; what is not begun when that ends is cancelled."""
+def run_tasks(executor: Executor, work: Callable[..., T], tasks: Iterable[Sequence[Any]]) -> Iterator[T]:
+    """Let workers do tasks, and yield each result when it is there; what is not begun when that ends is cancelled.
+
+    Raises WorkersLostError where nobody is left to do them, and what a task raises.
+    """
     futures: list[Future[T]] = []
     try:
         futures += [executor.submit(work, *task) for task in tasks]
-        for future in _finished(executor, futures):
+        for future in _wait_for(executor, futures):
             yield future.result()
     except (CancelledError, BrokenExecutor) as error:
         raise WorkersLostError(f"the workers are gone ({str(error) or type(error).__name__})") from error
@@ -228,19 +233,19 @@ def results(executor: Executor, work: Callable[..., T], tasks: Iterable[Sequence
             future.cancel()
 
 
-def _finished(executor: Executor, futures: Iterable[Future[T]]) -> Iterator[Future[T]]:
+def _wait_for(executor: Executor, futures: Iterable[Future[T]]) -> Iterator[Future[T]]:
     """Yield futures as they end, and give up where nobody is left to work on them."""
     pending, seen = set(futures), time.monotonic()
     while pending:
         done, pending = wait(pending, timeout=POLL, return_when=FIRST_COMPLETED)
         yield from done
-        if done or _manned(executor):
+        if done or _has_workers(executor):
             seen = time.monotonic()
-        elif time.monotonic() - seen > PATIENCE:
-            raise WorkersLostError(f"the workers are gone (none was there for {PATIENCE:g} s)")
+        elif time.monotonic() - seen > WITHOUT_WORKERS:
+            raise WorkersLostError(f"the workers are gone (none was there for {WITHOUT_WORKERS:g} s)")
 
 
-def _manned(executor: Executor) -> bool:
+def _has_workers(executor: Executor) -> bool:
     """Say whether an executor has a worker, as far as it can be asked."""
     client = getattr(executor, "_client", None)  # Dask's
     try:
@@ -249,5 +254,5 @@ def _manned(executor: Executor) -> bool:
         return False
 
 
-def _filled(site: Site | RemoteSite, tiles: Sequence[Tile]) -> list[Filled]:
+def _fill(site: Site | RemoteSite, tiles: Sequence[Tile]) -> list[FilledTile]:
     return list(site.fill(tiles))

@@ -16,17 +16,17 @@ import xarray as xr
 from ..identity import check_identity
 from ..objective import Objective, Status, name_of
 from ..plane import Plane
-from ..space import whole
+from ..space import as_whole
 from ..storage.disk import full, is_full
 from ..storage.store import SliceStore
 from ..storage.tiles import Tile
-from .distribution import Filled, ReadBack, Site, WorkersLostError, equal_batches, spread, workers_of
-from .memory import Halving
+from .distribution import FilledTile, ReadBack, Site, WorkersLostError, distribute, equal_batches, workers_of
+from .memory import MemoryBound
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Say how far a slice is.
+    """Hold how far a slice is.
 
     `done` of `total` points are finished, `resumed` of them before this run began; `statuses` counts the finished ones.
     `levels` coarse pictures are complete, each finer than the last, and `level_complete` says that one has just become
@@ -62,11 +62,15 @@ def sample(
     With an `executor` its workers evaluate batches and write them to the store, which processes must see at the same
     path. Threads share the objective; in a process `made`, a function that can be pickled, makes it once, or else it is
     pickled itself. Batches are equal then, and of at most `batch` points. Where workers are lost, `WorkersLostError`.
+
+    Raises StoreMismatchError where the store was made by other settings, TooLargeError where the slice does not fit
+    into memory, DiskFullError and WorkersLostError where filling ended early, which say what is kept, and MemoryError
+    where a single point is too much for the device.
     """
     if store is None:
-        store = SliceStore.in_memory(plane, objective.space, **_described(objective), grad=grad)
+        store = SliceStore.in_memory(plane, objective.space, **_describe(objective), grad=grad)
     _check_store(store, objective, plane, grad=grad)
-    batch = whole(getattr(objective, "preferred_batch", 1) if batch is None else batch, "sample's batch", least=1)
+    batch = as_whole(getattr(objective, "preferred_batch", 1) if batch is None else batch, "sample's batch", least=1)
     status = store.status()
     counts: Counter[Status] = Counter({kind: int((status == kind).sum()) for kind in Status if kind != Status.MISSING})
     resumed, pending = counts.total(), store.pending(status)
@@ -83,8 +87,8 @@ def sample(
 
     report()
     back = ReadBack(store)
-    site = Site(Halving(objective), store, made)
-    with _resumable(store, counts), closing(_filled(site, pending, batch, executor)) as tiles:
+    site = Site(MemoryBound(objective), store, made)
+    with _resumable(store, counts), closing(_fill(site, pending, batch, executor)) as tiles:
         for filled in tiles:
             for note in filled.notes:
                 warnings.warn(note, RuntimeWarning, stacklevel=2)
@@ -99,24 +103,24 @@ def sample(
     return dataset
 
 
-def _described(objective: Objective) -> dict[str, dict[str, Any]]:
+def _describe(objective: Objective) -> dict[str, dict[str, Any]]:
     """Return what an objective says of itself: an environment its fidelity and options, any its name and unit."""
     about: Callable[[], dict[str, Any]] = getattr(objective, "identity", lambda: {"objective": name_of(objective)})
     return {"identity": about(), "provenance": {"loss_unit": getattr(objective, "loss_unit", "")}}
 
 
-def _filled(
+def _fill(
     site: Site, pending: Sequence[Tile], batch: int, executor: Executor | None
-) -> Generator[Filled, None, None]:
+) -> Generator[FilledTile, None, None]:
     if executor is None:
         for tiles in _batches(site.store, batch, set(pending)):
             yield from site.fill(tiles)
     elif pending:
-        yield from spread(site, equal_batches(site.store, pending, batch, workers_of(executor)), executor)
+        yield from distribute(site, equal_batches(site.store, pending, batch, workers_of(executor)), executor)
 
 
 def _warn_of_damage(store: SliceStore, pending: Sequence[Tile]) -> None:
-    for tile in store.damaged(pending):
+    for tile in store.damaged_tiles(pending):
         warnings.warn(f"{store.path}: tile {tile.index} is damaged and computed again", RuntimeWarning, stacklevel=3)
 
 

@@ -1,4 +1,4 @@
-"""An objective whose batches are halved when its device runs out of memory."""
+"""Memory of the device: batches are halved where it runs out."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..objective import Evaluation, Objective, evaluated, name_of
+from ..objective import Evaluation, Objective, evaluate, name_of
 
 # What torch, Warp, Taichi and CUDA say; the first of them alone has a type of its own.
 SAID = re.compile(
@@ -17,7 +17,7 @@ SAID = re.compile(
 )
 
 
-class Halving:
+class MemoryBound:
     """Evaluate an objective at fewer points at a time once its device ran out of memory, down to one.
 
     That changes no result, given an objective whose rows do not depend on their batch. One that holds memory for all
@@ -32,33 +32,36 @@ class Halving:
         self._most: int | None = None
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
-        """Return losses, and gradients if asked, at points `x` in the parameters' own units."""
+        """Return losses, and gradients if asked, at points `x` in the parameters' own units.
+
+        Raises MemoryError where the device has too little memory for a single point.
+        """
         parts: list[Evaluation] = []
         start = 0
         while start < len(x):
             rows = x[start : start + (self._most or len(x))]
-            part = self._tried(rows, grad=grad)
+            part = self._try(rows, grad=grad)
             if part is None:
-                collect()  # the arrays of the attempt that failed
+                free_memory()  # the arrays of the attempt that failed
                 self._most = len(rows) // 2
                 getattr(self.objective, "shrink", _keep)(self._most)
                 self._notes.append(f"{self.name} ran out of memory at {len(rows)} points; going on with {self._most}")
                 continue
             parts.append(part)
             start += len(rows)
-        return _joined(parts) if parts else Evaluation.empty(x.shape[1], grad=grad)
+        return Evaluation.join(parts, dim=x.shape[1], grad=grad)
 
     def take_notes(self) -> tuple[str, ...]:
         """Return what to warn of since this was called last."""
         notes, self._notes = tuple(self._notes), []
         return notes
 
-    def _tried(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation | None:
+    def _try(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation | None:
         """Return the evaluation, None where the device has too little memory for so many points."""
         try:
-            return evaluated(self.objective, x, grad=grad)
+            return evaluate(self.objective, x, grad=grad)
         except (RuntimeError, MemoryError) as error:
-            if not ran_out(error):
+            if not is_out_of_memory(error):
                 raise
             if len(x) == 1:
                 raise MemoryError(
@@ -68,8 +71,8 @@ class Halving:
             return None
 
 
-def collect() -> None:
-    """Free what objects that are gone held, of a GPU's memory too."""
+def free_memory() -> None:
+    """Collect garbage and empty the cache of GPU memory."""
     gc.collect()  # some, such as a solver and its launches, refer to each other
     torch.cuda.empty_cache()
 
@@ -78,12 +81,6 @@ def _keep(rows: int) -> None:
     """Leave an objective that holds no memory between evaluations as it is."""
 
 
-def ran_out(error: BaseException) -> bool:
-    """Say whether an error is one of too little memory, of the host or of a GPU."""
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an error says that the host or a GPU has too little memory."""
     return isinstance(error, MemoryError | torch.OutOfMemoryError) or bool(SAID.search(str(error)))
-
-
-def _joined(parts: list[Evaluation]) -> Evaluation:
-    slopes = [part.grad for part in parts if part.grad is not None]
-    loss, status = (torch.cat([getattr(part, name) for part in parts]) for name in ("loss", "status"))
-    return Evaluation(loss, torch.cat(slopes) if slopes else None, status)

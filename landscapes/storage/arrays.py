@@ -1,4 +1,4 @@
-"""The arrays of a slice, and what is written on them: plain strings and numbers, by the CF conventions."""
+"""The arrays of a slice and their attributes, by the CF conventions."""
 
 from __future__ import annotations
 
@@ -14,12 +14,11 @@ import zarr
 from numpy.typing import NDArray
 
 from ..capacity import BLOCK, Need, require
-from ..identity import stored_identity
 from ..objective import Status
 from ..plane import Plane
 from ..space import ParameterSpace
 from .checksums import SUMS, lay_out_sums, text_sum, write_sums
-from .layout import CODECS, SMALL, analysis_chunks, consolidate, create_array, flags
+from .layout import CODECS, COMPACT_CODECS, analysis_chunks, consolidate, create_array, flags
 from .ownership import store_files
 from .tiles import coarse_to_fine, tile_side
 
@@ -41,7 +40,7 @@ def axes_of(plane: Plane, parameters: list[str], units: list[str], *, ascending:
 
 
 def need_of(shape: tuple[int, ...], dim: int, *, grad: bool) -> Need:
-    """Return what sampling a slice takes, at most: in memory beside what the process holds, and on the disk.
+    """Return an upper bound of what sampling a slice takes: memory beside what the process holds, and disk.
 
     In memory there are four copies of the arrays when it is finished and sorted, and what a picture takes. On the disk
     there are the files of the tiles, and for a moment the finished slice beside them.
@@ -53,7 +52,10 @@ def need_of(shape: tuple[int, ...], dim: int, *, grad: bool) -> Need:
 
 
 def refuse_too_large(plane: Plane, path: Path | None, *, grad: bool) -> None:
-    """Refuse a slice that is larger than this machine, in memory alone where there is no path."""
+    """Refuse a slice that is larger than this machine, in memory alone where there is no path.
+
+    Raises TooLargeError.
+    """
     most = max(plane.resolution)
 
     def need(side: int) -> Need:
@@ -103,7 +105,7 @@ def write_finished(path: Path, dataset: xr.Dataset) -> None:
         if values.dtype.kind in "fi" and dims != (name,):
             chunks = analysis_chunks(samples, *values.shape[len(samples) :])
             array = create_array(
-                group, str(name), values.shape, chunks, dims, values.dtype.name, codecs=SMALL, **values.attrs
+                group, str(name), values.shape, chunks, dims, values.dtype.name, codecs=COMPACT_CODECS, **values.attrs
             )
             array[...] = values.to_numpy()
         else:
@@ -113,7 +115,7 @@ def write_finished(path: Path, dataset: xr.Dataset) -> None:
 
 
 def attributes_of(node: zarr.Group | zarr.Array[Any]) -> dict[str, Any]:
-    """Return what is written on a group or an array, but for what xarray takes as a hint and takes away."""
+    """Return the attributes of a group or an array, without the hints that xarray removes as it reads."""
     return {str(name): value for name, value in node.attrs.items() if name not in COORDINATES}
 
 
@@ -121,11 +123,6 @@ def parameters_of(dataset: xr.Dataset) -> list[tuple[str, str]]:
     """Return the name and the unit of every parameter of a slice."""
     names, units = (map(str, dataset[name].to_numpy()) for name in ("dim", "unit"))
     return list(zip(names, units, strict=True))
-
-
-def plane_of(dataset: xr.Dataset) -> Plane:
-    """Return the plane that a slice was sampled on."""
-    return Plane.from_record(stored_identity(dataset)["plane"])
 
 
 def _axis(plane: Plane, number: int) -> dict[str, str]:
@@ -138,7 +135,7 @@ def _keep(
 ) -> None:
     """Write a small array whole."""
     number = values.dtype.kind in "fi"
-    kind, codecs = (values.dtype.name, SMALL) if number else ("string", CODECS)
+    kind, codecs = (values.dtype.name, COMPACT_CODECS) if number else ("string", CODECS)
     array = create_array(group, name, values.shape, values.shape, dims, kind, codecs=codecs, **attributes)
     array[...] = values if number else values.astype(object)
 

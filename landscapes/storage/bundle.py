@@ -1,4 +1,4 @@
-"""Datasets in one small file, for what is measured once and drawn again."""
+"""Several datasets in one small file."""
 
 from __future__ import annotations
 

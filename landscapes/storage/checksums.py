@@ -1,4 +1,4 @@
-"""Checksums of tiles in their places: those of single chunks do not say where a chunk belongs."""
+"""Checksums of tiles that include the tile's place, which the checksums of single chunks do not."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ Values = Mapping[str, NDArray[Any]]
 
 
 class Checksums:
-    """Hold what every tile of a slice comes to, in the array `checksum` beside the others."""
+    """Hold the checksum of every tile of a slice, in the array `checksum` beside the others."""
 
     def __init__(self, array: zarr.Array[Any]) -> None:
         self._array = array
 
     @classmethod
     def of(cls, group: zarr.Group, tiles: tuple[int, ...]) -> Checksums | None:
-        """Return those of a slice on disk, None of one that has none for its tiles: xarray writes copies without."""
+        """Return the checksums of a slice on disk, or None: copies that xarray wrote have none for their tiles."""
         array: Any = group.get(SUMS)
         return cls(array) if array is not None and array.shape == tiles else None
 
     def write(self, index: tuple[int, ...], values: Values) -> None:
-        """Keep what a tile comes to."""
+        """Write the checksum of a tile."""
         self._array[index] = tile_sum(index, values)
 
     def read(self, tiles: tuple[int, ...]) -> NDArray[np.int64]:
-        """Return those of the first so many tiles along each axis, and zero of the others, which no tile comes to."""
+        """Return the checksums of the first `tiles` along each axis, and 0 for the others, which is no tile's."""
         found = np.zeros(self._array.shape, dtype=np.int64)
         box = tuple(slice(count) for count in tiles)
         try:
@@ -47,7 +47,7 @@ class Checksums:
         return found
 
     def one(self, index: tuple[int, ...]) -> int:
-        """Return that of a tile, zero where it is torn."""
+        """Return the checksum of a tile, 0 where it cannot be read."""
         try:
             return int(np.asarray(self._array[index]))
         except Exception:  # as in `read`
@@ -55,7 +55,7 @@ class Checksums:
 
 
 def tile_sum(index: tuple[int, ...], values: Values) -> int:
-    """Return what a tile comes to, above zero: by its place, and by what it holds under which name."""
+    """Return the checksum of a tile, at least 1: of its place, and of the names and the content of its arrays."""
     total = zlib.crc32(str(index).encode())
     for name in sorted(values):
         total = zlib.crc32(np.ascontiguousarray(values[name]).tobytes(), total)
@@ -63,7 +63,7 @@ def tile_sum(index: tuple[int, ...], values: Values) -> int:
 
 
 def text_sum(words: Iterable[str]) -> str:
-    """Return what a list of words comes to, in hexadecimal digits: netCDF has no attributes so large."""
+    """Return the checksum of a list of words in hexadecimal digits: as a number it is too large for netCDF."""
     return f"{zlib.crc32(json.dumps(list(words)).encode()):08x}"
 
 

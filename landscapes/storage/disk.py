@@ -1,4 +1,4 @@
-"""A disk that is full ends a job by saying what is kept, and how to go on."""
+"""Full disks: a job ends with a message that says what is kept and how to go on."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from contextlib import contextmanager
 from typing import TypeGuard
 
 CODES = (errno.ENOSPC, errno.EDQUOT)
-WORDS = "No space left on device"  # of a program that writes for us, such as ffmpeg
+FULL_DISK_WORDS = "No space left on device"  # of a program that writes for us, such as ffmpeg
 
 
 class DiskFullError(OSError):
-    """Say what is kept of a job that a full disk ended."""
+    """A disk is full; the message says what is kept of the job."""
 
     def __str__(self) -> str:
         return str(self.strerror)
@@ -20,18 +20,21 @@ class DiskFullError(OSError):
 
 def is_full(error: BaseException) -> TypeGuard[OSError]:
     """Whether an error comes of a disk or a quota that is full."""
-    return isinstance(error, OSError) and (error.errno in CODES or WORDS in str(error))
+    return isinstance(error, OSError) and (error.errno in CODES or FULL_DISK_WORDS in str(error))
 
 
 def full(error: OSError, kept: str) -> DiskFullError:
-    """Return what to raise for a full disk, which keeps so much."""
+    """Return the error to raise for a full disk; `kept` says what of the job is."""
     said = f"the disk is full; {kept}: make room, and the same command goes on from there"
     return DiskFullError(error.errno or errno.ENOSPC, said)
 
 
 @contextmanager
 def until_full(kept: Callable[[], str]) -> Iterator[None]:
-    """Say what is `kept` where the disk is full, unless that is said already."""
+    """Say what is `kept` where the disk is full, unless that is said already.
+
+    Raises DiskFullError then; every other error passes.
+    """
     try:
         yield
     except OSError as error:

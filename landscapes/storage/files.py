@@ -22,7 +22,7 @@ from pathlib import Path
 MAKING = re.compile(r"\..+\.[0-9a-f]{32}\.making", re.DOTALL)  # the hidden folder of what is being made
 
 
-def resolved(path: str | Path) -> Path:
+def resolve(path: str | Path) -> Path:
     """Return a path from the root, without links; raises ValueError for links that lead in a circle."""
     try:
         os.stat(path)
@@ -42,13 +42,13 @@ def make_folder(folder: Path) -> None:
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Give a path of its own to write to, and put what was written in the place of `path` at the end."""
-    with _making(path) as folder:
+    with _hidden_folder(path) as folder:
         partial = folder / f"{path.name}.partial"
         yield partial
         os.replace(partial, path)
 
 
-def visible(folder: Path) -> list[Path]:
+def visible_files(folder: Path) -> list[Path]:
     """Return what a folder holds, but for hidden files: a process that was killed may have left what it was making.
 
     Raises ValueError where a file is in its place.
@@ -64,14 +64,14 @@ def print_width(name: str, picture: str) -> float | None:
     return float(found[1]) if found else None
 
 
-def others(folder: Path, ours: Collection[str], picture: str) -> list[Path]:
+def other_files(folder: Path, ours: Collection[str], picture: str) -> list[Path]:
     """Return what a folder holds beside files of our names and prints of a picture."""
-    return [file for file in visible(folder) if not _is_ours(file, ours, picture)]
+    return [file for file in visible_files(folder) if not _is_ours(file, ours, picture)]
 
 
 def clear(folder: Path, ours: Collection[str], picture: str) -> None:
     """Remove files of our names and prints of a picture from a folder."""
-    for file in visible(folder):
+    for file in visible_files(folder):
         if _is_ours(file, ours, picture):
             file.unlink()
 
@@ -91,8 +91,10 @@ def placing(path: Path, *, overwrite: bool, check: Callable[[], None] = lambda: 
     """Give a folder's path of its own to build at, and rename it to `path` at the end, unless that is taken by then.
 
     `check` is called just before a folder that is there is replaced, to refuse that.
+
+    Raises FileExistsError where another process has made it meanwhile, and what `check` raises.
     """
-    with _making(path) as folder:
+    with _hidden_folder(path) as folder:
         new, old = folder / f"{path.name}.partial", folder / f"{path.name}.replaced"
         yield new
         if overwrite and path.exists():
@@ -113,7 +115,7 @@ def discard(folder: Path) -> None:
     """Remove a folder at once, if it is there: killed in the middle of it, nothing is left under its name."""
     _clear_left(folder)
     if folder.exists():
-        with _making(folder) as gone, contextlib.suppress(FileNotFoundError):  # another process was quicker
+        with _hidden_folder(folder) as gone, contextlib.suppress(FileNotFoundError):  # another process was quicker
             os.rename(folder, gone / folder.name)
 
 
@@ -126,11 +128,11 @@ def tidy(folder: Path) -> None:
 
 
 @contextmanager
-def _making(path: Path) -> Iterator[Path]:
+def _hidden_folder(path: Path) -> Iterator[Path]:
     """Give a hidden folder beside `path`, held while something is made in it; clear away those that nobody holds."""
     make_folder(path.parent)
     _clear_left(path)
-    folder, lock = _held(path)
+    folder, lock = _hold(path)
     try:
         yield folder
     finally:
@@ -138,7 +140,7 @@ def _making(path: Path) -> Iterator[Path]:
         os.close(lock)
 
 
-def _held(path: Path) -> tuple[Path, int]:
+def _hold(path: Path) -> tuple[Path, int]:
     """Make a hidden folder beside `path` and hold it; return it with the descriptor that does."""
     while True:
         folder = path.with_name(f".{path.name}.{uuid.uuid4().hex}.making")

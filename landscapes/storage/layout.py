@@ -15,7 +15,7 @@ from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
 
 FILL = {"float64": float("nan"), "int8": 0, "int64": 0, "string": ""}
 CODECS = [ZstdCodec(level=3, checksum=True)]
-SMALL = [BloscCodec(cname="zstd", clevel=9, shuffle="shuffle"), Crc32cCodec()]
+COMPACT_CODECS = [BloscCodec(cname="zstd", clevel=9, shuffle="shuffle"), Crc32cCodec()]
 _QUIET = threading.Lock()  # threads share what warnings are shown
 SIDE, VALUES = 256, 1 << 20  # of a chunk of a finished slice: samples along an axis and values in all, at most
 

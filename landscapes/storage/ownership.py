@@ -1,4 +1,4 @@
-"""Whether all that a folder holds is of ours: only then is it replaced or removed."""
+"""Ownership of a folder's files: a folder is replaced or removed only where all of them are of ours."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 from .files import MAKING, discard
 
 Ours = Callable[[str], object]  # whether a file is of ours, by its path in the folder, with slashes
-SHOWN = 3  # files that a refusal names
+LISTED_FILES = 3  # files that a refusal names
 HALF = r"\.[0-9a-f]{32}\.partial"  # the end of the name of a file that zarr has not written whole
 
 
@@ -23,7 +23,7 @@ def store_files(arrays: Iterable[str], *others: str) -> Ours:
     return re.compile(rf"{root}|(?:{names})/(?:{root}|c(?:/\d+)*(?:{HALF})?){own}").fullmatch
 
 
-def foreign(folder: Path, ours: Ours) -> Iterator[str]:
+def foreign_files(folder: Path, ours: Ours) -> Iterator[str]:
     """Yield the files of a folder, at any depth, that are not `ours`, by their paths in it; a link never is."""
     for path, name in _files(folder):
         if path.is_symlink() or not (ours(name) or any(map(MAKING.fullmatch, Path(name).parts))):
@@ -32,12 +32,12 @@ def foreign(folder: Path, ours: Ours) -> Iterator[str]:
 
 def check_ours(folder: Path, ours: Ours, what: str) -> None:
     """Raise ValueError, naming some, where a folder that is to be replaced holds files that no such thing does."""
-    others = list(islice(foreign(folder, ours), SHOWN + 1))
+    others = list(islice(foreign_files(folder, ours), LISTED_FILES + 1))
     if others:
-        more = " and more" if len(others) > SHOWN else ""
+        more = " and more" if len(others) > LISTED_FILES else ""
         raise ValueError(
-            f"{folder} is not replaced, as it holds files that are not of {what}: {', '.join(others[:SHOWN])}{more}; "
-            "move them away, or write elsewhere with --out"
+            f"{folder} is not replaced, as it holds files that are not of {what}: "
+            f"{', '.join(others[:LISTED_FILES])}{more}; move them away, or write elsewhere with --out"
         )
 
 
@@ -45,26 +45,26 @@ def refuse_others(folder: Path, strange: Iterable[Path], what: str) -> None:
     """Raise ValueError, naming some, where a folder that results are to go to holds files of something else."""
     names = sorted(path.name for path in strange)
     if names:
-        more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+        more = f" and {len(names) - LISTED_FILES} more" if len(names) > LISTED_FILES else ""
         raise ValueError(
-            f"{folder} holds other files and no {what}: {', '.join(names[:SHOWN])}{more}; "
+            f"{folder} holds other files and no {what}: {', '.join(names[:LISTED_FILES])}{more}; "
             "give --out a new or an empty folder"
         )
 
 
-def lost_root(store: Path, ours: Ours) -> bool:
+def has_lost_root(store: Path, ours: Ours) -> bool:
     """Whether a zarr store has lost the file that says what it is, and everything else in it is of ours."""
     try:
         said = json.loads((store / "zarr.json").read_text())
     except (OSError, ValueError):
         said = None
     known = isinstance(said, dict) and isinstance(said.get("attributes"), dict)
-    return not known and (store / "status").is_dir() and not any(foreign(store, ours))
+    return not known and (store / "status").is_dir() and not any(foreign_files(store, ours))
 
 
 def remove(folder: Path, ours: Ours) -> None:
     """Remove a folder, at once where everything in it is of ours; what is not stays where it is."""
-    if not any(foreign(folder, ours)):
+    if not any(foreign_files(folder, ours)):
         discard(folder)
         return
     for path, name in _files(folder):

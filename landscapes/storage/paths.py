@@ -1,4 +1,4 @@
-"""Where a slice lies: in its own place once it is finished, beside it while it is being filled."""
+"""Paths of a slice: slice.zarr once it is finished, slice.filling.zarr beside it until then."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from pathlib import Path
 SLICE, FILLING = "slice.zarr", ".filling.zarr"
 
 
-def filling(path: Path) -> Path:
+def filling_path(path: Path) -> Path:
     """Return where the tiles of a slice are while it is being filled: slice.filling.zarr beside slice.zarr."""
     return path.with_name(path.name.removesuffix(".zarr") + FILLING)
 
 
-def finished(path: Path) -> Path:
+def finished_path(path: Path) -> Path:
     """Return where a slice will be once it is finished, given that place or the one of its tiles."""
     return path.with_name(path.name.removesuffix(FILLING) + ".zarr") if path.name.endswith(FILLING) else path
 
 
 def place_of(path: Path) -> Path:
     """Return where a slice is now."""
-    return path if path.exists() else filling(path)
+    return path if path.exists() else filling_path(path)
 
 
-def there(path: Path) -> bool:
+def slice_exists(path: Path) -> bool:
     """Say whether anything is in the place of a slice or of its tiles."""
     return place_of(path).exists()
 
@@ -42,9 +42,9 @@ def check_replaceable(store: Path) -> None:
     """Raise ValueError unless a folder is a slice's, its root damaged or not, and everything in it is of that."""
     from ..identity import StoreError
     from .arrays import FILES
-    from .ownership import check_ours, lost_root
+    from .ownership import check_ours, has_lost_root
 
-    if not is_slice(store) and not lost_root(store, FILES):
+    if not is_slice(store) and not has_lost_root(store, FILES):
         raise StoreError(f"{store} is no slice store, so it is not replaced; move it away or write elsewhere")
     check_ours(store, FILES, "a slice")
 

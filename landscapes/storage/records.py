@@ -1,4 +1,4 @@
-"""Files that one verb leaves and another reads: whatever is wrong with one is said by its name."""
+"""JSON files that one verb writes and another reads; an error names the file that is damaged."""
 
 from __future__ import annotations
 
@@ -10,45 +10,51 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from ..identity import DamagedError
 from .files import write_json
 
 CHECKSUM = "checksum"  # of the rest of a record, which holds it under this name
-SHOWN = 160  # characters of what is wrong
-
-
-class DamagedError(ValueError):
-    """Say which file is not what was written, why, and what to do."""
+REASON_LENGTH = 160  # characters of what is wrong
 
 
 @contextmanager
 def reading(path: Path, todo: str) -> Iterator[None]:
-    """Read a file of ours and take from it what is needed, all within: what goes wrong then is the file's fault."""
+    """Read a file within this context: any error that its content leads to says that the file is damaged.
+
+    Raises DamagedError, which says what `todo`; that a file is missing or may not be read passes.
+    """
     try:
         yield
     except (DamagedError, FileNotFoundError, PermissionError, IsADirectoryError):
         raise
     except Exception as error:  # a file of any content makes libraries raise anything at all
         said = f"it has no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
-        raise DamagedError(f"{path} is damaged ({said[:SHOWN] or type(error).__name__}); {todo}") from error
+        raise DamagedError.of(path, said[:REASON_LENGTH] or type(error).__name__, todo) from error
 
 
 def write_record(path: Path, record: Mapping[str, Any]) -> None:
     """Write what `read_json` reads again, with a checksum."""
-    write_json(path, signed(record))
+    write_json(path, sign(record))
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the JSON object that a file holds, held against its checksum if it has one."""
-    return unsigned(json.loads(path.read_text()))
+    """Return the JSON object that a file holds, held against its checksum if it has one.
+
+    Raises ValueError where it is no JSON or not what was written, TypeError where it is no object.
+    """
+    return verify(json.loads(path.read_text()))
 
 
-def signed(record: Mapping[str, Any]) -> dict[str, Any]:
+def sign(record: Mapping[str, Any]) -> dict[str, Any]:
     """Return a record with its checksum."""
     return {**record, CHECKSUM: _sum(json.loads(json.dumps(record)))}
 
 
-def unsigned(found: Any) -> dict[str, Any]:
-    """Return a record without its checksum; those of earlier versions have none."""
+def verify(found: Any) -> dict[str, Any]:
+    """Return a record without its checksum; those of earlier versions have none.
+
+    Raises TypeError where it is no JSON object, ValueError where the checksum is not that of the rest.
+    """
     if not isinstance(found, dict):
         raise TypeError("it is no JSON object")
     record = {name: value for name, value in found.items() if name != CHECKSUM}
@@ -62,19 +68,25 @@ def _sum(record: Mapping[str, Any]) -> int:
 
 
 def text(value: Any) -> str:
-    """Return what has to be a string."""
+    """Return what has to be a string.
+
+    Raises TypeError where it is none.
+    """
     if not isinstance(value, str):
         raise TypeError(f"{value!r} is no text")
     return value
 
 
 def number(value: Any) -> float:
-    """Return what has to be a finite number, as it is."""
+    """Return what has to be a finite number, as it is.
+
+    Raises TypeError where it is none.
+    """
     if not isinstance(value, int | float) or not math.isfinite(value):
         raise TypeError(f"{value!r} is no number")
     return value
 
 
-def maybe(kind: Callable[[Any], Any], value: Any) -> Any:
+def optional(kind: Callable[[Any], Any], value: Any) -> Any:
     """Return what has to be of a kind, or None."""
     return None if value is None else kind(value)

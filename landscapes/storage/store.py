@@ -3,15 +3,14 @@
 A slice is a group of arrays: `loss(v, u)`, `grad(v, u, dim)` unless sampled without gradients, `status(v, u)` and the
 coordinates `u`, `v`, `dim`, `unit(dim)`; a line has no `v`. It lies in one of two places:
 
-- `slice.filling.zarr` while it is being filled. Axes are stored coarse to fine (`tiling.coarse_to_fine`) and one chunk
+- `slice.filling.zarr` while it is being filled. Axes are stored coarse to fine (`tiles.coarse_to_fine`) and one chunk
   is one tile, so the first tile is a coarse picture of the whole box and every square of tiles from it a finer one.
 - `slice.zarr` once every point is there. Axes ascend, and chunks are as large as analysis wants them
   (`layout.analysis_chunks`), so that anybody's xarray or zarr reads it right. It appears whole, and only then the
   tiles go: a process killed at any instant leaves one or the other.
 
-A tile, or a chunk of a finished slice, counts when it decodes, its status has no MISSING, loss and gradient are finite
-exactly where the status is OK, and all of it together has the checksum that was written of it in its place. Everything
-else, a torn file included, is as if it had never been written.
+A tile, or a chunk of a finished slice, counts when it is whole (`samples.Samples`); a torn one is as if it had never
+been written.
 """
 
 from __future__ import annotations
@@ -33,19 +32,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 from zarr.storage import MemoryStore
 
-from ..identity import StoreError, StoreExistsError, check_identity, full_identity, plain_json
+from ..identity import StoreError, StoreExistsError, check_identity, full_identity
 from ..objective import Evaluation, Status
+from ..plain import plain_json
 from ..plane import Plane
 from ..space import ParameterSpace
 from .arrays import AXES, FILES, FORMAT, attributes_of, axes_of, lay_out, refuse_too_large, write_finished
-from .arrays import plane_of as plane_of
-from .checksums import Checksums, text_sum, tile_sum
-from .files import placing, resolved
-from .integrity import ANEW, check_integrity, check_layouts
+from .checksums import text_sum
+from .files import placing, resolve
+from .integrity import check_integrity, check_layouts, damage
 from .layout import consolidate, open_group
-from .ownership import lost_root, remove
-from .paths import SLICE, check_replaceable, corner, filling, finished, place_of, there
-from .paths import is_slice as is_slice
+from .ownership import has_lost_root, remove
+from .paths import SLICE, check_replaceable, filling_path, finished_path, is_slice, place_of, slice_exists
+from .samples import Arrays, Samples
 from .tiles import Tile
 
 T = TypeVar("T")
@@ -71,14 +70,11 @@ class SliceStore:
         self.provenance: dict[str, Any] = json.loads(str(self._about["provenance"]))
         self.plane = Plane.from_record(self.identity["plane"])
         self.dims = AXES[: self.plane.rank][::-1]
-        self._values: dict[str, zarr.Array[Any]] = {
-            name: arrays[name] for name in ("loss", "grad", "status") if name in arrays
-        }
         self._coordinates = {name: np.asarray(arrays[name][:]) for name in self.dims}
         self._parameters, self._units = ([str(one) for one in np.asarray(arrays[name][:])] for name in ("dim", "unit"))
         self._attributes = {name: attributes_of(array) for name, array in arrays.items()}
-        self.side = self._values["status"].chunks[: self.plane.rank]
-        self._sums = Checksums.of(group, self._tile_counts()) if place else None
+        shape = tuple(len(self._coordinates[name]) for name in self.dims)
+        self._samples = Samples(group, shape, place, ascending=self.ascending)
 
     @classmethod
     def create(
@@ -97,17 +93,20 @@ class SliceStore:
         `identity` holds what decides the numbers (objective, options, fidelity, device); plane, parameters, gradients
         and version are added here. `provenance` is anything else worth keeping. Both must be plain JSON. `overwrite`
         replaces a slice store with nothing else in it, and refuses to replace anything else.
+
+        Raises StoreExistsError where the path is taken, StoreError where what is there is not replaced, and
+        TooLargeError where the slice does not fit onto the disk or into memory.
         """
-        path = resolved(path)
+        path = resolve(path)
         whole = full_identity(identity, plane, space, grad=grad)
-        for taken in (path, filling(path)):
+        for taken in (path, filling_path(path)):
             if taken.exists() and not overwrite:
                 raise StoreExistsError(f"{path} exists already; write elsewhere with --out, or replace it with --force")
             if taken.exists():
                 check_replaceable(taken)
         refuse_too_large(plane, path, grad=grad)
         try:
-            with placing(filling(path), overwrite=overwrite) as new:
+            with placing(filling_path(path), overwrite=overwrite) as new:
                 group = zarr.create_group(new, zarr_format=3)
                 lay_out(group, plane, space, whole, plain_json(provenance or {}, "a slice's provenance"), grad=grad)
                 consolidate(new)
@@ -118,28 +117,31 @@ class SliceStore:
 
     @classmethod
     def open(cls, path: str | Path) -> SliceStore:
-        """Open a store that exists, the finished slice where there is one."""
-        path = finished(resolved(path))
+        """Open a store that exists, the finished slice where there is one.
+
+        Raises StoreError where there is none, DamagedError where it is not what was written.
+        """
+        path = finished_path(resolve(path))
         place = place_of(path)
         if not place.exists():
             raise StoreError(f"there is no slice store at {path}; make one with `landscape slice`")
         if not is_slice(place):
-            if lost_root(place, FILES):
-                raise StoreError(f"{place / 'zarr.json'} is damaged; {ANEW}")
+            if has_lost_root(place, FILES):
+                raise damage(place / "zarr.json", "it does not say what it is of")
             raise StoreError(f"{place} is no slice store of format {FORMAT}; move it away or write elsewhere")
         try:
             group = open_group(place, "r+")
             store = cls(group, path, place)
             axes = axes_of(store.plane, store.identity["parameters"], store._units, ascending=store.ascending)
             if store._attributes["unit"].get("checksum", sums := text_sum(store._units)) != sums:
-                raise StoreError(f"{place / 'unit'} is damaged: it is not what was written; {ANEW}")
+                raise damage(place / "unit", "it is not what was written")
             check_integrity(place, group, axes, ["loss", "status", *(["grad"] if store.identity["gradients"] else [])])
             return store
         except StoreError:
             raise
         except Exception as error:  # a damaged axis or layout raises whatever reads it; of tiles nothing is read here
             check_layouts(place)
-            raise StoreError(f"{place} is damaged ({type(error).__name__}: {error}); {ANEW}") from error
+            raise damage(place, f"{type(error).__name__}: {error}") from error
 
     @classmethod
     def open_or_create(
@@ -158,7 +160,7 @@ class SliceStore:
         store = cls.open(path)
         check_identity(store.path, wanted=full_identity(identity, plane, space, grad=grad), found=store.identity)
         if store.ascending and store.path:
-            remove(filling(store.path), FILES)  # left by a process that was killed when it had finished the slice
+            remove(filling_path(store.path), FILES)  # left by a process that was killed when it had finished the slice
         return store
 
     @classmethod
@@ -171,7 +173,10 @@ class SliceStore:
         provenance: Mapping[str, Any] | None = None,
         grad: bool = True,
     ) -> SliceStore:
-        """Make a store that lives as long as the object."""
+        """Make a store that lives as long as the object.
+
+        Raises TooLargeError where it does not fit into memory.
+        """
         refuse_too_large(plane, None, grad=grad)
         group = zarr.create_group(MemoryStore(), zarr_format=3)
         whole = full_identity(identity or {}, plane, space, grad=grad)
@@ -186,102 +191,94 @@ class SliceStore:
     @property
     def grad(self) -> bool:
         """Whether the slice holds gradients."""
-        return "grad" in self._values
+        return "grad" in self._samples.arrays
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Points per axis, in array order."""
-        return tuple(len(self._coordinates[name]) for name in self.dims)
+        return self._samples.shape
 
     def tiles(self) -> list[Tile]:
         """Return every tile, coarse to fine."""
-        return sorted(
-            map(Tile, np.ndindex(*self._tile_counts())), key=lambda tile: (tile.level, sum(tile.index), tile.index)
-        )
+        return self._samples.tiles()
 
     def pending(self, status: NDArray[np.int8] | None = None) -> list[Tile]:
         """Return the tiles that are not finished, coarse to fine; `status` spares reading it again."""
         status = self.status() if status is None else status
-        return [tile for tile in self.tiles() if (status[self._place(tile)] == Status.MISSING).any()]
+        return [tile for tile in self.tiles() if (status[self._samples.place(tile)] == Status.MISSING).any()]
 
-    def damaged(self, pending: Sequence[Tile]) -> list[Tile]:
+    def damaged_tiles(self, pending: Sequence[Tile]) -> list[Tile]:
         """Return those of the tiles not finished that once were: their status is there, or torn.
 
         A tile that another process has finished in the meantime is none of them.
         """
-        try:
-            status, begun = np.zeros(self.shape, np.int8), self._begun(self._whole())
-            status[begun] = self._values["status"][begun]
-            written = [tile for tile in pending if status[self._place(tile)].any()]
-        except Exception:  # as in `_read`
-            written = [tile for tile in pending if self._has_status(tile)]
-        return [tile for tile in written if not self.statuses(tile)]
+        return [tile for tile in self._samples.find_written(pending) if not self.statuses(tile)]
 
-    def finished(self, tile: Tile) -> dict[str, NDArray[Any]] | None:
+    def read_tile(self, tile: Tile) -> dict[str, NDArray[Any]] | None:
         """Return the arrays of a tile that is finished, None of one that is not."""
-        try:
-            values = self._stored(self._place(tile))
-        except Exception:  # as in `_read`
-            return None
-        if self._sums and self._sums.one(tile.index) != tile_sum(tile.index, values):
-            return None
-        return None if (self._judged(values) == Status.MISSING).any() else values
+        return self._samples.read_tile(tile)
 
     def statuses(self, tile: Tile) -> Counter[Status]:
         """Count how the points of a finished tile ended; nothing of one that is not finished."""
-        values = self.finished(tile)
+        values = self.read_tile(tile)
         return Counter() if values is None else Counter(map(Status, values["status"].ravel().tolist()))
 
     def count(self, tile: Tile) -> int:
         """Return how many points a tile has."""
-        return math.prod(at.stop - at.start for at in self._place(tile))
+        return math.prod(at.stop - at.start for at in self._samples.place(tile))
 
     def points(self, tile: Tile) -> Float[Tensor, "points dim"]:
         """Return the parameters at the points of a tile."""
-        parts = [self._coordinates[name][place] for name, place in zip(self.dims, self._place(tile), strict=True)]
+        box = zip(self.dims, self._samples.place(tile), strict=True)
+        parts = [self._coordinates[name][part] for name, part in box]
         grid = np.meshgrid(*parts, indexing="ij")[::-1]
         return self.plane.lift(torch.from_numpy(np.stack([axis.ravel() for axis in grid], axis=1)))
 
     def write(self, tile: Tile, evaluation: Evaluation) -> None:
-        """Write a whole tile, status last; `evaluation` has its points in the order of `points`, failures blanked."""
-        place = self._place(tile)
-        shape = tuple(at.stop - at.start for at in place)
+        """Write a whole tile, status last; `evaluation` has its points in the order of `points`, failures blanked.
+
+        Raises ValueError where gradients are missing or a point was not evaluated, StoreError where the store was
+        replaced.
+        """
+        shape = tuple(at.stop - at.start for at in self._samples.place(tile))
         if self.grad and evaluation.grad is None:
             raise ValueError("this slice holds gradients; got an evaluation without, so evaluate with grad=True")
         if bool((evaluation.status == Status.MISSING).any()):
             raise ValueError("a tile is written whole; got an evaluation with status MISSING")
-        if self._taken_over() or any(at >= count for at, count in zip(tile.index, self._tile_counts(), strict=True)):
+        counts = zip(tile.index, self._samples.tile_counts, strict=True)
+        if self._follow_finished() or any(at >= count for at, count in counts):
             return  # another process has finished the slice, which has larger and fewer tiles since
-        arrays = {}
-        for name, stored in self._values.items():  # loss, grad, status
+        arrays: Arrays = {}
+        for name, stored in self._samples.arrays.items():
             tensor: Tensor = getattr(evaluation, name)
             arrays[name] = tensor.detach().cpu().numpy().reshape(shape + tensor.shape[1:]).astype(stored.dtype)
         try:
-            if self._sums is not None:
-                self._sums.write(tile.index, arrays)
-            for name, values in arrays.items():
-                self._values[name][place] = values
+            self._samples.write_tile(tile, arrays)
         except FileNotFoundError:
-            if not self._taken_over():
+            if not self._follow_finished():
                 raise
 
     def status(self) -> NDArray[np.int8]:
         """Return the status of every point in stored order, MISSING wherever a tile is not finished."""
-        return self._steady(lambda: self._read(self._whole())["status"])
+        return self._read_steadily(lambda: self._samples.read(self._samples.whole)["status"])
 
     def dataset(self, known: Mapping[Tile, Mapping[str, NDArray[Any]]] | None = None) -> xr.Dataset:
         """Return everything sampled so far, axes ascending; MISSING and NaN where nothing is.
 
-        `known` spares reading tiles again: what `finished` returned of them.
+        `known` spares reading tiles again: what `read_tile` returned of them.
+
+        Raises StoreError where the store was replaced.
         """
-        return self._steady(lambda: self._dataset(self._whole(), None if self.ascending else known))
+        return self._read_steadily(lambda: self._dataset(self._samples.whole, None if self.ascending else known))
 
     def finish(self, dataset: xr.Dataset) -> None:
         """Put the whole slice, which `dataset` returned, in the place of its tiles: ascending, in large chunks.
 
         It appears at once, and only then the tiles go.
+
+        Raises StoreError where the slice is not complete, or the store was replaced.
         """
-        if self.path is None or self.ascending or self._taken_over():
+        if self.path is None or self.ascending or self._follow_finished():
             return
         if bool((dataset["status"] == Status.MISSING).any()):
             raise StoreError(f"{self.path} is not complete; run the command that samples it again")
@@ -295,15 +292,15 @@ class SliceStore:
         if not pending:
             return self.dataset()
         level = 0 if self.ascending else pending[0].level
-        return self._dataset(tuple(slice(level * side) for side in self.side)) if level else None
+        return self._dataset(tuple(slice(level * side) for side in self._samples.side)) if level else None
 
-    def _steady(self, read: Callable[[], T]) -> T:
+    def _read_steadily(self, read: Callable[[], T]) -> T:
         """Return what is read, once more where another process has finished the slice meanwhile."""
-        self._taken_over()
+        self._follow_finished()
         found = read()
-        return read() if self._taken_over() else found
+        return read() if self._follow_finished() else found
 
-    def _taken_over(self) -> bool:
+    def _follow_finished(self) -> bool:
         """Go on with the finished slice where another process has finished this one meanwhile, and say whether it has.
 
         Raise StoreError where the store was replaced or removed.
@@ -322,103 +319,12 @@ class SliceStore:
     def _move_on(self, path: Path) -> None:
         """Become the finished slice, and clear the tiles away."""
         self._adopt(open_group(path, "r+"), path, path)
-        remove(filling(path), FILES)
-
-    def _whole(self) -> tuple[slice, ...]:
-        return tuple(slice(points) for points in self.shape)
-
-    def _place(self, tile: Tile) -> tuple[slice, ...]:
-        sizes = zip(tile.index, self.side, self.shape, strict=True)
-        return tuple(slice(at * side, min((at + 1) * side, points)) for at, side, points in sizes)
-
-    def _tile_counts(self) -> tuple[int, ...]:
-        return tuple(math.ceil(points / side) for points, side in zip(self.shape, self.side, strict=True))
-
-    def _has_status(self, tile: Tile) -> bool:
-        try:
-            return bool(np.asarray(self._values["status"][self._place(tile)]).any())
-        except Exception:  # as in `_read`
-            return True
-
-    def _judged(self, values: Mapping[str, NDArray[Any]]) -> NDArray[np.int8]:
-        """Return the status, MISSING where it and the numbers contradict each other."""
-        intact = np.isfinite(values["loss"])
-        if self.grad:
-            intact &= np.isfinite(values["grad"]).all(axis=-1)
-        status: NDArray[np.int8] = values["status"]
-        status[(status == Status.OK) != intact] = Status.MISSING
-        return status
-
-    def _read(
-        self, box: tuple[slice, ...], known: Mapping[Tile, Mapping[str, NDArray[Any]]] | None = None
-    ) -> dict[str, NDArray[Any]]:
-        """Read a box of whole tiles, each array at once; where that fails, tile by tile, leaving out what is torn.
-
-        Where some tiles are `known`, the others are read one by one, too.
-        """
-        try:
-            values = self._by_tile(box, known) if known else self._stored(box)
-        except Exception:  # a damaged chunk raises whatever its codec does
-            values = self._by_tile(box, {})
-        status = self._judged(values)
-        sums = self._sums.read(self._tiles_begun()) if self._sums else None
-        for tile in self.tiles() if self._sums or (status == Status.MISSING).any() else ():
-            place = self._place(tile)
-            part = {name: array[place] for name, array in values.items()}
-            torn = sums is not None and part["status"].any() and sums[tile.index] != tile_sum(tile.index, part)
-            if torn or (part["status"] == Status.MISSING).any():  # finished whole or not at all
-                part["status"][...] = Status.MISSING
-        values["loss"][status == Status.MISSING] = np.nan
-        if self.grad:
-            values["grad"][status == Status.MISSING] = np.nan
-        return values
-
-    def _stored(self, box: tuple[slice, ...]) -> dict[str, NDArray[Any]]:
-        """Read a box of every array; where its status says that nothing is there, nothing else is looked for."""
-        values, there = self._blank(box), self._begun(box)
-        inside = tuple(slice(len(range(points)[at])) for points, at in zip(self.shape, there, strict=True))
-        values["status"][inside] = self._values["status"][there]
-        for name, array in self._values.items() if values["status"].any() else ():
-            if name != "status":
-                values[name][inside] = array[there]
-        return values
-
-    def _begun(self, box: tuple[slice, ...]) -> tuple[slice, ...]:
-        """Return the corner of the whole beyond which no tile is, since looking for each of many files takes long."""
-        if box != self._whole():
-            return box
-        begun = zip(self._tiles_begun(), self.side, self.shape, strict=True)
-        return tuple(slice(min(count * side, points)) for count, side, points in begun)
-
-    def _tiles_begun(self) -> tuple[int, ...]:
-        """Return how many tiles along each axis there may be."""
-        if self.place is None or self.ascending:
-            return self._tile_counts()
-        return corner(self.place / "status", len(self.dims))
-
-    def _blank(self, box: tuple[slice, ...]) -> dict[str, NDArray[Any]]:
-        shape = tuple(len(range(points)[at]) for at, points in zip(box, self.shape, strict=True))
-        return {
-            name: np.full(shape + array.shape[len(shape) :], array.fill_value, array.dtype)
-            for name, array in self._values.items()
-        }
-
-    def _by_tile(
-        self, box: tuple[slice, ...], known: Mapping[Tile, Mapping[str, NDArray[Any]]]
-    ) -> dict[str, NDArray[Any]]:
-        values = self._blank(box)
-        for tile in self.tiles():
-            place = self._place(tile)
-            inside = all(at.stop <= size for at, size in zip(place, values["status"].shape, strict=True))
-            if inside and (part := known.get(tile) or self.finished(tile)):
-                for name, array in part.items():
-                    values[name][place] = array
-        return values
+        remove(filling_path(path), FILES)
 
     def _dataset(
         self, box: tuple[slice, ...], known: Mapping[Tile, Mapping[str, NDArray[Any]]] | None = None
     ) -> xr.Dataset:
-        values = self._read(box, known)
+        values = self._samples.read(box, known)
         shaped = {"loss": self.dims, "grad": (*self.dims, "dim"), "status": self.dims}
         coordinates = {name: self._coordinates[name][at] for name, at in zip(self.dims, box, strict=True)}
         dataset = xr.Dataset(
@@ -435,6 +341,8 @@ def open_slice(path: str | Path) -> xr.Dataset:
     """Read a slice from disk: loss and gradient in float64, axes ascending, MISSING where it is not sampled yet.
 
     `path` is the slice, or the folder that `landscape slice` left it in.
+
+    Raises StoreError where there is no slice, DamagedError where it is not what was written.
     """
     path = Path(path)
-    return SliceStore.open(path / SLICE if there(path / SLICE) else path).dataset()
+    return SliceStore.open(path / SLICE if slice_exists(path / SLICE) else path).dataset()

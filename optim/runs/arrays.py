@@ -13,8 +13,8 @@ import zarr
 from numpy.typing import NDArray
 
 from ... import __version__
-from ...landscapes.identity import plain_json
 from ...landscapes.objective import Status
+from ...landscapes.plain import plain_json
 from ...landscapes.space import ParameterSpace
 from ...landscapes.storage.layout import FILL, create_array, flags
 from ...landscapes.storage.ownership import store_files

@@ -33,9 +33,9 @@ from torch import Tensor
 from ...landscapes.identity import StoreError, StoreExistsError, check_identity
 from ...landscapes.objective import Evaluation, Status
 from ...landscapes.space import ParameterSpace
-from ...landscapes.storage.files import placing, resolved
+from ...landscapes.storage.files import placing, resolve
 from ...landscapes.storage.layout import FILL, consolidate, open_group
-from ...landscapes.storage.ownership import check_ours, clear_halves, lost_root
+from ...landscapes.storage.ownership import check_ours, clear_halves, has_lost_root
 from ..base import Kind
 from .arrays import (
     COLUMNS,
@@ -97,7 +97,7 @@ class RunStore:
 
         Raises StoreExistsError where there is one, StoreError where something else is to be replaced.
         """
-        path = resolved(path)
+        path = resolve(path)
         attributes = attributes_of(space, identity, provenance or {}, budget)
         if path.exists() and not overwrite:
             raise StoreExistsError(f"{path} exists already; write elsewhere with --out, or replace it with --force")
@@ -115,11 +115,11 @@ class RunStore:
     @classmethod
     def open(cls, path: str | Path) -> RunStore:
         """Open a run that exists. Raises StoreError where there is none, and where it is damaged."""
-        path = resolved(path)
+        path = resolve(path)
         if not path.exists():
             raise StoreError(f"there is no run at {path}; make one with `landscape optimize`")
         if not is_run(path):
-            if lost_root(path, FILES):
+            if has_lost_root(path, FILES):
                 raise damage_error(path / "zarr.json", "it cannot be read")
             raise StoreError(f"{path} is no run of format {FORMAT}; move it away or write elsewhere")
         return cls(open_group(path).attrs.asdict(), path)
@@ -383,7 +383,7 @@ class RunStore:
 
 def check_replaceable(path: Path) -> None:
     """Raise ValueError unless a folder is a run's, its root damaged or not, and everything in it is of that."""
-    if not is_run(path) and not lost_root(path, FILES):
+    if not is_run(path) and not has_lost_root(path, FILES):
         raise StoreError(f"{path} is no run, so it is not replaced; move it away or write elsewhere")
     check_ours(path, FILES, "a run")
 

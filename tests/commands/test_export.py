@@ -63,7 +63,7 @@ def test_a_table_has_a_row_for_each_sample_with_its_place_loss_status_and_gradie
 @pytest.mark.parametrize("kind", list(READ))
 def test_a_run_has_a_row_for_each_episode(run: Callable[..., Said], results: Path, kind: str) -> None:
     assert run("export", "searched", "--to", kind, "--out", f"my{kind}", cwd=results).returncode == 0
-    table, rows = READ[kind](results / f"my{kind}"), gradscape.open_run(results / "searched")
+    table, rows = READ[kind](results / f"my{kind}"), gradscape.open_run(results / "searched").data
     assert table["episode"].tolist() == [1, 2, 3, 4, 5, 6, 7]
     np.testing.assert_array_equal(table["loss [m²]"], rows["loss"])
     np.testing.assert_array_equal(table[[f"velocity {axis} [m/s]" for axis in "xyz"]], rows["x"])
@@ -75,7 +75,7 @@ def test_a_run_has_a_row_for_each_episode(run: Callable[..., Said], results: Pat
 @pytest.mark.parametrize(("folder", "store"), [("cut", "slice"), ("line", "slice"), ("searched", "run")])
 def test_netcdf_keeps_arrays_names_and_units(run: Callable[..., Said], results: Path, folder: str, store: str) -> None:
     assert run("export", folder, "--to", "netcdf", cwd=results).returncode == 0
-    ours = {"slice": lambda path: gradscape.open_slice(path).data, "run": gradscape.open_run}[store](results / folder)
+    ours = {"slice": gradscape.open_slice, "run": gradscape.open_run}[store](results / folder).data
     with xr.open_dataset(results / folder / f"{store}.nc") as back:
         for name in ours.data_vars:
             np.testing.assert_array_equal(back[name], ours[name])

@@ -21,6 +21,7 @@ from gradscape.envs.functions import Branin
 from gradscape.gallery import parts as gallery_parts
 from gradscape.gallery.figures import Figure
 from gradscape.gallery.paper import Caption
+from gradscape.jobs.slice import SliceCost, SliceJob
 from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.storage.store import open_slice
 
@@ -86,7 +87,7 @@ def test_compute_goes_on_where_it_stopped_and_computes_nothing_twice(
         points.append(len(x))
         return evaluate(env, x, grad=grad)
 
-    monkeypatch.setattr(gallery_parts.SlicePart, "seconds_each", lambda _: 0.5)  # that evaluates the first points too
+    monkeypatch.setattr(SliceJob, "cost", lambda _: SliceCost(1, 0.5, 0))  # that evaluates the first points too
     monkeypatch.setattr(Branin, "_evaluate", stopping)
     command = ("--only", "branin", "--resolution", "40")
     assert compute(tmp_path, *command) == 130
@@ -142,7 +143,7 @@ def test_a_figure_of_which_nothing_is_sampled_begins_anew_by_other_code(
     listed: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gradscape.envs.base.code_digest", lambda *_: "other")
-    monkeypatch.setattr("gradscape.jobs.slice.SliceJob.run", stop)
+    monkeypatch.setattr(SliceJob, "run", stop)
     assert compute(tmp_path, "--only", "branin") == 1
     assert stored_identity(open_slice(tmp_path / "branin/slice.zarr"))["code"] == "other"
     monkeypatch.undo()

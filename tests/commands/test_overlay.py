@@ -13,8 +13,9 @@ from benchmarks.results import leave_blank
 
 import gradscape
 from gradscape.cli import main
+from gradscape.landscapes.identity import plane_of
 from gradscape.landscapes.overlay import best_point, overlay
-from gradscape.landscapes.storage.store import plane_of
+from gradscape.landscapes.storage.store import open_slice
 from gradscape.optim.runs.store import RunStore
 
 
@@ -75,7 +76,7 @@ def test_a_race_is_laid_over_a_slice(run: Callable[..., Said], tmp_path: Path) -
     assert sorted(file.name for file in Path("over").iterdir()) == ["overlay.png", "overlay.rrd"]
     assert (tmp_path / "over/overlay.png").read_bytes().startswith(b"\x89PNG")
     tables = [RunStore.open(path / "run.zarr").dataset() for path in sorted(Path("race").iterdir())]
-    away = max(float(laid["distance"].max()) for laid in overlay(gradscape.open_slice("cut/slice.zarr"), tables))
+    away = max(float(laid["distance"].max()) for laid in overlay(open_slice("cut/slice.zarr"), tables))
     assert f"2 runs, 40 points: 0 beyond the map, 0 failed; the farthest is {away:.2g} half-widths" in done.stderr
     assert run("overlay cut race").returncode == 0
     assert len(list(Path("out").glob("overlay-bounce-*"))) == 1
@@ -85,10 +86,10 @@ def test_a_slice_cut_through_the_best_point_shows_its_loss(run: Callable[..., Sa
     done = run("overlay cut race/cma-es-0 race/descents-0/run.zarr --through best --out over --device cpu")
     assert done.returncode == 0, done.stderr
     (folder,) = (path for path in Path("over").iterdir() if path.is_dir())
-    dataset = gradscape.open_slice(folder / "slice.zarr")
+    dataset = open_slice(folder / "slice.zarr")
     tables = [RunStore.open(path / "run.zarr").dataset() for path in sorted(Path("race").iterdir())]
     x, loss = best_point(tables)
-    plane, before = plane_of(dataset), plane_of(gradscape.open_slice("cut/slice.zarr"))
+    plane, before = plane_of(dataset), plane_of(open_slice("cut/slice.zarr"))
     assert float(plane.distance(x)) < 1e-12
     torch.testing.assert_close(plane.basis, before.basis, rtol=0, atol=0)
     assert (plane.resolution, plane.labels) == (before.resolution, before.labels)
@@ -104,7 +105,7 @@ def test_a_principal_plane_lies_nearer_to_the_run_than_the_slice_did(run: Callab
     assert done.returncode == 0, done.stderr
     (folder,) = (path for path in Path("over").iterdir() if path.is_dir())
     table = RunStore.open("race/cma-es-0/run.zarr").dataset()
-    slices = (gradscape.open_slice(path) for path in (folder / "slice.zarr", "cut/slice.zarr"))
+    slices = (open_slice(path) for path in (folder / "slice.zarr", "cut/slice.zarr"))
     principal, before = (overlay(dataset, [table])[0] for dataset in slices)
     assert float((principal["distance"] ** 2).sum()) < float((before["distance"] ** 2).sum())
     assert not principal["outside"].any()
@@ -113,7 +114,7 @@ def test_a_principal_plane_lies_nearer_to_the_run_than_the_slice_did(run: Callab
 def test_samples_beyond_the_box_are_left_out_of_a_principal_plane(run: Callable[..., Said]) -> None:
     assert run("overlay cut race --plane pca --resolution 7 --out over --device cpu").returncode == 0
     (folder,) = (path for path in Path("over").iterdir() if path.is_dir())
-    dataset = gradscape.open_slice(folder / "slice.zarr")
+    dataset = open_slice(folder / "slice.zarr")
     u, v = np.meshgrid(dataset["u"], dataset["v"])
     space = gradscape.make("bounce", device="cpu").space
     unit = space.to_unit(plane_of(dataset).lift(torch.from_numpy(np.stack([u, v], axis=-1))))
@@ -148,3 +149,10 @@ def test_what_does_not_belong_together_is_refused(run: Callable[..., Said], comm
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert said in done.stderr
+
+
+def test_a_missing_display_is_said_before_anything_is_sampled(run: Callable[..., Said]) -> None:
+    done = run("overlay cut race --through best --out over --spawn")
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert "there is no display here to open over/overlay.rrd on; leave out --spawn, or take --serve" in done.stderr
+    assert not Path("over").exists()

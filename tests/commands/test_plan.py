@@ -108,7 +108,7 @@ def test_pictures_come_with_finer_levels_batches_and_a_pause_between_them() -> N
     store = SliceStore.in_memory(gradscape.Plane.through(space, space.center, ("a", "b"), resolution=64), space)
     most = 1 + store.tiles()[-1].level
     cases = ((99, 1e6, 1.0), (99, 0.0, 1.0), (99, 44.0, 1.0), (3, 44.0, 1.0))
-    assert [count_pictures(most - 1, *case) for case in cases] == [most, 2, 6, 4]
+    assert [count_pictures(most - 1, *now) for now in cases] == [most, 2, 6, 4]
 
 
 def test_no_more_than_a_tenth_of_the_time_goes_into_pictures_of_what_is_unfinished() -> None:

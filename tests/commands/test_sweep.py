@@ -15,10 +15,10 @@ import xarray as xr
 
 import gradscape
 from gradscape.cli import main
-from gradscape.landscapes.identity import stored_identity
+from gradscape.landscapes.identity import plane_of, stored_identity
 from gradscape.landscapes.sampling.fill import sample
-from gradscape.landscapes.smoothing import smoothed
-from gradscape.landscapes.storage.store import open_slice, plane_of
+from gradscape.landscapes.smoothing import smooth
+from gradscape.landscapes.storage.store import open_slice
 
 from ..command import Said
 from ..processes import Instant, alone, landscape
@@ -106,7 +106,7 @@ def test_smoothing_averages_one_slice(run: Command) -> None:
     assert [frame["value"] for frame in summary["frames"]] == [0.0, 12.5, 25.0]
     assert summary["episodes"] == 81
     for frame in summary["frames"]:
-        assert frame["loss"]["lowest"] == float(smoothed(dataset, frame["value"] / 100)["loss"].min())
+        assert frame["loss"]["lowest"] == float(smooth(dataset, frame["value"] / 100)["loss"].min())
     assert names(Path("soft")) == ["slice.zarr", *FILES[1:]]
 
 

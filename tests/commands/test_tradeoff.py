@@ -56,7 +56,7 @@ class Converging(Environment):
         rounding = 1e-7 if self.fidelity.precision == "float32" else 0.0
         loss = x.square().sum(dim=1) + (1 + x[:, 0]) * dt**2 + rounding
         loss[(x[:, 0] > 0.5) & (dt >= 0.2)] = torch.nan
-        return Evaluation.judged(loss, 2 * x + dt**2 * x.new_tensor([1.0, 0.0]) if grad else None)
+        return Evaluation.from_results(loss, 2 * x + dt**2 * x.new_tensor([1.0, 0.0]) if grad else None)
 
 
 @pytest.fixture(autouse=True)

@@ -80,7 +80,7 @@ def test_a_recording_needs_a_display_or_is_served_until_it_is_stopped(
     def stopped(_: float) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(viewer, "served", serve)
+    monkeypatch.setattr(viewer, "serve_recording", serve)
     monkeypatch.setattr("time.sleep", stopped)
     done = run("view", "some.rrd", "--serve", cwd=desk)
     assert (done.returncode, served) == (0, ["some.rrd"])

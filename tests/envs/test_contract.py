@@ -179,7 +179,7 @@ def test_arrays_and_lists_are_points_too(env, points, monkeypatch):
 
     def evaluated(x, *, grad):
         asked.extend(x.tolist())
-        return Evaluation.judged(x.sum(dim=1), torch.ones_like(x) if grad else None)
+        return Evaluation.from_results(x.sum(dim=1), torch.ones_like(x) if grad else None)
 
     monkeypatch.setattr(env, "_evaluate", evaluated)
     for x in (points.numpy(), points.tolist(), reversed_, swapped):

@@ -30,14 +30,14 @@ class Bowl:
     space = SPACE
 
     def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
-        return Evaluation.judged(x.square().sum(dim=1), 2 * x if grad else None)
+        return Evaluation.from_results(x.square().sum(dim=1), 2 * x if grad else None)
 
 
 def told(status: list[int], loss: list[float], grad: list[list[float]] | None = None) -> Recorder:
     optimizer = Recorder(SPACE)
     optimizer.next = np.zeros((len(loss), 2))
     slope = None if grad is None else torch.tensor(grad, dtype=torch.float64)
-    evaluation = Evaluation.judged(torch.tensor(loss, dtype=torch.float64), slope, torch.tensor(status))
+    evaluation = Evaluation.from_results(torch.tensor(loss, dtype=torch.float64), slope, torch.tensor(status))
     optimizer.tell(optimizer.ask().x, evaluation)
     return optimizer
 

@@ -25,7 +25,7 @@ class Hole:
 
     def evaluate(self, x, *, grad=True):
         loss = torch.where(x[:, 0] < 0.0, torch.nan, ((x - 0.5) ** 2).sum(dim=1))
-        return Evaluation.judged(loss, 2 * (x - 0.5) if grad else None)
+        return Evaluation.from_results(loss, 2 * (x - 0.5) if grad else None)
 
 
 @pytest.mark.parametrize("method", [BO, BODescents])

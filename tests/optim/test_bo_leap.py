@@ -109,7 +109,7 @@ def test_the_process_sees_population_and_descents_failures_and_all():
 
         def evaluate(self, x, *, grad=True):
             loss = torch.where(x[:, 0] < -0.5, torch.nan, ((x - 0.5) ** 2).sum(dim=1))
-            return Evaluation.judged(loss, 2 * (x - 0.5) if grad else None)
+            return Evaluation.from_results(loss, 2 * (x - 0.5) if grad else None)
 
     optimizer = BOLeap(SPACE, seed=4)
     ends = []

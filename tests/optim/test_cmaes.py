@@ -115,7 +115,7 @@ def test_failed_episodes_push_the_search_away() -> None:
         space, name = BOX, "cliff"
 
         def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
-            return Evaluation.judged(x.sum(dim=1), None, torch.where(x[:, 0] < 0, Status.ESCAPED, Status.OK))
+            return Evaluation.from_results(x.sum(dim=1), None, torch.where(x[:, 0] < 0, Status.ESCAPED, Status.OK))
 
     table = search(Cliff(), CMAES(BOX, seed=4), budget=600).dataset()
     assert (table["status"] != Status.OK).any()
@@ -138,14 +138,14 @@ def test_a_restored_search_goes_on_bit_for_bit_past_restarts() -> None:
         again = restored(one, objective(ellipsoid))
         proposal = one.ask()
         assert torch.equal(again.ask().x, proposal.x)
-        one.tell(proposal.x, Evaluation.judged(ellipsoid(proposal.x), None))
+        one.tell(proposal.x, Evaluation.from_results(ellipsoid(proposal.x), None))
 
 
 def test_where_the_library_draws_other_points_it_goes_on_with_those_of_the_run() -> None:
     one = CMAES(BOX, seed=2)
     for _ in range(5):
         proposal = one.ask()
-        one.tell(proposal.x, Evaluation.judged(ellipsoid(proposal.x), None))
+        one.tell(proposal.x, Evaluation.from_results(ellipsoid(proposal.x), None))
     state = one.state()
     state["own"]["points"] += 1e-9
     with pytest.warns(RuntimeWarning, match="goes on with the points and losses that the run holds"):

@@ -116,7 +116,7 @@ def test_descents_go_on_past_failures():
 
         def evaluate(self, x, *, grad=True):
             loss = torch.where(x[:, 0] < 1.0, torch.nan, x[:, 0])
-            return Evaluation.judged(loss, torch.tensor([[1.0, 0.0]]).expand(len(x), 2).double())
+            return Evaluation.from_results(loss, torch.tensor([[1.0, 0.0]]).expand(len(x), 2).double())
 
     table = search(Cliff(), Descents(SPACE, seed=0), budget=80, gradient_cost=2.0).dataset()
     assert int((table["status"] == Status.NONFINITE).sum()) > 5

@@ -24,7 +24,7 @@ class Bowl:
     space = ParameterSpace.box(("x", "y"), -2.0, 2.0)
 
     def evaluate(self, x, *, grad=True):
-        return Evaluation.judged((x - torch.tensor([0.8, -1.0])).square().sum(dim=1), None)
+        return Evaluation.from_results((x - torch.tensor([0.8, -1.0])).square().sum(dim=1), None)
 
 
 class Coin:
@@ -42,7 +42,7 @@ class Coin:
         return torch.stack([seen, torch.full_like(seen, decision / 4)], dim=1)
 
     def evaluate(self, x, *, grad=True):
-        return Evaluation.judged((x[:, 1:] - 2 * self.side(x)[:, None]).square().mean(dim=1), None)
+        return Evaluation.from_results((x[:, 1:] - 2 * self.side(x)[:, None]).square().mean(dim=1), None)
 
     def side(self, x):
         return (25 * x[:, 0]).sin().sign()
@@ -53,7 +53,7 @@ class Fragile(Bowl):
 
     def evaluate(self, x, *, grad=True):
         loss = (x - torch.tensor([0.8, -1.0])).square().sum(dim=1)
-        return Evaluation.judged(loss.masked_fill(x[:, 0] < 0, torch.nan), None)
+        return Evaluation.from_results(loss.masked_fill(x[:, 0] < 0, torch.nan), None)
 
 
 SMALL = {

@@ -39,7 +39,9 @@ def points(count: int, *, grad: bool = True, start: int = 0) -> tuple[torch.Tens
     x = torch.rand(count, 2, generator=torch.Generator().manual_seed(start), dtype=torch.float64)
     loss = torch.arange(start, start + count, dtype=torch.float64)
     failed = torch.where(loss == 2, Status.ESCAPED, Status.OK)
-    return x, Evaluation.judged(loss, torch.tensor([3.0, 4.0]).expand(count, 2).double() if grad else None, failed)
+    return x, Evaluation.from_results(
+        loss, torch.tensor([3.0, 4.0]).expand(count, 2).double() if grad else None, failed
+    )
 
 
 def test_a_run_reads_back_as_it_was_written(tmp_path: Path) -> None:

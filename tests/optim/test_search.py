@@ -41,7 +41,7 @@ class Pit:
         u = SPACE.to_unit(x)
         failed = torch.where(u[:, 1] < 0.2, Status.ESCAPED, Status.OK)
         width = SPACE.upper - SPACE.lower
-        return Evaluation.judged((u**2).sum(dim=1), 2 * u / width if grad else None, failed)
+        return Evaluation.from_results((u**2).sum(dim=1), 2 * u / width if grad else None, failed)
 
 
 class Mixed(Optimizer):

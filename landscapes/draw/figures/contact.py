@@ -46,7 +46,10 @@ class Caption:
 
 
 def save_sheet(episode: Episode, path: str | Path, *, caption: Caption | None = None, keys: int = KEYS) -> None:
-    """Write key frames side by side as PNG, PDF or SVG, by the file's ending."""
+    """Write key frames side by side as PNG, PDF or SVG, by the file's ending.
+
+    Raises ValueError where the episode has no `parts`, or the ending is no picture's.
+    """
     page.save(episode_figure(episode, caption=caption, keys=keys), path)
 
 
@@ -56,11 +59,13 @@ def episode_figure(
     """Draw evenly spaced frames, first and last among them, each over its time; then a target of particles.
 
     The first has a scale. It is right at the middle of the view: what is nearer to the eye is larger.
+
+    Raises ValueError where the episode has no `parts`, or the page is too narrow or too wide.
     """
-    chosen, caption = replay.evenly(episode, keys), caption or Caption()
+    chosen, caption = replay.pick_frames(episode, keys), caption or Caption()
     shown = [*replay.frames(episode, chosen, marked=False)]
     said = [f"{style.number(float(episode.time[frame]), '.3g')} s" for frame in chosen]
-    if goals := tuple(replace(part, material="goal") for part in replay.sought(episode)):
+    if goals := tuple(replace(part, material="goal") for part in replay.goal_parts(episode)):
         shown += replay.frames(replace(episode, parts=goals), [0], marked=False)
         said.append("target")
     sheet = style.Sheet.of(width, pitch=PITCH, columns=len(shown), least=LEAST)
@@ -97,14 +102,14 @@ def _write(picture: page.Picture, caption: Caption, scale: str) -> None:
     room = sheet.width - 2 * typesetting.MARGIN
     if over := " · ".join(filter(None, (caption.title, caption.outcome))):
         page.entitle(picture, over)
-    lines = [_fitting(caption, room, sheet.small), scale, caption.provenance]
-    under = "\n".join(typesetting.wrapped(line, room, sheet.small) for line in lines if line)
+    lines = [_fit_parameters(caption, room, sheet.small), scale, caption.provenance]
+    under = "\n".join(typesetting.wrap_text(line, room, sheet.small) for line in lines if line)
     picture.supxlabel(under, size=sheet.small, color=style.QUIET, parse_math=False)
 
 
-def _fitting(caption: Caption, room: float, size: float) -> str:
+def _fit_parameters(caption: Caption, room: float, size: float) -> str:
     """Return the parameters, shortened to what two lines hold."""
     counts: Sequence[int] = range(len(caption.values), 0, -1)
     said = (caption.parameters(shown) for shown in counts)
-    whole = (text for text in said if not typesetting.wrapped(text, room, size).endswith(typesetting.MORE))
+    whole = (text for text in said if not typesetting.wrap_text(text, room, size).endswith(typesetting.MORE))
     return next(whole, "")

@@ -14,8 +14,8 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 from numpy.typing import NDArray
 
+from ...identity import plane_of
 from ...plane import Plane
-from ...storage.store import plane_of
 from .. import style
 from . import page, panel
 
@@ -31,6 +31,8 @@ def landscape_figure(dataset: xr.Dataset, *, width: float | None = None) -> page
     arrows are equally long and point down the steepest slope of the picture as it is seen, its axes scaled to the same
     length; their colour is the magnitude of the gradient along the plane. Failures are hatched and counted. `width` is
     that of a page for print [mm]; as for every picture, without it the picture is as large as suits a screen.
+
+    Raises ValueError where the slice is a line, or the page too narrow or too wide.
     """
     plane = plane_of(dataset)
     if plane.rank != 2:
@@ -58,7 +60,7 @@ def frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
     panel.name_axes(ax, y=plane.labels[1])
     status = dataset["status"].to_numpy()
     edges = cell_edges(dataset)
-    for kind, look in style.LOOKS.items():
+    for kind, look in style.STATUS_LOOKS.items():
         if (where := status == kind).any():
             patch = PathPatch(_cells(*edges, where), **look, zorder=1.5, antialiased=False, gid=kind.name)
             ax.add_patch(patch)
@@ -83,7 +85,7 @@ def loss_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) 
     if np.nanmin(loss) == np.nanmax(loss):
         return [Line2D([], [], linestyle="none", label=f"every sample: {style.number(np.nanmin(loss))}")]
     row, column = np.unravel_index(np.nanargmin(loss), loss.shape)
-    look = page.sheet_of(ax).look(style.LOWEST)
+    look = page.sheet_of(ax).look(style.LOWEST_MARK)
     (lowest,) = ax.plot(u[column], v[row], **look, label=f"lowest sample: {style.number(loss[row, column])}")
     return [lowest]
 
@@ -100,7 +102,7 @@ def loss_map(ax: Axes, dataset: xr.Dataset, scale: style.Scale) -> None:
 def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> list[Artist]:
     """Draw the negated gradients as arrows, on the slice's own scale unless given; return the legend's entries."""
     plane = plane_of(dataset)
-    rows, columns = (thinned(dataset.sizes[name]) for name in ("v", "u"))
+    rows, columns = (pick_arrows(dataset.sizes[name]) for name in ("v", "u"))
     slope = plane.slope(torch.from_numpy(dataset["grad"].to_numpy())).numpy()
     size, label = magnitude(slope, plane, dataset["loss"].attrs.get("units", ""))
     flat = size == 0
@@ -121,7 +123,7 @@ def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None)
     bar.ax.set_visible(bool(seen.any()))  # hidden rather than left out, so that both panels keep their width
     if not flat.any():
         return []
-    look = page.sheet_of(ax).look(style.FLAT)
+    look = page.sheet_of(ax).look(style.FLAT_MARK)
     ax.plot(u[flat[at]], v[flat[at]], **look, zorder=2.5)
     return [Line2D([], [], **look, label=f"gradient exactly zero: {int(flat.sum())} of {flat.size}")]
 
@@ -161,7 +163,7 @@ def magnitude(slope: Grid, plane: Plane, loss_unit: str) -> tuple[Grid, str]:
 
 
 def _limits(plane: Plane, axis: int) -> tuple[float, float]:
-    low, high = plane.window()
+    low, high = plane.cell_bounds()
     return float(low[axis]), float(high[axis])
 
 
@@ -187,7 +189,7 @@ def _edges(centers: Grid, low: float, high: float) -> Grid:
     return np.concatenate([[low], (centers[1:] + centers[:-1]) / 2, [high]])
 
 
-def thinned(points: int) -> NDArray[np.intp]:
+def pick_arrows(points: int) -> NDArray[np.intp]:
     """Return which of so many points along an axis keep their arrow."""
     step = -(-points // style.ARROWS)
     return cast("NDArray[np.intp]", np.arange((points - 1) % step // 2, points, step))

@@ -1,4 +1,4 @@
-"""One run against its episodes: every loss, and the best so far (matplotlib)."""
+"""The losses of one run by episode, and the best so far (matplotlib)."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def _draw_points(ax: Axes, table: xr.Dataset) -> list[Artist]:
             continue
         above = int((loss[here] > top).sum())
         label = f"{name} points" + (f" ({above} above the picture)" if above else "")
-        look = style.KINDS[name] | {"markersize": 3.0, "markeredgewidth": 0.0, "alpha": 0.55, "linestyle": "none"}
+        look = style.POINT_MARKS[name] | {"markersize": 3.0, "markeredgewidth": 0.0, "alpha": 0.55, "linestyle": "none"}
         entries += ax.plot(episodes[here], loss[here], **page.sheet_of(ax).look(look), label=label, gid=name)
     return entries
 

@@ -1,4 +1,4 @@
-"""Pictures for a page that is dark: greys turned over, colours as they are, so that a map keeps its bar."""
+"""Pictures for dark pages: greys are inverted, and colours stay, so that a map agrees with its colour bar."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ COLOURS = ("color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolo
 PALE_GREY, GREY = (0.04, 0.12), (0.015, 0.04)  # up to which difference of its channels a colour is grey, and from which
 # on it is none, where it is pale and where it is not: cividis has colours that are nearly grey, and not pale
 MIDDLE = (0.40, 0.53)  # lightness of greys that stay: turned over they would hardly change, and cividis has them
-PAPER, PALE, NEAR = 0.975, 0.6, 3  # lightness of the page, of colours that it shines through; how near they are [pixel]
+PAPER, PALE = 0.975, 0.6  # lightness of the page, and of colours that it shines through
+NEIGHBOURHOOD = 3  # pixels within which such colours are near the page
 
 
 def darken(picture: Picture) -> None:
@@ -46,10 +47,10 @@ def _darken(artist: Artist) -> None:
             continue
         found = to_rgba_array(value)
         if len(found):
-            write(turned(found) if np.ndim(value) == 2 else tuple(turned(found)[0]))
+            write(invert_greys(found) if np.ndim(value) == 2 else tuple(invert_greys(found)[0]))
     strokes = [_gc(effect) for effect in artist.get_path_effects() or [] if isinstance(effect, withStroke)]
     if strokes:
-        grounds = [tuple(turned(to_rgba_array(stroke["foreground"]))[0]) for stroke in strokes]
+        grounds = [tuple(invert_greys(to_rgba_array(stroke["foreground"]))[0]) for stroke in strokes]
         artist.set_path_effects(
             [withStroke(**{**stroke, "foreground": ground}) for stroke, ground in zip(strokes, grounds, strict=True)]
         )
@@ -60,7 +61,7 @@ def _gc(effect: Any) -> dict[str, Any]:
     return found
 
 
-def turned(colours: Colours) -> Colours:
+def invert_greys(colours: Colours) -> Colours:
     """Return colours, shape (..., 3 or 4), greys among them as light on the dark ground as they were dark on white."""
     rgb, rest = colours[..., :3], colours[..., 3:]
     level, chroma = rgb.mean(axis=-1, keepdims=True), np.ptp(rgb, axis=-1, keepdims=True)
@@ -78,9 +79,9 @@ def save_dark(source: Path, target: Path) -> None:
         light = np.asarray(picture.convert("RGB"), dtype=np.float64) / 255
     level, chroma = light.mean(axis=-1), np.ptp(light, axis=-1)
     paper, pale = (level > PAPER) & (chroma < PALE_GREY[0]), (level > PALE) & (chroma > PALE_GREY[0])
-    edge = binary_dilation(paper, iterations=NEAR) & pale
+    edge = binary_dilation(paper, iterations=NEIGHBOURHOOD) & pale
     ground = to_rgba_array(style.NIGHT)[0, :3]
-    dark = turned(light)
+    dark = invert_greys(light)
     dark[edge] = light[edge] - light[edge].min(axis=-1, keepdims=True) * (1 - ground)
     pixels = Image.fromarray(np.rint(255 * np.clip(dark, 0.0, 1.0)).astype(np.uint8))
     with replacing(target) as partial:

@@ -1,4 +1,4 @@
-"""Names beside what they name, where they cover nothing."""
+"""Labels of points, each placed where it covers nothing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SIDES = (  # right, up: where a name may stand, in the order tried; from the sec
     *((0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, -1), (-1, 1)),
     *((0.5, 1), (1, 0.5), (1, -0.5), (0.5, -1), (-0.5, -1), (-1, -0.5), (-1, 0.5), (-0.5, 1)),
 )
-NEAR = 8  # of the sides
+NEAR_SIDES = 8  # of the sides
 NOTHING: Grid = np.zeros((0, 2))
 ROOM = 1.15  # of a line, in the size of its type
 
@@ -58,7 +58,7 @@ def place(
         half = np.array([text_width(name.text, size) * 72, ROOM * size]) * dot / 2
         for avoided, (far, gap), side in product(points, enumerate(gaps), SIDES):
             shift = np.array(side) * (half + gap * dot)
-            if not far and side not in SIDES[:NEAR]:
+            if not far and side not in SIDES[:NEAR_SIDES]:
                 continue
             if crowd.takes(number, origins[number] + shift, half, avoided, led=far > 0):
                 _write(ax, name, shift / dot, size, led=far > 0, gid=gid)
@@ -71,7 +71,7 @@ def place(
 def _write(ax: Axes, name: Name, shift: Grid, size: float, *, led: bool, gid: str) -> None:
     text = ax.annotate(
         name.text, name.at, (float(shift[0]), float(shift[1])), textcoords="offset points", ha="center", va="center",
-        size=size, arrowprops=style.LEADER if led else None, parse_math=False, gid=gid, **style.NAME,
+        size=size, arrowprops=style.LEADER if led else None, parse_math=False, gid=gid, **style.NAME_TEXT,
     )  # fmt: skip
     text.set_in_layout(False)  # it has found its room
 

@@ -1,4 +1,4 @@
-"""Runs over a slice: the loss map with their points, and what the map shows against what they found (matplotlib)."""
+"""Runs over a slice: their points on the loss map, and their losses against those of the map (matplotlib)."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
+from ...identity import plane_of
 from ...objective import Status
 from ...overlay import improvements
 from ...plane import Plane
-from ...storage.store import plane_of
 from .. import style
 from . import contour, labels, page, panel
 
 Runs = Sequence[xr.Dataset]
 PITCH = 5.4  # room of a panel on a screen [inch]
+HEADING = "Marker size: distance from the plane; colour: the loss the point truly had"
 FEW = 24  # most improvements that are numbered, over all runs
 CROWD = 4  # runs from which on the lines that join them are thinner
 
@@ -31,14 +32,16 @@ CROWD = 4  # runs from which on the lines that join them are thinner
 def overlay_figure(dataset: xr.Dataset, runs: Runs, *, width: float | None = None) -> page.Picture:
     """Draw runs, as `overlay` lays them, over the loss map of their slice, and their losses against the map's.
 
-    A point is filled with the loss it truly had, on the map's own scale: where it differs from what is around it, the
-    plane does not show it. It is smaller, and a descent fainter, the farther it lies off the plane. A white line joins
-    what was a run's best so far, from one improvement to the next up to the star; of as many as there is room for, a
-    number says in which episode they came. Points beyond the map are hollow and at its border; failed episodes are
-    crosses. On the right, or below it on a narrow page, every point is held against the sample it lies over: it is on
-    the diagonal if the map tells its loss.
+    The colour of a marker is the loss that the point truly had, on the map's own scale: where it differs from the
+    colour around it, the plane does not show the point. Markers get smaller, and descents fainter, with the distance
+    from the plane. A white line joins the improvements of a run, up to the star at its best point; numbers say in which
+    episodes they came, as far as there is room. Points beyond the map are hollow and at its border; failed episodes are
+    crosses. The panel on the right, or below on a narrow page, compares each point with the sample beneath it: points
+    on the diagonal have the loss that the map shows.
+
+    Raises ValueError where the page is too narrow or too wide.
     """
-    plane, reach = plane_of(dataset), farthest(runs)
+    plane, reach = plane_of(dataset), farthest_distance(runs)
     sheet = style.Sheet.of(width, pitch=PITCH, columns=2)
     picture = page.Picture(sheet, 2 / sheet.columns * sheet.pitch)
     over, against = panel.grid(picture, 2)
@@ -50,10 +53,10 @@ def overlay_figure(dataset: xr.Dataset, runs: Runs, *, width: float | None = Non
         _draw_run(over, run, plane, scale, reach, _count(runs))
         _join_improvements(over, run, plane, len(runs))
     _draw_against(against, dataset, runs, reach)
-    page.head(picture, over, dataset, f"{page.title(dataset)} · {_said(runs)}")
+    page.head(picture, over, dataset, f"{page.title(dataset)} · {_describe_runs(runs)}")
     entries = [*_run_entries(sheet, runs), *_order_entries(sheet, runs), *_kind_entries(sheet, runs)]
     entries += [*_distance_entries(sheet, runs, reach), *_count_entries(sheet, runs)]
-    page.finish(picture, [*entries, *page.failure_key(dataset)])
+    page.finish(picture, [*entries, *page.failure_key(dataset)], heading=HEADING)
     _number_improvements(over, runs, plane)
     return picture
 
@@ -74,7 +77,7 @@ def joint_scale(dataset: xr.Dataset, runs: Runs) -> style.Scale:
     return style.Scale.of_loss(np.clip(values, floor, high)).over(values)
 
 
-def farthest(runs: Runs) -> float:
+def farthest_distance(runs: Runs) -> float:
     """Return the greatest distance of any point from the plane [half-widths of the box], 0 where it is rounding."""
     most = max((float(run["distance"].max()) for run in runs if run.sizes["evaluation"]), default=0.0)
     return most if most > 1e-9 else 0.0
@@ -84,10 +87,10 @@ def _draw_run(ax: Axes, run: xr.Dataset, plane: Plane, scale: style.Scale, reach
     color, sheet = style.method(run)["color"], page.sheet_of(ax)
     place = _places(run, plane)
     loss, distance, outside = (run[name].to_numpy() for name in ("loss", "distance", "outside"))
-    ax.add_collection(_trail(run, place, reach, sheet))
+    ax.add_collection(_descent_lines(run, place, reach, sheet))
     areas = sheet.weight**2 * style.point_areas(distance, reach, points)
     for name, here in by_kind(run):
-        look: dict[str, Any] = {"edgecolors": color, "marker": style.KINDS[name]["marker"]}
+        look: dict[str, Any] = {"edgecolors": color, "marker": style.POINT_MARKS[name]["marker"]}
         if (some := here & ~outside & np.isfinite(loss)).any():
             u, v = place[some].T
             ax.scatter(u, v, s=areas[some], marker=look["marker"], **sheet.look(style.HALO))
@@ -98,18 +101,18 @@ def _draw_run(ax: Axes, run: xr.Dataset, plane: Plane, scale: style.Scale, reach
             ax.scatter(u, v, gid="outside", **look, **sheet.look(style.BORDER))
     failed = (run["status"].to_numpy() != Status.OK) & ~outside
     if failed.any():
-        ax.scatter(place[failed, 0], place[failed, 1], **sheet.look(style.BROKEN), gid="failed")
+        ax.scatter(place[failed, 0], place[failed, 1], **sheet.look(style.FAILED_MARK), gid="failed")
     if np.isfinite(loss).any():
         row = int(np.nanargmin(loss))
         inside = "none" if outside[row] else [style.LOSS_MAP(scale.norm(loss[row]))]
         u, v = place[row]
-        best = sheet.look(style.BEST)
+        best = sheet.look(style.BEST_MARK)
         ax.scatter([u], [v], facecolors=inside, edgecolors=color, clip_on=False, gid="best", **best)
 
 
 def _places(run: xr.Dataset, plane: Plane) -> NDArray[np.float64]:
-    """Return where a run's points are drawn, shape (point, 2): those beyond the window at its border."""
-    low, high = (side.numpy() for side in plane.window())
+    """Return where a run's points are drawn, shape (point, 2): those beyond the map at its border."""
+    low, high = (side.numpy() for side in plane.cell_bounds())
     found: NDArray[np.float64] = np.clip(np.stack([run["u"], run["v"]], axis=1), low, high)
     return found
 
@@ -121,7 +124,7 @@ def by_kind(run: xr.Dataset) -> list[tuple[str, NDArray[np.bool_]]]:
     return [(name, kind == code) for code, name in pairs if (kind == code).any()]
 
 
-def _trail(run: xr.Dataset, place: NDArray[np.float64], reach: float, sheet: style.Sheet) -> LineCollection:
+def _descent_lines(run: xr.Dataset, place: NDArray[np.float64], reach: float, sheet: style.Sheet) -> LineCollection:
     rows = np.flatnonzero(run["previous"].to_numpy() >= 0)
     before = run["previous"].to_numpy()[rows]
     distance = run["distance"].to_numpy()
@@ -129,18 +132,18 @@ def _trail(run: xr.Dataset, place: NDArray[np.float64], reach: float, sheet: sty
     colors = np.tile(to_rgba(style.method(run)["color"]), (len(rows), 1))
     colors[:, 3] = 1 - (1 - style.FAINTEST) * away
     lines = np.stack([place[before], place[rows]], axis=1)
-    return LineCollection(list(lines), colors=colors, gid="descents", **sheet.look(style.TRAIL))
+    return LineCollection(list(lines), colors=colors, gid="descents", **sheet.look(style.DESCENT_LINE))
 
 
 def _join_improvements(ax: Axes, run: xr.Dataset, plane: Plane, runs: int) -> None:
     thinner = min(1.0, (CROWD / runs) ** 0.5)
-    for look in style.ORDER:
+    for look in style.IMPROVEMENTS:
         scaled = page.sheet_of(ax).look(look | {"linewidth": thinner * look["linewidth"]})
         ax.plot(*_places(run, plane)[improvements(run)].T, gid="order", **scaled)
 
 
 def _number_improvements(ax: Axes, runs: Runs, plane: Plane) -> None:
-    """Say of improvements, the last of each run first, in which episode they came, where there is room."""
+    """Write the episodes of improvements beside them, the last of each run first, as far as there is room."""
     places = [_places(run, plane) for run in runs]
     rows = [improvements(run)[::-1] for run in runs]
     turns = range(max(map(len, rows), default=0))
@@ -152,7 +155,7 @@ def _number_improvements(ax: Axes, runs: Runs, plane: Plane) -> None:
 
 
 def _draw_against(ax: Axes, dataset: xr.Dataset, runs: Runs, reach: float) -> None:
-    """Hold every loss against that of the sample beneath."""
+    """Draw the loss of every point against that of the sample beneath it."""
     panel.dress(ax)
     ax.set_box_aspect(1)
     sheet = page.sheet_of(ax)
@@ -165,7 +168,7 @@ def _draw_against(ax: Axes, dataset: xr.Dataset, runs: Runs, reach: float) -> No
         look = {"facecolors": style.method(run)["color"], "edgecolors": "white", **sheet.look(style.OVERLAID)}
         for name, here in by_kind(run):
             at = some & here
-            ax.scatter(beneath[at], loss[at], s=areas[at], marker=style.KINDS[name]["marker"], gid=name, **look)
+            ax.scatter(beneath[at], loss[at], s=areas[at], marker=style.POINT_MARKS[name]["marker"], gid=name, **look)
     unit = dataset["loss"].attrs.get("units", "")
     per = f" [{unit}]" if unit else ""
     panel.name_axes(ax, f"loss of the sample beneath{per}", f"loss of the point itself{per}")
@@ -196,11 +199,11 @@ def _run_entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
         name = f"{method}, seed {own[0].attrs['seed']}" if len(own) == 1 else f"{method}, {len(own)} runs"
         look = sheet.look({"linewidth": 1.6, "marker": "*", "markersize": 10, "markeredgewidth": 1.0})
         look |= {"color": style.method(own[0])["color"], "markerfacecolor": "white"}
-        entries.append(Line2D([], [], **look, label=f"{name}: {_best_said(own)}"))
+        entries.append(Line2D([], [], **look, label=f"{name}: {_describe_best(own)}"))
     return entries
 
 
-def _best_said(runs: Runs) -> str:
+def _describe_best(runs: Runs) -> str:
     found = [(float(run["best"][-1]), run) for run in runs if run.sizes["evaluation"] and run["best"][-1].notnull()]
     if not found:
         return "no episode succeeded"
@@ -220,12 +223,12 @@ def half_widths(distance: float) -> str:
 
 
 def _order_entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
-    """Say what the white lines are, where there is any."""
+    """Return the legend entry of the white lines, if there are any."""
     if not any(len(improvements(run)) > 1 for run in runs):
         return []
-    effects = [withStroke(linewidth=sheet.weight * style.ORDER[0]["linewidth"], foreground=style.INK)]
-    look = sheet.look(style.ORDER[1]) | {"path_effects": effects}
-    return [Line2D([], [], **look, label="the best so far, from one to the next; numbers are episodes")]
+    effects = [withStroke(linewidth=sheet.weight * style.IMPROVEMENTS[0]["linewidth"], foreground=style.INK)]
+    look = sheet.look(style.IMPROVEMENTS[1]) | {"path_effects": effects}
+    return [Line2D([], [], **look, label="white line: the best loss so far; numbers: episodes")]
 
 
 def _kind_entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
@@ -235,7 +238,7 @@ def _kind_entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
             counts[name] = counts.get(name, 0) + int(here.sum())
     look = _mark(sheet, markerfacecolor="white")
     return [
-        Line2D([], [], marker=style.KINDS[name]["marker"], **look, label=f"{name} point: {count}")
+        Line2D([], [], marker=style.POINT_MARKS[name]["marker"], **look, label=f"{name} point: {count}")
         for name, count in counts.items()
     ]
 
@@ -271,5 +274,5 @@ def _count(runs: Runs) -> int:
     return sum(run.sizes["evaluation"] for run in runs)
 
 
-def _said(runs: Runs) -> str:
+def _describe_runs(runs: Runs) -> str:
     return f"{len(runs)} run{'s' if len(runs) != 1 else ''}, {_count(runs)} episodes"

@@ -1,4 +1,4 @@
-"""The page a matplotlib picture stands on: its sheet, title, provenance, legend, height and files."""
+"""The page of a matplotlib picture: its size, title, provenance, legend and files."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from matplotlib.text import Text
 
 from ...identity import stored_identity, stored_provenance
 from ...objective import Status
-from ...storage.files import print_width, replacing, visible
+from ...storage.files import print_width, replacing, visible_files
 from .. import style
-from .typesetting import MARGIN, across, settle, wrapped
+from .typesetting import MARGIN, settle, title_room, wrap_text
 
 HANDLE = 4.5  # room of a legend's sign, in the height of its type
 # Type in a PDF can be selected and searched, its font goes with it. SVG cannot carry one: there type is outlines, which
@@ -61,7 +61,7 @@ def head(picture: Picture, ax: Axes, dataset: xr.Dataset, name: str | None = Non
 def entitle(picture: Picture, text: str) -> None:
     """Write a title over the figure."""
     sheet = picture.sheet
-    said = wrapped(text, sheet.width - 2 * MARGIN, sheet.title)
+    said = wrap_text(text, sheet.width - 2 * MARGIN, sheet.title)
     picture.suptitle(said, size=sheet.title, color=style.INK, parse_math=False)
 
 
@@ -73,11 +73,14 @@ def remark(ax: Axes, text: str) -> None:
 def write_over(ax: Axes, text: str, *, size: float, color: str) -> None:
     """Write over a panel, each line in two at most."""
     title = ax.set_title(text, size=size, color=color, parse_math=False)
-    picture_of(ax).fitted[title] = text, lambda: across(ax)
+    picture_of(ax).fitted[title] = text, lambda: title_room(ax)
 
 
 def picture_of(ax: Axes) -> Picture:
-    """Return the picture that a panel is in."""
+    """Return the picture that a panel is in.
+
+    Raises TypeError where it is in a figure that is no Picture.
+    """
     picture = ax.get_figure(root=True)
     if not isinstance(picture, Picture):
         raise TypeError(f"panels are drawn in a Picture, which knows its sheet; got one in a {type(picture).__name__}")
@@ -119,7 +122,7 @@ def failure_key(dataset: xr.Dataset) -> list[Patch]:
     status = dataset["status"].to_numpy()
     names = style.FAILURES | {Status.MISSING: "not sampled yet"}
     return [
-        Patch(**style.LOOKS[kind], label=f"{name}: {count} of {status.size}")
+        Patch(**style.STATUS_LOOKS[kind], label=f"{name}: {count} of {status.size}")
         for kind, name in names.items()
         if (count := int((status == kind).sum()))
     ]
@@ -137,7 +140,9 @@ def _key(picture: Picture, entries: Sequence[Artist], columns: int, heading: str
     sheet, room = picture.sheet, picture.sheet.width - 2 * MARGIN
     legend = picture.legend(
         handles=list(entries),
-        labels=[wrapped(str(one.get_label()), room - HANDLE * sheet.tick / 72, sheet.tick, lines=3) for one in entries],
+        labels=[
+            wrap_text(str(one.get_label()), room - HANDLE * sheet.tick / 72, sheet.tick, lines=3) for one in entries
+        ],
         loc="outside lower center",
         ncols=columns,
         fontsize=sheet.tick,
@@ -151,12 +156,15 @@ def _key(picture: Picture, entries: Sequence[Artist], columns: int, heading: str
         legend.remove()
         _key(picture, entries, columns - 1, heading)
     elif heading:
-        legend.set_title(wrapped(heading, room, sheet.small), prop=FontProperties(size=sheet.small))
+        legend.set_title(wrap_text(heading, room, sheet.small), prop=FontProperties(size=sheet.small))
         legend.get_title().set(color=style.QUIET, parse_math=False)
 
 
 def save(figure: Figure, path: str | Path) -> None:
-    """Write a figure as PNG, PDF or SVG, by the file's ending, whole or not at all."""
+    """Write a figure as PNG, PDF or SVG, by the file's ending, whole or not at all.
+
+    Raises ValueError where the ending is another.
+    """
     path = Path(path)
     kind = path.suffix.lower().removeprefix(".")
     if kind not in DATED:
@@ -170,8 +178,10 @@ def save_prints(draw: Callable[[float], Figure], path: Path, widths: Sequence[fl
     """Write what `draw` draws for a page of so many millimetres as PDF and SVG beside `path`; return their names.
 
     Those that are there from before are drawn anew, so that none is of something else.
+
+    Raises ValueError where a width is no page's.
     """
-    before = {width for file in visible(path.parent) if (width := print_width(file.name, path.name))}
+    before = {width for file in visible_files(path.parent) if (width := print_width(file.name, path.name))}
     names = []
     for width in dict.fromkeys([*sorted(before), *widths]):
         figure = draw(width)

@@ -1,4 +1,4 @@
-"""What every panel has: ticks, frame, names of its axes, a caption, a colour bar; in the sizes of its sheet."""
+"""Parts that panels share: ticks, frame, axis labels, a caption and a colour bar, in the sizes of the page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullForm
 
 from .. import style
 from .page import Picture, picture_of, sheet_of, write_over
-from .typesetting import across, upright
+from .typesetting import side_room, title_room
 
 NARROW = 1.8  # room of a panel that has fewer ticks [inch]
 
@@ -39,14 +39,14 @@ def dress(ax: Axes) -> None:
 
 
 def name_axes(ax: Axes, x: str | None = None, y: str | None = None) -> None:
-    """Write what is along the axes, with its unit."""
+    """Label the axes."""
     for axis, said in ((ax.xaxis, x), (ax.yaxis, y)):
         if said is not None:
-            _name(ax, axis, said, (lambda: across(ax)) if axis is ax.xaxis else (lambda: upright(ax)))
+            _name(ax, axis, said, (lambda: title_room(ax)) if axis is ax.xaxis else (lambda: side_room(ax)))
 
 
 def name_outer(ax: Axes, x: str, y: str) -> None:
-    """Write what is along the axes of one of several panels over the same window, once for a row and a column."""
+    """Label the axes of one of several panels over the same plane, once for a row and once for a column."""
     spec = ax.get_subplotspec()
     assert spec is not None  # as `grid` made it
     ax.label_outer()
@@ -69,7 +69,7 @@ def colour_bar(ax: Axes, drawn: ScalarMappable, label: str, scale: style.Scale |
     place: dict[str, Any] = {"fraction": 0.05, "pad": 0.02, "extend": scale.extend if scale else "neither"} | how
     bar = ax.figure.colorbar(drawn, ax=ax, **place)
     lying = bar.orientation == "horizontal"
-    _name(ax, bar.long_axis, label, (lambda: across(ax)) if lying else (lambda: upright(ax)))
+    _name(ax, bar.long_axis, label, (lambda: title_room(ax)) if lying else (lambda: side_room(ax)))
     bar.ax.tick_params(which="both", **_ticks(sheet))
     bar.ax.tick_params(which="minor", length=2 * sheet.type)
     bar.outline.set(edgecolor=style.QUIET, linewidth=max(0.4, 0.6 * sheet.weight))

@@ -12,8 +12,8 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
 
+from ...identity import plane_of
 from ...plane import Plane
-from ...storage.store import plane_of
 from .. import style
 from . import page, panel, typesetting
 
@@ -29,6 +29,8 @@ def profile_figure(
 
     `events` maps a name to a whole number per point (how many bounces, say): each is a strip on top, labelled where
     there is room, and a thin line through the panels wherever it changes. Failures are hatched and counted.
+
+    Raises ValueError where the slice is a plane, or the page too narrow or too wide.
     """
     plane = plane_of(dataset)
     if plane.rank != 1:
@@ -67,13 +69,13 @@ def _counts(name: str, values: ArrayLike, points: int) -> NDArray[np.int64]:
 def _draw_loss(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
     u, loss = dataset["u"].to_numpy(), dataset["loss"].to_numpy()
     sheet = page.sheet_of(ax)
-    ax.plot(u, loss, color=style.LINE, **sheet.look(style.stroke(len(u))))
+    ax.plot(u, loss, color=style.LOSS_LINE, **sheet.look(style.stroke(len(u))))
     panel.name_axes(ax, y=page.loss_name(dataset))
     if not np.isfinite(loss).any():
         return []
     lowest = int(np.nanargmin(loss))
     (star,) = ax.plot(
-        u[lowest], loss[lowest], **sheet.look(style.LOWEST), zorder=4,
+        u[lowest], loss[lowest], **sheet.look(style.LOWEST_MARK), zorder=4,
         label=f"lowest sample: {style.number(loss[lowest])}",
     )  # fmt: skip
     return [star]
@@ -108,7 +110,7 @@ def _frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
     ax.set_xlim(float(plane.lower[0]), float(plane.upper[0]))
     u, status = dataset["u"].to_numpy(), dataset["status"].to_numpy()
     edges = np.concatenate([u[:1], (u[1:] + u[:-1]) / 2, u[-1:]])
-    for kind, look in style.LOOKS.items():
+    for kind, look in style.STATUS_LOOKS.items():
         for start, stop in _runs(status == kind):
             ax.axvspan(edges[start], edges[stop], **look, zorder=0.6, gid=kind.name)
 
@@ -131,7 +133,7 @@ def _draw_strip(strip: Axes, panels: list[Axes], u: NDArray[np.float64], name: s
             strip.text((low + high) / 2, 0.5, str(label), size=sheet.small, color=style.INK, ha="center", va="center")
     for edge in edges[1:-1]:
         for ax in panels:
-            ax.axvline(edge, color=style.FAINT, linewidth=sheet.weight * style.thin(len(meets)), zorder=0.7)
+            ax.axvline(edge, color=style.FAINT, linewidth=sheet.weight * style.hairline_width(len(meets)), zorder=0.7)
     strip.set_ylim(0, 1)
     strip.set_yticks([])
     strip.tick_params(bottom=False, labelbottom=False)

@@ -1,4 +1,4 @@
-"""How good gradients are over a slice: their angle to the slope at several scales, first against zeroth order."""
+"""Gradient quality over a slice: cosines with finite differences by scale, and first against zeroth order."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from ...measures.gradient_quality import biased, disagreement, scale_table
+from ...identity import plane_of
+from ...measures.gradient_quality import disagreement, find_bias, scale_table
 from ...measures.ruggedness import box_slopes
-from ...storage.store import plane_of
 from .. import style
 from . import contour, page, panel
 
@@ -35,6 +35,8 @@ def quality_figure(
     `steps` is of `gradients.ladder`, `samples` of `gradients.of_samples` and `smooth` of `gradients.smoothed_slopes`.
     Panels that show the same by the same colours share a colour bar, beside the last of them. Six panels one below the
     other would be higher than a printed page: on a narrow one they are in pairs.
+
+    Raises ValueError where the page is too narrow or too wide.
     """
     plane = plane_of(dataset)
     sheet = style.Sheet.of(width, pitch=PITCH, columns=3, least=LEAST)
@@ -76,14 +78,14 @@ def _share_names(axes: dict[str, Axes], rows: Sequence[Sequence[str]], kind: Seq
 
 
 def _signs(sheet: style.Sheet, dataset: xr.Dataset) -> list[Artist]:
-    sure = Line2D([], [], **sheet.look(style.SURE), label="first order is biased beyond chance (p < 0.001)")
-    unseen = Patch(**style.UNSEEN, label="no slope above the noise, or too close to the border")
+    sure = Line2D([], [], **sheet.look(style.BIASED), label="first order is biased beyond chance (p < 0.001)")
+    unseen = Patch(**style.NO_SLOPE, label="no slope above the noise, or too close to the border")
     return [sure, *([unseen] if dataset["loss"].ndim == 2 else []), *page.failure_key(dataset)]
 
 
 def _cosine_map(ax: Axes, dataset: xr.Dataset, found: xr.Dataset, *, last: bool) -> None:
     plane, cosine = plane_of(dataset), found["cosine"].to_numpy()
-    ax.set_facecolor(style.UNSEEN["facecolor"])
+    ax.set_facecolor(style.NO_SLOPE["facecolor"])
     drawn = ax.imshow(np.ma.masked_invalid(cosine), extent=_extent(dataset), **style.COSINE)
     contour.frame(ax, dataset, plane)
     panel.name_axes(ax, plane.labels[0])
@@ -106,7 +108,7 @@ def _slope_lines(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
     difference = np.full_like(loss, np.nan)
     difference[1:-1] = (loss[2:] - loss[:-2]) * (len(loss) - 1) / 2
     look = page.sheet_of(ax).look(style.stroke(len(u)))
-    lines = ax.plot(u, difference, color=style.LINE, **look, label="difference over two samples")
+    lines = ax.plot(u, difference, color=style.LOSS_LINE, **look, label="difference over two samples")
     lines += ax.plot(u, slope, color=style.SLOPE_LINE, **look, label="gradient", alpha=0.8)
     panel.dress(ax)
     ax.set_box_aspect(FLAT)
@@ -122,7 +124,7 @@ def _scales(ax: Axes, steps: xr.Dataset, samples: xr.Dataset) -> list[Artist]:
     for found, filled in ((steps, True), (samples, False)):
         rows = [row for row in scale_table(found) if row["points"]]
         scale = [row["scale"] for row in rows]
-        for name, colour, label in (("cosine", style.LINE, "mean cosine"), ("uphill", style.SLOPE_LINE, "uphill")):
+        for name, colour, label in (("cosine", style.LOSS_LINE, "mean cosine"), ("uphill", style.SLOPE_LINE, "uphill")):
             estimates = [row["cosine"] if name == "cosine" else row["uphill"] for row in rows]
             value = np.array([one["value"] for one in estimates], dtype=float)
             ends = np.array([(one["low"], one["high"]) for one in estimates], dtype=float).reshape(-1, 2)
@@ -151,13 +153,13 @@ def _scales(ax: Axes, steps: xr.Dataset, samples: xr.Dataset) -> list[Artist]:
 def _disagreement_map(ax: Axes, dataset: xr.Dataset, smooth: xr.Dataset, number: int) -> list[Artist]:
     plane, place = plane_of(dataset), smooth["place"].to_numpy()
     side = round(len(place) ** 0.5)
-    apart, sure = (of(smooth).isel(width=number).to_numpy() for of in (disagreement, biased))
+    apart, sure = (of(smooth).isel(width=number).to_numpy() for of in (disagreement, find_bias))
     low, high = plane.lower.tolist(), plane.upper.tolist()
-    ax.set_facecolor(style.UNSEEN["facecolor"])
+    ax.set_facecolor(style.NO_SLOPE["facecolor"])
     drawn = ax.imshow(
-        np.ma.masked_invalid(apart.reshape(side, side)), extent=(low[0], high[0], low[1], high[1]), **style.APART
+        np.ma.masked_invalid(apart.reshape(side, side)), extent=(low[0], high[0], low[1], high[1]), **style.DISAGREEMENT
     )
-    ax.plot(*place[sure].T, **page.sheet_of(ax).look(style.SURE))
+    ax.plot(*place[sure].T, **page.sheet_of(ax).look(style.BIASED))
     panel.dress(ax)
     ax.set_box_aspect(1)
     panel.name_axes(ax, *plane.labels)
@@ -170,14 +172,14 @@ def _disagreement_map(ax: Axes, dataset: xr.Dataset, smooth: xr.Dataset, number:
 def _two_orders(ax: Axes, dataset: xr.Dataset, smooth: xr.Dataset, number: int) -> list[Artist]:
     plane, place, found = plane_of(dataset), smooth["place"].to_numpy()[:, 0], smooth.isel(width=number)
     sheet, entries = page.sheet_of(ax), list[Artist]()
-    for name, colour, marker in (("zeroth", style.LINE, "s"), ("first", style.SLOPE_LINE, "o")):
+    for name, colour, marker in (("zeroth", style.LOSS_LINE, "s"), ("first", style.SLOPE_LINE, "o")):
         error = found[f"{name}_error"].to_numpy()[:, 0]
         look = sheet.look({"color": colour, "marker": marker, "markersize": 4.0, "linewidth": 0.9, "capsize": 2.0})
         ax.errorbar(place, found[name].to_numpy()[:, 0], error, **look)
         del look["capsize"]
         entries.append(Line2D([], [], **look, label=f"{name} order"))
-    sure = biased(smooth).isel(width=number).to_numpy()
-    ax.plot(place[sure], found["first"].to_numpy()[sure, 0], **sheet.look(style.SURE), zorder=4)
+    sure = find_bias(smooth).isel(width=number).to_numpy()
+    ax.plot(place[sure], found["first"].to_numpy()[sure, 0], **sheet.look(style.BIASED), zorder=4)
     panel.dress(ax)
     ax.set_box_aspect(1)
     panel.name_axes(ax, plane.labels[0], _slope_label(dataset))
@@ -199,5 +201,5 @@ def _percent(share: xr.DataArray) -> str:
 
 
 def _extent(dataset: xr.Dataset) -> tuple[float, float, float, float]:
-    low, high = (end.tolist() for end in plane_of(dataset).window())
+    low, high = (end.tolist() for end in plane_of(dataset).cell_bounds())
     return low[0], high[0], low[1], high[1]

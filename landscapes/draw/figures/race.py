@@ -15,7 +15,7 @@ from .. import style
 from . import page, panel
 
 PITCH, SHAPE = 4.9, 0.95  # room of a panel on a screen [inch]; its height, against its width
-APART = 0.3  # between two markers of a line, as a share of the panel's diagonal
+MARK_SPACING = 0.3  # between two markers of a line, as a share of the panel's diagonal
 
 
 def race_figure(dataset: xr.Dataset, *, width: float | None = None) -> page.Picture:
@@ -49,11 +49,14 @@ def _draw_method(losses: Axes, shares: Axes, dataset: xr.Dataset, row: int) -> A
     one = dataset.isel(method=row)
     name = str(one["method"].item())
     look = page.sheet_of(losses).look(style.METHOD_LINE | style.METHODS.get(name, style.OTHER_METHOD))
-    look |= {"drawstyle": "steps-post", "markevery": (APART * (row + 0.5) / dataset.sizes["method"], APART)}
-    episodes, mean, low, high = (_known(one[key], one["mean"]) for key in ("episodes", "mean", "low", "high"))
+    look |= {
+        "drawstyle": "steps-post",
+        "markevery": (MARK_SPACING * (row + 0.5) / dataset.sizes["method"], MARK_SPACING),
+    }
+    episodes, mean, low, high = (_where_finite(one[key], one["mean"]) for key in ("episodes", "mean", "low", "high"))
     (line,) = losses.plot(episodes, mean, label=_label(name, one, dataset), **look)
     losses.fill_between(episodes, low, high, step="post", color=look["color"], **style.METHOD_BAND)
-    hits = np.sort(_known(one["hit"], one["hit"]))
+    hits = np.sort(_where_finite(one["hit"], one["hit"]))
     share = np.arange(len(hits) + 1) / max(one["hit"].size, 1)
     shares.plot([1, *hits, dataset.attrs["budget"]], [*share, share[-1]], **look)
     return line
@@ -64,7 +67,7 @@ def _label(name: str, one: xr.Dataset, dataset: xr.Dataset) -> str:
     return f"{name} (no success with {count} of {seeds} seeds, so no mean)" if count else name
 
 
-def _known(values: xr.DataArray, where: xr.DataArray) -> NDArray[np.float64]:
+def _where_finite(values: xr.DataArray, where: xr.DataArray) -> NDArray[np.float64]:
     found: NDArray[np.float64] = values.to_numpy()[np.isfinite(where.to_numpy())]
     return found
 

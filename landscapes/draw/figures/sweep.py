@@ -1,4 +1,4 @@
-"""A slice as something else moves: frames on one colour scale, as a film (matplotlib)."""
+"""A sweep as a film: one frame for each of its slices, all on one colour scale (matplotlib)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from ...storage.store import plane_of
+from ...identity import plane_of
 from .. import film, style
 from . import contour, page, panel, typesetting
 
@@ -35,7 +35,7 @@ class Sweep:
         """The label without its unit."""
         return self.label.partition(" [")[0]
 
-    def said(self, value: float) -> str:
+    def write_value(self, value: float) -> str:
         """Write a value with its unit, and as many decimals for each of them."""
         span = abs(self.values[-1] - self.values[0])
         decimals = min(9, max(0, 2 - math.floor(math.log10(span))))
@@ -147,7 +147,7 @@ def _write(picture: page.Picture, layout: Layout, dataset: xr.Dataset) -> None:
     x, y, *_ = layout.box(left, layout.height - 0.36 * sheet.type, 0.0, 0.0)
     picture.text(x, y, page.title(dataset), size=sheet.title, color=style.INK, parse_math=False)
     x, y, *_ = layout.box(left, 0.08, 0.0, 0.0)
-    said = typesetting.wrapped(page.provenance(dataset), room, sheet.small)
+    said = typesetting.wrap_text(page.provenance(dataset), room, sheet.small)
     picture.text(x, y, said, size=sheet.small, color=style.QUIET, parse_math=False)
 
 
@@ -172,11 +172,11 @@ def _draw_range(picture: page.Picture, layout: Layout, sweep: Sweep, value: floa
     ax.set_ylim(-1, 1)
     bar = sheet.look({"linewidth": 3, "solid_capstyle": "round", "clip_on": False})
     ax.plot([low, high], [0, 0], color=style.FAINT, **bar)
-    ax.plot([low, value], [0, 0], color=style.LINE, **bar)
-    ax.plot([value], [0], marker="o", color=style.LINE, **sheet.look({"markersize": 8, "clip_on": False}))
+    ax.plot([low, value], [0, 0], color=style.LOSS_LINE, **bar)
+    ax.plot([value], [0], marker="o", color=style.LOSS_LINE, **sheet.look({"markersize": 8, "clip_on": False}))
     plain: dict[str, Any] = {"textcoords": "offset points", "parse_math": False, "annotation_clip": False}
     for end, at in ((low, "left"), (high, "right")):
         look: dict[str, Any] = {"size": sheet.tick, "color": style.QUIET, "ha": at, "va": "top"}
-        ax.annotate(sweep.said(end), (end, 0), (0, -7 * sheet.type), **look, **plain)
-    said, look = f"{sweep.name} = {sweep.said(value)}", {"size": sheet.label + 1, "color": style.INK}
+        ax.annotate(sweep.write_value(end), (end, 0), (0, -7 * sheet.type), **look, **plain)
+    said, look = f"{sweep.name} = {sweep.write_value(value)}", {"size": sheet.label + 1, "color": style.INK}
     ax.annotate(said, (low, 0), (0, 8 * sheet.type), weight="bold", **look, **plain)

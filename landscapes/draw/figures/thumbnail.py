@@ -1,11 +1,11 @@
-"""A slice as a small picture without words, to recognise it by."""
+"""A slice as a small picture without text."""
 
 from __future__ import annotations
 
 import numpy as np
 import xarray as xr
 
-from ...storage.store import plane_of
+from ...identity import plane_of
 from .. import style
 from .page import Picture
 
@@ -22,7 +22,7 @@ def thumbnail_figure(dataset: xr.Dataset, *, width: float | None = None) -> Pict
     picture.set_facecolor(style.UNSAMPLED)
     loss = dataset["loss"].to_numpy()
     if plane_of(dataset).rank == 1:
-        ax.plot(dataset["u"], loss, color=style.LINE, linewidth=1.2)
+        ax.plot(dataset["u"], loss, color=style.LOSS_LINE, linewidth=1.2)
         return picture
     scale = style.Scale.of_loss(loss)
     ax.imshow(np.ma.masked_invalid(loss), origin="lower", aspect="auto", cmap=style.LOSS_MAP, norm=scale.norm)

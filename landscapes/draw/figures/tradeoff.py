@@ -1,4 +1,4 @@
-"""Accuracy against time: every rung of a trade-off, and the front of those that no other beats (matplotlib)."""
+"""Accuracy against time: the variants of a trade-off and their Pareto front (matplotlib)."""
 
 from __future__ import annotations
 
@@ -17,33 +17,35 @@ from .. import style
 from . import labels, page, panel
 
 PITCH, SHAPE, NARROW = 7.2, 0.58, 0.9  # room on a screen [inch]; the panel's height against its width, there and narrow
-GAPS = (7.0, 12.0, 18.0, 25.0, 34.0, 44.0)  # of a name from its rung, on a screen [pt]
+GAPS = (7.0, 12.0, 18.0, 25.0, 34.0, 44.0)  # of a name from its mark, on a screen [pt]
 INTERVAL = "interval"
-ROOM = 1.6  # what the axes reach beyond the outermost rungs, as a ratio
+ROOM = 1.6  # what the axes reach beyond the outermost variants, as a ratio
 
 Rows = Sequence[Mapping[str, Any]]
 
 
 def tradeoff_figure(report: Mapping[str, Any], *, width: float | None = None) -> page.Picture:
-    """Draw the 95th percentile of each rung's loss errors, with its interval, over seconds per episode with gradient.
+    """Draw the 95th percentile of each variant's loss errors, with its interval, over the time of an episode.
 
-    The reference is a line at its time: its own error is zero by definition. Rungs without a finite percentile stand on
-    the upper edge, counted in the legend, those that are exactly right on the lower one. Every rung is named, shortly:
-    its mark says what was turned, the name from which fidelity on and to what. Where it is crowded a line leads to the
-    name, or it stands in the legend, by number.
+    The reference is a line at its time: its own error is zero by definition. Variants without a finite percentile are
+    on the upper edge and counted in the legend; those without any error are on the lower edge. The mark of a variant
+    says which option was changed, its name from which fidelity and to what. Where there is little room a line leads to
+    the name, or the name is in the legend, by number.
+
+    Raises ValueError where the page is too narrow or too wide.
     """
     sheet = style.Sheet.of(width, pitch=PITCH)
     keyed: list[str] = []
     while True:
         picture, left = _draw(report, sheet, keyed)
-        if set(left) <= set(keyed):  # of numbers none is refused but among dozens of rungs in one place
+        if set(left) <= set(keyed):  # only among dozens of variants in one place a number finds no room
             return picture
         keyed += [name for name in left if name not in keyed]
 
 
 def _draw(report: Mapping[str, Any], sheet: style.Sheet, keyed: Sequence[str]) -> tuple[page.Picture, list[str]]:
-    """Draw the picture, those of the rungs that are `keyed` by number; return it and those there was no room for."""
-    report, time = _timed(report)
+    """Draw the picture, with the `keyed` variants named by number; return it and the names that found no room."""
+    report, time = _add_times(report)
     relative = report["spread"] is not None
     picture = page.Picture(sheet, sheet.width)
     ax = picture.subplots()
@@ -51,16 +53,19 @@ def _draw(report: Mapping[str, Any], sheet: style.Sheet, keyed: Sequence[str]) -
     ax.set_box_aspect(SHAPE if sheet.zoom > 0.75 else NARROW)
     rows = [row for row in report["rungs"] if row["name"] != report["reference"]]
     low, high = _limits(ax, report, rows, relative)
-    entries = _front(ax, report, rows, relative)
-    entries += _rungs(ax, rows, relative, low, high)
-    entries += [Line2D([], [], **sheet.look(style.WHISKER), label="95 % interval"), _against(ax, report, time)]
+    entries = _draw_front(ax, report, rows, relative)
+    entries += _draw_variants(ax, rows, relative, low, high)
+    entries += [
+        Line2D([], [], **sheet.look(style.INTERVAL_LINE), label="95 % interval"),
+        _draw_reference(ax, report, time),
+    ]
     unit = f" [{report['loss_unit']}]" if report["loss_unit"] else ""
     what = "loss error, 95th percentile"
     how = f"{what} [% of the losses' spread]" if relative else what + unit
     panel.name_axes(ax, f"time of an episode with gradient [{time}]", how)
-    _head(picture, ax, report)
+    _write_head(picture, ax, report)
     numbers = {name: str(number) for number, name in enumerate(keyed, start=1)}
-    page.finish(picture, [*entries, *_keys(sheet, rows, numbers)], columns=3)
+    page.finish(picture, [*entries, *_number_entries(sheet, rows, numbers)], columns=3)
     return picture, _name(ax, rows, numbers, relative, low, high)
 
 
@@ -76,8 +81,8 @@ def _limits(ax: Axes, report: Mapping[str, Any], rows: Rows, relative: bool) -> 
     return low / ROOM, high * ROOM
 
 
-def _timed(report: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
-    """Give each rung the `time` of an episode with gradient, in a unit that suits the reference; return that too."""
+def _add_times(report: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+    """Add the `time` of an episode with gradient to each variant, in a unit that suits the reference; return both."""
     long = _reference(report)["seconds"]["with_gradient"] >= 2.0
     factor, unit = (1.0, "s") if long else (1e3, "ms")
     rungs = [{**row, "time": factor * row["seconds"]["with_gradient"]} for row in report["rungs"]]
@@ -95,10 +100,10 @@ def _error(row: Mapping[str, Any], relative: bool, low: float, high: float) -> f
     return high if value is None else max(value, low)
 
 
-def _rungs(ax: Axes, rows: Rows, relative: bool, low: float, high: float) -> list[Artist]:
+def _draw_variants(ax: Axes, rows: Rows, relative: bool, low: float, high: float) -> list[Artist]:
     entries: list[Artist] = []
     sheet = page.sheet_of(ax)
-    for ladder, look in style.LADDERS.items():
+    for ladder, look in style.VARIANTS.items():
         members = [row for row in rows if row["ladder"] == ladder]
         if not members:
             continue
@@ -109,18 +114,21 @@ def _rungs(ax: Axes, rows: Rows, relative: bool, low: float, high: float) -> lis
             if ends["value"] is not None:
                 top = high if ends["high"] is None else ends["high"]
                 ax.plot(
-                    [x, x], [max(ends["low"] or low, low), max(top, low)], gid=INTERVAL, **sheet.look(style.WHISKER)
+                    [x, x],
+                    [max(ends["low"] or low, low), max(top, low)],
+                    gid=INTERVAL,
+                    **sheet.look(style.INTERVAL_LINE),
                 )
         lost = sum(_ends(row, relative)["value"] is None for row in members)
         label = f"{ladder} ({lost} failed too often: on the edge)" if lost else ladder
-        mark = sheet.look(style.RUNG | look)
+        mark = sheet.look(style.VARIANT_MARK | look)
         ax.plot(seconds, errors, **mark, gid=ladder, clip_on=False)
         entries.append(Line2D([], [], **mark, label=label))
     return entries
 
 
-def _front(ax: Axes, report: Mapping[str, Any], rows: Rows, relative: bool) -> list[Artist]:
-    """Draw the front as steps: at any time, the least error that so much time buys, until it buys the reference."""
+def _draw_front(ax: Axes, report: Mapping[str, Any], rows: Rows, relative: bool) -> list[Artist]:
+    """Draw the Pareto front as steps: the least error that is to be had for at most so much time."""
     end = _reference(report)["time"]
     seconds = [row["time"] for row in rows]
     errors = [
@@ -142,25 +150,27 @@ def _reference(report: Mapping[str, Any]) -> Mapping[str, Any]:
     return found
 
 
-def _against(ax: Axes, report: Mapping[str, Any], unit: str) -> Artist:
+def _draw_reference(ax: Axes, report: Mapping[str, Any], unit: str) -> Artist:
     row = _reference(report)
     seconds = row["time"]
     label = f"{row['name']}: {style.number(seconds)} {unit}, error 0 by definition"
-    line: Artist = ax.axvline(seconds, **page.sheet_of(ax).look(style.AGAINST), label=label)
+    line: Artist = ax.axvline(seconds, **page.sheet_of(ax).look(style.REFERENCE_LINE), label=label)
     return line
 
 
-def _keys(sheet: style.Sheet, rows: Rows, numbers: Mapping[str, str]) -> list[Artist]:
-    """Return what the numbers of rungs stand for, with their marks."""
+def _number_entries(sheet: style.Sheet, rows: Rows, numbers: Mapping[str, str]) -> list[Artist]:
+    """Return the legend entries of the variants that are named by number."""
     found = {row["name"]: row for row in rows}
-    looks = {name: sheet.look(style.RUNG | style.LADDERS[found[name]["ladder"]]) for name in numbers}
-    return [Line2D([], [], **looks[name], label=f"{number}: {short(found[name])}") for name, number in numbers.items()]
+    looks = {name: sheet.look(style.VARIANT_MARK | style.VARIANTS[found[name]["ladder"]]) for name in numbers}
+    return [
+        Line2D([], [], **looks[name], label=f"{number}: {short_name(found[name])}") for name, number in numbers.items()
+    ]
 
 
 def _name(ax: Axes, rows: Rows, numbers: Mapping[str, str], relative: bool, low: float, high: float) -> list[str]:
-    """Name the rungs where the name covers no mark, not the front, and rather no interval; return those without room.
+    """Name the variants where the name covers no mark, no front and if possible no interval; return those without room.
 
-    First come those whose number is in the legend, then the named fidelities.
+    Variants whose number is in the legend come first, then the named fidelities.
     """
     sheet = page.sheet_of(ax)
     lines = [line for line in ax.lines if line.get_gid()]
@@ -170,7 +180,7 @@ def _name(ax: Axes, rows: Rows, numbers: Mapping[str, str], relative: bool, low:
     )
     rows = sorted(rows, key=lambda row: (row["name"] not in numbers, row["ladder"] != "named"))
     names = [
-        labels.Name(numbers.get(row["name"], short(row)), (row["time"], _error(row, relative, low, high)))
+        labels.Name(numbers.get(row["name"], short_name(row)), (row["time"], _error(row, relative, low, high)))
         for row in rows
     ]
     gaps = [gap * sheet.type for gap in GAPS]
@@ -178,8 +188,8 @@ def _name(ax: Axes, rows: Rows, numbers: Mapping[str, str], relative: bool, low:
     return [rows[number]["name"] for number in left]
 
 
-def short(row: Mapping[str, Any]) -> str:
-    """Return a rung's name without what its mark says: of standard-dt-x0.5, standard \N{MULTIPLICATION SIGN}0.5."""
+def short_name(row: Mapping[str, Any]) -> str:
+    """Return a variant's name without what its mark says: of standard-dt-x0.5, standard \N{MULTIPLICATION SIGN}0.5."""
     base, *turned = str(row["name"]).replace(" on ", "-").split("-")
     if row["ladder"] == "named" or not turned:
         return str(row["name"])
@@ -197,7 +207,7 @@ def _outline(line: Line2D) -> NDArray[np.float64]:
     return between.reshape(-1, 2)
 
 
-def _head(picture: page.Picture, ax: Axes, report: Mapping[str, Any]) -> None:
+def _write_head(picture: page.Picture, ax: Axes, report: Mapping[str, Any]) -> None:
     page.entitle(picture, f"{report['env']} · accuracy against time · {report['points']} points")
     known = {**report["provenance"], **report["identity"]}
     said = [f"{known[key]}" for key in ("device", "created", "command") if known.get(key)]

@@ -1,4 +1,4 @@
-"""How a picture fits its page: as high as what stands on it, and type wrapped to the room there is."""
+"""Typesetting of a picture: the page gets the height that its panels need, and text is wrapped to its room."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def settle(picture: Picture) -> None:
         if turn < TURNS / 2:  # or lines might break now here, now there
             _wrap(picture)
         _lay_out(picture)
-        if abs(lack := _lack(picture, shapes)) < NEARLY:
+        if abs(lack := _missing_height(picture, shapes)) < NEARLY:
             break
         _set_height(picture, picture.get_figheight() + lack)
     for ax, shape in shapes.items():
@@ -55,7 +55,7 @@ def _lay_out(picture: Picture) -> None:
     engine.execute(picture)
 
 
-def _lack(picture: Picture, shapes: Mapping[Axes, float]) -> float:
+def _missing_height(picture: Picture, shapes: Mapping[Axes, float]) -> float:
     """Return how much higher the page should be for its panels to have their shapes, height against width [inch]."""
     width, height = picture.get_size_inches()
     rows: dict[int, float] = {}
@@ -70,10 +70,10 @@ def _lack(picture: Picture, shapes: Mapping[Axes, float]) -> float:
 def _wrap(picture: Picture) -> None:
     for text, (said, room) in picture.fitted.items():
         size = float(text.get_fontsize())
-        text.set_text("\n".join(wrapped(line, room(), size) for line in said.split("\n")))
+        text.set_text("\n".join(wrap_text(line, room(), size) for line in said.split("\n")))
 
 
-def across(ax: Axes) -> float:
+def title_room(ax: Axes) -> float:
     """Return how wide what is written about a panel's middle may be, for the columns it has of the page [inch]."""
     spec, box, (width, _) = ax.get_subplotspec(), ax.get_position(), _page_size(ax)
     if spec is None:
@@ -84,7 +84,7 @@ def across(ax: Axes) -> float:
     return float(2 * width * aside - MARGIN)
 
 
-def upright(ax: Axes) -> float:
+def side_room(ax: Axes) -> float:
     """Return how long what is written up a panel's side may be [inch]."""
     return float(BESIDE * ax.get_position().height * _page_size(ax)[1])
 
@@ -96,20 +96,20 @@ def _page_size(ax: Axes) -> tuple[float, float]:
     return float(width), float(height)
 
 
-def wrapped(text: str, width: float, size: float, *, lines: int = 2) -> str:
+def wrap_text(text: str, width: float, size: float, *, lines: int = 2) -> str:
     """Break a text in a type size [pt] into so many lines of a width [inch] at most, about equally long."""
     broken, fits = [text], len(text)
     while fits > LEAST and (most := max(text_width(line, size) for line in broken)) > width:
         fits = min(fits - 1, int(1.1 * fits * width / most))
-        broken = _broken(text, max(fits, LEAST), lines)
+        broken = _break_lines(text, max(fits, LEAST), lines)
     shorter = broken
     while fits > LEAST and len(shorter) == len(broken) > 1 and not shorter[-1].endswith(MORE):
         broken, fits = shorter, fits - 1
-        shorter = _broken(text, fits, lines)
+        shorter = _break_lines(text, fits, lines)
     return "\n".join(broken)
 
 
-def _broken(text: str, fits: int, lines: int) -> list[str]:
+def _break_lines(text: str, fits: int, lines: int) -> list[str]:
     return textwrap.wrap(text, fits, max_lines=lines, placeholder=MORE, break_on_hyphens=False) or [text]
 
 

@@ -1,1 +1,1 @@
-"""Scenes to walk around in and to play back (rerun)."""
+"""Recordings that play back in three dimensions (rerun)."""

@@ -1,4 +1,4 @@
-"""An episode as a scene to walk around in and to play back (rerun)."""
+"""An episode as a rerun recording, which plays it back in three dimensions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 
 from ..render import materials
-from ..render.replay import LONGEST, rests
+from ..render.replay import LONGEST, is_still
 from ..render.solids import mesh
 from .recording import recording
 
@@ -53,9 +53,9 @@ def save_episode(episode: Episode, path: str | Path, *, title: str, longest: int
 
 def _log_part(stream: rr.RecordingStream, path: str, part: Part, episode: Episode, chosen: Sequence[int]) -> None:
     """Log what does not change of a part once, and the rest at each frame, or once too where it rests."""
-    for archetype in _lasting(part):
+    for archetype in _static_parts(part):
         stream.log(path, archetype, static=True, strict=True)
-    if rests(part):
+    if is_still(part):
         stream.log(path, _at(part, 0), static=True, strict=True)
         return
     for frame in chosen:
@@ -63,7 +63,7 @@ def _log_part(stream: rr.RecordingStream, path: str, part: Part, episode: Episod
         stream.log(path, _at(part, frame), strict=True)
 
 
-def _lasting(part: Part) -> list[rr.AsComponents]:
+def _static_parts(part: Part) -> list[rr.AsComponents]:
     """Return what is the same in all frames: the surface of a solid at the origin, or the faces of a sheet."""
     color = _color(part)
     match part.shape:

@@ -1,4 +1,4 @@
-"""Runs over a slice as a scene to walk around in and to play back (rerun)."""
+"""Runs over a slice as a rerun recording, which plays the evaluations back in three dimensions."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ import xarray as xr
 from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 
+from ...identity import plane_of
 from ...objective import Status
 from ...overlay import improvements
 from ...plane import Plane
-from ...storage.store import plane_of
 from .. import style
 from ..figures import contour, page
-from ..figures.overlay import by_kind, farthest, half_widths, joint_scale
+from ..figures.overlay import by_kind, farthest_distance, half_widths, joint_scale
 from ..render import relief
 from ..render.relief import HEIGHT, SIDE
 from .recording import recording
@@ -70,7 +70,7 @@ class Scene:
     def of(cls, dataset: xr.Dataset, runs: Runs, scale: style.Scale | None = None) -> Scene:
         """Return the scene of a slice and of runs laid over it, on the scale of their losses unless given."""
         body = relief.Relief(plane_of(dataset), scale or joint_scale(dataset, runs))
-        return cls(body, farthest(runs), relief.stand(body, dataset))
+        return cls(body, farthest_distance(runs), relief.stand(body, dataset))
 
     @property
     def plane(self) -> Plane:
@@ -90,7 +90,7 @@ class Scene:
 
     def at(self, u: Grid, v: Grid, loss: Grid) -> Grid:
         """Return positions, shape (..., 3); places beyond the window are moved to its border."""
-        (left, front), (right, back) = (side.numpy() for side in self.plane.window())
+        (left, front), (right, back) = (side.numpy() for side in self.plane.cell_bounds())
         return self.body.at(np.clip(u, left, right), np.clip(v, front, back), loss)
 
     def tint(self, loss: Grid) -> NDArray[np.uint8]:
@@ -116,7 +116,7 @@ def surface(scene: Scene, dataset: xr.Dataset) -> rr.Mesh3D:
 
 def descent_arrows(scene: Scene, dataset: xr.Dataset, scale: style.Scale | None = None) -> rr.Arrows3D:
     """Lay the directions of steepest descent on the cells, coloured by the gradient's magnitude."""
-    rows, columns = (contour.thinned(dataset.sizes[name]) for name in ("v", "u"))
+    rows, columns = (contour.pick_arrows(dataset.sizes[name]) for name in ("v", "u"))
     at = np.ix_(rows, columns)
     slope = scene.plane.slope(torch.from_numpy(dataset["grad"].transpose("v", "u", "dim").to_numpy())).numpy()
     logarithm = contour.log_magnitude(dataset)
@@ -137,20 +137,20 @@ def descent_arrows(scene: Scene, dataset: xr.Dataset, scale: style.Scale | None 
 
 def log_axes(stream: rr.RecordingStream, scene: Scene, dataset: xr.Dataset) -> None:
     """Frame the scene, with the ticks of both parameters and of the loss."""
-    frame = rr.LineStrips3D(scene.stand.frame(), colors=rgba(style.BETWEEN), radii=LINE / 2)
+    frame = rr.LineStrips3D(scene.stand.frame(), colors=rgba(style.MID_GREY), radii=LINE / 2)
     _log(stream, "landscape/axes/frame", frame)
     for axis, name in enumerate((*scene.plane.labels, page.loss_name(dataset))):
         ticks, share = scene.body.ticks(axis)
         places = [scene.stand.beside(axis, part, TICKS) for part in share]
         places.append(scene.stand.beside(axis, 0.5, NAMES) if axis < 2 else scene.stand.beside(axis, OVER, TICKS))
         labels = [*map(style.number, ticks.tolist()), name]
-        points = rr.Points3D(places, labels=labels, show_labels=True, colors=rgba(style.BETWEEN), radii=DOT)
+        points = rr.Points3D(places, labels=labels, show_labels=True, colors=rgba(style.MID_GREY), radii=DOT)
         _log(stream, f"landscape/axes/{'uvz'[axis]}", points)
 
 
 def _log_key(stream: rr.RecordingStream, scene: Scene, runs: Runs) -> None:
     """Label the colours of points, behind the scene: the labels themselves in one that is read on every ground."""
-    shown = {name: style.KINDS[name]["color"] for run in runs for name, _ in by_kind(run)}
+    shown = {name: style.POINT_MARKS[name]["color"] for run in runs for name, _ in by_kind(run)}
     if any(run["outside"].any() for run in runs):
         shown["outside"] = style.BEYOND
     if any((run["status"] != Status.OK).any() for run in runs):
@@ -160,16 +160,16 @@ def _log_key(stream: rr.RecordingStream, scene: Scene, runs: Runs) -> None:
     places = [SIDE / 2 * behind + 0.45 * (number - 0.5) * left + high for number in range(len(shown))]
     colors = [rgba(color) for color in shown.values()]
     _log(stream, "landscape/key", rr.Points3D(places, colors=colors, radii=RADIUS))
-    names = rr.Points3D(places, labels=list(shown), show_labels=True, colors=rgba(style.BETWEEN), radii=DOT)
+    names = rr.Points3D(places, labels=list(shown), show_labels=True, colors=rgba(style.MID_GREY), radii=DOT)
     _log(stream, "landscape/key/names", names)
 
 
 def _log_run(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None:
     path, loss, outside = f"landscape/runs/{run.attrs['label']}", run["loss"].to_numpy(), run["outside"].to_numpy()
     places = scene.at(run["u"].to_numpy(), run["v"].to_numpy(), np.nan_to_num(loss, nan=-np.inf))
-    radii = RADIUS * np.sqrt(style.point_areas(run["distance"].to_numpy(), scene.reach, 1) / style.NEAR[1])
+    radii = RADIUS * np.sqrt(style.point_areas(run["distance"].to_numpy(), scene.reach, 1) / style.MARK_AREAS[1])
     failed = run["status"].to_numpy() != Status.OK
-    groups = [(name, here & ~outside & ~failed, style.KINDS[name]["color"]) for name, here in by_kind(run)]
+    groups = [(name, here & ~outside & ~failed, style.POINT_MARKS[name]["color"]) for name, here in by_kind(run)]
     groups += [("outside", outside & ~failed, style.BEYOND), ("failed", failed, style.LOST)]
     for name, here, color in groups:
         _log_points(stream, f"{path}/{name}", np.flatnonzero(here), places, radii, color)
@@ -185,7 +185,7 @@ def _log_gaps(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset, path: s
     feet[:, 2] = scene.body.height(run["beneath"].to_numpy())
     apart = np.isfinite(run["loss"].to_numpy()) & (np.abs(feet[:, 2] - places[:, 2]) > RADIUS)
     rows = np.flatnonzero(apart)
-    _log_lines(stream, path, rows, np.stack([feet[rows], places[rows]], axis=1), style.BETWEEN)
+    _log_lines(stream, path, rows, np.stack([feet[rows], places[rows]], axis=1), style.MID_GREY)
 
 
 def _log_best(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None:
@@ -255,7 +255,7 @@ def _about(dataset: xr.Dataset, runs: Runs, scene: Scene) -> str:
     unit = dataset["loss"].attrs.get("units", "")
     distance = (
         f"A point on the plane is largest; one {half_widths(scene.reach)} off it has "
-        f"{style.FAR**0.5:.0%} of that radius."
+        f"{style.FARTHEST_SHARE**0.5:.0%} of that radius."
         if scene.reach
         else "Every point lies on the plane."
     )

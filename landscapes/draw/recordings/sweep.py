@@ -1,4 +1,4 @@
-"""A slice as something else moves, as surfaces on a timeline to walk around in (rerun)."""
+"""A sweep as a rerun recording: the surfaces of its slices on a timeline."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def save_stream(sweep: Sweep, path: Path) -> None:
 
 def _label(sweep: Sweep, scene: stream.Scene, number: int) -> rr.Points3D:
     place = scene.stand.place(180.0, SIDE / 2, HEIGHT)
-    said = f"{sweep.name} = {sweep.said(sweep.values[number])}"
-    return rr.Points3D([place], labels=[said], show_labels=True, colors=stream.rgba(style.BETWEEN), radii=stream.DOT)
+    said = f"{sweep.name} = {sweep.write_value(sweep.values[number])}"
+    return rr.Points3D([place], labels=[said], show_labels=True, colors=stream.rgba(style.MID_GREY), radii=stream.DOT)
 
 
 def _blueprint(sweep: Sweep, scene: stream.Scene) -> rrb.Blueprint:
@@ -79,7 +79,8 @@ def _row(sweep: Sweep, number: int) -> str:
     dataset = sweep.slices[number]
     least = dataset["loss"].min().item()
     said = style.number(least) if np.isfinite(least) else "none"
-    return f"| {number} | {sweep.said(sweep.values[number])} | {said} | {int((dataset['status'] != Status.OK).sum())} |"
+    failed = int((dataset["status"] != Status.OK).sum())
+    return f"| {number} | {sweep.write_value(sweep.values[number])} | {said} | {failed} |"
 
 
 def _digest(sweep: Sweep) -> str:

@@ -17,11 +17,11 @@ from typing import IO
 from urllib.error import URLError
 from urllib.request import urlopen
 
-from ...storage.files import resolved
+from ...storage.files import resolve
 from ..loopback import LOOPBACK, LoopbackHandler, LoopbackServer
 
 RECORDING = "/recording.rrd"  # whatever the file's name, which may be none for an address
-PATIENCE = 20.0  # seconds for rerun's server to come up
+START_LIMIT = 20.0  # seconds for rerun's server to come up
 SILENT = {
     "CI": "true",
     "RUST_LOG": "error",
@@ -37,9 +37,12 @@ POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:"
 
 
 def open_viewer(path: Path, *, wait: float = 2.0) -> None:
-    """Open a recording in rerun's own window, which stays when this process ends; it has to survive `wait` seconds."""
+    """Open a recording in rerun's own window, which stays when this process ends; it has to survive `wait` seconds.
+
+    Raises OSError where it does not open, or rerun's program is not installed.
+    """
     with tempfile.TemporaryFile() as log:
-        viewer = _rerun(str(resolved(path)), "--port", "auto", log=log)
+        viewer = _rerun(str(resolve(path)), "--port", "auto", log=log)
         try:
             code = viewer.wait(wait)
         except subprocess.TimeoutExpired:
@@ -50,8 +53,11 @@ def open_viewer(path: Path, *, wait: float = 2.0) -> None:
 
 
 @contextmanager
-def served(path: Path) -> Iterator[str]:
-    """Serve a recording with rerun's web viewer on the loopback interface, and give the address to open."""
+def serve_recording(path: Path) -> Iterator[str]:
+    """Serve a recording with rerun's web viewer on the loopback interface, and give the address to open.
+
+    Raises OSError where rerun's own server does not answer, or its program is not installed.
+    """
     assets = _assets()
 
     class Handler(LoopbackHandler):
@@ -84,15 +90,15 @@ def _assets() -> dict[str, bytes]:
     port, other = _free_port(), _free_port()
     server = _rerun("--serve-web", "--web-viewer-port", str(port), "--port", str(other), log=subprocess.DEVNULL)
     try:
-        return {name: _fetched(f"http://{LOOPBACK}:{port}{name}", server) for name in ASSETS}
+        return {name: _fetch(f"http://{LOOPBACK}:{port}{name}", server) for name in ASSETS}
     finally:
         server.terminate()
         server.wait()
 
 
-def _fetched(address: str, server: subprocess.Popen[bytes]) -> bytes:
+def _fetch(address: str, server: subprocess.Popen[bytes]) -> bytes:
     """Return what a server answers, which may be about to come up."""
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + START_LIMIT
     while True:
         try:
             with urlopen(address) as answer:

@@ -1,4 +1,4 @@
-"""What the materials of episodes look like, and the light they stand in; style.py is for diagrams."""
+"""The look of the materials of episodes and their light; style.py has that of diagrams."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A slice as a body in space: where its samples are, its flat cells, and the side from which its valley is seen."""
+"""The geometry of a slice as a surface: its cells, its frame, and the azimuth that shows its valley."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ TOP = ((0, 0), (1, 0), (1, 1), (0, 1))  # corners of a cell to the right and bac
 WALLS = {(1, 0): ((1, 0), (1, 1)), (-1, 0): ((0, 1), (0, 0)), (0, 1): ((1, 1), (0, 1)), (0, -1): ((0, 0), (1, 0))}
 TRIANGLES = ((0, 1, 2), (0, 2, 3))  # of a cell's corners
 FOOT = 0.08  # share of the upright axis that has no ticks
-LOWEST = 0.1  # share of the samples that are the valley
-STEPS = 160  # of a line of sight across the surface
+VALLEY_SHARE = 0.1  # share of the samples that are the valley
+SIGHT_STEPS = 160  # of a line of sight across the surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class Relief:
 
     def at(self, u: Grid, v: Grid, loss: Grid) -> Grid:
         """Return positions, shape (..., 3)."""
-        low, high = (side.numpy() for side in self.plane.window())
+        low, high = (side.numpy() for side in self.plane.cell_bounds())
         flat = SIDE * ((np.stack([u, v], axis=-1) - low) / (high - low) - 0.5)
         return np.concatenate([flat, self.height(loss)[..., None]], axis=-1)
 
@@ -56,7 +56,7 @@ class Relief:
 
         Of the loss none is at the foot, where another axis begins.
         """
-        low, high = [*zip(*(side.tolist() for side in self.plane.window()), strict=True), self.scale.ends][axis]
+        low, high = [*zip(*(side.tolist() for side in self.plane.cell_bounds()), strict=True), self.scale.ends][axis]
         logarithmic = axis == 2 and self.scale.logarithmic
         ticks = np.asarray((LogLocator(numticks=6) if logarithmic else MaxNLocator(5)).tick_values(low, high))
         ticks = ticks[(ticks >= low) & (ticks <= high)]
@@ -158,14 +158,14 @@ def azimuth(relief: Relief, dataset: xr.Dataset) -> float:
     height = relief.height(dataset["loss"].transpose("v", "u").to_numpy())
     if not np.isfinite(height).any():
         return AZIMUTHS[0]
-    rows, columns = np.nonzero(height <= np.nanquantile(height, LOWEST))
-    seen = [_seen(np.nan_to_num(height, nan=0.0), rows, columns, np.radians(angle)) for angle in AZIMUTHS]
+    rows, columns = np.nonzero(height <= np.nanquantile(height, VALLEY_SHARE))
+    seen = [_visible_share(np.nan_to_num(height, nan=0.0), rows, columns, np.radians(angle)) for angle in AZIMUTHS]
     return AZIMUTHS[int(np.argmax(np.round(seen, 6)))]  # the first of equals
 
 
-def _seen(height: Grid, rows: NDArray[np.intp], columns: NDArray[np.intp], angle: float) -> float:
+def _visible_share(height: Grid, rows: NDArray[np.intp], columns: NDArray[np.intp], angle: float) -> float:
     """Return which share of the cells the eye sees: on the way to it, nothing is higher than the line of sight."""
-    way = np.linspace(0.0, 1.5 * SIDE, STEPS)[1:, None]
+    way = np.linspace(0.0, 1.5 * SIDE, SIGHT_STEPS)[1:, None]
     size = np.array(height.shape)
     at = np.stack([rows, columns]) + 0.5
     steps = np.array([np.sin(angle), np.cos(angle)]) / SIDE * size

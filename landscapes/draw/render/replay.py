@@ -32,21 +32,24 @@ HEIGHT = 600  # of a frame [pixel]
 STRIP, STRIP_DPI = 0.4, 100  # height of what is over a film [inch], and how fine it is
 BAR = 0.25  # most of a frame's width that its scale takes
 LIKELY = (0.5, 1.6)  # narrowest and widest frame, its width per height
-APART = 2.0  # from where on a target's surface is away from a body's particles, in their distances
+AWAY_DISTANCE = 2.0  # from where on a target's surface is away from a body's particles, in their distances
 LONGEST, RATE = 100, 25  # most frames of a film, and how many of them a second
 EXTENT, CELLS = 3.0, 192  # of the ground in halves of the view's diagonal; of its shadow along each side
 SAMPLES = 40_000  # of the surfaces that throw it
 
 
 def save_replay(episode: Episode, mp4: str | Path, gif: str | Path, *, title: str = "", longest: int = LONGEST) -> int:
-    """Write evenly spaced frames, first and last among them, under a title as MP4 and GIF; return how many."""
+    """Write evenly spaced frames, first and last among them, under a title as MP4 and GIF; return how many.
+
+    Raises ValueError where the episode has no `parts`, OSError where ffmpeg could not write.
+    """
     count = min(longest, len(episode.time))
-    pictures = headed(frames(episode, evenly(episode, count)), title)
+    pictures = add_title(frames(episode, pick_frames(episode, count)), title)
     save_film(pictures, Path(mp4), Path(gif), count=count, rate=RATE)
     return count
 
 
-def headed(pictures: Iterable[Picture], title: str) -> Iterator[Picture]:
+def add_title(pictures: Iterable[Picture], title: str) -> Iterator[Picture]:
     """Put a title over pictures, in a strip of its own; none is put where there is no title."""
     strip = None
     for picture in pictures:
@@ -62,12 +65,12 @@ def _strip(title: str, width: int) -> Picture:
     room = width / STRIP_DPI - 2 * typesetting.MARGIN
     fits = typesetting.text_width(title, style.Sheet.label) < room
     size = style.Sheet.label if fits else style.Sheet.small  # of which there is room for two lines
-    said, left = typesetting.wrapped(title, room, size), typesetting.MARGIN * STRIP_DPI / width
+    said, left = typesetting.wrap_text(title, room, size), typesetting.MARGIN * STRIP_DPI / width
     figure.text(left, 0.5, said, size=size, color=style.INK, va="center", parse_math=False)
     return picture_of(figure, dpi=STRIP_DPI)
 
 
-def evenly(episode: Episode, count: int) -> list[int]:
+def pick_frames(episode: Episode, count: int) -> list[int]:
     """Return evenly spaced frames, first and last among them, the fewer the shorter the episode."""
     found: list[int] = np.unique(np.linspace(0, len(episode.time) - 1, count).round().astype(int)).tolist()
     return found
@@ -77,23 +80,25 @@ def frames(episode: Episode, chosen: Sequence[int], *, height: int = HEIGHT, mar
     """Yield pictures of the chosen frames, shape (height, width, 3); each has its time and a scale unless not `marked`.
 
     The scale is right at the middle of the view: what is nearer is larger.
+
+    Raises ValueError where the episode has no `parts`.
     """
     if not episode.parts:
         raise ValueError("the episode says not what its parts look like; give Episode its `parts`")
     view = episode.viewpoint()
     shot = Shot.of(view, height)
     with _stage(view, shot) as plotter:
-        parts = [part for part in episode.parts if part not in sought(episode)]
-        still = [part for part in parts if rests(part)]
+        parts = [part for part in episode.parts if part not in goal_parts(episode)]
+        still = [part for part in parts if is_still(part)]
         moving = [part for part in parts if part not in still]
         bodies = [part for part in parts if part.shape == "lump"]
-        goals = [mesh(part, 0) for part in sought(episode)]
+        goals = [mesh(part, 0) for part in goal_parts(episode)]
         _place(plotter, still, [mesh(part, 0) for part in still], "still")
         if marked:
             _write_scale(plotter, shot)
         for frame in chosen:
             _place(plotter, moving, [mesh(part, frame) for part in moving], "moving")
-            _place(plotter, sought(episode), [missing(goal, bodies, frame) for goal in goals], "sought")
+            _place(plotter, goal_parts(episode), [missed_surface(goal, bodies, frame) for goal in goals], "sought")
             if view.ground is not None:
                 _lay_ground(plotter, view, [mesh(part, frame) for part in episode.parts if materials.solid(part)])
             if marked:
@@ -187,17 +192,17 @@ def axes(view: View) -> tuple[Grid, Grid, Grid]:
     return right, np.cross(eye, right), eye
 
 
-def sought(episode: Episode) -> list[Part]:
+def goal_parts(episode: Episode) -> list[Part]:
     """Return the targets that bodies are to become: of them, what is missed is drawn."""
     return [part for part in episode.parts if part.shape == "lump" and part.material == "target"]
 
 
-def missing(goal: pv.PolyData, bodies: Sequence[Part], frame: int) -> pv.PolyData:
+def missed_surface(goal: pv.PolyData, bodies: Sequence[Part], frame: int) -> pv.PolyData:
     """Return what of a target's surface bodies do not reach: what is away from their particles."""
     pitch = max(part.size[0] for part in bodies)
     every = np.concatenate([part.at[frame].numpy() for part in bodies])
-    away, _ = cKDTree(every).query(goal.points, distance_upper_bound=2 * APART * pitch)
-    return goal.extract_points(away > APART * pitch, adjacent_cells=False).extract_surface(algorithm=None)
+    away, _ = cKDTree(every).query(goal.points, distance_upper_bound=2 * AWAY_DISTANCE * pitch)
+    return goal.extract_points(away > AWAY_DISTANCE * pitch, adjacent_cells=False).extract_surface(algorithm=None)
 
 
 def _place(plotter: pv.Plotter, parts: Sequence[Part], surfaces: Sequence[pv.PolyData], label: str) -> None:
@@ -216,7 +221,7 @@ def _place(plotter: pv.Plotter, parts: Sequence[Part], surfaces: Sequence[pv.Pol
         plotter.add_mesh(surface, name=name, smooth_shading=smooth, reset_camera=False, render=False, **look)
 
 
-def rests(part: Part) -> bool:
+def is_still(part: Part) -> bool:
     """Whether a part is the same in all frames."""
     return part.shape != "trail" and all(
         bool((rows == rows[:1]).all()) for rows in (part.at, part.turn) if rows is not None
@@ -244,7 +249,7 @@ def _lay_ground(plotter: pv.Plotter, view: View, solids: Sequence[pv.PolyData]) 
 
 def _shadow(solids: Sequence[pv.PolyData], ground: float, x: Grid, z: Grid) -> Grid:
     """Return how much of the key light solids take from the ground, shape (x, z), 0 to 1."""
-    spots = np.concatenate([_scattered(solid) for solid in solids if solid.n_cells] or [np.zeros((0, 3))])
+    spots = np.concatenate([_scatter_points(solid) for solid in solids if solid.n_cells] or [np.zeros((0, 3))])
     lift = spots[:, 1:2] - ground
     shift = np.array(materials.KEY)
     feet = (spots - lift * shift / shift[1])[lift[:, 0] > 0]
@@ -253,7 +258,7 @@ def _shadow(solids: Sequence[pv.PolyData], ground: float, x: Grid, z: Grid) -> G
     return np.clip(1.6 * gaussian_filter(np.minimum(hits / 3.0, 1.0), 1.6), 0.0, 1.0)
 
 
-def _scattered(solid: pv.PolyData) -> Grid:
+def _scatter_points(solid: pv.PolyData) -> Grid:
     """Return points spread evenly over a surface."""
     corners = solid.points[solid.triangulate().regular_faces].astype(np.float64)
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Grid = NDArray[np.float64]
 
 AROUND, ARC = 48, 24  # facets around an axis, along a half circle
-LEVEL = 0.36  # of a lump's inner density, where its surface is
+SURFACE_DENSITY = 0.36  # of a lump's inner density, where its surface is
 STRAY = 0.16  # below which a particle is a drop of its own
 BLUR = 1.8  # of its density, in cells of half a pitch
 SHEET, DEEP = 0.004, 0.006  # how thick a pan is drawn, and how far below where sheets touch it [m]
@@ -72,7 +72,7 @@ def lump(x: Grid, pitch: float) -> pv.PolyData:
     density = gaussian_filter(density, BLUR)
     image = pv.ImageData(dimensions=tuple(shape), spacing=(step,) * 3, origin=tuple(low + step / 2))
     image["density"] = density.flatten(order="F")
-    surface = image.contour([LEVEL], scalars="density", method="flying_edges")
+    surface = image.contour([SURFACE_DENSITY], scalars="density", method="flying_edges")
     surface.clear_data()
     stray = x[density[tuple(cell.T)] < STRAY]
     drops = [_revolve(_circle(0.4 * pitch, 8), 12).translate(place, inplace=False) for place in stray]
@@ -97,10 +97,10 @@ def _sheet(part: Part, at: Grid) -> pv.PolyData:
     if part.material == "sugar":
         return surface
     surface = surface.compute_normals(cell_normals=False, split_vertices=False, consistent_normals=False)
-    return _thick(surface, part.faces.numpy(), part.size[0]) if part.size else surface
+    return _thicken(surface, part.faces.numpy(), part.size[0]) if part.size else surface
 
 
-def _thick(sheet: pv.PolyData, faces: NDArray[np.int64], thickness: float) -> pv.PolyData:
+def _thicken(sheet: pv.PolyData, faces: NDArray[np.int64], thickness: float) -> pv.PolyData:
     """Return a sheet with two sides and a rounded rim; the scalar `side` is 1 on the side of its normals, else 0."""
     lift, count = thickness / 2 * sheet.point_normals, sheet.n_points
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])

@@ -17,9 +17,9 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from ...identity import plane_of
 from ...objective import Status
 from ...storage.files import replacing
-from ...storage.store import plane_of
 from .. import style
 from ..figures import page, panel
 from ..figures.overlay import by_kind, joint_scale
@@ -63,6 +63,8 @@ def save_surface(dataset: xr.Dataset, runs: Runs, png: str | Path, gltf: str | P
 
     The model is turned so that who opens it looks at it from where the picture does: in glTF y points up and z to who
     looks.
+
+    Raises ValueError where the slice is a line.
     """
     page.save(surface_figure(dataset, runs), png)
     with scene(dataset, runs) as shown, replacing(Path(gltf)) as partial:
@@ -79,6 +81,8 @@ def surface_figure(dataset: xr.Dataset, runs: Runs = (), *, width: float | None 
     """Draw a slice as a body whose height and colour are the loss: every sample is flat, those that failed are holes.
 
     It is seen from the side, of eight, from which most of the valley is, its lowest tenth.
+
+    Raises ValueError where the slice is a line, or the page too narrow or too wide.
     """
     sheet = style.Sheet.of(width, pitch=PITCH)
     fine = max(1.0, FINE * sheet.width / PIXELS[0]) if width else 1.0
@@ -105,7 +109,10 @@ def surface_figure(dataset: xr.Dataset, runs: Runs = (), *, width: float | None 
 
 @contextmanager
 def scene(dataset: xr.Dataset, runs: Runs, *, pixels: tuple[int, int] = PIXELS) -> Iterator[Shown]:
-    """Give the scene of a slice and of runs laid over it."""
+    """Give the scene of a slice and of runs laid over it.
+
+    Raises ValueError where the slice is a line.
+    """
     plane = plane_of(dataset)
     if plane.rank != 2:
         raise ValueError(f"a surface shows a plane; got a slice of rank {plane.rank}, so vary two parameters")
@@ -158,7 +165,7 @@ def _add_run(plotter: pv.Plotter, body: Relief, run: xr.Dataset) -> None:
         if (here & shown).any():
             ball = pv.Sphere(radius=POINT, theta_resolution=16, phi_resolution=16)
             points = pv.PolyData(places[here & shown]).glyph(geom=ball, scale=False, orient=False)
-            look = {"color": style.KINDS[name]["color"], "smooth_shading": True, **MATTER}
+            look = {"color": style.POINT_MARKS[name]["color"], "smooth_shading": True, **MATTER}
             plotter.add_mesh(points, name=f"{label} {name}", reset_camera=False, **look)
     previous = run["previous"].to_numpy()
     rows = np.flatnonzero((previous >= 0) & shown & shown[previous])
@@ -213,7 +220,7 @@ def _entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
     """Return legend entries of methods and of kinds of points."""
     dot = sheet.look({"linestyle": "none", "marker": "o", "markersize": 6.0})
     kinds = dict.fromkeys(name for run in runs for name, _ in by_kind(run))
-    found: list[Artist] = [Line2D([], [], color=style.KINDS[name]["color"], **dot, label=name) for name in kinds]
+    found: list[Artist] = [Line2D([], [], color=style.POINT_MARKS[name]["color"], **dot, label=name) for name in kinds]
     methods = {str(run.attrs["method"]): style.method(run)["color"] for run in runs}
     large = dot | {"markersize": 10.0 * sheet.weight}
     bests = [Line2D([], [], color=color, **large, label=f"{m}: best") for m, color in methods.items()]

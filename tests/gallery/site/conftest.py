@@ -97,7 +97,7 @@ class Bowl:
         z = 2 * self.space.to_unit(x) - 1
         loss, slope = 1 + (z + 0.1).square().sum(dim=1), 2 * (z + 0.1) * torch.tensor([1, 0.1, 0.1])
         loss[(z[:, :2] > 0.75).all(dim=1)] = torch.nan
-        return Evaluation.judged(loss, slope if grad else None)
+        return Evaluation.from_results(loss, slope if grad else None)
 
 
 def keep(figure: Figure, folder: Path) -> None:

@@ -18,7 +18,8 @@ from gradscape.gallery.site.server import SiteHandler
 from gradscape.landscapes.draw.loopback import LoopbackServer
 from gradscape.landscapes.draw.render.relief import Relief, azimuth
 from gradscape.landscapes.draw.style import LOSS_MAP, Scale
-from gradscape.landscapes.storage.store import open_slice, plane_of
+from gradscape.landscapes.identity import plane_of
+from gradscape.landscapes.storage.store import open_slice
 
 from .conftest import FIGURES
 

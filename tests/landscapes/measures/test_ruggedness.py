@@ -115,8 +115,8 @@ def test_fitness_distance_correlation_of_a_cone_is_one() -> None:
 
 def test_level_samples_are_those_like_their_neighbours() -> None:
     loss = np.array([0.0, 0.0, 0.0, 0.5, 0.5, np.nan])
-    np.testing.assert_array_equal(ruggedness.level(loss, 0.0), [1, 1, 0, 0, 1, np.nan])
-    assert np.nansum(ruggedness.level(loss, 0.5)) == 5
+    np.testing.assert_array_equal(ruggedness.level_samples(loss, 0.0), [1, 1, 0, 0, 1, np.nan])
+    assert np.nansum(ruggedness.level_samples(loss, 0.5)) == 5
 
 
 def test_a_plateau_is_flat_where_it_is_and_failures_count_as_nothing() -> None:

@@ -33,12 +33,12 @@ from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.storage.files import print_width
 from gradscape.optim.registry import methods
 
+from ...measures.test_fidelity import REPORT
+from ...test_overlay import LAID, SLICE
+from .test_contour import BOUNCES, DATASET, LINE, Bowl, plane
 from .test_curve import table
-from .test_draw import BOUNCES, DATASET, LINE, Bowl, plane
-from .test_draw_race import race
-from .test_overlay import LAID, SLICE
+from .test_race import race
 from .test_sweep import SWEEP
-from .test_tradeoff import REPORT
 
 INCH, WIDTHS = 25.4, (85.0, 170.0)
 COMMAND = "landscape slice bowl --dims speed lift --resolution 16 --fidelity standard --through example:somewhere"
@@ -55,8 +55,8 @@ PLANE, LONG = dated(DATASET), dated(LINE)
 def quality(dataset):
     flat = plane(*dataset["loss"].shape[::-1], dims=("speed", "lift")[: dataset["loss"].ndim])
     places = gradients.subgrid(flat, 4 if flat.rank == 2 else 16)
-    steps, smooth = gradients.ladder(Bowl(), flat, places), gradients.smoothed_slopes(Bowl(), flat, places)
-    return dataset, steps, gradients.of_samples(dataset), smooth
+    steps, smooth = gradients.compare_differences(Bowl(), flat, places), gradients.smoothed_slopes(Bowl(), flat, places)
+    return dataset, steps, gradients.compare_samples(dataset), smooth
 
 
 EPISODE = Episode(
@@ -208,7 +208,7 @@ def test_prints_are_named_by_their_width_and_those_there_are_drawn_anew(tmp_path
 
 def test_a_text_is_wrapped_by_its_width() -> None:
     for width in (1.0, 2.5, 6.0):
-        lines = typesetting.wrapped(COMMAND, width, 7.0, lines=3).split("\n")
+        lines = typesetting.wrap_text(COMMAND, width, 7.0, lines=3).split("\n")
         assert max(typesetting.text_width(line, 7.0) for line in lines) <= width
         assert len(lines) <= 3
-    assert typesetting.wrapped("short", 6.0, 7.0) == "short"
+    assert typesetting.wrap_text("short", 6.0, 7.0) == "short"

@@ -61,11 +61,11 @@ def test_a_jump_beside_a_failure_is_left_undecided() -> None:
 def test_jumps_are_tied_to_what_is_counted_differently_across_them() -> None:
     objective, dataset = sampled(lambda x: step(x) + 2.0 * (x[:, 1] > EDGE))
     found = find_jumps(objective, dataset, least=0.5, events=lambda x: {"bounces": (x[:, 0] > EDGE).int()})
-    assert found.explained is not None
-    assert found.explained.value == 0.5
+    assert found.share_explained is not None
+    assert found.share_explained.value == 0.5
     assert found.record()["found"][0]["event"] is True  # the highest
     unseen = find_jumps(objective, dataset, least=0.5, events=lambda x: {})
-    assert unseen.explained is None
+    assert unseen.share_explained is None
 
 
 def test_a_constant_slice_has_no_steep_pair() -> None:

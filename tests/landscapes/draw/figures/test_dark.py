@@ -11,11 +11,11 @@ from PIL import Image
 from gradscape.landscapes.draw import style
 from gradscape.landscapes.draw.figures import page
 from gradscape.landscapes.draw.figures.contour import landscape_figure
-from gradscape.landscapes.draw.figures.dark import darken, save_dark, turned
+from gradscape.landscapes.draw.figures.dark import darken, invert_greys, save_dark
 from gradscape.landscapes.draw.figures.overlay import overlay_figure
 
-from .test_draw import DATASET
-from .test_overlay import LAID, SLICE
+from ...test_overlay import LAID, SLICE
+from .test_contour import DATASET
 
 NIGHT, INK = (np.array(to_rgb(name)) for name in (style.NIGHT, style.NIGHT_INK))
 
@@ -25,13 +25,13 @@ def pixels(path: Path) -> np.ndarray:
 
 
 def test_white_becomes_the_ground_black_the_ink_and_colours_stay() -> None:
-    np.testing.assert_allclose(turned(np.ones((1, 3))), [NIGHT], atol=1e-9)
-    np.testing.assert_allclose(turned(np.zeros((1, 3))), [INK], atol=1e-9)
-    quiet = turned(np.array([to_rgb(style.QUIET)]))[0]
+    np.testing.assert_allclose(invert_greys(np.ones((1, 3))), [NIGHT], atol=1e-9)
+    np.testing.assert_allclose(invert_greys(np.zeros((1, 3))), [INK], atol=1e-9)
+    quiet = invert_greys(np.array([to_rgb(style.QUIET)]))[0]
     assert quiet.mean() > 0.5
     for name in ("viridis", "cividis"):
-        colours = (style.LOSS_MAP if name == "viridis" else style.APART["cmap"])(np.linspace(0, 1, 256))
-        np.testing.assert_allclose(turned(colours), colours, atol=0.02, err_msg=name)
+        colours = (style.LOSS_MAP if name == "viridis" else style.DISAGREEMENT["cmap"])(np.linspace(0, 1, 256))
+        np.testing.assert_allclose(invert_greys(colours), colours, atol=0.02, err_msg=name)
 
 
 @pytest.mark.parametrize("draw", [lambda: landscape_figure(DATASET), lambda: overlay_figure(SLICE, LAID)])

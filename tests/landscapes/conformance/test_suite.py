@@ -43,7 +43,9 @@ class Sound:
             x = x.detach().clone().requires_grad_()
             losses = loss_of(x)
             (slope,) = torch.autograd.grad(losses.sum(), x)
-        return self.spoil(x.detach(), Evaluation.judged(losses.detach(), self.slope(slope) if grad else None), grad)
+        return self.spoil(
+            x.detach(), Evaluation.from_results(losses.detach(), self.slope(slope) if grad else None), grad
+        )
 
     def slope(self, slope):
         return slope
@@ -273,7 +275,7 @@ def broken():
 
 class Escaping(Sound):
     def spoil(self, x, found, grad):
-        return Evaluation.judged(found.loss, found.grad, torch.full((len(x),), Status.ESCAPED))
+        return Evaluation.from_results(found.loss, found.grad, torch.full((len(x),), Status.ESCAPED))
 
 
 class HalfFailed(Sound):

@@ -23,12 +23,12 @@ from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling import distribution as spread
 from gradscape.landscapes.sampling.distribution import Site, WorkersLostError, equal_batches
 from gradscape.landscapes.sampling.fill import sample
-from gradscape.landscapes.sampling.memory import Halving
+from gradscape.landscapes.sampling.memory import MemoryBound
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.store import SliceStore
 
-from ..clock import Clock
-from ..processes import FORK
+from ...clock import Clock
+from ...processes import FORK
 
 cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers need not find the tests
 SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
@@ -197,13 +197,13 @@ def test_workers_that_never_come_back_are_given_up(tmp_path, clock, monkeypatch)
     store = store_at(tmp_path / "s.zarr")
     with pytest.raises(WorkersLostError, match=r"none was there for 60 s.*0 of .* the same command goes on"):
         sample(from_torch(wave, SPACE), PLANE, store, executor=Deserted())
-    assert spread.PATIENCE < clock.now <= spread.PATIENCE + spread.POLL
+    assert spread.WITHOUT_WORKERS < clock.now <= spread.WITHOUT_WORKERS + spread.POLL
 
 
 def test_a_worker_of_another_store_or_without_the_file_system_says_so(tmp_path):
     store = store_at(tmp_path / "s.zarr")
     make, arguments = Site(
-        Halving(from_torch(wave, SPACE)), store, functools.partial(from_torch, wave, SPACE)
+        MemoryBound(from_torch(wave, SPACE)), store, functools.partial(from_torch, wave, SPACE)
     ).__reduce__()
     remote = make(*arguments)
     (tmp_path / "s.filling.zarr").rename(tmp_path / "elsewhere.zarr")
@@ -217,8 +217,8 @@ def test_a_worker_of_another_store_or_without_the_file_system_says_so(tmp_path):
 def test_a_batch_that_was_half_done_by_a_worker_that_died_is_not_done_again(tmp_path):
     store = store_at(tmp_path / "s.zarr")
     first = store.tiles()[0]
-    list(Site(Halving(from_torch(wave, SPACE)), store).fill([first]))
-    make, arguments = Site(Halving(from_torch(broken_in_a_corner, SPACE)), store).__reduce__()
+    list(Site(MemoryBound(from_torch(wave, SPACE)), store).fill([first]))
+    make, arguments = Site(MemoryBound(from_torch(broken_in_a_corner, SPACE)), store).__reduce__()
     remote = make(*arguments)
     assert [filled.tile for filled in remote.fill([first])] == [first]  # found: evaluated it would break
     with pytest.raises(RuntimeError, match="broken cable"):
@@ -228,13 +228,13 @@ def test_a_batch_that_was_half_done_by_a_worker_that_died_is_not_done_again(tmp_
 @pytest.fixture
 def hidden(monkeypatch):
     """Return how often each tile is still looked for in vain, as on a file system that shows files late."""
-    finished, times = SliceStore.finished, defaultdict[object, float](lambda: 2)
+    finished, times = SliceStore.read_tile, defaultdict[object, float](lambda: 2)
 
     def late(store, tile):
         times[tile] -= 1
         return None if times[tile] >= 0 else finished(store, tile)
 
-    monkeypatch.setattr(SliceStore, "finished", late)
+    monkeypatch.setattr(SliceStore, "read_tile", late)
     return times
 
 
@@ -259,7 +259,7 @@ def test_what_workers_wrote_and_never_appears_is_an_error(tmp_path, hidden, cloc
 
 
 def test_a_worker_keeps_a_store_open_until_another_lies_there(tmp_path):
-    site = Site(Halving(from_torch(wave, SPACE)), store_at(tmp_path / "s.zarr"), lambda: from_torch(wave, SPACE))
+    site = Site(MemoryBound(from_torch(wave, SPACE)), store_at(tmp_path / "s.zarr"), lambda: from_torch(wave, SPACE))
     remote = pickle.loads(pickle.dumps(site))
     tiles = site.store.tiles()
     assert list(remote.fill(tiles[:1]))

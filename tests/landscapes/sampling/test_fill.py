@@ -17,7 +17,7 @@ from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.store import SliceStore
 
-from ..processes import Instant, alone
+from ...processes import Instant, alone
 
 SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
 PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 16))
@@ -41,7 +41,7 @@ class Wave:
         loss = (3 * x).sin().prod(dim=1) + x.exp().sum(dim=1)
         loss[(x > 1).all(dim=1)] = torch.nan
         failed = torch.where((x[:, 0] < -1) & (x[:, 2] < -1), Status.ESCAPED, Status.OK)
-        return Evaluation.judged(loss, 3 * (3 * x).cos() if grad else None, failed)
+        return Evaluation.from_results(loss, 3 * (3 * x).cos() if grad else None, failed)
 
 
 def store_at(path: Path, *, grad: bool = True) -> SliceStore:

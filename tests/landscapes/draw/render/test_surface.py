@@ -29,7 +29,9 @@ class Hill:
     def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
         loss = 0.1 + torch.exp(-8 * (x - x.new_tensor(PEAK)).square().sum(dim=1))
         loss[(x > 0.5).all(dim=1)] = torch.nan
-        return Evaluation.judged(loss, torch.zeros_like(x) if grad else None, torch.ones(len(x), dtype=torch.int8))
+        return Evaluation.from_results(
+            loss, torch.zeros_like(x) if grad else None, torch.ones(len(x), dtype=torch.int8)
+        )
 
 
 def cut(dims: tuple[str, ...] = ("a", "b")) -> xr.Dataset:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gradscape.landscapes.adapters import from_torch
 from gradscape.landscapes.draw.figures.page import save
-from gradscape.landscapes.draw.figures.tradeoff import short, tradeoff_figure
+from gradscape.landscapes.draw.figures.tradeoff import short_name, tradeoff_figure
 from gradscape.landscapes.measures import fidelity as tradeoff
 from gradscape.landscapes.measures.fidelity import (
     Bootstrap,
@@ -224,7 +224,7 @@ def test_every_rung_is_named_beside_its_mark_or_by_number_in_the_legend(width: f
     keyed = {entry[0]: entry[1] for entry in entries if entry[0].isdigit()}
     said = sorted(keyed.get(text.get_text(), text.get_text()) for text in ax.texts)
     others = [row for row in report["rungs"] if row["name"] != "reference"]
-    assert said == sorted(short(row) for row in others)
+    assert said == sorted(short_name(row) for row in others)
     drawn.canvas.draw()
     boxes = [Text.get_window_extent(text) for text in ax.texts]
     assert not any(one.overlaps(other) for number, one in enumerate(boxes) for other in boxes[:number])
@@ -241,4 +241,4 @@ def test_every_rung_is_named_beside_its_mark_or_by_number_in_the_legend(width: f
     ],
 )
 def test_a_short_name_leaves_out_what_the_mark_says(name: str, ladder: str, said: str) -> None:
-    assert short({"name": name, "ladder": ladder}) == said
+    assert short_name({"name": name, "ladder": ladder}) == said

@@ -23,7 +23,7 @@ from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
 
-from ..processes import alone
+from ....processes import alone
 
 SPACE = ParameterSpace.box(("a", "b", "c"), -1.0, 1.0, "m")
 
@@ -35,7 +35,7 @@ class Bowl:
     def evaluate(self, x, *, grad=True):
         loss = x.square().sum(dim=1)
         loss[(x[:, :2] > 0.6).all(dim=1)] = torch.nan
-        return Evaluation.judged(loss, 2 * x if grad else None)
+        return Evaluation.from_results(loss, 2 * x if grad else None)
 
 
 def run(x, kind, *, seed=0) -> xr.Dataset:
@@ -162,10 +162,10 @@ def test_equal_runs_give_equal_recordings_and_others_do_not(
 @pytest.fixture
 def address(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.setattr(viewer, "PATIENCE", math.inf)
+    monkeypatch.setattr(viewer, "START_LIMIT", math.inf)
     named = tmp_path / "über die Ebene, 100% #1?&+.rrd"
     named.write_bytes(path.read_bytes())
-    with viewer.served(named) as address:
+    with viewer.serve_recording(named) as address:
         yield address
 
 
@@ -209,9 +209,9 @@ def test_every_label_is_legible_on_what_the_viewer_lays_under_it(held, ground: i
 
 
 def test_a_server_that_ends_before_it_answers_is_not_waited_for(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewer, "PATIENCE", math.inf)
+    monkeypatch.setattr(viewer, "START_LIMIT", math.inf)
     monkeypatch.setattr(viewer, "_rerun", lambda *_, log: subprocess.Popen([sys.executable, "-c", ""], stderr=log))
-    with pytest.raises(OSError, match="rerun's web viewer does not answer"), viewer.served(path):
+    with pytest.raises(OSError, match="rerun's web viewer does not answer"), viewer.serve_recording(path):
         pass
 
 

@@ -11,7 +11,7 @@ from gradscape.landscapes.draw.figures.labels import Name, place
 from gradscape.landscapes.draw.figures.page import Picture
 from gradscape.landscapes.draw.figures.quality import quality_figure
 
-from .test_print import PLANE, quality
+from .test_page import PLANE, quality
 
 
 @pytest.mark.parametrize(

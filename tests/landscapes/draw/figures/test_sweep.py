@@ -19,7 +19,7 @@ from gradscape.landscapes.draw.recordings.sweep import save_stream
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
-from gradscape.landscapes.smoothing import smoothed
+from gradscape.landscapes.smoothing import smooth
 from gradscape.landscapes.space import ParameterSpace
 
 SPACE = ParameterSpace.box(("a", "b", "c"), -1.0, 1.0, "m")
@@ -38,7 +38,7 @@ class Bowl:
         loss = 1 + x[:, 2] + away.square().sum(dim=1)
         loss[(x[:, :2] > 0.6).all(dim=1)] = torch.nan
         slope = torch.cat([2 * away, 1 - 2 * away[:, :1]], dim=1)
-        return Evaluation.judged(loss, slope if grad else None)
+        return Evaluation.from_results(loss, slope if grad else None)
 
 
 def plane(value: float) -> Plane:
@@ -134,13 +134,13 @@ def test_the_scene_has_a_surface_for_each_value_on_a_timeline_of_that_name(tmp_p
 def test_smoothing_keeps_a_constant_and_averages_no_value_that_is_not_there() -> None:
     dataset = SWEEP.slices[1]
     constant = dataset.assign(loss=dataset["loss"].copy(data=np.where(np.isfinite(dataset["loss"]), 3.0, np.nan)))
-    np.testing.assert_allclose(smoothed(constant, 0.2)["loss"], constant["loss"], rtol=1e-14)
-    soft = smoothed(dataset, 0.1)
+    np.testing.assert_allclose(smooth(constant, 0.2)["loss"], constant["loss"], rtol=1e-14)
+    soft = smooth(dataset, 0.1)
     assert (np.isnan(soft["loss"]) == (dataset["status"] != Status.OK)).all()
     assert float(dataset["loss"].min()) < float(soft["loss"].min())
     assert float(soft["loss"].max()) < float(dataset["loss"].max())
     assert "grad" not in soft
-    xarray.testing.assert_equal(smoothed(dataset, 0.0)["loss"], dataset["loss"])
+    xarray.testing.assert_equal(smooth(dataset, 0.0)["loss"], dataset["loss"])
 
 
 def test_smoothing_is_a_gaussian_of_that_share_of_each_side() -> None:
@@ -149,10 +149,10 @@ def test_smoothing_is_a_gaussian_of_that_share_of_each_side() -> None:
     u, v = np.meshgrid(dataset["u"], dataset["v"])
     ok = np.full(u.shape, Status.OK, dataset["status"].dtype)
     dataset = dataset.assign(loss=dataset["loss"].copy(data=u**2 + v**2), status=dataset["status"].copy(data=ok))
-    middle = smoothed(dataset, 0.05)["loss"].sel(u=0.0, v=0.0, method="nearest")
+    middle = smooth(dataset, 0.05)["loss"].sel(u=0.0, v=0.0, method="nearest")
     assert float(middle) == pytest.approx((0.05 * 2) ** 2 + (0.05 * 6) ** 2, rel=1e-6)  # of variances
 
 
 def test_smoothing_refuses_a_negative_width() -> None:
     with pytest.raises(ValueError, match="width that is not negative; got -1"):
-        smoothed(SWEEP.slices[0], -1.0)
+        smooth(SWEEP.slices[0], -1.0)

@@ -17,7 +17,7 @@ from gradscape.envs.outlines import about, skin, triangles
 from gradscape.envs.registry import BUILTIN, make
 from gradscape.landscapes.draw.figures.contact import Caption, episode_figure, save_sheet
 from gradscape.landscapes.draw.render import materials
-from gradscape.landscapes.draw.render.replay import Shot, axes, frames, headed, missing, save_replay
+from gradscape.landscapes.draw.render.replay import Shot, add_title, axes, frames, missed_surface, save_replay
 from gradscape.landscapes.draw.render.solids import lump, mesh
 from gradscape.landscapes.episode import Episode, Part, View
 
@@ -112,7 +112,7 @@ def test_a_target_of_particles_is_drawn_where_the_body_is_not_yet_and_alone_at_t
     away, there = frames(episode, [0, 1], height=200)
     assert green(away)[:, 110:].mean() > 0.1
     assert not green(there).any()
-    left = [missing(mesh(parts[1], 0), parts[:1], frame).n_cells for frame in (0, 1)]
+    left = [missed_surface(mesh(parts[1], 0), parts[:1], frame).n_cells for frame in (0, 1)]
     assert left == [mesh(parts[1], 0).n_cells, 0]
     shown = episode_figure(episode, keys=2).axes
     assert [ax.get_xlabel() for ax in shown] == ["0 s", "0.1 s", "target"]
@@ -167,7 +167,7 @@ def test_a_scale_is_as_long_as_it_says_at_the_middle_of_the_view() -> None:
     changed = np.nonzero((marked != plain).any(axis=2))
     bar = changed[1][changed[0] == 300 - materials.INSET[1] - 1]  # its lowest row
     assert np.ptp(bar) + 1 == round(shot.bar * shot.metre)
-    (titled,) = headed([marked], "a title that is longer than its picture is wide: loss 1 m")
+    (titled,) = add_title([marked], "a title that is longer than its picture is wide: loss 1 m")
     strip, below = np.split(titled, [len(titled) - 300])
     np.testing.assert_array_equal(below, marked)
     inked = np.flatnonzero((strip.min(axis=2) < 100).any(axis=0))

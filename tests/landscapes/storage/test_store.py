@@ -15,15 +15,15 @@ import pytest
 import torch
 import xarray as xr
 
-from gradscape.landscapes.identity import StoreError, StoreMismatchError
+from gradscape.landscapes.identity import StoreError, StoreMismatchError, plane_of
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.layout import consolidate
-from gradscape.landscapes.storage.paths import corner, filling
-from gradscape.landscapes.storage.store import SliceStore, open_slice, plane_of
+from gradscape.landscapes.storage.paths import corner, filling_path
+from gradscape.landscapes.storage.store import SliceStore, open_slice
 
-from ..processes import Instant, alone
+from ...processes import Instant, alone
 
 SPACE = ParameterSpace(
     ("x", "y", "z"), -torch.ones(3).double(), torch.tensor([1.0, 2.0, 3.0]).double(), ("m", "m/s", "")
@@ -38,7 +38,7 @@ def make(path: Path, **changes) -> SliceStore:
 
 
 def evaluated(x: torch.Tensor) -> Evaluation:
-    return Evaluation.judged(torch.where(x[:, 0] > 0.8, torch.nan, x.sum(dim=1)), 2 * x)
+    return Evaluation.from_results(torch.where(x[:, 0] > 0.8, torch.nan, x.sum(dim=1)), 2 * x)
 
 
 def fill(store: SliceStore, tiles=None) -> SliceStore:
@@ -135,7 +135,7 @@ def test_what_xarray_writes_of_a_slice_is_a_slice(tmp_path):
         xr.testing.assert_equal(back, ours)
         assert back.attrs == ours.attrs
     ours.isel(u=slice(1, None)).to_zarr(tmp_path / "cut.zarr", consolidated=False)
-    with pytest.raises(StoreError, match="u is damaged: it is not what the store's identity says"):
+    with pytest.raises(StoreError, match=r"u is damaged \(it is not what the store's identity says"):
         open_slice(tmp_path / "cut.zarr")
 
 
@@ -143,7 +143,7 @@ def test_a_finished_slice_has_large_chunks_in_few_files_and_nothing_beside_it(tm
     path = tmp_path / "slice.zarr"
     fill(make(path))
     assert [file.name for file in tmp_path.iterdir()] == ["slice.filling.zarr"]
-    tiles = len(chunks(filling(path)))
+    tiles = len(chunks(filling_path(path)))
     finished(path)
     assert len(chunks(path)) == 4 < tiles
     assert [file.name for file in tmp_path.iterdir()] == ["slice.zarr"]
@@ -170,9 +170,9 @@ def test_a_slice_that_is_not_complete_is_not_finished(tmp_path):
 def test_tiles_that_a_kill_left_beside_a_finished_slice_go(tmp_path):
     path = tmp_path / "slice.zarr"
     fill(make(path))
-    shutil.copytree(filling(path), tmp_path / "kept")
+    shutil.copytree(filling_path(path), tmp_path / "kept")
     finished(path)
-    (tmp_path / "kept").rename(filling(path))  # as if the process had been killed before they were removed
+    (tmp_path / "kept").rename(filling_path(path))  # as if the process had been killed before they were removed
     whole = open_slice(path)
     assert make(path).pending() == []
     assert [file.name for file in tmp_path.iterdir()] == ["slice.zarr"]
@@ -209,7 +209,7 @@ def test_a_nan_result_is_finished_and_not_missing(tmp_path):
     tile = store.tiles()[0]
     count = store.count(tile)
     nan = torch.full((count,), torch.nan).double()
-    store.write(tile, Evaluation.judged(nan, nan[:, None].expand(-1, 3)))
+    store.write(tile, Evaluation.from_results(nan, nan[:, None].expand(-1, 3)))
     assert tile not in store.pending()
     status = store.dataset()["status"].to_numpy()
     assert (status == Status.NONFINITE).sum() == count
@@ -222,11 +222,11 @@ def test_a_damaged_chunk_costs_exactly_its_tile(tmp_path, damage):
     small = {"plane": Plane.through(SPACE, SPACE.center, ["x", "y"], resolution=(7, 5))}
     store = fill(make(path, **small))
     whole = open_slice(path)
-    for file in chunks(filling(path)):
+    for file in chunks(filling_path(path)):
         sound = file.read_bytes()
         torn = {"truncated": sound[: len(sound) // 2], "altered": sound[:-1] + bytes([sound[-1] ^ 1])}
         file.unlink() if damage == "removed" else file.write_bytes(torn[damage])
-        index = tuple(map(int, file.relative_to(filling(path)).parts[2:4]))
+        index = tuple(map(int, file.relative_to(filling_path(path)).parts[2:4]))
         pending = make(path, **small).pending()
         assert [tile.index for tile in pending] == [index]
         seen = open_slice(path)["status"].to_numpy()
@@ -236,11 +236,11 @@ def test_a_damaged_chunk_costs_exactly_its_tile(tmp_path, damage):
     xr.testing.assert_identical(open_slice(path), whole)
 
 
-@pytest.mark.parametrize("place", [filling, Path])
+@pytest.mark.parametrize("place", [filling_path, Path])
 def test_chunks_in_each_others_place_are_missing_and_not_taken_for_right(tmp_path, monkeypatch, place):
     monkeypatch.setattr("gradscape.landscapes.storage.layout.SIDE", 4)  # so that a finished slice has several, too
     path = tmp_path / "s.zarr"
-    (fill(make(path)) if place is filling else finished(path))
+    (fill(make(path)) if place is filling_path else finished(path))
     whole, swapped = open_slice(path), 0
     for one, other in combinations(chunks(place(path)), 2):
         if one.relative_to(path.parent).parts[:2] == other.relative_to(path.parent).parts[:2]:
@@ -264,7 +264,7 @@ def test_chunks_in_each_others_place_are_missing_and_not_taken_for_right(tmp_pat
 def test_a_tile_without_its_status_is_not_there_yet(tmp_path):
     path = tmp_path / "s.zarr"
     store = fill(make(path))
-    (filling(path) / "status" / "c" / "0" / "0").unlink()
+    (filling_path(path) / "status" / "c" / "0" / "0").unlink()
     assert [tile.index for tile in store.pending()] == [(0, 0)]
     dataset = store.dataset()
     assert np.isnan(dataset["loss"].values[dataset["status"].values == Status.MISSING]).all()
@@ -375,7 +375,7 @@ def test_a_line_has_one_axis_and_a_slice_without_gradients_has_none():
     line = Plane.through(SPACE, SPACE.center, ["y"], resolution=37)
     store = SliceStore.in_memory(line, SPACE, grad=False)
     for tile in store.tiles():
-        store.write(tile, Evaluation.judged(store.points(tile)[:, 1], None))
+        store.write(tile, Evaluation.from_results(store.points(tile)[:, 1], None))
     dataset = store.dataset()
     assert "grad" not in dataset
     assert dataset["loss"].dims == ("u",)
@@ -396,9 +396,9 @@ def test_a_half_evaluated_tile_is_refused():
 def test_a_store_of_another_format_is_refused(tmp_path):
     path = tmp_path / "s.zarr"
     make(path)
-    about = json.loads((filling(path) / "zarr.json").read_text())
+    about = json.loads((filling_path(path) / "zarr.json").read_text())
     about["attributes"]["gradscape_slice"] = 99
-    (filling(path) / "zarr.json").write_text(json.dumps(about))
+    (filling_path(path) / "zarr.json").write_text(json.dumps(about))
     with pytest.raises(StoreError, match="format 2"):
         make(path)
 
@@ -440,7 +440,7 @@ def test_of_a_slice_that_was_begun_only_the_corner_with_tiles_is_read(tmp_path, 
     plane = Plane.through(SPACE, SPACE.center, ["x", "y"], resolution=(300, 200))
     store = make(tmp_path / "s.zarr", plane=plane)
     fill(store, store.tiles()[:3])
-    status, read = store._values["status"], []
+    status, read = store._samples.arrays["status"], []
 
     class Seen:
         shape, dtype, fill_value = status.shape, status.dtype, status.fill_value
@@ -449,9 +449,9 @@ def test_of_a_slice_that_was_begun_only_the_corner_with_tiles_is_read(tmp_path, 
             read.append(np.asarray(status[box]))
             return read[-1]
 
-    monkeypatch.setitem(store._values, "status", Seen())
+    monkeypatch.setitem(store._samples.arrays, "status", Seen())
     assert store.pending(store.status()) == store.tiles()[3:]
-    assert store.damaged(store.tiles()[3:]) == []
+    assert store.damaged_tiles(store.tiles()[3:]) == []
     assert {part.shape for part in read} == {(32, 32)}
 
 

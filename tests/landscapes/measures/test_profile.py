@@ -106,8 +106,8 @@ def test_the_picture_of_gradient_quality_is_written(tmp_path: Path, dims: tuple[
     dataset = sample(objective, Plane.through(space, space.center, dims, resolution=12))
     plane, points = Plane.through(space, space.center, dims, resolution=12), 3 if len(dims) == 2 else 9
     places = gradients.subgrid(plane, points)
-    steps, smooth = (of(objective, plane, places) for of in (gradients.ladder, gradients.smoothed_slopes))
-    figure = quality_figure(dataset, steps, gradients.of_samples(dataset), smooth)
+    steps, smooth = (of(objective, plane, places) for of in (gradients.compare_differences, gradients.smoothed_slopes))
+    figure = quality_figure(dataset, steps, gradients.compare_samples(dataset), smooth)
     save(figure, tmp_path / "quality.png")
     assert (tmp_path / "quality.png").read_bytes().startswith(b"\x89PNG")
     titles = [ax.get_title() for ax in figure.axes]

@@ -20,17 +20,17 @@ def test_subgrid_lies_within_the_box_with_u_fastest() -> None:
 
 def test_a_quadratic_agrees_at_every_scale() -> None:
     objective = from_torch(lambda x: (x[:, 0] - 0.3) ** 2 + 5 * x[:, 1] ** 2, SPACE)
-    found = gradients.ladder(objective, PLANE, gradients.subgrid(PLANE, 3))
+    found = gradients.compare_differences(objective, PLANE, gradients.subgrid(PLANE, 3))
     np.testing.assert_allclose(found["cosine"], 1)
     assert float(found["error"].max()) < 1e-7
-    free = gradients.of_samples(sample(objective, PLANE))
+    free = gradients.compare_samples(sample(objective, PLANE))
     np.testing.assert_allclose(free["cosine"].sel(scale=2 / 11)[1:-1, 1:-1], 1)
     assert bool(free["cosine"].sel(scale=2 / 11)[0].isnull().all())  # no neighbour to differ from
 
 
 def test_a_gradient_of_the_wrong_sign_points_uphill() -> None:
     wrong = from_numpy(lambda x: ((x**2).sum(axis=1), -2 * x), SPACE)
-    for row in gradients.scale_table(gradients.ladder(wrong, PLANE, gradients.subgrid(PLANE, 4))):
+    for row in gradients.scale_table(gradients.compare_differences(wrong, PLANE, gradients.subgrid(PLANE, 4))):
         assert row["cosine"]["value"] == pytest.approx(-1)
         assert (row["uphill"]["value"], row["sign"]["value"]) == (1, 0)
         assert row["error"] == pytest.approx(2)
@@ -38,7 +38,7 @@ def test_a_gradient_of_the_wrong_sign_points_uphill() -> None:
 
 def test_fine_ripples_agree_closely_and_mislead_at_the_scale_of_a_picture() -> None:
     rippled = from_torch(lambda x: (x**2 + 1e-2 * torch.sin(1e4 * x)).sum(1), SPACE)
-    rows = gradients.scale_table(gradients.ladder(rippled, PLANE, gradients.subgrid(PLANE, 5)))
+    rows = gradients.scale_table(gradients.compare_differences(rippled, PLANE, gradients.subgrid(PLANE, 5)))
     by_scale = {row["scale"]: row["cosine"]["value"] for row in rows}
     assert by_scale[1e-6] == pytest.approx(1, abs=1e-3)
     assert abs(by_scale[1e-2]) < 0.5
@@ -62,7 +62,7 @@ def test_both_orders_are_exact_on_a_linear_function() -> None:
     for name in ("first", "zeroth"):
         np.testing.assert_allclose(found[name], np.broadcast_to([8, -4], found[name].shape))  # per side of the box
     np.testing.assert_allclose(found["first_variance"], 0, atol=1e-20)
-    assert not bool(gradients.biased(found).any())
+    assert not bool(gradients.find_bias(found).any())
 
 
 def test_zeroth_order_has_its_known_variance() -> None:
@@ -85,14 +85,14 @@ def test_first_order_misses_a_step_by_the_slope_of_the_smoothed_one(offset: floa
     assert found["first"].item() == 0
     assert bias == pytest.approx(-wanted, abs=4 * error)
     assert error < 0.05 * wanted
-    assert bool(gradients.biased(found).all())
+    assert bool(gradients.find_bias(found).all())
     assert gradients.disagreement(found).item() == 1
 
 
 def test_a_smooth_function_is_hardly_ever_called_biased() -> None:
     waves = from_torch(lambda x: (x**2 - torch.cos(4 * x)).sum(1), SPACE)
     found = gradients.smoothed_slopes(waves, PLANE, gradients.subgrid(PLANE, 10), pairs=12)
-    assert int(gradients.biased(found).sum()) <= 2  # of 200
+    assert int(gradients.find_bias(found).sum()) <= 2  # of 200
     first = found["first"].sel(width=0.01).to_numpy()
     x = found["place"].to_numpy()
     exact = 4 * (2 * x + 4 * np.exp(-(0.16**2) / 2) * np.sin(4 * x))  # E sin(4 (x + s w)) has a factor exp(-(4 s)^2/2)

@@ -15,12 +15,12 @@ from gradscape.landscapes.identity import StoreError
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
-from gradscape.landscapes.sampling.memory import Halving, ran_out
+from gradscape.landscapes.sampling.memory import MemoryBound, is_out_of_memory
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.landscapes.storage.paths import filling
+from gradscape.landscapes.storage.paths import filling_path
 from gradscape.landscapes.storage.store import SliceStore
 
-from ..processes import FORK
+from ...processes import FORK
 
 SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
 PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 16))
@@ -113,10 +113,10 @@ def test_a_solver_that_does_not_fit_is_made_smaller(monkeypatch):
 
 def test_memory_for_no_point_at_all_ends_it_and_other_errors_pass():
     with pytest.raises(MemoryError, match=r"wave ran out of memory at a single point: .*--fidelity"):
-        Halving(Small(0, RuntimeError(MESSAGES[0]))).evaluate(SPACE.uniform(3, seed=0))
+        MemoryBound(Small(0, RuntimeError(MESSAGES[0]))).evaluate(SPACE.uniform(3, seed=0))
     with pytest.raises(RuntimeError, match="broken cable"):
-        Halving(Small(0, RuntimeError("broken cable"))).evaluate(SPACE.uniform(3, seed=0))
-    assert not ran_out(RuntimeError("the ball is out of the memory foam"))
+        MemoryBound(Small(0, RuntimeError("broken cable"))).evaluate(SPACE.uniform(3, seed=0))
+    assert not is_out_of_memory(RuntimeError("the ball is out of the memory foam"))
 
 
 @pytest.mark.parametrize("damage", ["truncated", "altered", "empty"])
@@ -124,7 +124,7 @@ def test_memory_for_no_point_at_all_ends_it_and_other_errors_pass():
 def test_a_damaged_tile_is_named_and_computed_again(tmp_path, kept, whole, array, damage):
     path = tmp_path / "s.zarr"
     sample(from_torch(wave, SPACE), PLANE, store_at(path))
-    place = filling(path) / array / "c" / "2" / "3"
+    place = filling_path(path) / array / "c" / "2" / "3"
     (file,) = place.rglob("*") if array == "grad" else [place]
     sound = file.read_bytes()
     torn = {"truncated": sound[: len(sound) // 2], "altered": bytes([*sound[:-1], sound[-1] ^ 1]), "empty": b""}
@@ -140,7 +140,7 @@ def test_a_damaged_tile_is_named_and_computed_again(tmp_path, kept, whole, array
 def test_a_tile_that_was_never_finished_is_no_damage(tmp_path, kept, whole):
     path = tmp_path / "s.zarr"
     sample(from_torch(wave, SPACE), PLANE, store_at(path))
-    (filling(path) / "status" / "c" / "2" / "3").unlink()
+    (filling_path(path) / "status" / "c" / "2" / "3").unlink()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert same(sample(from_torch(wave, SPACE), PLANE, store_at(path)), whole)
@@ -158,7 +158,7 @@ def test_a_damaged_finished_slice_is_named_and_computed_again(tmp_path, whole):
 def test_a_damaged_axis_is_said_with_what_to_do(tmp_path):
     path = tmp_path / "s.zarr"
     store_at(path)
-    (file,) = (filling(path) / "u" / "c").iterdir()
+    (file,) = (filling_path(path) / "u" / "c").iterdir()
     file.write_bytes(b"")
     with pytest.raises(StoreError, match=r"s\.filling\.zarr is damaged .*restore it, or sample the slice anew"):
         store_at(path)

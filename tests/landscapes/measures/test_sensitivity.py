@@ -14,7 +14,7 @@ from gradscape.landscapes.adapters import from_numpy, from_torch
 from gradscape.landscapes.measures.sensitivity import Design, Responses, default_samples, explore, rank
 from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.landscapes.storage.checkpoint import Pieces
+from gradscape.landscapes.storage.checkpoint import Checkpoint
 
 
 def found_in(
@@ -26,7 +26,7 @@ def found_in(
 
 def explored(objective: Objective, folder: Path, *, samples: int) -> Responses:
     design = Design.sobol(objective.space, samples, seed=0)
-    pieces = Pieces.open(folder, {"samples": samples}, what="pairs")
+    pieces = Checkpoint.open(folder, {"samples": samples}, what="pairs")
     return explore(objective, design, pieces)
 
 
@@ -117,7 +117,7 @@ class Counted:
         raw = from_torch(lambda x: (x * x.new_tensor([1.0, 2.0, 3.0])).square().sum(dim=1), self.space).evaluate(
             x, grad=grad
         )
-        return Evaluation.judged(raw.loss.masked_fill(x[:, 0] > self.corner, torch.nan), raw.grad)
+        return Evaluation.from_results(raw.loss.masked_fill(x[:, 0] > self.corner, torch.nan), raw.grad)
 
 
 def test_a_stopped_study_goes_on_to_the_same_result(tmp_path: Path) -> None:
@@ -138,11 +138,11 @@ def test_failed_episodes_are_counted_and_left_out(tmp_path: Path) -> None:
 
 
 def test_another_study_and_other_files_are_refused(tmp_path: Path) -> None:
-    Pieces.open(tmp_path / "a", {"seed": 0}, what="pairs")
+    Checkpoint.open(tmp_path / "a", {"seed": 0}, what="pairs")
     with pytest.raises(ValueError, match="seed: wanted 1, found 0"):
-        Pieces.open(tmp_path / "a", {"seed": 1}, what="pairs")
+        Checkpoint.open(tmp_path / "a", {"seed": 1}, what="pairs")
     (tmp_path / "b").mkdir()
     (tmp_path / "b/mine.txt").write_text("precious")
     for force in (False, True):
         with pytest.raises(ValueError, match="holds other files and no pairs"):
-            Pieces.open(tmp_path / "b", {"seed": 0}, what="pairs", force=force)
+            Checkpoint.open(tmp_path / "b", {"seed": 0}, what="pairs", force=force)

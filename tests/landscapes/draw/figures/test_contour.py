@@ -40,7 +40,9 @@ class Bowl:
         gradient[(unit[:, :2] < 0.25).all(dim=1)] = 0
         loss[(unit[:, :2] > 0.75).all(dim=1)] = torch.nan
         escaped = (unit[:, 0] < 0.25) & (unit[:, 1] > 0.75)
-        return Evaluation.judged(loss, gradient if grad else None, torch.where(escaped, Status.ESCAPED, Status.OK))
+        return Evaluation.from_results(
+            loss, gradient if grad else None, torch.where(escaped, Status.ESCAPED, Status.OK)
+        )
 
 
 def plane(*resolution: int, dims: tuple[str, ...] = ("speed", "lift")) -> Plane:
@@ -113,7 +115,9 @@ def test_colour_is_the_projected_gradient_in_its_unit_when_units_agree():
             self.space = space
 
         def evaluate(self, x, *, grad=True):
-            return Evaluation.judged(3 * x[:, 0] + 4 * x[:, 1], torch.tensor([3.0, 4.0]).double().expand(len(x), 2))
+            return Evaluation.from_results(
+                3 * x[:, 0] + 4 * x[:, 1], torch.tensor([3.0, 4.0]).double().expand(len(x), 2)
+            )
 
     figure = landscape_figure(sample(Ramp(), skew))
     np.testing.assert_allclose(quiver_of(figure).get_array(), np.log10(5.0))
@@ -164,7 +168,9 @@ class Plain(Bowl):
     name = "plain"
 
     def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
-        return Evaluation.judged(torch.full((len(x),), 4.5).double(), torch.zeros_like(x), torch.full((len(x),), 1))
+        return Evaluation.from_results(
+            torch.full((len(x),), 4.5).double(), torch.zeros_like(x), torch.full((len(x),), 1)
+        )
 
 
 def test_a_plain_has_neither_a_lowest_sample_nor_a_scale_of_gradients():
@@ -216,7 +222,7 @@ def test_a_slice_where_everything_failed_is_still_a_picture(tmp_path, grad):
     class Broken(Bowl):
         def evaluate(self, x, *, grad=True):
             nan = torch.full((len(x),), torch.nan).double()
-            return Evaluation.judged(nan, nan[:, None].expand(-1, 3) if grad else None)
+            return Evaluation.from_results(nan, nan[:, None].expand(-1, 3) if grad else None)
 
     figure = landscape_figure(sample(Broken(), plane(4, 4), grad=grad))
     page.save(figure, tmp_path / "broken.png")

@@ -8,11 +8,11 @@ from gradscape import Evaluation, ParameterSpace, Plane, Status, from_numpy, sam
 from gradscape.landscapes.adapters import within_box
 from gradscape.landscapes.conformance.suite import check
 from gradscape.landscapes.measures.fidelity import measure, sobol_points
-from gradscape.landscapes.measures.gradient_quality import ladder, subgrid
+from gradscape.landscapes.measures.gradient_quality import compare_differences, subgrid
 from gradscape.landscapes.measures.profile import measure_profile, named_measures
 from gradscape.landscapes.measures.sensitivity import Design, explore
-from gradscape.landscapes.objective import evaluated
-from gradscape.landscapes.storage.checkpoint import Pieces
+from gradscape.landscapes.objective import evaluate
+from gradscape.landscapes.storage.checkpoint import Checkpoint
 
 BOUNDS = torch.tensor([[-1.0, 0.1, -3.0], [2.0, 0.7, 3.0]], dtype=torch.float64)
 SPACE = ParameterSpace(("a", "b", "c"), *BOUNDS, ("", "m", "s"))
@@ -29,7 +29,7 @@ class Strict:
         unit = self.space.to_unit(x)
         if bool(((unit < 0) | (unit > 1)).any()):
             raise ValueError("Expected `x` to be within the bounds")
-        return Evaluation.judged((x**2).sum(dim=1), 2 * x if grad else None)
+        return Evaluation.from_results((x**2).sum(dim=1), 2 * x if grad else None)
 
 
 class Inviting(Strict):
@@ -38,7 +38,7 @@ class Inviting(Strict):
     beyond_box = True
 
     def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
-        return Evaluation.judged((x**2).sum(dim=1), 2 * x if grad else None)
+        return Evaluation.from_results((x**2).sum(dim=1), 2 * x if grad else None)
 
 
 def plane(*dims: str | int, **how) -> Plane:
@@ -47,13 +47,13 @@ def plane(*dims: str | int, **how) -> Plane:
 
 def test_points_beyond_have_left_the_domain_and_the_others_their_losses():
     x = torch.stack([SPACE.lower, SPACE.center, SPACE.upper, SPACE.upper + 1e-3, SPACE.lower - 1])
-    found = evaluated(Strict(), x, grad=True)
+    found = evaluate(Strict(), x, grad=True)
     assert found.status.tolist() == [Status.OK] * 3 + [Status.ESCAPED] * 2
     torch.testing.assert_close(found.loss[:3], (x[:3] ** 2).sum(dim=1))
     assert bool(found.loss[3:].isnan().all() & found.grad[3:].isnan().all())
-    assert evaluated(Strict(), x[3:], grad=False).status.tolist() == [Status.ESCAPED] * 2
-    assert evaluated(Inviting(), x, grad=True).status.tolist() == [Status.OK] * 5
-    assert evaluated(within_box(Inviting()), x, grad=True).status.tolist() == found.status.tolist()
+    assert evaluate(Strict(), x[3:], grad=False).status.tolist() == [Status.ESCAPED] * 2
+    assert evaluate(Inviting(), x, grad=True).status.tolist() == [Status.OK] * 5
+    assert evaluate(within_box(Inviting()), x, grad=True).status.tolist() == found.status.tolist()
 
 
 def test_a_window_beyond_the_box_shows_what_lies_in_it():
@@ -81,7 +81,7 @@ def test_a_report_leaves_out_what_it_may_not_ask_for_and_says_how_much(dims):
 
 def test_differences_over_long_steps_are_there_where_both_ends_are():
     u = subgrid(plane(), 12)  # closer to the border than half of the longest step
-    found = ladder(Strict(), plane(), u, scales=(1e-3, 1e-1))
+    found = compare_differences(Strict(), plane(), u, scales=(1e-3, 1e-1))
     share = np.isfinite(found["cosine"]).mean("point").to_numpy()
     assert share[0] == 1
     assert 0.5 < share[1] < 1
@@ -90,7 +90,7 @@ def test_differences_over_long_steps_are_there_where_both_ends_are():
 
 def test_pairs_checks_and_trade_offs_ask_nothing_beyond(tmp_path):
     design = Design.sobol(SPACE, 4, seed=0)
-    found = explore(Strict(), design, Pieces.open(tmp_path / "p", {}, what="pairs"))
+    found = explore(Strict(), design, Checkpoint.open(tmp_path / "p", {}, what="pairs"))
     assert found.failed == 0
     assert (measure(Strict(), sobol_points(SPACE, 4, seed=0)).status == Status.OK).all()
     outcomes = {finding.check: finding for finding in check(Strict(), points=2)}
@@ -109,3 +109,20 @@ def test_differences_of_a_function_stay_within_its_bounds():
     objective = from_numpy(strict, SPACE, differences=1e-4)
     x = torch.stack([SPACE.lower, SPACE.center, SPACE.upper])
     torch.testing.assert_close(objective.evaluate(x).grad, 2 * x, rtol=1e-3, atol=1e-3)
+
+
+def test_evaluations_of_several_batches_are_joined_in_order():
+    x = torch.tensor([[0.25, 0.5, 0.0], [9.0, 0.5, 0.0], [0.75, 0.5, 0.0]], dtype=torch.float64)
+    whole = evaluate(Strict(), x, grad=True)
+    parts = [evaluate(Strict(), rows, grad=True) for rows in x.split(2)]
+    joined = Evaluation.join(parts, dim=3, grad=True)
+    for name in ("loss", "grad", "status"):
+        assert torch.equal(getattr(joined, name).nan_to_num(-1.0), getattr(whole, name).nan_to_num(-1.0))
+    assert joined.rows(slice(1, 3)).status.tolist() == whole.status.tolist()[1:]
+    assert Evaluation.join(parts, dim=3, grad=False).grad is None
+    nothing = Evaluation.join([], dim=3, grad=True)
+    assert nothing.grad is not None
+    assert nothing.grad.shape == (0, 3)
+    blind = evaluate(Strict(), x, grad=False)
+    with pytest.raises(ValueError, match="1 of 3 evaluations to join have no gradients"):
+        Evaluation.join([*parts, blind], dim=3, grad=True)
