@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..envs.registry import completed, entries
+from ..envs.registry import complete_entry, entries
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -20,6 +20,6 @@ def list_envs() -> pd.DataFrame:
     rows = [
         {"name": one.name, "dim": one.dim, "parameters": one.parameters, "model": one.model,
          "fidelities": ", ".join(one.fidelities)}
-        for one in map(completed, entries().values())
+        for one in map(complete_entry, entries().values())
     ]  # fmt: skip
     return pd.DataFrame(rows).set_index("name")

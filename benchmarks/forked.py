@@ -31,7 +31,12 @@ LOADED = (
         for part in PACKAGES
         for one in walk_packages(import_module(f"gradscape.{part}").__path__, f"gradscape.{part}.")
     ),
-    *("gradscape.envs.bounce", "gradscape.envs.engines.rigid", "gradscape.envs.functions", "gradscape.envs.points"),
+    *(
+        "gradscape.envs.bounce",
+        "gradscape.envs.engines.balls.rigid",
+        "gradscape.envs.functions",
+        "gradscape.envs.points",
+    ),
     *("dask.array", "jinja2", "imageio_ffmpeg", "pyvista", "rerun", "cma", "pydantic.type_adapter"),
     *("pydantic.json_schema", "pydantic.functional_validators", "pydantic.fields"),
 )

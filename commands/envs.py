@@ -20,11 +20,11 @@ def envs(name: Annotated[str | None, typer.Argument(help="One environment, to sh
 
 def _list() -> None:
     """Print every registered environment as a row of a table; none of ours is imported for that."""
-    from ..envs.registry import completed, entries
+    from ..envs.registry import complete_entry, entries
     from .terminal import Console, table
 
     found = table("name", "dim", "parameters", "model", "fidelities", title="environments")
-    for entry in map(completed, entries().values()):
+    for entry in map(complete_entry, entries().values()):
         found.add_row(entry.name, entry.dim, entry.parameters, entry.model, ", ".join(entry.fidelities))
     console = Console()
     console.print(found)

@@ -26,7 +26,7 @@ class EpisodeOptions:
 
     horizon: float = dataclasses.field(default=1.0, kw_only=True, metadata={"most": 8.0})
 
-    def lasting(self, steps: int) -> int:
+    def count_steps(self, steps: int) -> int:
         """Return how many steps an episode has where the scene's own duration takes so many."""
         return max(1, round(self.horizon * steps))
 
@@ -36,7 +36,7 @@ def read_options(owner: str, declared: type[Any], given: Mapping[str, Any]) -> A
 
     Raises ValueError where an option does not exist or a value is not of its type; `owner` says whose options they are.
     """
-    known = _declared(declared)
+    known = _list_options(declared)
     for name in given:
         if name not in known:
             raise ValueError(f"{owner} has no option {name!r}; it has {describe(declared) or 'none'}")
@@ -45,19 +45,19 @@ def read_options(owner: str, declared: type[Any], given: Mapping[str, Any]) -> A
 
 def describe(declared: type[Any]) -> str:
     """Return every option with what it takes and its default, as one line."""
-    return ", ".join(f"{o.name}={o.wanted} (default {o.default})" for o in _declared(declared).values())
+    return ", ".join(f"{o.name}={o.wanted} (default {o.default})" for o in _list_options(declared).values())
 
 
 def in_full(declared: type[Any]) -> str:
     """Return every option on a line of its own, then what they mean, in the words of all classes that declare them."""
-    known = _declared(declared).values()
+    known = _list_options(declared).values()
     if not known:
         return "options: none"
     lines = "\n".join(f"  {option.name}={option.wanted} (default {option.default})" for option in known)
-    return f"options:\n{lines}\n\n{_explained(declared)}".rstrip()
+    return f"options:\n{lines}\n\n{_explain(declared)}".rstrip()
 
 
-def _explained(declared: type[Any]) -> str:
+def _explain(declared: type[Any]) -> str:
     """Return the docstrings of a class and of those it is derived from, but for those that dataclasses make up."""
     docs = [(kind.__name__, kind.__doc__ or "") for kind in declared.__mro__ if dataclasses.is_dataclass(kind)]
     return "\n\n".join(inspect.cleandoc(doc) for name, doc in docs if doc and not doc.startswith(f"{name}("))
@@ -80,7 +80,7 @@ class _Option:
         return names.get(self.kind, str(self.kind)) + (f" above 0, at most {self.most:g}" if self.most else "")
 
 
-def _declared(declared: type[Any]) -> dict[str, _Option]:
+def _list_options(declared: type[Any]) -> dict[str, _Option]:
     hints = get_type_hints(declared)
     own_first = sorted(dataclasses.fields(declared), key=lambda field: bool(field.kw_only))
     return {f.name: _Option(f.name, hints[f.name], f.default, f.metadata.get("most")) for f in own_first}

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TypeVar
 
 from ..landscapes.objective import Status
+from ..landscapes.plain import number, optional, text
 from ..landscapes.storage.files import write_json
-from ..landscapes.storage.records import number, optional, read_json, reading, sign, text, verify, write_record
+from ..landscapes.storage.records import read_json, reading, sign, verify, write_record
 from .files import REMAKE, episode_name
 
 T = TypeVar("T")

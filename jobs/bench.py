@@ -16,7 +16,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..envs.base import Environment, Work
-from ..envs.engines.runtime import compiled_modules, cores, device_names, free_memory, kernel_times
+from ..envs.engines import find_engine
+from ..envs.engines.profiling import count_compiled_modules, time_kernels
+from ..envs.engines.runtime import cores, device_names, free_memory
 from ..landscapes.capacity import Need, require
 from ..landscapes.cost import duration
 from ..landscapes.objective import Evaluation, Status
@@ -190,7 +192,7 @@ class BenchJob:
                 say(f"timing batches of {batch}")
                 rates += _time_batch(envs, _points(env, batch), self.seconds)
             say("timing kernels")
-            kernels = _time_kernels(env) if self.engine == "warp" else None
+            kernels = _time_kernels(env) if find_engine(self.engine).profiled else None
             say("timing the sampler")
             own = [rate.with_gradient.episodes_per_second for rate in rates if rate.engine == self.engine]
             sampler = _time_sampler(env, max(own) * self.seconds / 2)
@@ -217,7 +219,7 @@ class BenchJob:
 
 def _need(env: Environment, batch: int) -> Need:
     """Return what a batch takes: its points and gradients, some copies of them, and the episodes that run at once."""
-    return Need(8.0 * 8 * batch * env.space.dim + env.memory() * min(batch, env._share(batch) * env.threads))
+    return Need(8.0 * 8 * batch * env.space.dim + env.memory() * min(batch, env._rows_per_part(batch) * env.threads))
 
 
 def _start_engines(
@@ -228,7 +230,7 @@ def _start_engines(
         raise ValueError(f"two engines are compared; got {engine} against {against}")
     envs, starts = {engine: make(engine)}, {}
     if against is not None:
-        envs[engine].known_engine(against)
+        envs[engine].check_engine(against)
     for name in (engine,) if against is None else (engine, against):
         follow(f"starting {name}")
         if name not in envs:
@@ -239,12 +241,12 @@ def _start_engines(
 
 def _start(env: Environment) -> Start:
     """Make an environment's first gradient, then on CUDA a full batch of them, and say what that took."""
-    cached, began = compiled_modules(), time.perf_counter()
+    cached, began = count_compiled_modules(), time.perf_counter()
     free = _free(env)
     env.prepare()
     env.evaluate(_points(env, 1))
     seconds = time.perf_counter() - began
-    compiled = compiled_modules() - cached if env.engine == "warp" else None
+    compiled = count_compiled_modules() - cached if env.capabilities.profiled else None
     if env.device != "cuda":
         return Start(seconds, compiled, None)
     env.evaluate(_points(env, env.preferred_batch))
@@ -302,11 +304,11 @@ def _time_kernels(env: Environment) -> dict[str, KernelTable]:
 
     They run on one thread: what several launch at a time adds up to more than the time that passes.
     """
-    points = _points(env, env._share(env.preferred_batch))
+    points = _points(env, env._rows_per_part(env.preferred_batch))
     env._simulate(points, grad=True)
     found = {}
     for way, grad in WAYS.items():
-        with kernel_times(env.device) as times:
+        with time_kernels(env.device) as times:
             began = time.perf_counter()
             env._simulate(points, grad=grad)
             wall = time.perf_counter() - began

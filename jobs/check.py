@@ -25,30 +25,16 @@ if TYPE_CHECKING:
 
 FACTORS = (1, 2, 4, 8)  # of the fidelity's time step, and of the scene's horizon
 
-# Options that make a scene's material soft and stiff: the least and the most to try.
-MATERIALS: dict[str, tuple[str, float, float]] = {
-    "bounce": ("ke", 1e3, 1e5),  # contact stiffness [N/m], a tenth and ten times the default
-    "fluid": ("viscosity", 0.4, 40.0),  # [Pa s], the same
-    "pinball-2": ("restitution", 0.0, 1.0),
-    "pinball-16": ("restitution", 0.0, 1.0),
-}
-# Checks that scenes of ours are known to fail, and why: environment -> fidelity -> check -> reason.
-EXPECTED: dict[str, dict[str, dict[str, str]]] = {}
-
-
-def _expected(job: CheckJob) -> dict[str, str] | None:
-    return EXPECTED.get(job.name, {}).get(job.env.fidelity.name)
-
 
 def _materials(job: CheckJob) -> list[Variant]:
     """Return the softest and the stiffest of what a scene is made of, by its options or its parameters."""
     from ..landscapes.conformance.extremes import Variant
 
-    if job.name in MATERIALS:
-        option, *ends = MATERIALS[job.name]
-        return [Variant(f"{option} {end:g}", _with_option(job.spec, option, end)) for end in ends]
+    if (ends := job.env.material_range) is not None:
+        values = (ends.softest, ends.stiffest)
+        return [Variant(f"{ends.option} {value:g}", _with_option(job.spec, ends.option, value)) for value in values]
     space = job.env.space
-    stiff = [number for number, name in enumerate(space.names) if "stiffness" in name]
+    stiff = [space.names.index(name) for name in job.env.stiffness_parameters]
     if not stiff:
         return [Variant("softest and stiffest", why="it offers no stiffness to set")]
     found = []
@@ -170,7 +156,7 @@ class CheckJob:
             precision=self.env.fidelity.precision,
             twin=_twin(self),
             variants=[*_time_steps(self), *_materials(self), *_horizons(self)],
-            expected=_expected(self),
+            expected=self.env.known_failures.get(self.env.fidelity.name),
             follow=follow,
         )
 

@@ -309,8 +309,8 @@ def check_methods(names: Sequence[str]) -> list[str]:
 
 def check_threads(env: Environment, workers: int) -> None:
     """Raise ValueError where an environment's engine runs in one thread, and several are to simulate it."""
-    if workers > 1 and env.engine == "taichi":
-        raise ValueError(f"engine taichi runs in one thread only, so --workers is 1; got {workers}")
+    if workers > 1 and not env.capabilities.concurrent:
+        raise ValueError(f"engine {env.engine} runs in one thread only, so --workers is 1; got {workers}")
 
 
 def race_folder(env: Environment, options: Options, root: Path = ROOT) -> Path:

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NotRequired, Protocol, TypedDict, cast
 
 from ..landscapes.measures.records import ProfileRecord, WordRecord
-from ..landscapes.storage.records import read_json, reading, text
+from ..landscapes.plain import text
+from ..landscapes.storage.records import read_json, reading
 from .folder import REPORT
 from .report_tables import EnvironmentRecord, by_environment, slices_markdown
 

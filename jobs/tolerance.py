@@ -105,8 +105,9 @@ def _time(env: Environment, variants: Sequence[Environment]) -> dict[str, float]
 
     It is kept so that the same command chooses the same variant, and goes on with what it began.
     """
+    from ..landscapes.plain import number
     from ..landscapes.storage.files import write_json
-    from ..landscapes.storage.records import number, read_json, reading
+    from ..landscapes.storage.records import read_json, reading
 
     path = _place(env.name, asdict(env.options), env.device).with_suffix(f".{env.engine}-{env.code}.seconds.json")
     known: dict[str, float] = {}
@@ -199,11 +200,11 @@ def _read(name: str, path: Path) -> Tradeoff:
     """Return what `landscape tradeoff` left in a file, whose fidelities can be made."""
     from ..envs.base import Fidelity
     from ..landscapes.measures.tradeoff import Tradeoff
-    from ..landscapes.storage.records import reading
+    from ..landscapes.storage.records import read_json, reading
 
     todo = f"delete it, and `landscape tradeoff {name}` measures it anew"
-    found = Tradeoff.read(path, todo)
     with reading(path, todo):
+        found = Tradeoff.of_record(read_json(path))
         for row in found.variants:
             Fidelity(**row.fidelity)
     return found

@@ -13,7 +13,6 @@ from ..envs.registry import make
 SETTINGS = ("dt", "resolution", "particles", "precision", "stiffness", "engine", "device")
 STEPS, CELLS, PARTICLES, STIFFNESSES = (0.5, 2.0, 4.0), (2 / 3, 1.5), (0.5, 2.0), (0.25, 0.5, 2.0, 4.0)
 SLOWER = 1.5  # times what float32 takes, float64 is expected to take
-STIFFNESS = "ke"  # what scenes with penalty contact call its stiffness
 
 
 @dataclass(frozen=True)
@@ -131,9 +130,10 @@ def _precisions(base: Variant, env: Environment) -> Iterator[Variant]:
 
 
 def _stiffnesses(base: Variant, env: Environment) -> Iterator[Variant]:
-    for factor in STIFFNESSES if STIFFNESS in base.options else ():
-        options = base.options | {STIFFNESS: base.options[STIFFNESS] * factor}
-        yield base.change(f"{base.name}-{STIFFNESS}-x{factor:g}", "stiffness", options=options)
+    option = env.contact_stiffness
+    for factor in STIFFNESSES if option else ():
+        options = base.options | {option: base.options[option] * factor}
+        yield base.change(f"{base.name}-{option}-x{factor:g}", "stiffness", options=options)
 
 
 def _engines(base: Variant, env: Environment) -> Iterator[Variant]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 
@@ -44,3 +44,28 @@ def plain_json(settings: Mapping[str, Any], what: str) -> dict[str, Any]:
     except (TypeError, ValueError) as error:
         raise ValueError(f"{what} must be plain JSON (numbers, strings, lists, dicts): {error}") from None
     return found
+
+
+def text(value: Any) -> str:
+    """Return what has to be a string.
+
+    Raises TypeError where it is none.
+    """
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r} is no text")
+    return value
+
+
+def number(value: Any) -> float:
+    """Return what has to be a finite number, as it is.
+
+    Raises TypeError where it is none.
+    """
+    if not isinstance(value, int | float) or not math.isfinite(value):
+        raise TypeError(f"{value!r} is no number")
+    return value
+
+
+def optional(kind: Callable[[Any], Any], value: Any) -> Any:
+    """Return what has to be of a kind, or None."""
+    return None if value is None else kind(value)

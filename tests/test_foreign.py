@@ -130,7 +130,7 @@ def test_a_line_has_one_dimension(run: Callable[..., Said], folder: Path, words:
         ("arm.py:NOTHING", "arm.py holds no environment NOTHING"),
         ("leg.py:Leg", "there is no file leg.py"),
         ("broken.py:Arm", "broken.py cannot be imported: ZeroDivisionError"),
-        ("fluid.py:Mine", "fluid.py:Mine is called 'fluid', and so is gradscape.envs.fluid:Fluid"),
+        ("fluid.py:Mine", "fluid.py:Mine is called 'fluid', and so is gradscape.envs.mpm.fluid:Fluid"),
     ],
 )
 def test_a_file_without_the_class_is_refused_by_name(

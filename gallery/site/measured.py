@@ -10,7 +10,8 @@ from typing import Any
 
 from ...landscapes.measures.classify import WORDS
 from ...landscapes.measures.fidelity import cheapest, p95, pareto_front
-from ...landscapes.storage.records import number, optional, read_json, reading, text
+from ...landscapes.plain import number, optional, text
+from ...landscapes.storage.records import read_json, reading
 from ..files import DEVICES, REMAKE, REPORT, TRADEOFFS, TradeoffFiles
 from .manifest import Interval, ReportEntry, Rung, Seconds, TradeoffEntry, Word
 

@@ -14,8 +14,9 @@ import xarray as xr
 from ...jobs.slice import count_statuses, flat_points
 from ...landscapes.identity import plane_of
 from ...landscapes.objective import Status
+from ...landscapes.plain import number
 from ...landscapes.plane import Plane
-from ...landscapes.storage.records import number, read_json, reading
+from ...landscapes.storage.records import read_json, reading
 from ..files import EPISODE_KINDS, EPISODES, MEASURES, REMAKE, SWEEP_FILM, SWEEP_RECORD
 from ..records import Node, SweepRecord, read_nodes
 from .manifest import Axis, ColourScale, Episode, Nodes, Numbers, Trajectory

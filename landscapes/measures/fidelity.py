@@ -15,10 +15,9 @@ from scipy.stats import linregress, rankdata
 from torch import Tensor
 
 from ..objective import Evaluation, Objective, Status, evaluate
-from ..plain import finite
+from ..plain import finite, number, optional
 from ..space import ParameterSpace
 from ..statistics import CONFIDENCE
-from ..storage.records import number, optional
 
 REPETITION = 4.0  # least seconds that repetitions of a quick batch take, each way
 LARGEST = 60.0  # most seconds that a batch larger than the study's points may take

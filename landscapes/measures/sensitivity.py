@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations, pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -16,7 +16,9 @@ from torch import Tensor
 from ..objective import Objective, Status, evaluate
 from ..plain import finite
 from ..space import ParameterSpace, sobol
-from ..storage.checkpoint import Checkpoint
+
+if TYPE_CHECKING:
+    from ..storage.checkpoint import Checkpoint
 
 STEP, LINE = 0.025, 5  # of a short line: distance of its points in widths of the box, how many they are
 MOST, LEAST, AFFORDED = 16, 4, 2000  # base points by default, and the episodes up to which they are the most

@@ -8,10 +8,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..storage.records import number, optional, read_json, reading, text
+from ..plain import number, optional, text
 from .fidelity import Comparison, ConvergenceOrder, convergence_order, pareto_front
 
 if TYPE_CHECKING:
@@ -106,15 +105,6 @@ class Tradeoff:
     identity: dict[str, Any]
     provenance: dict[str, Any]
     command: str
-
-    @classmethod
-    def read(cls, path: Path, todo: str = "delete it, and `landscape tradeoff` measures it anew") -> Tradeoff:
-        """Read a trade-off's file.
-
-        Raises DamagedError, which names the file and says what to do, where it holds none.
-        """
-        with reading(path, todo):
-            return cls.of_record(read_json(path))
 
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> Tradeoff:

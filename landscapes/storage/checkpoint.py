@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..identity import DamagedError, check_identity
-from ..plain import plain_json
+from ..plain import plain_json, text
 from .files import discard, replacing, visible_files, write_json
 from .ownership import check_ours, refuse_others
-from .records import read_json, reading, text
+from .records import read_json, reading
 
 SETTINGS, PARTS = "settings.json", "pieces"
 NAME_KEY = "piece"  # the array with a part's own name, which tells files that were swapped

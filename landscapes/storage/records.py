@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import math
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -65,28 +64,3 @@ def verify(found: Any) -> dict[str, Any]:
 
 def _sum(record: Mapping[str, Any]) -> int:
     return zlib.crc32(json.dumps(record, sort_keys=True).encode())
-
-
-def text(value: Any) -> str:
-    """Return what has to be a string.
-
-    Raises TypeError where it is none.
-    """
-    if not isinstance(value, str):
-        raise TypeError(f"{value!r} is no text")
-    return value
-
-
-def number(value: Any) -> float:
-    """Return what has to be a finite number, as it is.
-
-    Raises TypeError where it is none.
-    """
-    if not isinstance(value, int | float) or not math.isfinite(value):
-        raise TypeError(f"{value!r} is no number")
-    return value
-
-
-def optional(kind: Callable[[Any], Any], value: Any) -> Any:
-    """Return what has to be of a kind, or None."""
-    return None if value is None else kind(value)

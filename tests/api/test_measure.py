@@ -60,7 +60,7 @@ class Bowl(gs.Environment):
     sign = 1.0
 
     def _evaluate(self, x: torch.Tensor, *, grad: bool) -> gs.Evaluation:
-        return gs.Evaluation.judged(x.square().sum(dim=1), 2 * self.sign * x if grad else None)
+        return gs.Evaluation.from_results(x.square().sum(dim=1), 2 * self.sign * x if grad else None)
 
 
 class Hill(Bowl):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gradscape.envs.registry import Entry, entries
+from gradscape.envs.registry import Entry, entries, environment_class
 from gradscape.jobs import check as job
 from gradscape.jobs.scene import SceneSpec
 from gradscape.landscapes.conformance import suite as conformance
@@ -149,7 +149,7 @@ def test_a_known_exception_is_printed_with_its_reason_until_it_is_none(
     run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bowl: None
 ) -> None:
     reasons = dict.fromkeys(("finite differences", "gradcheck"), "its gradient points downhill")
-    monkeypatch.setitem(job.EXPECTED, "bowl", {"only": reasons})
+    monkeypatch.setattr(environment_class("bowl"), "known_failures", {"only": reasons})
     excused = run("check", "bowl", "--set", "wrong=true", cwd=tmp_path)
     assert excused.returncode == 0
     assert excused.stdout.count("known: its gradient points downhill") == 2
@@ -158,17 +158,10 @@ def test_a_known_exception_is_printed_with_its_reason_until_it_is_none(
     assert "it passes, so this is no longer true: its gradient points downhill" in no_longer.stdout
 
 
-def nowhere(expected: dict[str, dict[str, dict[str, str]]]) -> list[tuple[str, str]]:
-    """Return expectations of environments or fidelities that there are not."""
-    known = {(name, fidelity) for name, entry in entries().items() for fidelity in entry.fidelities}
-    return [(name, one) for name, fidelities in expected.items() for one in fidelities if (name, one) not in known]
-
-
-def test_expectations_are_of_environments_and_fidelities_there_are() -> None:
-    assert nowhere({"fluid": {"draft": {}, "best": {}}, "liquid": {"draft": {}}}) == [
-        ("fluid", "best"), ("liquid", "draft")
-    ]  # fmt: skip
-    assert nowhere(job.EXPECTED) == []
+def test_known_failures_are_of_fidelities_there_are() -> None:
+    for name in entries():
+        kind = environment_class(name)
+        assert set(kind.known_failures) <= set(kind.fidelities), name
 
 
 def test_an_interrupt_says_that_nothing_is_kept(

@@ -79,8 +79,8 @@ def test_an_episodes_horizon_stands_last_and_is_explained():
     said = in_full(Scene)
     assert "\n\n`mu`: friction.\n\n`horizon`: how long an episode lasts" in said
     assert in_full(NoOptions) == "options: none"
-    assert read_options("scene", Scene, {"horizon": "0.5"}).lasting(5) == 2
-    assert Scene(horizon=1e-3).lasting(5) == 1
+    assert read_options("scene", Scene, {"horizon": "0.5"}).count_steps(5) == 2
+    assert Scene(horizon=1e-3).count_steps(5) == 1
 
 
 OPTIONS = {name: environment_class(name).Options for name in entries()} | {

@@ -8,10 +8,11 @@ import warp as wp
 
 from gradscape.envs.base import Environment, Fidelity, Work
 from gradscape.envs.bounce import Bounce
-from gradscape.envs.engines.model import Box
-from gradscape.envs.engines.replay import Replay
-from gradscape.envs.engines.runtime import KernelTime, cuda_available, kernel_times
-from gradscape.envs.fluid import Fluid
+from gradscape.envs.engines.launches import Launches
+from gradscape.envs.engines.mpm.model import Box
+from gradscape.envs.engines.profiling import KernelTime, time_kernels
+from gradscape.envs.engines.runtime import cuda_available
+from gradscape.envs.mpm.fluid import Fluid
 from gradscape.jobs.bench import BenchJob, alternate
 from gradscape.jobs.watch import Watch
 from gradscape.landscapes.objective import Evaluation, Status
@@ -133,7 +134,7 @@ def timed(request, monkeypatch):
     """Return kernels' times by the way of a ball's flight; on a CPU every look at the clock takes a second."""
     if request.param == "cpu":
         clock = Clock(tick=1.0)
-        for module in ("jobs.bench", "envs.engines.runtime"):
+        for module in ("jobs.bench", "envs.engines.profiling"):
             monkeypatch.setattr(f"gradscape.{module}.time", clock)
         monkeypatch.setattr(Bounce, "threads", 1)  # a solver takes fewer rows than are worth evaluating at once
     job = BenchJob(lambda engine: Bounce(device=request.param, engine=engine), "warp", batches=[1], seconds=0.0)
@@ -163,7 +164,7 @@ def test_kernels_have_the_same_names_on_cuda(monkeypatch):
     ]
     monkeypatch.setattr(wp, "timing_begin", lambda cuda_filter: None)
     monkeypatch.setattr(wp, "timing_end", lambda: runs)
-    with kernel_times("cuda") as times:
+    with time_kernels("cuda") as times:
         assert not times
     assert times == {"step_kernel.advance": KernelTime(2, 0.005), "step_kernel.advance backward": KernelTime(1, 0.007)}
 
@@ -172,13 +173,13 @@ def test_kernels_are_launched_one_by_one_to_be_timed(monkeypatch):
     monkeypatch.setattr(wp, "timing_begin", lambda cuda_filter: None)
     monkeypatch.setattr(wp, "timing_end", list)
     monkeypatch.setattr(wp, "capture_launch", lambda graph: launched.append(graph))
-    replay, launched = Replay("cuda"), []
+    launches, launched = Launches("cuda"), []
     box = Box((0, 0, 0), (1, 1, 1))
-    replay("key", box, None, lambda: replay.call(lambda: launched.append("kernel")), small=True)
-    replay.seen, replay.graphs = {("key", box)}, {("key", box): "graph"}
-    with kernel_times("cuda"):
-        replay("key", box, None, launched.clear, small=True)
-    replay("key", box, None, launched.clear, small=True)
+    launches.run("key", box, None, lambda: launches.call(lambda: launched.append("kernel")), small=True)
+    launches.seen, launches.graphs = {("key", box)}, {("key", box): "graph"}
+    with time_kernels("cuda"):
+        launches.run("key", box, None, launched.clear, small=True)
+    launches.run("key", box, None, launched.clear, small=True)
     assert launched == ["kernel", "kernel", "graph"]
 
 
@@ -192,7 +193,7 @@ def test_a_gpu_holds_what_was_estimated_or_more_where_it_has_room():
 
 def test_launches_are_timed_within_the_block_only():
     launch = wp.launch
-    with pytest.raises(KeyError), kernel_times("cpu") as times:
+    with pytest.raises(KeyError), time_kernels("cpu") as times:
         raise KeyError(times)
     assert wp.launch is launch
 

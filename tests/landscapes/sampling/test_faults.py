@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gradscape.envs.engines import springs
+from gradscape.envs.engines.sheets import springs
 from gradscape.envs.registry import make
 from gradscape.landscapes.adapters import from_torch
 from gradscape.landscapes.identity import StoreError
@@ -102,7 +102,7 @@ def test_a_solver_that_does_not_fit_is_made_smaller(monkeypatch):
             raise RuntimeError("Failed to allocate 1 bytes on device 'cuda:0'")
         fitting(self, *args, capacity=capacity, **settings)
 
-    monkeypatch.setattr("gradscape.envs.sheets.capacity", lambda memory, device: 16)
+    monkeypatch.setattr("gradscape.envs.sheets.sheets.capacity", lambda memory, device: 16)
     monkeypatch.setattr(springs.Solver, "__init__", init)
     with pytest.warns(RuntimeWarning, match="flip ran out of memory at"):
         env, found = sampled()

@@ -12,8 +12,8 @@ import torch
 from matplotlib.image import imread
 
 from gradscape.envs.base import Environment
-from gradscape.envs.fluid import TANK_HEIGHT, TANK_WIDTH
-from gradscape.envs.outlines import about, skin, triangles
+from gradscape.envs.mpm.fluid import TANK_HEIGHT, TANK_WIDTH
+from gradscape.envs.outlines import rotate_about, skin, triangles
 from gradscape.envs.registry import BUILTIN, make
 from gradscape.landscapes.draw.figures.contact import Caption, episode_figure, save_sheet
 from gradscape.landscapes.draw.render import materials
@@ -233,7 +233,7 @@ def test_solids_have_their_sizes(shape: str, size: tuple[float, ...], volume: fl
 
 
 def test_turns_and_skins_and_triangles() -> None:
-    quarter = about(1, torch.tensor([torch.pi / 2]))[0] @ torch.tensor([0.0, 0.0, 1.0])
+    quarter = rotate_about(1, torch.tensor([torch.pi / 2]))[0] @ torch.tensor([0.0, 0.0, 1.0])
     torch.testing.assert_close(quarter, torch.tensor([1.0, 0.0, 0.0]), atol=1e-6, rtol=0)
     axis = (torch.arange(4) + 0.5) / 4
     cube = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).view(1, -1, 3)
