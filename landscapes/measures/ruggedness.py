@@ -19,7 +19,7 @@ from scipy import fft
 from scipy.spatial.distance import pdist
 
 from ..identity import plane_of
-from ..plain import finite
+from ..plain import plain
 from ..statistics import Estimate, Values, jackknife
 from .records import LossesRecord
 
@@ -232,7 +232,7 @@ class Ruggedness:
 
     def record(self) -> LossesRecord:
         """Return it as plain JSON."""
-        return cast("LossesRecord", {name: finite(value) for name, value in vars(self).items()})
+        return cast("LossesRecord", plain(vars(self)))
 
 
 def ruggedness(dataset: xr.Dataset, *, floor: float) -> Ruggedness:
