@@ -279,7 +279,7 @@ class Environment(abc.ABC):
         if not isinstance(found, Evaluation):
             raise ValueError(
                 f"{self.name}._evaluate must return an Evaluation; got {type(found).__name__}. "
-                "Evaluation.judged(losses, gradients) makes one"
+                "Evaluation.from_results(losses, gradients) makes one"
             )
         if grad and found.grad is None:
             raise ValueError(f"{self.name}._evaluate was asked for gradients (grad=True) and returned none")

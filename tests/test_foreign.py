@@ -37,7 +37,7 @@ class TwoLinkArm(gs.Environment):
         loss = self.options.stiffness * (x[:, 0] ** 2 + (x[:, 1] - 1) ** 2) + x[:, 2]
         slope = torch.stack([2 * x[:, 0], 2 * (x[:, 1] - 1), torch.ones(len(x))], dim=1)
         slope[:, :2] *= self.options.stiffness
-        return gs.Evaluation.judged(loss, slope if grad else None)
+        return gs.Evaluation.from_results(loss, slope if grad else None)
 
 class Arm(TwoLinkArm):
     """An arm.

@@ -31,7 +31,7 @@ WRITING = {  # the command, the file for which there is no room any more, what i
     ),
     "tradeoff": (
         "tradeoff bounce --set horizon=0.05 --points 2 --variants precision --device cpu --out made", "tradeoff.json",
-        "rungs are kept in made",
+        "variants are kept in made",
     ),
     "pairs": ("pairs branin --samples 2 --out made", "pairs.json", "2 batches are kept in made"),
     "report": ("report cut --points 2 --out made", "report.json", "0 of 1 reports are kept in"),

@@ -44,7 +44,7 @@ class Bowl(Environment):
         self.calls += 1
         if self.options.drifting and self.calls % 2:
             x = x + torch.nan
-        return Evaluation.judged(x.square().sum(dim=1), (-x if self.options.wrong else 2 * x) if grad else None)
+        return Evaluation.from_results(x.square().sum(dim=1), (-x if self.options.wrong else 2 * x) if grad else None)
 '''
 
 
