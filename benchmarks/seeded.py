@@ -103,6 +103,7 @@ SEARCHED = {
     "flip": 1, "fluid": 1, "pinch": 1,
 }  # fmt: skip
 SWEPT = {"ackley": 2, "levy": 2, "bounce": 3, "pinball-16": 2, "cartpole": 1, "swing-velocity": 1}
+DEAR = ("swing-stiffness", "flip", "fluid", "pinch")  # whose reports take minutes
 METHODS = {  # with options of each
     "random": (),
     "cma-es": ("sigma=0.2", "population=5"),
@@ -257,7 +258,7 @@ def _sweeps(chance: random.Random, count: int, _: Sequence[Command]) -> list[Com
 def reportable(command: Command) -> bool:
     """Say whether a slice has what a report needs: gradients, and three samples along each axis."""
     enough = command.verb == "slice" and int(command.option("--resolution")) >= 3
-    return enough and "--no-gradients" not in command.words and "pinch" not in command.env
+    return enough and "--no-gradients" not in command.words and command.env[0] not in DEAR
 
 
 def _reports(chance: random.Random, count: int, made: Sequence[Command]) -> list[Command]:
