@@ -205,7 +205,7 @@ def _work(made: Iterable[Done], folder: Path) -> Iterator[tuple[str, Done]]:
         if command.verb in ("slice", "run"):
             yield "open", _opened(command, folder)
             yield "export", run(_reading(command, "export", command.name, file="table.csv"), folder)
-        if command.verb == "slice" and (over := [one.name for one in runs if one.env == command.env]):
+        if command.plane and (over := [one.name for one in runs if one.env == command.env]):
             yield "overlay", run(_reading(command, "overlay", command.name, *over[:2], *_source(command)), folder)
         if command.verb == "report":
             yield "report", run(_reading(command, "report", *command.words[1:-2]), folder)

@@ -47,6 +47,11 @@ class Command:
         """Return the value of an option, or a default where the command line has none."""
         return self.words[self.words.index(name) + 1] if name in self.words else default
 
+    @property
+    def plane(self) -> bool:
+        """Whether this makes a slice of two parameters, over which runs can be laid."""
+        return self.words[0] == "slice" and not self.words[self.words.index("--dims") + 2].startswith("--")
+
 
 @dataclass(frozen=True)
 class Scene:
