@@ -176,7 +176,10 @@ def short_of(**what: object) -> gs.Environment:
 @pytest.mark.parametrize(
     ("what", "said"),
     [
-        ({"_evaluate": lambda self, x, *, grad: x[:, 0]}, "must return an Evaluation; got Tensor. Evaluation.from_results"),
+        (
+            {"_evaluate": lambda self, x, *, grad: x[:, 0]},
+            "must return an Evaluation; got Tensor. Evaluation.from_results",
+        ),
         ({"_evaluate": lambda self, x, *, grad: None}, "must return an Evaluation; got NoneType"),
         (
             {"_evaluate": lambda self, x, *, grad: gs.Evaluation.from_results(x[:, 0], None)},
