@@ -37,6 +37,7 @@ def _describe(name: str) -> None:
 
     from ..envs.options import in_full
     from ..envs.registry import make
+    from ..gallery.paper import read_paper
     from .terminal import Console, table
 
     env, console = make(name, device="cpu"), Console(soft_wrap=True, highlight=False)
@@ -52,3 +53,5 @@ def _describe(name: str) -> None:
     console.print(f"engines: {', '.join(env.engines)}")
     console.print(in_full(env.Options))
     console.print(f"examples: {', '.join(env.examples) or 'none'}")
+    if words := read_paper().words.get(env.name):
+        console.print(f"the paper says: {words}")

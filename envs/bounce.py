@@ -54,8 +54,6 @@ class Bounce(Environment):
     sliding.
     Source: task Bounce of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
     2022), appendix B.1; contact constants of NVIDIA Warp's bounce example.
-    The paper says: gradients over horizontal velocity are smooth; over vertical velocity bounces come and go, and the
-    discontinuities remain in spite of relaxed contact.
     """
 
     name: ClassVar[str] = "bounce"

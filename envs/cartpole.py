@@ -62,7 +62,6 @@ class Cartpole(Environment):
     Source: task 3-link Cartpole of "Rethinking Optimization with Differentiable Simulation from a Global Perspective"
     (CoRL 2022), appendix A.1.1. The paper has 200 timesteps, four controls and 400 parameters: held for two timesteps,
     controls satisfy all three. Masses, torques, times and target are ours.
-    The paper says: the landscape is very smooth, gradients are of good quality.
     """
 
     name: ClassVar[str] = "cartpole"

@@ -61,8 +61,6 @@ class Pinball(Environment):
     since 4 s are short; a ball jammed between surfaces, at 8 impacts in a step, stays where it is until the next step.
     Source: task Pinball of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
     2022), appendix A.1.2; ball, bars, start, goal and duration are ours.
-    The paper says: large flat regions, where gradients are zero, and discontinuities, where they do not help; losses
-    from 0.4 to 8.5 with 2 bars, from 0.3 to 6.8 with 16 over the angles of the two in the middle of the lowest row.
     """
 
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")

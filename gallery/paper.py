@@ -20,10 +20,18 @@ ABSENT = "The paper does not have this environment, so it claims nothing about i
 
 @dataclass(frozen=True)
 class PaperWords:
-    """Hold the paper's words for an environment's landscape, of `classify.WORDS`, and where it says them."""
+    """Hold the paper's words for an environment's landscape, of `classify.WORDS`, and where it says them.
+
+    `losses` are the ends of the colour bars of its slices, None where they cannot be read.
+    """
 
     words: tuple[str, ...]
     where: str
+    losses: tuple[float, float] | None = None
+
+    def __str__(self) -> str:
+        said = f"{', '.join(self.words)} ({self.where})"
+        return f"{said}; losses from {self.losses[0]:g} to {self.losses[1]:g} in its slices" if self.losses else said
 
 
 @dataclass(frozen=True)
@@ -58,6 +66,7 @@ class Paper:
 class _Words(TypedDict):
     words: list[str]
     where: str
+    losses: NotRequired[tuple[float, float]]
 
 
 class _Claim(TypedDict):
@@ -98,7 +107,12 @@ def _words(tables: Mapping[str, _Words], path: Path) -> dict[str, PaperWords]:
     for name, table in tables.items():
         if unknown := set(table["words"]) - set(WORDS):
             raise ValueError(f"{path}: {name} has words {sorted(unknown)}; the words are {', '.join(WORDS)}")
-    return {name: PaperWords(tuple(table["words"]), table["where"]) for name, table in tables.items()}
+    return {name: _words_of(table) for name, table in tables.items()}
+
+
+def _words_of(table: _Words) -> PaperWords:
+    losses = table.get("losses")
+    return PaperWords(tuple(table["words"]), table["where"], (losses[0], losses[1]) if losses else None)
 
 
 def _claims(tables: Sequence[_Claim]) -> dict[str, tuple[Claim, ...]]:

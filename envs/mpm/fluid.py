@@ -66,7 +66,6 @@ class Fluid(MpmScene):
     on it; the shell is felt over a fraction of a grid cell.
     Source: task Fluid of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
     2022), appendix A.2.1; material and geometry where it is silent are ours.
-    The paper says: rugged, many local minima, gradients of good quality; losses from 0 to 0.72.
     """
 
     name: ClassVar[str] = "fluid"

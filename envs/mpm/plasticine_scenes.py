@@ -25,7 +25,7 @@ class Assembly(Plasticine):
     """Lift a ball with two spheres and set it on a box.
 
     A box 0.16 m wide on a sticky floor, a ball of 0.06 m radius 0.3 m to its left; yield stress 100 Pa. The target is
-    the ball on the box, where upstream has it. The paper's losses: 23 to 44.
+    the ball on the box, where upstream has it.
     """
 
     name: ClassVar[str] = "assembly"
@@ -84,7 +84,7 @@ class RollingPin(Plasticine):
     """Roll a slab flat with a rolling pin.
 
     A slab 0.3 m wide and 0.1 m high on a rubbing floor; the pin (0.3 m, radius 0.03 m) rolls without slip, turns about
-    the vertical and rises or sinks; yield stress 50 Pa. The paper says: smooth, with plateaus and flat gradients.
+    the vertical and rises or sinks; yield stress 50 Pa.
     """
 
     name: ClassVar[str] = "rolling-pin"
@@ -136,7 +136,7 @@ class Table(Plasticine):
     """Bend one leg of a table outwards with a sphere.
 
     Four legs that weigh as much as the top each, on a rubbing floor, a sphere of 0.04 m radius between them; its
-    vertical parameters do nothing; yield stress 50 Pa, Poisson's ratio 0.05. The paper's losses: 14 to 86.
+    vertical parameters do nothing; yield stress 50 Pa, Poisson's ratio 0.05.
     """
 
     name: ClassVar[str] = "table"
@@ -191,7 +191,7 @@ class TripleMove(Plasticine):
     """Carry three blocks through the air with three pairs of spheres.
 
     Blocks 0.1 m wide on a rubbing floor, each between two spheres of 0.03 m radius; yield stress 200 Pa. The targets
-    hang in the air, so that blocks must be lifted and held. The paper's losses: 49 to 85.
+    hang in the air, so that blocks must be lifted and held.
     """
 
     name: ClassVar[str] = "triple-move"
@@ -224,7 +224,7 @@ class Writer(Plasticine):
     """Write a stroke into a slab with a pen.
 
     A slab 0.3 m wide and 0.1 m high on a sticky floor, a frictionless upright capsule that starts 0.03 m deep in it;
-    yield stress 50 Pa. The paper's losses: 4 to 15.
+    yield stress 50 Pa.
     """
 
     name: ClassVar[str] = "writer"

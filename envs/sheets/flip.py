@@ -44,7 +44,6 @@ class Flip(SheetScene):
     pan falls on, since nothing else is there.
     Source: task Flip of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL 2022),
     appendix A.2.3; geometry and material where it is silent are ours.
-    The paper says: extremely rugged, gradients in random directions; losses from 0.018 to 0.62 in its slices.
     """
 
     name: ClassVar[str] = "flip"

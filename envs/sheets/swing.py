@@ -47,7 +47,6 @@ class Swing(SheetScene):
     of 0.5/s; stretching is resisted by 10 N/m, softer than fabric, so that a step may be long.
     Source: task Swing of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
     2022), appendix A.2.3; geometry and material are ours.
-    The paper says: rugged; gradients noisy in large areas, often opposite to the slope.
     """
 
     fidelities: ClassVar[dict[str, Fidelity]] = {

@@ -1,5 +1,6 @@
 """What the paper says: of environments, methods and slices that there are, in the words for landscapes."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,8 @@ from gradscape.gallery.files import PAPER
 from gradscape.gallery.paper import ABSENT, PaperCaption, read_paper
 from gradscape.optim.claims import Claims
 from gradscape.optim.registry import methods
+
+from ..command import Said
 
 WHOLE = read_paper()
 
@@ -51,3 +54,11 @@ def test_a_word_that_no_landscape_is_described_in_is_refused(tmp_path: Path) -> 
     (tmp_path / "paper.toml").write_text(text)
     with pytest.raises(ValueError, match=r"bounce has words \['bumpy'\]; the words are "):
         read_paper(tmp_path / "paper.toml")
+
+
+def test_an_environment_s_description_quotes_the_paper(run: Callable[..., Said], tmp_path: Path) -> None:
+    said = " ".join(run("envs", "pinball-2", cwd=tmp_path).stdout.split())
+    assert (
+        "the paper says: rugged, large flat regions, discontinuous, gradients zero (A.1.2, and B.2 for rugged)" in said
+    )
+    assert "losses from 0.4 to 8.5 in its slices" in said
