@@ -22,6 +22,7 @@ VOLATILE |= {"created", "command", "versions", "code", "method_code", "gradscape
 VOLATILE |= {"checksum", "key"}  # of a record, which are taken of the others
 TIMED = ("forward", "with_gradient", "batch")  # of the pieces of a trade-off
 SECONDS = ("seconds", "forwards")  # columns of runs
+RENAMED = {"longest": "max_step", "together": "batch_size", "most": "max_points"}  # options of methods, since 2026-11
 EMBEDDED = ("identity", "provenance")  # attributes that may be JSON in text
 
 
@@ -79,6 +80,7 @@ def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
     if isinstance(value, dict):
         for key, inner in value.items():
             if key not in VOLATILE:
+                key = RENAMED.get(key, key) if "method_options" in name else key
                 yield from _leaves(inner, f"{name}.{key}" if name else str(key))
     elif isinstance(value, list):
         yield f"{name} length", str(len(value))
