@@ -35,9 +35,9 @@ def _describe(name: str) -> None:
     """Print all there is to know about one environment."""
     from dataclasses import asdict
 
-    from ..envs.options import in_full
     from ..envs.registry import make
     from ..gallery.paper import read_paper
+    from ..landscapes.options import in_full
     from .terminal import Console, table
 
     env, console = make(name, device="cpu"), Console(soft_wrap=True, highlight=False)

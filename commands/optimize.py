@@ -71,7 +71,7 @@ def _describe(name: str) -> None:
     """Print all there is to know about one method."""
     import inspect
 
-    from ..envs.options import in_full
+    from ..landscapes.options import in_full
     from ..optim.registry import find_method, optimizer_class
     from .terminal import Console
 

@@ -19,13 +19,13 @@ from torch import Tensor
 
 from ..landscapes.episode import Episode as Episode
 from ..landscapes.objective import Evaluation
+from ..landscapes.options import NoOptions, read_options
 from ..landscapes.sampling.memory import free_memory
 from ..landscapes.space import ParameterSpace, as_tensor
 from .batching import Pool, map_parts
 from .code import code_digest
 from .engines import find_engine
 from .engines.engine import Engine
-from .options import NoOptions, read_options
 from .records import Fidelity as Fidelity
 from .records import MaterialRange as MaterialRange
 from .records import Work as Work
@@ -124,10 +124,9 @@ class Environment(abc.ABC):
         x = self._check_points(x)
         if len(x) == 0:
             return Evaluation.empty(self.space.dim, grad=grad)
-        results = self._map_parts(partial(self._simulate, grad=grad), x)
-        loss = torch.cat([r.loss.to(x) for r in results])
-        slope = torch.cat([r.grad.to(x) for r in results if r.grad is not None]) if grad else None
-        return Evaluation.from_results(loss, slope, torch.cat([r.status.cpu() for r in results]))
+        whole = Evaluation.join(self._map_parts(partial(self._simulate, grad=grad), x), dim=self.space.dim, grad=grad)
+        slope = None if whole.grad is None else whole.grad.to(x)
+        return Evaluation.from_results(whole.loss.to(x), slope, whole.status.cpu())
 
     @final
     def __call__(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"]:

@@ -11,9 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..landscapes.objective import Evaluation, Status
+from ..landscapes.options import NoOptions
 from ..landscapes.space import ParameterSpace
 from .base import Environment, Fidelity
-from .options import NoOptions
 
 
 @dataclass(frozen=True)

@@ -240,7 +240,7 @@ def make_optimizer(
     Raises ValueError for a method, an option or a value that is not there, and TooLargeError for one that would not fit
     this machine.
     """
-    from ..envs.options import read_options
+    from ..landscapes.options import read_options
 
     kind = optimizer_class(method)
     chosen = read_options(method, kind.Options, options or {})

@@ -42,11 +42,6 @@ class Proposal:
     grad: bool = False
 
 
-@dataclass(frozen=True)
-class NoOptions:
-    """The options of a method that has none."""
-
-
 class Optimizer(abc.ABC):
     """Search a box for the least loss: `ask` for points, evaluate them, `tell` what came out, and so on.
 

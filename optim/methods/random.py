@@ -6,7 +6,8 @@ from typing import ClassVar
 
 import torch
 
-from ..base import Kind, NoOptions, Optimizer, Points, Proposal
+from ...landscapes.options import NoOptions
+from ..base import Kind, Optimizer, Points, Proposal
 
 BATCH_SIZE = 16  # points of a proposal: a simulator is quicker at several at once
 

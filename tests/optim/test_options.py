@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from gradscape import ParameterSpace, from_torch
-from gradscape.envs.options import read_options
 from gradscape.landscapes.objective import Status
+from gradscape.landscapes.options import read_options
 from gradscape.optim.registry import methods, optimizer_class
 from gradscape.optim.search import search
 
