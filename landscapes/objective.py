@@ -68,6 +68,8 @@ class Evaluation:
         grad = None if grad is None else grad.masked_fill(blank[:, None], torch.nan)
         return cls(loss, grad, status)
 
+    judged = from_results  # its first name, which environments of others call it by
+
     @classmethod
     def join(cls, parts: Iterable[Evaluation], *, dim: int, grad: bool) -> Evaluation:
         """Return the evaluation of several batches, one after the other; of none, that of no points at all.

@@ -126,3 +126,10 @@ def test_evaluations_of_several_batches_are_joined_in_order():
     blind = evaluate(Strict(), x, grad=False)
     with pytest.raises(ValueError, match="1 of 3 evaluations to join have no gradients"):
         Evaluation.join([*parts, blind], dim=3, grad=True)
+
+
+def test_the_first_name_of_raw_results_still_works() -> None:
+    loss = torch.tensor([1.0, torch.nan])
+    torch.testing.assert_close(
+        Evaluation.judged(loss, None).loss, Evaluation.from_results(loss, None).loss, equal_nan=True
+    )

@@ -152,7 +152,7 @@ def test_pieces_in_each_others_place_are_computed_again(tmp_path: Path) -> None:
         file.write_bytes(content)
     for name in ("one", "two"):
         with pytest.warns(
-            RuntimeWarning, match=rf"{name}\.npz is damaged \(it is another piece\); it is computed again"
+            RuntimeWarning, match=rf"{name}\.npz is damaged \(it is another part\); it is computed again"
         ):
             assert pieces.load(name) is None
 
