@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from .api.overlay import overlay
     from .api.search import open_run, optimize, race
     from .api.slice import open_slice, slice
+    from .api.sweep import sweep
     from .envs.base import Environment, Fidelity
     from .envs.registry import make, register
     from .jobs.scene import SceneSpec
@@ -53,6 +54,7 @@ _HOMES = {
     "report": "api.measure",
     "sample": "landscapes.sampling.fill",
     "slice": "api.slice",
+    "sweep": "api.sweep",
     "tradeoff": "api.measure",
 }
 
@@ -85,6 +87,7 @@ __all__ = [
     "report",
     "sample",
     "slice",
+    "sweep",
     "tradeoff",
 ]
 
