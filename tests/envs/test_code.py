@@ -67,7 +67,7 @@ def files_of(name: str, engine: str = "warp", folder: Path = code.HERE) -> set[s
 SILENT = {"base.py", "batching.py", "code.py", "registry.py", "observation.py", "outlines.py", "engines/runtime.py"}
 SILENT |= {"records.py", "mpm/plasticine_look.py"}
 # What no scene imports.
-ELSEWHERE = {"bench.py", "importing.py", "points.py", "engines/profiling.py", "engines/engine.py", "engines/warp.py"}
+ELSEWHERE = {"importing.py", "points.py", "engines/profiling.py", "engines/engine.py", "engines/warp.py"}
 
 
 def home_of(name: str) -> str:
