@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..landscapes.objective import Evaluation, Objective, Status
+from ..landscapes.options import NoOptions as NoOptions
 from ..landscapes.space import ParameterSpace, as_whole
 from .memory import FLOAT, SearchSize
 
