@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import typer
-from benchmarks import damage, forked, results
+from benchmarks import damage, forked, results, seeded
 from benchmarks.forked import Ended, Limits
 
 from gradscape.cli import app
@@ -137,19 +137,7 @@ MADE = {
     "site": "gallery build --data data --out",
 }
 TORN = ("cut", "run", "race", "traded", "data")
-OWN = """
-import torch
-from gradscape import Environment, Fidelity, ParameterSpace
-
-class Bowl(Environment):
-    name, space = "bowl", ParameterSpace.box(["a", "b"], -1.0, 1.0)
-    fidelities = {"exact": Fidelity("exact", precision="float64")}
-
-    def _evaluate(self, x, *, grad):
-        return (x**2).sum(dim=1), 2 * x if grad else None
-
-class Torn: pass
-"""
+OWN = seeded.OWN + "\n\nclass Torn: pass\n"
 SAID_HOW_LONG = re.compile(
     r"about [\d.]|or more, without|to draw|is at http|until Ctrl-C|are there already|to compute|to measure"
 )
