@@ -3,19 +3,51 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from inspect import signature
 from io import TextIOWrapper
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from . import __version__
-from .verbs import gallery, look, measure, search
-from .verbs.dims import TakesDims
+from .commands import gallery
+from .commands.bench import bench
+from .commands.check import check
+from .commands.dims import TakesDims
+from .commands.envs import envs
+from .commands.export import export
+from .commands.info import info
+from .commands.optimize import methods, optimize
+from .commands.overlay import overlay
+from .commands.pairs import pairs
+from .commands.plan import plan
+from .commands.race import race
+from .commands.replay import replay
+from .commands.report import report_
+from .commands.slice import bounce, slice_
+from .commands.surface import surface
+from .commands.sweep import sweep
+from .commands.tradeoff import tradeoff
+from .commands.view import view
+
+
+class Verbs(TyperGroup):
+    """The verbs of the command, of which Ctrl-C ends as it is raised: the library would make an exit code of it."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a verb; return what Ctrl-C has raised, for `main` to raise it again."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as stop:
+            return stop
+
 
 app = typer.Typer(
     name="landscape",
+    cls=Verbs,
     help="See, measure and search the loss landscapes of differentiable simulators.",
     add_completion=False,
     rich_markup_mode=None,
@@ -23,12 +55,13 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+STOPPED = 130  # the exit code of what Ctrl-C has ended
 LONG = 200  # characters of a path that an error shows
 _VERBS = (
-    look.envs, look.info, look.slice_, look.sweep,
-    search.methods, search.optimize, search.race, search.overlay,
-    look.surface, look.replay, look.export, look.view, look.bounce,
-    measure.plan, measure.bench, measure.check, measure.tradeoff, measure.pairs, measure.report_,
+    envs, info, slice_, sweep,
+    methods, optimize, race, overlay,
+    surface, replay, export, view, bounce,
+    plan, bench, check, tradeoff, pairs, report_,
 )  # fmt: skip
 
 for _verb in _VERBS:
@@ -66,18 +99,38 @@ def main(arguments: list[str] | None = None) -> Any:
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a file's name need not be text
     try:
-        code = app(args=arguments, prog_name="landscape", standalone_mode=False)
-        if code == 130:  # what typer makes of Ctrl-C where a verb has not said what is kept
-            raise KeyboardInterrupt
+        code = _run(arguments)
     except TyperException as error:
         code = _fail(_usage(error), 2)
     except ValueError as error:
         code = _fail(str(error), 2)
     except OSError as error:
         code = _fail(_system(error), 1)
-    except (KeyboardInterrupt, typer.Abort):
-        code = _fail("stopped before anything was computed; the same command begins again", 130)
+    except (KeyboardInterrupt, typer.Abort) as stop:
+        code = _stop(stop) or _fail("stopped before anything was computed; the same command begins again", 130)
     sys.exit(code)
+
+
+def _run(arguments: list[str] | None) -> Any:
+    """Run the command, and raise what Ctrl-C has raised in a verb again."""
+    code = app(args=arguments, prog_name="landscape", standalone_mode=False)
+    if isinstance(code, KeyboardInterrupt):
+        raise code
+    if code == STOPPED:  # what the library makes of Ctrl-C where no verb has begun
+        raise KeyboardInterrupt
+    return code
+
+
+def _stop(stop: BaseException) -> int:
+    """Say what is kept of a job that was stopped; return 0 where nothing was begun."""
+    from .jobs.watch import Stopped
+
+    if not isinstance(stop, Stopped):
+        return 0
+    again = shlex.join(["landscape", *sys.argv[1:]])
+    then = "goes on from there" if stop.kept else "begins again"
+    typer.echo(f"stopped: {stop}; the same command {then}: {again}", err=True)
+    return STOPPED
 
 
 def _usage(error: Any) -> str:
@@ -89,7 +142,7 @@ def _usage(error: Any) -> str:
 
 def _system(error: OSError) -> str:
     """Return what to say where the system refused: of a full disk how to go on, of a file which, why and what to do."""
-    from .landscapes.disk import DiskFullError, is_full
+    from .landscapes.storage.disk import DiskFullError, is_full
 
     if not isinstance(error, DiskFullError) and is_full(error):
         return (

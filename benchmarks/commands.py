@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import typer
-from benchmarks import damage, forked, results
+from benchmarks import damage, forked, results, seeded
 from benchmarks.forked import Ended, Limits
 
 from gradscape.cli import app
@@ -56,7 +56,7 @@ view cut
 bounce --axis y --resolution 3 --extent 0:1 --fidelity draft
 bench branin --batch 2 --seconds 0
 check branin --points 2
-tradeoff bounce --points 2 --ladder precision
+tradeoff bounce --points 2 --variants precision
 pairs ackley --samples 2 --top 3 --set dim=3
 report cut --points 2
 report --all --data data --points 2
@@ -131,25 +131,13 @@ MADE = {
     "race": "race branin --methods random,descents --budget 6 --seeds 2 --out",
     "sweep": "sweep ackley --dims 0 1 --over 2 --set dim=3 --frames 2 --resolution 3 --out",
     "study": "pairs ackley --samples 2 --set dim=3 --out",
-    "traded": "tradeoff bounce --points 2 --ladder precision --device cpu --out",
+    "traded": "tradeoff bounce --points 2 --variants precision --device cpu --out",
     "reported": "report cut --points 2 --out",
     "data": "gallery compute --only pinball-2-0-1 --part slices --resolution 4 --fidelity draft --device cpu --data",
     "site": "gallery build --data data --out",
 }
 TORN = ("cut", "run", "race", "traded", "data")
-OWN = """
-import torch
-from gradscape import Environment, Fidelity, ParameterSpace
-
-class Bowl(Environment):
-    name, space = "bowl", ParameterSpace.box(["a", "b"], -1.0, 1.0)
-    fidelities = {"exact": Fidelity("exact", precision="float64")}
-
-    def _evaluate(self, x, *, grad):
-        return (x**2).sum(dim=1), 2 * x if grad else None
-
-class Torn: pass
-"""
+OWN = seeded.OWN + "\n\nclass Torn: pass\n"
 SAID_HOW_LONG = re.compile(
     r"about [\d.]|or more, without|to draw|is at http|until Ctrl-C|are there already|to compute|to measure"
 )

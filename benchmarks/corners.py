@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from gradscape.envs.registry import entries, environment_class, make
-from gradscape.landscapes.extremes import corners
+from gradscape.landscapes.conformance.extremes import corners
 from gradscape.landscapes.objective import Evaluation, Status
 
 OUTWARD = (0.0, 1e-12, 0.01, 0.1, 1.0, 1e3, 1e9, 1e30, 1e38, 1e39, 1e300)  # shares of the box

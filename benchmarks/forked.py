@@ -17,35 +17,28 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib import import_module
 from multiprocessing import get_context
 from pathlib import Path
+from pkgutil import walk_packages
 from typing import Any
 
 FORK = get_context("forkserver")
-VERBS = ("bench", "check", "export", "gallery", "measure", "overlay", "pairs", "plan", "race", "replay", "search")
-VERBS += ("surface", "sweep", "tradeoff")
+PACKAGES = ("commands", "jobs", "gallery", "landscapes", "optim")  # of which the process that forks loads all modules
 LOADED = (
-    *(f"gradscape.{verb}_report" for verb in VERBS),
     *(
-        "gradscape.tolerance",
-        "gradscape.swept",
+        one.name
+        for part in PACKAGES
+        for one in walk_packages(import_module(f"gradscape.{part}").__path__, f"gradscape.{part}.")
+    ),
+    *(
         "gradscape.envs.bounce",
-        "gradscape.envs.engines.rigid",
+        "gradscape.envs.engines.balls.rigid",
         "gradscape.envs.functions",
+        "gradscape.envs.points",
     ),
-    *("gradscape.envs.points", "gradscape.optim.race", "gradscape.optim.random", "gradscape.optim.descent"),
-    *("gradscape.optim.cmaes", "gradscape.optim.surrogate", "gradscape.optim.standings", "gradscape.landscapes.export"),
-    *("gradscape.landscapes.job", "gradscape.landscapes.adapters", "gradscape.landscapes.character"),
-    *("gradscape.landscapes.pairs", "gradscape.landscapes.tradeoff", "gradscape.landscapes.overlay"),
-    *("gradscape.gallery.build", "dask.array", "jinja2", "imageio_ffmpeg", "pyvista", "rerun", "cma"),
-    *(
-        "pydantic.type_adapter",
-        "pydantic.json_schema",
-        "pydantic.functional_validators",
-        "pydantic.fields",
-    ),
-    *(f"gradscape.landscapes.draw.{name}" for name in ("contour", "profile", "curve", "sweep", "race", "relief")),
-    *(f"gradscape.landscapes.draw.{name}" for name in ("sweep_stream", "stream", "overlay", "quality", "tradeoff")),
+    *("dask.array", "jinja2", "imageio_ffmpeg", "pyvista", "rerun", "cma", "pydantic.type_adapter"),
+    *("pydantic.json_schema", "pydantic.functional_validators", "pydantic.fields"),
 )
 GRACE = 10.0  # seconds that what a process started has to end after it
 CACHES = (Path.home() / ".cache", Path("/dev"), Path("/proc"), Path("/sys"))  # where every process may write

@@ -33,10 +33,10 @@ from pathlib import Path
 
 import torch
 from benchmarks import results
-from benchmarks.forked import at_home, ended, living
+from benchmarks.forked import LOADED, at_home, ended, living
 
 from gradscape.cli import main as landscape
-from gradscape.landscapes import tradeoff
+from gradscape.landscapes.measures import fidelity as tradeoff
 
 JOBS = {
     "slice": "slice bounce --dims 0 1 --resolution 32 --fidelity draft --out made",
@@ -44,17 +44,11 @@ JOBS = {
     "race": "race bounce --methods random,descents --seeds 2 --budget 40 --fidelity draft --out made",
     "gallery": "gallery compute --only bounce --part slices --resolution 96 --fidelity draft --device cpu --data made",
     "pairs": "pairs bounce --samples 32 --fidelity draft --device cpu --out made",
-    "tradeoff": "tradeoff bounce --points 8 --ladder precision --device cpu --out made",
+    "tradeoff": "tradeoff bounce --points 8 --variants precision --device cpu --out made",
     "report": "report branin --points 3 --out made",
     "workers": "slice bounce --dims 0 1 --resolution 48 --fidelity draft --device cpu --scheduler local:2 --out made",
 }
 VICTIMS = ("parent", "worker", "all")  # of a job with workers
-LOADED = (  # by all jobs together
-    *("search_report", "race_report", "sweep_report", "gallery_report", "envs.bounce", "envs.engines.rigid"),
-    *("pairs_report", "tradeoff_report", "measure_report", "landscapes.pairs", "landscapes.tradeoff"),
-    *("envs.points", "optim.race", "optim.random", "optim.descent", "landscapes.adapters", "landscapes.job"),
-    *(f"landscapes.draw.{name}" for name in ("contour", "profile", "sweep", "sweep_stream", "race")),
-)
 RECORDS = (".npz", "pairs.json", "report.json", "measures.json")  # of studies, beside stores
 MOST = 4  # times that one job is killed
 FORK = multiprocessing.get_context("fork")
@@ -77,7 +71,7 @@ def work(command: str, folder: Path) -> None:
     os.setsid()  # a group of its own
     os.chdir(folder)
     at_home(folder)
-    tradeoff.TIMING = 0.02
+    tradeoff.REPETITION = 0.02
     with open(os.devnull, "w") as nowhere:
         for stream in (1, 2):
             os.dup2(nowhere.fileno(), stream)
@@ -106,8 +100,9 @@ def run(command: str, folder: Path, patience: float | None = None, victim: str =
 
 def bits(folder: Path) -> tuple[int, str]:
     """Return how many points and records a folder holds, and a digest of all their values."""
-    from gradscape.landscapes.store import SliceStore, is_slice
-    from gradscape.optim.run import Run, is_run
+    from gradscape.landscapes.storage.paths import is_slice
+    from gradscape.landscapes.storage.store import SliceStore
+    from gradscape.optim.runs.store import RunStore, is_run
 
     digest, done = hashlib.sha256(), 0
     for path in sorted(folder.rglob("*.zarr")):
@@ -116,7 +111,7 @@ def bits(folder: Path) -> tuple[int, str]:
         if is_slice(path):
             dataset = SliceStore.open(path).dataset()
         elif is_run(path):
-            dataset = Run.open(path).table().drop_vars(["seconds", "forwards"])
+            dataset = RunStore.open(path).dataset().drop_vars(["seconds", "forwards"])
         else:
             continue
         digest.update(str(path.relative_to(folder)).encode())

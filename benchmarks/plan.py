@@ -55,7 +55,7 @@ def ratios(job: str, folder: Path) -> dict[str, float]:
     """Plan a job, do it, and return what was predicted by what it took."""
     _, _, what = job.partition(" ")
     planned, taken = run(f"plan {what}", folder).said, run(f"{job} --out made", folder)
-    from gradscape.landscapes.rehearsal import room_of
+    from gradscape.jobs.rehearsal import room_of
 
     room = room_of(folder / "made")
     return {

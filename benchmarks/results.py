@@ -43,7 +43,7 @@ class Kind:
 
 def unfinished_slice() -> None:
     """Stop a slice when all its tiles are there."""
-    from gradscape.landscapes.store import SliceStore
+    from gradscape.landscapes.storage.store import SliceStore
 
     small()
     SliceStore.finish = _interrupted  # type: ignore[method-assign]
@@ -51,18 +51,18 @@ def unfinished_slice() -> None:
 
 def unfinished_run() -> None:
     """Stop a search after some rows."""
-    from gradscape.optim import run
+    from gradscape.optim.runs import store
 
     small()
-    run.PAUSE, run.SHARE = 0.0, math.inf  # writes after every proposal
-    append = run.Run.append
+    store.PAUSE, store.SHARE = 0.0, math.inf  # writes after every proposal
+    append = store.RunStore.append
 
-    def stopped(filled: run.Run, *given: Any, **options: Any) -> None:
+    def stopped(filled: store.RunStore, *given: Any, **options: Any) -> None:
         if filled.count > 12:
             _interrupted()
         append(filled, *given, **options)
 
-    run.Run.append = stopped  # type: ignore[method-assign]
+    store.RunStore.append = stopped  # type: ignore[method-assign]
 
 
 def _interrupted(*_: object, **__: object) -> None:
@@ -95,9 +95,9 @@ KINDS = {
         needs=(f"{CUT} cut",),
     ),
     "pairs": Kind(f"pairs ackley --set dim=3 --samples 2 --out {MADE} --json"),
-    "tradeoff": Kind(f"tradeoff bounce --device cpu --points 2 --ladder precision --out {MADE} --json"),
+    "tradeoff": Kind(f"tradeoff bounce --device cpu --points 2 --variants precision --out {MADE} --json"),
     "kept tradeoff": Kind(
-        f"tradeoff bounce --device cpu --set horizon=0.5 --points 2 --ladder precision --out {MADE}",
+        f"tradeoff bounce --device cpu --set horizon=0.5 --points 2 --variants precision --out {MADE}",
         (f"slice bounce --device cpu --tolerance 20% --set horizon=0.5 --dims 0 1 --resolution 3 --out {READ}",),
         where="home/gradscape",
     ),
@@ -130,7 +130,7 @@ def leave_blank(put: Callable[[object, str, Any], object]) -> None:
     """
     from matplotlib.figure import Figure
 
-    from gradscape.landscapes.draw import page
+    from gradscape.landscapes.draw.figures import page
 
     save = Figure.savefig
 
@@ -146,13 +146,15 @@ def leave_blank(put: Callable[[object, str, Any], object]) -> None:
 
 def small() -> None:
     """Let pictures be blank, nothing be repeated only to be timed, and searches and films of the gallery be few."""
-    from gradscape import gallery_episodes, gallery_measures, gallery_parts
-    from gradscape.landscapes import job, tradeoff
-    from gradscape.optim import search
+    from gradscape.gallery import episodes as gallery_episodes
+    from gradscape.gallery import measures as gallery_measures
+    from gradscape.gallery import parts as gallery_parts
+    from gradscape.landscapes import cost
+    from gradscape.landscapes.measures import fidelity as tradeoff
 
     leave_blank(setattr)
-    tradeoff.TIMING = tradeoff.PATIENCE = 0.002
-    search.MOMENT = job.PATIENCE = job.FIRST_PATIENCE = 0.0
+    tradeoff.REPETITION = tradeoff.LARGEST = 0.002
+    cost.MOMENT = cost.ENOUGH = cost.WARM_UP = 0.0
     gallery_parts.METHODS, gallery_parts.BUDGET = ("random",), 8
     gallery_parts.FRAMES, gallery_parts.COARSE = 2, 4
     gallery_episodes.LONGEST, gallery_episodes.HEIGHT = 2, 48
@@ -165,7 +167,7 @@ def nothing() -> None:
     from http.server import ThreadingHTTPServer
 
     from gradscape.envs.base import Environment
-    from gradscape.gallery import build
+    from gradscape.gallery.site import build
 
     for place, name in ((Environment, "evaluate"), (build, "build_site"), (ThreadingHTTPServer, "serve_forever")):
         setattr(place, name, _interrupted)
@@ -221,10 +223,11 @@ def _readable(folder: Path) -> Iterator[tuple[Path, Callable[[Path], Numbers]]]:
 
 
 def _store(path: Path) -> Numbers:
-    from gradscape.landscapes.store import SliceStore, is_slice
-    from gradscape.optim.run import Run
+    from gradscape.landscapes.storage.paths import is_slice
+    from gradscape.landscapes.storage.store import SliceStore
+    from gradscape.optim.runs.store import RunStore
 
-    dataset = SliceStore.open(path).dataset() if is_slice(path) else Run.open(path).table()
+    dataset = SliceStore.open(path).dataset() if is_slice(path) else RunStore.open(path).dataset()
     return _of_dataset(dataset.drop_vars(["seconds", "forwards"], errors="ignore"))
 
 
@@ -248,10 +251,10 @@ def _of_dataset(dataset: Any) -> Numbers:
 
 
 def _json(path: Path) -> Numbers:
-    from gradscape.landscapes.records import unsigned
+    from gradscape.landscapes.storage.records import verify
 
     found = json.loads(path.read_text())
-    said = [unsigned(one) for one in found] if isinstance(found, list) else unsigned(found)
+    said = [verify(one) for one in found] if isinstance(found, list) else verify(found)
     return Numbers({}, _digest(json.dumps(plain(said), sort_keys=True).encode()))
 
 

@@ -20,11 +20,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from gradscape.envs.base import Environment, Fidelity
-from gradscape.envs.engines.runtime import kernel_times
-from gradscape.envs.fluid import SPAN
+from gradscape.envs.engines.profiling import time_kernels
+from gradscape.envs.mpm.fluid import SPAN
 from gradscape.envs.registry import make
 
-ON_GRID = ("velocity_kernel", "transfers.wipe")
+ON_GRID = ("velocity_kernel", "transfers.clear")
 UNIT = {"substeps": "episode"}
 SERIES: dict[str, list[Fidelity]] = {
     "particles": [Fidelity("", SPAN / 8, resolution=16, sampling=1.25 * 2 ** (k / 3)) for k in range(5)],
@@ -44,8 +44,8 @@ def size(what: str, env: Environment) -> float:
     """Return how much of `what` an episode has: grid points are those it runs over, near its particles."""
     model = env.model  # type: ignore[attr-defined]
     if what == "grid points":
-        with env._solvers.lend() as solver:  # type: ignore[union-attr]
-            return float(np.mean([box.cells for box in solver.boxes]))
+        with env._solvers.lend() as stage:  # type: ignore[union-attr]
+            return float(np.mean([box.cells for box in stage.solver.boxes]))
     return {"particles": model.particles, "substeps": model.steps * model.substeps}[what]
 
 
@@ -63,7 +63,7 @@ def once(what: str, env: Environment, work: Callable[[], object]) -> float:
     if what == "substeps":
         work()
         return time.perf_counter() - start
-    with kernel_times(env.device) as times:
+    with time_kernels(env.device) as times:
         work()
     return sum(t.seconds / t.calls for name, t in times.items() if name.startswith(ON_GRID) == (what == "grid points"))
 

@@ -51,8 +51,8 @@ class Pretended:
 def rate(made: Callable[[], Objective], resolution: int, executor: Executor | None) -> float:
     """Return the episodes with gradient per second of a slice through the box."""
     from gradscape.landscapes.plane import Plane
-    from gradscape.landscapes.sampling import sample
-    from gradscape.landscapes.store import SliceStore
+    from gradscape.landscapes.sampling.fill import sample
+    from gradscape.landscapes.storage.store import SliceStore
 
     objective = made()
     plane = Plane.through(objective.space, objective.space.center, (0, 1), resolution=resolution)
@@ -65,7 +65,7 @@ def rate(made: Callable[[], Objective], resolution: int, executor: Executor | No
 
 def measured(made: Callable[[], Objective], device: str, count: int, resolution: int, times: int) -> dict[str, Any]:
     """Return the rates of so many workers, once they are warm."""
-    from gradscape.cluster import workers
+    from gradscape.jobs.workers import workers
 
     start = time.perf_counter()
     with workers(f"local:{count}", device) as executor:
@@ -78,8 +78,8 @@ def measured(made: Callable[[], Objective], device: str, count: int, resolution:
 
 def chosen(given: argparse.Namespace) -> tuple[Callable[[], Objective], dict[str, Any]]:
     """Return what makes the objective, and what it is."""
-    from gradscape.cluster import recipe
     from gradscape.envs.registry import make
+    from gradscape.jobs.workers import recipe
 
     env = make(given.env, fidelity=given.fidelity, device="cpu" if given.pretend else given.device)
     about = {"env": env.name, "fidelity": env.fidelity.name}

@@ -6,55 +6,34 @@ import abc
 import inspect
 import re
 import threading
-from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from functools import partial
 from importlib import import_module
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, ClassVar, final
+from typing import Any, ClassVar, TypeVar, final
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..landscapes.episode import Episode as Episode
-from ..landscapes.halving import collect
 from ..landscapes.objective import Evaluation
+from ..landscapes.options import NoOptions, read_options
+from ..landscapes.sampling.memory import free_memory
 from ..landscapes.space import ParameterSpace, as_tensor
+from .batching import Pool, map_parts
 from .code import code_digest
-from .options import NoOptions, read_options
+from .engines import find_engine
+from .engines.engine import Engine
+from .records import Fidelity as Fidelity
+from .records import MaterialRange as MaterialRange
+from .records import Work as Work
 
-if TYPE_CHECKING:
-    from .engines.runtime import Pool
+COMPUTES_LOSSES = False  # for `code`
 
-
+T = TypeVar("T")
 FLOAT32 = torch.finfo(torch.float32).max
-
-
-@dataclass(frozen=True)
-class Fidelity:
-    """Say how accurately a scene is simulated.
-
-    `dt` is the time step [s], `resolution` the number of grid cells (or mesh edges) across the scene, 0 where it has
-    none, `sampling` the particles per cell along each axis, `precision` that of the engine: float32 or float64.
-    `particles` is how many there are, in scenes that count them instead.
-    """
-
-    name: str
-    dt: float
-    precision: str = "float32"
-    resolution: int = 0
-    sampling: float = 2.0
-    particles: int = 0
-
-
-@dataclass(frozen=True)
-class Work:
-    """Say how much an episode computes: `count` of a `unit`, such as one particle in one substep."""
-
-    count: int
-    unit: str
 
 
 class Environment(abc.ABC):
@@ -78,12 +57,15 @@ class Environment(abc.ABC):
     beyond_box: ClassVar[bool] = False  # whether parameters beyond their bounds mean something and may be tried
     decisions: ClassVar[int] = 1  # how often controls are chosen in an episode: dim / decisions of them, time first
     control_step: ClassVar[float] = 0.0  # how long a control is held [s], in whole time steps; 0 where any step does
+    known_failures: ClassVar[Mapping[str, Mapping[str, str]]] = {}  # fidelity -> check of `landscape check` -> reason
+    contact_stiffness: ClassVar[str] = ""  # the option that says how stiff contact is, where it is by penalty
+    material_range: ClassVar[MaterialRange | None] = None  # where an option sets what the scene is made of
 
     space: ParameterSpace
     _named: ClassVar[bool] = False
     _solvers: Pool[Any] | None = None  # a scene on an engine sets both in `_setup`: what simulates,
     _capacity = 1 << 20  # and how many rows it takes at once,
-    _most_rows = 1 << 20  # at most
+    _max_rows = 1 << 20  # at most
 
     def __init_subclass__(cls, **how: Any) -> None:
         super().__init_subclass__(**how)
@@ -102,13 +84,14 @@ class Environment(abc.ABC):
         deterministic: bool = False,
         **options: Any,
     ) -> None:
-        self.fidelity = self._named_fidelity(fidelity)
+        self.fidelity = self._find_fidelity(fidelity)
         self._refuse_broken_steps()
-        self.device = self._available_device(device)
-        self.engine = self.known_engine(engine)
+        self.device = self._find_device(device)
+        self.engine = self.check_engine(engine)
         self.deterministic = deterministic
-        if deterministic and engine == "taichi":
-            raise ValueError(f"{self.name} is deterministic on engine warp only; got engine taichi")
+        if deterministic and not self.capabilities.deterministic:
+            able = " and ".join(name for name in self.engines if find_engine(name).deterministic)
+            raise ValueError(f"{self.name} is deterministic on engine {able or 'none'} only; got engine {engine}")
         self.options = read_options(self.name, self.Options, options)
         self._stop = threading.Event()
         self._setup()
@@ -138,19 +121,16 @@ class Environment(abc.ABC):
         Rows do not depend on each other. A row whose simulation fails says so in its status. Raises ValueError where x
         has another shape, another type or values that are not finite.
         """
-        x = self._checked(x)
+        x = self._check_points(x)
         if len(x) == 0:
             return Evaluation.empty(self.space.dim, grad=grad)
-        parts = torch.split(x, self._share(len(x)))
-        with self._pool(len(parts)) as each:
-            results = list(each(lambda part: self._simulate(part, grad=grad), parts))
-        loss = torch.cat([r.loss.to(x) for r in results])
-        slope = torch.cat([r.grad.to(x) for r in results if r.grad is not None]) if grad else None
-        return Evaluation.judged(loss, slope, torch.cat([r.status.cpu() for r in results]))
+        whole = Evaluation.join(self._map_parts(partial(self._simulate, grad=grad), x), dim=self.space.dim, grad=grad)
+        slope = None if whole.grad is None else whole.grad.to(x)
+        return Evaluation.from_results(whole.loss.to(x), slope, whole.status.cpu())
 
     @final
     def __call__(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"]:
-        """Return losses that torch can differentiate."""
+        """Return losses that torch can differentiate. Raises ValueError for x that holds no floating-point numbers."""
         if not isinstance(x, Tensor) or not x.is_floating_point():
             kind = f"a tensor of {x.dtype}" if isinstance(x, Tensor) else type(x).__name__
             raise ValueError(f"{self.name}(x) takes a floating-point tensor, and evaluate(x) any numbers; got {kind}")
@@ -165,8 +145,13 @@ class Environment(abc.ABC):
     @classmethod
     def about(cls) -> str:
         """Return what a scene says of itself, and after it what its family says."""
-        family = cls.__mro__[: cls.__mro__.index(Environment)]
-        return "\n\n".join(inspect.cleandoc(kind.__doc__) for kind in family if kind.__doc__)
+        return "\n\n".join(inspect.cleandoc(kind.__doc__) for kind in cls.own_classes() if kind.__doc__)
+
+    @final
+    @classmethod
+    def own_classes(cls) -> tuple[type, ...]:
+        """Return the scene's class and those it is derived from, up to this one."""
+        return cls.__mro__[: cls.__mro__.index(Environment)]
 
     @final
     @classmethod
@@ -176,21 +161,21 @@ class Environment(abc.ABC):
 
     @final
     @classmethod
-    def known_engine(cls, engine: str) -> str:
-        """Return the name of one of the scene's engines, and refuse any other."""
+    def check_engine(cls, engine: str) -> str:
+        """Return the name of one of the scene's engines. Raises ValueError where the scene has no such engine."""
         if engine not in cls.engines:
             raise ValueError(f"{cls.name} has engine {' and '.join(cls.engines)}; got engine {engine!r}")
         return engine
 
     @final
     def example(self, name: str) -> Float[Tensor, " dim"]:
-        """Return a parameter vector this scene is known for."""
+        """Return a parameter vector this scene is known for. Raises ValueError where it has no such example."""
         if name not in self.examples:
             raise ValueError(f"{self.name} has no example {name!r}; it has {', '.join(self.examples) or 'none'}")
         return torch.tensor(self.examples[name], dtype=torch.float64)
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
-        """Return the frames of the episode at one point."""
+        """Return the frames of the episode at one point. Raises ValueError where a scene has nothing to draw."""
         raise ValueError(f"{self.name} has no episode to draw")
 
     def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Int[Tensor, " batch"]]:
@@ -204,7 +189,7 @@ class Environment(abc.ABC):
         Counted from rest at the lowest place, so that what there is at first is its scale: it may fall, never rise.
         None where a scene has no such motion.
         """
-        parts = [self._energy(part) for part in torch.split(self._checked(x), self._capacity)]
+        parts = [self._energy(part) for part in torch.split(self._check_points(x), self._capacity)]
         known = [part for part in parts if part is not None]
         return torch.cat(known) if known else None
 
@@ -214,9 +199,10 @@ class Environment(abc.ABC):
 
         Parameters that this decision and later ones set do not matter. The last feature is the share of the episode
         that is over. It is all there is to see where parameters say how an episode begins or what it is made of: such
-        a scene is a bandit, with a single decision. Decisions share an episode of horizon 1; others have none to see.
+        a scene is a bandit, with a single decision. Raises ValueError where there is no such decision, and at a horizon
+        other than 1, where episodes are not shared by decisions.
         """
-        x = self._checked(x)
+        x = self._check_points(x)
         horizon = getattr(self.options, "horizon", 1.0)
         if self.decisions > 1 and horizon != 1.0:
             raise ValueError(f"{self.name} is decided step by step at horizon 1 only; got horizon {horizon:g}")
@@ -224,9 +210,7 @@ class Environment(abc.ABC):
             raise ValueError(f"{self.name} numbers its decisions 0 to {self.decisions - 1}; got {decision}")
         ahead = self.space.center[self.space.dim * decision // self.decisions :]
         x = torch.cat([x[:, : self.space.dim - len(ahead)], ahead.expand(len(x), -1)], dim=1)
-        parts = torch.split(x, self._share(len(x)))
-        with self._pool(len(parts)) as each:
-            seen = torch.cat(list(each(lambda part: self._observe(part, decision), parts)))
+        seen = torch.cat(self._map_parts(partial(self._observe, decision=decision), x))
         return torch.cat([seen, seen.new_full((len(x), 1), decision / self.decisions)], dim=1)
 
     @final
@@ -240,8 +224,8 @@ class Environment(abc.ABC):
     @final
     def shrink(self, rows: int) -> None:
         """Take at most `rows` rows at once from now on: solvers hold room for all they take, and it was too much."""
-        self._most_rows, self._solvers = rows, None
-        collect()
+        self._max_rows, self._solvers = rows, None
+        free_memory()
         self._setup()
 
     def memory(self) -> int:
@@ -253,9 +237,19 @@ class Environment(abc.ABC):
         return Work(1, "evaluation")
 
     @property
+    def stiffness_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that say how stiff a material is: those that say so in their name."""
+        return tuple(name for name in self.space.names if "stiffness" in name)
+
+    @property
     def threads(self) -> int:
-        """Number of Python threads a batch is spread over: Warp's CPU kernels leave each other alone."""
-        return _cores() if self._solvers is not None and self.device == "cpu" and self.engine == "warp" else 1
+        """Number of threads a batch is spread over: on a CPU, if the engine's solvers run beside each other."""
+        return _cores() if self._solvers is not None and self.device == "cpu" and self.capabilities.concurrent else 1
+
+    @property
+    def capabilities(self) -> Engine:
+        """What the environment's engine can do."""
+        return find_engine(self.engine)
 
     @property
     def _solvers_at_most(self) -> int | None:
@@ -284,7 +278,7 @@ class Environment(abc.ABC):
         if not isinstance(found, Evaluation):
             raise ValueError(
                 f"{self.name}._evaluate must return an Evaluation; got {type(found).__name__}. "
-                "Evaluation.judged(losses, gradients) makes one"
+                "Evaluation.from_results(losses, gradients) makes one"
             )
         if grad and found.grad is None:
             raise ValueError(f"{self.name}._evaluate was asked for gradients (grad=True) and returned none")
@@ -299,16 +293,21 @@ class Environment(abc.ABC):
     @final
     def _engine(self, kind: str) -> ModuleType:
         """Return the engine's module for `kind` (mpm, springs), imported only when asked for."""
-        module = kind if self.engine == "warp" else f"{self.engine}_{kind}"
+        module = self.capabilities.solvers.get(kind)
+        if module is None:
+            raise ValueError(
+                f"{self.name} needs an engine that simulates {kind}; got engine {self.engine}, which has none"
+            )
         try:
             return import_module(f".engines.{module}", __package__)
         except ImportError as error:
             raise ValueError(f"{self.name} cannot run on engine {self.engine} here: {error}") from error
 
     @final
-    def _rows_at_once(self, capacity: int) -> int:
-        """Return the rows a solver takes where one on Warp takes `capacity`: Taichi's has every core to itself."""
-        return min(self._most_rows, capacity * (_cores() if self.engine == "taichi" and self.device == "cpu" else 1))
+    def _limit_rows(self, capacity: int) -> int:
+        """Return the rows a solver takes where one that runs beside others takes `capacity`."""
+        alone = self.device == "cpu" and not self.capabilities.concurrent
+        return min(self._max_rows, capacity * (_cores() if alone else 1))
 
     def _refuse_broken_steps(self) -> None:
         dt, nearest = self.fidelity.dt, self.nearest_dt(self.fidelity.dt)
@@ -318,24 +317,14 @@ class Environment(abc.ABC):
                 f"{dt:.6g} s, nearest to it is {nearest:.6g} s"
             )
 
-    def _share(self, rows: int) -> int:
+    def _rows_per_part(self, rows: int) -> int:
         return max(1, min(-(-rows // self.threads), self._capacity))
 
-    @contextmanager
-    def _pool(self, parts: int) -> Iterator[Any]:
-        if self.threads == 1 or parts == 1:
-            yield map
-            return
-        with ThreadPoolExecutor(self.threads) as executor:
-            try:
-                yield executor.map
-            except BaseException:  # an interrupt too: let no thread simulate on
-                self._stop.set()
-                executor.shutdown(cancel_futures=True)
-                self._stop.clear()
-                raise
+    def _map_parts(self, work: Callable[[Tensor], T], x: Float[Tensor, "batch dim"]) -> list[T]:
+        parts = torch.split(x, self._rows_per_part(len(x)))
+        return map_parts(work, parts, threads=self.threads, stop=self._stop)
 
-    def _checked(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch dim"]:
+    def _check_points(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch dim"]:
         x = as_tensor(x, self.name)
         if x.ndim != 2 or x.shape[1] != self.space.dim:
             raise ValueError(
@@ -354,9 +343,9 @@ class Environment(abc.ABC):
 
     def _row(self, x: Float[Tensor, " dim"]) -> Float[Tensor, "one dim"]:
         """Return a single point, as `episode` takes it, as a batch of one row."""
-        return self._checked(as_tensor(x, self.name)[None])
+        return self._check_points(as_tensor(x, self.name)[None])
 
-    def _named_fidelity(self, fidelity: str | Fidelity | None) -> Fidelity:
+    def _find_fidelity(self, fidelity: str | Fidelity | None) -> Fidelity:
         if isinstance(fidelity, Fidelity):
             return fidelity
         if fidelity is None:
@@ -365,7 +354,7 @@ class Environment(abc.ABC):
             raise ValueError(f"{self.name} has fidelities {', '.join(self.fidelities)}; got {fidelity!r}")
         return self.fidelities[fidelity]
 
-    def _available_device(self, device: str) -> str:
+    def _find_device(self, device: str) -> str:
         if device == "auto":
             return "cuda" if "cuda" in self.devices and _cuda() else "cpu"
         if device not in self.devices:

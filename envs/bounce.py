@@ -14,9 +14,9 @@ from torch import Tensor
 from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
-from .base import Environment, Episode, Fidelity, Work
-from .engines.rigid import Ball, Solver
-from .engines.runtime import Pool
+from .base import Environment, Episode, Fidelity, MaterialRange, Work
+from .batching import Pool
+from .engines.balls.rigid import Ball, Solver
 from .options import EpisodeOptions
 
 START = (-0.5, 1.0, 0.0)  # [m]
@@ -54,8 +54,6 @@ class Bounce(Environment):
     sliding.
     Source: task Bounce of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
     2022), appendix B.1; contact constants of NVIDIA Warp's bounce example.
-    The paper says: gradients over horizontal velocity are smooth; over vertical velocity bounces come and go, and the
-    discontinuities remain in spite of relaxed contact.
     """
 
     name: ClassVar[str] = "bounce"
@@ -67,6 +65,8 @@ class Bounce(Environment):
         "reference": Fidelity("reference", dt=1 / 3840, precision="float64"),
     }
     loss_unit: ClassVar[str] = "m²"
+    contact_stiffness: ClassVar[str] = "ke"
+    material_range: ClassVar[MaterialRange] = MaterialRange("ke", 1e3, 1e5)  # a tenth and ten times the default
     Options: ClassVar[type[Any]] = BounceOptions
     examples: ClassVar[dict[str, tuple[float, ...]]] = {"aim": (6.12, -9.68, 0.0)}
     _solvers: Pool[Solver]
@@ -85,7 +85,7 @@ class Bounce(Environment):
     @property
     def steps(self) -> int:
         """Number of time steps of an episode."""
-        steps: int = self.options.lasting(round(DURATION / self.fidelity.dt))
+        steps: int = self.options.count_steps(round(DURATION / self.fidelity.dt))
         return steps
 
     def memory(self) -> int:
@@ -99,7 +99,7 @@ class Bounce(Environment):
     def bounces(self, x: Float[Tensor, "batch 3"]) -> Int[Tensor, " batch"]:
         """Count how often each ball leaves the ground."""
         counts = []
-        for part in torch.split(self._checked(x), self._capacity):
+        for part in torch.split(self._check_points(x), self._capacity):
             with self._solvers.lend() as solver:
                 height = solver.run(torch.tensor(START), part)[:, :, 1].cpu()
             inside = height < self.ball.radius

@@ -15,9 +15,9 @@ from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
 from .base import Environment, Episode, Fidelity, Work
-from .controls import hold, lasting
+from .batching import Pool
+from .controls import extend, hold
 from .engines.chain import Chain, Solver
-from .engines.runtime import Pool
 from .options import EpisodeOptions
 
 CHAIN = Chain(masses=(1.0, 0.5, 0.25), lengths=(1.0, 1.0, 1.0), gravity=9.81)
@@ -62,7 +62,6 @@ class Cartpole(Environment):
     Source: task 3-link Cartpole of "Rethinking Optimization with Differentiable Simulation from a Global Perspective"
     (CoRL 2022), appendix A.1.1. The paper has 200 timesteps, four controls and 400 parameters: held for two timesteps,
     controls satisfy all three. Masses, torques, times and target are ours.
-    The paper says: the landscape is very smooth, gradients are of good quality.
     """
 
     name: ClassVar[str] = "cartpole"
@@ -89,19 +88,19 @@ class Cartpole(Environment):
     )
 
     @property
-    def held(self) -> int:
+    def control_steps(self) -> int:
         """Number of control steps of an episode."""
-        count: int = self.options.lasting(CONTROLS)
+        count: int = self.options.count_steps(CONTROLS)
         return count
 
     @property
     def steps(self) -> int:
         """Number of time steps of an episode."""
-        return round(self.held * SPAN / self.fidelity.dt)
+        return round(self.control_steps * SPAN / self.fidelity.dt)
 
     def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
-        numbers = (self.steps + 1) * 4 * 3 + self.held * 2 * 4
+        numbers = (self.steps + 1) * 4 * 3 + self.control_steps * 2 * 4
         return numbers * (8 if self.fidelity.precision == "float64" else 4)
 
     def work(self) -> Work:
@@ -129,7 +128,9 @@ class Cartpole(Environment):
         dt = self.fidelity.dt
         self._capacity = 256 if self.device == "cpu" else 1 << 14
         settings: dict[str, Any] = {"capacity": self._capacity, "device": self.device, "name": self.fidelity.precision}
-        self._solvers = Pool(partial(Solver, CHAIN, dt=dt, hold=round(SPAN / dt), controls=self.held, **settings))
+        self._solvers = Pool(
+            partial(Solver, CHAIN, dt=dt, hold=round(SPAN / dt), controls=self.control_steps, **settings)
+        )
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         x = x.clone().requires_grad_(grad)
@@ -148,7 +149,7 @@ class Cartpole(Environment):
         """
         torque = x.view(len(x), CONTROLS, 4)[:, 0, 1:]
         with self._solvers.lend() as solver:
-            still = x.new_zeros(len(x), self.held, 4)
+            still = x.new_zeros(len(x), self.control_steps, 4)
             phi = solver.run(torch.pi * torque / x.new_tensor(BOUND[1:]), x.new_zeros(3), still).cpu().double()
             energy: Tensor = solver.energy(len(x), phi)
         return energy.T
@@ -164,7 +165,7 @@ class Cartpole(Environment):
 
     def _controls(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch control 4"]:
         """Return cart velocity and torques in each control step; none after the last that parameters set."""
-        return lasting(x.view(len(x), CONTROLS, 4), self.held, then=x.new_zeros(len(x), 1, 4))
+        return extend(x.view(len(x), CONTROLS, 4), self.control_steps, then=x.new_zeros(len(x), 1, 4))
 
     def _cart(self, controls: Float[Tensor, "batch control 4"]) -> Float[Tensor, "batch step_plus_1"]:
         """Return where the cart is at the ends of steps [m]."""

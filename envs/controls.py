@@ -8,14 +8,17 @@ from torch import Tensor
 
 
 def hold(segments: Float[Tensor, "batch segment axis"], steps: int) -> Float[Tensor, "batch step axis"]:
-    """Hold each of the equally long segments' values over its control steps."""
+    """Hold each of the equally long segments' values over its control steps.
+
+    Raises ValueError where control steps cannot be shared equally.
+    """
     count = segments.shape[1]
     if steps % count:
         raise ValueError(f"{steps} control steps cannot be shared equally by {count} segments")
     return segments.repeat_interleave(steps // count, dim=1)
 
 
-def lasting(
+def extend(
     rows: Float[Tensor, "batch row axis"], count: int, *, then: Float[Tensor, "batch 1 axis"]
 ) -> Float[Tensor, "batch count axis"]:
     """Return the first `count` rows of a course in time, those that it lacks being `then`."""
@@ -34,7 +37,7 @@ def ramp(
     return (1 - share) * corners[:, segment] + share * corners[:, segment + 1]
 
 
-def travel(
+def integrate_velocity(
     start: Float[Tensor, " axis"],
     velocity: Float[Tensor, "batch step axis"],
     span: float,
@@ -68,4 +71,4 @@ def roll(
     motion = torch.stack([-radius * spin * heading.cos(), lift, radius * spin * heading.sin()], dim=2)
     angles = torch.stack([spin.cumsum(dim=1), yaw, torch.zeros_like(yaw)], dim=2)
     angles = torch.cat([torch.zeros_like(angles[:, :1]), angles], dim=1)
-    return travel(start, motion, 1.0, lower=lower, upper=upper), angles
+    return integrate_velocity(start, motion, 1.0, lower=lower, upper=upper), angles

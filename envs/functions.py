@@ -11,9 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..landscapes.objective import Evaluation, Status
+from ..landscapes.options import NoOptions
 from ..landscapes.space import ParameterSpace
 from .base import Environment, Fidelity
-from .options import NoOptions
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Function(Environment):
         return Evaluation(loss.detach(), slope, torch.full((len(x),), Status.OK, dtype=torch.int8))
 
 
-def _named(name: str, function: type[synthetic.SyntheticTestFunction], options: type[Any]) -> type[Function]:
+def _make_class(name: str, function: type[synthetic.SyntheticTestFunction], options: type[Any]) -> type[Function]:
     """Return the environment of one function."""
     body = {
         "name": name,
@@ -80,12 +80,12 @@ def _named(name: str, function: type[synthetic.SyntheticTestFunction], options: 
     return type(function.__name__, (Function,), body)
 
 
-Branin = _named("branin", synthetic.Branin, NoOptions)
-Beale = _named("beale", synthetic.Beale, NoOptions)
-SixHumpCamel = _named("six-hump-camel", synthetic.SixHumpCamel, NoOptions)
-Ackley = _named("ackley", synthetic.Ackley, AnyDimension)
-Griewank = _named("griewank", synthetic.Griewank, AnyDimension)
-Levy = _named("levy", synthetic.Levy, AnyDimension)
-Rastrigin = _named("rastrigin", synthetic.Rastrigin, AnyDimension)
-Rosenbrock = _named("rosenbrock", synthetic.Rosenbrock, AnyDimension)
-StyblinskiTang = _named("styblinski-tang", synthetic.StyblinskiTang, AnyDimension)
+Branin = _make_class("branin", synthetic.Branin, NoOptions)
+Beale = _make_class("beale", synthetic.Beale, NoOptions)
+SixHumpCamel = _make_class("six-hump-camel", synthetic.SixHumpCamel, NoOptions)
+Ackley = _make_class("ackley", synthetic.Ackley, AnyDimension)
+Griewank = _make_class("griewank", synthetic.Griewank, AnyDimension)
+Levy = _make_class("levy", synthetic.Levy, AnyDimension)
+Rastrigin = _make_class("rastrigin", synthetic.Rastrigin, AnyDimension)
+Rosenbrock = _make_class("rosenbrock", synthetic.Rosenbrock, AnyDimension)
+StyblinskiTang = _make_class("styblinski-tang", synthetic.StyblinskiTang, AnyDimension)

@@ -13,23 +13,23 @@ from types import ModuleType
 IN_FILE = re.compile(r".+\.py:\w+", re.DOTALL)  # FILE.py:Class
 
 
-def module_of(name: str) -> ModuleType:
+def import_named(name: str) -> ModuleType:
     """Import a module by its name, or a file by its path, once; what a file raises is said with its name.
 
-    A file finds modules beside it, as a program does.
+    A file finds modules beside it, as a program does. Raises ImportError for a module and ValueError for a file.
     """
     if not name.endswith(".py"):
         return import_module(name)
     known = f"gradscape_file_{hashlib.sha256(name.encode()).hexdigest()[:12]}"
     if known not in sys.modules:
         try:
-            sys.modules[known] = _loaded(known, name)
+            sys.modules[known] = _load_file(known, name)
         except Exception as error:
             raise ValueError(f"{name} cannot be imported: {type(error).__name__}: {error}") from error
     return sys.modules[known]
 
 
-def _loaded(known: str, path: str) -> ModuleType:
+def _load_file(known: str, path: str) -> ModuleType:
     spec = spec_from_file_location(known, path)
     assert spec is not None  # of a path that ends in .py there is one,
     assert spec.loader is not None  # which is loaded

@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+COMPUTES_LOSSES = False  # for `code`
+
 
 def triangles(points: np.ndarray) -> Int[Tensor, "face 3"]:
     """Return the triangles between lattice points, shape (vertex, 2): two a cell, one where it has three corners."""
@@ -35,7 +37,7 @@ def skin(frames: Float[Tensor, "frame particle 3"]) -> tuple[Float[Tensor, "fram
     return block.reshape(len(frames), -1, 3), torch.cat([_split(side) for side in sides])
 
 
-def about(axis: int, angle: Float[Tensor, " frame"]) -> Float[Tensor, "frame 3 3"]:
+def rotate_about(axis: int, angle: Float[Tensor, " frame"]) -> Float[Tensor, "frame 3 3"]:
     """Return the rotations by angles [rad] about a coordinate axis."""
     c, s = angle.cos(), angle.sin()
     turn = torch.eye(3, dtype=angle.dtype).repeat(len(angle), 1, 1)

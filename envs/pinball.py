@@ -15,16 +15,16 @@ from torch.nn.functional import normalize, pad
 from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
-from .base import Environment, Episode, Fidelity, Work
-from .engines.board import Board
-from .engines.impacts import Solver
-from .engines.runtime import Pool
+from .base import Environment, Episode, Fidelity, MaterialRange, Work
+from .batching import Pool
+from .engines.balls.board import Board
+from .engines.balls.impacts import Solver
 from .options import EpisodeOptions
 
 WIDTH, HEIGHT = 8.0, 10.0  # the board [m]
 BALL, BAR = 0.25, 0.1  # radius of the ball, half the thickness of a bar [m]
 DURATION = 4.0  # [s]
-MEMORY = 1 << 28  # bytes a solver may take
+SOLVER_BYTES = 1 << 28  # bytes a solver may take
 VIEW = View((0.0, -0.8, -0.5), (WIDTH, HEIGHT, 0.5), eye=(0.08, 0.1, 1.0), ground=None)
 
 
@@ -61,8 +61,6 @@ class Pinball(Environment):
     since 4 s are short; a ball jammed between surfaces, at 8 impacts in a step, stays where it is until the next step.
     Source: task Pinball of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
     2022), appendix A.1.2; ball, bars, start, goal and duration are ours.
-    The paper says: large flat regions, where gradients are zero, and discontinuities, where they do not help; losses
-    from 0.4 to 8.5 with 2 bars, from 0.3 to 6.8 with 16 over the angles of the two in the middle of the lowest row.
     """
 
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
@@ -73,6 +71,7 @@ class Pinball(Environment):
         "reference": Fidelity("reference", dt=1 / 1920, precision="float64"),
     }
     loss_unit: ClassVar[str] = "m"
+    material_range: ClassVar[MaterialRange] = MaterialRange("restitution", 0.0, 1.0)
     Options: ClassVar[type[Any]] = PinballOptions
     pivots: ClassVar[tuple[tuple[float, float], ...]]
     half_length: ClassVar[float]
@@ -82,7 +81,7 @@ class Pinball(Environment):
     @property
     def steps(self) -> int:
         """Number of time steps of an episode."""
-        steps: int = self.options.lasting(round(DURATION / self.fidelity.dt))
+        steps: int = self.options.count_steps(round(DURATION / self.fidelity.dt))
         return steps
 
     @property
@@ -101,7 +100,7 @@ class Pinball(Environment):
     def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Int[Tensor, " batch"]]:
         """Count the impacts of each episode that are faster than crawling."""
         counts = [torch.zeros(0, dtype=torch.int64)]
-        for part in torch.split(self._checked(x), self._capacity):
+        for part in torch.split(self._check_points(x), self._capacity):
             with self._solvers.lend() as solver:
                 solver.run(part, self._start)
                 counts.append(solver.at_end("hits").cpu().long())
@@ -112,21 +111,25 @@ class Pinball(Environment):
         (row,) = self._row(x)
         with self._solvers.lend() as solver:
             solver.run(row[None], self._start)
-            flight = _in_space(solver.at_steps("x", 0).double().cpu())
+            flight = _embed(solver.at_steps("x", 0).double().cpu())
         time = self.fidelity.dt * torch.arange(self.steps + 1, dtype=torch.float64)
         along = self.half_length * torch.stack([row.cos(), row.sin()], dim=1)
         pivots = torch.tensor(self.pivots, dtype=torch.float64)
-        bars = _in_space(torch.stack([pivots - along, pivots + along], dim=1).view(-1, 2))
+        bars = _embed(torch.stack([pivots - along, pivots + along], dim=1).view(-1, 2))
         points = {"ball": flight[:, None], "bars": bars.expand(len(time), -1, 3)}
-        goal = _in_space(self.goal).expand(len(time), 3)
-        parts = (*_case(len(time)), *_moving(points["ball"], points["bars"]), _ball("target", goal[:, None]))
+        goal = _embed(self.goal).expand(len(time), 3)
+        parts = (
+            *_draw_case(len(time)),
+            *_draw_movers(points["ball"], points["bars"]),
+            _draw_ball("target", goal[:, None]),
+        )
         return Episode(time, points, {"goal": goal}, parts, VIEW)
 
     def _setup(self) -> None:
         o = self.options
         self._start = torch.tensor(self.start, dtype=torch.float64)
         board = Board(WIDTH, HEIGHT, self.pivots, self.half_length, BAR, BALL, o.restitution, o.friction)
-        self._capacity = max(1, min(256 if self.device == "cpu" else 1 << 14, MEMORY // self.memory()))
+        self._capacity = max(1, min(256 if self.device == "cpu" else 1 << 14, SOLVER_BYTES // self.memory()))
         settings: dict[str, Any] = {"dt": self.fidelity.dt, "steps": self.steps, "name": self.fidelity.precision}
         settings |= {"capacity": self._capacity, "device": self.device, "contacts": o.contacts}
         self._solvers = Pool(partial(Solver, board, **settings))
@@ -184,16 +187,16 @@ class Pinball16(Pinball):
     space = angles(16)
 
 
-def _ball(material: Literal["rubber", "target"], at: Float[Tensor, "frame 1 3"]) -> Part:
+def _draw_ball(material: Literal["rubber", "target"], at: Float[Tensor, "frame 1 3"]) -> Part:
     return Part("sphere", material, at, (BALL,))
 
 
-def _moving(ball: Float[Tensor, "frame 1 3"], bars: Float[Tensor, "frame end 3"]) -> tuple[Part, ...]:
+def _draw_movers(ball: Float[Tensor, "frame 1 3"], bars: Float[Tensor, "frame end 3"]) -> tuple[Part, ...]:
     rods = [Part("path", "steel", ends, (BAR,)) for ends in torch.split(bars, 2, dim=1)]
-    return (_ball("rubber", ball), Part("trail", "rubber", ball, (BALL / 8,)), *rods)
+    return (_draw_ball("rubber", ball), Part("trail", "rubber", ball, (BALL / 8,)), *rods)
 
 
-def _case(frames: int) -> list[Part]:
+def _draw_case(frames: int) -> list[Part]:
     """Return the board behind the ball, and the walls around it."""
     depth, wall = 2 * BALL, 0.2
     pieces = [
@@ -205,5 +208,5 @@ def _case(frames: int) -> list[Part]:
     return [Part("box", material, still + still.new_tensor(at), size) for at, size, material in pieces]  # type: ignore[arg-type]
 
 
-def _in_space(p: Float[Tensor, "*frame 2"]) -> Float[Tensor, "*frame 3"]:
+def _embed(p: Float[Tensor, "*frame 2"]) -> Float[Tensor, "*frame 3"]:
     return pad(p, (0, 1))

@@ -16,7 +16,10 @@ FORMS = "center, random:SEED, example:NAME, best:RUN or a file with its paramete
 
 
 def point(environment: Environment, text: str) -> Float[Tensor, " dim"]:
-    """Return the point that `text` means: center, random:SEED, example:NAME or a file of numbers."""
+    """Return the point that `text` means: center, random:SEED, example:NAME or a file of numbers.
+
+    Raises ValueError where there is no such example or file, or the file holds anything but the scene's parameters.
+    """
     kind, _, value = text.partition(":")
     if text == "center":
         return environment.space.center

@@ -16,11 +16,13 @@ from functools import cache
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ..landscapes.files import resolved
-from .importing import IN_FILE, module_of
+from ..landscapes.storage.files import resolve
+from .importing import IN_FILE, import_named
 
 if TYPE_CHECKING:
     from .base import Environment, Fidelity
+
+COMPUTES_LOSSES = False  # for `code`
 
 Kind = TypeVar("Kind", bound="Environment")
 GROUP = "gradscape.environments"
@@ -32,7 +34,7 @@ class Entry:
     """Say what an environment is without importing it.
 
     `target` is "module:Class", "FILE.py:Class" or the class itself. What another package's entry point cannot say is
-    empty; `completed` asks the class.
+    empty; `complete_entry` asks the class.
     """
 
     name: str
@@ -43,14 +45,14 @@ class Entry:
     fidelities: tuple[str, ...] = ()
 
 
-def _function(name: str, target: str, model: str, dim: str = "2") -> Entry:
+def _function_entry(name: str, target: str, model: str, dim: str = "2") -> Entry:
     return Entry(name, f"gradscape.envs.functions:{target}", dim, "x0, x1, ... (no unit)", model, ("exact",))
 
 
-def _plasticine(name: str, target: str, dim: str, tools: str, task: str) -> Entry:
+def _plasticine_entry(name: str, target: str, dim: str, tools: str, task: str) -> Entry:
     parameters = f"5 x ({tools}{'' if ':' in tools else ': x, y, z'}), shares (no unit)"
     model = f"MLS-MPM: von Mises plasticine, tools; {task}"
-    return Entry(name, f"gradscape.envs.plasticine_scenes:{target}", dim, parameters, model, SCENE)
+    return Entry(name, f"gradscape.envs.mpm.plasticine_scenes:{target}", dim, parameters, model, SCENE)
 
 
 BUILTIN = (
@@ -72,7 +74,7 @@ BUILTIN = (
     ),
     Entry(
         "fluid",
-        "gradscape.envs.fluid:Fluid",
+        "gradscape.envs.mpm.fluid:Fluid",
         "10",
         "5 x (ladle speed x, ladle speed y) [m/s]",
         "MLS-MPM: viscous fluid, elastic cube, moving ladle",
@@ -96,7 +98,7 @@ BUILTIN = (
     ),
     Entry(
         "swing-velocity",
-        "gradscape.envs.swing:SwingVelocity",
+        "gradscape.envs.sheets.swing:SwingVelocity",
         "3",
         "initial velocity x, y, z [m/s]",
         "mass-spring cloth, held at two corners, over a floor",
@@ -104,7 +106,7 @@ BUILTIN = (
     ),
     Entry(
         "swing-stiffness",
-        "gradscape.envs.swing:SwingStiffness",
+        "gradscape.envs.sheets.swing:SwingStiffness",
         "16",
         "stiffness of 4 x 4 patches [N/m]",
         "mass-spring cloth, held at two corners, over a floor",
@@ -112,35 +114,38 @@ BUILTIN = (
     ),
     Entry(
         "flip",
-        "gradscape.envs.flip:Flip",
+        "gradscape.envs.sheets.flip:Flip",
         "15",
         "5 x (pan x [m], pan y [m], tilt [rad])",
         "mass-spring disc, moving pan",
         SCENE,
     ),
-    _plasticine("assembly", "Assembly", "30", "2 spheres", "lift a ball onto a box"),
-    _plasticine("pinch", "Pinch", "15", "sphere", "dent a cube"),
-    _plasticine("rolling-pin", "RollingPin", "15", "pin: roll, turn, height", "roll a slab flat"),
-    _plasticine("rope", "Rope", "30", "2 spheres", "bend a rope around a post"),
-    _plasticine("table", "Table", "15", "sphere", "bend a table's leg"),
-    _plasticine("torus", "Torus", "15", "ring", "press a ring into a slab"),
-    _plasticine("triple-move", "TripleMove", "90", "6 spheres", "carry three blocks"),
-    _plasticine("writer", "Writer", "15", "pen", "write into a slab"),
-    _function("ackley", "Ackley", "many shallow minima around a funnel", "any"),
-    _function("beale", "Beale", "flat plain with sharp corner peaks"),
-    _function("branin", "Branin", "three equal minima in a smooth valley"),
-    _function("griewank", "Griewank", "regular ripples on a bowl", "any"),
-    _function("levy", "Levy", "wavy steps", "any"),
-    _function("rastrigin", "Rastrigin", "a lattice of minima on a bowl", "any"),
-    _function("rosenbrock", "Rosenbrock", "a bent, narrow valley", "any"),
-    _function("six-hump-camel", "SixHumpCamel", "six minima, two of them global"),
-    _function("styblinski-tang", "StyblinskiTang", "two minima along each axis", "any"),
+    _plasticine_entry("assembly", "Assembly", "30", "2 spheres", "lift a ball onto a box"),
+    _plasticine_entry("pinch", "Pinch", "15", "sphere", "dent a cube"),
+    _plasticine_entry("rolling-pin", "RollingPin", "15", "pin: roll, turn, height", "roll a slab flat"),
+    _plasticine_entry("rope", "Rope", "30", "2 spheres", "bend a rope around a post"),
+    _plasticine_entry("table", "Table", "15", "sphere", "bend a table's leg"),
+    _plasticine_entry("torus", "Torus", "15", "ring", "press a ring into a slab"),
+    _plasticine_entry("triple-move", "TripleMove", "90", "6 spheres", "carry three blocks"),
+    _plasticine_entry("writer", "Writer", "15", "pen", "write into a slab"),
+    _function_entry("ackley", "Ackley", "many shallow minima around a funnel", "any"),
+    _function_entry("beale", "Beale", "flat plain with sharp corner peaks"),
+    _function_entry("branin", "Branin", "three equal minima in a smooth valley"),
+    _function_entry("griewank", "Griewank", "regular ripples on a bowl", "any"),
+    _function_entry("levy", "Levy", "wavy steps", "any"),
+    _function_entry("rastrigin", "Rastrigin", "a lattice of minima on a bowl", "any"),
+    _function_entry("rosenbrock", "Rosenbrock", "a bent, narrow valley", "any"),
+    _function_entry("six-hump-camel", "SixHumpCamel", "six minima, two of them global"),
+    _function_entry("styblinski-tang", "StyblinskiTang", "two minima along each axis", "any"),
 )
 
 
 @cache
 def entries() -> dict[str, Entry]:
-    """Return every registered environment by name, ours before other packages'."""
+    """Return every registered environment by name, ours before other packages'.
+
+    Raises ValueError where two packages register the same name.
+    """
     found = {entry.name: entry for entry in BUILTIN}
     for point in entry_points(group=GROUP):
         if point.name in found:
@@ -172,7 +177,7 @@ def register(kind: type[Kind]) -> type[Kind]:
     return kind
 
 
-def completed(entry: Entry) -> Entry:
+def complete_entry(entry: Entry) -> Entry:
     """Return an entry with what its class says of itself, which is imported for that."""
     if entry.dim:
         return entry
@@ -192,9 +197,12 @@ def completed(entry: Entry) -> Entry:
 
 
 def environment_class(name: str) -> type[Environment]:
-    """Import and return the class of a registered environment, or of `FILE.py:Class`, which is registered by that."""
+    """Import and return the class of a registered environment, or of `FILE.py:Class`, which is registered by that.
+
+    Raises ValueError where no environment has that name, or its module or file cannot be imported.
+    """
     if IN_FILE.fullmatch(name):
-        return _of_file(name)
+        return _import_from_file(name)
     known = entries()
     if name not in known:
         close = get_close_matches(name, known, n=1)
@@ -205,7 +213,7 @@ def environment_class(name: str) -> type[Environment]:
         return target
     module, _, attribute = target.rpartition(":")
     try:
-        found: type[Environment] = getattr(module_of(module), attribute)
+        found: type[Environment] = getattr(import_named(module), attribute)
     except (ImportError, AttributeError) as error:
         raise ValueError(f"{name} is registered as {target}, which cannot be imported: {error}") from error
     return found
@@ -219,18 +227,18 @@ def source_of(env: Environment) -> str | type[Environment]:
     return entry.target if IN_FILE.fullmatch(entry.target) else env.name
 
 
-def _of_file(text: str) -> type[Environment]:
+def _import_from_file(text: str) -> type[Environment]:
     """Import a class from a file and register it under its name."""
     from .base import Environment
 
     path, _, attribute = text.rpartition(":")
-    file = resolved(path)
+    file = resolve(path)
     if not file.is_file():
         raise ValueError(f"there is no file {path} to take {attribute} from")
-    module = module_of(str(file))
+    module = import_named(str(file))
     kind = getattr(module, attribute, None)
     if not (isinstance(kind, type) and issubclass(kind, Environment)):
-        there = [one.__name__ for one in vars(module).values() if _own(one, module.__name__)]
+        there = [one.__name__ for one in vars(module).values() if _is_scene_of(one, module.__name__)]
         raise ValueError(f"{path} holds no environment {attribute}; it has {', '.join(there) or 'none'}")
     taken = entries().get(kind.name)
     target = f"{file}:{attribute}"
@@ -240,7 +248,7 @@ def _of_file(text: str) -> type[Environment]:
     return kind
 
 
-def _own(value: object, module: str) -> bool:
+def _is_scene_of(value: object, module: str) -> bool:
     from .base import Environment
 
     return isinstance(value, type) and issubclass(value, Environment) and value.__module__ == module
@@ -258,7 +266,8 @@ def make(
 ) -> Environment:
     """Make an environment by its registered name, by FILE.py:Class, or of a class.
 
-    `fidelity` defaults to its cheapest, `device` is auto, cpu or cuda.
+    `fidelity` defaults to its cheapest, `device` is auto, cpu or cuda. Raises ValueError where the environment does not
+    exist, or has no such fidelity, device, engine or option.
     """
     kind = name if isinstance(name, type) else environment_class(name)
     settings: dict[str, Any] = {"fidelity": fidelity, "device": device, "engine": engine}

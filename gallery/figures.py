@@ -1,26 +1,32 @@
-"""The list of figures that the gallery shows, and where their data is."""
+"""The slices that the gallery shows, and the commands that make what is shown of each."""
 
 from __future__ import annotations
 
 import shlex
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-HERE = Path(__file__).parent
-DATA = HERE / "data"  # of a checkout; what is installed from a wheel has trade-offs there and no figures
-ELSEWHERE = Path("out") / "gallery-data"
+from ..jobs.scene import SceneSpec
+from .files import FIGURES
+from .paper import PaperCaption, read_paper
+
+if TYPE_CHECKING:
+    from ..envs.base import Environment
+    from ..landscapes.plane import Plane
+
 KINDS: dict[str, type] = {  # of a figure's fields in TOML
-    **dict.fromkeys(("id", "env", "says", "through", "fidelity", "over"), str),
-    **{"dims": list, "number": int, "resolution": int, "options": dict},
+    **dict.fromkeys(("id", "env", "through", "fidelity", "over"), str),
+    **{"dims": list, "resolution": int, "options": dict},
 }
+SCENE_OPTIONS = {"fidelity", "device", "engine", "deterministic"}  # of a SceneSpec, so none of a scene's own
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A slice of an environment: `number` is the paper's, `says` what the paper says of it, in our words.
+    """A slice of an environment to show, and what the paper says of it.
 
     One dimension makes a line, two a plane; `through`, `options` and `fidelity` are those of `landscape slice`, and
     `over` is what its sweep moves, nothing if empty.
@@ -29,13 +35,24 @@ class Figure:
     id: str
     env: str
     dims: tuple[int, ...]
-    says: str
-    number: int | None = None
+    caption: PaperCaption = field(default_factory=PaperCaption)
     through: str = "center"
     resolution: int = 48
     fidelity: str = "standard"
-    options: dict[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
     over: str = "horizon"
+
+    def scene(self, device: str, fidelity: str | None = None) -> SceneSpec:
+        """Return the scene that is sliced, on a device, at the figure's fidelity or another."""
+        return SceneSpec(self.env, fidelity or self.fidelity, device=device, options=self.options)
+
+    def plane(self, env: Environment, resolution: int | None = None) -> Plane:
+        """Return the plane that is sampled, with so many points along each axis, the figure's own by default."""
+        from ..envs.points import point
+        from ..landscapes.plane import Plane
+
+        through = point(env, self.through)
+        return Plane.through(env.space, through, self.dims, resolution=resolution or self.resolution)
 
     def command(self, device: str) -> str:
         """Return the command that makes this slice alone."""
@@ -62,15 +79,8 @@ class Figure:
         return [word for name, value in self.options.items() for word in ("--set", f"{name}={value}")]
 
 
-def data_folder(named: str | None) -> Path:
-    """Return where the figures' data is: as named, else a checkout's own, else under the folder where one stands."""
-    if named:
-        return Path(named)
-    return DATA if any(DATA.glob("*/slice.zarr")) else ELSEWHERE
-
-
-def read_figures(path: Path = HERE / "figures.toml") -> list[Figure]:
-    """Read a list of figures."""
+def read_figures(path: Path = FIGURES) -> list[Figure]:
+    """Read a list of figures. Raises ValueError, naming the file, where it is none."""
     with path.open("rb") as file:
         tables = tomllib.load(file).get("figure", [])
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
@@ -82,8 +92,11 @@ def read_figures(path: Path = HERE / "figures.toml") -> list[Figure]:
     return figures
 
 
-def chosen(figures: Sequence[Figure], only: Sequence[str]) -> list[Figure]:
-    """Return the figures of these ids or environments, all of them if none is named."""
+def choose_figures(figures: Sequence[Figure], only: Sequence[str]) -> list[Figure]:
+    """Return the figures of these ids or environments, all of them if none is named.
+
+    Raises ValueError for a name that is neither.
+    """
     for name in only:
         if not any(name in (figure.id, figure.env) for figure in figures):
             raise ValueError(f"no figure or environment {name!r} is in the gallery; `landscape gallery list` shows all")
@@ -91,8 +104,8 @@ def chosen(figures: Sequence[Figure], only: Sequence[str]) -> list[Figure]:
 
 
 def _figure(path: Path, table: dict[str, Any]) -> Figure:
-    unknown = set(table) - {one.name for one in fields(Figure)}
-    missing = {"id", "env", "dims", "says"} - set(table)
+    unknown = set(table) - ({one.name for one in fields(Figure)} - {"caption"})
+    missing = {"id", "env", "dims"} - set(table)
     if unknown or missing:
         raise ValueError(
             f"{path}: figure {table.get('id', '?')} has unknown {sorted(unknown)} and lacks {sorted(missing)}"
@@ -100,8 +113,9 @@ def _figure(path: Path, table: dict[str, Any]) -> Figure:
     for name, kind in KINDS.items():
         if not isinstance(value := table.get(name, kind()), kind):
             raise ValueError(f"{path}: figure {table['id']} has {name} {value!r}, which is no {kind.__name__}")
-    if taken := {"fidelity", "device", "engine", "deterministic"} & set(table.get("options", {})):
+    if taken := SCENE_OPTIONS & set(table.get("options", {})):
         raise ValueError(f"{path}: figure {table['id']} has options {', '.join(sorted(taken))}, which no scene has")
     if len(table["dims"]) not in (1, 2):
         raise ValueError(f"{path}: figure {table['id']} needs one dimension or two; got {table['dims']}")
-    return Figure(**(table | {"dims": tuple(table["dims"])}))
+    how = table | {"dims": tuple(table["dims"]), "caption": read_paper().caption_of(table["id"])}
+    return Figure(**how)

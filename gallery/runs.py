@@ -10,26 +10,24 @@ from zipfile import ZipFile
 import xarray as xr
 from zarr.storage import ZipStore
 
-from ..landscapes.files import replacing
-from ..landscapes.layout import SMALL
-from ..landscapes.records import reading
-from ..optim.run_arrays import COLUMNS
-from .page_data import REMAKE
-
-FOLDER, SUFFIX = "runs", ".zarr.zip"
+from ..landscapes.storage.files import replacing
+from ..landscapes.storage.layout import COMPACT_CODECS
+from ..landscapes.storage.records import reading
+from ..optim.runs.arrays import COLUMNS
+from .files import REMAKE
 
 
 def save_run(table: xr.Dataset, path: Path) -> None:
     """Write a run's table as one file, whole or not at all."""
     numbers = [str(name) for name, column in table.variables.items() if column.dtype.kind in "fi"]
-    encoding = {name: {"compressors": SMALL, "chunks": table[name].shape} for name in numbers}
+    encoding = {name: {"compressors": COMPACT_CODECS, "chunks": table[name].shape} for name in numbers}
     with replacing(path) as partial, ZipStore(partial, mode="w") as store, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # zarr's specification has no strings yet
         table.to_zarr(store, encoding=encoding, zarr_format=3, consolidated=False)
 
 
 def open_run(path: Path) -> xr.Dataset:
-    """Read a run's table; raise ValueError, naming the file, where it is not what `save_run` wrote."""
+    """Read a run's table. Raises ValueError, naming the file, where it is not what `save_run` wrote."""
     plain: Any = {"mask_and_scale": False, "decode_times": False}
     with reading(path, REMAKE.format("searches")):
         with ZipFile(path) as packed:

@@ -1,4 +1,4 @@
-"""Anyone's function as an objective, with one line."""
+"""Adapters that make an objective of a torch or numpy function."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .objective import Evaluation, Objective, evaluated_inside, name_of
+from .objective import Evaluation, Objective, evaluate_inside, name_of
 from .space import ParameterSpace, as_tensor
 
 TorchFunction = Callable[[Tensor], Tensor]
@@ -33,7 +33,7 @@ def from_torch(
     Gradients come by autograd. Each loss may depend on its own row only. With `vectorized=False` the function takes a
     single point, shape (dim,), and returns one loss.
     """
-    return _TorchObjective(fn if vectorized else _Pointwise(fn, _stacked), space, name or _name(fn), loss_unit)
+    return _TorchObjective(fn if vectorized else _Pointwise(fn, _stack), space, name or _name(fn), loss_unit)
 
 
 def from_numpy(
@@ -51,6 +51,8 @@ def from_numpy(
     `differences` makes gradients by central differences with that step, a fraction of each parameter's range; at the
     bounds they are one-sided, since the function is not asked beyond them. With `vectorized=False` the function takes a
     single point, shape (dim,), and returns one loss, or that and its gradient.
+
+    Raises ValueError where `differences` is no fraction of the bounds, or lost in rounding beside them.
     """
     differences = None if differences is None else _step(differences, space)
     return _NumpyObjective(fn if vectorized else _Pointwise(fn, list), space, name or _name(fn), loss_unit, differences)
@@ -100,7 +102,7 @@ class _TorchObjective:
             raise ValueError(f"{self.name} must return a tensor; got {type(loss).__name__}")
         _check_shape(tuple(loss.shape), (len(x),), "losses", self.name)
         losses = as_tensor(loss, f"the loss of {self.name}")
-        return Evaluation.judged(losses, self._gradient(loss, x) if grad else None)
+        return Evaluation.from_results(losses, self._gradient(loss, x) if grad else None)
 
     def _gradient(self, loss: Float[Tensor, " batch"], x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch dim"]:
         (gradient,) = torch.autograd.grad(loss.sum(), x, allow_unused=True) if loss.requires_grad else (None,)
@@ -127,8 +129,8 @@ class _NumpyObjective:
             return Evaluation.empty(self.space.dim, grad=grad)
         loss, gradient = self._call(points)
         if not grad:
-            return Evaluation.judged(loss, None)
-        return Evaluation.judged(loss, self._differences(points) if gradient is None else gradient)
+            return Evaluation.from_results(loss, None)
+        return Evaluation.from_results(loss, self._differences(points) if gradient is None else gradient)
 
     def _call(self, x: Float[Tensor, "batch dim"]) -> tuple[Tensor, Tensor | None]:
         result = self.fn(x.numpy().copy())
@@ -171,7 +173,7 @@ class _BoxedObjective:
         return getattr(self.objective, name)
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
-        return evaluated_inside(self.objective, _points(x, self.space, name_of(self.objective)), grad=grad)
+        return evaluate_inside(self.objective, _points(x, self.space, name_of(self.objective)), grad=grad)
 
 
 def _step(differences: object, space: ParameterSpace) -> float:
@@ -189,7 +191,7 @@ def _step(differences: object, space: ParameterSpace) -> float:
     return fraction
 
 
-def _stacked(found: Sequence[Any]) -> Any:
+def _stack(found: Sequence[Any]) -> Any:
     """Return losses of single points as one tensor; what is none is returned for the objective to refuse."""
     return torch.stack(list(found)) if all(isinstance(one, Tensor) for one in found) else found[0]
 

@@ -1,4 +1,4 @@
-"""What this machine has room for: a size is reckoned before anything is allocated, and refused where it cannot fit."""
+"""The memory and the disk that are free: a size that cannot fit is refused before anything is allocated."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ MEMINFO, CGROUPS = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
 
 
 class TooLargeError(ValueError):
-    """Say that a size does not fit into the memory or onto the disk of this machine."""
+    """A size does not fit into the memory or onto the disk of this machine."""
 
 
 @dataclass(frozen=True)
 class Need:
-    """Say what something takes, about: bytes of memory, and bytes on the disk."""
+    """Hold an estimate of the bytes of memory and of disk that something takes."""
 
     memory: float = 0.0
     disk: float = 0.0
 
     def times(self, count: float) -> Need:
-        """Return what so many of it take."""
+        """Return the need of `count` such things."""
         return Need(count * self.memory, count * self.disk)
 
 
@@ -35,6 +35,8 @@ def require(what: str, value: int, need: Callable[[int], Need], folder: Path | N
 
     `what` names the value, such as resolution, and `need` says what each value of it takes, a larger one no less.
     Without a `folder` nothing is written.
+
+    Raises TooLargeError where it does not fit.
     """
     there = Need(available_memory(), free_disk(folder) if folder else float("inf"))
     too_large = min(value, ENDLESS)
@@ -46,7 +48,7 @@ def require(what: str, value: int, need: Callable[[int], Need], folder: Path | N
         fits, too_large = (middle, too_large) if _fits(need(middle), there) else (fits, middle)
     wanted = need(min(value, ENDLESS))
     name = "memory" if wanted.memory > there.memory else "disk"
-    most = f"{what} {_rounded_down(fits)} would fit" if fits else f"not even {what} 1 would fit, so make room"
+    most = f"{what} {_round_down(fits)} would fit" if fits else f"not even {what} 1 would fit, so make room"
     raise TooLargeError(
         f"{what} {value} takes about {size(getattr(wanted, name))} of {name}, and {size(getattr(there, name))} are "
         f"free here; {most}"
@@ -58,7 +60,7 @@ def available_memory() -> float:
     if not MEMINFO.exists():
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     lines = dict(line.split(":") for line in MEMINFO.read_text().splitlines())
-    return min([1024.0 * int(lines["MemAvailable"].split()[0]), *_left_to_groups()])
+    return min([1024.0 * int(lines["MemAvailable"].split()[0]), *_group_limits()])
 
 
 def free_disk(folder: Path) -> float:
@@ -68,14 +70,14 @@ def free_disk(folder: Path) -> float:
 
 
 def size(count: float) -> str:
-    """Return a number of bytes in words."""
+    """Write a number of bytes with a unit, such as "2 MB"."""
     unit = next((at for at, _ in enumerate(UNITS) if count < 1000.0 ** (at + 2)), len(UNITS) - 1)
     amount = count / 1000.0 ** (unit + 1)
     return f"{amount:.0f} {UNITS[unit]}" if unit < 2 else f"{amount:.1f} {UNITS[unit]}"
 
 
-def _rounded_down(value: int) -> int:
-    """Return a value to two digits: more of it would be no truer."""
+def _round_down(value: int) -> int:
+    """Round a value down to two digits: more would pretend to more accuracy than an estimate has."""
     digit: int = 10 ** max(0, len(str(value)) - 2)
     return value // digit * digit
 
@@ -84,17 +86,19 @@ def _fits(wanted: Need, there: Need) -> bool:
     return wanted.memory <= there.memory and wanted.disk <= there.disk
 
 
-def _left_to_groups() -> list[float]:
+def _group_limits() -> list[float]:
     """Return what the control groups (version 2) that this process is in leave of their limits, where they have one."""
     try:
         own = next(line[3:] for line in Path("/proc/self/cgroup").read_text().splitlines() if line.startswith("0::"))
     except (OSError, StopIteration):
         return []
     group = CGROUPS / own.strip("/")
-    return [left for place in (group, *group.parents) if place.is_relative_to(CGROUPS) for left in _left_to(place)]
+    return [
+        left for place in (group, *group.parents) if place.is_relative_to(CGROUPS) for left in _free_in_group(place)
+    ]
 
 
-def _left_to(group: Path) -> list[float]:
+def _free_in_group(group: Path) -> list[float]:
     try:
         most, taken = ((group / name).read_text().strip() for name in ("memory.max", "memory.current"))
         stat = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())

@@ -1,13 +1,17 @@
-"""What there is to draw of an episode: frames over time, and the things they show."""
+"""An episode as it is drawn: its frames over time, and the look of the things in them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
+import numpy as np
 from jaxtyping import Float, Int
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from .draw.figures.page import Picture
 
 Point = tuple[float, float, float]
 Shape = Literal[
@@ -44,7 +48,7 @@ Material = Literal[
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Say what one thing of an episode looks like.
+    """Hold the shape, material and motion of one thing in an episode.
 
     `at` [m], shape (frame, point, 3), is where it is: the vertices of a sheet, the particles of a lump, the points of a
     path, else the places of so many copies of a solid of `size` [m]. `turn`, shape (frame, 3, 3), rotates solids about
@@ -86,3 +90,21 @@ class Episode:
     tools: Mapping[str, Float[Tensor, "frame 3"]] = field(default_factory=dict)
     parts: tuple[Part, ...] = ()
     view: View | None = None
+
+    def viewpoint(self) -> View:
+        """Return the view of the episode, or one of all that its parts take up where it has none."""
+        if self.view:
+            return self.view
+        every = np.concatenate([part.at.reshape(-1, 3).numpy() for part in self.parts])
+        low, high = every.min(axis=0), every.max(axis=0)
+        room = 0.1 * float((high - low).max() or 1.0)
+        return View(tuple((low - room).tolist()), tuple((high + room).tolist()), ground=None)
+
+    def show(self, keys: int = 5) -> Picture:
+        """Draw so many key frames side by side, evenly spaced from the first to the last; a notebook shows the picture.
+
+        Raises ValueError where the episode has no `parts`, which say what things look like.
+        """
+        from .draw.figures.contact import episode_figure
+
+        return episode_figure(self, keys=keys)

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from .files import replacing
-from .slice_arrays import parameters_of, plane_of
+from .identity import plane_of
+from .storage.arrays import parameters_of
+from .storage.files import replacing
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -21,6 +22,8 @@ def save_as(dataset: xr.Dataset, path: Path, kind: str) -> None:
     """Write a slice or a run as csv, parquet or netcdf, whole or not at all.
 
     The first two hold `frame`; the last holds the dataset itself, with all of its attributes.
+
+    Raises ValueError where `kind` is another.
     """
     if kind not in SUFFIXES:
         raise ValueError(f"a slice or a run is exported to {', '.join(SUFFIXES)}; got {kind!r}")
@@ -43,18 +46,18 @@ def frame(dataset: xr.Dataset) -> pd.DataFrame:
 
     columns = _places(dataset) if "x" not in dataset else _points(dataset)
     unit = str(dataset["loss"].attrs.get("units", ""))
-    columns[_labelled("loss", unit)] = dataset["loss"].to_numpy().ravel()
+    columns[_label("loss", unit)] = dataset["loss"].to_numpy().ravel()
     for name in ("status", "kind"):
         if name in dataset:
-            columns[name] = _worded(dataset[name])
+            columns[name] = _name_codes(dataset[name])
     for name in ("forwards", "seconds"):
         if name in dataset:
-            columns[_labelled(name, str(dataset[name].attrs.get("units", "")))] = dataset[name].to_numpy()
+            columns[_label(name, str(dataset[name].attrs.get("units", "")))] = dataset[name].to_numpy()
     if "grad" in dataset:
         grad = dataset["grad"].to_numpy().reshape(-1, dataset.sizes["dim"])
         for (name, by), slope in zip(parameters_of(dataset), grad.T, strict=True):
             per = f"{unit or '1'}/({by})" if by else unit
-            columns[_labelled(f"gradient by {name}", per)] = slope
+            columns[_label(f"gradient by {name}", per)] = slope
     return pd.DataFrame(columns)
 
 
@@ -68,16 +71,16 @@ def _places(dataset: xr.Dataset) -> dict[str, np.ndarray]:
 def _points(run: xr.Dataset) -> dict[str, np.ndarray]:
     """Return number and parameters of every episode."""
     values = run["x"].to_numpy().T
-    named = {_labelled(*one): column for one, column in zip(parameters_of(run), values, strict=True)}
+    named = {_label(*one): column for one, column in zip(parameters_of(run), values, strict=True)}
     return {"episode": run["episodes"].to_numpy(), **named}
 
 
-def _worded(codes: xr.DataArray) -> np.ndarray:
+def _name_codes(codes: xr.DataArray) -> np.ndarray:
     """Return the words that codes stand for."""
     words = str(codes.attrs["flag_meanings"]).split()
     by_code = dict(zip(codes.attrs["flag_values"], words, strict=True))
     return np.array([by_code[code] for code in codes.to_numpy().ravel().tolist()])
 
 
-def _labelled(name: str, unit: str) -> str:
+def _label(name: str, unit: str) -> str:
     return f"{name} [{unit}]" if unit else name

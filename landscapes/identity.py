@@ -1,4 +1,4 @@
-"""What makes two slices, or two runs, the same, and the refusal to mix two that differ."""
+"""The identity of a slice or a run: all settings that decide its numbers; stores of different ones are never mixed."""
 
 from __future__ import annotations
 
@@ -8,29 +8,42 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .. import __version__
+from .plain import plain_json
 from .plane import Plane
 from .space import ParameterSpace
 
 if TYPE_CHECKING:
     import xarray as xr
 
-SHOWN = 6
+LISTED_SETTINGS = 6  # settings that differ, in the refusal of a store
 
 
 class StoreError(ValueError):
-    """Say that a path does not hold the store that was asked for."""
+    """A path does not hold the store that was asked for."""
 
 
 class StoreExistsError(StoreError):
-    """Say that a store is not made because its path is taken."""
+    """A store is not made because its path is taken."""
 
 
 class StoreMismatchError(StoreError):
-    """Say that a store was made by other settings."""
+    """A store was made by other settings."""
+
+
+class DamagedError(StoreError):
+    """A file is not what was written."""
+
+    @classmethod
+    def of(cls, path: Path, why: str, todo: str) -> DamagedError:
+        """Return the error for a file, with the reason and what to do."""
+        return cls(f"{path} is damaged ({why}); {todo}")
 
 
 def full_identity(identity: Mapping[str, Any], plane: Plane, space: ParameterSpace, *, grad: bool) -> dict[str, Any]:
-    """Add to a caller's settings what the slice itself decides, as plain JSON."""
+    """Add to a caller's settings what the slice itself decides, as plain JSON.
+
+    Raises ValueError where the settings hold a name of the slice's own, or are not plain JSON.
+    """
     own = {"plane": plane.record(), "parameters": space.names, "gradients": grad, "gradscape": __version__}
     if clash := own.keys() & identity.keys():
         raise ValueError(f"a slice's identity gets {', '.join(sorted(clash))} from the slice; leave them out")
@@ -38,16 +51,27 @@ def full_identity(identity: Mapping[str, Any], plane: Plane, space: ParameterSpa
 
 
 def stored_identity(dataset: xr.Dataset) -> dict[str, Any]:
-    """Return what decides the numbers of a slice or a run: objective, options, fidelity, device and so on."""
-    return _decoded(dataset, "identity")
+    """Return what decides the numbers of a slice or a run: objective, options, fidelity, device and so on.
+
+    Raises ValueError where the dataset is neither.
+    """
+    return _decode(dataset, "identity")
 
 
 def stored_provenance(dataset: xr.Dataset) -> dict[str, Any]:
-    """Return what else is known of how a slice or a run was made: command, date, versions, the loss's unit."""
-    return _decoded(dataset, "provenance")
+    """Return what else is known of how a slice or a run was made: command, date, versions, the loss's unit.
+
+    Raises ValueError where the dataset is neither.
+    """
+    return _decode(dataset, "provenance")
 
 
-def _decoded(dataset: xr.Dataset, name: str) -> dict[str, Any]:
+def plane_of(dataset: xr.Dataset) -> Plane:
+    """Return the plane that a slice was sampled on; raises ValueError where the dataset is no slice."""
+    return Plane.from_record(stored_identity(dataset)["plane"])
+
+
+def _decode(dataset: xr.Dataset, name: str) -> dict[str, Any]:
     try:
         found = json.loads(dataset.attrs[name])
     except (KeyError, TypeError, ValueError):
@@ -55,15 +79,6 @@ def _decoded(dataset: xr.Dataset, name: str) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise ValueError(f"no slice or run of gradscape: the dataset's attribute {name} is missing or no JSON object")
     return found
-
-
-def plain_json(settings: Mapping[str, Any], what: str) -> dict[str, Any]:
-    """Return settings as they come back from JSON: tuples are lists, keys are strings."""
-    try:
-        plain: dict[str, Any] = json.loads(json.dumps(settings, allow_nan=False))
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{what} must be plain JSON (numbers, strings, lists, dicts): {error}") from None
-    return plain
 
 
 def check_identity(
@@ -74,9 +89,9 @@ def check_identity(
         return
     ours, theirs = dict(_leaves(wanted)), dict(_leaves(found))
     names = [name for name in ours | theirs if ours.get(name) != theirs.get(name)]
-    said = [f"{name}: wanted {_shown(ours, name)}, found {_shown(theirs, name)}" for name in names[:SHOWN]]
-    if len(names) > SHOWN:
-        said.append(f"and {len(names) - SHOWN} more")
+    said = [f"{name}: wanted {_show(ours, name)}, found {_show(theirs, name)}" for name in names[:LISTED_SETTINGS]]
+    if len(names) > LISTED_SETTINGS:
+        said.append(f"and {len(names) - LISTED_SETTINGS} more")
     raise StoreMismatchError(
         f"{path or 'the store'} holds a {what} made by other settings ({'; '.join(said)}); "
         "write elsewhere with --out, or replace it with --force"
@@ -94,5 +109,5 @@ def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
         yield name, value
 
 
-def _shown(settings: Mapping[str, Any], name: str) -> str:
+def _show(settings: Mapping[str, Any], name: str) -> str:
     return repr(settings[name]) if name in settings else "none"

@@ -1,7 +1,8 @@
-"""What can be evaluated at a batch of points, and what an evaluation says."""
+"""Objectives, which are evaluated at a batch of points, and the records of their results."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Protocol, runtime_checkable
@@ -41,10 +42,10 @@ class Evaluation:
     def __post_init__(self) -> None:
         object.__setattr__(self, "loss", _real(self.loss, "a loss"))
         object.__setattr__(self, "grad", None if self.grad is None else _real(self.grad, "a gradient"))
-        object.__setattr__(self, "status", _known(self.status))
+        object.__setattr__(self, "status", _check_codes(self.status))
 
     @classmethod
-    def judged(
+    def from_results(
         cls,
         loss: Float[Tensor, " batch"],
         grad: Float[Tensor, "batch dim"] | None,
@@ -53,11 +54,13 @@ class Evaluation:
         """Make an evaluation from raw results: mark non-finite rows, keep what `failed` says, blank every failure.
 
         `failed` holds a Status per row, OK where nothing is known to have gone wrong.
+
+        Raises ValueError where results are no real numbers, or codes in `failed` mean no Status.
         """
         loss, grad = _real(loss, "a loss"), None if grad is None else _real(grad, "a gradient")
         status = torch.full(loss.shape, Status.OK, dtype=torch.int8)
         if failed is not None:
-            status = _known(failed).to(torch.int8).clone()
+            status = _check_codes(failed).to(torch.int8).clone()
         finite = loss.isfinite() if grad is None else loss.isfinite() & grad.isfinite().all(dim=1)
         status[(status == Status.OK) & ~finite] = Status.NONFINITE
         blank = status != Status.OK
@@ -65,11 +68,32 @@ class Evaluation:
         grad = None if grad is None else grad.masked_fill(blank[:, None], torch.nan)
         return cls(loss, grad, status)
 
+    judged = from_results  # its first name, which environments of others call it by
+
+    @classmethod
+    def join(cls, parts: Iterable[Evaluation], *, dim: int, grad: bool) -> Evaluation:
+        """Return the evaluation of several batches, one after the other; of none, that of no points at all.
+
+        Gradients are left out unless `grad` asks for them. Raises ValueError where a part has none of those asked for.
+        """
+        parts = list(parts)
+        if not parts:
+            return cls.empty(dim, grad=grad)
+        slopes = [part.grad for part in parts if part.grad is not None] if grad else []
+        if grad and len(slopes) < len(parts):
+            raise ValueError(f"{len(parts) - len(slopes)} of {len(parts)} evaluations to join have no gradients")
+        loss, status = torch.cat([part.loss for part in parts]), torch.cat([part.status for part in parts])
+        return cls(loss, torch.cat(slopes) if grad else None, status)
+
+    def rows(self, rows: slice | Int[Tensor, " some"]) -> Evaluation:
+        """Return the evaluation of some of the points."""
+        return Evaluation(self.loss[rows], None if self.grad is None else self.grad[rows], self.status[rows])
+
     @classmethod
     def empty(cls, dim: int, *, grad: bool) -> Evaluation:
         """Return the evaluation of no points at all."""
         loss = torch.zeros(0, dtype=torch.float64)
-        return cls.judged(loss, loss.new_zeros(0, dim) if grad else None)
+        return cls.from_results(loss, loss.new_zeros(0, dim) if grad else None)
 
 
 @runtime_checkable
@@ -87,39 +111,43 @@ class Objective(Protocol):
         """Return losses, and gradients if asked, at points `x` in the parameters' own units."""
 
 
-def evaluated(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+def evaluate(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
     """Evaluate an objective, hold the result against the protocol, and blank every failure.
 
     Points beyond its bounds have left the domain (status ESCAPED), unless the objective invites them.
+
+    Raises ValueError where the objective's answer is not what the protocol says, and what it raises itself.
     """
     invited = getattr(objective, "beyond_box", False)
-    raw = _answer(objective, x, grad=grad) if invited else evaluated_inside(objective, x, grad=grad)
+    raw = _ask(objective, x, grad=grad) if invited else evaluate_inside(objective, x, grad=grad)
     loss, status = (tensor.detach().cpu() for tensor in (raw.loss, raw.status))
     gradient = raw.grad.detach().cpu().double() if grad and raw.grad is not None else None
-    return Evaluation.judged(loss.double(), gradient, status)
+    return Evaluation.from_results(loss.double(), gradient, status)
 
 
-def evaluated_inside(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+def evaluate_inside(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
     """Evaluate an objective at those of the points that lie in its box; the others have left the domain.
 
     What is no point at all, of a wrong shape or not a number, is for the objective to refuse.
+
+    Raises what `evaluate` does.
     """
     if x.ndim != 2 or x.shape[1] != objective.space.dim:
         return objective.evaluate(x, grad=grad)
     inside = in_box(objective.space, x)
     if bool(inside.all()):
-        return _answer(objective, _moved_back(objective.space, x), grad=grad)
+        return _ask(objective, _clamp(objective.space, x), grad=grad)
     loss, slope = x.new_full((len(x),), torch.nan), torch.full_like(x, torch.nan) if grad else None
     status = torch.full((len(x),), Status.ESCAPED, dtype=torch.int8)
     if bool(inside.any()):
-        found = _answer(objective, _moved_back(objective.space, x[inside]), grad=grad)
+        found = _ask(objective, _clamp(objective.space, x[inside]), grad=grad)
         loss[inside], status[inside] = found.loss.detach().to(loss), found.status.to(status)
         if slope is not None and found.grad is not None:
             slope[inside] = found.grad.detach().to(slope)
     return Evaluation(loss, slope, status)
 
 
-def _answer(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+def _ask(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
     """Return what an objective says of points, held against the protocol."""
     found, who = objective.evaluate(x, grad=grad), name_of(objective)
     if not isinstance(found, Evaluation):
@@ -130,7 +158,7 @@ def _answer(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) 
         "status": (found.status, (count,)),
     }
     if grad:
-        wanted["grad"] = (_present(found.grad, who), tuple(x.shape))
+        wanted["grad"] = (_require_gradient(found.grad, who), tuple(x.shape))
     for field, (tensor, shape) in wanted.items():
         if tuple(tensor.shape) != shape:
             raise ValueError(
@@ -147,7 +175,7 @@ def in_box(space: ParameterSpace, x: Float[Tensor, "batch dim"]) -> Bool[Tensor,
     return ~((unit < -ROUNDING) | (unit > 1 + ROUNDING)).any(dim=1)
 
 
-def _moved_back(space: ParameterSpace, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch dim"]:
+def _clamp(space: ParameterSpace, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch dim"]:
     return torch.clamp(x, space.lower, space.upper)
 
 
@@ -163,7 +191,7 @@ def _real(values: object, what: str) -> Tensor:
     return as_tensor(values, what)
 
 
-def _known(status: object) -> Tensor:
+def _check_codes(status: object) -> Tensor:
     """Return a tensor of statuses as it is, and refuse codes that mean none: as int8, 257 would be OK."""
     codes = _real(status, "a status")
     sound = (codes >= 0) & (codes <= max(Status)) & (codes % 1 == 0)
@@ -173,7 +201,7 @@ def _known(status: object) -> Tensor:
     return codes
 
 
-def _present(grad: Tensor | None, who: str) -> Tensor:
+def _require_gradient(grad: Tensor | None, who: str) -> Tensor:
     if grad is None:
         raise ValueError(
             f"{who} was asked for gradients and returned none; sample with grad=False (--no-gradients), "

@@ -1,4 +1,4 @@
-"""Runs laid over a slice: where their points fall, how far off the plane they are, what the slice shows there."""
+"""Runs laid over a slice: the plane coordinates of their points, their distances from the plane, the losses beneath."""
 
 from __future__ import annotations
 
@@ -13,21 +13,23 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from .identity import plane_of
 from .plane import Plane
-from .store import plane_of
 
 RECENT = 64  # how many evaluations ago an iterate's predecessor is looked for
 PARALLEL = 1e-12  # most by which the cosine between a step and the negative gradient may differ from 1
 
 
 def overlay(dataset: xr.Dataset, tables: Sequence[xr.Dataset]) -> list[xr.Dataset]:
-    """Lay runs over a slice of rank 2: return their tables with where each point falls.
+    """Lay runs over a slice of rank 2: return their tables with the plane coordinates of each point.
 
     Added are, over `evaluation`: `u` and `v` [plane units], the nearest point of the plane; `distance` to it
     [half-widths of the box]; `outside`, whether it lies beyond what the slice's picture covers; `beneath` [loss unit],
     the loss of the sample whose cell is there, NaN outside and where that sample failed; `previous`, the row whose
     gradient led to this one, -1 for none; `best`, the least loss so far. Nearness is measured in the box scaled to
     [-1, 1], so that the parameters' units do not count. The attribute `label` tells runs apart.
+
+    Raises ValueError where the slice is a line, or a run searched other parameters.
     """
     plane = plane_of(dataset)
     if plane.rank != 2:
@@ -36,18 +38,21 @@ def overlay(dataset: xr.Dataset, tables: Sequence[xr.Dataset]) -> list[xr.Datase
 
 
 def lay(dataset: xr.Dataset, table: xr.Dataset, label: str) -> xr.Dataset:
-    """Lay one run over a line, where no point has a `v`, or a plane, as `overlay` does."""
+    """Lay one run over a line, where no point has a `v`, or a plane, as `overlay` does.
+
+    Raises ValueError where the run searched other parameters than the slice has.
+    """
     plane = plane_of(dataset)
     parameters = [str(name) for name in dataset["dim"].to_numpy()]
     if parameters != [str(name) for name in table["dim"].to_numpy()]:
         raise ValueError(
-            f"{label} searched {table.sizes['dim']} parameters ({_shown(table)}), "
-            f"the slice has {len(parameters)} ({_shown(dataset)}); lay runs over slices of the same environment"
+            f"{label} searched {table.sizes['dim']} parameters ({_list_parameters(table)}), the slice has "
+            f"{len(parameters)} ({_list_parameters(dataset)}); lay runs over slices of the same environment"
         )
     half, x = _box(table)[1], _points(table)
     scaled = replace(plane, origin=plane.origin / half, basis=plane.basis / half)
     place = scaled.project(x / half)
-    low, high = plane.window()
+    low, high = plane.cell_bounds()
     outside = ((place < low) | (place > high)).any(dim=1).numpy()
     axes = dict(zip(("u", "v"), place.numpy().T, strict=False))
     columns = {
@@ -70,7 +75,10 @@ def improvements(run: xr.Dataset) -> NDArray[np.intp]:
 
 
 def best_point(tables: Sequence[xr.Dataset]) -> tuple[Float[Tensor, " dim"], float]:
-    """Return the point of least loss among all the runs, and its loss."""
+    """Return the point of least loss among all the runs, and its loss.
+
+    Raises ValueError where no episode succeeded.
+    """
     losses = np.concatenate([table["loss"].to_numpy() for table in tables])
     if not np.isfinite(losses).any():
         raise ValueError("no episode of these runs succeeded, so there is no best point")
@@ -85,12 +93,14 @@ def principal_plane(
     """Lay a plane through the principal directions of the runs' points, found in the box scaled to [-1, 1].
 
     Its coordinates are in half-widths of the box. With `through` it is moved, parallel to itself, to hold that point.
+
+    Raises ValueError where the points are too few, or spread in one direction alone.
     """
     center, half = _box(tables[0])
     scaled = torch.cat([(_points(table) - center) / half for table in tables])
     flat = Plane.principal(scaled, resolution=resolution)
     if through is not None:
-        flat = flat.moved((through - center) / half)
+        flat = flat.shift_to((through - center) / half)
     return replace(flat, origin=center + half * flat.origin, basis=half * flat.basis)
 
 
@@ -114,13 +124,13 @@ def _previous(table: xr.Dataset) -> NDArray[np.intp]:
     for row in np.flatnonzero(np.isfinite(slope).all(axis=1) | np.isnan(table["loss"].to_numpy())):
         first = max(0, int(row) - RECENT)
         earlier = first + np.flatnonzero(free[first:row])
-        if len(earlier) and (near := _aligned(z[row] - z[earlier], slope[earlier], np.abs(z[row]) < 1 - 1e-9)).any():
+        if len(earlier) and (near := _is_aligned(z[row] - z[earlier], slope[earlier], np.abs(z[row]) < 1 - 1e-9)).any():
             found[row] = earlier[near][np.argmin(np.linalg.norm(z[row] - z[earlier[near]], axis=1))]
             free[found[row]] = False
     return found
 
 
-def _aligned(step: NDArray[np.float64], slope: NDArray[np.float64], inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _is_aligned(step: NDArray[np.float64], slope: NDArray[np.float64], inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
     step, slope = step[:, inside], slope[:, inside]
     with np.errstate(divide="ignore", invalid="ignore"):
         cosine = (step * slope).sum(axis=1) / np.linalg.norm(step, axis=1) / np.linalg.norm(slope, axis=1)
@@ -148,6 +158,6 @@ def _points(table: xr.Dataset) -> Float[Tensor, "evaluation dim"]:
     return torch.from_numpy(table["x"].to_numpy().copy())
 
 
-def _shown(dataset: xr.Dataset) -> str:
+def _list_parameters(dataset: xr.Dataset) -> str:
     names = [str(name) for name in dataset["dim"].to_numpy()]
     return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")

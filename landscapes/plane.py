@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .space import ParameterSpace, as_tensor, tensor_of, whole
+from .space import ParameterSpace, as_tensor, as_whole, tensor_of
 
 Bound = float | Sequence[float] | NDArray[Any] | Tensor
 
@@ -38,7 +38,7 @@ class Plane:
         for field in ("origin", "basis", "lower", "upper"):
             object.__setattr__(self, field, as_tensor(getattr(self, field), f"Plane's {field}"))
         object.__setattr__(
-            self, "resolution", tuple(whole(n, "a slice's resolution", least=2) for n in self.resolution)
+            self, "resolution", tuple(as_whole(n, "a slice's resolution", least=2) for n in self.resolution)
         )
         self._check()
 
@@ -77,6 +77,8 @@ class Plane:
         The plane coordinate is the parameter's own value. `extent` is None for the parameters' bounds, a fraction of
         them for a window of that size around `origin` (moved to stay inside the bounds if it fits), or a pair (lower,
         upper) in the parameters' units, each one number or one per axis.
+
+        Raises ValueError where parameters, point, resolution or extent are none of this space's.
         """
         numbers = [space.index(dim) for dim in dims]
         if len(numbers) not in (1, 2) or len(set(numbers)) != len(numbers):
@@ -86,7 +88,7 @@ class Plane:
         origin = as_tensor(origin, "a slice's point")
         if origin.shape != (space.dim,):
             raise ValueError(f"a slice goes through a point of shape ({space.dim},); got shape {tuple(origin.shape)}")
-        lower, upper = _window(space.lower[numbers], space.upper[numbers], origin[numbers], extent)
+        lower, upper = _bounds(space.lower[numbers], space.upper[numbers], origin[numbers], extent)
         start = origin.clone()
         start[numbers] = 0
         basis = torch.eye(space.dim, dtype=torch.float64)[numbers]
@@ -94,7 +96,7 @@ class Plane:
         return cls(start, basis, lower, upper, _per_axis(resolution, len(numbers)), labels)
 
     @classmethod
-    def spanned(
+    def span(
         cls,
         origin: Float[Tensor, " dim"],
         directions: Float[Tensor, "rank dim"],
@@ -103,7 +105,10 @@ class Plane:
         extent: tuple[Bound, Bound] = (-1.0, 1.0),
         labels: Sequence[str] | None = None,
     ) -> Plane:
-        """Span a plane by any directions, kept as given: coordinate 1 is one whole `directions[i]` from `origin`."""
+        """Span a plane by any directions, kept as given: coordinate 1 is one whole `directions[i]` from `origin`.
+
+        Raises ValueError where the directions are zero or parallel, or sizes do not fit each other.
+        """
         origin, directions = (as_tensor(t, "a slice's point and directions") for t in (origin, directions))
         rank = len(directions)
         lower, upper = _ends(extent, rank)
@@ -124,6 +129,8 @@ class Plane:
         The origin is their mean and the directions have unit length, the largest component positive. The axes cover
         the projected points and a `margin`, as a fraction of their range. Parameters count in their own units: where
         these differ wildly, run it on a space of comparable ones.
+
+        Raises ValueError where the points are too few, not finite, or spread in fewer directions than `rank`.
         """
         points = as_tensor(points, "a principal plane")
         if points.ndim != 2 or len(points) <= rank:
@@ -157,12 +164,12 @@ class Plane:
     @property
     def names(self) -> tuple[str, ...]:
         """Axis labels without their units."""
-        return tuple(_split(label)[0] for label in self.labels)
+        return tuple(_split_label(label)[0] for label in self.labels)
 
     @property
     def units(self) -> tuple[str, ...]:
         """Units of the axes, empty where they have none."""
-        return tuple(_split(label)[1] for label in self.labels)
+        return tuple(_split_label(label)[1] for label in self.labels)
 
     def lift(self, u: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch dim"]:
         """Return the parameters at plane coordinates `u`; each row's bits are independent of the batch it is in."""
@@ -183,12 +190,12 @@ class Plane:
         """Return the derivatives along the plane's axes [loss unit / plane unit] (chain rule, so any basis)."""
         return (tensor_of(grad, "slope")[..., None, :] * self.basis).sum(dim=-1)
 
-    def moved(self, x: Float[Tensor, " dim"]) -> Plane:
+    def shift_to(self, x: Float[Tensor, " dim"]) -> Plane:
         """Return the parallel plane through `x`, with the same coordinates and the same window."""
         x = tensor_of(x, "moved")
         return replace(self, origin=x - self.project(x) @ self.basis)
 
-    def window(self) -> tuple[Float[Tensor, " rank"], Float[Tensor, " rank"]]:
+    def cell_bounds(self) -> tuple[Float[Tensor, " rank"], Float[Tensor, " rank"]]:
         """Return what a picture of the samples covers: their box and half a sample's width around it."""
         half = (self.upper - self.lower) / (torch.tensor(self.resolution, dtype=torch.float64) - 1) / 2
         return self.lower - half, self.upper + half
@@ -215,32 +222,32 @@ class Plane:
 
 
 def _per_axis(resolution: int | Sequence[int], rank: int) -> tuple[Any, ...]:
-    return tuple(resolution) if _several(resolution) else (resolution,) * rank
+    return tuple(resolution) if _is_sequence(resolution) else (resolution,) * rank
 
 
-def _split(label: str) -> tuple[str, str]:
+def _split_label(label: str) -> tuple[str, str]:
     name, bracket, unit = label.removesuffix("]").partition(" [")  # a unit may hold brackets, a name does not
     return (name, unit) if bracket and label.endswith("]") else (label, "")
 
 
-def _bound(bound: Bound, rank: int) -> Float[Tensor, " rank"]:
+def _as_bound(bound: Bound, rank: int) -> Float[Tensor, " rank"]:
     values = as_tensor(bound, "extent")
     if values.ndim > 1 or (values.ndim == 1 and len(values) != rank):
         raise ValueError(f"extent needs one number per axis, {rank} in all; got {bound}")
     return values.expand(rank).clone()
 
 
-def _several(values: object) -> TypeGuard[Sequence[Any]]:
+def _is_sequence(values: object) -> TypeGuard[Sequence[Any]]:
     return isinstance(values, list | tuple) or getattr(values, "ndim", 0) > 0
 
 
 def _ends(extent: Sequence[Bound], rank: int) -> tuple[Float[Tensor, " rank"], Float[Tensor, " rank"]]:
     if len(extent) != 2:
         raise ValueError(f"extent takes a pair (lower, upper); got {len(extent)} values")
-    return _bound(extent[0], rank), _bound(extent[1], rank)
+    return _as_bound(extent[0], rank), _as_bound(extent[1], rank)
 
 
-def _window(
+def _bounds(
     lower: Float[Tensor, " rank"],
     upper: Float[Tensor, " rank"],
     center: Float[Tensor, " rank"],
@@ -248,7 +255,7 @@ def _window(
 ) -> tuple[Float[Tensor, " rank"], Float[Tensor, " rank"]]:
     if extent is None:
         return lower.clone(), upper.clone()
-    if _several(extent):
+    if _is_sequence(extent):
         return _ends(extent, len(lower))
     fraction = float(as_tensor(extent, "extent"))
     if not 0 < fraction < np.inf:

@@ -1,4 +1,4 @@
-"""A slice as seen through a Gaussian: every loss an average over the samples around it."""
+"""Smoothing of a slice by a Gaussian: each loss becomes a weighted mean of the samples around it."""
 
 from __future__ import annotations
 
@@ -6,15 +6,17 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from .store import plane_of
+from .identity import plane_of
 
 
-def smoothed(dataset: xr.Dataset, width: float) -> xr.Dataset:
+def smooth(dataset: xr.Dataset, width: float) -> xr.Dataset:
     """Average a slice's losses by a Gaussian of standard deviation `width`, a fraction of each side of its box.
 
     Only samples that are there count: weights beyond the box and on failed samples are left out and the others scaled
     to sum to one, so that no value is invented; a failed sample stays failed. Gradients are left out. Width 0 is the
     slice itself.
+
+    Raises ValueError where the width is negative.
     """
     if not width >= 0:
         raise ValueError(f"a slice is smoothed over a width that is not negative; got {width}")

@@ -94,13 +94,23 @@ class ParameterSpace:
         return (tensor_of(x, "to_unit") - self.lower) / (self.upper - self.lower)
 
     def uniform(self, count: int, *, seed: int) -> Float[Tensor, "count dim"]:
-        """Draw points uniformly from the box; the same seed gives the same points."""
-        generator = torch.Generator().manual_seed(whole(seed, "a seed"))
-        count = whole(count, "a count of points")
+        """Draw points uniformly from the box; the same seed gives the same points.
+
+        Raises ValueError where the count or the seed is no whole number.
+        """
+        generator = torch.Generator().manual_seed(as_whole(seed, "a seed"))
+        count = as_whole(count, "a count of points")
         return self.from_unit(torch.rand(count, self.dim, generator=generator, dtype=torch.float64))
 
+    def sobol(self, count: int, *, seed: int) -> Float[Tensor, "count dim"]:
+        """Return points spread evenly over the box, of a scrambled Sobol sequence; the same seed gives the same."""
+        return self.from_unit(sobol(count, self.dim, seed=seed))
+
     def index(self, parameter: str | int) -> int:
-        """Return the number of a parameter given by name or by number."""
+        """Return the number of a parameter given by name or by number.
+
+        Raises ValueError where there is none.
+        """
         if isinstance(parameter, str) and parameter in self.names:
             return self.names.index(parameter)
         try:
@@ -112,7 +122,14 @@ class ParameterSpace:
         return number
 
 
-def whole(value: object, what: str, *, least: int = 0) -> int:
+def sobol(count: int, dim: int, *, seed: int) -> Float[Tensor, "count dim"]:
+    """Return the first points of a scrambled Sobol sequence in the unit cube, float64."""
+    engine = torch.quasirandom.SobolEngine(dim, scramble=True, seed=seed)  # type: ignore[no-untyped-call]
+    points: Tensor = engine.draw(count, dtype=torch.float64)
+    return points
+
+
+def as_whole(value: object, what: str, *, least: int = 0) -> int:
     """Return a whole number of 64 bits that is not below `least`; raises ValueError, which says `what` it is, else."""
     try:
         number = least - 1 if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type] # as it tells

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..landscapes.objective import Evaluation, Objective, Status
-from ..landscapes.space import ParameterSpace, whole
+from ..landscapes.options import NoOptions as NoOptions
+from ..landscapes.space import ParameterSpace, as_whole
+from .memory import FLOAT, SearchSize
 
 Points = NDArray[np.float64]
 COMMON = {"space", "seed", "options", "random", "worst", "_told_any"}  # attributes of every optimiser
@@ -41,11 +43,6 @@ class Proposal:
     grad: bool = False
 
 
-@dataclass(frozen=True)
-class NoOptions:
-    """The options of a method that has none."""
-
-
 class Optimizer(abc.ABC):
     """Search a box for the least loss: `ask` for points, evaluate them, `tell` what came out, and so on.
 
@@ -54,8 +51,8 @@ class Optimizer(abc.ABC):
     asked for them, gradients (zero where an episode failed) with respect to the scaled parameters. Randomness comes
     from `self.random` alone, so that a seed decides everything.
 
-    Between `tell` and `ask` an optimiser is its `state`: what is `restored` from it goes on bit for bit. A method whose
-    attributes are numbers, strings, arrays, lists and mappings of them needs nothing for that; any other says in
+    Between `tell` and `ask` an optimiser is its `state`: what `from_state` makes of it goes on bit for bit. A method
+    whose attributes are numbers, strings, arrays, lists and mappings of them needs nothing for that; any other says in
     `_state` and `_restore` what of it is data.
     """
 
@@ -64,7 +61,7 @@ class Optimizer(abc.ABC):
     needs_grad: ClassVar[bool] = False
 
     def __init__(self, space: ParameterSpace, *, seed: int = 0, options: Any = None) -> None:
-        self.space, self.seed = space, whole(seed, f"the seed of {self.name}")
+        self.space, self.seed = space, as_whole(seed, f"the seed of {self.name}")
         self.options = self.Options() if options is None else options
         self.random = np.random.default_rng(seed)
         self.worst = 0.0  # the largest finite loss so far
@@ -75,6 +72,11 @@ class Optimizer(abc.ABC):
     def on(cls, objective: Objective, *, seed: int = 0, options: Any = None) -> Self:
         """Return the optimiser for an objective, of which most methods need no more than its box."""
         return cls(objective.space, seed=seed, options=options)
+
+    @classmethod
+    def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
+        """Estimate what a search takes at most [bytes]; `options` holds a value for each of the method's options."""
+        return 100 * FLOAT * size.dim
 
     def attach(self, objective: Objective) -> None:  # noqa: B027 -- most methods need no more than its box
         """Take the objective in hand, for methods that ask it for more; `search` calls it, after a restart too."""
@@ -103,7 +105,7 @@ class Optimizer(abc.ABC):
 
     @final
     def state(self) -> dict[str, Any]:
-        """Return all there is to go on from, as data that `optim.state.encoded` writes."""
+        """Return all there is to go on from, as data that `optim.runs.state.encoded` writes."""
         return {
             "method": self.name,
             "seed": self.seed,
@@ -116,19 +118,19 @@ class Optimizer(abc.ABC):
 
     @final
     @classmethod
-    def restored(cls, objective: Objective, state: Mapping[str, Any]) -> Self:
+    def from_state(cls, objective: Objective, state: Mapping[str, Any]) -> Self:
         """Return the optimiser that had this state, attached to the objective.
 
         What does not fit raises whatever it is stumbled upon: KeyError, TypeError, ValueError and others.
         """
-        made = cls.on(objective, seed=state["seed"], options=cls.Options(**state["options"]))
-        made.attach(objective)
-        made._restore(state["own"])
-        made.worst, made._told_any = float(state["worst"]), bool(state["told"])
-        made.random.bit_generator.state = state["random"]  # last, since it may have drawn meanwhile
-        return made
+        optimizer = cls.on(objective, seed=state["seed"], options=cls.Options(**state["options"]))
+        optimizer.attach(objective)
+        optimizer._restore(state["own"])
+        optimizer.worst, optimizer._told_any = float(state["worst"]), bool(state["told"])
+        optimizer.random.bit_generator.state = state["random"]  # last, since it may have drawn meanwhile
+        return optimizer
 
-    def penalised(self, loss: Points) -> Points:
+    def penalise(self, loss: Points) -> Points:
         """Return losses for models that take finite numbers only: a failure counts as the worst loss so far."""
         return np.where(np.isfinite(loss), loss, self.worst)
 

@@ -2,31 +2,40 @@
 
 from __future__ import annotations
 
+import json
+import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
 from ..landscapes.objective import Objective
-from . import standings
+from . import statistics
 from .base import Optimizer
-from .orderings import findings, silence
-from .run import Run
-from .search import Progress, search
+from .runs.run import Run
+from .runs.store import RunStore
+from .search import SearchProgress, search
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from ..landscapes.draw.figures.page import Picture
 
 
 @dataclass(frozen=True, eq=False)
-class Entry:
-    """One method with one seed, and the run it fills; `made` returns the optimiser as it is at the start."""
+class Competitor:
+    """One method with one seed, and the run it fills; `make` returns the optimiser as it is at the start."""
 
     method: str
     seed: int
-    run: Run
-    made: Callable[[], Optimizer]
+    run: RunStore
+    make: Callable[[], Optimizer]
 
 
 class RaceStopped(Exception):  # noqa: N818 -- no error: it ends the other runs
@@ -35,39 +44,39 @@ class RaceStopped(Exception):  # noqa: N818 -- no error: it ends the other runs
 
 def race(
     objective: Objective,
-    entries: Sequence[Entry],
+    competitors: Sequence[Competitor],
     *,
     budget: int,
     workers: int = 1,
     gradient_cost: float | None = None,
-    progress: Callable[[Entry, Progress], None] | None = None,
+    progress: Callable[[Competitor, SearchProgress], None] | None = None,
 ) -> None:
-    """Let every entry search until its run holds `budget` episodes; runs that do already are not touched.
+    """Let every competitor search until its run holds `budget` episodes; runs that do already are not touched.
 
     `workers` runs are filled at a time, each in a thread, in the order given; what comes out does not depend on it but
     for the seconds. More than one needs an objective that several threads may evaluate at once. `gradient_cost`, what
     an episode with gradient costs in episodes without, is measured by the first run that needs it if not given.
     `progress` may be called from any of the threads. Stop it at any instant: the same call goes on.
     """
-    left = [entry for entry in entries if entry.run.count < budget]
+    left = [one for one in competitors if one.run.count < budget]
     stop = threading.Event()
 
-    def fill(entry: Entry) -> None:
-        def follow(now: Progress) -> None:
+    def fill(one: Competitor) -> None:
+        def follow(now: SearchProgress) -> None:
             if progress is not None:
-                progress(entry, now)
+                progress(one, now)
             if stop.is_set():
                 raise RaceStopped
 
         if not stop.is_set():
-            search(objective, entry.made(), entry.run, budget=budget, gradient_cost=gradient_cost, progress=follow)
+            search(objective, one.make(), one.run, budget=budget, gradient_cost=gradient_cost, progress=follow)
 
     if workers == 1:
-        for entry in left:
-            fill(entry)
+        for one in left:
+            fill(one)
         return
     with ThreadPoolExecutor(workers) as threads:
-        futures = [threads.submit(fill, entry) for entry in left]
+        futures = [threads.submit(fill, one) for one in left]
         try:
             for future in as_completed(futures):
                 future.result()
@@ -77,64 +86,130 @@ def race(
             raise
 
 
-def tables(entries: Sequence[Entry], budget: int) -> dict[str, list[xr.Dataset]]:
-    """Return the first `budget` rows of every run but for its points and gradients, method -> one table per seed."""
-    found: dict[str, list[xr.Dataset]] = {}
-    for entry in entries:
-        table = entry.run.table().drop_vars(["x", "grad"]).isel(evaluation=slice(budget))
-        found.setdefault(entry.method, []).append(table)
-    return found
+@dataclass(frozen=True, eq=False, repr=False)
+class Race:
+    """Hold the runs of a race, method -> one run per seed, of which the first `budget` episodes count.
+
+    `folder` is where its files are, None of one in memory; `provenance` is how it came about, by default as its first
+    run did.
+    """
+
+    runs: Mapping[str, Sequence[Run]]
+    budget: int
+    folder: Path | None = None
+    provenance: Mapping[str, Any] | None = None
+
+    @property
+    def methods(self) -> list[str]:
+        """The methods that compete."""
+        return list(self.runs)
+
+    @property
+    def seeds(self) -> int:
+        """How many seeds each of them has."""
+        return len(self.runs[self.methods[0]])
+
+    @property
+    def loss_unit(self) -> str:
+        """The unit of the losses, empty where they have none."""
+        return str(self._about["loss_unit"])
+
+    @cached_property
+    def statistics(self) -> statistics.RaceStatistics:
+        """Ranks, differences, targets reached and curves, with their bootstrap intervals over the seeds."""
+        return statistics.RaceStatistics.of(self._tables)
+
+    def table(self) -> pd.DataFrame:
+        """Return a row for each method, the best mean rank first, with 95 % intervals; columns name their units."""
+        import pandas as pd
+
+        unit = f" [{self.loss_unit}]" if self.loss_unit else ""
+        rows = [
+            {
+                "method": rank.method,
+                "mean rank": rank.rank,
+                "mean rank, low": rank.rank_low,
+                "mean rank, high": rank.rank_high,
+                "wins": rank.wins,
+                f"best loss{unit}": rank.mean,
+                f"best loss, low{unit}": rank.low,
+                f"best loss, high{unit}": rank.high,
+                "seeds without success": rank.unsuccessful,
+                "failed episodes": rank.failed,
+                "forward equivalents": rank.forward_equivalents,
+                "seconds [s]": rank.seconds,
+            }
+            for rank in self.statistics.ranks
+        ]
+        return pd.DataFrame(rows)
+
+    def plot(self, *, width: float | None = None) -> Picture:
+        """Draw best losses against episodes, and the share of targets reached.
+
+        The picture is matplotlib's figure, shown by a notebook as it is; `width` draws it for a page so wide [mm].
+        """
+        from ..landscapes.draw.figures.race import race_figure
+
+        return race_figure(self._picture, width=width)
+
+    @cached_property
+    def _tables(self) -> dict[str, list[xr.Dataset]]:
+        """The first `budget` rows of every run but for its points and gradients."""
+        return {
+            method: [run.data.drop_vars(["x", "grad"]).isel(evaluation=slice(self.budget)) for run in runs]
+            for method, runs in self.runs.items()
+        }
+
+    @property
+    def _about(self) -> Mapping[str, Any]:
+        return self.runs[self.methods[0]][0].data.attrs
+
+    @cached_property
+    def _picture(self) -> xr.Dataset:
+        about, goals = self._about, self.statistics.targets
+        title = (about["env"], about["fidelity"], f"{self.budget} episodes", name_seeds(self.seeds))
+        provenance = about["provenance"] if self.provenance is None else json.dumps(self.provenance)
+        return picture(self._tables, self.statistics).assign_attrs(
+            title=" · ".join(part for part in title if part),
+            budget=self.budget,
+            seeds=self.seeds,
+            loss_unit=self.loss_unit,
+            spacing=goals.spacing,
+            targets=(len(goals.loss), *(goals.loss[[0, -1]] if len(goals.loss) else (math.nan, math.nan))),
+            identity=about["identity"],
+            provenance=provenance,
+        )
+
+    def __repr__(self) -> str:
+        """Return in a line what competed and what came out best."""
+        best = self.statistics.ranks[0].method
+        where = f", in {self.folder}" if self.folder else ""
+        return (
+            f"<Race of {', '.join(self.methods)} on {self._about['env']}: {self.budget} episodes, "
+            f"{name_seeds(self.seeds)}, {best} has the best mean rank{where}>"
+        )
 
 
-def picture(runs: standings.Tables, goals: standings.Targets) -> xr.Dataset:
-    """Return what `landscapes.draw.race` draws of a race, its attributes aside."""
-    curves = [standings.curve(tables, "episodes") for tables in runs.values()]
+def picture(tables: statistics.Tables, figures: statistics.RaceStatistics) -> xr.Dataset:
+    """Return what `landscapes.draw.figures.race` draws of a race, its attributes aside."""
+    curves = list(figures.curves["episodes"].values())
     steps = max(len(curve.cost) for curve in curves)
     padded = {
         key: [np.pad(getattr(curve, name), (0, steps - len(curve.cost)), constant_values=np.nan) for curve in curves]
         for key, name in (("episodes", "cost"), ("mean", "mean"), ("low", "low"), ("high", "high"))
     }
-    hits = [standings.hits(tables, goals).ravel() for tables in runs.values()]
-    missing = [int(np.isnan(losses).sum()) for losses in standings.final_losses(runs)]
+    hits = [statistics.hits(runs, figures.targets).ravel() for runs in tables.values()]
+    missing = [int(np.isnan(losses).sum()) for losses in statistics.final_losses(tables)]
     return xr.Dataset(
         {
             **{key: (("method", "step"), np.stack(values)) for key, values in padded.items()},
             "hit": (("method", "pair"), np.stack(hits)),
             "unsuccessful": ("method", missing),
         },
-        {"method": list(runs)},
+        {"method": list(tables)},
     )
 
 
-def judged(env: str, runs: standings.Tables, goals: standings.Targets) -> dict[str, Any]:
-    """Return all figures of a race, the paper's claims about its environment included."""
-    differences = standings.differences(runs)
-    found = findings(env, differences)
-    return {
-        "ranks": [asdict(rank) for rank in standings.ranks(runs)],
-        "differences": [asdict(one) | {"better": one.better} for one in differences],
-        "claims": [
-            asdict(one.claim) | {"claim": str(one.claim), "verdict": one.verdict, "difference": _record(one.difference)}
-            for one in found
-        ],
-        "silence": None if found else silence(env),
-        "targets": {"loss": goals.loss.tolist(), "spacing": goals.spacing, "easiest": goals.easiest},
-        "ecdf": {method: _shares(standings.hits(tables, goals)) for method, tables in runs.items()},
-        "curves": {
-            cost: {
-                method: {key: values.tolist() for key, values in vars(standings.curve(tables, cost)).items()}
-                for method, tables in runs.items()
-            }
-            for cost in standings.COSTS
-        },
-    }
-
-
-def _record(difference: standings.Difference | None) -> dict[str, Any] | None:
-    return None if difference is None else asdict(difference)
-
-
-def _shares(hits: standings.Array) -> dict[str, list[float]]:
-    """Return the ECDF as the episodes at which it steps and its values from there on."""
-    reached = np.sort(hits[np.isfinite(hits)])
-    return {"episodes": reached.tolist(), "share": (np.arange(1, len(reached) + 1) / hits.size).tolist()}
+def name_seeds(count: int) -> str:
+    """Return a number of seeds in words."""
+    return f"{count} seed{'s' if count > 1 else ''}"

@@ -1,17 +1,33 @@
-"""Find optimisers by name; import them only when one is made."""
+"""Find optimisers by name; import them only when one is made.
+
+Another package registers its own by an entry point of the group `gradscape.optimizers`:
+
+    [project.entry-points."gradscape.optimizers"]
+    my-search = "my_package.search:MySearch"
+
+The class derives from `gradscape.optim.base.Optimizer`, and its `name` is that of the entry point.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import inspect
 import sys
 from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import cache
 from importlib import import_module
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..landscapes.code import bare
+
 if TYPE_CHECKING:
     from .base import Optimizer
+
+GROUP = "gradscape.optimizers"
+NO_NUMBERS = frozenset({"memory"})  # functions of a method that no point depends on
 
 
 @dataclass(frozen=True)
@@ -24,47 +40,96 @@ class Method:
     extra: str = ""
 
 
+def _own(name: str, target: str, summary: str, extra: str = "") -> Method:
+    return Method(name, f"gradscape.optim.methods.{target}", summary, extra)
+
+
 BUILTIN = (
-    Method("random", "random:RandomSearch", "points drawn uniformly from the box"),
-    Method("cma-es", "cmaes:CMAES", "covariance matrix adaptation, restarted when it has converged"),
-    Method("descents", "descent:Descents", "gradient descents from random starts"),
-    Method("bo", "bayes:BO", "Bayesian optimisation: the lower confidence bound of a Gaussian process"),
-    Method("bo-descents", "bayes:BODescents", "Bayesian optimisation proposes, gradient descent refines"),
-    Method("bo-leap", "bo_leap:BOLeap", "BO-Leap: Bayesian optimisation, then leaps of populations and descents"),
-    Method("ppo", "policy:PPO", "proximal policy optimisation of a neural policy", "rl"),
-    Method("sac", "policy:SAC", "soft actor-critic for a neural policy", "rl"),
+    _own("random", "random:RandomSearch", "points drawn uniformly from the box"),
+    _own("cma-es", "cmaes:CMAES", "covariance matrix adaptation, restarted when it has converged"),
+    _own("descents", "descent:Descents", "gradient descents from random starts"),
+    _own("bo", "bayes:BO", "Bayesian optimisation: the lower confidence bound of a Gaussian process"),
+    _own("bo-descents", "bayes:BODescents", "Bayesian optimisation proposes, gradient descent refines"),
+    _own("bo-leap", "bo_leap:BOLeap", "BO-Leap: Bayesian optimisation, then leaps of populations and descents"),
+    _own("ppo", "policy:PPO", "proximal policy optimisation of a neural policy", "rl"),
+    _own("sac", "policy:SAC", "soft actor-critic for a neural policy", "rl"),
 )
-METHODS = {method.name: method for method in BUILTIN}
 
 
-def optimizer_class(name: str) -> type[Optimizer]:
-    """Import and return the class of a method."""
-    if name not in METHODS:
-        close = get_close_matches(name, METHODS, n=1)
-        hint = f"; did you mean {close[0]}?" if close else ";"
-        raise ValueError(f"no method is called {name!r}{hint} there are {', '.join(METHODS)}")
-    method = METHODS[name]
-    module, _, attribute = method.target.partition(":")
-    try:
-        found: type[Optimizer] = getattr(import_module(f".{module}", __package__), attribute)
-    except ImportError as error:
-        if not method.extra:
-            raise
-        raise ValueError(
-            f"{name} needs the extra {method.extra}: pip install '.[{method.extra}]' in gradscape's sources ({error})"
-        ) from error
+@cache
+def methods() -> dict[str, Method]:
+    """Return every registered optimiser by name, ours before other packages'.
+
+    Raises ValueError where two have the same name.
+    """
+    found = {method.name: method for method in BUILTIN}
+    for point in entry_points(group=GROUP):
+        if point.name in found:
+            raise ValueError(
+                f"two methods are called {point.name!r}: {found[point.name].target} and {point.value}; "
+                "uninstall one of the packages or rename its entry point"
+            )
+        package = point.dist.name if point.dist else "another package"
+        found[point.name] = Method(point.name, point.value, f"registered by {package}")
     return found
 
 
+def find_method(name: str) -> Method:
+    """Return what is registered under a name. Raises ValueError, with the names there are, where nothing is."""
+    known = methods()
+    if name not in known:
+        close = get_close_matches(name, known, n=1)
+        hint = f"; did you mean {close[0]}?" if close else ";"
+        raise ValueError(f"no method is called {name!r}{hint} there are {', '.join(known)}")
+    return known[name]
+
+
+def optimizer_class(name: str) -> type[Optimizer]:
+    """Import and return the class of a method.
+
+    Raises ValueError where no method has the name, where its extra is not installed, and where another package's entry
+    point leads nowhere or to an optimiser of another name.
+    """
+    method = find_method(name)
+    module, _, attribute = method.target.rpartition(":")
+    try:
+        kind: type[Optimizer] = getattr(import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        if method.extra:
+            install = f"pip install '.[{method.extra}]' in gradscape's sources"
+            raise ValueError(f"{name} needs the extra {method.extra}: {install} ({error})") from error
+        if method in BUILTIN:
+            raise
+        raise ValueError(f"{name} is registered as {method.target}, which cannot be imported: {error}") from error
+    if getattr(kind, "name", None) != name:
+        raise ValueError(
+            f"{name} is registered as {method.target}, whose name is {getattr(kind, 'name', None)!r}; "
+            "give entry point and class the same name"
+        )
+    return kind
+
+
 def code_digest(kind: type[Optimizer]) -> str:
-    """Return a digest of the code a method's points come from: its module, and those of this folder it draws on."""
+    """Return a digest of the code a method's points come from: its modules, and those of this folder they draw on.
+
+    It is taken without comments, docstrings and imports, which no point depends on.
+    """
+    own = {one.__module__ for one in kind.__mro__} - {"builtins", "abc"}
     found: set[str] = set()
-    left = [kind.__module__]
+    left = list(own)
     while left:
         name = left.pop()
-        if name not in found:
+        if name not in found and (name in own or name.startswith(f"{__package__}.")):
             found.add(name)
-            used = {getattr(value, "__module__", None) or "" for value in vars(sys.modules[name]).values()}
-            left += [other for other in used if other.startswith(f"{__package__}.")]
-    files = sorted(Path(str(sys.modules[name].__file__)) for name in found)
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
+            left += [getattr(value, "__module__", None) or "" for value in vars(sys.modules[name]).values()]
+    files = sorted(file for name in found if (file := _file_of(name)))
+    texts = [bare(file, NO_NUMBERS) for file in files] or [repr(kind)]
+    return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:12]
+
+
+def _file_of(module: str) -> Path | None:
+    """Return the file of a module, None for one of a notebook."""
+    try:
+        return Path(inspect.getfile(sys.modules[module])).resolve()
+    except (OSError, TypeError):
+        return None

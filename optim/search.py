@@ -8,19 +8,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from ..landscapes.cost import episode_cost
 from ..landscapes.identity import StoreError
-from ..landscapes.objective import Objective, evaluated, name_of
-from ..landscapes.space import whole
+from ..landscapes.objective import Objective, evaluate, name_of
+from ..landscapes.space import as_whole
 from .base import Optimizer
 from .registry import optimizer_class
-from .run import Run
-
-MOMENT = 0.5  # seconds to spend on measuring what an episode costs
-LONG = 5.0  # seconds from which the first, which warms things up, must do
+from .runs.store import RunStore
 
 
 @dataclass(frozen=True)
-class Progress:
+class SearchProgress:
     """Say how far a run is: `done` of `total` episodes, `resumed` of them before; `best` is NaN before a success."""
 
     done: int
@@ -33,31 +31,34 @@ class Progress:
 def search(
     objective: Objective,
     method: Optimizer | str,
-    run: Run | None = None,
+    run: RunStore | None = None,
     *,
     budget: int,
     gradient_cost: float | None = None,
-    progress: Callable[[Progress], None] | None = None,
-) -> Run:
+    progress: Callable[[SearchProgress], None] | None = None,
+) -> RunStore:
     """Let a method evaluate `budget` episodes, not one more, and return the run; what it holds already is not repeated.
 
     A method is an optimiser or the name of one, made with the run's seed. Without a run one is made in memory. Stop it
     at any instant: the same call goes on, and the rows are those of an uninterrupted one but for their `seconds`, given
     an objective whose rows do not depend on their batch. A proposal that does not fit into the budget is cut short.
     `gradient_cost` is what an episode with gradient costs in episodes without; it is measured if not given.
+
+    Raises ValueError for a budget, a method or a gradient cost that cannot be, and StoreError where the run on disk
+    cannot be gone on from.
     """
-    budget = whole(budget, "a budget", least=1)
+    budget = as_whole(budget, "a budget", least=1)
     if gradient_cost is not None and not 0 < gradient_cost < math.inf:
         raise ValueError(f"search takes a gradient_cost above 0 and finite; got {gradient_cost}")
     if run is None:
         run = _in_memory(objective, method, budget)
-    with run.filling():
-        optimizer = _begun(objective, method, run, gradient_cost) if run.count < budget else None
+    with run.lock():
+        optimizer = _begin(objective, method, run, gradient_cost) if run.count < budget else None
         resumed = run.count
 
         def report() -> None:
             if progress is not None:
-                progress(Progress(run.count, budget, resumed, run.failed, run.best))
+                progress(SearchProgress(run.count, budget, resumed, run.failed, run.best_loss))
 
         report()
         if optimizer is not None:
@@ -66,24 +67,24 @@ def search(
     return run
 
 
-def _in_memory(objective: Objective, method: Optimizer | str, budget: int) -> Run:
+def _in_memory(objective: Objective, method: Optimizer | str, budget: int) -> RunStore:
     name, seed = (method, 0) if isinstance(method, str) else (method.name, method.seed)
     identity = {"objective": name_of(objective), "method": name, "seed": seed}
-    return Run.in_memory(objective.space, identity=identity, budget=budget)
+    return RunStore.in_memory(objective.space, identity=identity, budget=budget)
 
 
-def _fill(objective: Objective, optimizer: Optimizer, run: Run, budget: int, report: Callable[[], None]) -> None:
+def _fill(objective: Objective, optimizer: Optimizer, run: RunStore, budget: int, report: Callable[[], None]) -> None:
     mark = time.perf_counter()
     complete, largest = True, 0
     while run.count < budget:
         if budget - run.count < largest:  # the next proposal may be cut short, and is proposed again by who goes on
-            run.hold(optimizer.state)
+            run.stage(optimizer.state)
         proposal = optimizer.ask()
         _check(optimizer, len(proposal.x), grad=proposal.grad)
         largest = max(largest, len(proposal.x))
         x = proposal.x[: budget - run.count]
         complete = len(x) == len(proposal.x)
-        evaluation = evaluated(objective, x, grad=proposal.grad)
+        evaluation = evaluate(objective, x, grad=proposal.grad)
         seconds, mark = time.perf_counter() - mark, time.perf_counter()
         if complete:
             optimizer.tell(x, evaluation)
@@ -92,11 +93,11 @@ def _fill(objective: Objective, optimizer: Optimizer, run: Run, budget: int, rep
     run.save(optimizer.state if complete else None)
 
 
-def _begun(objective: Objective, method: Optimizer | str, run: Run, gradient_cost: float | None) -> Optimizer:
+def _begin(objective: Objective, method: Optimizer | str, run: RunStore, gradient_cost: float | None) -> Optimizer:
     """Return the optimiser that the run goes on with, the one it kept or a new one, and take the run back to it."""
     state = run.state()
     if state is not None:
-        optimizer = _restored(objective, method, run, state)
+        optimizer = _restore_optimizer(objective, method, run, state)
     else:
         seed = int(run.attributes["seed"])
         optimizer = optimizer_class(method).on(objective, seed=seed) if isinstance(method, str) else method
@@ -106,11 +107,13 @@ def _begun(objective: Objective, method: Optimizer | str, run: Run, gradient_cos
         run.save(optimizer.state)  # what to go back to
     getattr(objective, "prepare", lambda: None)()
     if optimizer.needs_grad and run.gradient_cost is None:
-        run.begin(gradient_cost=gradient_cost or episode_cost(objective).ratio)
+        run.set_gradient_cost(gradient_cost or episode_cost(objective).ratio)
     return optimizer
 
 
-def _restored(objective: Objective, method: Optimizer | str, run: Run, state: dict[str, Any]) -> Optimizer:
+def _restore_optimizer(
+    objective: Objective, method: Optimizer | str, run: RunStore, state: dict[str, Any]
+) -> Optimizer:
     """Return the optimiser that a run kept, of the class of `method`."""
     kind = optimizer_class(method) if isinstance(method, str) else type(method)
     if state.get("method") != kind.name:
@@ -118,7 +121,7 @@ def _restored(objective: Objective, method: Optimizer | str, run: Run, state: di
             f"{run.path} holds a run of {state.get('method')}, not of {kind.name}; give each a run of its own"
         )
     try:
-        return kind.restored(objective, state)
+        return kind.from_state(objective, state)
     except Exception as error:  # whatever the method stumbles upon
         raise StoreError(
             f"{run.path} keeps no state of {kind.name} that can be gone on from ({type(error).__name__}: {error}); "
@@ -131,31 +134,3 @@ def _check(optimizer: Optimizer, count: int, *, grad: bool) -> None:
         raise ValueError(f"{optimizer.name} proposed no point; a proposal holds at least one")
     if grad and not optimizer.needs_grad:
         raise ValueError(f"{optimizer.name} asks for gradients, so its class must say needs_grad = True")
-
-
-@dataclass(frozen=True)
-class Cost:
-    """Say what an episode costs [s], alone, without gradient and with it; the latter NaN where it was not measured."""
-
-    forward: float
-    gradient: float
-
-    @property
-    def ratio(self) -> float:
-        """What an episode with gradient costs, in episodes without."""
-        return self.gradient / self.forward
-
-
-def episode_cost(objective: Objective, *, grad: bool = True) -> Cost:
-    """Measure one random episode, without and with gradient in turn: the best of those that fit into a moment."""
-    getattr(objective, "prepare", lambda: None)()
-    x = objective.space.uniform(1, seed=0)
-    best = {False: float("inf"), True: float("inf") if grad else float("nan")}
-    began, rounds = time.perf_counter(), 0
-    while time.perf_counter() - began < (MOMENT if rounds > 1 else LONG):
-        for way in (False, True) if grad else (False,):
-            start = time.perf_counter()
-            objective.evaluate(x, grad=way)
-            best[way] = min(best[way], time.perf_counter() - start)
-        rounds += 1
-    return Cost(best[False], best[True])

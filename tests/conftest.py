@@ -62,9 +62,8 @@ def run(blank: None, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.Mon
 
     What a job takes is foretold by one episode or two and no more.
     """
-    monkeypatch.setattr("gradscape.optim.search.MOMENT", 0.0)
-    for name in ("PATIENCE", "FIRST_PATIENCE"):
-        monkeypatch.setattr(f"gradscape.landscapes.job.{name}", 0.0)
+    for name in ("MOMENT", "ENOUGH", "WARM_UP"):
+        monkeypatch.setattr(f"gradscape.landscapes.cost.{name}", 0.0)
 
     def command(*arguments: str, cwd: Path, width: int = 160) -> Said:
         monkeypatch.chdir(cwd)
@@ -81,7 +80,7 @@ def run(blank: None, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.Mon
 @pytest.fixture
 def rerun() -> Callable[..., int]:
     """Run rerun's own program, which asks nobody outside, and return its exit code."""
-    from gradscape.landscapes.draw import viewer
+    from gradscape.landscapes.draw.recordings import viewer
 
     spec = find_spec("rerun_cli")
     assert spec is not None

@@ -21,8 +21,9 @@ from benchmarks.forked import FORK, LOADED
 from benchmarks.results import leave_blank
 
 from gradscape.cli import main
-from gradscape.landscapes import job
-from gradscape.optim import run, search
+from gradscape.jobs import slice as job
+from gradscape.landscapes import cost
+from gradscape.optim.runs import store
 
 from .command import Said
 
@@ -83,8 +84,8 @@ def _work(work: Callable[[], object], folder: Path, said: Path, changes: Any, st
                 if number == stop.number:
                     os.kill(os.getpid(), stop.by)
 
-    run.PAUSE, run.SHARE, search.MOMENT = 0.0, math.inf, 0.0  # writes after every proposal, times two episodes
-    job.PAUSE, job.PATIENCE, job.FIRST_PATIENCE = math.inf, 0.0, 0.0  # draws no coarse picture
+    store.PAUSE, store.SHARE, cost.MOMENT = 0.0, math.inf, 0.0  # writes after every proposal, times two episodes
+    job.PAUSE, cost.ENOUGH, cost.WARM_UP = math.inf, 0.0, 0.0  # draws no coarse picture
     zarr.config.set({"threading.max_workers": 1})  # so that its threads never take turns
     leave_blank(setattr)
     sys.addaudithook(watch)

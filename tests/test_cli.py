@@ -36,21 +36,6 @@ def test_a_word_too_few_or_too_many_says_where_to_read_on(run: Callable[..., Sai
     assert "(`landscape --help` says what it takes)" in run("plot", cwd=tmp_path).stderr
 
 
-def test_envs_lists_every_environment_with_units(
-    run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
-    said = run("envs", cwd=tmp_path).stdout
-    for shown in ("bounce", "initial velocity x, y, z [m/s]", "fluid", "draft, standard, reference", "branin"):
-        assert shown in said
-
-
-def test_envs_shows_one_in_full(run: Callable[..., Said], tmp_path: Path) -> None:
-    said = run("envs", "fluid", cwd=tmp_path).stdout
-    for shown in ("ladle x speed, segment 1", "goal=high|printed", "scoop", "reference", "m/s", "y - 0.2"):
-        assert shown in said
-
-
 @pytest.mark.drawn
 def test_slice_leaves_store_picture_and_summary(run: Callable[..., Said], tmp_path: Path) -> None:
     done = run("slice", "branin", "--dims", "x0", "1", "--resolution", "9", "--json", "--out", "cut", cwd=tmp_path)
@@ -60,7 +45,7 @@ def test_slice_leaves_store_picture_and_summary(run: Callable[..., Said], tmp_pa
     assert summary["env"] == "branin"
     assert summary["dims"] == ["x0", "x1"]
     assert summary["episodes"] == summary["status"]["ok"] == 81
-    dataset = gradscape.open_slice(tmp_path / "cut/slice.zarr")
+    dataset = gradscape.open_slice(tmp_path / "cut/slice.zarr").data
     assert dataset["grad"].shape == (9, 9, 2)
     assert summary["loss"]["lowest"] == float(dataset["loss"].min())
     assert (tmp_path / "cut/landscape.png").read_bytes().startswith(b"\x89PNG")
@@ -70,7 +55,7 @@ def test_slice_leaves_store_picture_and_summary(run: Callable[..., Said], tmp_pa
 def test_slice_says_where_the_gradient_is_exactly_zero(run: Callable[..., Said], tmp_path: Path) -> None:
     done = run("slice", "pinball-2", "--dims", "0", "1", "--resolution", "9", "--json", "--out", "cut", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    dataset = gradscape.open_slice(tmp_path / "cut/slice.zarr")
+    dataset = gradscape.open_slice(tmp_path / "cut/slice.zarr").data
     flat = int((dataset["grad"] == 0).all("dim").sum())
     assert json.loads(done.stdout)["flat"] == flat
     assert 0 < flat < 81
@@ -158,7 +143,7 @@ def test_a_slice_goes_through_the_point_in_a_file(
     (tmp_path / name).write_text(text)
     arguments = ["--through", name, "--extent", "0.1", "--resolution", "3", "--out", "cut", "--no-gradients"]
     assert run("slice", "branin", "--dims", "0", "1", *arguments, cwd=tmp_path).returncode == 0
-    dataset = gradscape.open_slice(tmp_path / "cut/slice.zarr")
+    dataset = gradscape.open_slice(tmp_path / "cut/slice.zarr").data
     assert "grad" not in dataset
     assert (float(dataset["u"][1]), float(dataset["v"][1])) == (1.5, 2.5)
 
@@ -230,7 +215,7 @@ def test_sigkill_costs_nothing_but_the_tiles_under_way(run: Callable[..., Said],
     resumed = json.loads(run(*LONG, cwd=tmp_path / "killed").stdout)
     assert 0 < resumed["resumed"] < SIDE**2
     assert resumed["episodes"] + resumed["resumed"] == SIDE**2
-    one, two = (gradscape.open_slice(tmp_path / name / "cut/slice.zarr") for name in ("whole", "killed"))
+    one, two = (gradscape.open_slice(tmp_path / name / "cut/slice.zarr").data for name in ("whole", "killed"))
     for name in ("loss", "grad", "status"):
         np.testing.assert_array_equal(one[name], two[name])
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from gradscape import tolerance
-from gradscape.landscapes import tradeoff
+from gradscape.jobs import tolerance
+from gradscape.landscapes.measures import fidelity as tradeoff
 
 from .command import Said
 
@@ -18,7 +18,7 @@ MADE = {  # by folder: the verb that leaves it, then those that read it
     "race": ["race branin --methods random --seeds 1 --budget 4 --out race"],
     "told": ["report cut --points 2 --out told"],
     "pairs": ["pairs branin --samples 2 --out pairs"],
-    "trade": ["tradeoff bounce --set horizon=0.05 --points 2 --ladder precision --device cpu --out trade"],
+    "trade": ["tradeoff bounce --set horizon=0.05 --points 2 --variants precision --device cpu --out trade"],
     "user": ["slice bounce --set horizon=0.05 --dims 0 1 --resolution 2 --tolerance 50% --device cpu --out chosen"],
 }
 DAMAGES = ("", "[]", "{}", '{"attributes": 3', "cut")
@@ -41,7 +41,7 @@ READ_ALIKE = {
 def desk(run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of each kind of result, made by the verbs themselves."""
     monkeypatch.setattr(tolerance, "user_data_path", lambda name: tmp_path / "user" / name)
-    for name in ("TIMING", "PATIENCE"):
+    for name in ("REPETITION", "LARGEST"):
         monkeypatch.setattr(tradeoff, name, 0.002)
     monkeypatch.setattr(tradeoff, "RESAMPLES", 9)
     for verb, *_ in MADE.values():

@@ -37,7 +37,7 @@ class TwoLinkArm(gs.Environment):
         loss = self.options.stiffness * (x[:, 0] ** 2 + (x[:, 1] - 1) ** 2) + x[:, 2]
         slope = torch.stack([2 * x[:, 0], 2 * (x[:, 1] - 1), torch.ones(len(x))], dim=1)
         slope[:, :2] *= self.options.stiffness
-        return gs.Evaluation.judged(loss, slope if grad else None)
+        return gs.Evaluation.from_results(loss, slope if grad else None)
 
 class Arm(TwoLinkArm):
     """An arm.
@@ -70,7 +70,7 @@ def folder(tmp_path: Path) -> Path:
 def test_a_class_in_a_file_is_sliced_measured_searched_and_shown(run: Callable[..., Said], folder: Path) -> None:
     cut = run("slice", "arm.py:TwoLinkArm", "--dims", "elbow", "0", "--resolution", "9", "--out", "cut", cwd=folder)
     assert cut.returncode == 0, cut.stderr
-    dataset = gs.open_slice(folder / "cut")
+    dataset = gs.open_slice(folder / "cut").data
     assert stored_identity(dataset)["objective"] == "two-link-arm"
     assert dataset["loss"].attrs["units"] == "J"
     found = run("optimize", "arm.py:TwoLinkArm", "--method", "descents", "--budget", "9", "--out", "run", cwd=folder)
@@ -116,7 +116,7 @@ def test_a_line_has_one_dimension(run: Callable[..., Said], folder: Path, words:
     done = run(*command, "--resolution", "5", "--out", "line", "--json", cwd=folder)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["dims"] == ["elbow"]
-    line = gs.open_slice(folder / "line")
+    line = gs.open_slice(folder / "line").data
     np.testing.assert_allclose(line["loss"], (line["u"] - 1) ** 2 + 0.5)
     assert (folder / "line/landscape.png").exists()
     again = run(*command, "--resolution", "5", "--out", "line", cwd=folder)
@@ -130,7 +130,7 @@ def test_a_line_has_one_dimension(run: Callable[..., Said], folder: Path, words:
         ("arm.py:NOTHING", "arm.py holds no environment NOTHING"),
         ("leg.py:Leg", "there is no file leg.py"),
         ("broken.py:Arm", "broken.py cannot be imported: ZeroDivisionError"),
-        ("fluid.py:Mine", "fluid.py:Mine is called 'fluid', and so is gradscape.envs.fluid:Fluid"),
+        ("fluid.py:Mine", "fluid.py:Mine is called 'fluid', and so is gradscape.envs.mpm.fluid:Fluid"),
     ],
 )
 def test_a_file_without_the_class_is_refused_by_name(
@@ -151,7 +151,7 @@ class Spring(gs.Environment):
     space = gs.ParameterSpace({"pull": (0, 1, "m")})
 
     def _evaluate(self, x, *, grad):  # type: ignore[no-untyped-def]
-        return gs.Evaluation.judged(x[:, 0] ** 2, 2 * x if grad else None)
+        return gs.Evaluation.from_results(x[:, 0] ** 2, 2 * x if grad else None)
 
 
 def test_a_program_registers_a_class_and_the_command_finds_it(run: Callable[..., Said], tmp_path: Path) -> None:
@@ -176,10 +176,13 @@ def short_of(**what: object) -> gs.Environment:
 @pytest.mark.parametrize(
     ("what", "said"),
     [
-        ({"_evaluate": lambda self, x, *, grad: x[:, 0]}, "must return an Evaluation; got Tensor. Evaluation.judged"),
+        (
+            {"_evaluate": lambda self, x, *, grad: x[:, 0]},
+            "must return an Evaluation; got Tensor. Evaluation.from_results",
+        ),
         ({"_evaluate": lambda self, x, *, grad: None}, "must return an Evaluation; got NoneType"),
         (
-            {"_evaluate": lambda self, x, *, grad: gs.Evaluation.judged(x[:, 0], None)},
+            {"_evaluate": lambda self, x, *, grad: gs.Evaluation.from_results(x[:, 0], None)},
             r"was asked for gradients \(grad=True\) and returned none",
         ),
         ({"space": None}, "needs its parameters: give the class a ParameterSpace as `space`"),
@@ -197,7 +200,7 @@ def test_what_is_sampled_of_an_environment_keeps_its_unit_fidelity_and_options(t
     assert (identity["objective"], identity["fidelity"], identity["options"]["ke"]) == ("bounce", "draft", 2e4)
     assert dataset["loss"].attrs["units"] == "m²"
     dataset.to_zarr(tmp_path / "mine.zarr", consolidated=False)
-    again = gs.open_slice(tmp_path / "mine.zarr")
+    again = gs.open_slice(tmp_path / "mine.zarr").data
     assert again.attrs == dataset.attrs
     np.testing.assert_array_equal(again["grad"], dataset["grad"])
     function = gs.from_torch(lambda x: x[:, 0], env.space, name="first", loss_unit="m")

@@ -10,7 +10,7 @@ import pytest
 import typer
 
 from gradscape.cli import app
-from gradscape.landscapes import tradeoff
+from gradscape.landscapes.measures import fidelity as tradeoff
 
 from .command import Said
 
@@ -30,12 +30,12 @@ WRITING = {  # the command, the file for which there is no room any more, what i
         "race branin --methods random --seeds 1 --budget 4 --out made", "race.json", "4 of 4 episodes are kept in made"
     ),
     "tradeoff": (
-        "tradeoff bounce --set horizon=0.05 --points 2 --ladder precision --device cpu --out made", "tradeoff.json",
-        "rungs are kept in made",
+        "tradeoff bounce --set horizon=0.05 --points 2 --variants precision --device cpu --out made", "tradeoff.json",
+        "variants are kept in made",
     ),
     "pairs": ("pairs branin --samples 2 --out made", "pairs.json", "2 batches are kept in made"),
     "report": ("report cut --points 2 --out made", "report.json", "0 of 1 reports are kept in"),
-    "overlay": ("overlay cut run --out made", "overlay.png", ANEW),
+    "overlay": ("overlay cut run --out made", "overlay.png", "each file in made is whole"),
     "surface": ("surface cut --out made", "surface.png", ANEW),
     "replay": ("replay bounce --no-film --out made", "episode.json", ANEW),
     "export": ("export cut --out made.csv", "made.csv", ANEW),
@@ -56,8 +56,8 @@ def test_every_verb_that_writes_is_tried() -> None:
 def test_a_full_disk_says_what_is_kept_and_the_same_command_goes_on(
     run: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, verb: str
 ) -> None:
-    monkeypatch.setattr("gradscape.tolerance.user_data_path", lambda name: tmp_path / "data" / name)
-    for name in ("TIMING", "PATIENCE"):
+    monkeypatch.setattr("gradscape.jobs.tolerance.user_data_path", lambda name: tmp_path / "data" / name)
+    for name in ("REPETITION", "LARGEST"):
         monkeypatch.setattr(tradeoff, name, 0.002)
     monkeypatch.setattr(tradeoff, "RESAMPLES", 9)
     command, last, kept = WRITING[verb]

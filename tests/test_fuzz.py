@@ -17,10 +17,10 @@ from benchmarks import commands, full_disks, results
 from benchmarks.damage import BAD, Trial, damage, files
 from benchmarks.forked import Limits, last_words
 
-from gradscape import ParameterSpace, Plane, from_torch, open_run, open_slice, sample
-from gradscape.landscapes.store import SliceStore
-from gradscape.optim.random import RandomSearch
-from gradscape.optim.run import Run
+from gradscape import ParameterSpace, Plane, from_torch, open_run, sample
+from gradscape.landscapes.storage.store import SliceStore, open_slice
+from gradscape.optim.methods.random import RandomSearch
+from gradscape.optim.runs.store import RunStore
 from gradscape.optim.search import search
 
 from . import processes  # noqa: F401 -- which says what processes are forked from
@@ -63,12 +63,12 @@ def made_tiles(path: Path) -> None:
 
 
 def made_run(path: Path) -> None:
-    run = Run.create(path, SPACE, identity={"objective": "sines"}, budget=80)
+    run = RunStore.create(path, SPACE, identity={"objective": "sines"}, budget=80)
     search(SINES, RandomSearch.on(SINES, seed=0), run, budget=70)
 
 
 STORES = {"tiles": made_tiles, "finished": made_slice, "run": made_run}
-OPENED = {"tiles": open_slice, "finished": open_slice, "run": open_run}
+OPENED = {"tiles": open_slice, "finished": open_slice, "run": lambda path: open_run(path).data}
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gradscape.landscapes.bundle import open_bundle, save_bundle
+from gradscape.landscapes.storage.bundle import open_bundle, save_bundle
 
 from .command import Said
 
@@ -93,7 +93,7 @@ def test_a_report_is_printed_from_what_it_kept(run: Run, tmp_path: Path, monkeyp
     def compute(*_: object) -> None:
         raise AssertionError("it is measured again")
 
-    monkeypatch.setattr("gradscape.measure_report._character", compute)
+    monkeypatch.setattr("gradscape.jobs.report.measure", compute)
     again = run(*command, "--print", "85", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     assert (tmp_path / "told" / name).read_bytes() == before

@@ -25,16 +25,16 @@ import torch
 from distributed.comm import connect
 from distributed.security import Security
 
-from gradscape.cluster import recipe, workers
 from gradscape.envs.registry import make
+from gradscape.jobs.slice import STORE
+from gradscape.jobs.workers import recipe, workers
 from gradscape.landscapes.adapters import from_torch
-from gradscape.landscapes.job import STORE
 from gradscape.landscapes.plane import Plane
-from gradscape.landscapes.sampling import sample
+from gradscape.landscapes.sampling.distribution import WorkersLostError
+from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.landscapes.spread import WorkersLostError
-from gradscape.landscapes.store import SliceStore, open_slice
-from gradscape.optim.run import Run
+from gradscape.landscapes.storage.store import SliceStore, open_slice
+from gradscape.optim.runs.store import RunStore
 
 from .sockets import beyond_loopback, listening
 
@@ -57,7 +57,7 @@ def machine():
 def executor(machine):
     """Give two workers, where another cluster has Dask's usual port."""
     with socket.socket() as usual, pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gradscape.cluster.ANSWER", PATIENCE)
+        patch.setattr("gradscape.jobs.workers.ANSWER", PATIENCE)
         with suppress(OSError):  # another cluster has it indeed
             usual.bind(("127.0.0.1", 8787))
             usual.listen()
@@ -212,7 +212,7 @@ def once(x: torch.Tensor, mark: Path) -> torch.Tensor:
 
 
 def test_a_scheduler_that_is_gone_ends_it_with_a_slice_to_go_on_with(tmp_path, mortal, monkeypatch, capsys):
-    monkeypatch.setattr("gradscape.cluster.ANSWER", PATIENCE)
+    monkeypatch.setattr("gradscape.jobs.workers.ANSWER", PATIENCE)
     address, scheduler = mortal
     store = store_at(tmp_path / "s.zarr")
 
@@ -249,7 +249,7 @@ def test_a_race_has_the_same_runs_whoever_searches(tmp_path, run, address):
     runs = sorted(path.relative_to(tmp_path / "alone") for path in (tmp_path / "alone").glob("*/run.zarr"))
     assert len(runs) == 4
     for path in runs:
-        one, other = (Run.open(tmp_path / where / path).table() for where in ("alone", "spread"))
+        one, other = (RunStore.open(tmp_path / where / path).dataset() for where in ("alone", "spread"))
         np.testing.assert_array_equal(one["x"], other["x"])
         np.testing.assert_array_equal(one["loss"], other["loss"])
 
@@ -269,7 +269,7 @@ def test_a_number_of_workers_that_is_none_is_refused(tmp_path, run, wrong):
 
 
 def test_what_listens_at_an_address_and_is_no_scheduler_is_not_waited_for(tmp_path, run, monkeypatch):
-    monkeypatch.setattr("gradscape.cluster.ANSWER", 0.1)
+    monkeypatch.setattr("gradscape.jobs.workers.ANSWER", 0.1)
     with socket.create_server(("127.0.0.1", 0)) as mute:
         address = f"tcp://127.0.0.1:{mute.getsockname()[1]}"
         said = run("slice", "branin", "--dims", "0", "1", "--scheduler", address, cwd=tmp_path)
@@ -293,7 +293,7 @@ def test_an_address_of_tls_takes_certificates(tmp_path, run, named, said):
 
 
 def test_an_address_where_nothing_answers_and_a_missing_dask_are_said(tmp_path, run, monkeypatch):
-    monkeypatch.setattr("gradscape.cluster.ANSWER", 1.0)
+    monkeypatch.setattr("gradscape.jobs.workers.ANSWER", 1.0)
     how = ["slice", "bounce", "--dims", "0", "1", "--device", "cpu", "--scheduler", "tcp://127.0.0.1:9"]
     said = run(*how, cwd=tmp_path)
     assert said.returncode == 1

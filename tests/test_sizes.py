@@ -10,12 +10,12 @@ from typing import Any, get_args
 import pytest
 import typer
 
-from gradscape import planned
 from gradscape.cli import app
 from gradscape.envs.registry import make
+from gradscape.jobs import plan
 from gradscape.landscapes.capacity import TooLargeError
-from gradscape.optim.memory import NEEDS, Search, require_method
-from gradscape.optim.registry import METHODS, optimizer_class
+from gradscape.optim.memory import SearchSize, require_method
+from gradscape.optim.registry import methods, optimizer_class
 
 from .processes import Ended, alone, landscape
 
@@ -88,7 +88,7 @@ def test_a_plan_answers_at_any_size(desk: Path, said: list[str]) -> None:
 
 
 def small_rehearsal(*arguments: str) -> None:
-    planned.MOST_POINTS, planned.MOST_FRAMES = 8, planned.MORE
+    plan.MOST_POINTS, plan.MOST_FRAMES = 8, plan.MORE
     landscape(*arguments)
 
 
@@ -101,21 +101,21 @@ def test_a_dimension_that_cannot_be_is_refused(desk: Path, dim: str) -> None:
     ]
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", methods())
 def test_every_method_says_what_it_takes_and_is_refused_where_that_is_too_much(name: str) -> None:
     options = optimizer_class(name).Options()
-    require_method(name, options, Search(100, budget=1000))
+    require_method(optimizer_class(name), options, SearchSize(100, budget=1000))
     with pytest.raises(TooLargeError, match=f"{name}: number of parameters 1000000000000"):
-        require_method(name, options, Search(10**12))
+        require_method(optimizer_class(name), options, SearchSize(10**12))
 
 
 def huge_options() -> list[tuple[str, str]]:
     """Return the options of methods that are whole numbers and decide how much is held."""
-    found, search = [], Search(2, budget=10**9)
-    for name in METHODS:
+    found, search = [], SearchSize(2, budget=10**9)
+    for name in methods():
         known = asdict(optimizer_class(name).Options())
         more = [one for one, value in known.items() if type(value) is int]
-        found += [(name, one) for one in more if NEEDS[name]({**known, one: HUGE}, search) > 1e12]
+        found += [(name, one) for one in more if optimizer_class(name).memory({**known, one: HUGE}, search) > 1e12]
     return found
 
 
@@ -124,7 +124,7 @@ def test_an_option_that_takes_too_much_is_refused_by_name(name: str, option: str
     options = optimizer_class(name).Options()
     object.__setattr__(options, option, HUGE)  # whatever else it may be refused for
     with pytest.raises(TooLargeError, match=f"{name} option {option} {HUGE} takes .* would fit"):
-        require_method(name, options, Search(2, budget=10**9))
+        require_method(optimizer_class(name), options, SearchSize(2, budget=10**9))
 
 
 def test_a_method_is_refused_before_it_is_made(desk: Path) -> None:
@@ -144,7 +144,7 @@ def test_matrices_take_no_more_than_is_foretold(name: str, dim: int) -> None:
     optimizer.state()
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak < NEEDS[name](asdict(optimizer.options), Search(dim)) + 2e6
+    assert peak < kind.memory(asdict(optimizer.options), SearchSize(dim)) + 2e6
 
 
 def test_a_race_leaves_out_the_methods_that_do_not_fit(desk: Path) -> None:

@@ -15,9 +15,9 @@ import pytest
 import typer
 from benchmarks.results import leave_blank
 
-from gradscape import cluster
 from gradscape.cli import app, main
-from gradscape.landscapes.draw import viewer
+from gradscape.jobs import workers as cluster
+from gradscape.landscapes.draw.recordings import viewer
 
 from .processes import FORK
 from .sockets import beyond_loopback, listening
@@ -39,7 +39,7 @@ bounce --axis y --resolution 3 --fidelity draft --device cpu
 plan bounce --resolution 2 --fidelity draft --device cpu
 bench bounce --batch 2 --seconds 0 --fidelity draft --device cpu
 check branin --points 2
-tradeoff cartpole --points 2 --ladder precision --device cpu
+tradeoff cartpole --points 2 --variants precision --device cpu
 pairs bounce --samples 2 --fidelity draft --device cpu
 report cut --device cpu
 gallery compute --only bounce-y --part slices --resolution 4 --fidelity draft --device cpu --data data
@@ -124,8 +124,8 @@ def walk(folder: Path) -> None:
     os.environ |= {"DISPLAY": ":none", "XDG_DATA_HOME": str(folder)}
     patch = pytest.MonkeyPatch()
     leave_blank(patch.setattr)
-    for name, value in (("TIMING", 0.002), ("PATIENCE", 0.002), ("RESAMPLES", 9)):
-        patch.setattr(f"gradscape.landscapes.tradeoff.{name}", value)
+    for name, value in (("REPETITION", 0.002), ("LARGEST", 0.002), ("RESAMPLES", 9)):
+        patch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", value)
     patch.setattr(viewer, "_rerun", windowless)
     sys.addaudithook(watch)
     found = {}

@@ -18,4 +18,4 @@ class Throw(gs.Environment):
         x = x.clone().requires_grad_(grad)
         loss = (x[:, 1] ** 2 * torch.sin(2 * x[:, 0]) / 9.81 - 8.0) ** 2
         slope = torch.autograd.grad(loss.sum(), x)[0] if grad else None
-        return gs.Evaluation.judged(loss.detach(), slope)
+        return gs.Evaluation.from_results(loss.detach(), slope)

@@ -26,7 +26,7 @@ class Chain:
     @property
     def beta(self) -> tuple[float, ...]:
         """Static moment [kg m] of each rod about its joint, all that hangs from its end being put there."""
-        return tuple(self.lengths[i] * (self.masses[i] / 2 + self._carried(i)) for i in range(3))
+        return tuple(self.lengths[i] * (self.masses[i] / 2 + self._mass_below(i)) for i in range(3))
 
     @property
     def inertia(self) -> tuple[float, ...]:
@@ -36,9 +36,9 @@ class Chain:
     def _inertia(self, i: int, j: int) -> float:
         if i != j:
             return self.beta[max(i, j)] * self.lengths[min(i, j)]
-        return self.lengths[i] ** 2 * (self.masses[i] / 3 + self._carried(i))
+        return self.lengths[i] ** 2 * (self.masses[i] / 3 + self._mass_below(i))
 
-    def _carried(self, i: int) -> float:
+    def _mass_below(self, i: int) -> float:
         return sum(self.masses[i + 1 :])
 
 

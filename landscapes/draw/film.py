@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-from ..files import replacing
+from ..storage.files import replacing
 
 Picture = NDArray[np.uint8]
 
@@ -39,6 +39,8 @@ def save_film(
     """Write `count` pictures of one size as an MP4, and as a GIF with one palette, `rate` of them a second.
 
     `loss` is x264's constant rate factor: 18 looks as the pictures do, 28 takes about a third of the bytes.
+
+    Raises OSError where ffmpeg could not write them.
     """
     pictures = iter(pictures)
     first = next(pictures)

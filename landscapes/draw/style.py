@@ -1,4 +1,4 @@
-"""Colours, weights, type sizes and norms of every picture; nothing else sets style."""
+"""Colours, line weights, type sizes and colour norms of all pictures; no other module sets style."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ DPI, PRINT_DPI = 150, 600  # of a picture for a screen, and of what is pixels in
 INK, QUIET, FAINT = "#1a1a1a", "#5f5f5f", "#c9c9c9"
 UNSAMPLED = "#ececec"  # MISSING: nothing there yet
 BAND = ("#dfe6ee", "#f6f8fa")  # alternating event counts
-LINE = "#31688e"  # the loss over a line: viridis' blue
+LOSS_LINE = "#31688e"  # the loss over a line: viridis' blue
 SLOPE_LINE = "#b5367a"  # the gradient along it: magma's pink
 
 NIGHT, NIGHT_INK = "#16181b", "#ececec"  # ground and ink of the gallery's pages where they are dark
-BETWEEN = "#777777"  # as far from white as from black: lines and labels in a viewer, whose ground is light or dark
+MID_GREY = "#777777"  # as far from white as from black: lines and labels in a viewer, whose ground is light or dark
 BEYOND, LOST = "#9a7b00", "#c94f4f"  # points there that are outside the window, or failed
 
 LOSS_MAP: Colormap = colormaps["viridis"]
@@ -35,7 +35,7 @@ SLOPE_MAP_DARK: Colormap = ListedColormap(colormaps["magma"](np.linspace(0.42, 1
 
 FAILURES = {Status.NONFINITE: "not finite", Status.ESCAPED: "left the domain", Status.ERROR: "error"}
 _FAILED: dict[str, Any] = {"facecolor": "white", "edgecolor": QUIET, "linewidth": 0.0}
-LOOKS: dict[Status, dict[str, Any]] = {  # of every sample that is not OK
+STATUS_LOOKS: dict[Status, dict[str, Any]] = {  # of every sample that is not OK
     Status.MISSING: {"facecolor": UNSAMPLED, "linewidth": 0.0},
     Status.NONFINITE: _FAILED | {"hatch": "////"},
     Status.ESCAPED: _FAILED | {"hatch": "\\\\\\\\"},
@@ -45,11 +45,11 @@ LOOKS: dict[Status, dict[str, Any]] = {  # of every sample that is not OK
 ARROWS = 32  # most arrows per axis
 LONGEST_ARROW = 0.055  # as a fraction of a side
 ARROW: dict[str, Any] = {"width": 0.0032, "headwidth": 4.0, "headlength": 4.5, "headaxislength": 4.0, "minlength": 0.0}
-LOWEST: dict[str, Any] = {
+LOWEST_MARK: dict[str, Any] = {
     "marker": "*", "markersize": 12, "markeredgewidth": 1.0, "markerfacecolor": "white", "markeredgecolor": INK,
     "linestyle": "none",
 }  # fmt: skip
-FLAT: dict[str, Any] = {"marker": "o", "markersize": 2.6, "color": QUIET, "linestyle": "none"}
+FLAT_MARK: dict[str, Any] = {"marker": "o", "markersize": 2.6, "color": QUIET, "linestyle": "none"}
 
 # Okabe & Ito 2008, told apart without colour by line style and marker
 METHODS: dict[str, dict[str, Any]] = {
@@ -64,7 +64,7 @@ METHODS: dict[str, dict[str, Any]] = {
 }
 OTHER_METHOD: dict[str, Any] = {"color": INK, "linestyle": "solid", "marker": "h"}
 METHOD_LINE: dict[str, Any] = {"linewidth": 1.4, "markersize": 6.0, "markeredgewidth": 0.7, "markeredgecolor": "white"}
-KINDS: dict[str, dict[str, Any]] = {  # what a run evaluated a point for
+POINT_MARKS: dict[str, dict[str, Any]] = {  # what a run evaluated a point for
     "random": {"color": "#7f7f7f", "marker": "P"},
     "population": {"color": "#31688e", "marker": "o"},
     "descent": {"color": "#b5367a", "marker": "v"},
@@ -74,26 +74,27 @@ KINDS: dict[str, dict[str, Any]] = {  # what a run evaluated a point for
 METHOD_BAND: dict[str, Any] = {"alpha": 0.12, "linewidth": 0.0}
 OVERLAID: dict[str, Any] = {"linewidths": 0.6, "zorder": 3, "rasterized": True}  # the points of a run over a map
 HALO: dict[str, Any] = OVERLAID | {"linewidths": 1.5, "zorder": 2.9, "facecolors": "none", "edgecolors": "white"}
-NEAR, FAR = (4.0, 34.0), 0.2  # area of a point on the plane [pt^2], fewest of many; share of it left at the farthest
-TRAIL: dict[str, Any] = {"linewidths": 1.1, "zorder": 2.6, "capstyle": "round"}  # a descent
-ORDER: tuple[dict[str, Any], ...] = (  # what was the best so far, joined: white with a dark edge, for any ground
+MARK_AREAS = (4.0, 34.0)  # of points on the plane [pt^2]: of one among many, and of one among few
+FARTHEST_SHARE = 0.2  # of that area, at the farthest from the plane
+DESCENT_LINE: dict[str, Any] = {"linewidths": 1.1, "zorder": 2.6, "capstyle": "round"}  # a descent
+IMPROVEMENTS: tuple[dict[str, Any], ...] = (  # the line through them: white with a dark edge, for any ground
     {"color": INK, "alpha": 0.6, "linewidth": 2.2, "zorder": 2.75},
     {"color": "white", "linewidth": 1.0, "zorder": 2.8},
 )
 FAINTEST = 0.25  # opacity of a descent at the farthest
-BEST: dict[str, Any] = {"marker": "*", "s": 190.0, "linewidths": 1.1, "zorder": 5}
-BROKEN: dict[str, Any] = {"marker": "x", "s": 18.0, "linewidths": 0.9, "color": INK, "zorder": 3.5}  # a failed episode
+BEST_MARK: dict[str, Any] = {"marker": "*", "s": 190.0, "linewidths": 1.1, "zorder": 5}
+FAILED_MARK: dict[str, Any] = {"marker": "x", "s": 18.0, "linewidths": 0.9, "color": INK, "zorder": 3.5}
 BORDER: dict[str, Any] = {"s": 20.0, "facecolors": "none", "linewidths": 0.8, "zorder": 3.2, "clip_on": False}
 
 _MAP: dict[str, Any] = {"origin": "lower", "aspect": "auto", "interpolation": "nearest", "rasterized": True}
 COSINE: dict[str, Any] = _MAP | {"cmap": colormaps["RdBu"], "vmin": -1.0, "vmax": 1.0}  # of a gradient and a slope
-APART: dict[str, Any] = _MAP | {"cmap": colormaps["cividis"], "vmin": 0.0, "vmax": 1.0}  # of two estimates
-UNSEEN: dict[str, Any] = {"facecolor": "#dcdcdc", "linewidth": 0.0}  # no slope above the noise
-SURE: dict[str, Any] = {
+DISAGREEMENT: dict[str, Any] = _MAP | {"cmap": colormaps["cividis"], "vmin": 0.0, "vmax": 1.0}  # of two estimates
+NO_SLOPE: dict[str, Any] = {"facecolor": "#dcdcdc", "linewidth": 0.0}  # no slope above the noise
+BIASED: dict[str, Any] = {
     "marker": "D", "markersize": 5.0, "markerfacecolor": "white", "markeredgecolor": INK, "linestyle": "none"
 }  # fmt: skip
 
-LADDERS: dict[str, dict[str, Any]] = {  # what was turned to make a rung of a trade-off
+VARIANTS: dict[str, dict[str, Any]] = {  # which option was changed to make a variant
     "dt": {"color": "#0072b2", "marker": "o"},
     "resolution": {"color": "#009e73", "marker": "s"},
     "particles": {"color": "#e69f00", "marker": "^"},
@@ -103,19 +104,19 @@ LADDERS: dict[str, dict[str, Any]] = {  # what was turned to make a rung of a tr
     "device": {"color": "#7f7f7f", "marker": "X"},
     "named": {"color": INK, "marker": "*", "markersize": 13.0},
 }
-RUNG: dict[str, Any] = {
+VARIANT_MARK: dict[str, Any] = {
     "linestyle": "none", "markersize": 6.5, "markeredgewidth": 0.7, "markeredgecolor": "white", "zorder": 3
 }  # fmt: skip
-WHISKER: dict[str, Any] = {"color": FAINT, "linewidth": 1.0, "zorder": 1.5, "solid_capstyle": "butt"}
+INTERVAL_LINE: dict[str, Any] = {"color": FAINT, "linewidth": 1.0, "zorder": 1.5, "solid_capstyle": "butt"}
 FRONT: dict[str, Any] = {"color": QUIET, "linewidth": 1.2, "zorder": 2}
-AGAINST: dict[str, Any] = {"color": INK, "linewidth": 0.9, "linestyle": (0, (4, 2)), "zorder": 1}
-NAME: dict[str, Any] = {"color": INK, "zorder": 6, "path_effects": [withStroke(linewidth=2.0, foreground="white")]}
+REFERENCE_LINE: dict[str, Any] = {"color": INK, "linewidth": 0.9, "linestyle": (0, (4, 2)), "zorder": 1}
+NAME_TEXT: dict[str, Any] = {"color": INK, "zorder": 6, "path_effects": [withStroke(linewidth=2.0, foreground="white")]}
 LEADER: dict[str, Any] = {"arrowstyle": "-", "color": QUIET, "linewidth": 0.5, "shrinkA": 0.0, "shrinkB": 2.0}
 
 EXTEND = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
 SUBS = ((6.0, (1, 1.5, 2, 3, 4, 5, 7)), (2e3, (1, 2, 5)))  # ticks of a decade, by the axis' span
 INCH = 25.4  # [mm]
-RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 NARROWEST, WIDEST = 80.0, 400.0  # of a picture for print [mm]
 LIGHTEST = 0.5  # of lines and marks, against those on a screen: a tenth of a millimetre
 WEIGHTS = {"linewidth": 1, "linewidths": 1, "markersize": 1, "markeredgewidth": 1, "capsize": 1, "s": 2}
@@ -123,7 +124,7 @@ WEIGHTS = {"linewidth": 1, "linewidths": 1, "markersize": 1, "markeredgewidth": 
 
 @dataclass(frozen=True)
 class Sheet:
-    """What a picture's place decides: a screen, as wide as its panels, or a printed page that is so wide."""
+    """Sizes of a picture for its medium: a screen, as wide as its panels need, or a printed page of a given width."""
 
     width: float  # [inch]
     columns: int  # panels side by side
@@ -140,6 +141,8 @@ class Sheet:
         """Return a screen's, `columns` panels of a `pitch` [inch], or that of a page `width` millimetres wide.
 
         There, as many of the `panels` stand side by side as have `least` millimetres each; type has a journal's sizes.
+
+        Raises ValueError where the page is narrower or wider than any that is printed.
         """
         if width is None:
             return cls(columns * pitch, columns, 1.0)
@@ -258,7 +261,7 @@ def log_axis(axis: Axis) -> None:
 
 
 def stroke(points: int) -> dict[str, Any]:
-    """Return how a line of so many points is drawn: with its points where they can be told apart."""
+    """Return the look of a line of so many points: with markers where they can be told apart."""
     return {"linewidth": 1.1, "marker": "o" if points <= 100 else "", "markersize": 2.4}
 
 
@@ -268,10 +271,10 @@ def method(run: xr.Dataset) -> dict[str, Any]:
 
 
 def point_areas(distance: NDArray[np.float64], reach: float, points: int) -> NDArray[np.float64]:
-    """Return how large so many points are drawn [pt^2]: smaller the farther off the plane, `reach` being farthest."""
-    least, most = NEAR
+    """Return marker areas of so many points [pt^2], which fall with the distance from the plane, at most `reach`."""
+    least, most = MARK_AREAS
     area = max(least, min(most, most * (150 / max(points, 1)) ** 0.35))
-    share: NDArray[np.float64] = 1 - (1 - FAR) * distance / reach if reach else np.ones_like(distance)
+    share: NDArray[np.float64] = 1 - (1 - FARTHEST_SHARE) * distance / reach if reach else np.ones_like(distance)
     areas: NDArray[np.float64] = area * share
     return areas
 
@@ -287,11 +290,11 @@ def power(value: float, plain: int = 4) -> str:
     if -plain <= exponent < plain:
         return number(value)
     factor = round(value / 10.0**exponent)
-    ten = "10" + str(exponent).translate(RAISED)
+    ten = "10" + str(exponent).translate(SUPERSCRIPTS)
     return ten if factor == 1 else f"{factor}\N{MULTIPLICATION SIGN}{ten}"
 
 
-def thin(lines: int) -> float:
+def hairline_width(lines: int) -> float:
     """Return the width of so many vertical lines [pt]: hairlines where there are many."""
     return max(0.25, min(0.8, 40 / max(lines, 1)))
 

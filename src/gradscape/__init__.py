@@ -1,30 +1,95 @@
 """See, measure and search the loss landscapes of differentiable simulators."""
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
-# What `gradscape.<name>` means, imported when first used: nothing heavy loads before it is needed.
+if TYPE_CHECKING:
+    from .api.environments import list_envs
+    from .api.measure import check, pairs, report, tradeoff
+    from .api.overlay import overlay
+    from .api.search import open_run, optimize, race
+    from .api.slice import open_slice, slice
+    from .api.sweep import sweep
+    from .envs.base import Environment, Fidelity
+    from .envs.registry import make, register
+    from .jobs.scene import SceneSpec
+    from .landscapes.adapters import from_numpy, from_torch
+    from .landscapes.episode import Episode
+    from .landscapes.objective import Evaluation, Objective, Status
+    from .landscapes.plane import Plane
+    from .landscapes.sampling.fill import sample
+    from .landscapes.slice import Slice
+    from .landscapes.space import ParameterSpace
+    from .optim.race import Race
+    from .optim.runs.run import Run
+
+# Where `gradscape.<name>` is, imported when first used: nothing heavy loads before it is needed.
 _HOMES = {
-    "ParameterSpace": "landscapes.space",
+    "Environment": "envs.base",
+    "Episode": "landscapes.episode",
     "Evaluation": "landscapes.objective",
+    "Fidelity": "envs.base",
     "Objective": "landscapes.objective",
-    "Status": "landscapes.objective",
+    "ParameterSpace": "landscapes.space",
     "Plane": "landscapes.plane",
+    "Race": "optim.race",
+    "Run": "optim.runs.run",
+    "SceneSpec": "jobs.scene",
+    "Slice": "landscapes.slice",
+    "Status": "landscapes.objective",
+    "check": "api.measure",
     "from_numpy": "landscapes.adapters",
     "from_torch": "landscapes.adapters",
-    "open_slice": "landscapes.store",
-    "open_run": "optim.run",
-    "sample": "landscapes.sampling",
-    "Environment": "envs.base",
-    "Episode": "envs.base",
-    "Fidelity": "envs.base",
+    "list_envs": "api.environments",
     "make": "envs.registry",
+    "open_run": "api.search",
+    "open_slice": "api.slice",
+    "optimize": "api.search",
+    "overlay": "api.overlay",
+    "pairs": "api.measure",
+    "race": "api.search",
     "register": "envs.registry",
+    "report": "api.measure",
+    "sample": "landscapes.sampling.fill",
+    "slice": "api.slice",
+    "sweep": "api.sweep",
+    "tradeoff": "api.measure",
 }
 
-__all__ = sorted([*_HOMES, "__version__"])
+__all__ = [
+    "Environment",
+    "Episode",
+    "Evaluation",
+    "Fidelity",
+    "Objective",
+    "ParameterSpace",
+    "Plane",
+    "Race",
+    "Run",
+    "SceneSpec",
+    "Slice",
+    "Status",
+    "__version__",
+    "check",
+    "from_numpy",
+    "from_torch",
+    "list_envs",
+    "make",
+    "open_run",
+    "open_slice",
+    "optimize",
+    "overlay",
+    "pairs",
+    "race",
+    "register",
+    "report",
+    "sample",
+    "slice",
+    "sweep",
+    "tradeoff",
+]
 
 
 def __getattr__(name: str) -> Any:

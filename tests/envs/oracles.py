@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from gradscape.envs.engines.rigid import Ball
+from gradscape.envs.engines.balls.rigid import Ball
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gradscape.envs.bounce import DURATION, START, Bounce
-from gradscape.envs.engines.rigid import Ball, Solver
+from gradscape.envs.engines.balls.rigid import Ball, Solver
 from gradscape.envs.engines.runtime import to_torch
 
 from . import oracles

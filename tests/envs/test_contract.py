@@ -5,34 +5,11 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from gradscape.envs.base import Fidelity
-from gradscape.envs.bounce import Bounce
-from gradscape.envs.cartpole import Cartpole
-from gradscape.envs.fluid import SPAN
-from gradscape.envs.pinball import Pinball2, Pinball16
-from gradscape.envs.plasticine_model import SPAN as SOFT_SPAN
 from gradscape.envs.registry import entries, environment_class, make
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 
-# Float64, since gradients are held against differences, and cheap, since that takes many episodes.
-SETTINGS = {
-    "bounce": {"fidelity": replace(Bounce.fidelities["draft"], precision="float64")},
-    "cartpole": {"fidelity": replace(Cartpole.fidelities["draft"], precision="float64")},
-    "pinball-2": {"fidelity": replace(Pinball2.fidelities["draft"], precision="float64")},
-    "pinball-16": {"fidelity": replace(Pinball16.fidelities["draft"], precision="float64")},
-    "fluid": {"fidelity": Fidelity("tiny", dt=SPAN / 2, precision="float64", resolution=6, sampling=1.5)},
-}
-SETTINGS |= {
-    name: {"fidelity": Fidelity("tiny", dt=1 / 500, precision="float64", resolution=4)}
-    for name in ("swing-velocity", "swing-stiffness", "flip")
-}
-SOFT = ("assembly", "pinch", "rolling-pin", "rope", "table", "torus", "triple-move", "writer")
-SOFT_TINY = Fidelity("tiny", dt=SOFT_SPAN / 5, precision="float64", resolution=16, particles=100)
-SETTINGS |= {name: {"fidelity": SOFT_TINY} for name in SOFT}
-# Of these two fifths of an episode, in which every tool works: `test_plasticine` holds whole ones against slopes.
-SHORT = {name: {"horizon": 0.4} for name in SOFT}
-# Where vertices strike a surface their losses jump, by little but often: differences need a step between the jumps.
-SMALL_STEPS = dict.fromkeys(("swing-velocity", "swing-stiffness", "flip"), 1e-8)
+from .scenes import SETTINGS, SHORT, SMALL_STEPS
+
 ROWS = 5
 
 
@@ -179,7 +156,7 @@ def test_arrays_and_lists_are_points_too(env, points, monkeypatch):
 
     def evaluated(x, *, grad):
         asked.extend(x.tolist())
-        return Evaluation.judged(x.sum(dim=1), torch.ones_like(x) if grad else None)
+        return Evaluation.from_results(x.sum(dim=1), torch.ones_like(x) if grad else None)
 
     monkeypatch.setattr(env, "_evaluate", evaluated)
     for x in (points.numpy(), points.tolist(), reversed_, swapped):

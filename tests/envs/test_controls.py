@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gradscape.envs.controls import hold, ramp, travel
+from gradscape.envs.controls import hold, integrate_velocity, ramp
 
 START = torch.tensor([0.1, 0.2], dtype=torch.float64)
 LOWER, UPPER = torch.tensor([-0.5, 0.0], dtype=torch.float64), torch.tensor([0.5, 1.0], dtype=torch.float64)
@@ -12,7 +12,7 @@ SPAN = 0.01
 
 
 def drive(velocity):
-    return travel(START, velocity, SPAN, lower=LOWER, upper=UPPER)
+    return integrate_velocity(START, velocity, SPAN, lower=LOWER, upper=UPPER)
 
 
 def velocities(*shape, size=1.0):

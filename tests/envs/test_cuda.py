@@ -8,7 +8,7 @@ import torch
 from gradscape.envs.engines.runtime import cuda_available
 from gradscape.envs.registry import entries, environment_class, make
 
-from .test_contract import SMALL_STEPS
+from .scenes import SMALL_STEPS
 
 # A small difference grows from contact to contact: by as much as gradients are steep.
 ROUGH = dict.fromkeys(("pinball-16", "swing-velocity", "swing-stiffness", "flip"), 100)
@@ -40,8 +40,8 @@ def test_gradients_on_cuda_are_slopes(name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "known"), [("fluid", "scoop"), ("assembly", "demonstration")])  # odd substeps
-def test_launches_replayed_as_graphs_do_what_they_did_at_first(name: str, known: str) -> None:
-    """One row is few enough for graphs: recorded when it comes again, replayed from then on."""
+def test_launches_repeated_as_graphs_do_what_they_did_at_first(name: str, known: str) -> None:
+    """One row is few enough for graphs: recorded when it comes again, launched whole from then on."""
     fidelity = replace(environment_class(name).fidelities["draft"], precision="float64")
     env = make(name, fidelity=fidelity, device="cuda")
     one, other = env.example(known)[None], env.space.uniform(1, seed=3)
@@ -51,8 +51,7 @@ def test_launches_replayed_as_graphs_do_what_they_did_at_first(name: str, known:
     again = env.evaluate(one)
     assert env._solvers is not None
     with env._solvers.lend() as lent:
-        replay = getattr(lent, "solver", lent).replay
-        assert {key[0][0] for key in replay.graphs} == {"forward", "backward"}
+        assert {key[0][0] for key in lent.solver.launches.graphs} == {"forward", "backward"}
     assert first.grad is not None
     assert again.grad is not None
     torch.testing.assert_close(again.loss, first.loss, rtol=1e-12, atol=0)

@@ -5,28 +5,25 @@ from importlib.util import find_spec
 import pytest
 import torch
 
-from gradscape.envs.base import Fidelity
-from gradscape.envs.fluid import SPAN
-from gradscape.envs.plasticine_model import SPAN as SOFT_SPAN
+from gradscape.envs.base import Environment
+from gradscape.envs.engines import ENGINES
+from gradscape.envs.engines.engine import Engine
+from gradscape.envs.mpm.fluid import Fluid
 from gradscape.envs.registry import entries, environment_class, make
+from gradscape.envs.sheets.sheets import SheetScene
 from gradscape.landscapes.objective import Status
+from gradscape.landscapes.space import ParameterSpace
+
+from .scenes import SETTINGS, SHORT, of_family
 
 pytestmark = pytest.mark.skipif(find_spec("taichi") is None, reason="Taichi has no wheel for this machine")
 
-SHEET = Fidelity("tiny", dt=1 / 500, precision="float64", resolution=4)
-TINY = {
-    "fluid": Fidelity("tiny", dt=SPAN / 2, precision="float64", resolution=6, sampling=1.5),
-    "rolling-pin": Fidelity("tiny", dt=SOFT_SPAN / 5, precision="float64", resolution=16, particles=100),
-    **dict.fromkeys(("swing-velocity", "swing-stiffness", "flip"), SHEET),
-}
+COMPARED = [*of_family(Fluid, SheetScene), "rolling-pin"]  # of plasticine one scene, with the tool that rolls
 
 
-SHORT = {"rolling-pin": {"horizon": 0.4}}
-
-
-@pytest.fixture(scope="module", params=TINY)
+@pytest.fixture(scope="module", params=COMPARED)
 def both(request):
-    how = {"fidelity": TINY[request.param], "device": "cpu", **SHORT.get(request.param, {})}
+    how = {**SETTINGS[request.param], "device": "cpu", **SHORT.get(request.param, {})}
     return tuple(make(request.param, engine=engine, **how) for engine in ("warp", "taichi"))
 
 
@@ -62,6 +59,27 @@ def test_scenes_that_only_warp_has_refuse_taichi():
         if "taichi" not in kind.engines:
             with pytest.raises(ValueError, match=f"{name} has engine warp; got engine 'taichi'"):
                 make(name, device="cpu", engine="taichi")
+
+
+def test_every_engine_of_a_scene_is_known_and_has_its_solvers():
+    for name in entries():
+        for engine in environment_class(name).engines:
+            assert ENGINES[engine].name == engine
+    for engine in ENGINES.values():
+        for module in engine.solvers.values():
+            assert find_spec(f"gradscape.envs.engines.{module}") is not None
+
+
+def test_a_scene_may_bring_an_engine_of_its_own():
+    class Rod(Environment):
+        engines = ("own",)
+        space = ParameterSpace.box(["x"], 0.0, 1.0)
+
+        def _evaluate(self, x, *, grad):
+            raise NotImplementedError
+
+    rod = Rod(engine="own", deterministic=True)
+    assert (rod.capabilities, rod.threads) == (Engine("own"), 1)
 
 
 def test_taichi_refuses_to_be_deterministic():

@@ -5,7 +5,8 @@ import torch
 
 from gradscape.envs.registry import entries, environment_class, make
 
-from .test_contract import SETTINGS, SMALL_STEPS, SOFT, refusal
+from .scenes import SETTINGS, SMALL_STEPS, SOFT
+from .test_contract import refusal
 
 ENGINES = ("bounce", "cartpole", "flip", "fluid", "pinball-2", "pinch")  # a scene each
 CONTROLLED = ("cartpole", "flip", "fluid", "rolling-pin", "rope")

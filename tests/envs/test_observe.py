@@ -4,11 +4,14 @@ import torch
 from gradscape.envs.base import Fidelity
 from gradscape.envs.cartpole import SPAN as CONTROL_SPAN
 from gradscape.envs.cartpole import TEMPO
-from gradscape.envs.fluid import SPAN, STEPS
-from gradscape.envs.fluid import Fluid as FluidScene
-from gradscape.envs.observation import watched
-from gradscape.envs.plasticine_model import SPAN as SOFT_SPAN
+from gradscape.envs.mpm.fluid import SPAN
+from gradscape.envs.mpm.fluid import Fluid as FluidScene
+from gradscape.envs.mpm.plasticine_model import SPAN as SOFT_SPAN
+from gradscape.envs.mpm.scene import STEPS, MpmScene
+from gradscape.envs.observation import watch
 from gradscape.envs.registry import entries, environment_class, make
+
+from .scenes import of_family
 
 SOFT = {"fidelity": Fidelity("tiny", dt=SOFT_SPAN / 5, resolution=16, particles=100)}
 SETTINGS = {
@@ -43,7 +46,7 @@ def inner(env):
 
 def test_scenes_with_controls_have_five_decisions_and_cartpole_one_for_every_control():
     assert STAGED.pop("cartpole") == 100
-    assert set(STAGED) >= {"fluid", "flip", "assembly", "pinch", "rolling-pin", "rope", "table", "torus", "writer"}
+    assert set(STAGED) >= {"flip", *of_family(MpmScene)}
     assert set(STAGED.values()) == {5}
 
 
@@ -119,7 +122,7 @@ def test_the_cartpole_policy_sees_cart_and_links_where_the_episode_has_them():
 
 def test_points_are_watched_all_over_a_body():
     x = torch.arange(2 * 100 * 3, dtype=torch.float64).view(2, 100, 3)
-    seen = watched(x, [90, 10])
+    seen = watch(x, [90, 10])
     assert seen.shape == (2, 33 + 11, 3)
     torch.testing.assert_close(seen[:, 0], x[:, :90].mean(dim=1))
     assert torch.equal(seen[:, 1], x[:, 0])

@@ -70,7 +70,7 @@ def test_a_name_that_is_taken_is_refused_with_both_owners(package):
     package({"fluid": "gradscape_test_arm:Arm"})
     with pytest.raises(ValueError, match="two environments are called 'fluid'") as refusal:
         entries()
-    assert "gradscape.envs.fluid:Fluid" in str(refusal.value)
+    assert "gradscape.envs.mpm.fluid:Fluid" in str(refusal.value)
     assert "gradscape_test_arm:Arm" in str(refusal.value)
 
 

@@ -7,15 +7,15 @@ import pytest
 
 from gradscape.envs.points import point
 from gradscape.envs.registry import make
-from gradscape.gallery.figures import chosen, read_figures
+from gradscape.gallery.figures import choose_figures, read_figures
 
 FIGURES = read_figures()
 
 
 def test_the_supplements_figures_are_all_there_and_ours() -> None:
-    panels = Counter(figure.number for figure in FIGURES if figure.number)
+    panels = Counter(figure.caption.number for figure in FIGURES if figure.caption.number)
     assert panels == {8: 2, 9: 2, 10: 3, 11: 3, 12: 3, 13: 3, 14: 3, 15: 3}
-    ours = Counter(figure.env for figure in FIGURES if not figure.number)
+    ours = Counter(figure.env for figure in FIGURES if not figure.caption.number)
     once = dict.fromkeys(("rope", "rolling-pin", "pinch", "torus", "cartpole"), 1)
     assert ours == once | {"swing-velocity": 3, "swing-stiffness": 3}
 
@@ -29,19 +29,24 @@ def test_a_figure_names_what_its_environment_has(figure) -> None:  # type: ignor
 
 
 def test_figures_are_chosen_by_id_and_by_environment() -> None:
-    assert [figure.id for figure in chosen(FIGURES, ["fluid-6-8", "bounce"])] == ["bounce-x", "bounce-y", "fluid-6-8"]
+    assert [figure.id for figure in choose_figures(FIGURES, ["fluid-6-8", "bounce"])] == [
+        "bounce-x",
+        "bounce-y",
+        "fluid-6-8",
+    ]
     with pytest.raises(ValueError, match="no figure or environment 'fluids'"):
-        chosen(FIGURES, ["fluids"])
+        choose_figures(FIGURES, ["fluids"])
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         ("", "needs figures"),
-        ('[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1]', "lacks .'says'"),
-        ('[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1]\nsays = ""\ndim = 3', "unknown .'dim'"),
-        ('[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1, 2]\nsays = ""', "needs one dimension or two"),
-        (2 * '[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1]\nsays = ""\n', "repeated: a"),
+        ('[[figure]]\nid = "a"\nenv = "fluid"', "lacks .'dims'"),
+        ('[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1]\ndim = 3', "unknown .'dim'"),
+        ('[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1]\nsays = "It is smooth."', "unknown .'says'"),
+        ('[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1, 2]', "needs one dimension or two"),
+        (2 * '[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1]\n', "repeated: a"),
     ],
 )
 def test_a_wrong_list_is_refused(text: str, said: str, tmp_path: Path) -> None:

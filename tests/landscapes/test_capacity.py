@@ -8,8 +8,8 @@ import pytest
 from gradscape import ParameterSpace, Plane
 from gradscape.landscapes import capacity
 from gradscape.landscapes.capacity import Need, TooLargeError, require
-from gradscape.landscapes.slice_arrays import need_of
-from gradscape.landscapes.store import SliceStore
+from gradscape.landscapes.storage.arrays import need_of
+from gradscape.landscapes.storage.store import SliceStore
 
 
 @pytest.fixture
@@ -49,9 +49,9 @@ def test_a_group_of_processes_has_what_its_limit_leaves(tmp_path: Path, monkeypa
     for name, text in (("max", "3000"), ("current", "2000"), ("stat", "anon 1500\ninactive_file 500\n")):
         (group / f"memory.{name}").write_text(text)
     (tmp_path / "memory.max").write_text("max")
-    assert capacity._left_to(group) == [1500.0]
-    assert capacity._left_to(tmp_path) == []
-    monkeypatch.setattr(capacity, "_left_to_groups", lambda: [1500.0, math.inf])
+    assert capacity._free_in_group(group) == [1500.0]
+    assert capacity._free_in_group(tmp_path) == []
+    monkeypatch.setattr(capacity, "_group_limits", lambda: [1500.0, math.inf])
     assert capacity.available_memory() == 1500.0
 
 

@@ -56,7 +56,7 @@ class Single(Environment):
 
     def _evaluate(self, x: Any, *, grad: bool) -> Evaluation:
         loss = 1 / x.float().abs().sum(dim=1).double()
-        return Evaluation.judged(loss, torch.zeros_like(x) if grad else None)
+        return Evaluation.from_results(loss, torch.zeros_like(x) if grad else None)
 
 
 MASKED = np.ma.array(X.numpy(), mask=[[False, True]] * 4)
@@ -71,7 +71,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: from_torch(lambda x: x[:, 0] > 0, SPACE, name="f").evaluate(X, grad=False),
         "the loss of f takes numbers; got a tensor of torch.bool",
     ),
-    "complex gradients": (lambda: Evaluation.judged(X[:, 0], X + 1j), "a gradient takes numbers"),
+    "complex gradients": (lambda: Evaluation.from_results(X[:, 0], X + 1j), "a gradient takes numbers"),
     "masked losses": (lambda: from_numpy(lambda x: MASKED[:, 1], SPACE).evaluate(X, grad=False), "masks some"),
     "masked gradients": (lambda: from_numpy(lambda x: (x[:, 0], MASKED), SPACE).evaluate(X), "masks some"),
     "masked gradients of points": (
@@ -85,7 +85,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "status 1.5": (answered(1.5), "a status is one of .*; got 1.5"),
     "status 7": (answered(7), "a status is one of .*; got 7"),
     "no status yet": (answered(0), "own must say how every point ended"),
-    "failures coded 257": (lambda: Evaluation.judged(X[:, 0], None, torch.full((4,), 257)), "got 257"),
+    "failures coded 257": (lambda: Evaluation.from_results(X[:, 0], None, torch.full((4,), 257)), "got 257"),
     "a tuple": (sampled(lambda x: (x[:, 0], x, 1)), "own must return an Evaluation; got tuple"),
     "nothing": (sampled(lambda x: None), "own must return an Evaluation; got NoneType"),
     "losses that use no x": (
@@ -118,7 +118,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "a box of infinite bounds": (lambda: ParameterSpace.box(["a"], -INF, INF), "finite lower < upper"),
     "a box of text": (lambda: ParameterSpace.box(["a"], "0", "1"), "takes numbers"),  # type: ignore[arg-type]
     "a plane through infinity": (lambda: Plane.through(SPACE, [INF, INF], [0], resolution=3), "finite origin"),
-    "a direction of zeros": (lambda: Plane.spanned([0, 0], [[0, 0]], resolution=3), "not zero and not parallel"),
+    "a direction of zeros": (lambda: Plane.span([0, 0], [[0, 0]], resolution=3), "not zero and not parallel"),
     "principal directions of NaN": (lambda: Plane.principal(X * NAN, resolution=3), "finite points"),
     **{
         f"differences {d}": (differing(differences=d), "from_numpy takes differences from 1e-12 to 1")
@@ -179,7 +179,7 @@ def test_arrays_of_every_kind_are_numbers(kind: str) -> None:
         within_box(BOWL).evaluate(as_kind).loss - BOWL.evaluate(X).loss,
         Single().evaluate(as_kind).loss - Single().evaluate(X).loss,
         from_numpy(lambda _: (flat, as_kind), SPACE).evaluate(X).grad - X,
-        Evaluation.judged(flat, as_kind, [1] * 4).loss - X[:, 0],
+        Evaluation.from_results(flat, as_kind, [1] * 4).loss - X[:, 0],
         ParameterSpace(["a", "b"], as_kind[0], [9, 9]).lower - X[0],
         SPACE.from_unit(SPACE.to_unit(as_kind)) - X,
         PLANE.lift(PLANE.project(as_kind)) - X,
@@ -187,7 +187,7 @@ def test_arrays_of_every_kind_are_numbers(kind: str) -> None:
         PLANE.slope(as_kind) - X,
         Plane.through(SPACE, as_kind[0], [0], resolution=3).origin[1:] - X[0, 1:],
         Plane.through(SPACE, [0, 0], [0, 1], resolution=3, extent=(as_kind[0], [9, 9])).lower - X[0],
-        Plane.spanned(as_kind[0], as_kind[:2], resolution=3).basis - X[:2],
+        Plane.span(as_kind[0], as_kind[:2], resolution=3).basis - X[:2],
         Plane.principal(as_kind, resolution=3).origin - X.mean(dim=0),
         Plane(as_kind[0], as_kind[:2], [0, 0], [1, 1], [3, 3], ["a", "b"]).basis - X[:2],
     ]
@@ -206,6 +206,6 @@ def test_bounds_stay_what_they_were() -> None:
 def test_a_status_is_kept_as_it_is_said() -> None:
     codes = [Status.OK, Status.NONFINITE, Status.ESCAPED, Status.ERROR]
     for dtype in (torch.int8, torch.int64, torch.float64):
-        found = Evaluation.judged(X[:, 0], X, torch.tensor(codes, dtype=dtype))
+        found = Evaluation.from_results(X[:, 0], X, torch.tensor(codes, dtype=dtype))
         assert found.status.tolist() == codes
         assert found.status.dtype == torch.int8

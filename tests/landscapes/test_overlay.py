@@ -6,11 +6,11 @@ from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import to_rgba
 
 from gradscape.landscapes.draw import style
-from gradscape.landscapes.draw.overlay import joint_scale, overlay_figure
+from gradscape.landscapes.draw.figures.overlay import joint_scale, overlay_figure
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.overlay import best_point, improvements, overlay, principal_plane
 from gradscape.landscapes.plane import Plane
-from gradscape.landscapes.sampling import sample
+from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
 
 # Units that differ a thousandfold: half-widths 1 m/s, 1000 N and 10.
@@ -31,7 +31,7 @@ class Bowl:
         z = 2 * self.space.to_unit(x) - 1
         loss, slope = z.square().sum(dim=1), 2 * z / torch.from_numpy(HALF)
         loss[(z[:, :2] > 0.75).all(dim=1)] = torch.nan
-        return Evaluation.judged(loss, slope if grad else None)
+        return Evaluation.from_results(loss, slope if grad else None)
 
 
 def run(z, kind, *, seed=0, method="bo-leap", grad=True) -> xr.Dataset:
@@ -68,7 +68,7 @@ def test_points_fall_on_the_plane_and_their_distance_is_in_half_widths_of_the_bo
 
 def test_a_skew_plane_is_nearest_in_the_scaled_box_whatever_the_units():
     directions = torch.tensor([[1.0, 1000, 0], [0, 0, 10.0]]).double()  # (1, 1, 0) and (0, 0, 1) there
-    skew = Plane.spanned(SPACE.center, directions, resolution=5)
+    skew = Plane.span(SPACE.center, directions, resolution=5)
     (laid,) = overlay(sample(Bowl(), skew), [run([[0.6, 0.0, 0.3]], [0])])
     np.testing.assert_allclose([laid["u"][0], laid["v"][0]], [0.3, 0.3])
     np.testing.assert_allclose(laid["distance"], np.hypot(0.3, 0.3))
@@ -278,4 +278,5 @@ def test_what_was_the_best_so_far_is_joined_in_its_order_and_numbered_where_ther
         assert any(np.allclose(text.xy, place) for place in at)
     boxes = [text.get_window_extent() for text in numbers]
     assert not any(one.overlaps(other) for number, one in enumerate(boxes) for other in boxes[:number])
-    assert any("numbers are episodes" in text.get_text() for text in figure.legends[0].get_texts())
+    assert any("numbers: episodes" in text.get_text() for text in figure.legends[0].get_texts())
+    assert "colour: the loss the point truly had" in figure.legends[0].get_title().get_text().replace("\n", " ")

@@ -19,7 +19,7 @@ FEW = settings(max_examples=40)
 def tilted(seed: int, rank: int = 2, dim: int = 6) -> Plane:
     draw = torch.Generator().manual_seed(seed)
     origin, directions = (torch.randn(size, generator=draw).double() for size in ((dim,), (rank, dim)))
-    return Plane.spanned(origin, directions, resolution=4)
+    return Plane.span(origin, directions, resolution=4)
 
 
 @FEW
@@ -151,7 +151,7 @@ def test_a_slice_that_makes_no_sense_is_refused(dims, options, said):
 
 def test_parallel_directions_and_a_foreign_origin_are_refused():
     with pytest.raises(ValueError, match="parallel"):
-        Plane.spanned(torch.zeros(3), torch.tensor([[1.0, 2, 3], [2.0, 4, 6]]), resolution=4)
+        Plane.span(torch.zeros(3), torch.tensor([[1.0, 2, 3], [2.0, 4, 6]]), resolution=4)
     with pytest.raises(ValueError, match=r"shape \(4,\); got shape \(3,\)"):
         Plane.through(SPACE, torch.zeros(3), ["x"], resolution=4)
     with pytest.raises(ValueError, match="spread"):

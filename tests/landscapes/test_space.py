@@ -90,4 +90,4 @@ def test_planes_go_through_lists_and_arrays_too():
     for point in ([1.0, 0.25], (1.0, 0.25), np.array([1.0, 0.25]), torch.tensor([1.0, 0.25])):
         plane = Plane.through(SPACE, point, ["angle"], resolution=3)
         assert plane.lift(torch.tensor([[0.5]]).double()).tolist() == [[1.0, 0.5]]
-    assert Plane.spanned([0, 0], [[1, 0], [0, 2]], resolution=3).basis.tolist() == [[1, 0], [0, 2]]
+    assert Plane.span([0, 0], [[1, 0], [0, 2]], resolution=3).basis.tolist() == [[1, 0], [0, 2]]

@@ -4,11 +4,11 @@ from typing import TypeVar
 
 from gradscape.landscapes.objective import Objective
 from gradscape.optim.base import Optimizer
-from gradscape.optim.state import decoded, encoded
+from gradscape.optim.runs.state import decode, encode
 
 T = TypeVar("T", bound=Optimizer)
 
 
 def restored(optimizer: T, objective: Objective) -> T:
     """Return the optimiser that is read from what is written of this one."""
-    return type(optimizer).restored(objective, decoded(encoded(optimizer.state())))
+    return type(optimizer).from_state(objective, decode(encode(optimizer.state())))

@@ -30,14 +30,14 @@ class Bowl:
     space = SPACE
 
     def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
-        return Evaluation.judged(x.square().sum(dim=1), 2 * x if grad else None)
+        return Evaluation.from_results(x.square().sum(dim=1), 2 * x if grad else None)
 
 
 def told(status: list[int], loss: list[float], grad: list[list[float]] | None = None) -> Recorder:
     optimizer = Recorder(SPACE)
     optimizer.next = np.zeros((len(loss), 2))
     slope = None if grad is None else torch.tensor(grad, dtype=torch.float64)
-    evaluation = Evaluation.judged(torch.tensor(loss, dtype=torch.float64), slope, torch.tensor(status))
+    evaluation = Evaluation.from_results(torch.tensor(loss, dtype=torch.float64), slope, torch.tensor(status))
     optimizer.tell(optimizer.ask().x, evaluation)
     return optimizer
 
@@ -64,7 +64,7 @@ def test_a_failed_episode_is_infinite_without_slope_and_counts_as_the_worst_so_f
     optimizer = told([Status.OK, Status.ESCAPED, Status.OK], [-7.0, 1.0, -9.0], [[1.0, 1.0]] * 3)
     assert optimizer.loss.tolist() == [-7.0, np.inf, -9.0]
     assert optimizer.grad[1].tolist() == [0.0, 0.0]
-    assert optimizer.penalised(optimizer.loss).tolist() == [-7.0, -7.0, -9.0]
+    assert optimizer.penalise(optimizer.loss).tolist() == [-7.0, -7.0, -9.0]
 
 
 def test_a_method_whose_attributes_are_data_is_restored_without_more() -> None:
@@ -86,4 +86,4 @@ def test_what_is_no_data_is_named() -> None:
 def test_a_state_puts_nothing_in_the_place_of_a_method() -> None:
     state = told([Status.OK], [2.0]).state()
     with pytest.raises(ValueError, match="_ask is no attribute that recorder keeps"):
-        Recorder.restored(Bowl(), state | {"own": {"_ask": 3}})
+        Recorder.from_state(Bowl(), state | {"own": {"_ask": 3}})

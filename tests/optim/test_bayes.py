@@ -8,8 +8,8 @@ from gradscape.landscapes.adapters import from_torch
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
-from gradscape.optim.bayes import BO, BODescents, BODescentsOptions
-from gradscape.optim.random import RandomSearch
+from gradscape.optim.methods.bayes import BO, BODescents, BODescentsOptions
+from gradscape.optim.methods.random import RandomSearch
 from gradscape.optim.search import search
 
 from .states import restored
@@ -25,13 +25,13 @@ class Hole:
 
     def evaluate(self, x, *, grad=True):
         loss = torch.where(x[:, 0] < 0.0, torch.nan, ((x - 0.5) ** 2).sum(dim=1))
-        return Evaluation.judged(loss, 2 * (x - 0.5) if grad else None)
+        return Evaluation.from_results(loss, 2 * (x - 0.5) if grad else None)
 
 
 @pytest.mark.parametrize("method", [BO, BODescents])
 def test_the_process_sees_the_loss_of_every_point(method):
     optimizer = method(SPACE, seed=2)
-    table = search(Hole(), optimizer, budget=20, gradient_cost=2.0).table()
+    table = search(Hole(), optimizer, budget=20, gradient_cost=2.0).dataset()
     assert (table["status"] != Status.OK).any()
     np.testing.assert_allclose(1.0 + 3.0 * optimizer.surrogate.z, table["x"], atol=1e-12)
     np.testing.assert_array_equal(optimizer.surrogate.loss, table["loss"].fillna(np.inf))
@@ -53,7 +53,7 @@ def test_a_seed_decides_every_point_bit_for_bit_through_its_state_too(method):
 
 def test_bo_evaluates_where_the_bound_of_all_it_knows_is_least_and_the_first_ten_at_random():
     optimizer = BO(SPACE, seed=1)
-    table = search(BOWL, optimizer, budget=18).table()
+    table = search(BOWL, optimizer, budget=18).dataset()
     assert table["kind"].to_numpy().tolist() == 10 * [Kind.RANDOM] + 8 * [Kind.ACQUISITION]
     assert table["slope"].isnull().all()
     found = SPACE.to_unit(optimizer.ask().x)
@@ -66,7 +66,7 @@ def test_bo_evaluates_where_the_bound_of_all_it_knows_is_least_and_the_first_ten
 def test_bo_comes_closer_to_branins_minimum_than_chance_does():
     branin = make("branin")
     gaps = [
-        [search(branin, method(branin.space, seed=seed), budget=40).best - branin.minimum for seed in range(3)]
+        [search(branin, method(branin.space, seed=seed), budget=40).best_loss - branin.minimum for seed in range(3)]
         for method in (BO, RandomSearch)
     ]
     assert np.median(gaps[0]) < 0.1 * np.median(gaps[1])
@@ -74,7 +74,7 @@ def test_bo_comes_closer_to_branins_minimum_than_chance_does():
 
 def test_bo_descents_descends_from_each_proposal_and_proposes_anew_when_a_descent_ends():
     options = BODescentsOptions(steps=5, step=0.01, patience=5, initial=5)
-    table = search(BOWL, BODescents(SPACE, seed=3, options=options), budget=15, gradient_cost=2.0).table()
+    table = search(BOWL, BODescents(SPACE, seed=3, options=options), budget=15, gradient_cost=2.0).dataset()
     first = [Kind.RANDOM] + 4 * [Kind.DESCENT]
     later = [Kind.ACQUISITION] + 4 * [Kind.DESCENT]
     assert table["kind"].to_numpy().tolist() == first + later + later

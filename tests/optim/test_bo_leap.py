@@ -9,7 +9,7 @@ from gradscape.landscapes.adapters import from_torch
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
-from gradscape.optim.bo_leap import BOLeap, BOLeapOptions, SemiLocal
+from gradscape.optim.methods.bo_leap import BOLeap, BOLeapOptions, SemiLocal
 from gradscape.optim.search import search
 
 from .states import restored
@@ -21,7 +21,7 @@ RIPPLES = from_torch(lambda x: ((x - 0.5) ** 2).sum(dim=1) + (4 * x).cos().sum(d
 def test_branins_minimum_is_reached_to_a_thousandth_within_300_evaluations():
     branin = make("branin")
     runs = [search(branin, BOLeap(branin.space, seed=seed), budget=300, gradient_cost=2.0) for seed in range(5)]
-    reached = [run.best - branin.minimum < 1e-3 for run in runs]
+    reached = [run.best_loss - branin.minimum < 1e-3 for run in runs]
     assert sum(reached) >= 4
     assert all(run.count == 300 for run in runs)
 
@@ -37,7 +37,7 @@ def test_sigma_and_c_follow_hansen_and_ostermeier_2001_equations_14_to_17():
     sigma, C, p_c, p_sigma = 0.7, local.es.sm.C.copy(), np.zeros(n), np.zeros(n)
     np.testing.assert_allclose(C, np.eye(n), atol=1e-4)  # pycma tells the axes of its identity apart
     for step in range(4):
-        x = local.population().clip(-1.0, 1.0)
+        x = local.draw().clip(-1.0, 1.0)
         loss = (x - 0.6) @ np.array([1.0, -2.0, 0.5])
         mean = x[np.argsort(loss)[:best]].mean(axis=0)
         np.testing.assert_allclose(local.tell(x, loss), mean, rtol=1e-12)
@@ -58,17 +58,17 @@ def test_sigma_and_c_follow_hansen_and_ostermeier_2001_equations_14_to_17():
 def test_a_population_is_drawn_around_the_leapt_point():
     options = BOLeapOptions(population=400, best=5, sigma=0.5)
     local = SemiLocal(np.zeros(2), options, np.random.default_rng(0))
-    x = local.population()
+    x = local.draw()
     local.tell(x, x.sum(axis=1))
     local.leap(np.array([0.4, -0.9]))
-    drawn = local.population()
+    drawn = local.draw()
     expected = local.es.sigma**2 * local.es.sm.C
     np.testing.assert_allclose(drawn.mean(axis=0), [0.4, -0.9], atol=4 * local.es.sigma / math.sqrt(400))
     np.testing.assert_allclose(np.cov(drawn.T), expected, atol=0.25 * expected.max())
 
 
 def test_a_local_step_is_a_population_the_mean_of_its_best_five_and_a_descent_from_there():
-    table = search(RIPPLES, BOLeap(SPACE, seed=1), budget=120, gradient_cost=2.0).table()
+    table = search(RIPPLES, BOLeap(SPACE, seed=1), budget=120, gradient_cost=2.0).dataset()
     x, loss, kind = (table[name].to_numpy() for name in ("x", "loss", "kind"))
     starts = np.flatnonzero((kind[1:] == Kind.DESCENT) & (kind[:-1] == Kind.POPULATION)) + 1
     assert len(starts) >= 3
@@ -80,20 +80,20 @@ def test_a_local_step_is_a_population_the_mean_of_its_best_five_and_a_descent_fr
 
 
 def test_gradients_are_asked_for_in_descents_and_nowhere_else():
-    table = search(RIPPLES, BOLeap(SPACE, seed=1), budget=60, gradient_cost=2.0).table()
+    table = search(RIPPLES, BOLeap(SPACE, seed=1), budget=60, gradient_cost=2.0).dataset()
     np.testing.assert_array_equal(table["slope"].notnull(), table["kind"] == Kind.DESCENT)
 
 
 def test_a_new_proposal_is_made_once_the_local_budget_is_spent(monkeypatch):
     optimizer = BOLeap(SPACE, seed=0, options=BOLeapOptions(local_budget=25, steps=4))
     spent: list[int] = []
-    lowest = optimizer.surrogate.lowest
+    lowest = optimizer.surrogate.minimise
 
     def counting(random):
         spent.append(len(optimizer.surrogate.loss))
         return lowest(random)
 
-    monkeypatch.setattr(optimizer.surrogate, "lowest", counting)
+    monkeypatch.setattr(optimizer.surrogate, "minimise", counting)
     for _ in range(40):
         ask = optimizer.ask()
         optimizer.tell(ask.x, RIPPLES.evaluate(ask.x, grad=ask.grad))
@@ -109,7 +109,7 @@ def test_the_process_sees_population_and_descents_failures_and_all():
 
         def evaluate(self, x, *, grad=True):
             loss = torch.where(x[:, 0] < -0.5, torch.nan, ((x - 0.5) ** 2).sum(dim=1))
-            return Evaluation.judged(loss, 2 * (x - 0.5) if grad else None)
+            return Evaluation.from_results(loss, 2 * (x - 0.5) if grad else None)
 
     optimizer = BOLeap(SPACE, seed=4)
     ends = []
@@ -125,7 +125,7 @@ def test_the_process_sees_population_and_descents_failures_and_all():
 
 
 def test_points_lie_in_the_box():
-    table = search(RIPPLES, BOLeap(SPACE, seed=2), budget=60, gradient_cost=2.0).table()
+    table = search(RIPPLES, BOLeap(SPACE, seed=2), budget=60, gradient_cost=2.0).dataset()
     assert (np.abs(table["x"] - 1.0) <= 3.0).all()
     assert (table["status"] == Status.OK).all()
 

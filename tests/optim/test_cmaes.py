@@ -11,7 +11,7 @@ from gradscape.landscapes.adapters import from_torch
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind, Points
-from gradscape.optim.cmaes import CMAES, CMAESOptions, Normal
+from gradscape.optim.methods.cmaes import CMAES, CMAESOptions, Normal
 from gradscape.optim.search import search
 
 from .states import restored
@@ -29,14 +29,14 @@ def objective(loss: Callable[[torch.Tensor], torch.Tensor], space: ParameterSpac
 
 
 def points(loss: Callable[[torch.Tensor], torch.Tensor], *, seed: int = 0, budget: int = 300) -> Points:
-    table = search(objective(loss), CMAES(BOX, seed=seed), budget=budget).table()
+    table = search(objective(loss), CMAES(BOX, seed=seed), budget=budget).dataset()
     assert (table["kind"] == Kind.POPULATION).all()
     return table["x"].to_numpy()
 
 
 def test_it_finds_the_minimum_of_an_ellipsoid_to_many_digits() -> None:
     run = search(objective(ellipsoid), CMAES(BOX), budget=700)
-    assert run.best < 1e-9
+    assert run.best_loss < 1e-9
 
 
 def test_losses_matter_by_their_order_only() -> None:
@@ -115,9 +115,9 @@ def test_failed_episodes_push_the_search_away() -> None:
         space, name = BOX, "cliff"
 
         def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
-            return Evaluation.judged(x.sum(dim=1), None, torch.where(x[:, 0] < 0, Status.ESCAPED, Status.OK))
+            return Evaluation.from_results(x.sum(dim=1), None, torch.where(x[:, 0] < 0, Status.ESCAPED, Status.OK))
 
-    table = search(Cliff(), CMAES(BOX, seed=4), budget=600).table()
+    table = search(Cliff(), CMAES(BOX, seed=4), budget=600).dataset()
     assert (table["status"] != Status.OK).any()
     assert float(table["loss"].min()) == pytest.approx(-2.0, abs=1e-3)  # a = 0, b = c = -1
 
@@ -138,18 +138,18 @@ def test_a_restored_search_goes_on_bit_for_bit_past_restarts() -> None:
         again = restored(one, objective(ellipsoid))
         proposal = one.ask()
         assert torch.equal(again.ask().x, proposal.x)
-        one.tell(proposal.x, Evaluation.judged(ellipsoid(proposal.x), None))
+        one.tell(proposal.x, Evaluation.from_results(ellipsoid(proposal.x), None))
 
 
 def test_where_the_library_draws_other_points_it_goes_on_with_those_of_the_run() -> None:
     one = CMAES(BOX, seed=2)
     for _ in range(5):
         proposal = one.ask()
-        one.tell(proposal.x, Evaluation.judged(ellipsoid(proposal.x), None))
+        one.tell(proposal.x, Evaluation.from_results(ellipsoid(proposal.x), None))
     state = one.state()
     state["own"]["points"] += 1e-9
     with pytest.warns(RuntimeWarning, match="goes on with the points and losses that the run holds"):
-        again = CMAES.restored(objective(ellipsoid), state)
+        again = CMAES.from_state(objective(ellipsoid), state)
     assert again.strategy.best.f == one.strategy.best.f
     near = 3 * one.strategy.sigma  # not the same mean: points that were folded into the box are unfolded differently
     assert bool(((again.ask().x - one.ask().x).mean(dim=0).abs() < near).all())

@@ -6,7 +6,7 @@ from gradscape.landscapes.adapters import from_torch
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
-from gradscape.optim.descent import Descent, DescentOptions, Descents, DescentsOptions
+from gradscape.optim.methods.descent import Descent, DescentOptions, Descents, DescentsOptions
 from gradscape.optim.search import search
 
 from .states import restored
@@ -27,14 +27,14 @@ def path(descent: Descent, losses, grads) -> np.ndarray:
 def test_a_descent_contracts_a_quadratic_at_the_exact_rate():
     curvature, step = np.array([1.0, 3.0, 7.0]), 0.1
     start = np.array([0.9, -0.5, 0.2])
-    options = DescentOptions(step=step, longest=1.0, steps=12)
+    options = DescentOptions(step=step, max_step=1.0, steps=12)
     z = path(Descent(start, options), lambda z: 0.5 * (curvature * z**2).sum(), lambda z: curvature * z)
     rate = (1.0 - step * curvature) ** np.arange(12)[:, None]
     np.testing.assert_allclose(z, rate * start, rtol=1e-12)
 
 
 def test_a_move_is_shortened_to_the_longest_allowed_and_keeps_its_direction():
-    descent = Descent(np.zeros(2), DescentOptions(step=1.0, longest=0.25))
+    descent = Descent(np.zeros(2), DescentOptions(step=1.0, max_step=0.25))
     descent.tell(1.0, np.array([3e6, -6e6]))
     np.testing.assert_allclose(descent.at, [-0.125, 0.25])
 
@@ -69,31 +69,31 @@ def test_a_failed_episode_ends_a_descent_at_the_last_point_that_has_a_loss():
     np.testing.assert_array_equal(descent.at, np.zeros(2))
 
 
-@pytest.mark.parametrize("wrong", [{"step": 0.0}, {"longest": -1.0}, {"steps": 0}, {"shrink": 0.0}, {"shrink": 2.0}])
+@pytest.mark.parametrize("wrong", [{"step": 0.0}, {"max_step": -1.0}, {"steps": 0}, {"shrink": 0.0}, {"shrink": 2.0}])
 def test_a_descent_that_would_go_nowhere_is_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         DescentOptions(**wrong)
 
 
-def iterates(together: int, budget: int) -> np.ndarray:
+def iterates(batch_size: int, budget: int) -> np.ndarray:
     """Return what descents evaluate, as descent, step, dim of the scaled box; all take their six steps."""
-    options = DescentsOptions(together=together, step=0.01, longest=2.0, steps=6)
-    table = search(BOWL, Descents(SPACE, seed=3, options=options), budget=budget, gradient_cost=2.0).table()
+    options = DescentsOptions(batch_size=batch_size, step=0.01, max_step=2.0, steps=6)
+    table = search(BOWL, Descents(SPACE, seed=3, options=options), budget=budget, gradient_cost=2.0).dataset()
     assert (table["kind"] == Kind.DESCENT).all()
     z = (table["x"].to_numpy() - 1.0) / 3.0
-    rows = z.reshape(-1, together, 2).swapaxes(0, 1)  # step of the search, descent -> descent, step of the search
+    rows = z.reshape(-1, batch_size, 2).swapaxes(0, 1)  # step of the search, descent -> descent, step of the search
     return rows.reshape(-1, 6, 2)
 
 
 def test_descents_evaluated_together_are_those_evaluated_one_after_the_other():
-    alone = iterates(together=1, budget=24)
+    alone = iterates(batch_size=1, budget=24)
     np.testing.assert_allclose(alone[:, 1:], alone[:, :-1] * (1 - 0.01 * 18 * np.array([1, 3])), atol=1e-12)
-    np.testing.assert_allclose(iterates(together=4, budget=24), alone, atol=1e-12)
+    np.testing.assert_allclose(iterates(batch_size=4, budget=24), alone, atol=1e-12)
 
 
 def test_a_zero_gradient_ends_a_descent_and_begins_another():
     flat = from_torch(lambda x: 0.0 * x.sum(dim=1), SPACE)
-    table = search(flat, Descents(SPACE, seed=1), budget=40, gradient_cost=2.0).table()
+    table = search(flat, Descents(SPACE, seed=1), budget=40, gradient_cost=2.0).dataset()
     assert len(np.unique(table["x"], axis=0)) == 40
 
 
@@ -116,8 +116,8 @@ def test_descents_go_on_past_failures():
 
         def evaluate(self, x, *, grad=True):
             loss = torch.where(x[:, 0] < 1.0, torch.nan, x[:, 0])
-            return Evaluation.judged(loss, torch.tensor([[1.0, 0.0]]).expand(len(x), 2).double())
+            return Evaluation.from_results(loss, torch.tensor([[1.0, 0.0]]).expand(len(x), 2).double())
 
-    table = search(Cliff(), Descents(SPACE, seed=0), budget=80, gradient_cost=2.0).table()
+    table = search(Cliff(), Descents(SPACE, seed=0), budget=80, gradient_cost=2.0).dataset()
     assert int((table["status"] == Status.NONFINITE).sum()) > 5
     assert float(table["loss"].min()) < 1.5

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from gradscape import ParameterSpace, from_torch
-from gradscape.envs.options import read_options
 from gradscape.landscapes.objective import Status
-from gradscape.optim.registry import METHODS, optimizer_class
+from gradscape.landscapes.options import read_options
+from gradscape.optim.registry import methods, optimizer_class
 from gradscape.optim.search import search
 
 SPACE = ParameterSpace(["a", "b"], [0, -1], [1, 1])
@@ -28,7 +28,7 @@ SHORT = {  # what makes a method show all it does within a few episodes
 
 
 def options() -> Iterator[Any]:
-    for method in METHODS:
+    for method in methods():
         for option in dataclasses.fields(optimizer_class(method).Options):
             yield pytest.param(method, option, id=f"{method}.{option.name}")
 
@@ -42,7 +42,7 @@ def searched(objective: Any, method: str, options: dict[str, Any], budget: int =
 def outcome(method: str, options: dict[str, Any]) -> tuple[str, Any]:
     """Return how a search was refused, or the points it went to."""
     try:
-        return "", searched(BOWL, method, options).table()["x"].to_numpy()
+        return "", searched(BOWL, method, options).dataset()["x"].to_numpy()
     except ValueError as refusal:
         return str(refusal), np.empty(0)
 
@@ -80,10 +80,10 @@ LOSSES = {
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("losses", LOSSES)
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", methods())
 def test_a_method_searches_losses_of_any_size(method: str, losses: str) -> None:
     run = searched(from_torch(LOSSES[losses], SPACE, name=losses), method, SHORT.get(method, {}))
-    table = run.table()
+    table = run.dataset()
     assert run.count == 8
     assert np.isfinite(table["x"]).all()
     assert np.isfinite(table["loss"]).equals(table["status"] == Status.OK)

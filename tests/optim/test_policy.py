@@ -11,7 +11,7 @@ pytest.importorskip("stable_baselines3", reason="the extra rl is not installed")
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
-from gradscape.optim.policy import PPO, SAC, PPOOptions, SACOptions
+from gradscape.optim.methods.policy import PPO, SAC, PPOOptions, SACOptions
 from gradscape.optim.registry import optimizer_class
 from gradscape.optim.search import search
 
@@ -24,7 +24,7 @@ class Bowl:
     space = ParameterSpace.box(("x", "y"), -2.0, 2.0)
 
     def evaluate(self, x, *, grad=True):
-        return Evaluation.judged((x - torch.tensor([0.8, -1.0])).square().sum(dim=1), None)
+        return Evaluation.from_results((x - torch.tensor([0.8, -1.0])).square().sum(dim=1), None)
 
 
 class Coin:
@@ -42,7 +42,7 @@ class Coin:
         return torch.stack([seen, torch.full_like(seen, decision / 4)], dim=1)
 
     def evaluate(self, x, *, grad=True):
-        return Evaluation.judged((x[:, 1:] - 2 * self.side(x)[:, None]).square().mean(dim=1), None)
+        return Evaluation.from_results((x[:, 1:] - 2 * self.side(x)[:, None]).square().mean(dim=1), None)
 
     def side(self, x):
         return (25 * x[:, 0]).sin().sign()
@@ -53,7 +53,7 @@ class Fragile(Bowl):
 
     def evaluate(self, x, *, grad=True):
         loss = (x - torch.tensor([0.8, -1.0])).square().sum(dim=1)
-        return Evaluation.judged(loss.masked_fill(x[:, 0] < 0, torch.nan), None)
+        return Evaluation.from_results(loss.masked_fill(x[:, 0] < 0, torch.nan), None)
 
 
 SMALL = {
@@ -94,14 +94,14 @@ def played(optimizer, objective, proposals):
 
 @pytest.mark.parametrize("method", ["ppo", "sac"])
 def test_it_learns_a_bandit_within_the_budget(method):
-    losses = search(Bowl(), optimizer_class(method).on(Bowl(), seed=1), budget=300).table()["loss"].values
+    losses = search(Bowl(), optimizer_class(method).on(Bowl(), seed=1), budget=300).dataset()["loss"].values
     random = Bowl().evaluate(Bowl.space.uniform(2000, seed=0)).loss.mean()
     assert losses[-60:].mean() < 0.6 * random
 
 
 def test_it_learns_to_use_what_it_sees():
     sighted, blind = (
-        search(objective, PPO.on(objective, seed=0), budget=400).table()["loss"].values[-100:].mean()
+        search(objective, PPO.on(objective, seed=0), budget=400).dataset()["loss"].values[-100:].mean()
         for objective in (Coin(), Coin(blind=True))
     )
     assert sighted < 0.5 * blind
@@ -194,7 +194,7 @@ def test_only_sacs_warm_up_is_called_random(small):
 
 
 def test_failed_episodes_teach_it_to_stay_away():
-    losses = search(Fragile(), PPO.on(Fragile(), seed=0), budget=400).table()["loss"].values
+    losses = search(Fragile(), PPO.on(Fragile(), seed=0), budget=400).dataset()["loss"].values
     assert np.isnan(losses[:60]).mean() > 0.3
     assert np.isnan(losses[-60:]).mean() < 0.2
 

@@ -5,7 +5,7 @@ from scipy.stats import kstest
 from gradscape.landscapes.adapters import from_torch
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
-from gradscape.optim.random import RandomSearch
+from gradscape.optim.methods.random import RandomSearch
 from gradscape.optim.search import search
 
 SPACE = ParameterSpace(("a", "b"), torch.tensor([-3.0, 10.0]), torch.tensor([1.0, 30.0]), ("m", "s"))
@@ -13,7 +13,7 @@ FLAT = from_torch(lambda x: 0 * x.sum(dim=1), SPACE, name="flat")
 
 
 def test_points_are_uniform_in_the_box_whatever_their_losses() -> None:
-    table = search(FLAT, RandomSearch(SPACE, seed=1), budget=2000).table()
+    table = search(FLAT, RandomSearch(SPACE, seed=1), budget=2000).dataset()
     u = SPACE.to_unit(torch.from_numpy(table["x"].values)).numpy()
     for axis in u.T:
         assert kstest(axis, "uniform").pvalue > 0.01
@@ -22,6 +22,6 @@ def test_points_are_uniform_in_the_box_whatever_their_losses() -> None:
 
 
 def test_a_seed_decides_every_point() -> None:
-    one, again, other = (search(FLAT, RandomSearch(SPACE, seed=seed), budget=20).table()["x"] for seed in (1, 1, 2))
+    one, again, other = (search(FLAT, RandomSearch(SPACE, seed=seed), budget=20).dataset()["x"] for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, again)
     assert not np.isin(one, other).any()

@@ -20,8 +20,8 @@ from gradscape.landscapes.identity import StoreError
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
-from gradscape.optim.kept import CHUNK, STATE, Kept
-from gradscape.optim.run import Run, is_run
+from gradscape.optim.runs.journal import CHUNK, STATE, Journal
+from gradscape.optim.runs.store import RunStore, is_run
 
 from ..clock import Clock
 
@@ -29,9 +29,9 @@ SPACE = ParameterSpace(("speed", "angle"), torch.tensor([-1.0, 0.0]), torch.tens
 IDENTITY = {"objective": "hill", "fidelity": "draft", "method": "walk", "seed": 4}
 
 
-def run_at(path: Path, *, budget: int = 100, **changes: object) -> Run:
+def run_at(path: Path, *, budget: int = 100, **changes: object) -> RunStore:
     provenance = {"loss_unit": "m", "command": "landscape optimize"}
-    return Run.open_or_create(path, SPACE, identity=IDENTITY | changes, provenance=provenance, budget=budget)
+    return RunStore.open_or_create(path, SPACE, identity=IDENTITY | changes, provenance=provenance, budget=budget)
 
 
 def points(count: int, *, grad: bool = True, start: int = 0) -> tuple[torch.Tensor, Evaluation]:
@@ -39,19 +39,21 @@ def points(count: int, *, grad: bool = True, start: int = 0) -> tuple[torch.Tens
     x = torch.rand(count, 2, generator=torch.Generator().manual_seed(start), dtype=torch.float64)
     loss = torch.arange(start, start + count, dtype=torch.float64)
     failed = torch.where(loss == 2, Status.ESCAPED, Status.OK)
-    return x, Evaluation.judged(loss, torch.tensor([3.0, 4.0]).expand(count, 2).double() if grad else None, failed)
+    return x, Evaluation.from_results(
+        loss, torch.tensor([3.0, 4.0]).expand(count, 2).double() if grad else None, failed
+    )
 
 
 def test_a_run_reads_back_as_it_was_written(tmp_path: Path) -> None:
     run = run_at(tmp_path / "run.zarr")
-    run.begin(gradient_cost=2.5)
+    run.set_gradient_cost(2.5)
     run.append(*points(4), Kind.DESCENT, 1.5)
     run.append(*points(2, grad=False, start=4), Kind.POPULATION, 0.5)
     run.save(lambda: {"at": "what\ncomes\nnext"})
-    again = Run.open(tmp_path / "run.zarr")
-    xr.testing.assert_identical(again.table(), run.table())
+    again = RunStore.open(tmp_path / "run.zarr")
+    xr.testing.assert_identical(again.dataset(), run.dataset())
     assert (again.count, again.told, again.state()) == (6, 6, {"at": "what\ncomes\nnext"})
-    table = again.table()
+    table = again.dataset()
     np.testing.assert_array_equal(table["loss"], [0, 1, np.nan, 3, 4, 5])
     np.testing.assert_array_equal(table["slope"], [5, 5, np.nan, 5, np.nan, np.nan])
     np.testing.assert_array_equal(table["episodes"], [1, 2, 3, 4, 5, 6])
@@ -62,7 +64,7 @@ def test_a_run_reads_back_as_it_was_written(tmp_path: Path) -> None:
     assert table["kind"].values.tolist() == [Kind.DESCENT] * 4 + [Kind.POPULATION] * 2
     assert table["kind"].attrs["flag_meanings"].split()[Kind.POPULATION] == "population"
     assert again.failed == 1
-    assert again.best == 0.0
+    assert again.best_loss == 0.0
 
 
 def test_plain_xarray_reads_the_table_with_its_units(tmp_path: Path) -> None:
@@ -73,7 +75,7 @@ def test_plain_xarray_reads_the_table_with_its_units(tmp_path: Path) -> None:
     there = table.isel(evaluation=table["status"] != Status.MISSING)
     assert table.sizes == {"evaluation": 100, "dim": 2}
     assert there.sizes["evaluation"] == 5
-    for name, values in run.table().items():
+    for name, values in run.dataset().items():
         np.testing.assert_array_equal(there[name], values)
     assert list(there["dim"].values) == ["speed", "angle"]
     assert there["loss"].attrs["units"] == "m"
@@ -89,9 +91,9 @@ def test_rows_that_the_state_does_not_count_do_not_exist(tmp_path: Path) -> None
     run.append(*points(3, start=3), Kind.RANDOM, 1.0)
     run.save(lambda: {"at": "six"})
     (tmp_path / "run.zarr" / STATE).write_bytes(state)  # as if killed between the rows and the state
-    again = Run.open(tmp_path / "run.zarr")
+    again = RunStore.open(tmp_path / "run.zarr")
     assert (again.count, again.state()) == (3, {"at": "three"})
-    assert again.table().sizes["evaluation"] == 3
+    assert again.dataset().sizes["evaluation"] == 3
 
 
 def test_a_proposal_cut_short_is_in_the_table_and_dropped_before_the_run_goes_on(tmp_path: Path) -> None:
@@ -100,14 +102,14 @@ def test_a_proposal_cut_short_is_in_the_table_and_dropped_before_the_run_goes_on
     run.save(lambda: {"at": "three"})
     run.append(*points(2, start=3), Kind.RANDOM, 1.0)
     run.save()
-    again = Run.open(tmp_path / "run.zarr")
+    again = RunStore.open(tmp_path / "run.zarr")
     assert (again.count, again.told, again.state()) == (5, 3, {"at": "three"})
     again.rewind()
-    assert (again.count, len(again.table()["loss"])) == (3, 3)
+    assert (again.count, len(again.dataset()["loss"])) == (3, 3)
     again.extend(8)
     again.append(*points(5, start=3), Kind.RANDOM, 1.0)
     again.save(lambda: {"at": "eight"})
-    assert Run.open(tmp_path / "run.zarr").table()["loss"].values[-5:].tolist() == [3, 4, 5, 6, 7]
+    assert RunStore.open(tmp_path / "run.zarr").dataset()["loss"].values[-5:].tolist() == [3, 4, 5, 6, 7]
     assert xr.open_zarr(tmp_path / "run.zarr").sizes["evaluation"] == 8
 
 
@@ -122,7 +124,7 @@ def test_a_run_killed_while_it_writes_anew_what_was_cut_short_keeps_what_was_tol
     run.append(*points(2, start=3), Kind.RANDOM, 2.0)
     run.save(lambda: {"at": "five"})
     (tmp_path / "run.zarr" / STATE).write_bytes(state)  # as if killed between the rows and the state
-    again = Run.open(tmp_path / "run.zarr")
+    again = RunStore.open(tmp_path / "run.zarr")
     assert (again.count, again.told, again.state()) == (3, 3, {"at": "three"})
 
 
@@ -135,10 +137,10 @@ def test_a_missing_row_is_damage_not_data(tmp_path: Path) -> None:
         StoreError,
         match=f"rows {CHUNK + 1} to {2 * CHUNK} are not what was written; .* begin the run anew",
     ):
-        Run.open(tmp_path / "run.zarr")
+        RunStore.open(tmp_path / "run.zarr")
 
 
-def whole_run(path: Path) -> Run:
+def whole_run(path: Path) -> RunStore:
     """A run of several chunks, whose optimiser has been told two thirds of it."""
     run = run_at(path, budget=3 * CHUNK)
     run.append(*points(2 * CHUNK), Kind.RANDOM, 1.0)
@@ -151,7 +153,7 @@ def whole_run(path: Path) -> Run:
 def told_of(path: Path, whole: xr.Dataset) -> str:
     """Return why a run is refused; nothing where it is not, and then it has to be whole."""
     try:
-        found = Run.open(path).table()
+        found = RunStore.open(path).dataset()
     except StoreError as error:
         return str(error)
     xr.testing.assert_identical(found, whole)
@@ -161,7 +163,7 @@ def told_of(path: Path, whole: xr.Dataset) -> str:
 @pytest.mark.parametrize("damage", ["flipped", "cut", "removed", "empty", "swapped"])
 def test_whatever_file_of_a_run_is_damaged_it_is_refused_by_name_or_read_right(tmp_path: Path, damage: str) -> None:
     path = tmp_path / "run.zarr"
-    whole, refused = whole_run(path).table(), 0
+    whole, refused = whole_run(path).dataset(), 0
     files = sorted(file for file in path.rglob("*") if file.is_file())
     for number, file in enumerate(files):
         other = files[number - 1]
@@ -181,7 +183,7 @@ def test_whatever_file_of_a_run_is_damaged_it_is_refused_by_name_or_read_right(t
         file.write_bytes(content)
         other.write_bytes(next_content)
     assert refused > len(files) / 2
-    xr.testing.assert_identical(Run.open(path).table(), whole)
+    xr.testing.assert_identical(RunStore.open(path).dataset(), whole)
 
 
 def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
@@ -195,7 +197,7 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 
 def test_what_a_run_says_of_itself_is_what_was_written(tmp_path: Path) -> None:
     path = tmp_path / "run.zarr"
-    whole = whole_run(path).table()
+    whole = whole_run(path).dataset()
     about = json.loads((path / "zarr.json").read_text())
     for place in leaves(about["attributes"]):
         changed = json.loads(json.dumps(about))
@@ -204,10 +206,10 @@ def test_what_a_run_says_of_itself_is_what_was_written(tmp_path: Path) -> None:
         inner[last] = {"x": 1}
         (path / "zarr.json").write_text(json.dumps(changed))
         if place == ("gradient_cost",):  # the file `state` has it, too
-            xr.testing.assert_identical(Run.open(path).table(), whole)
+            xr.testing.assert_identical(RunStore.open(path).dataset(), whole)
         else:
             with pytest.raises(StoreError, match=re.escape(str(path))):
-                Run.open(path)
+                RunStore.open(path)
 
 
 def test_a_state_that_is_no_data_is_refused_and_not_run(tmp_path: Path) -> None:
@@ -221,26 +223,26 @@ def test_a_state_that_is_no_data_is_refused_and_not_run(tmp_path: Path) -> None:
     trap = np.empty(1, dtype=object)
     trap[0] = Trap()
     np.savez(traps, outline=trap, **{"0": trap})
-    kept = Kept.read(path)
+    kept = Journal.read(path)
     for planted in (pickle.dumps(Trap()), traps.getvalue()):
         (path / STATE).write_bytes(planted)
         with pytest.raises(StoreError, match="state is damaged"):
-            Run.open(path)
+            RunStore.open(path)
         replace(kept, state=planted).write(path)  # by somebody who knows how
         with pytest.raises(StoreError, match="state is damaged"):
-            Run.open(path).state()
+            RunStore.open(path).state()
     assert not (tmp_path / "sprung").exists()
     assert run.count == kept.rows
 
 
 def test_memory_grows_with_the_rows_and_not_with_the_budget(tmp_path: Path) -> None:
-    for run in (Run.in_memory(SPACE, budget=10**15), run_at(tmp_path / "run.zarr", budget=10**15)):
+    for run in (RunStore.in_memory(SPACE, budget=10**15), run_at(tmp_path / "run.zarr", budget=10**15)):
         for start in range(0, 300, 3):
             run.append(*points(3, start=start), Kind.RANDOM, 1.0)
         run.save(lambda: {})
-        assert run.table().sizes["evaluation"] == 300
+        assert run.dataset().sizes["evaluation"] == 300
         run.extend(10**16)
-    assert Run.open(tmp_path / "run.zarr").table().identical(run.table())
+    assert RunStore.open(tmp_path / "run.zarr").dataset().identical(run.dataset())
 
 
 def test_the_budget_is_the_end_of_the_table(tmp_path: Path) -> None:
@@ -256,23 +258,23 @@ def test_other_settings_are_refused_by_name_and_another_budget_is_not(tmp_path: 
     assert run_at(tmp_path / "run.zarr", budget=70).budget == 7
     wider = ParameterSpace(SPACE.names, SPACE.lower, torch.tensor([1.0, 4.0]), SPACE.units)
     with pytest.raises(StoreError, match=r"upper\[1\]: wanted 4.0, found 3.0"):
-        Run.open_or_create(tmp_path / "run.zarr", wider, identity=IDENTITY, budget=7)
+        RunStore.open_or_create(tmp_path / "run.zarr", wider, identity=IDENTITY, budget=7)
 
 
 def test_only_a_run_is_replaced(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/thesis.txt").write_text("precious")
     with pytest.raises(StoreError, match="is no run, so it is not replaced"):
-        Run.create(tmp_path / "mine", SPACE, identity={}, budget=3, overwrite=True)
+        RunStore.create(tmp_path / "mine", SPACE, identity={}, budget=3, overwrite=True)
     assert not is_run(tmp_path / "mine")
     with pytest.raises(StoreError, match="is no run of format 2"):
-        Run.open(tmp_path / "mine")
+        RunStore.open(tmp_path / "mine")
     with pytest.raises(StoreError, match="make one with `landscape optimize`"):
-        Run.open(tmp_path / "nothing")
+        RunStore.open(tmp_path / "nothing")
     run = run_at(tmp_path / "run.zarr")
     run.append(*points(3), Kind.RANDOM, 1.0)
     run.save(lambda: {})
-    assert Run.create(tmp_path / "run.zarr", SPACE, identity={}, budget=3, overwrite=True).count == 0
+    assert RunStore.create(tmp_path / "run.zarr", SPACE, identity={}, budget=3, overwrite=True).count == 0
     with pytest.raises(StoreError, match="was replaced or removed"):
         run.save(lambda: {})
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine", "run.zarr"]
@@ -283,13 +285,13 @@ def test_a_file_of_somebody_elses_in_a_run_is_not_lost_by_force(tmp_path: Path) 
     run_at(path)
     (path / "x/thesis.txt").write_text("precious")
     with pytest.raises(ValueError, match=r"holds files that are not of a run: x/thesis\.txt"):
-        Run.create(path, SPACE, identity={}, budget=3, overwrite=True)
+        RunStore.create(path, SPACE, identity={}, budget=3, overwrite=True)
     assert (path / "x/thesis.txt").read_text() == "precious"
     (path / "x/thesis.txt").unlink()
     (path / "zarr.json").write_text("{")
     with pytest.raises(StoreError, match=r"run\.zarr/zarr\.json is damaged: .*begin the run anew in another"):
-        Run.open(path)
-    assert Run.create(path, SPACE, identity={}, budget=3, overwrite=True).budget == 3
+        RunStore.open(path)
+    assert RunStore.create(path, SPACE, identity={}, budget=3, overwrite=True).budget == 3
 
 
 def test_what_zarr_had_not_written_whole_goes_when_the_run_is_filled_again(tmp_path: Path) -> None:
@@ -297,7 +299,7 @@ def test_what_zarr_had_not_written_whole_goes_when_the_run_is_filled_again(tmp_p
     half = tmp_path / f"run.zarr/loss/c/0.{32 * 'a'}.partial"
     half.parent.mkdir(parents=True)
     half.write_bytes(b"half")
-    with run.filling():
+    with run.lock():
         assert not half.exists()
 
 
@@ -305,16 +307,16 @@ def test_one_process_at_a_time_fills_a_run(tmp_path: Path) -> None:
     run = run_at(tmp_path / "run.zarr")
     other = os.open(tmp_path / "run.zarr", os.O_RDONLY)
     fcntl.flock(other, fcntl.LOCK_EX)
-    with pytest.raises(StoreError, match="being filled by another process"), run.filling():
+    with pytest.raises(StoreError, match="being filled by another process"), run.lock():
         pass
     os.close(other)
-    with run.filling():
+    with run.lock():
         pass
 
 
 def test_writing_takes_a_twentieth_of_the_time_at_most(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     clock, saved = Clock(), []
-    monkeypatch.setattr("gradscape.optim.run.time", clock)
+    monkeypatch.setattr("gradscape.optim.runs.store.time", clock)
     run = run_at(tmp_path / "run.zarr")
 
     def slow_state() -> dict[str, int]:
@@ -326,4 +328,4 @@ def test_writing_takes_a_twentieth_of_the_time_at_most(tmp_path: Path, monkeypat
         clock.sleep(0.3)
         run.append(*points(1, start=number), Kind.RANDOM, 0.3, slow_state)
     assert saved == [4, 31, 58]  # after the first second, then after 0.4 s / 5 % = 8 s each
-    assert Kept.read(tmp_path / "run.zarr").rows == 58
+    assert Journal.read(tmp_path / "run.zarr").rows == 58

@@ -8,13 +8,14 @@ import torch
 import xarray as xr
 
 from gradscape.landscapes.adapters import from_torch
+from gradscape.landscapes.cost import LONG, MOMENT, episode_cost
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind, NoOptions, Optimizer, Points, Proposal
-from gradscape.optim.cmaes import CMAES
-from gradscape.optim.random import RandomSearch
-from gradscape.optim.run import Run
-from gradscape.optim.search import LONG, MOMENT, Progress, episode_cost, search
+from gradscape.optim.methods.cmaes import CMAES
+from gradscape.optim.methods.random import RandomSearch
+from gradscape.optim.runs.store import RunStore
+from gradscape.optim.search import SearchProgress, search
 
 from ..clock import Clock
 from ..processes import Instant, alone
@@ -40,7 +41,7 @@ class Pit:
         u = SPACE.to_unit(x)
         failed = torch.where(u[:, 1] < 0.2, Status.ESCAPED, Status.OK)
         width = SPACE.upper - SPACE.lower
-        return Evaluation.judged((u**2).sum(dim=1), 2 * u / width if grad else None, failed)
+        return Evaluation.from_results((u**2).sum(dim=1), 2 * u / width if grad else None, failed)
 
 
 class Mixed(Optimizer):
@@ -66,18 +67,19 @@ class Mixed(Optimizer):
 METHODS = [RandomSearch, CMAES, Mixed]
 
 
-def run_at(path: Path, kind: type[Optimizer] = CMAES, *, budget: int = 60) -> Run:
-    return Run.open_or_create(path, SPACE, identity={"objective": "pit", "method": kind.name, "seed": 3}, budget=budget)
+def run_at(path: Path, kind: type[Optimizer] = CMAES, *, budget: int = 60) -> RunStore:
+    identity = {"objective": "pit", "method": kind.name, "seed": 3}
+    return RunStore.open_or_create(path, SPACE, identity=identity, budget=budget)
 
 
 def filled(path: Path, kind: type[Optimizer], *, budget: int, objective: Pit | None = None) -> xr.Dataset:
     run = run_at(path, kind, budget=budget)
     search(objective or Pit(), kind(SPACE, seed=3), run, budget=budget, gradient_cost=3.0)
-    return run.table().drop_vars("seconds")
+    return run.dataset().drop_vars("seconds")
 
 
 def test_the_table_holds_the_objective_at_the_points_that_were_asked_for() -> None:
-    table = search(Pit(), Mixed(SPACE), budget=40).table()
+    table = search(Pit(), Mixed(SPACE), budget=40).dataset()
     wanted = Pit().evaluate(torch.from_numpy(table["x"].values))
     np.testing.assert_array_equal(table["loss"], wanted.loss)
     np.testing.assert_array_equal(table["status"], wanted.status)
@@ -94,15 +96,15 @@ def test_the_budget_is_met_and_not_exceeded_by_one_episode(kind: type[Optimizer]
     objective = Pit()
     run = search(objective, kind(SPACE), budget=budget, gradient_cost=2.0)
     assert sum(objective.batches) == run.count == budget
-    assert run.table()["episodes"].values.tolist() == list(range(1, budget + 1))
+    assert run.dataset()["episodes"].values.tolist() == list(range(1, budget + 1))
 
 
 @pytest.mark.parametrize("kind", METHODS)
 def test_a_run_stopped_at_every_instant_ends_as_an_undisturbed_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: type[Optimizer]
 ) -> None:
-    monkeypatch.setattr("gradscape.optim.run.PAUSE", 0.0)
-    monkeypatch.setattr("gradscape.optim.run.SHARE", 1.0e9)  # write every time
+    monkeypatch.setattr("gradscape.optim.runs.store.PAUSE", 0.0)
+    monkeypatch.setattr("gradscape.optim.runs.store.SHARE", 1.0e9)  # write every time
     whole, stops = filled(tmp_path / "whole.zarr", kind, budget=45), 0
     while run_at(tmp_path / "run.zarr", kind, budget=45).count < 45:
         before = run_at(tmp_path / "run.zarr", kind, budget=45).count
@@ -112,7 +114,7 @@ def test_a_run_stopped_at_every_instant_ends_as_an_undisturbed_one(
             stops += 1
             assert run_at(tmp_path / "run.zarr", kind, budget=45).count > before  # nothing was computed twice
     assert stops >= 2
-    xr.testing.assert_equal(run_at(tmp_path / "run.zarr", kind, budget=45).table().drop_vars("seconds"), whole)
+    xr.testing.assert_equal(run_at(tmp_path / "run.zarr", kind, budget=45).dataset().drop_vars("seconds"), whole)
 
 
 @pytest.mark.parametrize("kind", METHODS)
@@ -142,8 +144,8 @@ def test_a_run_continued_to_a_larger_budget_is_the_one_that_had_it_from_the_begi
 def test_a_run_in_memory_can_be_continued_too() -> None:
     run = search(Pit(), Mixed(SPACE), budget=5, gradient_cost=3.0)
     xr.testing.assert_equal(
-        search(Pit(), Mixed(SPACE), run, budget=33).table().drop_vars("seconds"),
-        search(Pit(), Mixed(SPACE), budget=33, gradient_cost=3.0).table().drop_vars("seconds"),
+        search(Pit(), Mixed(SPACE), run, budget=33).dataset().drop_vars("seconds"),
+        search(Pit(), Mixed(SPACE), budget=33, gradient_cost=3.0).dataset().drop_vars("seconds"),
     )
 
 
@@ -153,7 +155,7 @@ def searching(path: Path) -> None:
 
 def test_sigkill_at_any_instant_changes_no_bit(tmp_path: Path) -> None:
     instants = alone(partial(searching, tmp_path / "whole.zarr"), tmp_path).changes
-    whole, found = run_at(tmp_path / "whole.zarr", budget=45).table().drop_vars("seconds"), []
+    whole, found = run_at(tmp_path / "whole.zarr", budget=45).dataset().drop_vars("seconds"), []
     for instant in range(1, instants + 1, 17):
         path = tmp_path / f"{instant}.zarr"
         assert alone(partial(searching, path), tmp_path, Instant(instant)).returncode == -signal.SIGKILL
@@ -169,11 +171,11 @@ def test_sigkill_at_any_instant_changes_no_bit(tmp_path: Path) -> None:
 def test_forward_equivalents_count_a_gradient_for_what_it_costs(tmp_path: Path) -> None:
     run, objective = run_at(tmp_path / "run.zarr", Mixed), Pit()
     search(objective, Mixed(SPACE, seed=3), run, budget=24, gradient_cost=2.5)
-    assert run.table()["forwards"].values[[6, 7, 8, 23]].tolist() == [7.0, 9.5, 10.5, 28.5]
+    assert run.dataset()["forwards"].values[[6, 7, 8, 23]].tolist() == [7.0, 9.5, 10.5, 28.5]
     assert objective.with_gradient == 3
     search(Pit(), Mixed(SPACE, seed=3), run, budget=60, gradient_cost=99.0)  # what was measured first stays
-    assert run.table()["forwards"].values[-1] == 60 + 7 * 1.5
-    assert Run.open(tmp_path / "run.zarr").gradient_cost == 2.5
+    assert run.dataset()["forwards"].values[-1] == 60 + 7 * 1.5
+    assert RunStore.open(tmp_path / "run.zarr").gradient_cost == 2.5
 
 
 class Timed(Pit):
@@ -191,7 +193,8 @@ class Timed(Pit):
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    monkeypatch.setattr("gradscape.optim.search.time", clock)
+    for module in ("optim.search", "landscapes.cost"):
+        monkeypatch.setattr(f"gradscape.{module}.time", clock)
     return clock
 
 
@@ -211,17 +214,17 @@ def test_a_slow_first_episode_must_do(clock: Clock) -> None:
 
 
 def test_seconds_add_up_to_the_time_it_took(clock: Clock) -> None:
-    table = search(Timed(clock), RandomSearch(SPACE), budget=40).table()
+    table = search(Timed(clock), RandomSearch(SPACE), budget=40).dataset()
     np.testing.assert_allclose(table["seconds"], np.minimum(np.arange(16, 64) // 16 * 0.16, 0.4)[:40])
 
 
 def test_progress_counts_up_and_knows_the_best(tmp_path: Path) -> None:
-    seen: list[Progress] = []
+    seen: list[SearchProgress] = []
     run = run_at(tmp_path / "run.zarr")
     search(Pit(), CMAES(SPACE, seed=3), run, budget=20, progress=seen.append)
     assert [now.done for now in seen] == [0, 7, 14, 20]
     assert np.isnan(seen[0].best)
-    table = run.table()
+    table = run.dataset()
     assert seen[2].best == float(table["loss"][:14].min())
     assert seen[-1].failed == int((table["status"] != Status.OK).sum())
     seen.clear()
@@ -236,7 +239,7 @@ def test_a_method_is_known_by_its_name_and_not_exchanged(tmp_path: Path) -> None
     named = run_at(tmp_path / "named.zarr", budget=20)
     search(Pit(), "cma-es", named, budget=20)
     made = filled(tmp_path / "made.zarr", CMAES, budget=20)
-    xr.testing.assert_identical(named.table().drop_vars("seconds"), made)
+    xr.testing.assert_identical(named.dataset().drop_vars("seconds"), made)
     with pytest.raises(ValueError, match="holds a run of cma-es, not of random"):
         search(Pit(), "random", named, budget=30)
     with pytest.raises(ValueError, match="no method is called 'cmaes'; did you mean cma-es"):

@@ -6,8 +6,8 @@ import pytest
 import torch
 from botorch.acquisition.analytic import UpperConfidenceBound
 
-from gradscape.optim.state import decoded, encoded
-from gradscape.optim.surrogate import GROWTH, NegativeBound, Surrogate, SurrogateOptions
+from gradscape.optim.methods.surrogate import GROWTH, NegativeBound, Surrogate, SurrogateOptions
+from gradscape.optim.runs.state import decode, encode
 
 
 def waves(z: np.ndarray) -> np.ndarray:
@@ -27,7 +27,7 @@ def test_the_bounds_argmin_agrees_with_a_dense_grid(count, kernel):
     surrogate = informed(count, kernel=kernel)
     axis = torch.linspace(0.0, 1.0, 201, dtype=torch.float64)
     grid = torch.cartesian_prod(axis, axis)
-    found = torch.from_numpy(surrogate.lowest(np.random.default_rng(0)) + 1.0)[None] / 2.0
+    found = torch.from_numpy(surrogate.minimise(np.random.default_rng(0)) + 1.0)[None] / 2.0
     bound = UpperConfidenceBound(surrogate.model(), beta=1.0, maximize=False)
     with torch.no_grad():
         values, value = -bound(grid[:, None]), -bound(found[:, None])
@@ -64,7 +64,7 @@ def test_the_bound_lies_the_coefficient_below_the_mean():
 def test_more_exploration_goes_further_from_what_is_known():
     def distance(coefficient: float) -> float:
         surrogate = informed(15, coefficient=coefficient)
-        return np.linalg.norm(surrogate.z - surrogate.lowest(np.random.default_rng(0)), axis=1).min()
+        return np.linalg.norm(surrogate.z - surrogate.minimise(np.random.default_rng(0)), axis=1).min()
 
     assert distance(20.0) > 2.0 * distance(0.0)
 
@@ -81,7 +81,7 @@ def test_a_failure_counts_as_the_worst_loss():
     surrogate, plain = informed(20), informed(20)
     worst, failed = plain.loss.argmax(), plain.loss.argmin()
     surrogate.loss[failed], plain.loss[failed] = np.inf, plain.loss[worst]
-    z = [one.lowest(np.random.default_rng(0)) for one in (surrogate, plain)]
+    z = [one.minimise(np.random.default_rng(0)) for one in (surrogate, plain)]
     np.testing.assert_array_equal(*z)
 
 
@@ -89,7 +89,7 @@ def test_a_failure_counts_as_the_worst_loss():
 def test_few_equal_and_wildly_different_losses_are_no_obstacle(loss):
     surrogate = Surrogate(3, SurrogateOptions(initial=1))
     surrogate.add(np.random.default_rng(0).uniform(-1, 1, (len(loss), 3)), np.array(loss))
-    z = surrogate.lowest(np.random.default_rng(0))
+    z = surrogate.minimise(np.random.default_rng(0))
     assert np.isfinite(z).all()
     assert (np.abs(z) <= 1.0).all()
 
@@ -100,7 +100,7 @@ def test_points_are_drawn_at_random_until_there_are_enough_and_one_has_a_loss():
         z = np.random.default_rng(1).uniform(-1.0, 1.0, (count, 2))
         surrogate.add(z, loss + waves(z))
         assert surrogate.informed == (count == 4 and loss < np.inf)
-        return [surrogate.lowest(np.random.default_rng(seed)) for seed in (0, 1)]
+        return [surrogate.minimise(np.random.default_rng(seed)) for seed in (0, 1)]
 
     np.testing.assert_array_equal(drawn(0, 0.0), drawn(3, 0.0))
     np.testing.assert_array_equal(drawn(0, 0.0), drawn(4, np.inf))
@@ -108,8 +108,8 @@ def test_points_are_drawn_at_random_until_there_are_enough_and_one_has_a_loss():
 
 
 def test_every_point_is_modelled_up_to_the_most_and_the_best_half_and_a_spread_past_it():
-    assert len(informed(50, most=50).model().train_targets) == 50
-    surrogate = informed(100, most=20)
+    assert len(informed(50, max_points=50).model().train_targets) == 50
+    surrogate = informed(100, max_points=20)
     kept = set(map(tuple, 2.0 * surrogate.model().train_inputs[0].numpy() - 1.0))
     order = np.argsort(surrogate.loss)
     assert len(kept) == 20
@@ -138,8 +138,8 @@ def test_its_state_is_whole_and_it_leaves_no_trace_in_global_generators_or_warni
     surrogate.model()
     before = torch.get_rng_state(), np.random.get_state()[1].copy(), list(warnings.filters)
     copy = Surrogate(2, surrogate.options)
-    copy.restore(decoded(encoded(surrogate.state())))
-    z = [one.lowest(np.random.default_rng(4)) for one in (surrogate, copy)]
+    copy.restore(decode(encode(surrogate.state())))
+    z = [one.minimise(np.random.default_rng(4)) for one in (surrogate, copy)]
     np.testing.assert_array_equal(*z)
     assert torch.equal(before[0], torch.get_rng_state())
     np.testing.assert_array_equal(before[1], np.random.get_state()[1])
@@ -149,7 +149,7 @@ def test_its_state_is_whole_and_it_leaves_no_trace_in_global_generators_or_warni
 def test_threads_find_what_one_alone_finds():
     def lowest(seed: int) -> list[np.ndarray]:
         surrogate = informed(30 + seed)
-        return [surrogate.lowest(np.random.default_rng(seed)) for _ in range(3)]
+        return [surrogate.minimise(np.random.default_rng(seed)) for _ in range(3)]
 
     alone = [lowest(seed) for seed in range(4)]
     with ThreadPoolExecutor(4) as executor:

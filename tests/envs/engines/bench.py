@@ -85,7 +85,7 @@ class BoundaryBench:
 
     def __init__(self, boundary, *, rate):
         self.boundary, self.rate, self.types = boundary, rate, precision("float64")
-        meet, Data = boundary.function("float64")
+        contact, Data = boundary.function("float64")
         self.data = boundary.data("float64", "cpu")
         real, vec3 = self.types.real, self.types.vec3
 
@@ -101,7 +101,7 @@ class BoundaryBench:
             out: wp.array[vec3],
         ):
             i = wp.tid()
-            out[i] = meet(data, p[i], v[i], 0, tools, still, 0, fraction, rate)
+            out[i] = contact(data, p[i], v[i], 0, tools, still, 0, fraction, rate)
 
         self.kernel = apply
 

@@ -1,0 +1,143 @@
+"""`gs.report`, `gs.check`, `gs.tradeoff`, `gs.pairs`: what a scene's landscape is like, and what may be asked of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Unpack
+
+from ..jobs.scene import SceneSpec
+from ..jobs.watch import Watch
+from .progress import default_watch
+from .scene import SceneKeywords, environment, say_call, spec_of
+
+if TYPE_CHECKING:
+    from ..envs.base import Environment
+    from ..jobs.check import CheckReport
+    from ..jobs.pairs import PairRanking
+    from ..jobs.report import ReportedSlice
+    from ..jobs.report_record import Report
+    from ..landscapes.measures.tradeoff import Tradeoff
+    from ..landscapes.slice import Slice
+
+    Scene = str | type[Environment] | Environment | SceneSpec
+
+
+def report(
+    what: Slice | Path | Scene,
+    *,
+    points: int = 6,
+    seed: int = 0,
+    out: str | Path | None = None,
+    **keywords: Unpack[SceneKeywords],
+) -> Report:
+    """Say what a landscape is like: minima, flatness, jumps, correlation, gradient quality, and the verdict in words.
+
+    `what` is a slice, a slice's folder, or a scene, of which a slice over its first two parameters is sampled first.
+    Gradients are tested by new evaluations at `points` places along each axis; of the `keywords`, those but `device`
+    are for a scene alone. The report's files lie in `out`, by default a folder under out/ named after it: the same call
+    reads them again.
+
+    Raises ValueError for a slice without gradients or on no disk, for what the scene does not have, and where the
+    folder holds something else or another report; Stopped where it is interrupted.
+    """
+    from ..jobs.report import ReportJob
+
+    watch, command = default_watch(), say_call("report", what, points=points, seed=seed, **keywords)
+    subject = _subject(what, points, watch, keywords)
+    job = ReportJob.open(
+        [subject], what=subject.name, single=True, out=_path(out), points=points, seed=seed,
+        device=keywords.get("device", "auto"), command=command,
+    )  # fmt: skip
+    return job.run(watch).reports[0]
+
+
+def check(scene: Scene, *, points: int = 4, seed: int = 0, **keywords: Unpack[SceneKeywords]) -> CheckReport:
+    """Check that an environment keeps what every environment promises, and that it answers at the extremes.
+
+    Checks are made at `points` random points of its box, two or more. The record says whether it `passed`, its
+    `findings` one by one, and shows them as a `table()`.
+
+    Raises ValueError for what the scene does not have, TooLargeError for more points than there is memory for, and
+    Stopped where it is interrupted.
+    """
+    from ..jobs.check import CheckJob
+
+    watch = default_watch()
+    spec = spec_of(scene, keywords).resolve(watch)
+    command = say_call("check", scene, points=points, seed=seed, **keywords)
+    return CheckJob.open(spec, points=points, seed=seed, command=command).run(watch)
+
+
+def tradeoff(
+    scene: Scene,
+    *,
+    points: int = 64,
+    seed: int = 0,
+    variants: Sequence[str] = (),
+    out: str | Path | None = None,
+    force: bool = False,
+    **keywords: Unpack[SceneKeywords],
+) -> Tradeoff:
+    """Measure accuracy against speed: the same points in several variants of a scene, each against the reference.
+
+    `variants` names what is changed beside the scene's fidelities: dt, resolution, particles, precision, stiffness,
+    engine, device; by default all that the scene has. The scene's own fidelity does not matter: its last one is the
+    reference. The study lies in `out`, by default a folder under out/ named after it: the same call goes on there. What
+    is found is also kept for `tolerance`. The record has `front`, `table()` and `plot()`.
+
+    Raises ValueError where the scene has one fidelity only, StoreMismatchError where the folder holds another study,
+    which `force` replaces; Stopped where it is interrupted.
+    """
+    from ..jobs.tolerance import keep
+    from ..jobs.tradeoff import TradeoffJob
+
+    command = say_call("tradeoff", scene, points=points, seed=seed, variants=tuple(variants), **keywords)
+    spec, folder = spec_of(scene, keywords), _path(out)
+    job = TradeoffJob.open(spec, points=points, seed=seed, settings=variants, out=folder, force=force, command=command)
+    found = job.run(default_watch())
+    keep(found)
+    return found
+
+
+def pairs(
+    scene: Scene,
+    *,
+    samples: int | None = None,
+    seed: int = 0,
+    out: str | Path | None = None,
+    force: bool = False,
+    **keywords: Unpack[SceneKeywords],
+) -> PairRanking:
+    """Rank pairs of parameters by sensitivity, ruggedness and misleading gradients: which slices to look at.
+
+    `samples` base points are taken, each of 1 + 5 x dim + 28 episodes (fewer below 8 parameters). The study lies in
+    `out`, by default a folder under out/ named after it: the same call goes on there.
+
+    Raises ValueError where the scene has one parameter, StoreMismatchError where the folder holds another study, which
+    `force` replaces; Stopped where it is interrupted.
+    """
+    from ..jobs.pairs import PairsJob
+
+    watch, spec = default_watch(), spec_of(scene, keywords)
+    command = say_call("pairs", scene, samples=samples, seed=seed, **keywords)
+    job = PairsJob.open(spec.resolve(watch), samples=samples, seed=seed, out=_path(out), force=force, command=command)
+    return job.run(watch)
+
+
+def _subject(what: Slice | Path | Scene, points: int, watch: Watch, keywords: SceneKeywords) -> ReportedSlice:
+    from ..jobs.report import ReportedSlice, sample_subject
+    from ..landscapes.slice import Slice
+
+    if isinstance(what, Slice):
+        if what.folder is None:
+            raise ValueError("report takes a slice on disk; this one is in memory alone, so use its own report()")
+        return ReportedSlice.of(what.folder)
+    if isinstance(what, Path) or (isinstance(what, str) and Path(what).exists()):
+        return ReportedSlice.of(Path(what))
+    env = environment(what, keywords, watch)
+    return sample_subject(env, points, say_call("report", what, **keywords), watch)
+
+
+def _path(out: str | Path | None) -> Path | None:
+    return None if out is None else Path(out)

@@ -1,0 +1,57 @@
+"""`landscape envs`: which environments there are, and all there is to know about one."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+
+def envs(name: Annotated[str | None, typer.Argument(help="One environment, to show it in full.")] = None) -> None:
+    """List the environments: name, dimension, parameters, model and fidelities.
+
+    With NAME it shows one in full: what it models, bounds, fidelities, engines, options and examples. It writes no
+    file.
+
+    Example: landscape envs fluid
+    """
+    _describe(name) if name else _list()
+
+
+def _list() -> None:
+    """Print every registered environment as a row of a table; none of ours is imported for that."""
+    from ..envs.registry import complete_entry, entries
+    from .terminal import Console, table
+
+    found = table("name", "dim", "parameters", "model", "fidelities", title="environments")
+    for entry in map(complete_entry, entries().values()):
+        found.add_row(entry.name, entry.dim, entry.parameters, entry.model, ", ".join(entry.fidelities))
+    console = Console()
+    console.print(found)
+    console.print("`landscape envs NAME` shows one in full: bounds, options, examples, fidelities, what it models.")
+
+
+def _describe(name: str) -> None:
+    """Print all there is to know about one environment."""
+    from dataclasses import asdict
+
+    from ..envs.registry import make
+    from ..gallery.paper import read_paper
+    from ..landscapes.options import in_full
+    from .terminal import Console, table
+
+    env, console = make(name, device="cpu"), Console(soft_wrap=True, highlight=False)
+    about = env.about() or "It says nothing of itself: its class has no docstring."
+    console.print(f"{env.name}: {env.space.dim} parameter{'s' if env.space.dim > 1 else ''}\n\n{about}\n")
+    bounded = table("no.", "parameter", "lower", "upper", "unit")
+    bounds = zip(env.space.lower.tolist(), env.space.upper.tolist(), strict=True)
+    for number, (label, unit, (lower, upper)) in enumerate(zip(env.space.names, env.space.units, bounds, strict=True)):
+        bounded.add_row(str(number), label, f"{lower:g}", f"{upper:g}", unit)
+    console.print(bounded)
+    for fidelity in env.fidelities.values():
+        console.print(f"fidelity {asdict(fidelity)}")
+    console.print(f"engines: {', '.join(env.engines)}")
+    console.print(in_full(env.Options))
+    console.print(f"examples: {', '.join(env.examples) or 'none'}")
+    if words := read_paper().words.get(env.name):
+        console.print(f"the paper says: {words}")

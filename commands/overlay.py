@@ -1,0 +1,56 @@
+"""`landscape overlay`: draw runs over a slice."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from .arguments import Device, Of, Print
+
+
+def overlay(
+    slice_: Annotated[str, typer.Argument(metavar="SLICE", help="A slice's folder.")],
+    runs: Annotated[list[str], typer.Argument(metavar="RUN", help="Folders of runs; a race's for all of it.")],
+    env: Of = None,
+    out: Annotated[
+        str | None, typer.Option(help="Folder for the results; by default one under out/ named after the overlay.")
+    ] = None,
+    print_: Print = None,
+    through: Annotated[
+        str | None, typer.Option(help="Cut anew through the best point of all runs (best) or of one run's folder.")
+    ] = None,
+    plane: Annotated[str | None, typer.Option(help="Cut anew along the runs' two principal directions: pca.")] = None,
+    resolution: Annotated[
+        int | None, typer.Option(min=2, help="Points along each axis of a new slice; by default as in SLICE.")
+    ] = None,
+    device: Device = "auto",
+    spawn: Annotated[bool, typer.Option("--spawn", help="Open it in rerun's viewer.")] = False,
+    serve: Annotated[bool, typer.Option("--serve", help="Serve it to a browser here, until Ctrl-C.")] = False,
+) -> None:
+    """Draw runs over a slice: where they went, how far off its plane, and what it does not show of what they found.
+
+    The folder then holds overlay.png, and overlay.rrd to walk around in and to play back.
+
+    Example: landscape overlay out/fluid-6-8 out/race-fluid --through best
+    """
+    from ..api.slice import open_slice
+    from ..envs.registry import environment_class
+    from ..jobs.folder import run_tables
+    from ..jobs.overlay import STREAM, Cut, OverlayJob
+    from .terminal import Bars, command_line
+    from .view import check_display, show_recording
+
+    if env:
+        environment_class(env)  # which registers it
+    bars, cut = Bars(), Cut.of(through, plane, resolution)
+    how: dict[str, Any] = {"out": Path(out) if out else None, "prints": print_ or [], "watch": bars, "device": device}
+    job = OverlayJob.of(open_slice(slice_), run_tables(runs), command=command_line(), cut=cut, **how)
+    recording = job.folder / STREAM
+    if spawn and not serve:
+        check_display(recording, "leave out --spawn, or take --serve to look at it in a browser")
+    drawn = job.run(bars)
+    bars.note(f"{drawn.summary.outcome()}\n{drawn.folder}: {', '.join(drawn.files)}")
+    if spawn or serve:
+        show_recording(recording, bars, serve=serve)

@@ -1,0 +1,181 @@
+"""`landscape race`: let methods compete, and say which of them is better than which."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ..jobs.scene import SceneSpec
+from .arguments import Budget, Json, Print, Scheduler, read_settings, takes_scene
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from ..jobs.race import RaceSummary
+
+ENOUGH = 10  # seeds, as the paper has
+
+
+@takes_scene("tolerance")
+def race(
+    scene: SceneSpec,
+    methods: Annotated[
+        list[str] | None,
+        typer.Option(help="Methods, a,b or repeated; by default all that can run here (`landscape methods`)."),
+    ] = None,
+    budget: Budget = 1000,
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each method, with seeds 0, 1, ...")] = 10,
+    workers: Annotated[
+        int, typer.Option(min=1, help="Runs at a time, each in a thread; losses do not depend on it, seconds do.")
+    ] = 1,
+    scheduler: Scheduler = None,
+    option: Annotated[
+        list[str] | None, typer.Option(help="A method's option, METHOD.NAME=VALUE; may be repeated.")
+    ] = None,
+    out: Annotated[
+        str | None, typer.Option(help="Folder for the results; by default one under out/ named after the race.")
+    ] = None,
+    print_: Print = None,
+    json_: Json = False,
+    report: Annotated[bool, typer.Option("--report", help="Say which of the paper's orderings hold.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Begin anew where these runs exist already.")] = False,
+) -> None:
+    """Let methods compete on the same budget, with several seeds each: best loss, targets reached, ranks.
+
+    The folder then holds race.png, race.json (ranks, differences, curves) and each run in a folder of its own. Stop it
+    at any moment: the same command goes on where it stopped. More methods, seeds or episodes go on from there too; runs
+    that are finished are not repeated. Refuses --workers beside --scheduler.
+
+    Example: landscape race fluid --methods random,bo-leap --budget 200 --seeds 3
+    """
+    from ..gallery.paper import read_paper
+    from ..jobs.race import RaceJob, check_methods
+    from ..jobs.workers import workers as cluster
+    from .terminal import Bars, command_line, print_json
+
+    if workers > 1 and scheduler:
+        raise ValueError(f"--scheduler has workers of its own, so --workers is 1; got {workers}")
+    chosen = check_methods([name.strip() for text in methods or [] for name in text.split(",") if name.strip()])
+    bars, options = Bars(), _read_options(option or [], chosen)
+    env = scene.make(bars)
+    how: dict[str, Any] = {"out": Path(out) if out else None, "force": force, "prints": print_ or [], "watch": bars}
+    how |= {
+        "claims": read_paper().claims_about(env.name),
+        "command": command_line(),
+        "options": options,
+        "workers": workers,
+    }
+    job = RaceJob.of(env, chosen, budget=budget, seeds=seeds, **how)
+    with cluster(scheduler, env.device) as executor:
+        summary = replace(job, executor=executor).run(bars)
+    if json_:
+        short = {key: value for key, value in summary.record().items() if key not in ("curves", "ecdf")}
+        print_json(short, folder=str(job.folder))
+    else:
+        _print(summary, claims=report)
+    bars.note(f"{job.folder}: {', '.join(summary.files)}")
+
+
+def _read_options(settings: Sequence[str], chosen: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Return options given as METHOD.NAME=VALUE, method -> name -> value. Raises ValueError for other methods'."""
+    from ..optim.registry import methods
+
+    names = chosen or list(methods())
+    found: dict[str, dict[str, str]] = {}
+    for setting, value in read_settings(settings, "--option").items():
+        method, dot, name = setting.partition(".")
+        if not dot or method not in names:
+            raise ValueError(
+                f"--option takes METHOD.NAME=VALUE for one of {', '.join(names)}; got {setting + '=' + value!r}"
+            )
+        found.setdefault(method, {})[name] = value
+    return found
+
+
+def _print(summary: RaceSummary, *, claims: bool) -> None:
+    """Print the ranks, and if asked what the paper claims beside what was measured."""
+    from .terminal import Console
+
+    console = Console(soft_wrap=True, highlight=False)
+    console.print(_ranks(summary))
+    for method, others in _beaten(summary).items():
+        console.print(f"{method} is better than {', '.join(others)}")
+    if summary.seeds < ENOUGH:
+        console.print(_doubt(summary.seeds))
+    if claims:
+        console.print(_claims(summary) if summary.claims else summary.silence)
+
+
+def _ranks(summary: RaceSummary) -> Table:
+    from ..optim.race import name_seeds
+    from .terminal import table
+
+    seeds = name_seeds(summary.seeds)
+    shown = table(
+        *("method", "mean rank", "wins", f"best loss{_unit(summary)}", "failed", "forward equivalents", "seconds"),
+        title=f"{summary.env} · {summary.fidelity} · {summary.budget} episodes · {seeds}",
+    )
+    for rank in summary.race.statistics.ranks:
+        none = f"; none with {name_seeds(rank.unsuccessful)}" if rank.unsuccessful else ""
+        shown.add_row(
+            rank.method,
+            _format_interval(rank.rank, rank.rank_low, rank.rank_high, 2),
+            str(rank.wins),
+            _format_interval(rank.mean, rank.low, rank.high, 3) + none,
+            str(rank.failed),
+            f"{rank.forward_equivalents:.0f}",
+            f"{rank.seconds:.3g}",
+        )
+    return shown
+
+
+def _beaten(summary: RaceSummary) -> dict[str, list[str]]:
+    """Return the methods that are better than others, by rank: the intervals of these differences exclude zero."""
+    figures = summary.race.statistics
+    found: dict[str, list[str]] = {}
+    for better in (rank.method for rank in figures.ranks):
+        pairs = [{one.first, one.second} for one in figures.differences if one.better == better]
+        if pairs:
+            found[better] = [(pair - {better}).pop() for pair in pairs]
+    return found
+
+
+def _doubt(seeds: int) -> str:
+    from ..optim.race import name_seeds
+
+    if seeds == 1:
+        return "one seed: no intervals, so no method is better than another"
+    return (
+        f"{name_seeds(seeds)}: too few for intervals as wide as they should be "
+        "(with 3 they cover the true mean in 75 % of cases, with 10 in 91 %; "
+        "of two equal methods they call one better in 20 % and 7 %)"
+    )
+
+
+def _claims(summary: RaceSummary) -> Table:
+    from .terminal import table
+
+    headings = ("claim", "this race", f"difference of mean losses{_unit(summary)}", "where the paper says so")
+    shown = table(*headings, title="what the paper claims, and this race")
+    for finding in summary.claims:
+        one = finding.difference
+        numbers = _format_interval(one.mean, one.low, one.high, 3) if one else ""
+        shown.add_row(str(finding.claim), finding.verdict, numbers, finding.claim.source)
+    return shown
+
+
+def _unit(summary: RaceSummary) -> str:
+    return f" [{summary.loss_unit}]" if summary.loss_unit else ""
+
+
+def _format_interval(value: float, low: float, high: float, digits: int) -> str:
+    """Write a number and its interval, as far as they are finite."""
+    from math import isfinite
+
+    if not isfinite(value):
+        return "none"
+    return f"{value:.{digits}g}" + (f" [{low:.{digits}g}, {high:.{digits}g}]" if isfinite(low) else "")

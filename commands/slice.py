@@ -1,0 +1,117 @@
+"""`landscape slice` and `landscape bounce`: sample a plane, or a line, through parameter space."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ..jobs.scene import SceneSpec
+from .arguments import (
+    Dims,
+    Extent,
+    Force,
+    Json,
+    NoGradients,
+    Out,
+    Print,
+    Resolution,
+    Scheduler,
+    Through,
+    read_extent,
+    takes_scene,
+)
+
+
+@takes_scene()
+def slice_(
+    scene: SceneSpec,
+    dims: Dims,
+    resolution: Resolution = 16,
+    through: Through = "center",
+    extent: Extent = None,
+    no_gradients: NoGradients = False,
+    scheduler: Scheduler = None,
+    out: Out = None,
+    print_: Print = None,
+    json_: Json = False,
+    force: Force = False,
+) -> None:
+    """Sample losses and gradients over a plane through parameter space, and draw them.
+
+    The folder then holds slice.zarr (the samples), landscape.png and summary.json. Stop it at any moment: the same
+    command goes on where it stopped.
+
+    Example: landscape slice fluid --dims 6 8 --resolution 24
+    """
+    how: dict[str, Any] = {"resolution": resolution, "through": through, "grad": not no_gradients}
+    _sample(scene, dims, extent, print_, out, **how, as_json=json_, force=force, scheduler=scheduler)
+
+
+@takes_scene("env", "tolerance", "engine", "deterministic", env="bounce", fidelity="standard")
+def bounce(
+    scene: SceneSpec,
+    axis: Annotated[str, typer.Option(help="The initial velocity to vary: x, y or z.")],
+    resolution: Annotated[int, typer.Option(min=2, help="Number of velocities.")] = 512,
+    through: Through = "example:aim",
+    extent: Extent = None,
+    out: Out = None,
+    print_: Print = None,
+    json_: Json = False,
+    force: Force = False,
+) -> None:
+    """Draw loss and gradient of the bouncing ball over one velocity, and mark where the number of bounces changes.
+
+    The folder then holds slice.zarr (the samples), landscape.png and summary.json.
+
+    Example: landscape bounce --axis y
+    """
+    if axis not in ("x", "y", "z"):
+        raise ValueError(f"bounce varies the velocity along axis x, y or z; got {axis!r}")
+    how: dict[str, Any] = {"resolution": resolution, "through": through, "grad": True}
+    _sample(scene, (f"velocity {axis}",), extent, print_, out, **how, as_json=json_, force=force)
+
+
+def _sample(
+    scene: SceneSpec,
+    dims: Sequence[str],
+    extent: str | None,
+    prints: Sequence[float] | None,
+    out: str | None,
+    *,
+    resolution: int,
+    through: str,
+    grad: bool,
+    as_json: bool,
+    force: bool,
+    scheduler: str | None = None,
+) -> None:
+    """Sample a slice, and say what came out."""
+    from .terminal import Bars, command_line, print_json
+
+    bars = Bars()
+    env = scene.make(bars)
+    from ..jobs.scene import plane_through
+    from ..jobs.slice import SliceJob
+    from ..jobs.workers import workers
+
+    plane = plane_through(env, dims, through=through, extent=read_extent(extent), resolution=resolution)
+    folder, widths = Path(out) if out else None, prints or []
+    with workers(scheduler, env.device) as executor:
+        job = SliceJob.of(
+            env,
+            plane,
+            command=command_line(),
+            out=folder,
+            grad=grad,
+            force=force,
+            executor=executor,
+            prints=widths,
+        )
+        summary = job.run(bars)
+    bars.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
+    if as_json:
+        print_json(asdict(summary), folder=str(job.folder))

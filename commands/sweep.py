@@ -1,0 +1,58 @@
+"""`landscape sweep`: sample slices as something else moves, and film them."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ..jobs.scene import SceneSpec
+from .arguments import Dims, Extent, Json, NoGradients, Resolution, Scheduler, Through, read_extent, takes_scene
+
+
+@takes_scene("tolerance")
+def sweep(
+    scene: SceneSpec,
+    dims: Dims,
+    over: Annotated[
+        str,
+        typer.Option(help="What moves from frame to frame: a third parameter over its bounds, horizon, or smoothing."),
+    ],
+    frames: Annotated[int, typer.Option(min=2, help="Number of its values, both ends included.")] = 24,
+    resolution: Resolution = 16,
+    through: Through = "center",
+    extent: Extent = None,
+    no_gradients: NoGradients = False,
+    scheduler: Scheduler = None,
+    out: Annotated[
+        str | None, typer.Option(help="Folder for the results; by default one under out/ named after the sweep.")
+    ] = None,
+    json_: Json = False,
+    force: Annotated[bool, typer.Option("--force", help="Begin anew where a sweep exists already.")] = False,
+) -> None:
+    """Sample a slice for each value of a third parameter, and film the slices on one colour scale.
+
+    The folder then holds frames/ (the samples of each frame; slice.zarr where there is one slice only), sweep.mp4,
+    sweep.gif, sweep.rrd (a 3-D scene, which `landscape view` opens) and summary.json. Stop it at any moment: the same
+    command goes on where it stopped.
+
+    Example: landscape sweep fluid --dims 6 8 --over 7 --frames 12
+    """
+    from ..jobs.scene import plane_through
+    from ..jobs.sweep import SweepJob
+    from ..jobs.workers import workers
+    from .terminal import Bars, command_line, print_json
+
+    bars = Bars()
+    env, folder = scene.make(bars), Path(out) if out else None
+    plane = plane_through(env, dims, through=through, extent=read_extent(extent), resolution=resolution)
+    how: dict[str, Any] = {"command": command_line(), "grad": not no_gradients, "force": force}
+    with bars.busy(f"opening {frames} slices"):
+        job = SweepJob.of(env, plane, over, frames, out=folder, **how)
+    with workers(scheduler, env.device) as executor:
+        summary = replace(job, executor=executor).run(bars)
+    bars.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
+    if json_:
+        print_json(asdict(summary), folder=str(job.folder))

@@ -1,0 +1,32 @@
+"""The terminal, as the verbs write to it: tables, lines, bars and one JSON object."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from typing import Any
+
+from rich.table import Table
+
+from ..api.progress import Bars as Bars
+from ..api.progress import Console as Console
+from ..api.progress import Described as Described
+
+
+def command_line() -> str:
+    """Return the command that this process runs, as one types it."""
+    return shlex.join(["landscape", *sys.argv[1:]])
+
+
+def table(*headings: str, title: str | None = None, **look: Any) -> Table:
+    """Return an empty table whose columns fold where the terminal is narrow; `look` is rich's."""
+    found = Table(title=title, title_justify="left", **look)
+    for heading in headings:
+        found.add_column(heading, overflow="fold")
+    return found
+
+
+def print_json(record: dict[str, Any], **more: Any) -> None:
+    """Print one JSON object on standard output."""
+    print(json.dumps({**record, **more}))

@@ -1,0 +1,105 @@
+"""`landscape view`: open what the other verbs leave, with the viewer it is made for."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from .terminal import Bars
+
+SITE = "index.html"
+SHOWN = (  # of a folder, the first that is there
+    *(SITE, "overlay.rrd", "race.png", "landscape.png", "progress.png", "sweep.mp4"),
+    *("surface.png", "episode.mp4", "episode.png", "sweep.rrd", "episode.rrd"),
+)
+PICTURES = (".png", ".html", ".mp4", ".gif")
+DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")  # variables of the environment that name one
+
+
+def view(
+    file: Annotated[str, typer.Argument(help="A picture, a film, a page, a recording (.rrd), or a results folder.")],
+    serve: Annotated[bool, typer.Option("--serve", help="Serve a recording to a browser, until Ctrl-C.")] = False,
+) -> None:
+    """Open what the other verbs leave, with the viewer it is made for.
+
+    Pictures, films and pages open in this system's programs, recordings (.rrd) in rerun's viewer or with --serve in a
+    browser. It writes no file.
+
+    Example: landscape view out/my-episode --serve
+    """
+    from .terminal import Bars
+
+    path = _choose(Path(file), serve=serve)
+    if path.suffix == ".rrd":
+        show_recording(path, Bars(), serve=serve)
+    else:
+        _open(path, Bars(), serve=serve)
+
+
+def show_recording(path: Path, bars: Bars, *, serve: bool) -> None:
+    """Show a recording in rerun's viewer, or serve it to a browser until Ctrl-C.
+
+    Raises ValueError where a window is wanted and there is no display, OSError where the viewer does not come up.
+    """
+    from ..landscapes.draw.recordings.viewer import open_viewer, serve_recording
+
+    if not serve:
+        check_display(path, f"look at it in a browser: landscape view {shlex.quote(str(path))} --serve")
+        bars.note(f"opening {path} in rerun's viewer")
+        open_viewer(path)
+        return
+    with serve_recording(path) as address:
+        try:
+            bars.note(f"{path} is at {address} until Ctrl-C")
+            while True:
+                time.sleep(3600)
+        except KeyboardInterrupt:
+            return
+
+
+def check_display(path: Path, instead: str) -> None:
+    """Raise ValueError, saying what to do `instead`, where there is no display to open a file on."""
+    if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in DISPLAYS):
+        raise ValueError(f"there is no display here to open {path} on; {instead}")
+
+
+def _open(path: Path, bars: Bars, *, serve: bool) -> None:
+    """Open a picture, a film or a page with this system's program for it."""
+    from ..landscapes.storage.files import resolve
+
+    serving = f"landscape gallery serve --out {shlex.quote(str(path.parent))}"
+    if serve and path.name == SITE:
+        raise ValueError(f"a site is served by: {serving}")
+    if serve:
+        raise ValueError(f"--serve shows recordings (.rrd) in a browser; {path} is none")
+    check_display(path, f"serve it to a browser: {serving}" if path.name == SITE else "copy it to where one is")
+    bars.note(f"opening {path}")
+    if typer.launch(str(resolve(path))):
+        raise OSError(f"no program of this system opens {path}; open it with one of your own")
+
+
+def _choose(path: Path, *, serve: bool) -> Path:
+    """Return what to open for a path; of a folder that is to be served, first a recording."""
+    from ..jobs.folder import RUN_STORE, SLICE_STORE
+
+    folder = path.parent if path.name in (SLICE_STORE, RUN_STORE) else path
+    if folder.is_dir():
+        for name in sorted(SHOWN, key=lambda name: serve and not name.endswith(".rrd")):
+            if (folder / name).exists():
+                return folder / name
+        raise ValueError(
+            f"{path} holds none of {', '.join(SHOWN)}; what `landscape slice`, sweep, optimize, race, overlay, replay "
+            "and gallery build leave does"
+        )
+    if not path.exists():
+        raise ValueError(f"there is no file {path}")
+    if path.suffix not in (*PICTURES, ".rrd"):
+        raise ValueError(f"view opens {', '.join(PICTURES)}, .rrd and results folders; got {path}")
+    return path

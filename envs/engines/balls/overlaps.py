@@ -1,0 +1,97 @@
+"""The same ball by fixed steps without a time of impact, as many simulators take them, for comparison.
+
+Semi-implicit Euler: the velocity is reflected in a step at whose start the ball overlaps a surface and approaches it.
+Such steps can tunnel, and their gradients know nothing of the time of impact.
+"""
+
+from functools import cache
+from typing import no_type_check
+
+import warp as wp
+
+from ..runtime import precision
+from .board import DONE, FREE, Kernels, surfaces
+
+
+@cache
+@no_type_check
+def step_kernels(name: str) -> Kernels:
+    """Return the kernels of a step; they take what those of `impacts` take."""
+    real = precision(name).real
+    vec2 = wp.types.vector(2, real)
+    Reals, Vecs, Ints = wp.array2d[real], wp.array2d[vec2], wp.array2d[int]
+    module = f"gradscape.overlaps.{name}"
+    Data, along, _, outward, distance, nearest, _, rebound, deflect = surfaces(name)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def find(
+        i: int,
+        data: Data,
+        angle: Reals,
+        x: Vecs,
+        v: Vecs,
+        spin: Reals,
+        rest: Reals,
+        step: Ints,
+        impacts: Ints,
+        support: Ints,
+        pick: Ints,
+        hits: Ints,
+    ):
+        """Find the surface that is overlapped most, of those that are approached."""
+        e = wp.tid()
+        if step[i, e] >= data.steps:
+            pick[i, e] = DONE
+            return
+        here = x[i, e]
+        w = v[i, e] - vec2(real(0.0), data.gravity * data.dt)
+        bars = data.pivot.shape[0]
+        deepest = real(0.0)
+        first = int(FREE)
+        for k in range(bars + 4):
+            surface = int(3 * bars + k)
+            if k < bars:
+                to = here - data.pivot[k]
+                axis = along(angle[e, k])
+                surface = 4 * k + nearest(data, vec2(wp.dot(to, axis), axis[0] * to[1] - axis[1] * to[0]))
+            gap = distance(data, surface, angle, e, here)
+            if gap < deepest and wp.dot(outward(data, surface, angle, e, here), w) < real(0.0):
+                deepest = gap
+                first = surface
+        pick[i, e] = first
+
+    @wp.kernel(module=module)
+    def move(
+        i: int,
+        data: Data,
+        angle: Reals,
+        x: Vecs,
+        v: Vecs,
+        spin: Reals,
+        rest: Reals,
+        step: Ints,
+        impacts: Ints,
+        support: Ints,
+        pick: Ints,
+        hits: Ints,
+    ):
+        e = wp.tid()
+        surface = pick[i, e]
+        step[i + 1, e] = step[i, e]
+        if surface == DONE:
+            return
+        here, turn = x[i, e], real(spin[i, e])
+        w = v[i, e] - vec2(real(0.0), data.gravity * data.dt)
+        hits[i + 1, e] = hits[i, e]
+        if surface != FREE:
+            n = outward(data, surface, angle, e, here)
+            approach = -wp.dot(n, w)
+            w, turn = deflect(data, n, w, turn, rebound(data, approach))
+            if approach > data.crawl:
+                hits[i + 1, e] = hits[i, e] + 1
+        x[i + 1, e] = here + data.dt * w
+        v[i + 1, e] = w
+        spin[i + 1, e] = turn
+        step[i + 1, e] = step[i, e] + 1
+
+    return Kernels(find, move)

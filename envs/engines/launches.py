@@ -1,0 +1,130 @@
+"""Kernel launches that come again: what Warp makes of their arguments is stored, and on a GPU whole graphs of them.
+
+A launch that is made anew costs Python more than most kernels take; one that is stored costs a tenth of that, and one
+in a CUDA graph next to nothing.
+"""
+
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import warp as wp
+
+from .mpm.model import Box
+
+MAX_GRAPHS, MAX_SEQUENCES = 512, 1024  # that are stored; more are not worth their memory
+
+BLOCK = 128  # threads of a GPU that share registers; scatters and gathers like few
+
+
+@dataclass(frozen=True)
+class _Call:
+    launch: Callable[[], None]
+
+
+@dataclass
+class _Sequence:
+    """Launches in their order, as they were made for a box of nodes.
+
+    `located` are those whose first argument says where that lies, `on_nodes` those that run over its nodes in so many
+    environments.
+    """
+
+    box: Box
+    launches: list[Any] = field(default_factory=list)
+    located: list[Any] = field(default_factory=list)
+    on_nodes: list[tuple[Any, int]] = field(default_factory=list)
+
+    def run(self) -> None:
+        for command in self.launches:
+            command.launch()
+
+    def move(self, box: Box, lattice: Any) -> None:
+        """Make the launches run on another box."""
+        if box != self.box:
+            for command in self.located:
+                command.set_param_at_index(0, lattice)
+            for command, batch in self.on_nodes:
+                command.set_dim((batch, box.cells))
+            self.box = box
+
+
+class Launches:
+    """Run the launches of a piece of work: made when it first comes, stored from then on.
+
+    What is launched under one key must be the same every time, arrays and numbers: only the box of nodes may be
+    another. Where an array is replaced by another, `clear` must be called.
+    """
+
+    use_graphs: ClassVar[bool] = True
+
+    def __init__(self, device: str) -> None:
+        self.device = device
+        self.sequences: dict[Hashable, _Sequence] = {}
+        self.seen: set[Hashable] = set()
+        self.graphs: dict[Hashable, Any] = {}
+
+    def run(self, key: Hashable, box: Box, lattice: Any, work: Callable[[], None], *, small: bool) -> None:
+        """Do `work` on a box of nodes; where it is `small`, a GPU records it when it comes again on the same box."""
+        known = self.sequences.get(key)
+        if known is None:
+            if len(self.sequences) == MAX_SEQUENCES:
+                self.clear()
+            self.sequences[key] = self._recording = _Sequence(box)
+            self._lattice = lattice
+            work()
+            return
+        known.move(box, lattice)
+        if self.device == "cpu" or not small or not self.use_graphs:
+            known.run()
+        else:
+            self._run_graph((key, box), known)
+
+    def launch(
+        self, kernel: Any, dim: tuple[int, int], inputs: list[Any], *, nodes: bool = False, **adjoint: Any
+    ) -> None:
+        """Launch a kernel as part of the work under way; `nodes` says that it runs over those of the box."""
+        how: dict[str, Any] = {"record_tape": False, "record_cmd": True, "block_dim": BLOCK}
+        command = wp.launch(kernel, dim, inputs, device=self.device, **how, **adjoint)
+        if inputs[0] is self._lattice:
+            self._recording.located.append(command)
+        if nodes:
+            self._recording.on_nodes.append((command, dim[0]))
+        self._recording.launches.append(command)
+        command.launch()
+
+    def call(self, work: Callable[[], None]) -> None:
+        """Do anything else as part of the work under way."""
+        self._recording.launches.append(_Call(work))
+        work()
+
+    def clear(self) -> None:
+        """Drop all that is stored."""
+        self.sequences.clear()
+        self.seen.clear()
+        self.graphs.clear()
+
+    def _run_graph(self, key: Hashable, known: _Sequence) -> None:
+        if key not in self.seen:
+            self.seen.add(key)
+            known.run()
+            return
+        if key not in self.graphs:
+            if len(self.graphs) == MAX_GRAPHS:
+                self.seen.clear()
+                self.graphs.clear()
+            with wp.ScopedCapture(device=self.device) as capture:
+                known.run()
+            self.graphs[key] = capture.graph
+        wp.capture_launch(self.graphs[key])
+
+
+@contextmanager
+def suspend_graphs() -> Iterator[None]:
+    """Launch kernels one by one within a with block, not as graphs."""
+    Launches.use_graphs = False
+    try:
+        yield
+    finally:
+        Launches.use_graphs = True

@@ -1,0 +1,1 @@
+"""MLS-MPM on Warp: particles that meet on a grid."""

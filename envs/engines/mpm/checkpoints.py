@@ -1,0 +1,109 @@
+"""What MLS-MPM stores of an episode: the particles of an instant, the grids of a substep, a control step whole."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from ..runtime import precision
+from .model import Box, Model, place_grid
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """The state of a batch at one instant, or its adjoint: arrays [environment, particle]."""
+
+    x: wp.array
+    v: wp.array
+    C: wp.array
+    S: tuple[wp.array, ...]
+
+    def arrays(self) -> tuple[wp.array, ...]:
+        """Return every array of the frame."""
+        return (self.x, self.v, self.C, *self.S)
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """What nodes hold in one substep, [environment, node]: momentum and mass, then velocity; or the adjoints."""
+
+    m: wp.array
+    v: wp.array
+
+
+class Allocator:
+    """Allocate arrays of zeros for up to `capacity` environments of a model."""
+
+    def __init__(self, model: Model, capacity: int, device: str) -> None:
+        self.model, self.capacity, self.device = model, capacity, device
+        self.types = precision(model.precision)
+
+    def array(self, dtype: Any, size: int) -> wp.array:
+        """Return zeros [environment, element]."""
+        return wp.zeros((self.capacity, size), dtype=dtype, device=self.device)
+
+    def frame(self) -> Frame:
+        """Return a frame of zeros."""
+        types, count = self.types, self.model.particles
+        x, v, C = (self.array(kind, count) for kind in (types.vec3, types.vec3, types.mat33))
+        states = (self.array(b.material.state(self.model.precision), len(b.x)) for b in self.model.bodies)
+        return Frame(x, v, C, tuple(states))
+
+    def grid(self, cells: int) -> Grid:
+        """Return a grid of zeros."""
+        return Grid(*(self.array(self.types.vec4, cells) for _ in range(2)))
+
+    def affine_momentum(self) -> wp.array:
+        """Return zeros for A, [environment, particle]."""
+        return self.array(self.types.mat33, self.model.particles)
+
+    def paths(self, lanes: int) -> wp.array:
+        """Return zeros [environment and lane, step, slot]."""
+        shape = self.capacity * lanes, self.model.steps + 1, self.model.boundary.slots
+        return wp.zeros(shape, dtype=self.types.vec3, device=self.device)
+
+
+class Tape:
+    """Hold one control step whole: frames between its ends, A and grids of its substeps, and where the grids lie."""
+
+    def __init__(self, allocator: Allocator, cells: int = 1) -> None:
+        model = allocator.model
+        self.step = -1
+        self.frames = [allocator.frame() for _ in range(model.substeps - 1)]
+        self.A = [allocator.affine_momentum() for _ in range(model.substeps)]
+        self.grids = [allocator.grid(cells) for _ in range(model.substeps)]
+        self.lattice = place_grid(model)
+        self._allocator = allocator
+
+    @property
+    def bytes(self) -> int:
+        """What its arrays take."""
+        grids = [array for grid in self.grids for array in (grid.m, grid.v)]
+        frames = [array for frame in self.frames for array in frame.arrays()]
+        return sum(array.capacity for array in (*frames, *self.A, *grids))
+
+    def growth(self, cells: int) -> int:
+        """Return the bytes that grids of so many nodes take beyond those that are there, 0 where these suffice."""
+        if self._cells >= cells:
+            return 0
+        more = self._room(cells) - self._cells
+        size = int(wp.types.type_size_in_bytes(self._allocator.types.vec4))
+        return 2 * len(self.grids) * self._allocator.capacity * more * size
+
+    def make_room(self, step: int, box: Box) -> None:
+        """Become the place of a control step that runs on a box of nodes."""
+        self.step = -1
+        if self._cells < box.cells:
+            for substep in range(len(self.grids)):
+                self.grids[substep] = self._allocator.grid(0)  # the old one goes first
+                self.grids[substep] = self._allocator.grid(self._room(box.cells))
+        self.step, self.lattice = step, place_grid(self._allocator.model, box)
+
+    @property
+    def _cells(self) -> int:
+        """How many nodes all its grids have room for."""
+        return min(int(grid.v.shape[1]) for grid in self.grids)
+
+    def _room(self, cells: int) -> int:
+        """Return how many nodes to make room for where so many are needed."""
+        return int(min(cells * 5 // 4, self._allocator.model.cells))

@@ -1,0 +1,123 @@
+"""What particles are made of: how motion changes a material's state, and what stress that state gives.
+
+A material carries only the state its stress needs: a fluid its volume ratio J, a solid its deformation gradient F. It
+has two kernels: `update` advances the state by the affine velocity C and fills the affine momentum A that p2g scatters,
+
+    S' = deform(S, C),    A = -dt V 4/dx^2 tau(S', C) + m C,
+
+and `adjoint` turns the adjoints of S' and A into those of S and C. Both are written by hand; the tests hold the second
+against differences of the first. tau is the Kirchhoff stress J sigma [Pa].
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...runtime import precision
+from . import elastic, fluid, plasticine
+
+
+@dataclass(frozen=True)
+class Fluid:
+    """A viscous, weakly compressible fluid: density [kg/m^3], bulk modulus [Pa], dynamic viscosity [Pa s].
+
+    Its pressure grows with log J, so that however hard a droplet is hit it pushes back, and a lone particle oscillates
+    at sqrt(12) c/dx whatever its J (stable for c dt/dx < 0.57). It bears tension up to a tenth more than its volume,
+    then tears: J grows no further.
+    """
+
+    density: float
+    bulk: float
+    viscosity: float
+
+    def volume_ratio(self, pressure: np.ndarray) -> np.ndarray:
+        """Return J at which the fluid bears `pressure` [Pa], counted on its reference volume."""
+        return np.asarray(np.exp(-pressure / self.bulk))  # K log J = -pressure
+
+    def kernels(self, name: str) -> tuple[Any, Any]:
+        """Return (update, adjoint) for one precision."""
+        update, adjoint = fluid.kernels(name)
+        return update, adjoint
+
+    def constants(self) -> tuple[float, ...]:
+        """Return what the kernels take besides state and motion."""
+        return self.bulk, self.viscosity
+
+    def state(self, name: str) -> Any:
+        """Return the Warp type of one particle's state."""
+        return precision(name).real
+
+    def initial(self, ratio: np.ndarray) -> np.ndarray:
+        """Return the state of particles compressed to volume ratio J, shape (particle,)."""
+        return ratio
+
+
+@dataclass(frozen=True)
+class _Solid:
+    """What solids share: density [kg/m^3], Young's modulus [Pa], Poisson's ratio; their state is F."""
+
+    density: float
+    young: float
+    poisson: float
+
+    @property
+    def mu(self) -> float:
+        """Shear modulus [Pa]."""
+        return self.young / (2.0 * (1.0 + self.poisson))
+
+    @property
+    def lam(self) -> float:
+        """First Lame parameter [Pa]."""
+        return self.young * self.poisson / ((1.0 + self.poisson) * (1.0 - 2.0 * self.poisson))
+
+    def volume_ratio(self, pressure: np.ndarray) -> np.ndarray:
+        """Return J at which the solid bears `pressure` [Pa], to first order."""
+        return 1.0 - pressure / (self.lam + 2.0 * self.mu / 3.0)
+
+    def state(self, name: str) -> Any:
+        """Return the Warp type of one particle's state."""
+        return precision(name).mat33
+
+    def initial(self, ratio: np.ndarray) -> np.ndarray:
+        """Return the state of particles compressed to volume ratio J, shape (particle, 3, 3)."""
+        return np.asarray(np.cbrt(ratio)[:, None, None] * np.eye(3))
+
+
+@dataclass(frozen=True)
+class Elastic(_Solid):
+    """A compressible neo-Hookean solid."""
+
+    @classmethod
+    def with_wave_speed(cls, density: float, speed: float, *, poisson: float) -> "Elastic":
+        """Return the solid in which pressure waves travel at `speed` [m/s]."""
+        modulus = density * speed**2  # lam + 2 mu
+        return cls(density, modulus * (1.0 + poisson) * (1.0 - 2.0 * poisson) / (1.0 - poisson), poisson)
+
+    def kernels(self, name: str) -> tuple[Any, Any]:
+        """Return (update, adjoint) for one precision."""
+        update, adjoint = elastic.kernels(name)
+        return update, adjoint
+
+    def constants(self) -> tuple[float, ...]:
+        """Return what the kernels take besides state and motion."""
+        return self.mu, self.lam
+
+
+@dataclass(frozen=True)
+class Plasticine(_Solid):
+    """A fixed-corotated solid that yields by von Mises at `yield_stress` [Pa]: its shape flows, its volume returns."""
+
+    yield_stress: float
+
+    def kernels(self, name: str) -> tuple[Any, Any]:
+        """Return (update, adjoint) for one precision."""
+        update, adjoint = plasticine.kernels(name)
+        return update, adjoint
+
+    def constants(self) -> tuple[float, ...]:
+        """Return what the kernels take besides state and motion; the last is the largest deviatoric log strain."""
+        return self.mu, self.lam, self.yield_stress / (2.0 * self.mu)
+
+
+Material = Fluid | Elastic | Plasticine

@@ -1,0 +1,74 @@
+"""Kernels of a viscous, weakly compressible fluid, which carries its volume ratio J."""
+
+from functools import cache
+from typing import Any, no_type_check
+
+import warp as wp
+
+from ...runtime import precision
+
+TORN = 1.1  # volume ratio at which a fluid tears
+
+
+@cache
+@no_type_check
+def kernels(name: str) -> tuple[Any, Any]:
+    """Return (update, adjoint): J' = min(exp(dt tr C) J, TORN), tau = K log J' I + J' mu (C + C^T - 2/3 tr C I)."""
+    types = precision(name)
+    real, mat33 = types.real, types.mat33
+    module = f"gradscape.fluid.{name}"
+
+    @wp.func(module=module)
+    def shear(C: mat33) -> mat33:
+        return C + wp.transpose(C) - (real(2.0) / real(3.0)) * wp.trace(C) * wp.identity(n=3, dtype=real)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def update(
+        first: int,
+        dt: real,
+        scale: real,
+        bulk: real,
+        viscosity: real,
+        mass: wp.array2d[real],
+        volume: wp.array2d[real],
+        J: wp.array2d[real],
+        C: wp.array2d[mat33],
+        J_new: wp.array2d[real],
+        A: wp.array2d[mat33],
+    ):
+        e, p = wp.tid()
+        c = C[e, first + p]
+        j = wp.min(wp.exp(dt * wp.trace(c)) * J[e, p], real(TORN))
+        tau = bulk * wp.log(j) * wp.identity(n=3, dtype=real) + j * viscosity * shear(c)
+        J_new[e, p] = j
+        A[e, first + p] = scale * volume[e, first + p] * tau + mass[e, first + p] * c
+
+    @wp.kernel(module=module, enable_backward=False)
+    def adjoint(
+        first: int,
+        dt: real,
+        scale: real,
+        bulk: real,
+        viscosity: real,
+        mass: wp.array2d[real],
+        volume: wp.array2d[real],
+        J: wp.array2d[real],
+        C: wp.array2d[mat33],
+        adj_J_new: wp.array2d[real],
+        adj_A: wp.array2d[mat33],
+        adj_J: wp.array2d[real],
+        adj_C: wp.array2d[mat33],
+    ):
+        e, p = wp.tid()
+        c = C[e, first + p]
+        growth = wp.exp(dt * wp.trace(c))
+        j = wp.min(growth * J[e, p], real(TORN))
+        g = (scale * volume[e, first + p]) * adj_A[e, first + p]  # the adjoint of tau
+        adj_j = adj_J_new[e, p] + bulk * wp.trace(g) / j + viscosity * wp.ddot(g, shear(c))
+        if growth * J[e, p] > real(TORN):
+            adj_j = real(0.0)
+        adj_J[e, p] = growth * adj_j
+        dilation = dt * j * adj_j * wp.identity(n=3, dtype=real)
+        adj_C[e, first + p] = mass[e, first + p] * adj_A[e, first + p] + j * viscosity * shear(g) + dilation
+
+    return update, adjoint

@@ -1,0 +1,135 @@
+"""What a batch of MLS-MPM episodes shares: bodies, boundary, grid, time; and which of the grid's nodes matter when."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from ..runtime import precision
+from .boundaries import Boundary
+from .materials import Fluid, Material
+from .transfers import lattice
+
+BOX_MARGIN = 1  # cells around the particles that a control step begins with
+EMPTY = 1e-8  # nodes lighter than this part of the lightest particle carry no velocity
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """One body: positions `x` [m], shape (particle, 3), `volume` [m^3] and initial `ratio` J, shape (particle,)."""
+
+    material: Material
+    x: np.ndarray
+    volume: np.ndarray
+    ratio: np.ndarray
+
+    @property
+    def mass(self) -> np.ndarray:
+        """Mass of each particle [kg]."""
+        return self.material.density * self.volume
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Everything a batch of episodes shares. Lengths [m], times [s]; `nodes` of the grid along x, y, z."""
+
+    precision: str
+    bodies: tuple[Body, ...]
+    boundary: Boundary
+    origin: tuple[float, float, float]
+    dx: float
+    nodes: tuple[int, int, int]
+    dt: float
+    substeps: int
+    steps: int
+    gravity: float = 9.81
+
+    @property
+    def particles(self) -> int:
+        """Number of particles of all bodies."""
+        return sum(len(body.x) for body in self.bodies)
+
+    @property
+    def particle_substeps(self) -> int:
+        """Number of particles times that of an episode's substeps."""
+        return self.particles * self.steps * self.substeps
+
+    @property
+    def mass(self) -> np.ndarray:
+        """Mass of each particle of all bodies [kg], shape (particle,)."""
+        return np.concatenate([body.mass for body in self.bodies])
+
+    @property
+    def volume(self) -> np.ndarray:
+        """Volume of each particle of all bodies [m^3], shape (particle,)."""
+        return np.concatenate([body.volume for body in self.bodies])
+
+    @property
+    def cells(self) -> int:
+        """Number of nodes of the grid."""
+        return int(np.prod(self.nodes))
+
+    def bytes_per_environment(self, tapes: int) -> int:
+        """Return about what an environment takes of a solver that stores so many control steps whole, with adjoints.
+
+        Grids are counted as large as they are around the bodies at rest, and as large again.
+        """
+        state = sum(len(body.x) * (1 if isinstance(body.material, Fluid) else 9) for body in self.bodies)
+        frame = 15 * self.particles + state  # x, v, C and each material's own
+        grid = 8 * min(self.cells, nodes_around(self, *self.corners, BOX_MARGIN).cells * 2)
+        substep = frame + 9 * self.particles + grid
+        return self.real_bytes * ((self.steps + 3) * frame + (tapes * self.substeps + 1) * substep)
+
+    @property
+    def corners(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the lowest and highest coordinates of particles at rest [m], each of shape (3,)."""
+        x = torch.from_numpy(np.concatenate([body.x for body in self.bodies]))
+        return x.amin(dim=0), x.amax(dim=0)
+
+    @property
+    def real_bytes(self) -> int:
+        """Bytes of one number."""
+        return 8 if self.precision == "float64" else 4
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box of nodes: the `first` of them, and how many there are along x, y, z."""
+
+    first: tuple[int, int, int]
+    nodes: tuple[int, int, int]
+
+    @property
+    def cells(self) -> int:
+        """Number of nodes."""
+        return int(np.prod(self.nodes))
+
+
+def place_grid(model: Model, box: Box | None = None) -> Any:
+    """Return where a model's grid lies, for the transfer kernels: the nodes in `box`, or all."""
+    first, nodes = (box.first, box.nodes) if box else ((0, 0, 0), model.nodes)
+    placed = lattice(model.precision)()
+    placed.origin = precision(model.precision).vec3(*model.origin)
+    placed.inv_dx = 1.0 / model.dx
+    placed.first = wp.vec3i(*first)
+    placed.nx, placed.ny, placed.nz = nodes
+    return placed
+
+
+def nodes_around(model: Model, low: torch.Tensor, high: torch.Tensor, margin: int, grain: int = 1) -> Box:
+    """Return the nodes that particles between two corners [m], shape (3,), touch while none moves `margin` cells.
+
+    It begins and ends at multiples of `grain`, or with the grid.
+    """
+    if not bool((low + high).isfinite().all()):
+        return Box((0, 0, 0), model.nodes)
+    origin = torch.tensor(model.origin, dtype=torch.float64)
+    last = torch.tensor(model.nodes) - 1
+    farthest = max(model.nodes)  # from the grid that matters; an exploded body may be beyond what an integer holds
+    first = ((low - origin) / model.dx - 0.5).floor().clamp(-farthest, farthest).int() - margin
+    end = ((high - origin) / model.dx + 1.5).floor().clamp(-farthest, farthest).int() + margin
+    first, end = first // grain * grain, -(-end // grain) * grain
+    first, end = first.clamp_min(0).minimum(last - 2), end.minimum(last)
+    return Box(tuple(first.tolist()), tuple((end - first).clamp_min(2).add(1).tolist()))

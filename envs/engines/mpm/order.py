@@ -1,0 +1,174 @@
+"""In which order particles lie: by cell, so that neighbours in memory are neighbours on the grid.
+
+A scatter can then add up the particles of one cell before it adds them to the grid, and a gather finds what it reads in
+the cache. Particles stay with their body, so that each body remains one piece of every array.
+"""
+
+from functools import cache
+from itertools import chain
+from types import SimpleNamespace
+from typing import Any, no_type_check
+
+import numpy as np
+import torch
+import warp as wp
+
+from ..runtime import load, precision, to_torch
+from .model import Model, place_grid
+from .transfers import lattice
+
+
+@cache
+@no_type_check
+def sorting_kernels(name: str) -> SimpleNamespace:
+    """Return the kernels `label, take, give`, and `take_state, give_state` by a state's type."""
+    types = precision(name)
+    real, vec3, mat33 = types.real, types.vec3, types.mat33
+    Lattice, module = lattice(name), f"gradscape.order.{name}"
+
+    @wp.kernel(module=module, enable_backward=False)
+    def label(
+        grid: Lattice,
+        bodies: int,
+        body: wp.array[wp.int32],
+        x: wp.array2d[vec3],
+        keys: wp.array[wp.int64],
+        places: wp.array[wp.int32],
+    ):
+        """Give each particle a key by environment, body and cell."""
+        e, p = wp.tid()
+        s = (x[e, p] - grid.origin) * grid.inv_dx
+        i = wp.clamp(int(s[0] - real(0.5)), 0, grid.nx - 1)
+        j = wp.clamp(int(s[1] - real(0.5)), 0, grid.ny - 1)
+        k = wp.clamp(int(s[2] - real(0.5)), 0, grid.nz - 1)
+        group = wp.int64(e * bodies + body[p])
+        at = e * x.shape[1] + p
+        keys[at] = group * wp.int64(grid.nx * grid.ny * grid.nz) + wp.int64((i * grid.ny + j) * grid.nz + k)
+        places[at] = p
+
+    @wp.kernel(module=module, enable_backward=False)
+    def take(
+        places: wp.array[wp.int32],
+        place: wp.array2d[wp.int32],
+        old_name: wp.array2d[wp.int32],
+        old_mass: wp.array2d[real],
+        old_volume: wp.array2d[real],
+        old_x: wp.array2d[vec3],
+        old_v: wp.array2d[vec3],
+        old_C: wp.array2d[mat33],
+        name: wp.array2d[wp.int32],
+        mass: wp.array2d[real],
+        volume: wp.array2d[real],
+        x: wp.array2d[vec3],
+        v: wp.array2d[vec3],
+        C: wp.array2d[mat33],
+    ):
+        e, p = wp.tid()
+        q = places[e * x.shape[1] + p]
+        place[e, p] = q
+        name[e, p] = old_name[e, q]
+        mass[e, p] = old_mass[e, q]
+        volume[e, p] = old_volume[e, q]
+        x[e, p] = old_x[e, q]
+        v[e, p] = old_v[e, q]
+        C[e, p] = old_C[e, q]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def give(
+        place: wp.array2d[wp.int32],
+        x: wp.array2d[vec3],
+        v: wp.array2d[vec3],
+        C: wp.array2d[mat33],
+        old_x: wp.array2d[vec3],
+        old_v: wp.array2d[vec3],
+        old_C: wp.array2d[mat33],
+    ):
+        e, p = wp.tid()
+        q = place[e, p]
+        old_x[e, q] = x[e, p]
+        old_v[e, q] = v[e, p]
+        old_C[e, q] = C[e, p]
+
+    states = {kind: _state_kernels(kind, f"{module}.{tail}") for tail, kind in (("number", real), ("matrix", mat33))}
+    return SimpleNamespace(label=label, take=take, give=give, states=states)
+
+
+@no_type_check
+def _state_kernels(kind: Any, module: str) -> tuple[Any, Any]:
+    @wp.kernel(module=module, enable_backward=False)
+    def take_state(first: int, place: wp.array2d[wp.int32], before: wp.array2d[kind], after: wp.array2d[kind]):
+        e, p = wp.tid()
+        after[e, p] = before[e, place[e, first + p] - first]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def give_state(first: int, place: wp.array2d[wp.int32], after: wp.array2d[kind], before: wp.array2d[kind]):
+        e, p = wp.tid()
+        before[e, place[e, first + p] - first] = after[e, p]
+
+    return take_state, give_state
+
+
+class Order:
+    """The order of one control step, at first the model's: arrays [environment, particle].
+
+    `place` says where each particle was in the control step before, `name` which of the model's it is; `mass` [kg] and
+    `volume` [m^3] lie in this order.
+    """
+
+    def __init__(self, model: Model, capacity: int, device: str) -> None:
+        def rows(values: np.ndarray, dtype: Any) -> wp.array:
+            return wp.array(np.tile(values, (capacity, 1)), dtype=dtype, device=device)
+
+        real, numbers = precision(model.precision).real, np.arange(model.particles, dtype=np.int32)
+        self.place, self.name = rows(numbers, wp.int32), rows(numbers, wp.int32)
+        self.mass, self.volume = rows(model.mass, real), rows(model.volume, real)
+
+    def to_model(self, x: torch.Tensor) -> torch.Tensor:
+        """Return what lies in this order, shape (batch, particle, *), in the model's."""
+        return torch.empty_like(x).scatter_(1, self._names(x), x)
+
+    def from_model(self, x: torch.Tensor) -> torch.Tensor:
+        """Return what lies in the model's order, shape (batch, particle, *), in this one."""
+        return x.gather(1, self._names(x))
+
+    def _names(self, x: torch.Tensor) -> torch.Tensor:
+        name = to_torch(self.name)[: len(x)].long()
+        return name.view(*name.shape, *[1] * (x.ndim - 2)).expand_as(x)
+
+
+class Sorter:
+    """Sort the particles of up to `capacity` environments between control steps, and bring adjoints back."""
+
+    def __init__(self, model: Model, capacity: int, device: str) -> None:
+        self.model, self.device, self.lattice = model, device, place_grid(model)
+        sizes = [len(body.x) for body in model.bodies]
+        self.body: wp.array = wp.array(np.repeat(np.arange(len(sizes), dtype=np.int32), sizes), device=device)
+        room = 2 * capacity * model.particles
+        self.keys, self.places = (wp.zeros(room, dtype=kind, device=device) for kind in (wp.int64, wp.int32))
+        self.bits = int(capacity * len(sizes) * model.cells).bit_length()
+        self.kernels = sorting_kernels(model.precision)
+        states = (self.kernels.states[body.material.state(model.precision)] for body in model.bodies)
+        load([self.kernels.label, *chain.from_iterable(states)], device)
+        self.first = np.cumsum([0, *sizes])[:-1].tolist()
+
+    def sort(self, old: Any, new: Any, before: Order, order: Order, batch: int) -> None:
+        """Fill `order` and the frame `new` from the frame `old`, which lies in the order of the step `before`."""
+        count = self.model.particles
+        inputs = [self.lattice, len(self.model.bodies), self.body, old.x, self.keys, self.places]
+        self._launch(self.kernels.label, count, batch, inputs)
+        wp.utils.radix_sort_pairs(self.keys, self.places, batch * count, 0, self.bits)
+        theirs = [before.name, before.mass, before.volume, old.x, old.v, old.C]
+        ours = [order.name, order.mass, order.volume, new.x, new.v, new.C]
+        self._launch(self.kernels.take, count, batch, [self.places, order.place, *theirs, *ours])
+        for first, source, S in zip(self.first, old.S, new.S, strict=True):
+            self._launch(self.kernels.states[S.dtype][0], S.shape[1], batch, [first, order.place, source, S])
+
+    def unsort(self, new: Any, old: Any, order: Order, batch: int) -> None:
+        """Fill the frame `old`, in the order of the step before, from the frame `new`, in `order`."""
+        arrays = [new.x, new.v, new.C, old.x, old.v, old.C]
+        self._launch(self.kernels.give, self.model.particles, batch, [order.place, *arrays])
+        for first, S, target in zip(self.first, new.S, old.S, strict=True):
+            self._launch(self.kernels.states[S.dtype][1], S.shape[1], batch, [first, order.place, S, target])
+
+    def _launch(self, kernel: Any, size: int, batch: int, inputs: list[Any]) -> None:
+        wp.launch(kernel, (batch, size), inputs, device=self.device, record_tape=False)

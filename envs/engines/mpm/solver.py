@@ -1,0 +1,374 @@
+"""MLS-MPM (Hu et al. 2018) for a batch of environments, with gradients recomputed from control-step checkpoints.
+
+One substep, state (x, v, C, S) of frame s to frame s + 1, S being each material's own state:
+
+    update  S'   = deform(S, C), A = -dt V 4/dx^2 tau(S', C) + m C
+    p2g     m_i  = sum w m,   q_i = sum w (m v + A (x_i - x))
+    grid    v_i  = boundary(q_i / m_i + dt g)
+    g2p     v'   = sum w v_i, C' = 4/dx^2 sum w v_i (x_i - x)^T, x' = x + dt v'
+
+Particles are kept at the ends of control steps; as many of the last control steps as fit are kept whole, with A and
+grids of every substep (on a CPU all or one). The gradient recomputes the others, one at a time. Between control steps
+particles are sorted (`order`).
+"""
+
+import threading
+import weakref
+from collections.abc import Callable, Mapping
+from itertools import chain
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from ..launches import Launches
+from ..runtime import free_memory, load, to_torch
+from .checkpoints import Allocator, Frame, Tape
+from .grid import velocity_kernel
+from .model import BOX_MARGIN, EMPTY, Box, Model, nodes_around
+from .order import Order, Sorter
+from .transfers import lattice, transfers
+
+CROWD = 8_000  # particles that hide what a launch costs on one core
+BUSY, FULL_CARD = 400_000, 1_000_000  # particles that keep a GPU busy; more than which gain nothing
+WHOLE_EPISODE = 192e6  # bytes up to which a CPU stores an episode whole
+LAUNCHES = 200_000  # particles up to which launches cost a GPU more than what they launch
+SPARE = 0.85  # part of a GPU's free memory that control steps are kept in
+GRAIN = 4  # nodes to which the boxes of so few are rounded, so that the same ones come again
+LANES = 32  # copies of the tools on a GPU, so that fewer nodes wait for each other to add to the same adjoint
+
+
+def capacity(model: Model, device: str) -> int:
+    """Return how many environments of a model a solver should take at once."""
+    if device == "cpu":
+        return max(1, min(4, CROWD // model.particles))  # few enough for the cache
+    free = free_memory() * 3 // 4
+    fitting, whole = free // memory(model, device), free // model.bytes_per_environment(model.steps)
+    return max(1, min(1024, FULL_CARD // model.particles, fitting, max(whole, BUSY // model.particles)))
+
+
+def memory(model: Model, device: str) -> int:
+    """Return about how many bytes an environment takes; a GPU's spare memory is used beyond that."""
+    whole = model.bytes_per_environment(model.steps)
+    return whole if device == "cpu" and whole <= WHOLE_EPISODE else model.bytes_per_environment(1)
+
+
+class Solver:
+    """Run up to `capacity` environments of one model at once, and differentiate where their control steps end.
+
+    Setting `stop` ends a run within a control step, with InterruptedError. `deterministic` makes a GPU's sums come in
+    the same order every time; on a CPU they do.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        *,
+        capacity: int,
+        device: str,
+        stop: threading.Event | None = None,
+        deterministic: bool = False,
+    ) -> None:
+        self.model, self.capacity, self.device = model, capacity, device
+        self.stop = stop or threading.Event()
+        self.allocator = Allocator(model, capacity, device)
+        self.types = self.allocator.types
+        self.kernels = transfers(model.precision, deterministic=deterministic)
+        boundary = model.boundary.function(model.precision)
+        self.velocity = velocity_kernel(model.precision, *boundary, deterministic=deterministic)
+        self.boundary = model.boundary.data(model.precision, device)
+        self.materials = [body.material.kernels(model.precision) for body in model.bodies]
+        transferring = [self.kernels.p2g, self.kernels.g2p, self.kernels.adjoint_p2g, self.kernels.adjoint_g2p]
+        load([*transferring, self.velocity, *chain.from_iterable(self.materials)], device)
+        self.first = np.concatenate([[0], np.cumsum([len(body.x) for body in model.bodies])]).tolist()
+        self.empty = EMPTY * float(model.mass.min())
+        self.boxes = [Box((0, 0, 0), model.nodes)] * model.steps
+        self.margins = [BOX_MARGIN] * model.steps  # cells around the particles, as each step has needed so far
+        self.checkpoints = [self.allocator.frame() for _ in range(model.steps + 1)]
+        self.orders = [Order(model, capacity, device) for _ in self.checkpoints]
+        self.end = self.allocator.frame()  # of a control step, before its particles are sorted
+        self.sorter = Sorter(model, capacity, device)
+        self.launches = Launches(device)
+        whole = device == "cpu" and memory(model, device) > model.bytes_per_environment(1)
+        self.tapes = [Tape(self.allocator) for _ in range(model.steps if whole else 1)]
+        self.spare_used = device == "cpu"  # whether spare memory has been put to use
+        self.lanes = 1 if device == "cpu" else LANES
+        self.tools = self.allocator.paths(self.lanes)
+        self.left_box, self.escaped = (wp.zeros(capacity, dtype=wp.int32, device=device) for _ in range(2))
+        self.adjoint: _Adjoint | None = None
+        self._start()
+
+    def run(self, tools: torch.Tensor) -> torch.Tensor:
+        """Simulate with the boundary's `tools`, shape (batch, step + 1, slot, 3); return x at their end [m]."""
+        batch, steps = len(tools), tools.shape[1] - 1
+        self.escaped.zero_()
+        self.by_lane(self.tools)[:batch, :, : steps + 1] = tools[:, None].to(self.types.torch)
+        corners = self.model.corners
+        for step in range(steps):
+            corners = self._advance_on_box(step, batch, *corners)
+        if not self.spare_used:
+            self._add_tapes()
+        return self.read_positions(steps, batch)
+
+    def _add_tapes(self) -> None:
+        """Store more control steps whole from the next run on, in most of a GPU's memory that is free after a first."""
+        self.spare_used = True
+        more = min(self.model.steps - 1, int(SPARE * free_memory()) // self.tapes[0].bytes)
+        cells = self.tapes[0].grids[0].m.shape[1]
+        self.tapes += [Tape(self.allocator, cells) for _ in range(more)]
+        self.tapes[0].step = -1  # it keeps other steps now
+        self.launches.clear()
+
+    def read_positions(self, step: int, batch: int) -> torch.Tensor:
+        """Return x [m] before control step `step` of the last run, shape (batch, particle, 3)."""
+        return self.orders[step].to_model(to_torch(self.checkpoints[step].x)[:batch])
+
+    def read_trajectory(self, environment: int) -> torch.Tensor:
+        """Return x [m] of one environment of the last run at the ends of control steps, (step + 1, particle, 3)."""
+        rows = [self.read_positions(step, environment + 1)[environment] for step in range(len(self.checkpoints))]
+        return torch.stack(rows).double().cpu()
+
+    def read_escaped(self, batch: int) -> torch.Tensor:
+        """Say for each environment whether a particle has left the grid, shape (batch,)."""
+        return to_torch(self.escaped)[:batch] > 0
+
+    def gradient(self, adj_x: Mapping[int, torch.Tensor]) -> torch.Tensor:
+        """Return the adjoint of the tools of the last run from those of x before some control steps, same shapes."""
+        if self.adjoint is None:
+            self.adjoint = _Adjoint(self)
+        return self.adjoint.run(adj_x)
+
+    def frames(self, step: int) -> list[Frame]:
+        """Return the frames of one control step, both ends included."""
+        return [self.checkpoints[step], *self.tape(step).frames, self.end]
+
+    def tape(self, step: int) -> Tape:
+        """Return where a control step is stored whole, or another one at the moment."""
+        return self.tapes[step % len(self.tapes)]
+
+    def _advance_on_box(
+        self, step: int, batch: int, low: torch.Tensor, high: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Simulate a control step on the nodes around the particles, or on more where one leaves them.
+
+        Take the corners between which they are at its beginning [m], shape (3,), and return those of its end.
+        """
+        whole = Box((0, 0, 0), self.model.nodes)
+        grain = GRAIN if self.device != "cpu" and self._small(batch) else 1
+        while True:
+            self.boxes[step] = nodes_around(self.model, low, high, self.margins[step], grain)
+            self.left_box.zero_()
+            self._advance(step, batch)
+            *corners, left = self._read_extent(batch)
+            if self.boxes[step] == whole or not bool(left.any()):
+                break
+            self.margins[step] *= 2
+        to_torch(self.escaped)[:batch] += to_torch(self.left_box)[:batch]
+        orders = self.orders[step], self.orders[step + 1]
+        self.sorter.sort(self.end, self.checkpoints[step + 1], *orders, batch)
+        return corners[0], corners[1]
+
+    def _read_extent(self, batch: int) -> tuple[torch.Tensor, ...]:
+        """Return the corners of all particles [m] and whether one left its box, by one transfer."""
+        x, left = to_torch(self.end.x)[:batch], to_torch(self.left_box)[:batch]
+        seen = torch.cat([x.amin(dim=(0, 1)), x.amax(dim=(0, 1)), left.amax()[None].to(x)])
+        return torch.split(seen.double().cpu(), 3)
+
+    def _advance(self, step: int, batch: int) -> None:
+        if self.stop.is_set():
+            raise InterruptedError("the simulation was stopped")
+        self._make_room(step)
+        self.launch_again(("forward", step, batch), step, batch, lambda: self._substeps(step, batch))
+
+    def _make_room(self, step: int) -> None:
+        """Make room for a control step, at the cost of others where memory runs out."""
+        while len(self.tapes) > 1 and not self._fits(step):
+            self._drop_tapes()
+        if self.tape(step).growth(self.boxes[step].cells):
+            self.launches.clear()
+        try:
+            self.tape(step).make_room(step, self.boxes[step])
+        except RuntimeError:  # what is free need not be of one piece
+            if len(self.tapes) == 1:
+                raise
+            self._drop_tapes()
+            self._make_room(step)
+
+    def _fits(self, step: int) -> bool:
+        """Say whether a tape can grow to what a control step needs and leave a GPU as much memory as it takes.
+
+        Torch, and Warp's sorting, want some, and of an allocation that fails Warp says so on standard error.
+        """
+        if self.device == "cpu":
+            return True
+        growth = self.tape(step).growth(self.boxes[step].cells)
+        return not growth or growth <= free_memory() // 2
+
+    def _drop_tapes(self) -> None:
+        self.launches.clear()
+        del self.tapes[len(self.tapes) // 2 :]
+
+    def launch_again(self, key: tuple[Any, ...], step: int, batch: int, work: Callable[[], None]) -> None:
+        """Do a control step's work, by the launches kept from the last time if there was one."""
+        self.launches.run(key, self.boxes[step], self.tape(step).lattice, work, small=self._small(batch))
+
+    def _small(self, batch: int) -> bool:
+        return batch * self.model.particles <= LAUNCHES
+
+    def _substeps(self, step: int, batch: int) -> None:
+        tape, frames = self.tape(step), self.frames(step)
+        for s in range(self.model.substeps):
+            self._update(step, frames[s], frames[s + 1], tape.A[s], batch)
+            self._fill_grid(frames[s], step, s, batch)
+            self._move_particles(frames[s], frames[s + 1], step, s, batch)
+
+    def _update(self, step: int, frame: Frame, new: Frame, A: wp.array, batch: int) -> None:
+        for b, (update, _) in enumerate(self.materials):
+            self.launch(update, self.size(b), batch, [*self.material_inputs(b, step, frame), new.S[b], A])
+
+    def _fill_grid(self, frame: Frame, step: int, substep: int, batch: int) -> None:
+        """Fill the substep's grid: momentum and mass from particles, then velocity."""
+        tape = self.tape(step)
+        self.clear(tape.grids[substep].m, step, batch)
+        particles = [self.orders[step].mass, frame.x, frame.v, tape.A[substep]]
+        inputs = [tape.lattice, *particles, tape.grids[substep].m]
+        self.launch(self.kernels.p2g, self.model.particles, batch, inputs)
+        inputs = self.velocity_inputs(step, substep)
+        self.launch(self.velocity, self.boxes[step].cells, batch, inputs, nodes=True)
+
+    def clear(self, grid: wp.array, step: int, batch: int) -> None:
+        """Zero what a control step uses of a grid."""
+        if self.device == "cpu":  # where numpy is quicker, and torch would spread it over threads that others want
+            values = grid.numpy()[:batch]
+            self.launches.call(lambda: values[:, : self.boxes[step].cells].fill(0.0))
+        else:
+            self.launch(self.kernels.clear, self.boxes[step].cells, batch, [grid], nodes=True)
+
+    def _move_particles(self, frame: Frame, new: Frame, step: int, substep: int, batch: int) -> None:
+        tape = self.tape(step)
+        grid_v = tape.grids[substep].v
+        inputs = [tape.lattice, self.model.dt, frame.x, grid_v, new.x, new.v, new.C, self.left_box]
+        self.launch(self.kernels.g2p, self.model.particles, batch, inputs)
+
+    def material_inputs(self, b: int, step: int, frame: Frame) -> list[Any]:
+        """Return what both kernels of a material take."""
+        dt, scale = self.model.dt, -self.model.dt * 4.0 / self.model.dx**2
+        constants = self.model.bodies[b].material.constants()
+        order = self.orders[step]
+        return [self.first[b], dt, scale, *constants, order.mass, order.volume, frame.S[b], frame.C]
+
+    def velocity_inputs(self, step: int, substep: int) -> list[Any]:
+        """Return the arguments of the grid's velocity kernel."""
+        model, tape = self.model, self.tape(step)
+        time = [self.lanes, step, substep / model.substeps, 1.0 / (model.substeps * model.dt)]
+        grid = tape.grids[substep]
+        return [
+            tape.lattice,
+            self.boundary,
+            model.dt,
+            model.gravity,
+            self.empty,
+            *time,
+            self.tools,
+            self.tools,
+            grid.m,
+            grid.v,
+        ]
+
+    def size(self, b: int) -> int:
+        """Return the number of particles of body b."""
+        return len(self.model.bodies[b].x)
+
+    def launch(self, kernel: Any, size: int, batch: int, inputs: list[Any], **how: Any) -> None:
+        """Launch a kernel over [environment, element]."""
+        self.launches.launch(kernel, (batch, size), inputs, **how)
+
+    def by_lane(self, paths: wp.array) -> torch.Tensor:
+        """View paths as [environment, lane, step, slot, axis]."""
+        view = to_torch(paths)
+        return view.view(self.capacity, self.lanes, *view.shape[1:])
+
+    def _start(self) -> None:
+        first = self.checkpoints[0]
+        to_torch(first.x)[:] = torch.from_numpy(np.concatenate([body.x for body in self.model.bodies]))
+        for body, state in zip(self.model.bodies, first.S, strict=True):
+            to_torch(state)[:] = torch.from_numpy(body.material.initial(body.ratio))
+
+
+class _Adjoint:
+    """Hold the adjoint arrays of a solver and run its backward pass."""
+
+    def __init__(self, solver: Solver) -> None:
+        self.solver = weakref.proxy(solver)  # which holds this: a cycle would keep a GPU's memory until it is collected
+        self.new, self.old = solver.allocator.frame(), solver.allocator.frame()
+        self.A = solver.allocator.affine_momentum()
+        self.grid = solver.allocator.grid(max(box.cells for box in solver.boxes))
+        self.tools = solver.allocator.paths(solver.lanes)
+        self.structs = (
+            lattice(solver.model.precision)(),
+            type(solver.boundary)(),
+        )  # unwanted adjoints, whose place Warp wants
+
+    def run(self, adj_x: Mapping[int, torch.Tensor]) -> torch.Tensor:
+        """Return the adjoint of the tools, shape (batch, step + 1, slot, 3)."""
+        solver, batch = self.solver, len(next(iter(adj_x.values())))
+        for array in (*self.new.arrays(), self.tools):
+            array.zero_()
+        for step in reversed(range(max(adj_x))):
+            if step + 1 in adj_x:
+                x = to_torch(self.new.x)[:batch]
+                x += solver.orders[step + 1].from_model(adj_x[step + 1].to(x))
+            solver.sorter.unsort(self.new, self.old, solver.orders[step + 1], batch)
+            self.new, self.old = self.old, self.new
+            if solver.tape(step).step != step:
+                solver._advance(step, batch)
+            self._retreat(step, batch)
+        by_lane: torch.Tensor = solver.by_lane(self.tools)[:batch]
+        return by_lane.sum(dim=1)
+
+    def _retreat(self, step: int, batch: int) -> None:
+        solver = self.solver
+        if self.grid.m.shape[1] < solver.boxes[step].cells:
+            self.grid = solver.allocator.grid(solver.boxes[step].cells)
+            solver.launches.clear()
+        ends = (self.old, self.new) if solver.model.substeps % 2 else (self.new, self.old)
+        key = "backward", step, batch, id(self.new)
+        solver.launch_again(key, step, batch, lambda: self._substeps(step, batch))
+        self.new, self.old = ends  # launches that are kept exchange nothing here
+
+    def _substeps(self, step: int, batch: int) -> None:
+        solver = self.solver
+        tape, frames = solver.tape(step), solver.frames(step)
+        for s in reversed(range(solver.model.substeps)):
+            solver.clear(self.grid.v, step, batch)
+            self._adjoint_g2p(frames[s], tape, s, batch)
+            self._adjoint_velocity(step, s, batch)
+            self._adjoint_p2g(step, frames[s], tape, s, batch)
+            self._adjoint_update(step, frames[s], batch)
+            self.new, self.old = self.old, self.new
+
+    def _adjoint_g2p(self, frame: Frame, tape: Tape, substep: int, batch: int) -> None:
+        solver = self.solver
+        inputs = [tape.lattice, solver.model.dt, frame.x, tape.grids[substep].v]
+        inputs += [self.new.x, self.new.v, self.new.C, self.grid.v, self.old.x]
+        solver.launch(solver.kernels.adjoint_g2p, solver.model.particles, batch, inputs)
+
+    def _adjoint_velocity(self, step: int, substep: int, batch: int) -> None:
+        solver = self.solver
+        inputs = solver.velocity_inputs(step, substep)
+        adjoints = [*self.structs, *[None] * (len(inputs) - 6), self.tools, None, self.grid.m, self.grid.v]
+        how = {"adj_inputs": adjoints, "adj_outputs": [], "adjoint": True}
+        solver.launch(solver.velocity, solver.boxes[step].cells, batch, inputs, nodes=True, **how)
+
+    def _adjoint_p2g(self, step: int, frame: Frame, tape: Tape, substep: int, batch: int) -> None:
+        solver = self.solver
+        inputs = [tape.lattice, solver.orders[step].mass, frame.x, frame.v, tape.A[substep], self.grid.m]
+        inputs += [self.old.x, self.old.v, self.A]
+        solver.launch(solver.kernels.adjoint_p2g, solver.model.particles, batch, inputs)
+
+    def _adjoint_update(self, step: int, frame: Frame, batch: int) -> None:
+        solver = self.solver
+        for b, (_, adjoint) in enumerate(solver.materials):
+            inputs = [*solver.material_inputs(b, step, frame), self.new.S[b], self.A, self.old.S[b], self.old.C]
+            solver.launch(adjoint, solver.size(b), batch, inputs)

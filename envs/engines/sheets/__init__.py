@@ -1,0 +1,1 @@
+"""Mass-spring sheets on Warp."""

@@ -1,0 +1,266 @@
+"""Mass-spring sheets: vertices joined by damped springs, against a moving surface that takes their normal velocity.
+
+Arrays are [row, vertex], one of each per step. A vertex gathers the forces of its own springs: every spring is computed
+twice, but no sum is atomic. The adjoint is written by hand in the same way: with d = x_j - x_i, w = v_j - v_i and mu_i
+the adjoint of the force on i, a pair that pulls i by f and j by -f adds -(mu_j - mu_i) . df to the loss's change.
+"""
+
+import threading
+from dataclasses import dataclass
+from functools import cache, partial
+from types import SimpleNamespace
+from typing import Any, no_type_check
+
+import numpy as np
+import torch
+import warp as wp
+
+from ..runtime import free_memory, load, precision, to_torch
+from .contact import Surface, contact_kernel
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """Vertices and the springs between them, in SI units.
+
+    `x` are the vertices at the start, shape (vertex, 3); `pairs` the two ends of each spring, shape (spring, 2); `rest`
+    its length and `weight` its share of stiffness and damping, shape (spring,). A spring of weight w between vertices
+    of stiffness s_i and s_j [N/m] pulls with w (s_i + s_j) / 2 times its elongation, and with w `damping` [N s/m] times
+    its rate. `mass` [kg] is that of each vertex; air takes `drag` [1/s] of its velocity; `held` vertices never move.
+    """
+
+    x: np.ndarray
+    pairs: np.ndarray
+    rest: np.ndarray
+    weight: np.ndarray
+    mass: float
+    damping: float
+    drag: float = 0.0
+    gravity: float = 9.81
+    held: tuple[int, ...] = ()
+
+
+def bytes_per_row(sheet: Sheet, steps: int, name: str) -> int:
+    """Return the bytes an episode keeps: position and velocities of every step."""
+    return 9 * (steps + 1) * len(sheet.x) * (8 if name == "float64" else 4)
+
+
+def capacity(size: int, device: str) -> int:
+    """Return how many episodes of a `size` in bytes a solver should take at once."""
+    if device == "cpu":
+        return max(1, min(32, (1 << 28) // size))
+    return max(1, min(1024, free_memory() * 3 // 4 // size))
+
+
+class Solver:
+    """Integrate up to `capacity` sheets by semi-implicit Euler, and differentiate where they end.
+
+    In each step springs, gravity and air change velocities; the surface takes from vertices inside it what goes into
+    it; then vertices move. The whole episode is kept. Setting `stop` ends it within a step, with InterruptedError.
+    """
+
+    def __init__(
+        self,
+        sheet: Sheet,
+        surface: Surface,
+        *,
+        dt: float,
+        steps: int,
+        name: str,
+        capacity: int,
+        device: str,
+        stop: threading.Event | None = None,
+    ) -> None:
+        self.sheet, self.dt, self.steps, self.device = sheet, dt, steps, device
+        self.stop = stop or threading.Event()
+        self.types = precision(name)
+        self.springs = spring_kernels(name)
+        self.touch = contact_kernel(name, *surface.function(name))
+        load([self.springs.pull, self.springs.adjoint, self.touch], device)
+        self.surface = surface.data(name)
+        self.network = _network(sheet, self.springs.Network, self.types, device)
+        self.held: Any = wp.array(np.isin(np.arange(len(sheet.x)), sheet.held), dtype=wp.bool, device=device)
+        self._allocate(capacity)
+
+    def run(self, velocity: torch.Tensor, stiffness: torch.Tensor, poses: torch.Tensor | None = None) -> torch.Tensor:
+        """Return where vertices are after each step [m], shape (step + 1, batch, vertex, 3).
+
+        All but held vertices start at `velocity` [m/s], shape (batch, 3); `stiffness` [N/m] has shape (batch, vertex);
+        `poses` of the surface have shape (batch, step + 1, 3), and are zeros unless given.
+        """
+        batch = len(velocity)
+        to_torch(self.x[0])[:batch] = torch.from_numpy(self.sheet.x).to(self.x_all)
+        to_torch(self.v[0])[:batch] = (velocity[:, None] * self._free()).to(self.x_all)
+        to_torch(self.stiffness)[:batch] = stiffness.to(self.x_all)
+        to_torch(self.poses)[:, :batch] = 0.0 if poses is None else poses.transpose(0, 1).to(self.x_all)
+        for step in range(self.steps):
+            self._launch(self.springs.pull, batch, self._pull_inputs(step), [self.pulled[step]])
+            self._launch(self.touch, batch, self._touch_inputs(step), [self.x[step + 1], self.v[step + 1]])
+        return self.x_all[:, :batch]
+
+    def gradient(self, adj_x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return the adjoints of `run`'s velocity, stiffness and poses from that of the last positions."""
+        batch = len(adj_x)
+        for array in (self.adj_v, self.adj_stiffness, self.adj_poses):
+            array.zero_()
+        to_torch(self.adj_x)[:batch] = adj_x.to(self.x_all)
+        for step in reversed(range(self.steps)):
+            self._step_back(step, batch)
+        stiffness, poses = to_torch(self.adj_stiffness)[:batch], to_torch(self.adj_poses)[:, :batch]
+        start = to_torch(self.adj_v)[:batch].cpu() * self._free().to(self.x_all.dtype)
+        velocity = torch.stack([row.sum(dim=0) for row in start])  # by row: batched sums round as the batch is split
+        return velocity, stiffness.cpu().clone(), poses.cpu().transpose(0, 1).clone()
+
+    def _allocate(self, capacity: int) -> None:
+        count, frames = len(self.sheet.x), self.steps + 1
+        vec3 = {"dtype": self.types.vec3, "device": self.device}
+        states = [wp.zeros((frames, capacity, count), **vec3) for _ in range(3)]
+        self.x_all = to_torch(states[0])
+        self.x, self.v, self.pulled = ([array[step] for step in range(frames)] for array in states)
+        self.poses, self.adj_poses = (wp.zeros((frames, capacity), **vec3) for _ in range(2))
+        self.adj_x, self.adj_v, self.adj_here, self.adj_pulled = (wp.zeros((capacity, count), **vec3) for _ in range(4))
+        self.stiffness, self.adj_stiffness = (
+            wp.zeros((capacity, count), dtype=self.types.real, device=self.device) for _ in range(2)
+        )
+
+    def _free(self) -> torch.Tensor:
+        """Return 1 for vertices that can move and 0 for held ones, shape (vertex, 1)."""
+        free = torch.ones(len(self.sheet.x), 1, dtype=torch.float64)
+        free[list(self.sheet.held)] = 0.0
+        return free
+
+    def _step_back(self, step: int, batch: int) -> None:
+        self.adj_here.zero_()
+        self.adj_pulled.zero_()
+        wp.launch(
+            self.touch,
+            (batch, len(self.sheet.x)),
+            self._touch_inputs(step),
+            [self.x[step + 1], self.v[step + 1]],
+            adj_inputs=[None, None, type(self.surface)(), None, self.adj_poses, self.adj_here, self.adj_pulled],
+            adj_outputs=[self.adj_x, self.adj_v],
+            device=self.device,
+            adjoint=True,
+            record_tape=False,
+        )
+        seeds = [self.adj_here, self.adj_pulled]
+        self._launch(
+            self.springs.adjoint,
+            batch,
+            [*self._pull_inputs(step), *seeds],
+            [self.adj_x, self.adj_v, self.adj_stiffness],
+        )
+
+    def _pull_inputs(self, step: int) -> list[Any]:
+        return [self.network, self.dt, self.stiffness, self.x[step], self.v[step]]
+
+    def _touch_inputs(self, step: int) -> list[Any]:
+        return [step, self.dt, self.surface, self.held, self.poses, self.x[step], self.pulled[step]]
+
+    def _launch(self, kernel: Any, batch: int, inputs: list[Any], outputs: list[Any]) -> None:
+        if self.stop.is_set():
+            raise InterruptedError("the simulation was stopped")
+        size = (batch, len(self.sheet.x))
+        wp.launch(kernel, size, inputs, outputs, device=self.device, record_tape=False)
+
+
+def _network(sheet: Sheet, Network: Any, types: Any, device: str) -> Any:
+    """List every vertex's neighbours one after the other, those of vertex i from first[i] to first[i + 1]."""
+    ends = np.concatenate([sheet.pairs, sheet.pairs[:, ::-1]])
+    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    network = Network()
+    network.first = wp.array(np.searchsorted(ends[order, 0], np.arange(len(sheet.x) + 1)), dtype=int, device=device)
+    network.neighbor = wp.array(ends[order, 1], dtype=int, device=device)
+    network.rest = wp.array(np.tile(sheet.rest, 2)[order], dtype=types.real, device=device)
+    network.weight = wp.array(np.tile(sheet.weight, 2)[order], dtype=types.real, device=device)
+    for name in ("mass", "damping", "drag", "gravity"):
+        setattr(network, name, getattr(sheet, name))
+    return network
+
+
+@cache
+@no_type_check
+def spring_kernels(name: str) -> SimpleNamespace:
+    """Return the kernel `pull` of forces on velocities, its `adjoint`, and the struct `Network` of one precision."""
+    types = precision(name)
+    real, vec3 = types.real, types.vec3
+    module = f"gradscape.springs.{name}"
+
+    @partial(wp.struct, module=module)
+    class Network:
+        """Springs as lists of each vertex's neighbours, and the scalars of Sheet."""
+
+        first: wp.array[int]
+        neighbor: wp.array[int]
+        rest: wp.array[real]
+        weight: wp.array[real]
+        mass: real
+        damping: real
+        drag: real
+        gravity: real
+
+    @wp.kernel(module=module, enable_backward=False)
+    def pull(
+        network: Network,
+        dt: real,
+        stiffness: wp.array2d[real],
+        x: wp.array2d[vec3],
+        v: wp.array2d[vec3],
+        pulled: wp.array2d[vec3],
+    ):
+        row, i = wp.tid()
+        x_i, v_i, s_i = x[row, i], v[row, i], stiffness[row, i]
+        f = vec3()
+        for k in range(network.first[i], network.first[i + 1]):
+            j = network.neighbor[k]
+            d = x[row, j] - x_i
+            length = wp.length(d)
+            if length > real(0.0):  # ends that coincide have no direction
+                n = (real(1.0) / length) * d
+                s = real(0.5) * (s_i + stiffness[row, j])
+                tension = s * (length - network.rest[k]) + network.damping * wp.dot(v[row, j] - v_i, n)
+                f += (network.weight[k] * tension) * n
+        a = f / network.mass - network.drag * v_i - vec3(real(0.0), network.gravity, real(0.0))
+        pulled[row, i] = v_i + dt * a
+
+    @wp.kernel(module=module, enable_backward=False)
+    def adjoint(
+        network: Network,
+        dt: real,
+        stiffness: wp.array2d[real],
+        x: wp.array2d[vec3],
+        v: wp.array2d[vec3],
+        adj_here: wp.array2d[vec3],
+        adj_pulled: wp.array2d[vec3],
+        adj_x: wp.array2d[vec3],
+        adj_v: wp.array2d[vec3],
+        adj_stiffness: wp.array2d[real],
+    ):
+        row, i = wp.tid()
+        x_i, v_i, s_i, adj_i = x[row, i], v[row, i], stiffness[row, i], adj_pulled[row, i]
+        gx = vec3()
+        gv = vec3()
+        gs = real(0.0)
+        for k in range(network.first[i], network.first[i + 1]):
+            j = network.neighbor[k]
+            d = x[row, j] - x_i
+            length = wp.length(d)
+            if length > real(0.0):
+                inverse = real(1.0) / length
+                n = inverse * d
+                w = v[row, j] - v_i
+                mu = network.weight[k] * (adj_pulled[row, j] - adj_i)
+                s = real(0.5) * (s_i + stiffness[row, j])
+                along, rate = wp.dot(mu, n), wp.dot(w, n)
+                across = mu - along * n
+                tension = s * (length - network.rest[k]) + network.damping * rate
+                gx += (s * along) * n + (tension * inverse) * across
+                gx += (network.damping * along * inverse) * (w - rate * n)
+                gv += (network.damping * along) * n
+                gs -= real(0.5) * along * (length - network.rest[k])
+        scale = dt / network.mass
+        adj_x[row, i] = adj_here[row, i] + scale * gx
+        adj_v[row, i] = (real(1.0) - dt * network.drag) * adj_i + scale * gv
+        adj_stiffness[row, i] += scale * gs
+
+    return SimpleNamespace(pull=pull, adjoint=adjoint, Network=Network)

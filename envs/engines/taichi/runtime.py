@@ -1,0 +1,67 @@
+"""Start Taichi: once per process, on one device, quietly."""
+
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from functools import cache
+from io import StringIO
+from typing import Any
+
+import torch
+
+from ..runtime import cores
+
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", DeprecationWarning)  # it asks locale for what Python 3.15 will not have
+    import taichi as ti  # type: ignore[import-untyped]
+
+__all__ = ["one_torch_thread", "real", "start", "ti"]
+
+_started: list[str] = []  # the device
+
+
+def start(device: str) -> Any:
+    """Start Taichi on cpu or cuda, unless it runs there already, and return its module.
+
+    Raises ValueError where Taichi cannot run on that device, or runs on the other one already in this process.
+    Fields must name their types and kernels cast their literals: a float that does neither is a float64.
+    """
+    if device not in ("cpu", "cuda"):
+        raise ValueError(f"Taichi runs here on cpu and cuda; got device {device!r}")
+    if _started and _started != [device]:
+        raise ValueError(f"Taichi runs on {_started[0]} in this process and on nothing else; use another for {device}")
+    if not _started:
+        _init(device)
+        torch.set_flush_denormal(False)  # Taichi sets it for the whole thread, and so for what others compute there
+        _started.append(device)
+    return ti
+
+
+@cache
+def real(name: str) -> Any:
+    """Return Taichi's type of `float32` or `float64`. Raises ValueError for any other name."""
+    types = {"float32": ti.f32, "float64": ti.f64}
+    if name not in types:
+        raise ValueError(f"precision must be float32 or float64; got {name!r}")
+    return types[name]
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Keep torch to one thread: its others busily wait for work on the cores that Taichi needs, and triple times."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _init(device: str) -> None:
+    wanted = ti.cuda if device == "cuda" else ti.cpu
+    if device == "cuda" and not ti._lib.core.with_cuda():
+        raise ValueError("Taichi found no CUDA device here; use device cpu")
+    with redirect_stdout(StringIO()):  # it says on which arch it starts, whatever its log level
+        ti.init(arch=wanted, default_fp=ti.f64, cpu_max_num_threads=cores(), log_level=ti.ERROR)

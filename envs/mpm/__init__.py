@@ -1,0 +1,1 @@
+"""The MLS-MPM scenes: syrup and plasticine."""

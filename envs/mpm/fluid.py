@@ -1,0 +1,209 @@
+"""The Fluid scene: a ladle scoops a sugar cube out of a tank of syrup."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...landscapes.episode import Part, View
+from ...landscapes.space import ParameterSpace
+from ..base import Fidelity, MaterialRange
+from ..controls import extend, hold, integrate_velocity
+from ..engines.mpm.boundaries import LadleInTank
+from ..engines.mpm.materials import Elastic
+from ..engines.mpm.materials import Fluid as Liquid
+from ..engines.mpm.model import Body, Model
+from ..options import EpisodeOptions
+from ..outlines import skin
+from .scene import SEGMENTS, STEPS, MpmScene, Stage
+
+TANK_WIDTH, TANK_HEIGHT, FILL = 0.4, 0.2, 0.15  # the tank, and the depth of the syrup [m]
+HEADROOM = 0.6  # what the grid covers above the floor [m]
+CUBE_EDGE, CUBE_CENTER = 0.05, (0.11, 0.122, 0.0)  # [m]
+BOWL, SHELL, HANDLE = 0.07, 0.01, 0.25  # the ladle: radius, half its thickness, its handle's height [m]
+RIM = (0.0, 0.09, 0.0)  # centre of the bowl's rim at the start [m]
+LOWEST, HIGHEST = 0.085, 0.3  # how far the rim can go [m]
+SYRUP_DENSITY, SPEED_OF_SOUND = 1330.0, 5.0  # [kg/m^3], [m/s]
+GRAVITY = 9.81  # [m/s^2]
+SPAN = 0.01  # length of a control step [s]
+MARGIN = 2  # nodes outside the walls
+VIEW = View((-0.2, 0.0, -0.2), (0.2, 0.42, 0.2), eye=(0.4, 0.55, 1.0))
+
+
+@dataclass(frozen=True)
+class FluidOptions(EpisodeOptions):
+    """`goal`: high rewards a cube lifted above the tank's edge; printed is the sign the paper prints, for a low one.
+
+    `viscosity` of the syrup [Pa s], `cube_density` [kg/m^3], `friction` of the ladle (Coulomb).
+    """
+
+    goal: Literal["high", "printed"] = "high"
+    viscosity: float = 4.0
+    cube_density: float = 1400.0
+    friction: float = 0.1
+
+
+class Fluid(MpmScene):
+    """Scoop a sugar cube out of a tank of syrup with a ladle.
+
+    Model: MLS-MPM. Syrup (1330 kg/m^3, 4 Pa s, a little lighter than the cube) as a viscous, weakly compressible fluid
+    that carries its volume ratio J; the cube (5 cm) as a neo-Hookean solid; the ladle (half-sphere shell of radius 7 cm
+    with an upright handle) as a signed distance at grid nodes, with Coulomb friction. The tank is 0.4 m x 0.4 m and 0.2
+    m high, filled 0.15 m deep; x right, y up, z to the front.
+    Parameters: ladle speed x, y [m/s] in each of 5 segments of 0.1 s; even numbers are horizontal, odd ones vertical.
+    Loss at the end, after 0.5 s [m], cube's centre (x, y, z): max(0, 0.2 - y) + 3 |(x, z) - ladle| + |(x, z) - tank's
+    axis|. The paper prints max(0, y - 0.2), which rewards a low cube although the goal is "as high as possible"; that
+    is goal=printed.
+    Simplifications: sound travels at 5 m/s, so that the syrup compresses by some percent and a step may be long; walls
+    are slippery and reach up to a lid at 0.6 m, so that no syrup is lost; the ladle has no mass and stops where it
+    would leave the tank; the cube is as soft as that speed of sound makes it (26 kPa), which is stiff beside the loads
+    on it; the shell is felt over a fraction of a grid cell.
+    Source: task Fluid of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
+    2022), appendix A.2.1; material and geometry where it is silent are ours.
+    """
+
+    name: ClassVar[str] = "fluid"
+    fidelities: ClassVar[dict[str, Fidelity]] = {
+        "draft": Fidelity("draft", dt=SPAN / 3, resolution=12, sampling=1.4),
+        "standard": Fidelity("standard", dt=SPAN / 20, resolution=22),
+        "reference": Fidelity("reference", dt=SPAN / 40, resolution=22, precision="float64"),
+    }
+    examples: ClassVar[dict[str, tuple[float, ...]]] = {
+        "scoop": (1.41, -0.77, 0.15, 0.74, 0.08, 1.13, -1.3, 1.41, 0.17, 0.27)
+    }
+    loss_unit: ClassVar[str] = "m"
+    control_step: ClassVar[float] = SPAN
+    Options: ClassVar[type[Any]] = FluidOptions
+    material_range: ClassVar[MaterialRange] = MaterialRange("viscosity", 0.4, 40.0)  # a tenth and ten times the default
+    space = ParameterSpace.box(
+        [f"ladle {axis} speed, segment {segment}" for segment in range(1, SEGMENTS + 1) for axis in "xy"],
+        -2.0,
+        2.0,
+        "m/s",
+    )
+
+    def tools(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 1 3"]:
+        """Return where the centre of the ladle's rim is at the ends of control steps [m]."""
+        velocity = hold(x.view(len(x), SEGMENTS, 2), STEPS)
+        velocity = extend(velocity, self.model.steps, then=x.new_zeros(len(x), 1, 2))
+        reach = TANK_WIDTH / 2 - BOWL - SHELL
+        start, lower, upper = (x.new_tensor(p) for p in (RIM[:2], (-reach, LOWEST), (reach, HIGHEST)))
+        path = integrate_velocity(start, velocity, SPAN, lower=lower, upper=upper)
+        depth = path.new_full((*path.shape[:2], 1), RIM[2])
+        return torch.cat([path, depth], dim=2)[:, :, None]
+
+    def cube(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch 3"]:
+        """Return where the cube's centre is at the end of the episode [m]."""
+        with self._solvers.lend() as stage:
+            parts = torch.split(self._check_points(x), self._capacity)
+            return torch.cat([self._center(stage.solver.run(self.tools(part)).double().cpu()) for part in parts])
+
+    def _model(self) -> Model:
+        return _model(self.fidelity, self.options)
+
+    def _losses(self, stage: Stage, step: int, end: Tensor, paths: Tensor) -> Float[Tensor, " batch"]:
+        return self._loss(self._center(end.double().cpu()), paths[:, step, 0].cpu())
+
+    def _length_scale(self, tools: Float[Tensor, "batch step_plus_1 1 3"], points: int) -> float:
+        return TANK_WIDTH / 2
+
+    def _body_names(self) -> tuple[str, str]:
+        return "syrup", "cube"
+
+    def _surroundings(self, tools: Float[Tensor, "frame 1 3"]) -> dict[str, Tensor]:
+        return {"ladle": tools[:, 0]}
+
+    def _view(self) -> View:
+        return VIEW
+
+    def _parts(self, bodies: Sequence[Tensor], tools: Float[Tensor, "frame 1 3"]) -> tuple[Part, ...]:
+        syrup, cube = bodies
+        block, faces = skin(cube)
+        tank = torch.zeros(len(tools), 1, 3, dtype=tools.dtype)
+        return (
+            Part("sheet", "sugar", block, faces=faces),
+            Part("ladle", "steel", tools, (BOWL, SHELL, HANDLE)),
+            Part("lump", "syrup", syrup, (self.model.dx / self.fidelity.sampling,)),
+            Part("tank", "glass", tank, (TANK_WIDTH, TANK_HEIGHT, TANK_WIDTH)),
+        )
+
+    def _center(self, end: Float[Tensor, "batch particle 3"]) -> Float[Tensor, "batch 3"]:
+        return end[:, len(self.model.bodies[0].x) :].mean(dim=1)
+
+    def _loss(self, cube: Float[Tensor, "batch 3"], ladle: Float[Tensor, "batch 3"]) -> Float[Tensor, " batch"]:
+        depth = TANK_HEIGHT - cube[:, 1] if self.options.goal == "high" else cube[:, 1] - TANK_HEIGHT
+        to_ladle, to_axis = (cube - ladle)[:, ::2], cube[:, ::2]
+        loss: Tensor = depth.clamp_min(0) + 3 * to_ladle.norm(dim=1) + to_axis.norm(dim=1)
+        return loss
+
+
+def _model(fidelity: Fidelity, options: FluidOptions) -> Model:
+    dx = TANK_WIDTH / fidelity.resolution
+    across = fidelity.resolution + 1 + 2 * MARGIN
+    corner = -TANK_WIDTH / 2 - MARGIN * dx
+    return Model(
+        precision=fidelity.precision,
+        bodies=_bodies(dx / fidelity.sampling, options),
+        boundary=LadleInTank(TANK_WIDTH / 2, HEADROOM, BOWL, SHELL, HANDLE, band=0.75 * dx, friction=options.friction),
+        origin=(corner, -MARGIN * dx, corner),
+        dx=dx,
+        nodes=(across, int(np.ceil(HEADROOM / dx)) + 1 + 2 * MARGIN, across),
+        dt=fidelity.dt,
+        substeps=round(SPAN / fidelity.dt),
+        steps=options.count_steps(STEPS),
+        gravity=GRAVITY,
+    )
+
+
+def _bodies(pitch: float, options: FluidOptions) -> tuple[Body, Body]:
+    """Fill the tank with particles about `pitch` [m] apart, but for cube and ladle, all at hydrostatic pressure."""
+    counts = round(TANK_WIDTH / pitch), round(FILL / pitch), round(TANK_WIDTH / pitch)
+    sides = (TANK_WIDTH, FILL, TANK_WIDTH)
+    grid = _lattice(counts, sides) + np.array([0.0, FILL / 2, 0.0])
+    volume = _volume_outside_cube(grid, np.divide(sides, counts))
+    free = (np.abs(grid - CUBE_CENTER).max(axis=1) >= CUBE_EDGE / 2) & (_distance_to_bowl(grid - RIM) >= SHELL)
+    edge = max(3, round(CUBE_EDGE / pitch))
+    syrup = Liquid(SYRUP_DENSITY, SYRUP_DENSITY * SPEED_OF_SOUND**2, options.viscosity)
+    sugar = Elastic.with_wave_speed(options.cube_density, SPEED_OF_SOUND, poisson=0.3)
+    return (
+        _body(syrup, grid[free], volume[free]),
+        _body(sugar, _lattice((edge,) * 3, (CUBE_EDGE,) * 3) + CUBE_CENTER, np.full(edge**3, (CUBE_EDGE / edge) ** 3)),
+    )
+
+
+def _body(material: Liquid | Elastic, x: np.ndarray, volume: np.ndarray) -> Body:
+    pressure = SYRUP_DENSITY * GRAVITY * np.maximum(FILL - x[:, 1], 0.0)
+    return Body(material, x, volume, material.volume_ratio(pressure))
+
+
+def _volume_outside_cube(grid: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    """Return what each particle's cell has outside the cube [m^3], so that the cube displaces just its own volume.
+
+    What cells with their centre in the cube (they get no particle) have outside goes to those its surface cuts.
+    """
+    reach = np.clip((CUBE_EDGE + cell) / 2 - np.abs(grid - CUBE_CENTER), 0.0, np.minimum(cell, CUBE_EDGE))
+    volume = np.asarray(np.prod(cell) - np.prod(reach, axis=1))
+    inside = np.abs(grid - CUBE_CENTER).max(axis=1) < CUBE_EDGE / 2
+    cut = ~inside & (volume < np.prod(cell) * (1 - 1e-9))
+    if cut.any():
+        volume[cut] *= 1.0 + volume[inside].sum() / volume[cut].sum()
+    return volume
+
+
+def _lattice(counts: tuple[int, ...], sides: tuple[float, ...]) -> np.ndarray:
+    """Return the centres of equal cells of a box around 0, shape (count, 3)."""
+    axes = [((np.arange(n) + 0.5) / n - 0.5) * side for n, side in zip(counts, sides, strict=True)]
+    return np.asarray(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
+
+
+def _distance_to_bowl(p: np.ndarray) -> np.ndarray:
+    """Return the distance of points to the bowl's mid-surface, whose rim's centre is 0 [m]."""
+    below = np.abs(np.linalg.norm(p, axis=1) - BOWL)
+    above = np.hypot(np.hypot(p[:, 0], p[:, 2]) - BOWL, p[:, 1])
+    return np.asarray(np.where(p[:, 1] < 0, below, above))

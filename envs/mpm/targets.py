@@ -1,0 +1,111 @@
+"""What a plasticine loss is made of: the target's mass and distance field, how far tools are from plasticine."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from platformdirs import user_cache_path
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from ...landscapes.storage.files import replacing
+from ..engines.mpm.model import Model
+from ..engines.mpm.raster import Raster
+from ..engines.mpm.tools import Kind, Tool
+
+SOLID = 1e-4  # mass at a node of a grid 1/64 m wide from which it is the target's [kg]; PlasticineLab's
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """Hold, at each node, the target's `mass` [kg] and the `distance` [m] to its nearest solid node, shape (node,)."""
+
+    mass: Float[Tensor, " node"]
+    distance: Float[Tensor, " node"]
+
+    @classmethod
+    def of(cls, model: Model, x: np.ndarray, device: str) -> Target:
+        """Return the target that a model's particles are at `x` [m], shape (particle, 3), on its grid.
+
+        Distances are from nodes with more than SOLID; what lies around them and holds any of the target costs nothing.
+        """
+        raster = Raster(model, model.mass, capacity=1, device="cpu")
+        at_nodes = raster(torch.from_numpy(x)[None])[0]
+        solid = min(SOLID * (64 * model.dx) ** 3, float(at_nodes.max()) / 2)
+        empty = (at_nodes <= solid).numpy().reshape(model.nodes)
+        distance = torch.from_numpy(model.dx * distance_transform_edt(empty)).flatten()
+        return cls(at_nodes.to(device), distance.where(at_nodes == 0, 0.0).to(device))
+
+
+def contact(
+    x: Float[Tensor, "batch particle 3"], tools: Float[Tensor, "batch slot 3"], movable: Sequence[Tool]
+) -> Float[Tensor, " batch"]:
+    """Return the sum over movable tools of the squared distance to the closest particle [m^2].
+
+    The closest one alone has a gradient: it is found first, and its distance is then the loss.
+    """
+    total = x.new_zeros(len(x))
+    slot = 0
+    for tool in movable:
+        with torch.no_grad():
+            closest = distance_outside(tool, x, tools[:, None, slot : slot + tool.slots]).argmin(dim=1)
+        nearest = x[torch.arange(len(x), device=x.device), closest]
+        total = total + distance_outside(tool, nearest, tools[:, slot : slot + tool.slots]) ** 2
+        slot += tool.slots
+    return total
+
+
+def distance_outside(
+    tool: Tool, x: Float[Tensor, "*batch 3"], pose: Float[Tensor, "*batch slot 3"]
+) -> Float[Tensor, "*batch"]:
+    """Return how far points are from a tool [m], 0 inside; `pose` is its position, for a roller then its angles.
+
+    Raises ValueError for a cylinder, which does not move.
+    """
+    p = x - pose[..., 0, :]
+    size = tool.size
+    match tool.kind:
+        case Kind.SPHERE:
+            gap = p.norm(dim=-1) - size[0]
+        case Kind.TORUS:
+            gap = torch.hypot(torch.hypot(p[..., 0], p[..., 2]) - size[0], p[..., 1]) - size[1]
+        case Kind.CAPSULE:
+            along = p[..., 1].clamp(-size[0], size[0])
+            gap = torch.stack([p[..., 0], p[..., 1] - along, p[..., 2]], dim=-1).norm(dim=-1) - size[1]
+        case Kind.ROLLER:
+            yaw = pose[..., 1, 1]
+            axis = torch.stack([yaw.sin(), torch.zeros_like(yaw), yaw.cos()], dim=-1)
+            along = (p * axis).sum(dim=-1, keepdim=True).clamp(-size[0], size[0])
+            gap = (p - along * axis).norm(dim=-1) - size[1]
+        case Kind.CYLINDER:
+            raise ValueError("a post does not move: it has no part in the contact term")
+    outer: Tensor = gap.clamp_min(0)
+    return outer
+
+
+def load_or_make(name: str, content: str, make: Callable[[], np.ndarray]) -> np.ndarray:
+    """Return what `make` returns, from the user's cache if it was made from the same `content` before."""
+    digest = hashlib.sha256(content.encode()).hexdigest()[:16]
+    path = user_cache_path("gradscape") / "targets" / f"{name}-{digest}.npy"
+    found = _read(path)
+    if found is None:
+        log.info("%s: making the target by its demonstration", name)
+        found = make()
+        with replacing(path) as partial, partial.open("wb") as file:
+            np.save(file, found)
+    return found
+
+
+def _read(path: Path) -> np.ndarray | None:
+    try:
+        return np.asarray(np.load(path, allow_pickle=False))
+    except (OSError, ValueError):
+        return None

@@ -1,0 +1,41 @@
+"""What a scene says of itself in records: how accurately it is simulated, how much it computes, its material."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+COMPUTES_LOSSES = False  # for `code`
+
+
+@dataclass(frozen=True)
+class Fidelity:
+    """Say how accurately a scene is simulated.
+
+    `dt` is the time step [s], `resolution` the number of grid cells (or mesh edges) across the scene, 0 where it has
+    none, `sampling` the particles per cell along each axis, `precision` that of the engine: float32 or float64.
+    `particles` is how many there are, in scenes that count them instead.
+    """
+
+    name: str
+    dt: float
+    precision: str = "float32"
+    resolution: int = 0
+    sampling: float = 2.0
+    particles: int = 0
+
+
+@dataclass(frozen=True)
+class Work:
+    """Say how much an episode computes: `count` of a `unit`, such as one particle in one substep."""
+
+    count: int
+    unit: str
+
+
+@dataclass(frozen=True)
+class MaterialRange:
+    """Name the option that makes a scene's material soft or stiff, and the values at both ends to try."""
+
+    option: str
+    softest: float
+    stiffest: float

@@ -1,0 +1,1 @@
+"""The mass-spring scenes: cloth and pancake."""

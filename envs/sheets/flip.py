@@ -1,0 +1,111 @@
+"""The Flip scene: a pan tosses a pancake so that it lands on its other side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...landscapes.episode import Part, View
+from ...landscapes.space import ParameterSpace
+from ..base import Fidelity
+from ..controls import extend, ramp
+from ..engines.sheets.contact import Pan
+from ..engines.sheets.springs import Sheet
+from ..outlines import rotate_about, triangles
+from . import lattice
+from .sheets import Drive, SheetScene
+
+ACROSS = 0.2  # the pancake's diameter [m]
+AREAL_DENSITY, STIFFNESS = 3.0, 60.0  # [kg/m^2], [N/m]
+THICK, MARK = 0.01, 0.009  # of the pancake and of the mark on its rim, as they are drawn [m]
+SEGMENTS = 5
+BEND = 0.8  # the bending springs' share
+LOWER, UPPER = (-0.075, -0.075, -0.6), (0.075, 0.15, 0.6)  # of a waypoint [m], [m], [rad]
+
+
+class Flip(SheetScene):
+    """Toss a pancake with a pan so that it ends on its other side.
+
+    Model: the pancake (20 cm across, 3 kg/m^2, stretching resisted by 60 N/m, much softer for its weight than the
+    cloth) starts at rest in the middle of the pan; x right, y up, z to the front. The pan has a radius of 0.2 m and an
+    edge that bends up along an arc of 7 cm, to 3.4 cm; it moves in x and y and tilts about z, through the middle of its
+    bottom, whatever it carries. An episode is 1 s.
+    Parameters: x [m], y [m] and tilt [rad] of the pan at the end of each of 5 segments of 0.2 s, from 0 and linear in
+    between.
+    Loss [m]: mean distance of the left-, right-, back- and frontmost vertices to where they were at the start, left and
+    right exchanged. Example `flip` was found by CMA-ES at draft (2400 episodes) and flips at every fidelity.
+    Simplifications: the pan has no handle and no mass; the pancake is a sheet without thickness, and what misses the
+    pan falls on, since nothing else is there.
+    Source: task Flip of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL 2022),
+    appendix A.2.3; geometry and material where it is silent are ours.
+    """
+
+    name: ClassVar[str] = "flip"
+    fidelities: ClassVar[dict[str, Fidelity]] = {
+        "draft": Fidelity("draft", dt=1 / 400, resolution=8),
+        "standard": Fidelity("standard", dt=1 / 1000, resolution=16),
+        "reference": Fidelity("reference", dt=1 / 2000, resolution=16, precision="float64"),
+    }
+    examples: ClassVar[dict[str, tuple[float, ...]]] = {
+        "flip": (
+            *(0.042, -0.016, -0.463, -0.039, -0.071, 0.596, 0.041, -0.055, -0.115),
+            *(0.045, -0.012, -0.138, 0.074, 0.003, -0.005),
+        )
+    }
+    decisions: ClassVar[int] = SEGMENTS
+    duration: ClassVar[float] = 1.0
+    surface: ClassVar[Pan] = Pan(flat=0.14, bend=0.07, sweep=math.asin(6 / 7), thickness=0.03)
+    view: ClassVar[View] = View((-0.24, -0.12, -0.2), (0.24, 0.26, 0.2), eye=(0.2, 0.5, 1.0), ground=None)
+    space = ParameterSpace(
+        tuple(f"pan {what}, segment {k}" for k in range(1, SEGMENTS + 1) for what in ("x", "y", "tilt")),
+        torch.tensor(LOWER * SEGMENTS, dtype=torch.float64),
+        torch.tensor(UPPER * SEGMENTS, dtype=torch.float64),
+        ("m", "m", "rad") * SEGMENTS,
+    )
+
+    def _sheet(self) -> Sheet:
+        cells = self.fidelity.resolution
+        points, pitch = lattice.disc(cells), ACROSS / cells
+        pairs, rest, weight = lattice.springs(points, reach=max(1, round(cells / 4)), bend=BEND)
+        x = np.stack([points[:, 0] * pitch, np.zeros(len(points)), points[:, 1] * pitch], axis=1)
+        mass = AREAL_DENSITY * math.pi * (ACROSS / 2) ** 2 / len(points)
+        return Sheet(x, pairs, rest * pitch, weight, mass, damping=0.02)
+
+    def _drive(self, x: Float[Tensor, "batch dim"]) -> Drive:
+        course = ramp(x.new_zeros(3), x.view(len(x), SEGMENTS, 3), self.own_steps)
+        poses = extend(course, self.steps + 1, then=course[:, -1:])
+        return Drive(x.new_zeros(len(x), 3), x.new_full((len(x), len(self.sheet.x)), STIFFNESS), poses)
+
+    def _extremes(self) -> list[int]:
+        """Return the numbers of the left-, right-, back- and frontmost vertices."""
+        x, _, z = self.sheet.x.T
+        return [int(i) for i in (x.argmin(), x.argmax(), z.argmin(), z.argmax())]
+
+    def _loss(self, end: Float[Tensor, "vertex 3"]) -> Float[Tensor, ""]:
+        extremes = self._extremes()
+        loss: Tensor = (end[extremes] - self._goal().to(end)).norm(dim=1).mean()
+        return loss
+
+    def _goal(self) -> Float[Tensor, "vertex 3"]:
+        """Return where those vertices are wanted [m]."""
+        return torch.from_numpy(self.sheet.x[self._extremes()] * (-1.0, 1.0, 1.0))
+
+    def _surroundings(self, poses: Float[Tensor, "frame 3"]) -> Mapping[str, Float[Tensor, "frame 3"]]:
+        return {"pan": poses}
+
+    def _parts(self, frames: Float[Tensor, "frame vertex 3"], poses: Float[Tensor, "frame 3"]) -> tuple[Part, ...]:
+        faces = triangles(lattice.disc(self.fidelity.resolution))
+        place = torch.cat([poses[:, :2], torch.zeros_like(poses[:, :1])], dim=1)[:, None]
+        size = (self.surface.flat, self.surface.bend, self.surface.sweep)
+        return (
+            Part("sheet", "dough", frames, (THICK,), faces=faces),
+            Part("pan", "iron", place, size, rotate_about(2, poses[:, 2])),
+            Part("sphere", "rubber", frames[:, self._extremes()[:1]], (MARK,)),  # one of the four, to tell its sides
+            Part("sphere", "target", self._goal()[:1].expand(len(frames), 1, 3), (1.5 * MARK,)),
+        )

@@ -1,0 +1,163 @@
+"""The Swing scenes: a cloth held at two corners swings down onto the floor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...landscapes.episode import Part, View
+from ...landscapes.space import ParameterSpace
+from ..base import Fidelity
+from ..engines.sheets.contact import Floor
+from ..engines.sheets.springs import Sheet
+from ..options import EpisodeOptions
+from ..outlines import triangles
+from . import lattice
+from .sheets import Drive, SheetScene
+
+SIDE, HEIGHT = 0.2, 0.1  # the cloth's edge, and how far above the floor it is held [m]
+AREAL_DENSITY = 0.2  # [kg/m^2]
+STIFFNESS, SWING = 10.0, (1.0, -0.5, 0.0)  # where they are no parameters [N/m], [m/s]
+PATCHES = 4  # along each edge
+BEND = 0.4  # the bending springs' share
+
+
+@dataclass(frozen=True)
+class SwingOptions(EpisodeOptions):
+    """`loss`: the distance of the centre of mass (single), or the mean one of the corners or of all vertices (mesh)."""
+
+    loss: Literal["single", "corner", "mesh"] = "single"
+
+
+class Swing(SheetScene):
+    """The cloth swings down from where it is held and drags over the floor.
+
+    Model: a cloth (20 cm x 20 cm, 0.2 kg/m^2) starts level, 10 cm above the floor, held fast at its two right corners;
+    x right, y up, z to the front. An episode is 0.8 s.
+    Loss [m] against where example `target` brings the cloth at the same fidelity: the centre of mass's distance
+    (single), or the mean distance of the corners (corner) or of all vertices (mesh), by option.
+    Simplifications: the anchors stand still, since what they hold is what makes the cloth swing; air is felt as a drag
+    of 0.5/s; stretching is resisted by 10 N/m, softer than fabric, so that a step may be long.
+    Source: task Swing of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
+    2022), appendix A.2.3; geometry and material are ours.
+    """
+
+    fidelities: ClassVar[dict[str, Fidelity]] = {
+        "draft": Fidelity("draft", dt=1 / 500, resolution=7),
+        "standard": Fidelity("standard", dt=1 / 2000, resolution=19),
+        "reference": Fidelity("reference", dt=1 / 4000, resolution=19, precision="float64"),
+    }
+    Options: ClassVar[type[Any]] = SwingOptions
+    duration: ClassVar[float] = 0.8
+    surface: ClassVar[Floor] = Floor()
+    view: ClassVar[View] = View((-0.2, 0.0, -0.11), (0.15, 0.12, 0.11), eye=(-0.45, 0.5, 1.0), ground=-0.003)
+
+    def _sheet(self) -> Sheet:
+        cells = self.fidelity.resolution
+        points = lattice.square(cells)
+        pitch = SIDE / cells
+        pairs, rest, weight = lattice.springs(points, reach=max(1, round(cells / 4)), bend=BEND)
+        x = np.stack(
+            [points[:, 0] * pitch - SIDE, np.full(len(points), HEIGHT), points[:, 1] * pitch - SIDE / 2], axis=1
+        )
+        mass = AREAL_DENSITY * SIDE**2 / len(points)
+        return Sheet(x, pairs, rest * pitch, weight, mass, damping=8e-3, drag=0.5, held=self._corners()[2:])
+
+    def _energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"]:
+        """Return kinetic energy, that of height above the floor, and that of the springs."""
+        drive, sheet = self._drive(x), self.sheet
+        with self._solvers.lend() as solver:
+            frames = solver.run(*drive.detach()).double().cpu()
+        kinetic = (frames.diff(dim=0) / self.fidelity.dt).square().sum(dim=(2, 3)) / 2  # the step's own velocities
+        ends = torch.from_numpy(sheet.pairs).T.long()
+        stretch = (frames[1:, :, ends[0]] - frames[1:, :, ends[1]]).norm(dim=3) - torch.from_numpy(sheet.rest)
+        stiffness = drive.stiffness.detach()[:, ends].mean(dim=1) * torch.from_numpy(sheet.weight)
+        potential = sheet.mass * sheet.gravity * frames[1:, :, :, 1].sum(dim=2)
+        found: Tensor = sheet.mass * kinetic + potential + (stiffness * stretch.square()).sum(dim=2) / 2
+        return found.T
+
+    def _corners(self) -> tuple[int, int, int, int]:
+        """Return the numbers of the corners: left back, left front, right back, right front."""
+        n = self.fidelity.resolution
+        return 0, n, n * (n + 1), (n + 1) ** 2 - 1
+
+    def _loss(self, end: Float[Tensor, "vertex 3"]) -> Float[Tensor, ""]:
+        match self.options.loss:
+            case "single":
+                miss = (end.mean(dim=0) - self._target.mean(dim=0))[None]
+            case "corner":
+                miss = (end - self._target)[list(self._corners())]
+            case _:
+                miss = end - self._target
+        loss: Tensor = miss.norm(dim=1).mean()
+        return loss
+
+    def _surroundings(self, poses: Float[Tensor, "frame 3"]) -> Mapping[str, Float[Tensor, "frame 3"]]:
+        held = torch.from_numpy(self.sheet.x[list(self.sheet.held)])
+        return {f"anchor {number}": place.expand(len(poses), 3) for number, place in enumerate(held, start=1)}
+
+    def _parts(self, frames: Float[Tensor, "frame vertex 3"], poses: Float[Tensor, "frame 3"]) -> tuple[Part, ...]:
+        faces = triangles(lattice.square(self.fidelity.resolution))
+        held = frames[:, list(self.sheet.held)]
+        return (
+            Part("sheet", "cloth", frames, faces=faces),
+            Part("sphere", "iron", held, (SIDE / 40,)),
+            Part("sheet", "target", self._target.expand_as(frames), faces=faces),
+        )
+
+    def _rest_poses(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 3"]:
+        return x.new_zeros(len(x), self.steps + 1, 3)
+
+    def _prepare(self) -> None:
+        _ = self._target
+
+    @cached_property
+    def _target(self) -> Float[Tensor, "vertex 3"]:
+        """Where the example `target` brings the vertices, on the CPU whatever this device."""
+        return type(self)(fidelity=self.fidelity, device="cpu").end(self.example("target"))
+
+
+class SwingVelocity(Swing):
+    """Throw a cloth held at two corners so that it ends like a target.
+
+    Parameters: initial velocity x, y, z [m/s] of all vertices that are not held. Stiffness is 10 N/m throughout.
+    """
+
+    name: ClassVar[str] = "swing-velocity"
+    examples: ClassVar[dict[str, tuple[float, ...]]] = {"target": (1.0, -0.5, 0.3)}
+    space = ParameterSpace.box([f"velocity {axis}" for axis in "xyz"], -2.0, 2.0, "m/s")
+
+    def _drive(self, x: Float[Tensor, "batch dim"]) -> Drive:
+        return Drive(x, torch.full((len(x), len(self.sheet.x)), STIFFNESS, dtype=x.dtype), self._rest_poses(x))
+
+
+class SwingStiffness(Swing):
+    """Choose how stiff the patches of a swinging cloth are, so that it ends like a target.
+
+    Parameters: stiffness [N/m] of 4 x 4 patches, from left to right and within that from back to front; a spring has
+    the mean of its ends'. The swing is fixed: initial velocity (1, -0.5, 0) m/s.
+    """
+
+    name: ClassVar[str] = "swing-stiffness"
+    examples: ClassVar[dict[str, tuple[float, ...]]] = {
+        "target": (12.0, 6.0, 7.0, 13.0, 5.0, 9.0, 11.0, 4.0, 8.0, 3.0, 4.0, 9.0, 10.0, 12.0, 6.0, 7.0)
+    }
+    space = ParameterSpace.box(
+        [f"stiffness of patch {row} {column}" for row in range(1, PATCHES + 1) for column in range(1, PATCHES + 1)],
+        2.0,
+        15.0,
+        "N/m",
+    )
+
+    def _drive(self, x: Float[Tensor, "batch dim"]) -> Drive:
+        across = self.fidelity.resolution + 1
+        patch = torch.arange(across) * PATCHES // across
+        stiffness = x[:, (patch[:, None] * PATCHES + patch).flatten()]
+        return Drive(x.new_tensor(SWING).expand(len(x), 3), stiffness, self._rest_poses(x))

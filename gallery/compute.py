@@ -1,0 +1,139 @@
+"""Make what is missing of the gallery's figures, part by part: slices first, since all else is made of them."""
+
+from __future__ import annotations
+
+import gc
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+from ..jobs.watch import Stopped, Watch
+from ..jobs.workers import workers
+from ..landscapes.capacity import require
+from ..landscapes.cost import duration
+from ..landscapes.storage.disk import full, is_full
+from ..landscapes.storage.files import tidy
+from .episodes import EpisodePart
+from .figures import Figure
+from .measures import ReportPart, TradeoffPart
+from .parts import FigurePart, SearchPart, SlicePart, SweepPart
+
+T = TypeVar("T")
+PARTS: dict[str, type[FigurePart]] = {
+    "slices": SlicePart,
+    "sweeps": SweepPart,
+    "episodes": EpisodePart,
+    "searches": SearchPart,
+    "reports": ReportPart,
+    "tradeoffs": TradeoffPart,
+}
+
+
+def compute_parts(
+    figures: Sequence[Figure],
+    root: Path,
+    watch: Watch,
+    *,
+    parts: Sequence[str] = (),
+    device: str = "auto",
+    scheduler: str | None = None,
+) -> list[str]:
+    """Make what is missing of these figures in `root`, and return the names of those that failed.
+
+    It makes all kinds of parts where no `parts` are named. A figure that fails, by whatever cause, leaves the others to
+    be made. Raises ValueError for a part or a device that there is not, Stopped where it is interrupted, and
+    DiskFullError; the same call goes on then.
+    """
+    if unknown := set(parts) - set(PARTS):
+        raise ValueError(f"--part takes {', '.join(PARTS)}; got {', '.join(sorted(unknown))}")
+    _check_device(device)
+    work = _Work(root, watch)
+    with workers(scheduler, device) as executor:
+        for name, kind in PARTS.items():
+            if name in parts or not parts:
+                sound = [figure for figure in figures if figure.id not in work.failed]
+                work.make(name, [kind(figure, root, device, executor) for figure in sound])
+    tidy(root)
+    return sorted(work.failed)
+
+
+def change_figures(figures: Sequence[Figure], fidelity: str | None, resolution: int | None, root: Path) -> list[Figure]:
+    """Return figures with another fidelity and another resolution, as far as these are given.
+
+    Raises ValueError where this machine has no room for so many points.
+    """
+    from ..landscapes.storage.arrays import need_of
+
+    if resolution:
+        rank = max(len(figure.dims) for figure in figures)
+        require("resolution", resolution, lambda points: need_of((points,) * rank, rank, grad=True), root)
+    return [
+        replace(figure, fidelity=fidelity or figure.fidelity, resolution=resolution or figure.resolution)
+        for figure in figures
+    ]
+
+
+def _check_device(device: str) -> None:
+    from ..envs.engines.runtime import cuda_available
+
+    if device == "cuda" and not cuda_available():
+        raise ValueError("no CUDA device was found here, so nothing is computed on one; use --device cpu or auto")
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What is done in `root`, and the names of the figures that failed in it."""
+
+    root: Path
+    watch: Watch
+    failed: set[str] = field(default_factory=set)
+
+    def make(self, name: str, parts: Sequence[FigurePart]) -> None:
+        """Make what is missing of one kind of part, its cost announced."""
+        left = [part for part in parts if not self._try(part, part.there)]
+        left = self._sound(left)
+        self.watch.note(f"{name}: {len(parts) - len(left)} of {len(parts)} are there already")
+        self._announce(name, left)
+        for part in left:
+            if part.figure.id not in self.failed and not part.there():  # figures may share what one of them made
+                self.watch.note(f"{part.figure.id}: {part.label()}")
+                if outcome := self._try(part, partial(part.make, self.watch)):
+                    self.watch.note(outcome)
+
+    def _announce(self, name: str, parts: Sequence[FigurePart]) -> None:
+        """Say what all of it should take, from the first figure of each scene."""
+        rates: dict[str, float] = {}
+        total = 0.0
+        for part in parts:
+            kind = json.dumps([part.figure.env, part.figure.options])
+            if kind not in rates:
+                rate = self._try(part, part.seconds_each)
+                if rate is None:
+                    continue
+                rates[kind] = rate
+            total += rates[kind] * part.count_left()
+        if left := self._sound(parts):
+            self.watch.note(f"{name}: {len(left)} to make, about {duration(total)} in all")
+
+    def _sound(self, parts: Sequence[FigurePart]) -> list[FigurePart]:
+        return [part for part in parts if part.figure.id not in self.failed]
+
+    def _try(self, part: FigurePart, work: Callable[[], T]) -> T | None:
+        """Return what a part's work returns, None where it failed, which is said."""
+        try:
+            return work()
+        except KeyboardInterrupt as stop:
+            kept = str(stop) if isinstance(stop, Stopped) else f"all that is finished is kept in {self.root}"
+            raise Stopped(f"in {part.figure.id}, {kept}") from stop
+        except Exception as error:
+            if is_full(error):
+                raise full(error, f"all that is finished is kept in {self.root}") from error
+            why = " ".join(str(error).split())
+            self.watch.note(f"{part.figure.id} failed: {type(error).__name__}: {why}")
+            self.failed.add(part.figure.id)
+            return None
+        finally:
+            gc.collect()  # an environment may hold gigabytes of the GPU

@@ -1,0 +1,70 @@
+"""The files of the gallery: what it shows, what the paper says, and what is computed of both, each named here alone.
+
+Of the data, a figure's folder holds `slice.zarr` and what else was made of it: `sweep.mp4` with `sweep.json`,
+`episodes.json` with a film and a picture of each episode, and the files of `landscape report`. Searches lie in
+`runs/ENVIRONMENT-OPTIONS/`, trade-offs in `tradeoff/`: figures share them.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..jobs.folder import REPORT as REPORT_FILES
+from ..jobs.folder import SLICE as SLICE_FILES
+from ..jobs.folder import TRADEOFF as TRADEOFF_FILES
+
+HERE = Path(__file__).parent
+FIGURES, PAPER = HERE / "figures.toml", HERE / "paper.toml"
+DATA = HERE / "data"  # of a checkout; what is installed from a wheel has trade-offs there and no figures
+ELSEWHERE = Path("out") / "gallery-data"
+
+STORE, PICTURE = SLICE_FILES.store, SLICE_FILES.picture
+SWEEP_FILM, SWEEP_RECORD = "sweep.mp4", "sweep.json"
+EPISODES = "episodes.json"
+EPISODE_KINDS = ("mp4", "webp")  # a film, and its last frame
+REPORT, MEASURES, QUALITY, QUALITY_ARRAYS = REPORT_FILES.files
+SURFACES = ("surface.png", "surface.html", "surface.gltf", "surface.glb")
+RUNS, RUN_SUFFIX = "runs", ".zarr.zip"
+TRADEOFFS = "tradeoff"
+TRADEOFF_PICTURE = TRADEOFF_FILES.picture  # in the folder of `landscape tradeoff`
+DEVICES = ("cuda", "cpu")  # that trade-offs are shown of
+REMAKE = "delete it, and `landscape gallery compute --part {}` makes it anew"
+
+_EPISODE = re.compile(r"episode-\d+-\d+\.(?:mp4|webp)")
+
+
+def data_folder(named: str | None) -> Path:
+    """Return where the figures' data is: as named, else a checkout's own, else under the folder where one stands."""
+    if named:
+        return Path(named)
+    return DATA if any(DATA.glob(f"*/{STORE}")) else ELSEWHERE
+
+
+def episode_name(row: int, column: int) -> str:
+    """Return the name of the files of an episode at a node, without their ending."""
+    return f"episode-{row}-{column}"
+
+
+def is_of_episode(file: Path) -> bool:
+    """Say whether a file is the film or the picture of an episode."""
+    return bool(_EPISODE.fullmatch(file.name))
+
+
+@dataclass(frozen=True)
+class TradeoffFiles:
+    """Name the files of a trade-off: the record and the picture."""
+
+    record: Path
+    picture: Path
+
+    @classmethod
+    def of(cls, root: Path, env: str, device: str) -> TradeoffFiles:
+        """Return where the trade-off of an environment on a device is, in the gallery's data or in its site."""
+        record = root / TRADEOFFS / f"{env}-{device}.json"
+        return cls(record, record.with_suffix(".png"))
+
+    def there(self) -> bool:
+        """Say whether both are there."""
+        return self.record.exists() and self.picture.exists()

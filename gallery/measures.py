@@ -1,0 +1,108 @@
+"""What the gallery measures: the report of a figure's slice, the trade-off of its environment."""
+
+from __future__ import annotations
+
+import shutil
+from typing import TYPE_CHECKING
+
+from ..envs.registry import environment_class
+from ..jobs.scene import SceneSpec
+from ..jobs.variants import SETTINGS
+from ..jobs.watch import Watch
+from ..landscapes.storage.records import read_json
+from .files import DEVICES, MEASURES, QUALITY, QUALITY_ARRAYS, REPORT, STORE, TRADEOFF_PICTURE, TradeoffFiles
+from .parts import FigurePart
+from .records import read_if_sound
+
+if TYPE_CHECKING:
+    from ..jobs.tradeoff import TradeoffJob
+
+SEED = 0
+REPORT_POINTS, TRADEOFF_POINTS = 6, 64  # those of `landscape report` and `landscape tradeoff`
+TURNED = [one for one in SETTINGS if one not in ("engine", "device")]  # those take hours on another device
+
+
+class ReportPart(FigurePart):
+    """What the slice is like, beside it."""
+
+    def label(self) -> str:
+        """Return the command that measures it elsewhere."""
+        return f"landscape report {self.folder} --device {self.device}"
+
+    def count_left(self) -> int:
+        """Return 1 where there is no report of this slice."""
+        from ..jobs.report import digest_of
+        from ..landscapes.storage.paths import is_slice
+        from ..landscapes.storage.store import open_slice
+
+        record, store = read_if_sound(read_json, self.folder / REPORT), self.folder / STORE
+        if record is None or read_if_sound(read_json, self.folder / MEASURES) is None or not is_slice(store):
+            return 1
+        key = record.get("key")
+        return int(not isinstance(key, dict) or key.get("slice") != digest_of(open_slice(store)))
+
+    def seconds_each(self) -> float:
+        """Estimate a report by the first episodes."""
+        from ..jobs.report import estimate_seconds
+        from ..landscapes.measures.profile import effort
+
+        return estimate_seconds(self._scene().make(), *effort(len(self.figure.dims), REPORT_POINTS))
+
+    def make(self, watch: Watch) -> str:
+        """Measure the slice, in the place of a report of another one."""
+        from ..jobs.report import ReportedSlice, ReportJob
+        from ..landscapes.draw.film import lighten
+        from .paper import read_paper
+
+        for name in (REPORT, MEASURES, QUALITY, QUALITY_ARRAYS):
+            (self.folder / name).unlink(missing_ok=True)
+        subject, words = ReportedSlice(self.figure.id, self.folder / STORE), read_paper().words
+        job = ReportJob([subject], self.folder, True, REPORT_POINTS, SEED, self.device, words, command=self.label())
+        report = job.report(subject, watch)
+        lighten(self.folder / QUALITY)
+        return ", ".join(report.words)
+
+
+class TradeoffPart(FigurePart):
+    """Accuracy against time of the figure's environment, which its other figures share."""
+
+    def label(self) -> str:
+        """Return the command that measures it elsewhere."""
+        turned = ",".join(TURNED)
+        return f"landscape tradeoff {self.figure.env} --device {self.device} --variants {turned}"
+
+    def count_left(self) -> int:
+        """Return 1 where there is none, of an environment that has fidelities to trade."""
+        some = len(environment_class(self.figure.env).fidelities) > 1
+        devices = DEVICES if self.device == "auto" else (self.device,)
+        return int(some and not any(map(self._sound, devices)))
+
+    def seconds_each(self) -> float:
+        """Estimate all variants by the work of their episodes."""
+        return sum(self._open().estimate().values())
+
+    def make(self, watch: Watch) -> str:
+        """Measure every variant; those that are measured stay in a folder of their own under out/ until the last is."""
+        from ..landscapes.draw.film import lighten
+        from ..landscapes.storage.files import make_folder
+        from ..landscapes.storage.records import write_record
+
+        job = self._open()
+        found = job.run(watch)
+        files = TradeoffFiles.of(self.root, self.figure.env, job.env.device)
+        make_folder(files.record.parent)
+        shutil.copyfile(job.folder / TRADEOFF_PICTURE, files.picture)
+        lighten(files.picture)
+        write_record(files.record, found.record())
+        return f"{len(found.variants)} variants at {found.points} points"
+
+    def _sound(self, device: str) -> bool:
+        """Whether there is one of a device."""
+        files = TradeoffFiles.of(self.root, self.figure.env, device)
+        return bool(read_if_sound(read_json, files.record)) and files.picture.is_file()
+
+    def _open(self) -> TradeoffJob:
+        from ..jobs.tradeoff import TradeoffJob
+
+        scene = SceneSpec(self.figure.env, device=self.device)
+        return TradeoffJob.open(scene, points=TRADEOFF_POINTS, seed=SEED, settings=TURNED, command=self.label())

@@ -1,0 +1,252 @@
+"""What the gallery makes of a figure: its slice, its sweep, searches of its environment."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..envs.registry import environment_class
+from ..jobs.watch import Watch
+from .figures import Figure
+from .files import PICTURE, RUN_SUFFIX, RUNS, STORE, SWEEP_FILM, SWEEP_RECORD
+from .records import SweepRecord, read_if_sound
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    import xarray as xr
+
+    from ..envs.base import Environment
+    from ..jobs.scene import SceneSpec
+    from ..jobs.slice import SliceJob
+    from ..jobs.sweep import SweepJob
+
+DRAFT = "draft"  # fidelity of sweeps and searches, of which there are many episodes; of functions their only one
+FRAMES, COARSE = 12, 24  # of a sweep: frames, and points along each axis
+DPI, LOSS = 80, 28  # of its film
+METHODS, BUDGET, SEED = ("random", "cma-es", "descents", "bo", "bo-leap"), 100, 0
+
+
+@dataclass(frozen=True)
+class State:
+    """How much of a slice is sampled: `done` of `points`, or None where the data is another slice's."""
+
+    points: int
+    done: int | None
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing is left to compute."""
+        return self.done == self.points
+
+    def __str__(self) -> str:
+        if self.finished:
+            return "there"
+        if self.done is None:
+            return "other settings"
+        return f"{self.done} of {self.points} points" if self.done else "missing"
+
+
+@dataclass(frozen=True)
+class FigurePart(abc.ABC):
+    """Something to make of a figure, in the gallery's data at `root`."""
+
+    figure: Figure
+    root: Path
+    device: str
+    executor: Executor | None = None  # whose workers sample slices and sweeps
+
+    @property
+    def folder(self) -> Path:
+        """Where the figure's data is."""
+        return self.root / self.figure.id
+
+    @abc.abstractmethod
+    def label(self) -> str:
+        """Say what is made."""
+
+    def there(self) -> bool:
+        """Say whether nothing is left to make."""
+        return self.count_left() == 0
+
+    @abc.abstractmethod
+    def count_left(self) -> int:
+        """Count what is left to make: points, films or runs."""
+
+    @abc.abstractmethod
+    def seconds_each(self) -> float:
+        """Estimate what one of them takes, from a first episode or more."""
+
+    @abc.abstractmethod
+    def make(self, watch: Watch) -> str:
+        """Make what is left and say in a line what came out."""
+
+    def _scene(self, fidelity: str | None = None) -> SceneSpec:
+        """Return the scene at the figure's fidelity or another; at its default where it does not have that one."""
+        scene = self.figure.scene(self.device, fidelity)
+        known = scene.fidelity in environment_class(self.figure.env).fidelities
+        return scene if known else replace(scene, fidelity=None)
+
+
+class SlicePart(FigurePart):
+    """The slice itself, at the figure's fidelity."""
+
+    def label(self) -> str:
+        """Return the command that samples it."""
+        return self.figure.command(self.device)
+
+    def count_left(self) -> int:
+        """Count the points not sampled."""
+        state = self.state()
+        return state.points - (state.done or 0)
+
+    def state(self) -> State:
+        """Look at the data without making an environment; who sampled it, and on what device, does not matter."""
+        from ..landscapes.storage.arrays import FILES
+        from ..landscapes.storage.ownership import has_lost_root
+        from ..landscapes.storage.paths import is_slice
+        from ..landscapes.storage.store import SliceStore
+
+        points, store = self.figure.resolution ** len(self.figure.dims), self.folder / STORE
+        if not is_slice(store) and not has_lost_root(store, FILES):
+            return State(points, 0)
+        stored = SliceStore.open(store)
+        return State(points, int((stored.status() > 0).sum()) if _same(self.figure, stored.identity) else None)
+
+    def seconds_each(self) -> float:
+        """Time a point."""
+        cost = self._open().cost()
+        return cost.seconds / max(cost.episodes, 1)
+
+    def make(self, watch: Watch) -> str:
+        """Sample the slice."""
+        outcome = self._open().run(watch).outcome()
+        if len(self.figure.dims) == 2:
+            (self.folder / PICTURE).unlink()  # `landscape gallery build` draws planes; a line's events need episodes
+        return outcome
+
+    def _open(self) -> SliceJob:
+        from ..jobs.slice import SliceJob
+        from ..landscapes.storage.paths import is_slice
+
+        env = self._scene().make()
+        return SliceJob.of(
+            env,
+            self.figure.plane(env),
+            command=self.figure.command(self.device),
+            out=self.folder,
+            # nothing is lost of a store made by other code or for another device
+            force=is_slice(self.folder / STORE) and self.state().done == 0,
+            executor=self.executor,
+        )
+
+
+class SweepPart(FigurePart):
+    """The slice as something else moves: a film, of slices that stay in the sweep's own folder under out/."""
+
+    def label(self) -> str:
+        """Return the command that makes it."""
+        return self.figure.sweep_command(frames=FRAMES, resolution=COARSE, fidelity=DRAFT, device=self.device)
+
+    def count_left(self) -> int:
+        """Return 1 where there is no film of these settings yet."""
+        if not self.figure.over or len(self.figure.dims) != 2:
+            return 0
+        record = read_if_sound(SweepRecord.read, self.folder / SWEEP_RECORD)
+        if record is None or not (self.folder / SWEEP_FILM).exists():
+            return 1
+        return int(record != self._record(record.label, record.low, record.high, record.command))
+
+    def seconds_each(self) -> float:
+        """Time the film by its last slice."""
+        return self._open().cost().seconds
+
+    def make(self, watch: Watch) -> str:
+        """Sample the sweep's slices and film them."""
+        from ..landscapes.draw.figures.sweep import save_films
+
+        drawn = self._open().sample(watch)
+        save_films(drawn, self.folder / SWEEP_FILM, None, dpi=DPI, loss=LOSS)
+        record = self._record(drawn.label, drawn.values[0], drawn.values[-1], self.label())
+        record.write(self.folder / SWEEP_RECORD)
+        return f"{FRAMES} frames of {COARSE} x {COARSE} points over {drawn.label}"
+
+    def _record(self, label: str, low: float, high: float, command: str) -> SweepRecord:
+        return SweepRecord(self.figure.over, DRAFT, FRAMES, [COARSE, COARSE], label, low, high, command)
+
+    def _open(self) -> SweepJob:
+        from ..jobs.motion import SMOOTHING, Motion
+        from ..jobs.sweep import SweepJob, sweep_folder
+
+        env, over = self._scene(DRAFT).make(), self.figure.over
+        motion = Motion.of(env, self.figure.plane(env, COARSE), over, FRAMES)
+        grad = over != SMOOTHING
+        folder = sweep_folder(env, motion, over, grad=grad)
+        return replace(SweepJob.open(env, motion, folder, command=self.label(), grad=grad), executor=self.executor)
+
+
+class SearchPart(FigurePart):
+    """A run of each method in the figure's environment, which its other figures share."""
+
+    def label(self) -> str:
+        """Name methods, budget and scene."""
+        return f"{', '.join(METHODS)}: {BUDGET} episodes each in {self._where.name}"
+
+    def count_left(self) -> int:
+        """Count the runs not made."""
+        return len(self._missing())
+
+    def seconds_each(self) -> float:
+        """Time a run by one of its episodes; what a method takes itself comes on top."""
+        return BUDGET * 2 * seconds_of_one(self._scene(DRAFT).make())
+
+    def make(self, watch: Watch) -> str:
+        """Run every method that has not run."""
+        from .runs import save_run
+
+        env = self._scene(DRAFT).make()
+        for method in self._missing():
+            save_run(self._search(env, method, watch), self._file(method))
+        return f"{len(METHODS)} runs of {BUDGET} episodes"
+
+    def _search(self, env: Environment, method: str, watch: Watch) -> xr.Dataset:
+        """Run a method, in a folder of its own under out/, and return the run's table."""
+        from ..jobs.search import SearchJob, make_optimizer
+
+        command = self.figure.search_command(
+            method, budget=BUDGET, seed=SEED, fidelity=env.fidelity.name, device=self.device
+        )
+        job = SearchJob.of(env, make_optimizer(method, env, seed=SEED), budget=BUDGET, command=command)
+        job.run(watch)
+        return job.store.dataset()
+
+    @property
+    def _where(self) -> Path:
+        return self.root / RUNS / "-".join([self.figure.env, *map(str, self.figure.options.values())])
+
+    def _file(self, method: str) -> Path:
+        return self._where / f"{method}-{SEED}{RUN_SUFFIX}"
+
+    def _missing(self) -> list[str]:
+        from .runs import open_run
+
+        return [method for method in METHODS if read_if_sound(open_run, self._file(method)) is None]
+
+
+def _same(figure: Figure, identity: Mapping[str, Any]) -> bool:
+    """Whether a slice has the figure's environment, fidelity, options, resolution and dimensions."""
+    plane = identity["plane"]
+    dims = tuple(row.index(1.0) for row in plane["basis"] if row.count(1.0) == 1)
+    same = identity["objective"] == figure.env and identity["fidelity"] == figure.fidelity and dims == figure.dims
+    options = {name: identity["options"].get(name) for name in figure.options}
+    return bool(same and options == figure.options and plane["resolution"] == [figure.resolution] * len(dims))
+
+
+def seconds_of_one(env: Environment) -> float:
+    """Return the seconds of an episode without gradient."""
+    from ..landscapes.cost import episode_cost
+
+    return episode_cost(env, grad=False).forward

@@ -1,0 +1,223 @@
+"""The static site: what is in the figures' data, as pages that need no network and no server.
+
+Whatever of `surface.png`, `.html`, `.gltf` and `.glb` lies in a figure's folder beside what `..files` names is shown,
+too. Runs are laid over every slice of their environment and options; trade-offs are shown with every slice of theirs.
+
+`manifest.json` lists all of it for programs. Its `files` are all that the site has: a folder is built anew only where
+it holds nothing else.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from ... import __version__
+from ...envs.registry import entries
+from ...landscapes.identity import plane_of, stored_identity, stored_provenance
+from ...landscapes.storage.arrays import parameters_of
+from ...landscapes.storage.files import placing, resolve
+from ...landscapes.storage.ownership import check_ours
+from ...landscapes.storage.paths import is_slice
+from ...landscapes.storage.records import reading
+from ...landscapes.storage.store import SliceStore, open_slice
+from ..figures import Figure
+from ..files import MEASURES, PICTURE, QUALITY, REMAKE, REPORT, STORE, SURFACES, SWEEP_FILM
+from .manifest import SCHEMA, FigureEntry, Manifest, TradeoffEntry, as_json
+from .measured import dark_name, place_tradeoffs, read_report
+from .page_data import count_numbers, read_episodes, read_measures, read_off_nodes, read_sweep
+from .trajectories import lay_runs, read_runs
+
+HERE = Path(__file__).parent
+MANIFEST, NODES, THUMBNAIL = "manifest.json", "nodes.js", "thumbnail.png"
+
+
+def build_site(
+    figures: Sequence[Figure], data: Path, out: Path, follow: Callable[[int], None] = lambda count: None
+) -> Manifest:
+    """Build the site of the figures that `data` has into `out`, whole or not at all, and return its manifest.
+
+    What is in `out` is replaced if a site built earlier is all that is there. `follow` hears how many figures are
+    drawn, before the first is. Raises ValueError where `out` holds anything else, where `data` holds no figure, and,
+    naming it, for a file of it that is damaged.
+    """
+    out = resolve(out)
+    _check(out)
+    there = [figure for figure in figures if _has_samples(data / figure.id / STORE)]
+    if not there:
+        raise ValueError(f"{data} holds no slice of a figure; `landscape gallery compute` samples them")
+    tables = read_runs(data)
+    with placing(out, overwrite=True, check=partial(_check, out)) as new:
+        follow(len(there))
+        shutil.copytree(HERE / "static", new / "static")
+        site = _Site(new, _templates(), tables, place_tradeoffs(data, new, [figure.env for figure in there]))
+        shown = [site.write_page(figure, data / figure.id) for figure in there]
+        return site.write_index(shown, [figure.id for figure in figures if figure not in there])
+
+
+def _check(out: Path) -> None:
+    """Refuse a folder that holds anything but a site whose manifest lists all of it."""
+    if not out.exists():
+        return
+    if not out.is_dir():
+        raise ValueError(f"{out} is a file; give --out a new or an empty folder")
+    try:
+        listed = json.loads((out / MANIFEST).read_text())
+        ours = frozenset(listed["files"] if {"schema", "gradscape"} <= listed.keys() else ())
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        ours = frozenset()  # none, or of an earlier version, which listed no files
+    check_ours(out, ours.__contains__, f"a gallery by its {MANIFEST}")
+
+
+def _has_samples(store: Path) -> bool:
+    return is_slice(store) and bool((SliceStore.open(store).status() > 0).any())
+
+
+def _templates() -> Environment:
+    pages = Environment(
+        loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    pages.filters["number"] = _number
+    pages.filters["dark"] = dark_name
+    pages.filters["times"] = lambda text: re.sub(r"(?<=\d) x (?=[\d(])", " \N{MULTIPLICATION SIGN} ", text)
+    return pages
+
+
+def _number(value: Any, digits: int = 4) -> str:
+    """Write a number with a minus sign, and anything else as it is."""
+    return f"{value:z.{digits}g}".replace("-", "\N{MINUS SIGN}") if isinstance(value, int | float) else str(value)
+
+
+@dataclass(frozen=True)
+class Held:
+    """A parameter that a slice holds, and at what value."""
+
+    name: str
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class _Site:
+    """A site under way in `folder`, with what its pages share."""
+
+    folder: Path
+    pages: Environment
+    tables: Sequence[xr.Dataset]
+    tradeoffs: Mapping[str, Sequence[TradeoffEntry]]
+
+    def write_page(self, figure: Figure, source: Path) -> FigureEntry:
+        """Write a slice's page and all it shows, and return its entry in the manifest."""
+        folder = self.folder / figure.id
+        folder.mkdir()
+        dataset = open_slice(source / STORE)
+        _draw(dataset, source, folder)
+        episodes, runs = read_episodes(source, dataset), lay_runs(dataset, self.tables)
+        shown = json.dumps(as_json(read_off_nodes(dataset, episodes, runs)), separators=(",", ":"))
+        (folder / NODES).write_text(f"const SLICE = {shown};\n")
+        given = [name for name in (*SURFACES, SWEEP_FILM) if (source / name).exists()]
+        given += [name for episode in episodes for name in episode.files]
+        given += [name for name in (REPORT, MEASURES, QUALITY) if (source / name).exists()]
+        entry = replace(
+            _entry(figure, dataset, source),
+            files=[NODES, "index.html", *_place(given, source, folder)],
+            episodes=episodes,
+            runs=[run.search() for run in runs],
+            tradeoffs=self.tradeoffs.get(figure.env, []),
+        )
+        about = {"entry": entry, "held": list(_held_parameters(dataset)), "scene": entries().get(figure.env)}
+        (folder / "index.html").write_text(self.pages.get_template("slice.html").render(**about))
+        return entry
+
+    def write_index(self, shown: Sequence[FigureEntry], missing: Sequence[str]) -> Manifest:
+        """Write the page of all pages and the manifest, and return that."""
+        manifest = Manifest(SCHEMA, __version__, shown, missing, [])
+        groups = [(env, list(group)) for env, group in groupby(shown, key=lambda entry: entry.env)]
+        index = self.pages.get_template("index.html").render(groups=groups, manifest=manifest, scenes=entries())
+        (self.folder / "index.html").write_text(index)
+        files = [file.relative_to(self.folder).as_posix() for file in self.folder.rglob("*") if file.is_file()]
+        manifest = replace(manifest, files=sorted([*files, MANIFEST]))
+        (self.folder / MANIFEST).write_text(json.dumps(as_json(manifest), indent=1) + "\n")
+        return manifest
+
+
+def _place(given: Sequence[str], source: Path, folder: Path) -> list[str]:
+    """Copy files of a figure's data, draw pictures for dark pages, and return the names of all but those drawn."""
+    from ...landscapes.draw.figures.dark import save_dark
+
+    for name in given:
+        shutil.copyfile(source / name, folder / name)
+    pictures = [PICTURE, THUMBNAIL, *(name for name in given if name.endswith(".png"))]
+    for name in pictures:
+        if not (folder / dark_name(name)).exists():
+            with reading(source / name, REMAKE.format("slices")):
+                save_dark(folder / name, folder / dark_name(name))
+    copied = [name for name in given if name not in pictures]
+    return [*copied, *(name for one in pictures for name in (one, dark_name(one)))]
+
+
+def _entry(figure: Figure, dataset: xr.Dataset, source: Path) -> FigureEntry:
+    """Return what the manifest says of a slice, but for what other files of the site it goes with."""
+    identity, provenance = stored_identity(dataset), stored_provenance(dataset)
+    return FigureEntry(
+        id=figure.id,
+        env=figure.env,
+        paper_figure=figure.caption.number,
+        page=f"{figure.id}/index.html",
+        dims=figure.dims,
+        labels=identity["plane"]["labels"],
+        through=figure.through,
+        says=figure.caption.says,
+        resolution=identity["plane"]["resolution"],
+        loss_unit=provenance.get("loss_unit", ""),
+        numbers=count_numbers(dataset),
+        command=provenance.get("command") or figure.command(identity.get("device", "auto")),
+        identity={name: value for name, value in identity.items() if name != "plane"},
+        provenance=provenance,
+        files=[],
+        episodes=[],
+        sweep=read_sweep(source),
+        runs=[],
+        measures=read_measures(source),
+        report=read_report(source),
+        tradeoffs=[],
+    )
+
+
+def _draw(dataset: xr.Dataset, source: Path, folder: Path) -> None:
+    """Draw a slice for light and for dark; a line's picture is the one made with it, since its events need episodes."""
+    from ...landscapes.draw.figures.contour import landscape_figure
+    from ...landscapes.draw.figures.dark import darken
+    from ...landscapes.draw.figures.page import save
+    from ...landscapes.draw.figures.profile import profile_figure
+    from ...landscapes.draw.figures.thumbnail import thumbnail_figure
+
+    drawn = {THUMBNAIL: thumbnail_figure(dataset)}
+    if len(dataset["loss"].dims) == 1 and (source / PICTURE).exists():
+        shutil.copyfile(source / PICTURE, folder / PICTURE)
+    else:
+        drawn[PICTURE] = (landscape_figure if len(dataset["loss"].dims) == 2 else profile_figure)(dataset)
+    for name, picture in drawn.items():
+        save(picture, folder / name)
+        darken(picture)
+        save(picture, folder / dark_name(name))
+
+
+def _held_parameters(dataset: xr.Dataset) -> Iterator[Held]:
+    """Yield the parameters that the slice holds."""
+    plane = plane_of(dataset)
+    varied = plane.basis.any(dim=0).tolist()
+    for (name, unit), value, varies in zip(parameters_of(dataset), plane.origin.tolist(), varied, strict=True):
+        if not varies:
+            yield Held(name, value, unit)

@@ -1,0 +1,248 @@
+"""What the site says to programs and to its pages: the records of its JSON, each with the keys that are read there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any
+
+from ..records import SweepRecord
+
+SCHEMA = 2  # counts up whenever the meaning of a name in the manifest changes
+Column = Sequence[float | None]  # of numbers, None for what is not finite
+LEFT_OUT = {"left out": True}  # metadata of a key that is not there where its value is None
+
+
+def as_json(value: Any) -> Any:
+    """Return records as plain JSON."""
+    if is_dataclass(value):
+        return {
+            one.name: as_json(held)
+            for one in fields(value)
+            if (held := getattr(value, one.name)) is not None or not one.metadata
+        }
+    if isinstance(value, Mapping):
+        return {name: as_json(held) for name, held in value.items()}
+    return list(map(as_json, value)) if isinstance(value, list | tuple) else value
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Say how a slice's points ended, the ends of their losses, and at what share of them the gradient is zero."""
+
+    points: int
+    status: Mapping[str, int]
+    lowest: float | None
+    highest: float | None
+    flat: float | None
+
+
+@dataclass(frozen=True)
+class EpisodeEntry:
+    """A node whose episode is shown: where it lies, in numbers of nodes and `at` which parameters, and its files."""
+
+    row: int
+    column: int
+    why: str
+    loss: float | None
+    status: str
+    at: Mapping[str, float]
+    mp4: str | None = field(default=None, metadata=LEFT_OUT)
+    webp: str | None = field(default=None, metadata=LEFT_OUT)
+
+    @property
+    def files(self) -> list[str]:
+        """The files that there are of it."""
+        return [name for name in (self.mp4, self.webp) if name]
+
+
+@dataclass(frozen=True)
+class Search:
+    """A run that is laid over a slice: how it was made, and what became of it.
+
+    `outside` counts the episodes beyond the map, `distance` is from the slice, the least and the most.
+    """
+
+    method: str
+    seed: int
+    label: str
+    fidelity: str
+    colour: str
+    budget: int
+    episodes: int
+    best: float | None
+    outside: int
+    failed: int
+    distance: tuple[float, float]
+    command: str
+
+
+@dataclass(frozen=True)
+class Trajectory(Search):
+    """A run with its points, in the order of evaluation, for the map alone.
+
+    Of every point: where it falls, its own loss, and how large its mark is [pixels] (the smaller, the farther off the
+    slice). `path` holds the points that were the best so far, `hidden` those beyond the map.
+    """
+
+    u: Column
+    v: Column | None = field(metadata=LEFT_OUT)
+    loss: Column
+    radius: Sequence[float]
+    path: Sequence[int]
+    hidden: Sequence[int]
+
+    def search(self) -> Search:
+        """Return it without its points."""
+        return Search(**{one.name: getattr(self, one.name) for one in fields(Search)})
+
+
+@dataclass(frozen=True)
+class Axis:
+    """An axis of a map: its label, the values at its nodes, and where it is labelled."""
+
+    label: str
+    values: Sequence[float]
+    ticks: Sequence[float]
+
+
+@dataclass(frozen=True)
+class ColourScale:
+    """The scale of a map's colours, or of a line's height."""
+
+    low: float
+    high: float
+    logarithmic: bool
+    extend: str
+    ticks: Sequence[float]
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """A slice as plain lists, row by row from the lowest v: what the map draws and says of a node.
+
+    `slope` is the gradient along the axes, `gradient` its length in all dimensions; `azimuth` is where the surface is
+    seen from at first [degrees].
+    """
+
+    axes: Sequence[Axis]
+    unit: str
+    loss: Column
+    status: Sequence[str]
+    scale: ColourScale
+    palette: Sequence[str]
+    episodes: Sequence[EpisodeEntry]
+    runs: Sequence[Trajectory]
+    azimuth: float | None = field(default=None, metadata=LEFT_OUT)
+    slope: Sequence[Column] | None = field(default=None, metadata=LEFT_OUT)
+    gradient: Column | None = field(default=None, metadata=LEFT_OUT)
+
+
+@dataclass(frozen=True)
+class Word:
+    """A word that was measured, or that the paper says: `agree` is None where the paper is silent."""
+
+    word: str
+    measured: bool
+    reason: str
+    agree: bool | None
+
+
+@dataclass(frozen=True)
+class ReportEntry:
+    """What `landscape report` found of a slice; `picture` says what the picture of gradient quality shows."""
+
+    words: Sequence[Word]
+    where: str
+    device: str
+    fidelity: str
+    picture: str
+    file: str
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An estimate and the ends of its interval, None where there is none."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True)
+class SecondsEntry:
+    """What an episode takes [s]."""
+
+    forward: float
+    with_gradient: float
+
+
+@dataclass(frozen=True)
+class Rung:
+    """A way to simulate: how near it is to the reference, and what it takes; `front` where nothing beats it in both."""
+
+    name: str
+    front: bool
+    error: Interval
+    spearman: float | None
+    cosine: float | None
+    diverged: float | None
+    seconds: SecondsEntry
+    memory: float
+
+
+@dataclass(frozen=True)
+class TradeoffEntry:
+    """What `landscape tradeoff` found of an environment on a device; `alt` says what its picture shows."""
+
+    env: str
+    reference: str
+    loss_unit: str
+    command: str
+    points: float
+    spread: float | None
+    refused: Sequence[Mapping[str, str]]
+    options: Mapping[str, Any]
+    device: str
+    picture: str
+    file: str
+    alt: str
+    rungs: Sequence[Rung]
+
+
+@dataclass(frozen=True)
+class FigureEntry:
+    """A slice of the gallery, and all that its page shows."""
+
+    id: str
+    env: str
+    paper_figure: int | None
+    page: str
+    dims: Sequence[int]
+    labels: Sequence[str]
+    through: str
+    says: str
+    resolution: Sequence[int]
+    loss_unit: str
+    numbers: Numbers
+    command: str
+    identity: Mapping[str, Any]
+    provenance: Mapping[str, Any]
+    files: Sequence[str]
+    episodes: Sequence[EpisodeEntry]
+    sweep: SweepRecord | None
+    runs: Sequence[Search]
+    measures: Mapping[str, str | float]
+    report: ReportEntry | None
+    tradeoffs: Sequence[TradeoffEntry]
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """All of a site: its slices, those that are not sampled yet, and its files."""
+
+    schema: int
+    gradscape: str
+    figures: Sequence[FigureEntry]
+    missing: Sequence[str]
+    files: Sequence[str]

@@ -1,0 +1,162 @@
+"""What a page says of a slice's report, and of its environment's accuracy against time."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ...landscapes.measures.classify import WORDS
+from ...landscapes.measures.fidelity import cheapest, p95, pareto_front
+from ...landscapes.plain import number, optional, text
+from ...landscapes.storage.records import read_json, reading
+from ..files import DEVICES, REMAKE, REPORT, TRADEOFFS, TradeoffFiles
+from .manifest import Interval, ReportEntry, Rung, SecondsEntry, TradeoffEntry, Word
+
+Record = Mapping[str, Any]
+TOLERANCE = 0.05  # of the loss error that a picture's description names the quickest rung for
+
+
+def read_report(folder: Path) -> ReportEntry | None:
+    """Return what `landscape report` found of a slice, None where there is no report."""
+    path = folder / REPORT
+    if not path.exists():
+        return None
+    with reading(path, REMAKE.format("reports")):
+        record = read_json(path)
+        return ReportEntry(
+            words=_words(record),
+            where=text(record["paper"]["where"]) if record["paper"] else "",
+            device=text(record["device"]),
+            fidelity=text(record["fidelity"]),
+            picture=_describe_quality(record),
+            file=REPORT,
+        )
+
+
+def _words(record: Record) -> list[Word]:
+    """Return every word that was measured or that the paper says."""
+    reasons = record["verdict"]["reasons"]
+    paper = [one["word"] for one in (record["paper"] or {"words": []})["words"]]
+    return [
+        Word(word, word in reasons, text(reasons.get(word, "")), word in reasons if word in paper else None)
+        for word in WORDS
+        if word in reasons or word in paper
+    ]
+
+
+def _describe_quality(record: Record) -> str:
+    """Say what the picture of gradient quality shows."""
+    parts = [
+        f"mean cosine of gradient and difference {_format_signed(row['cosine']['value'])} "
+        f"over {row['scale']:.2g} of the box"
+        for row in [_small(record["differences"]), *record["differences_of_samples"]]
+        if row and row["cosine"]["value"] is not None
+    ]
+    for row in record["smoothing"]:
+        if row["biased"]["value"] is not None:
+            biased = round(row["biased"]["value"] * row["points"])
+            parts.append(
+                f"smoothed over {row['width']:.0%} of it, first order is biased at {biased} of {row['points']}"
+            )
+    return "Gradient quality over the slice: " + ("; ".join(parts) or "no slope above the noise")
+
+
+def _small(rows: Sequence[Record]) -> Record | None:
+    return next((row for row in rows if row["points"] >= row["of"] / 2), None)
+
+
+def _format_signed(value: float) -> str:
+    return f"{value:z.2f}".replace("-", "\N{MINUS SIGN}")
+
+
+def dark_name(picture: str) -> str:
+    """Return the name of a picture for pages that are dark."""
+    return picture.removesuffix(".png") + "-dark.png"
+
+
+def place_tradeoffs(data: Path, out: Path, envs: Sequence[str]) -> dict[str, list[TradeoffEntry]]:
+    """Copy what was measured of these environments' accuracy into the site, and return it by environment."""
+    from ...landscapes.draw.figures.dark import save_dark
+
+    placed: dict[str, list[TradeoffEntry]] = {}
+    for env, device in ((env, device) for env in dict.fromkeys(envs) for device in DEVICES):
+        source, target = (TradeoffFiles.of(root, env, device) for root in (data, out))
+        if not source.there():
+            continue
+        with reading(source.record, REMAKE.format("tradeoffs")):
+            placed.setdefault(env, []).append(_tradeoff(read_json(source.record), target))
+        target.record.parent.mkdir(exist_ok=True)
+        shutil.copyfile(source.record, target.record)
+        shutil.copyfile(source.picture, target.picture)
+        save_dark(source.picture, target.picture.with_name(dark_name(target.picture.name)))
+    return placed
+
+
+def _tradeoff(record: Record, files: TradeoffFiles) -> TradeoffEntry:
+    rows = sorted(record["rungs"], key=_time)
+    reference = next(row for row in rows if row["name"] == record["reference"])
+    quicker = [row for row in rows if _time(row) < _time(reference)]
+    errors = [math.inf if (off := _error(row, record)) is None else off for row in quicker]
+    best = {quicker[place]["name"] for place in pareto_front([_time(row) for row in quicker], errors)}
+    return TradeoffEntry(
+        **{name: text(record[name]) for name in ("env", "reference", "loss_unit", "command")},
+        points=number(record["points"]),
+        spread=optional(number, record["spread"]),
+        refused=record["refused"],
+        options=dict(record["identity"]["options"]),
+        device=text(record["identity"]["device"]),
+        picture=f"{TRADEOFFS}/{files.picture.name}",
+        file=f"{TRADEOFFS}/{files.record.name}",
+        alt=_describe_accuracy(record, reference),
+        rungs=[_rung(row, record, best) for row in rows],
+    )
+
+
+def _rung(row: Record, record: Record, best: set[str]) -> Rung:
+    error = row["loss_error"]["p95_relative" if record["spread"] else "p95"]
+    return Rung(
+        name=text(row["name"]),
+        front=row["name"] in best,
+        error=Interval(**{end: optional(number, error[end]) for end in ("value", "low", "high")}),
+        spearman=optional(number, row["spearman"]["value"]),
+        cosine=optional(number, row["gradient"]["cosine"]["value"]),
+        diverged=optional(number, row["diverged"]),
+        seconds=SecondsEntry(**{way: number(row["seconds"][way]) for way in ("forward", "with_gradient")}),
+        memory=number(row["memory"]),
+    )
+
+
+def _describe_accuracy(record: Record, reference: Record) -> str:
+    """Say what the picture of accuracy against time shows."""
+    named = [row for row in record["rungs"] if row["ladder"] == "named" and row is not reference]
+    parts = [
+        f"{row['name']} takes {_milliseconds(row)} and is off by {_share(_error(row, record), record)}" for row in named
+    ]
+    others = [row for row in record["rungs"] if row is not reference]
+    if quickest := cheapest(others, TOLERANCE, relative=True):
+        parts.append(f"the quickest within {TOLERANCE:.0%} is {quickest['name']} with {_milliseconds(quickest)}")
+    count = len(record["rungs"])
+    return f"Loss error of {count} ways to simulate {record['env']} over the time of an episode: " + "; ".join(
+        [*parts, f"the reference takes {_milliseconds(reference)}"]
+    )
+
+
+def _time(row: Record) -> float:
+    return number(row["seconds"]["with_gradient"])
+
+
+def _error(row: Record, record: Record) -> float | None:
+    return p95(row, relative=record["spread"] is not None)
+
+
+def _milliseconds(row: Record) -> str:
+    return f"{1e3 * _time(row):.3g} ms"
+
+
+def _share(error: float | None, record: Record) -> str:
+    if error is None:
+        return "more than a number can say (it failed too often)"
+    return f"{error:.2g} {record['loss_unit']}".rstrip() if record["spread"] is None else f"{100 * error:.2g} %"

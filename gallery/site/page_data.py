@@ -1,0 +1,125 @@
+"""What a page needs of a slice: its numbers, its nodes for the map to hover over, and its films."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import xarray as xr
+
+from ...jobs.slice import count_statuses, flat_points
+from ...landscapes.identity import plane_of
+from ...landscapes.objective import Status
+from ...landscapes.plain import number
+from ...landscapes.plane import Plane
+from ...landscapes.storage.records import read_json, reading
+from ..files import EPISODE_KINDS, EPISODES, MEASURES, REMAKE, SWEEP_FILM, SWEEP_RECORD
+from ..records import Node, SweepRecord, read_nodes
+from .manifest import Axis, ColourScale, EpisodeEntry, Nodes, Numbers, Trajectory
+
+
+def count_numbers(dataset: xr.Dataset) -> Numbers:
+    """Count how the points of a slice ended, and find the range of their losses."""
+    loss, status, flat = dataset["loss"].to_numpy(), dataset["status"].to_numpy(), flat_points(dataset)
+    finite, evaluated = loss[np.isfinite(loss)], int((status != Status.MISSING).sum())
+    return Numbers(
+        points=int(status.size),
+        status=count_statuses(dataset),
+        lowest=float(finite.min()) if finite.size else None,
+        highest=float(finite.max()) if finite.size else None,
+        flat=None if flat is None or not evaluated else flat / evaluated,
+    )
+
+
+def read_off_nodes(dataset: xr.Dataset, episodes: Sequence[EpisodeEntry], runs: Sequence[Trajectory]) -> Nodes:
+    """Read off a slice what the map draws and says of its nodes."""
+    from ...landscapes.draw.render.relief import Relief, azimuth
+    from ...landscapes.draw.style import LOSS_MAP, Scale
+
+    plane, loss = plane_of(dataset), dataset["loss"].to_numpy()
+    nodes = Nodes(
+        axes=_axes(plane),
+        unit=str(dataset["loss"].attrs.get("units", "")),
+        loss=round_off(loss.ravel()),
+        status=[Status(code).name for code in dataset["status"].to_numpy().ravel()],
+        scale=_scale(loss, [run.best for run in runs if run.best is not None]),
+        palette=[bytes(round(255 * part) for part in LOSS_MAP(level)[:3]).hex() for level in range(256)],
+        episodes=episodes,
+        runs=runs,
+        azimuth=azimuth(Relief(plane, Scale.of_loss(loss)), dataset) if plane.rank == 2 else None,
+    )
+    if "grad" not in dataset:
+        return nodes
+    grad = dataset["grad"].to_numpy().reshape(loss.size, -1)
+    slope = [round_off(column) for column in plane.slope(torch.from_numpy(grad)).numpy().T]
+    return replace(nodes, slope=slope, gradient=round_off(np.linalg.norm(grad, axis=1)))
+
+
+def _axes(plane: Plane) -> list[Axis]:
+    from ...landscapes.draw.style import round_values
+
+    labelled = zip(plane.labels, (axis.tolist() for axis in plane.axes()), strict=True)
+    return [Axis(label, values, round_values(values[0], values[-1])) for label, values in labelled]
+
+
+def _scale(loss: np.ndarray[Any, Any], below: Sequence[float]) -> ColourScale:
+    """Return the scale of a map's colours, or of a line's height: that is linear and goes down to what lies below."""
+    from ...landscapes.draw.style import Scale
+
+    scale = Scale.of_loss(loss)
+    if loss.ndim == 1 and np.isfinite(loss).any():
+        low, high = float(np.nanmin([*loss, *below])), float(np.nanmax(loss))
+        room = 0.04 * (high - low) or 0.5
+        scale = Scale.linear(low - room, high + room)
+    ends = float(scale.norm.vmin or 0.0), float(scale.norm.vmax or 0.0)
+    return ColourScale(*ends, scale.logarithmic, scale.extend, scale.ticks())
+
+
+def read_episodes(folder: Path, dataset: xr.Dataset) -> list[EpisodeEntry]:
+    """Return the episodes that `episodes.json` lists and that have a film or a picture, one a node."""
+    listed = folder / EPISODES
+    if not listed.exists():
+        return []
+    nodes = read_nodes(listed)
+    with reading(listed, REMAKE.format("episodes")):  # a node may lie beyond the slice
+        shown: dict[tuple[int, int], EpisodeEntry] = {}
+        for node in nodes:
+            place = (node.row, node.column)
+            if place in shown:
+                shown[place] = replace(shown[place], why=f"{shown[place].why}, {node.why}")
+            else:
+                shown[place] = _episode(node, folder, plane_of(dataset))
+    return [episode for episode in shown.values() if episode.files]
+
+
+def _episode(node: Node, folder: Path, plane: Plane) -> EpisodeEntry:
+    places = zip(plane.labels, plane.axes(), (node.column, node.row), strict=False)
+    at = {label: float(axis[place]) for label, axis, place in places}
+    files = {kind: f"{node.name}.{kind}" for kind in EPISODE_KINDS}
+    there = {kind: name for kind, name in files.items() if (folder / name).exists()}
+    return EpisodeEntry(node.row, node.column, node.why, node.loss, node.status, at, **there)
+
+
+def read_sweep(folder: Path) -> SweepRecord | None:
+    """Return what the film of a sweep shows, None where there is no film or nothing is said of it."""
+    there = (folder / SWEEP_FILM).exists() and (folder / SWEEP_RECORD).exists()
+    return SweepRecord.read(folder / SWEEP_RECORD) if there else None
+
+
+def read_measures(folder: Path) -> dict[str, str | float]:
+    """Return the numbers of a slice's report by their names, none where there is no report."""
+    path = folder / MEASURES
+    if not path.exists():
+        return {}
+    with reading(path, REMAKE.format("reports")):
+        found = read_json(path)
+        return {name: value if isinstance(value, str) else number(value) for name, value in found.items()}
+
+
+def round_off(values: np.ndarray[Any, Any]) -> list[float | None]:
+    """Return numbers to six digits, None for what is not finite."""
+    return [float(f"{value:.6g}") if np.isfinite(value) else None for value in values.tolist()]

@@ -1,0 +1,250 @@
+"""The checks of an environment: what every objective owes, and the variants that its own options and settings allow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from ..landscapes.capacity import Need, require
+from ..landscapes.conformance.finding import Finding
+from ..landscapes.cost import duration, episode_cost
+from ..landscapes.plain import plain
+from .scene import SceneSpec
+from .watch import PREPARING, Say, Stopped, Watch
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import pandas as pd
+
+    from ..envs.base import Environment
+    from ..landscapes.conformance.extremes import ExtremeCase
+
+FACTORS = (1, 2, 4, 8)  # of the fidelity's time step, and of the scene's horizon
+
+
+def _materials(job: CheckJob) -> list[ExtremeCase]:
+    """Return the softest and the stiffest of what a scene is made of, by its options or its parameters."""
+    from ..landscapes.conformance.extremes import ExtremeCase
+
+    if (ends := job.env.material_range) is not None:
+        values = (ends.softest, ends.stiffest)
+        return [ExtremeCase(f"{ends.option} {value:g}", _with_option(job.spec, ends.option, value)) for value in values]
+    space = job.env.space
+    stiff = [space.names.index(name) for name in job.env.stiffness_parameters]
+    if not stiff:
+        return [ExtremeCase("softest and stiffest", why="it offers no stiffness to set")]
+    found = []
+    for name, bound in (("softest", space.lower), ("stiffest", space.upper)):
+        x = space.center[None].clone()
+        x[0, stiff] = bound[stiff]
+        found.append(ExtremeCase(name, lambda: job.env, x=x))
+    return found
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """Hold what was found of an environment; fields are called as `landscape check --json` has them."""
+
+    env: str
+    fidelity: str
+    settings: dict[str, Any]
+    options: dict[str, Any]
+    device: str
+    engine: str
+    points: int
+    seed: int
+    passed: bool
+    findings: tuple[Finding, ...]
+    command: str
+
+    def record(self) -> dict[str, Any]:
+        """Return it as plain JSON, which knows no infinity; findings are its `checks`."""
+        found = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in ("findings", "command")}
+        return {**found, "checks": list(map(_record, self.findings)), "command": self.command}
+
+    def table(self) -> pd.DataFrame:
+        """Return a row for each check, indexed by `check`: its `outcome`, its `figure` and `why`."""
+        import pandas as pd
+
+        rows = [(one.check, one.outcome, one.figure, one.why) for one in self.findings]
+        return pd.DataFrame(rows, columns=["check", "outcome", "figure", "why"]).set_index("check")
+
+    def _repr_html_(self) -> str:
+        """Show the table in a notebook."""
+        return str(self.table().to_html())
+
+
+@dataclass(frozen=True)
+class CheckJob:
+    """An environment to check at random points of its box; `spec` makes it again, and its variants."""
+
+    env: Environment
+    spec: SceneSpec
+    points: int
+    seed: int
+    command: str = ""
+
+    @classmethod
+    def open(cls, scene: SceneSpec, *, points: int = 4, seed: int = 0, command: str = "") -> CheckJob:
+        """Make the environment; nothing is kept on disk.
+
+        Raises ValueError for what the scene does not have, TooLargeError for more points than there is memory for.
+        """
+        env = scene.make()
+        require("points", points, partial(_need, env.space.dim))
+        known = replace(scene, fidelity=env.fidelity, tolerance=None, device=env.device, engine=env.engine)
+        return cls(env, known, points, seed, command)
+
+    @property
+    def name(self) -> str:
+        """The name that the environment is registered by."""
+        return self.spec.name if isinstance(self.spec.name, str) else self.env.name
+
+    def findings(self, watch: Watch | None = None) -> Iterator[Finding]:
+        """Say what it will cost, then yield what each check finds as soon as it is found.
+
+        Raises Stopped where it is interrupted.
+        """
+        watch, count = watch or Watch(), 0
+        say: Say = lambda text: None  # noqa: E731 -- of the moment
+        found = self._run(lambda check: say(f"{self.name}: {check}"))
+        try:
+            with watch.busy(f"{self.name}: {PREPARING}"):
+                watch.note(self._cost())
+            while True:
+                with watch.busy(f"{self.name}: checking") as say:
+                    finding = next(found, None)
+                if finding is None:
+                    return
+                count += 1
+                yield finding
+        except KeyboardInterrupt as error:
+            raise Stopped(f"{count} checks are done, and nothing is kept of them", kept=False) from error
+
+    def run(self, watch: Watch | None = None) -> CheckReport:
+        """Check it and return all that was found. Raises Stopped where it is interrupted."""
+        return self.report(tuple(self.findings(watch)))
+
+    def report(self, findings: tuple[Finding, ...]) -> CheckReport:
+        """Return what was found as one record."""
+        env = self.env
+        return CheckReport(
+            env=env.name,
+            fidelity=env.fidelity.name,
+            settings=asdict(env.fidelity),
+            options=asdict(env.options),
+            device=env.device,
+            engine=env.engine,
+            points=self.points,
+            seed=self.seed,
+            passed=not any(finding.bad for finding in findings),
+            findings=findings,
+            command=self.command,
+        )
+
+    def _run(self, follow: Callable[[str], None]) -> Iterator[Finding]:
+        from ..landscapes.conformance.suite import check
+
+        return check(
+            self.env,
+            points=self.points,
+            seed=self.seed,
+            precision=self.env.fidelity.precision,
+            twin=_twin(self),
+            variants=[*_time_steps(self), *_materials(self), *_horizons(self)],
+            expected=self.env.known_failures.get(self.env.fidelity.name),
+            follow=follow,
+        )
+
+    def _cost(self) -> str:
+        """Return what is checked and how long it will take."""
+        from ..landscapes.conformance.suite import episodes
+
+        env, cost = self.env, episode_cost(self.env)
+        plain, sloped = episodes(env.space.dim, self.points)
+        sloped += 2 * (sum(FACTORS) + 4)  # two points over longer horizons, time steps and materials
+        seconds = (plain * cost.forward + sloped * cost.gradient) / env.threads
+        subject = f"{env.name} · {env.fidelity.name} · {env.device} · {env.engine} · {self.points} points"
+        return f"{subject}: some {plain} episodes and {sloped} with gradients, about {duration(seconds)}"
+
+
+def _need(dim: int, points: int) -> Need:
+    """Return what the points and gradients of all checks take, a copy of each included."""
+    from ..landscapes.conformance.suite import episodes
+
+    return Need(4.0 * 8 * dim * sum(episodes(dim, points)))
+
+
+def _with_option(scene: SceneSpec, option: str, value: float) -> Callable[[], Environment]:
+    """Return what makes a scene with one of its options changed."""
+    return replace(scene, options={**scene.options, option: value}).make
+
+
+def _twin(job: CheckJob) -> Callable[[], Environment] | None:
+    """Return what makes the environment in the other precision, if it has one."""
+    own = job.env.fidelity
+    if not own.dt:  # a formula, not a simulation
+        return None
+    other = "float32" if own.precision == "float64" else "float64"
+    twin = replace(job.spec, fidelity=replace(own, name=f"{own.name} in {other}", precision=other))
+    with suppress(ValueError):  # refused: it computes in its own precision only
+        twin.make()
+        return twin.make
+    return None
+
+
+def _time_steps(job: CheckJob) -> list[ExtremeCase]:
+    from ..landscapes.conformance.extremes import ExtremeCase
+
+    if not job.env.fidelity.dt:
+        return [ExtremeCase("dt 1x to 8x", why="it has no time step")]
+    found: list[ExtremeCase] = []
+    taken: dict[float, int] = {}
+    for factor in FACTORS:
+        dt = job.env.nearest_dt(factor * job.env.fidelity.dt)
+        if dt in taken:
+            why = f"the nearest step that fits into a control step is that of dt {taken[dt]}x"
+            found.append(ExtremeCase(f"dt {factor}x", why=why))
+        else:
+            found.append(_time_step(job, factor, dt))
+            taken[dt] = factor
+    return found
+
+
+def _time_step(job: CheckJob, factor: int, dt: float) -> ExtremeCase:
+    from ..landscapes.conformance.extremes import ExtremeCase
+
+    if factor == 1:
+        return ExtremeCase("dt 1x", lambda: job.env)
+    own = job.env.fidelity
+    longer_steps = replace(job.spec, fidelity=replace(own, name=f"{own.name}, dt {factor}x", dt=dt))
+    note = ""
+    if abs(dt - factor * own.dt) > 1e-6 * dt:
+        note = f"{dt / own.dt:.3g}x, the nearest step that fits into a control step"
+    with suppress(Exception):  # the check itself will meet it, and say so
+        work, before = longer_steps.make().work().count, job.env.work().count
+        longer = dt / own.dt * work / before
+        if work != before and abs(longer - 1) > 1e-3:
+            note = f"its steps are rounded: an episode is {longer:.3g} times as long"
+    return ExtremeCase(f"dt {factor}x", longer_steps.make, why=note)
+
+
+def _horizons(job: CheckJob) -> list[ExtremeCase]:
+    from ..landscapes.conformance.extremes import ExtremeCase
+
+    if "horizon" not in {field.name for field in fields(job.env.options)}:
+        return [ExtremeCase("horizon 1x to 8x", why="it has no option `horizon`")]
+    own = job.env.options.horizon
+    longer = [
+        ExtremeCase(f"horizon {factor}x", _with_option(job.spec, "horizon", factor * own)) for factor in FACTORS[1:]
+    ]
+    return [ExtremeCase("horizon 1x", lambda: job.env), *longer]
+
+
+def _record(finding: Finding) -> dict[str, Any]:
+    record = {name: getattr(finding, name) for name in ("check", "outcome", "figure", "why")}
+    return {**record, "numbers": plain(finding.numbers or {}), "table": plain(finding.table)}

@@ -1,0 +1,141 @@
+"""An episode to simulate, to draw and to film into a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .. import __version__
+from ..landscapes.objective import Status
+from ..landscapes.storage.files import tidy, write_json
+from .folder import EPISODE, folder_named
+from .scene import point_of, provenance
+from .watch import Watch
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
+    from ..envs.base import Environment, Episode
+    from ..landscapes.draw.figures.contact import Caption
+
+SHEET, FILM, LOOP, STREAM, RECORD = EPISODE.files
+
+
+@dataclass(frozen=True)
+class EpisodeRecord:
+    """Say what was drawn and how it came about, as `episode.json` has it; `loss` is None where the episode failed."""
+
+    identity: dict[str, Any]
+    provenance: dict[str, Any]
+    parameters: dict[str, float]
+    loss: float | None
+    status: str
+
+
+@dataclass(frozen=True)
+class EpisodeSummary:
+    """Say what was drawn, what came out, and which files there are."""
+
+    title: str
+    outcome: str
+    record: EpisodeRecord
+    files: list[str]
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeJob:
+    """An episode of `env` at `x` to draw into `folder`; `source` says where its parameters are from.
+
+    `prints` are widths of pages [mm] that its key frames are also drawn for; `command` is how it is made again.
+    """
+
+    env: Environment
+    x: Float[Tensor, " dim"]
+    source: str
+    folder: Path
+    command: str
+    film: bool = True
+    prints: Sequence[float] = ()
+
+    @classmethod
+    def of(
+        cls,
+        env: Environment,
+        params: str,
+        *,
+        command: str,
+        out: Path | None = None,
+        film: bool = True,
+        prints: Sequence[float] = (),
+    ) -> EpisodeJob:
+        """Read which episode `params` names; results go to `out`, by default to a folder named after the episode.
+
+        Raises ValueError where there is no such point, and where `out` holds something else.
+        """
+        x = point_of(env, params)
+        folder = out or folder_named(["replay", env.name], [env.identity(), x.tolist()])
+        EPISODE.check(folder)
+        return cls(env, x, params, folder, command, film, prints)
+
+    def run(self, watch: Watch | None = None) -> EpisodeSummary:
+        """Simulate the episode, draw it, write and return what came out.
+
+        Raises ValueError where the environment has no episodes to draw.
+        """
+        watch = watch or Watch()
+        with watch.busy(f"{self.env.name}: simulating (kernels are compiled once, then kept)"):
+            episode = self.env.episode(self.x)
+            result = self.env.evaluate(self.x[None], grad=False)
+        loss, status = float(result.loss[0]), Status(int(result.status[0]))
+        caption = self._caption(loss, status)
+        watch.note(f"{caption.title}: {len(episode.time)} instants to draw{', and to film' if self.film else ''}")
+        with watch.busy(f"{self.env.name}: drawing"):
+            files = self._draw(episode, caption)
+        record = self._record(loss, status)
+        write_json(self.folder / RECORD, asdict(record))
+        tidy(self.folder)
+        return EpisodeSummary(caption.title, caption.outcome, record, [*files, RECORD])
+
+    def _draw(self, episode: Episode, caption: Caption) -> list[str]:
+        """Draw key frames, a recording and perhaps films; return the names of the files."""
+        from ..landscapes.draw.figures.contact import episode_figure, save_sheet
+        from ..landscapes.draw.figures.page import save_prints
+        from ..landscapes.draw.recordings.episode import save_episode
+        from ..landscapes.draw.render.replay import save_replay
+
+        folder, said = self.folder, f"{caption.title} · {caption.outcome}"
+        save_sheet(episode, folder / SHEET, caption=caption)
+        save_episode(episode, folder / STREAM, title=said)
+        if self.film:
+            save_replay(episode, folder / FILM, folder / LOOP, title=said)
+        draw = partial(episode_figure, episode, caption=caption)
+        printed = save_prints(lambda width: draw(width=width), folder / SHEET, self.prints)
+        return [SHEET, STREAM, *([FILM, LOOP] if self.film else []), *printed]
+
+    def _caption(self, loss: float, status: Status) -> Caption:
+        """Say what the episode is."""
+        from ..landscapes.draw.figures.contact import Caption
+        from ..landscapes.draw.style import FAILURES, number
+
+        env, failed = self.env, status != Status.OK
+        outcome = f"no loss: {FAILURES[status]}" if failed else f"loss {number(loss)} {env.loss_unit}".rstrip()
+        values = {
+            name: f"{number(value)} {unit}".rstrip()
+            for name, value, unit in zip(env.space.names, self.x.tolist(), env.space.units, strict=True)
+        }
+        about = provenance(env, self.command)
+        said = [f"gradscape {__version__}", env.device, str(about["created"]), str(about["command"])]
+        return Caption(f"{env.name} · {env.fidelity.name}", outcome, self.source, values, RECORD, " · ".join(said))
+
+    def _record(self, loss: float, status: Status) -> EpisodeRecord:
+        return EpisodeRecord(
+            identity=self.env.identity(),
+            provenance=provenance(self.env, self.command),
+            parameters=dict(zip(self.env.space.names, self.x.tolist(), strict=True)),
+            loss=loss if status == Status.OK else None,
+            status=status.name,
+        )

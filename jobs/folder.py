@@ -1,0 +1,97 @@
+"""A result's folder: what its files are called, what it is called itself, and whose it is."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..landscapes.storage import paths
+from ..landscapes.storage.files import other_files, visible_files
+from ..landscapes.storage.ownership import refuse_others
+from ..landscapes.storage.paths import slice_exists
+from ..optim.runs import store
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+SLICE_STORE, RUN_STORE = paths.SLICE, store.RUN
+ROOT = Path("out")  # where results go that are given no folder
+
+
+@dataclass(frozen=True)
+class Results:
+    """Say what a kind of result is called, and which files it leaves in its folder.
+
+    `store` is what others read of it, without which a folder of other files is none of it. `picture` is the one that is
+    also drawn for print, in files named after it.
+    """
+
+    kind: str
+    files: tuple[str, ...]
+    picture: str = ""
+    store: str = ""
+
+    def check(self, folder: Path, allowed: Iterable[Path] = ()) -> None:
+        """Raise ValueError where a folder holds other files than those of such a result, or than those `allowed`."""
+        if self.store and slice_exists(folder / self.store):
+            return
+        held = visible_files(folder) if self.store else other_files(folder, self.files, self.picture)
+        refuse_others(folder, set(held) - set(allowed), self.kind)
+
+
+SUMMARY = "summary.json"
+SLICE = Results("slice", (SLICE_STORE, "landscape.png", SUMMARY), "landscape.png", SLICE_STORE)
+RUN = Results("run", (RUN_STORE, "progress.png", SUMMARY), "progress.png", RUN_STORE)
+SWEEP = Results("sweep", ("frames", SLICE_STORE, "sweep.mp4", "sweep.gif", "sweep.rrd", SUMMARY))
+RACE_FIGURES = "race.json"
+RACE = Results("race", ("race.png", RACE_FIGURES), "race.png")
+OVERLAY = Results("overlay", ("overlay.png", "overlay.rrd"), "overlay.png")
+SURFACE = Results("surface", ("surface.png", "surface.gltf"), "surface.png")
+EPISODE = Results(
+    "episode", ("episode.png", "episode.mp4", "episode.gif", "episode.rrd", "episode.json"), "episode.png"
+)
+REPORT = Results(
+    "report",
+    ("report.json", "measures.json", "gradient-quality.png", "gradient-quality.npz"),
+    "gradient-quality.png",
+)
+REPORTS = Results("set of reports", ("report.json", "report.md"))
+TRADEOFF = Results("trade-off", ("tradeoff.json", "tradeoff.png"), "tradeoff.png")
+PAIRS = Results("study of pairs", ("pairs.json",))
+
+
+def digest(settings: Any) -> str:
+    """Return six digits that are the same for the same settings, which are plain JSON."""
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:6]
+
+
+def folder_named(parts: Iterable[object], settings: Any, root: Path = ROOT) -> Path:
+    """Return a folder of its own for all different settings, the same for the same ones, named after `parts`."""
+    return root / "-".join([*map(str, parts), digest(settings)])
+
+
+def store_in(path: Path, store: str) -> Path:
+    """Return the store in a results folder, finished or not, or the path itself."""
+    return path / store if slice_exists(path / store) else path
+
+
+def run_tables(paths: Sequence[str]) -> list[xr.Dataset]:
+    """Return what runs, or all runs of races, evaluated; those without an episode are left out.
+
+    Raises ValueError where a path holds no run, and where there is no episode at all.
+    """
+    from ..optim.runs.store import RunStore
+
+    tables = []
+    for path in paths:
+        found = [store_in(Path(path), RUN_STORE)]
+        if not Path(path, RUN_STORE).exists() and (members := sorted(Path(path).glob(f"*/{RUN_STORE}"))):
+            found = members
+        tables += [RunStore.open(store).dataset() for store in found]
+    if not any(table.sizes["evaluation"] for table in tables):
+        raise ValueError(f"{', '.join(paths)}: there are no episodes yet; `landscape optimize` evaluates them")
+    return [table for table in tables if table.sizes["evaluation"]]

@@ -1,0 +1,226 @@
+"""Runs to lay over a slice, or over one cut anew for them: what does not belong together, the plane, the files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import xarray as xr
+
+from ..landscapes.identity import plane_of, stored_identity
+from ..landscapes.objective import Objective, Status
+from ..landscapes.overlay import best_point, overlay, principal_plane
+from ..landscapes.plane import Plane
+from ..landscapes.slice import Slice
+from ..landscapes.storage.files import tidy, visible_files
+from ..landscapes.storage.paths import slice_exists
+from ..landscapes.storage.store import open_slice
+from .folder import OVERLAY, ROOT, SLICE_STORE, folder_named, run_tables
+from .scene import environment_of
+from .slice import SliceJob
+from .watch import Watch, resumable
+
+if TYPE_CHECKING:
+    from ..landscapes.draw.figures.page import Picture
+
+
+PICTURE, STREAM = OVERLAY.files
+PCA, BEST = "pca", "best"
+MUST, SHOULD = ("objective", "options"), ("fidelity", "settings", "engine", "code")  # agree between slice and runs
+
+
+@dataclass(frozen=True)
+class Cut:
+    """Say how a slice is cut anew: through a point of runs, along their principal directions, with other resolution.
+
+    `through` is the best point of all runs (best) or of one run's folder, `principal` takes the runs' two principal
+    directions instead of the slice's own, and `resolution` is by default the slice's.
+    """
+
+    through: str | None = None
+    principal: bool = False
+    resolution: int | None = None
+
+    @classmethod
+    def of(cls, through: str | None, plane: str | None, resolution: int | None) -> Cut | None:
+        """Return how to cut, None where nothing asks for that. Raises ValueError for what makes no plane."""
+        if plane not in (None, PCA):
+            raise ValueError(f"--plane takes pca, the runs' principal plane; got {plane!r}")
+        if not (through or plane):
+            if resolution:
+                raise ValueError("--resolution is that of a new slice; give --through or --plane too")
+            return None
+        return cls(through, plane is not None, resolution)
+
+    def plane(self, present: Plane, tables: Sequence[xr.Dataset]) -> Plane:
+        """Return the plane of the new slice: parallel to the one that is present, or the runs' principal one.
+
+        Raises ValueError where the run it goes through searched another number of parameters.
+        """
+        shape = (self.resolution,) * present.rank if self.resolution else present.resolution
+        point = None
+        if self.through:
+            point, _ = best_point(tables if self.through == BEST else run_tables([self.through]))
+            if len(point) != present.dim:
+                raise ValueError(f"{self.through} searched {len(point)} parameters; the slice has {present.dim}")
+        if self.principal:
+            return principal_plane(tables, resolution=shape, through=point)
+        assert point is not None  # as one of the two is asked for
+        return replace(present.shift_to(point), resolution=shape)
+
+
+@dataclass(frozen=True)
+class OverlaySummary:
+    """Say what an overlay shows; `farthest` is how far a point lies off the plane at most [half-widths of the box]."""
+
+    runs: int
+    points: int
+    outside: int
+    failed: int
+    farthest: float
+    files: list[str]
+
+    def outcome(self) -> str:
+        """Say it in a line."""
+        counted = f"{self.runs} run{'s' if self.runs > 1 else ''}, {self.points} points"
+        where = f"{self.outside} beyond the map, {self.failed} failed"
+        return f"{counted}: {where}; the farthest is {self.farthest:.2g} half-widths of the box off the plane"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Overlay:
+    """Hold runs laid over a slice: `runs` are their data with where each point lies, as `landscapes.overlay` adds it.
+
+    `slice` is the one they lie over, which is a new one where one was cut for them; `files` lie in `folder`.
+    """
+
+    slice: Slice
+    runs: Sequence[xr.Dataset]
+    folder: Path
+    files: list[str]
+
+    @cached_property
+    def summary(self) -> OverlaySummary:
+        """What the overlay shows, counted."""
+        return OverlaySummary(
+            runs=len(self.runs),
+            points=sum(run.sizes["evaluation"] for run in self.runs),
+            outside=sum(int(run["outside"].sum()) for run in self.runs),
+            failed=sum(int((run["status"] != Status.OK).sum()) for run in self.runs),
+            farthest=max(float(run["distance"].max().round(9)) for run in self.runs),
+            files=self.files,
+        )
+
+    def plot(self, *, width: float | None = None) -> Picture:
+        """Draw the runs over the slice; the picture is matplotlib's figure, `width` is that of a page [mm]."""
+        from ..landscapes.draw.figures.overlay import overlay_figure
+
+        return overlay_figure(self.slice.data, self.runs, width=width)
+
+    def __repr__(self) -> str:
+        """Return in a line what it shows."""
+        return f"<Overlay of {self.summary.outcome()}, in {self.folder}>"
+
+
+@dataclass(frozen=True)
+class OverlayJob:
+    """Runs to lay over a slice in `folder`; with a `cut` over one that is sampled there first, on `device`.
+
+    `prints` are widths of pages [mm] that the picture is also drawn for; `command` is how it is made again.
+    """
+
+    slice: Slice
+    runs: Sequence[xr.Dataset]
+    folder: Path
+    command: str
+    cut: Cut | None = None
+    device: str = "auto"
+    prints: Sequence[float] = ()
+
+    @classmethod
+    def of(
+        cls,
+        slice: Slice,
+        runs: Sequence[xr.Dataset],
+        *,
+        command: str,
+        cut: Cut | None = None,
+        device: str = "auto",
+        out: Path | None = None,
+        prints: Sequence[float] = (),
+        watch: Watch | None = None,
+    ) -> OverlayJob:
+        """Refuse runs that cannot be laid over the slice, before anything is computed, and warn of other simulations.
+
+        Raises ValueError for those, for slices that are lines, and where the folder holds something else.
+        """
+        for run in runs:
+            check_run(slice.data, run, watch or Watch())
+        overlay(slice.data, runs)
+        folder = out or overlay_folder(slice.data, runs, cut)
+        OVERLAY.check(folder, allowed=[file for file in visible_files(folder) if slice_exists(file / SLICE_STORE)])
+        return cls(slice, runs, folder, command, cut, device, prints)
+
+    def run(self, watch: Watch | None = None) -> Overlay:
+        """Sample the new slice, if there is to be one, lay the runs over it and write the files.
+
+        Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
+        """
+        beneath = self._sample(watch or Watch()) if self.cut else self.slice
+        with resumable(lambda: f"each file in {self.folder} is whole"):
+            return self._write(Overlay(beneath, overlay(beneath.data, self.runs), self.folder, []))
+
+    def _sample(self, watch: Watch) -> Slice:
+        """Sample the slice that is cut anew."""
+        assert self.cut is not None  # as `run` has seen
+        plane = self.cut.plane(plane_of(self.slice.data), self.runs)
+        env = self._objective()
+        how: dict[str, Any] = {"grad": "grad" in self.slice.data, "boxed": self.cut.principal}
+        job = SliceJob.of(env, plane, command=self.command, root=self.folder, **how)
+        summary = job.run(watch)
+        watch.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
+        return Slice(open_slice(job.folder / SLICE_STORE), job.folder, lambda: env)
+
+    def _objective(self) -> Objective:
+        """Return what the slice was sampled from."""
+        if self.device == "auto" and self.slice.remake:
+            return self.slice.remake()
+        return environment_of(self.slice.data, self.device)
+
+    def _write(self, drawn: Overlay) -> Overlay:
+        from ..landscapes.draw.figures.page import save, save_prints
+        from ..landscapes.draw.recordings.runs import save_stream
+
+        path = self.folder / PICTURE
+        save(drawn.plot(), path)
+        save_stream(drawn.slice.data, drawn.runs, self.folder / STREAM)
+        printed = save_prints(lambda width: drawn.plot(width=width), path, self.prints)
+        tidy(self.folder)
+        return replace(drawn, files=[PICTURE, STREAM, *printed])
+
+
+def check_run(dataset: xr.Dataset, run: xr.Dataset, watch: Watch) -> None:
+    """Raise ValueError for a run of another landscape than a slice's; warn where it is simulated otherwise."""
+    ours, theirs = stored_identity(dataset), stored_identity(run)
+    name = f"{theirs.get('objective')}, {theirs.get('method')}, seed {theirs.get('seed')}"
+    for setting in MUST:
+        if ours.get(setting) != theirs.get(setting):
+            raise ValueError(
+                f"the slice and the run ({name}) are of different landscapes: {setting} is {ours.get(setting)!r} there "
+                f"and {theirs.get(setting)!r} here; lay runs over a slice of their own"
+            )
+    if differ := [one for one in SHOULD if ours.get(one) != theirs.get(one)]:
+        settings = (f"{one} {ours.get(one)!r} there, {theirs.get(one)!r} here" for one in differ if one != "settings")
+        watch.note(
+            f"warning: slice and run ({name}) are simulated differently ({'; '.join(settings)}), so losses differ"
+        )
+
+
+def overlay_folder(dataset: xr.Dataset, runs: Sequence[xr.Dataset], cut: Cut | None, root: Path = ROOT) -> Path:
+    """Return a folder of its own for every different overlay, the same for the same one."""
+    ours = stored_identity(dataset)
+    how = [cut.through, PCA if cut.principal else None, cut.resolution] if cut else [None, None, None]
+    return folder_named(["overlay", ours["objective"]], [ours, [stored_identity(run) for run in runs], how], root)

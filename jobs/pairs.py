@@ -1,0 +1,167 @@
+"""The pairs of a scene's parameters, ranked by what a slice over them would show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..landscapes.capacity import Need, require
+from ..landscapes.cost import duration, seconds_per_episode
+from ..landscapes.measures.sensitivity import Design, Pair, default_samples, explore, rank
+from ..landscapes.storage.checkpoint import Checkpoint
+from ..landscapes.storage.files import tidy, write_json
+from .folder import PAIRS, ROOT, folder_named
+from .scene import SceneSpec, provenance
+from .watch import PREPARING, Watch, resumable
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from ..envs.base import Environment
+
+(RECORD,) = PAIRS.files
+NUMBERS = 60  # that are held for each parameter of a base point, copies included
+
+
+@dataclass(frozen=True)
+class PairRanking:
+    """Hold the pairs of a scene's parameters, those with the largest score first.
+
+    `identity` decides the numbers, `options` are those that were given; `spread` is the standard deviation of the
+    losses, `total` each parameter's total sensitivity index, and `failed` how many of the `episodes` failed.
+    """
+
+    identity: dict[str, Any]
+    options: dict[str, Any]
+    env: str
+    episodes: int
+    failed: int
+    spread: float
+    parameters: tuple[str, ...]
+    total: tuple[float, ...]
+    pairs: tuple[Pair, ...]
+    provenance: dict[str, Any]
+
+    @property
+    def fidelity(self) -> str:
+        """The fidelity it was measured at."""
+        return str(self.identity["fidelity"])
+
+    def record(self) -> dict[str, Any]:
+        """Return it as plain JSON, by the keys of the file: the identity's own first, `options` as `set`."""
+        return {
+            **self.identity,
+            "set": self.options,
+            "env": self.env,
+            "episodes": self.episodes,
+            "failed": self.failed,
+            "spread": self.spread,
+            "parameters": list(self.parameters),
+            "total": list(self.total),
+            "pairs": [asdict(pair) | {"dims": list(pair.dims)} for pair in self.pairs],
+            "provenance": self.provenance,
+        }
+
+    def name(self, pair: Pair) -> str:
+        """Return the names of a pair's parameters."""
+        return " \N{MULTIPLICATION SIGN} ".join(self.parameters[axis] for axis in pair.dims)
+
+    def table(self) -> pd.DataFrame:
+        """Return a row for each pair, the largest score first, with the pair's name and its measures."""
+        import pandas as pd
+
+        return pd.DataFrame([{"pair": self.name(pair), **asdict(pair)} for pair in self.pairs])
+
+    def _repr_html_(self) -> str:
+        """Show the table in a notebook."""
+        return str(self.table().to_html())
+
+
+@dataclass(frozen=True)
+class PairsJob:
+    """A design of points to evaluate for an environment; a piece on disk for each batch."""
+
+    env: Environment
+    design: Design
+    identity: dict[str, Any]
+    pieces: Checkpoint
+    options: Mapping[str, Any] = field(default_factory=dict)
+    command: str = ""
+
+    @classmethod
+    def open(
+        cls,
+        scene: SceneSpec,
+        *,
+        samples: int | None = None,
+        seed: int = 0,
+        out: Path | None = None,
+        root: Path = ROOT,
+        force: bool = False,
+        command: str = "",
+    ) -> PairsJob:
+        """Go on with the study in its folder, by default one named after it under `root`, or begin it there.
+
+        `samples` base points are taken, by default as many as their episodes are worth. Raises ValueError where the
+        scene has one parameter, TooLargeError for more samples than there is memory for, StoreMismatchError where the
+        folder holds another study.
+        """
+        env = scene.make()
+        dim = env.space.dim
+        if dim < 2:
+            raise ValueError(f"{env.name} has one parameter; a pair takes two")
+        samples = samples or default_samples(dim)
+        require("samples", samples, lambda count: Need(8.0 * NUMBERS * dim * count))
+        identity = {**env.identity(), "samples": samples, "seed": seed}
+        folder = out or folder_named(["pairs", identity["objective"], identity["fidelity"], samples], identity, root)
+        pieces = Checkpoint.open(folder, identity, what="pairs", force=force)
+        return cls(env, Design.sobol(env.space, samples, seed=seed), identity, pieces, scene.options, command)
+
+    @property
+    def folder(self) -> Path:
+        """Where it is kept."""
+        return self.pieces.folder
+
+    def run(self, watch: Watch | None = None) -> PairRanking:
+        """Evaluate what is missing, write and return the ranking.
+
+        Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
+        """
+        watch = watch or Watch()
+        with resumable(self.say_kept):
+            self._announce(watch)
+            with watch.progress(self.design.episodes) as advance:
+                found = explore(self.env, self.design, self.pieces, follow=advance)
+            ranking = PairRanking(
+                identity=self.identity,
+                options=dict(self.options),
+                env=self.env.name,
+                episodes=self.design.episodes,
+                failed=found.failed,
+                spread=found.spread,
+                parameters=tuple(self.env.space.names),
+                total=tuple(found.total().tolist()),
+                pairs=tuple(rank(found)),
+                provenance=provenance(self.env, self.command),
+            )
+            write_json(self.folder / RECORD, ranking.record())
+        tidy(self.folder)
+        return ranking
+
+    def say_kept(self) -> str:
+        """Say how much of it is on disk."""
+        return f"{self.pieces.count()} batches are kept in {self.folder}"
+
+    def _announce(self, watch: Watch) -> None:
+        env, design = self.env, self.design
+        with watch.busy(f"{env.name}: {PREPARING}"):
+            env.prepare()
+            each = seconds_per_episode(env, design.move_one(range(1))[: env.preferred_batch], grad=False)
+        samples, dim = len(design.base), env.space.dim
+        watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {self.folder}")
+        watch.note(
+            f"{design.episodes} episodes, {samples} with gradients, for {dim} parameters and {dim * (dim - 1) // 2} "
+            f"pairs: at most about {duration(design.episodes * each)}; --samples lowers it"
+        )

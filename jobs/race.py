@@ -1,0 +1,389 @@
+"""A race of methods to run in a folder: what it will cost, its picture, its figures; in threads or by workers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cloudpickle
+
+from ..landscapes.cost import EpisodeCost, duration, episode_cost
+from ..landscapes.plain import plain
+from ..landscapes.sampling.distribution import make_objective as objective_of
+from ..landscapes.sampling.distribution import run_tasks, workers_of
+from ..landscapes.space import as_whole
+from ..landscapes.storage.files import clear, tidy, visible_files, write_json
+from ..landscapes.storage.ownership import refuse_others
+from ..optim.claims import ClaimFinding, Claims, check_claims
+from ..optim.memory import SearchSize, require_method, require_runs
+from ..optim.race import Competitor, Race, name_seeds, race
+from ..optim.registry import find_method, methods, optimizer_class
+from ..optim.runs.store import RunStore
+from ..optim.search import SearchProgress, search
+from .folder import RACE, RACE_FIGURES, ROOT, RUN_STORE, folder_named
+from .scene import provenance
+from .search import make_optimizer, one_torch_thread, open_run_store
+from .watch import PREPARING, Watch, resumable
+from .workers import recipe
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from ..envs.base import Environment
+    from ..optim.base import Optimizer
+
+PICTURE = RACE.picture
+Options = Mapping[str, Mapping[str, Any]]  # method -> name -> value, which may be text
+
+
+@dataclass(frozen=True)
+class RaceSummary:
+    """Say what a race found, as `race.json` in its folder has it; `race` holds the runs, whose figures are in it, too.
+
+    `silence` says why there is no claim.
+    """
+
+    env: str
+    fidelity: str
+    device: str
+    engine: str
+    options: dict[str, Any]
+    loss_unit: str
+    methods: list[str]
+    method_options: dict[str, dict[str, Any]]
+    budget: int
+    seeds: int
+    race: Race
+    claims: list[ClaimFinding]
+    silence: str | None
+    command: str
+    files: list[str]
+
+    def record(self) -> dict[str, Any]:
+        """Return the summary as its file has it."""
+        figures = self.race.statistics.record()
+        about = ("env", "fidelity", "device", "engine", "options", "loss_unit")
+        whole = {
+            **{name: getattr(self, name) for name in (*about, "methods", "method_options", "budget", "seeds")},
+            **{name: figures[name] for name in ("ranks", "differences")},
+            "claims": [_claim_record(finding) for finding in self.claims],
+            "silence": self.silence,
+            **{name: figures[name] for name in ("targets", "ecdf", "curves")},
+            "command": self.command,
+            "files": self.files,
+        }
+        return {name: plain(value) for name, value in whole.items()}
+
+
+@dataclass(frozen=True)
+class RaceJob:
+    """A race to run in `folder`, and to hold claims against; `workers` runs are filled at a time, each in a thread.
+
+    With an `executor` its workers search instead, a run each.
+    """
+
+    env: Environment
+    competitors: Sequence[Competitor]
+    folder: Path
+    budget: int
+    command: str
+    claims: Claims = Claims()  # noqa: RUF009 -- it is frozen
+    workers: int = 1
+    executor: Executor | None = None
+    prints: Sequence[float] = ()
+
+    @classmethod
+    def of(
+        cls,
+        env: Environment,
+        methods: Sequence[str],
+        *,
+        budget: int,
+        seeds: int,
+        command: str,
+        options: Options | None = None,
+        claims: Claims | None = None,
+        workers: int = 1,
+        out: Path | None = None,
+        force: bool = False,
+        prints: Sequence[float] = (),
+        watch: Watch | None = None,
+    ) -> RaceJob:
+        """Go on with the race in `out`, by default a folder named after it, or begin it there; `force` begins anew.
+
+        `methods` are by default all that can search the environment here. Seeds go by turns, so that methods stay
+        level. Raises ValueError where the folder holds something else, where
+        the environment cannot be simulated in several threads at once and for methods and options that are not there,
+        StoreMismatchError where it holds a run of other settings, and TooLargeError where the race would not fit this
+        machine.
+        """
+        watch, options = watch or Watch(), options or {}
+        budget, seeds = as_whole(budget, "a budget", least=1), as_whole(seeds, "a number of seeds", least=1)
+        check_threads(env, as_whole(workers, "a number of workers", least=1))
+        methods = check_methods(methods) or able_methods(env, watch)
+        folder = out or race_folder(env, options)
+        if not any(folder.glob(f"*-*/{RUN_STORE}")):
+            refuse_others(
+                folder, (one for one in visible_files(folder) if not one.is_dir() or visible_files(one)), RACE.kind
+            )
+        _require_room(env, methods, options, seeds=seeds, budget=budget, folder=folder)
+        how: dict[str, Any] = {"budget": budget, "command": command, "force": force}
+        with watch.busy(f"opening {len(methods) * seeds} runs"):
+            competitors = [
+                _open_competitor(env, method, seed, options.get(method, {}), folder, **how)
+                for seed in range(seeds)
+                for method in methods
+            ]
+        if force:
+            clear(folder, (PICTURE, RACE_FIGURES), PICTURE)
+        return cls(env, competitors, folder, budget, command, claims or Claims(), workers, None, prints)
+
+    @property
+    def methods(self) -> list[str]:
+        """The methods that compete."""
+        return list(dict.fromkeys(one.method for one in self.competitors))
+
+    @property
+    def seeds(self) -> int:
+        """How many seeds each of them has."""
+        return len(self.competitors) // len(self.methods)
+
+    def run(self, watch: Watch | None = None) -> RaceSummary:
+        """Compute what is missing, draw the race, write and return its figures.
+
+        Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
+        """
+        watch = watch or Watch()
+        with resumable(self.say_kept), one_torch_thread():
+            self._search(watch)
+            with watch.busy("resampling seeds"):
+                return self._save()
+
+    def result(self) -> Race:
+        """Return the race as one works with it."""
+        runs = {method: [one.run.read() for one in self.competitors if one.method == method] for method in self.methods}
+        return Race(runs, self.budget, self.folder, provenance(self.env, self.command))
+
+    def say_kept(self) -> str:
+        """Say how much of it is on disk."""
+        stores = (RunStore.open(one.run.path) for one in self.competitors if one.run.path)
+        done = sum(min(store.count, self.budget) for store in stores)
+        return f"{done} of {self.budget * len(self.competitors)} episodes are kept in {self.folder}"
+
+    def _search(self, watch: Watch) -> None:
+        ratio, lines = self._announce(watch), Lines(self)
+        with watch.progress_of(dict.fromkeys(self.methods, self.budget * self.seeds)) as advance:
+            for method in self.methods:
+                advance(method, lines.done(method), lines.text(method))
+
+            def follow(one: Competitor, now: SearchProgress) -> None:
+                lines.take(one, now)
+                advance(one.method, lines.done(one.method), lines.text(one.method))
+
+            if self.executor:
+                self._distribute(self.executor, ratio, follow)
+                return
+            how: dict[str, Any] = {"workers": self.workers, "gradient_cost": ratio, "progress": follow}
+            race(self.env, self.competitors, budget=self.budget, **how)
+
+    def _distribute(
+        self, executor: Executor, ratio: float | None, follow: Callable[[Competitor, SearchProgress], None]
+    ) -> None:
+        """Let workers search, and read what they wrote."""
+        left = [one for one in self.competitors if self._count_left(one)]
+        for one, now in search_by_workers(executor, self.env, left, budget=self.budget, gradient_cost=ratio):
+            with one.run.lock():  # reads it
+                follow(one, now)
+
+    def _save(self) -> RaceSummary:
+        from ..landscapes.draw.figures.page import save, save_prints
+
+        result, path = self.result(), self.folder / PICTURE
+        save(result.plot(), path)
+        printed = save_prints(lambda width: result.plot(width=width), path, self.prints)
+        summary = self._summary(result, [RACE_FIGURES, PICTURE, *printed])
+        write_json(self.folder / RACE_FIGURES, summary.record())
+        tidy(self.folder)
+        return summary
+
+    def _summary(self, result: Race, files: list[str]) -> RaceSummary:
+        return RaceSummary(
+            env=self.env.name,
+            fidelity=self.env.fidelity.name,
+            device=self.env.device,
+            engine=self.env.engine,
+            options=asdict(self.env.options),
+            loss_unit=self.env.loss_unit,
+            methods=self.methods,
+            method_options={one.method: one.run.identity["method_options"] for one in self.competitors},
+            budget=self.budget,
+            seeds=self.seeds,
+            race=result,
+            claims=check_claims(self.claims.claims, result.statistics.differences),
+            silence=self.claims.silence,
+            command=self.command,
+            files=files,
+        )
+
+    def _announce(self, watch: Watch) -> float | None:
+        """Say what is left to compute, and return what an episode with gradient costs if any method asks for it."""
+        env = self.env
+        watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {self.folder}")
+        needs = {method: optimizer_class(method).needs_grad for method in self.methods}
+        left = {
+            way: sum(self._count_left(one) for one in self.competitors if needs[one.method] == way) for way in (0, 1)
+        }
+        whole = self.budget * len(self.competitors)
+        racers = f"{', '.join(self.methods)}, {name_seeds(self.seeds)} each"
+        if not any(left.values()):
+            watch.note(f"{racers}: all {whole} episodes are there already")
+            return None
+        with watch.busy(f"{env.name}: {PREPARING}"):
+            cost = self._cost(grad=any(needs.values()))
+        known = [one.run.gradient_cost for one in self.competitors if one.run.gradient_cost]
+        seconds = cost.forward * left[0] + (cost.gradient * left[1] if left[1] else 0.0)
+        kept = f", {whole - sum(left.values())} are there already" if sum(left.values()) < whole else ""
+        many = workers_of(self.executor) if self.executor else self.workers
+        at_once = f", {many} runs at a time" if many > 1 else ""
+        watch.note(
+            f"{racers}: {sum(left.values())} episodes to compute{kept}: {duration(seconds)} one by one, "
+            f"and what the methods take themselves{at_once}"
+        )
+        return (known[0] if known else cost.ratio) if any(needs.values()) else None
+
+    def _cost(self, *, grad: bool) -> EpisodeCost:
+        if self.executor is None:
+            return episode_cost(self.env, grad=grad)
+        (cost,) = run_tasks(self.executor, _cost_there, [(cloudpickle.dumps(recipe(self.env)), grad)])
+        return cost
+
+    def _count_left(self, one: Competitor) -> int:
+        return max(0, self.budget - one.run.count)
+
+
+class Lines:
+    """Say of each method how many episodes are done and the best loss so far, over its seeds."""
+
+    def __init__(self, job: RaceJob) -> None:
+        self._runs: dict[tuple[str, int], tuple[int, int, float]] = {}
+        for one in job.competitors:
+            loss = one.run.dataset()["loss"].to_numpy()[: job.budget].tolist()
+            self._runs[one.method, one.seed] = (len(loss), sum(map(math.isnan, loss)), _least(loss))
+
+    def take(self, one: Competitor, now: SearchProgress) -> None:
+        """Take in how far a run is."""
+        self._runs[one.method, one.seed] = (min(now.done, now.total), now.failed, now.best)
+
+    def done(self, method: str) -> int:
+        """Return the episodes a method has done."""
+        return sum(done for (name, _), (done, _, _) in self._runs.items() if name == method)
+
+    def text(self, method: str) -> str:
+        """Return a method's line."""
+        mine = [run for (name, _), run in self._runs.items() if name == method]
+        least = _least([best for _, _, best in mine])
+        failed = sum(count for _, count, _ in mine)
+        best = "no loss yet" if math.isnan(least) else f"best loss {least:.4g}"
+        return f"{method}: {best}{f', {failed} failed' if failed else ''}"
+
+
+def able_methods(env: Environment, watch: Watch) -> list[str]:
+    """Return the methods that can search an environment here, and say of the others why they cannot."""
+    able = []
+    for method in methods():
+        try:
+            make_optimizer(method, env)
+        except ValueError as error:
+            watch.note(f"without {method}: {error}")
+        else:
+            able.append(method)
+    return able
+
+
+def check_methods(names: Sequence[str]) -> list[str]:
+    """Return methods without repetitions. Raises ValueError where one is not registered."""
+    return [find_method(name).name for name in dict.fromkeys(names)]
+
+
+def check_threads(env: Environment, workers: int) -> None:
+    """Raise ValueError where an environment's engine runs in one thread, and several are to simulate it."""
+    if workers > 1 and not env.capabilities.concurrent:
+        raise ValueError(f"engine {env.engine} runs in one thread only, so --workers is 1; got {workers}")
+
+
+def race_folder(env: Environment, options: Options, root: Path = ROOT) -> Path:
+    """Return a folder of its own for every different race; more methods, seeds or episodes go on in the same one."""
+    texts = {method: {name: str(value) for name, value in chosen.items()} for method, chosen in options.items()}
+    return folder_named(["race", env.name, env.fidelity.name], [env.identity(), texts], root)
+
+
+def search_by_workers(
+    executor: Executor, env: Environment, competitors: Sequence[Competitor], *, budget: int, gradient_cost: float | None
+) -> Iterator[tuple[Competitor, SearchProgress]]:
+    """Let workers fill runs, and yield each with how far it came as it ends."""
+    there = cloudpickle.dumps(recipe(env))
+    tasks = [(number, there, *_recipe_of(one), budget, gradient_cost) for number, one in enumerate(competitors)]
+    for number, now in run_tasks(executor, _search_there, tasks):
+        yield competitors[number], now
+
+
+def _recipe_of(one: Competitor) -> tuple[str, str, dict[str, Any]]:
+    """Return the path of a run, its method, and how the optimiser is made."""
+    how = one.make.keywords  # type: ignore[attr-defined] # of the partial that `_open_competitor` makes
+    return str(one.run.path), one.method, {"seed": one.seed, "options": dict(how["options"])}
+
+
+def _search_there(
+    number: int, there: bytes, path: str, method: str, how: dict[str, Any], budget: int, gradient_cost: float | None
+) -> tuple[int, SearchProgress]:
+    env: Any = objective_of(there).objective
+    seen: list[SearchProgress] = []
+    with one_torch_thread():
+        optimizer = make_optimizer(method, env, **how)
+        search(env, optimizer, RunStore.open(path), budget=budget, gradient_cost=gradient_cost, progress=seen.append)
+    return number, seen[-1]
+
+
+def _cost_there(there: bytes, grad: bool) -> EpisodeCost:
+    return episode_cost(objective_of(there).objective, grad=grad)
+
+
+def _require_room(
+    env: Environment, methods: Sequence[str], options: Options, *, seeds: int, budget: int, folder: Path
+) -> None:
+    """Refuse a race that is larger than this machine."""
+    require_runs(env.space.dim, budget, seeds, folder, abreast=len(methods))
+    for method in methods:
+        optimizer = make_optimizer(method, env, options=options.get(method))
+        require_method(type(optimizer), optimizer.options, SearchSize(env.space.dim, env.decisions, budget))
+
+
+def _open_competitor(
+    env: Environment,
+    method: str,
+    seed: int,
+    options: Mapping[str, Any],
+    folder: Path,
+    *,
+    budget: int,
+    command: str,
+    force: bool,
+) -> Competitor:
+    make: Callable[[], Optimizer] = partial(make_optimizer, method, env, seed=seed, options=options)
+    path = folder / f"{method}-{seed}" / RUN_STORE
+    store = open_run_store(env, make(), path, budget=budget, command=command, force=force)
+    return Competitor(method, seed, store, make)
+
+
+def _claim_record(finding: ClaimFinding) -> dict[str, Any]:
+    difference = None if finding.difference is None else asdict(finding.difference)
+    said = {"claim": str(finding.claim), "verdict": finding.verdict, "difference": difference}
+    return asdict(finding.claim) | said
+
+
+def _least(losses: Sequence[float]) -> float:
+    return min((loss for loss in losses if not math.isnan(loss)), default=math.nan)

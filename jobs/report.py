@@ -1,0 +1,394 @@
+"""What slices are like, in numbers and in words: a folder with a report of each, measured once and read again."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import torch
+from torch import Tensor
+
+from ..landscapes.capacity import Need, require, size
+from ..landscapes.cost import duration, seconds_per_episode
+from ..landscapes.identity import stored_identity
+from ..landscapes.objective import Evaluation
+from ..landscapes.storage.disk import is_full
+from ..landscapes.storage.files import make_folder, other_files, replacing, tidy, write_json
+from ..landscapes.storage.records import read_json, write_record
+from .folder import REPORT, REPORTS, ROOT, SLICE_STORE, folder_named, store_in
+from .report_record import ARRAYS, MEASURES, PICTURE, RECORD, PaperRecord, Quoted, Report, ReportKey, Reports
+from .report_tables import slices_markdown
+from .scene import environment_of
+from .watch import PREPARING, Watch, resumable
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from ..envs.base import Environment
+    from ..landscapes.measures.profile import Profile
+    from ..landscapes.measures.records import ProfileRecord
+    from ..landscapes.objective import Objective
+    from ..landscapes.space import ParameterSpace
+
+TABLE = REPORTS.files[1]
+POINTS = 6  # along each axis where gradients are tested by new evaluations
+RESOLUTION = 24  # points per axis of a slice that is sampled for its report
+
+
+@dataclass(frozen=True)
+class ReportedSlice:
+    """A slice to report on: what it is called, and where its store is."""
+
+    name: str
+    store: Path
+
+    @classmethod
+    def of(cls, path: Path) -> ReportedSlice:
+        """Return the slice in a folder, or at the path itself."""
+        name = path.resolve().parent.name if path.name == SLICE_STORE else path.name or path.resolve().name
+        return cls(name, store_in(path, SLICE_STORE))
+
+
+def sample_subject(env: Environment, points: int, command: str, watch: Watch) -> ReportedSlice:
+    """Sample the slice that a scene without any is reported on by: its first two parameters, through the centre.
+
+    Raises TooLargeError for more points than a report has memory for, and as `SliceJob.run` does.
+    """
+    from .scene import plane_through
+    from .slice import SliceJob
+
+    dims = list(range(min(2, env.space.dim)))
+    refuse_too_many(points, len(dims), env.space.dim)
+    plane = plane_through(env, dims, through="center", extent=None, resolution=RESOLUTION)
+    job = SliceJob.of(env, plane, command=command)
+    summary = job.run(watch)
+    watch.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
+    return ReportedSlice.of(job.folder)
+
+
+@dataclass(frozen=True)
+class ReportJob:
+    """Slices to measure: a `single` one into `folder`, several into folders of their own there.
+
+    `points` along each axis are where gradients are tested by new evaluations; `paper` holds the paper's words by
+    environment, and `prints` the widths of pages [mm] that a report is also drawn for.
+    """
+
+    subjects: Sequence[ReportedSlice]
+    folder: Path
+    single: bool
+    points: int = POINTS
+    seed: int = 0
+    device: str = "auto"
+    paper: Mapping[str, Quoted] = field(default_factory=dict)
+    prints: Sequence[float] = ()
+    command: str = ""
+
+    @classmethod
+    def open(
+        cls,
+        subjects: Sequence[ReportedSlice],
+        *,
+        what: str,
+        single: bool,
+        out: Path | None = None,
+        root: Path = ROOT,
+        points: int = POINTS,
+        seed: int = 0,
+        **how: Any,
+    ) -> ReportJob:
+        """Go on with the reports in a folder, by default one under `root` named after `what`, or begin them there.
+
+        Raises ValueError where the folder holds something else.
+        """
+        settings = {"points": points, "seed": seed}
+        name = subjects[0].name if len(subjects) == 1 else what
+        folder = out or folder_named(["report", name], [[str(one.store) for one in subjects], settings], root)
+        _check(folder, single)
+        return cls(subjects, folder, single, points, seed, **how)
+
+    def run(self, watch: Watch | None = None) -> Reports:
+        """Measure what is missing, write and return the reports: those on disk as they are, the others measured now.
+
+        One that fails among several is left out, and named with what was wrong. Raises Stopped where it is interrupted,
+        and DiskFullError; the same job goes on with the next slice then. Raises ValueError where a single slice cannot
+        be reported on, or where another report is there.
+        """
+        watch, done, failed = watch or Watch(), list[Report](), dict[str, str]()
+
+        def say_kept() -> str:
+            return f"{len(done)} of {len(self.subjects)} reports are kept in {self._place(self.subjects[0]).parent}"
+
+        with resumable(say_kept):
+            for number, subject in enumerate(self.subjects):
+                if len(self.subjects) > 1:
+                    watch.note(f"slice {number + 1} of {len(self.subjects)}: {subject.name}")
+                try:
+                    done.append(self.report(subject, watch))
+                except Exception as error:  # whatever one slice meets, the others are not lost by it
+                    if is_full(error) or len(self.subjects) == 1:
+                        raise
+                    failed[subject.name] = f"{type(error).__name__}: {' '.join(str(error).split())}"
+                    watch.note(f"{subject.name} failed: {failed[subject.name]}")
+            found = Reports(tuple(done), failed)
+            if not self.single:
+                write_json(self.folder / RECORD, found.record())
+                with replacing(self.folder / TABLE) as partial:
+                    partial.write_text(slices_markdown(found.reports))
+        return found
+
+    def report(self, subject: ReportedSlice, watch: Watch) -> Report:
+        """Return the report of a slice that is there, or else measure it now and leave it there."""
+        folder = self._place(subject)
+        report = replace(self._find(subject, folder, watch), folder=folder, store=subject.store)
+        self._print(report, watch)
+        tidy(folder)
+        return report
+
+    def _place(self, subject: ReportedSlice) -> Path:
+        return self.folder if self.single else self.folder / subject.name
+
+    def _find(self, subject: ReportedSlice, folder: Path, watch: Watch) -> Report:
+        """Return a report that is there, or beside its slice, or else measure it.
+
+        One that is to be drawn for print is not taken from beside the slice without what it is drawn from.
+        """
+        dataset = _open(subject)
+        env = environment_of(dataset, self.device)
+        key: ReportKey = {"points": self.points, "seed": self.seed, "slice": digest_of(dataset), "code": env.code}
+        beside = subject.store.parent
+        if not self.prints or (beside / ARRAYS).exists():
+            _fetch(beside, folder, key, watch)
+        if (folder / RECORD).exists():
+            return _keep(folder, key, env.device, watch)
+        refuse_too_many(self.points, dataset["loss"].ndim, env.space.dim)
+        _warn(subject, dataset, env, watch)
+        return self._measure(subject, dataset, env, key, folder, watch)
+
+    def _measure(
+        self, subject: ReportedSlice, dataset: xr.Dataset, env: Environment, key: ReportKey, folder: Path, watch: Watch
+    ) -> Report:
+        from ..landscapes.measures.profile import own_cost
+
+        require("number of samples", dataset["loss"].size, lambda count: Need(own_cost(count)[1]))
+        start = time.monotonic()
+        profile = measure(env, dataset, self.points, self.seed, watch)
+        report = Report(
+            name=subject.name,
+            env=env.name,
+            options=stored_identity(dataset)["options"],
+            fidelity=env.fidelity.name,
+            device=env.device,
+            profile=cast("ProfileRecord", json.loads(json.dumps(profile.record()))),
+            paper=_beside(profile, self.paper.get(env.name)),
+            seconds=round(time.monotonic() - start, 3),
+            command=self.command,
+            key=key,
+        )
+        _leave(dataset, profile, report, folder, watch)
+        return report
+
+    def _print(self, report: Report, watch: Watch) -> None:
+        """Draw a report that is there for pages."""
+        if not self.prints or report.folder is None:
+            return
+        from ..landscapes.draw.figures.page import save_prints
+
+        draw = report.picture()
+        printed = save_prints(lambda width: draw(width=width), report.folder / PICTURE, self.prints)
+        watch.note(f"{report.folder}: {', '.join(printed)}")
+
+
+def measure(env: Environment, dataset: xr.Dataset, points: int, seed: int, watch: Watch) -> Profile:
+    """Announce what measuring a slice of an environment costs, and measure it."""
+    from ..landscapes.adapters import within_box
+    from ..landscapes.measures.profile import PRECISION, effort, measure_profile
+
+    total = sum(effort(dataset["loss"].ndim, points))
+    _announce(env, dataset, points, watch)
+    objective = within_box(env) if stored_identity(dataset).get("boxed") else env
+    with watch.progress(total) as advance:
+        counted = _Counted(objective, env.preferred_batch, advance)
+        rounding = PRECISION[env.fidelity.precision]
+        found = measure_profile(counted, dataset, rounding=rounding, points=points, seed=seed, events=env.events)
+        advance(total)
+    return found
+
+
+class _Counted:
+    """Evaluate an objective a batch at a time, and say how many rows are done."""
+
+    def __init__(self, objective: Objective, batch: int, advance: Callable[[int], None]) -> None:
+        self.objective, self.batch, self.advance, self.done = objective, batch, advance, 0
+        self.space: ParameterSpace = objective.space
+        self.beyond_box = getattr(objective, "beyond_box", False)
+        self.name = getattr(objective, "name", type(objective).__name__)
+
+    def evaluate(self, x: Tensor, *, grad: bool = True) -> Evaluation:
+        """Return losses, and gradients if asked, at points `x` in the parameters' own units."""
+        parts = []
+        for rows in torch.split(x, self.batch):
+            parts.append(self.objective.evaluate(rows, grad=grad))
+            self.done += len(rows)
+            self.advance(self.done)
+        return Evaluation.join(parts, dim=self.space.dim, grad=grad)
+
+
+def refuse_too_many(points: int, rank: int, dim: int) -> None:
+    """Raise TooLargeError for more points along each axis than this machine has memory for."""
+    from ..landscapes.measures.profile import need_of
+
+    require("points", points, lambda count: need_of(rank, dim, count))
+
+
+def estimate_seconds(env: Environment, losses: int, gradients: int) -> float:
+    """Estimate what so many episodes without and with gradient take [s]."""
+    env.prepare()
+    x = env.space.uniform(min(env.preferred_batch, losses + gradients), seed=0)
+    return sum(count * seconds_per_episode(env, x, grad=grad) for grad, count in ((False, losses), (True, gradients)))
+
+
+def _announce(env: Environment, dataset: xr.Dataset, points: int, watch: Watch) -> None:
+    """Say what a report takes: its episodes, and what is measured of the slice itself."""
+    from ..landscapes.measures.profile import effort, need_of, own_cost
+    from .slice import peak_memory
+
+    rank = dataset["loss"].ndim
+    losses, gradients = effort(rank, points)
+    own_seconds, own_bytes = own_cost(dataset["loss"].size)
+    with watch.busy(f"{env.name}: {PREPARING}"):
+        seconds = estimate_seconds(env, losses, gradients)
+    episodes = env.memory() * env.preferred_batch
+    device = f", {size(episodes)} of the GPU's" if env.device == "cuda" else ""
+    memory = peak_memory() + own_bytes + need_of(rank, env.space.dim, points).memory + (0 if device else episodes)
+    watch.note(
+        f"{env.name} · {env.fidelity.name} · {env.device}: up to {losses} episodes and {gradients} with gradients: "
+        f"about {duration(seconds)}, and {duration(own_seconds)} to measure {dataset['loss'].size} samples; "
+        f"{size(memory)} of memory{device}"
+    )
+
+
+def _open(subject: ReportedSlice) -> xr.Dataset:
+    """Read a slice that can be reported on; raise ValueError for one that cannot."""
+    from ..landscapes.storage.store import open_slice
+
+    dataset = open_slice(subject.store)
+    if "grad" not in dataset or min(dataset["loss"].shape) < 3:
+        raise ValueError(f"{subject.name}: report needs a slice with gradients and three samples per axis; got another")
+    if missing := int((dataset["status"] == 0).sum()):
+        raise ValueError(
+            f"{subject.store}: {missing} of {dataset['status'].size} samples are missing or damaged; let the command "
+            "that samples the slice go on first"
+        )
+    return dataset
+
+
+def _warn(subject: ReportedSlice, dataset: xr.Dataset, env: Environment, watch: Watch) -> None:
+    theirs, ours = stored_identity(dataset), env.identity()
+    differ = [name for name in ("code", "device") if theirs.get(name) != ours[name]]
+    if differ:
+        said = "; ".join(f"{name} {theirs.get(name)} there, {ours[name]} here" for name in differ)
+        watch.note(f"warning: {subject.name} was sampled otherwise ({said}), so losses may differ")
+
+
+def _beside(profile: Profile, said: Quoted | None) -> PaperRecord | None:
+    if said is None:
+        return None
+    return {"words": profile.verdict.beside(said.words), "where": said.where}
+
+
+def _leave(dataset: xr.Dataset, profile: Profile, report: Report, folder: Path, watch: Watch) -> None:
+    """Write a report's files."""
+    import xarray as xr
+
+    from ..landscapes.draw.figures.page import save
+    from ..landscapes.draw.figures.quality import quality_figure
+    from ..landscapes.storage.bundle import save_bundle
+
+    noise = xr.Dataset({"deviation": profile.noise.deviation})
+    save_bundle(folder / ARRAYS, steps=profile.steps, smooth=profile.smooth, noise=noise)
+    save(quality_figure(dataset, profile.steps, profile.samples, profile.smooth), folder / PICTURE)
+    _leave_measures(folder, report)
+    write_record(folder / RECORD, report.record())
+    watch.note(f"{folder}: {RECORD}, {MEASURES}, {PICTURE}, {ARRAYS}")
+
+
+def _leave_measures(folder: Path, report: Report) -> None:
+    """Write the report's numbers by their names, unless the same are there."""
+    with contextlib.suppress(OSError, TypeError, ValueError):  # not there, or damaged
+        if read_json(folder / MEASURES) == report.measures:
+            return
+    write_record(folder / MEASURES, report.measures)
+
+
+def digest_of(dataset: xr.Dataset) -> str:
+    """Return what a slice is known by in its report."""
+    identity = json.dumps(stored_identity(dataset), sort_keys=True).encode()
+    return hashlib.sha256(identity + dataset["loss"].to_numpy().tobytes()).hexdigest()[:12]
+
+
+def _fetch(source: Path, folder: Path, key: ReportKey, watch: Watch) -> None:
+    """Copy the same report from beside its slice, where the gallery has it, rather than measure again."""
+    files = [source / name for name in (PICTURE, MEASURES, RECORD)]
+    if (folder / RECORD).exists() or not all(file.exists() for file in files):
+        return
+    if not _differences(Report.read(source / RECORD).key, key):
+        make_folder(folder)
+        for file in [*files, *source.glob(ARRAYS)]:
+            with replacing(folder / file.name) as partial:
+                shutil.copyfile(file, partial)
+        watch.note(f"{folder} is copied from {source}")
+
+
+def _keep(folder: Path, key: ReportKey, device: str, watch: Watch) -> Report:
+    """Return the report that is there, on whatever device it was measured; raise ValueError where it is another."""
+    kept = Report.read(folder / RECORD)
+    if differences := _differences(kept.key, key):
+        raise ValueError(f"{folder} holds another report ({differences}); write elsewhere with --out, or delete it")
+    _leave_measures(folder, kept)
+    elsewhere = f", measured on {kept.device}" if kept.device != device else ""
+    watch.note(f"{folder} is there already{elsewhere}")
+    if kept.key["code"] != key["code"]:
+        said = f"by other code of the scenes, {kept.key['code']}; this is {key['code']}"
+        watch.note(f"warning: it was measured {said}. Delete the folder to measure it anew")
+    return kept
+
+
+def _differences(theirs: ReportKey, ours: ReportKey) -> str:
+    """Say in what two reports differ, nothing where they are of the same slice and settings, whatever the code is."""
+    differ = {name: (theirs.get(name), value) for name, value in ours.items() if theirs.get(name) != value}
+    if set(differ) <= {"code"}:
+        return ""
+    return ", ".join(f"{name} {there} there, {here} here" for name, (there, here) in differ.items())
+
+
+def _check(folder: Path, single: bool) -> None:
+    """Raise ValueError where a folder holds anything but reports."""
+    if single:
+        REPORT.check(folder)
+        return
+    _check_summary(folder)
+    REPORTS.check(folder, (file for file in other_files(folder, REPORTS.files, "") if (file / PICTURE).exists()))
+
+
+def _check_summary(folder: Path) -> None:
+    """Raise ValueError for a summary of several reports that is none of ours, as a table without one is not either."""
+    path = folder / RECORD
+    if not path.exists() and not (folder / TABLE).exists():
+        return
+    try:
+        ours = {"reports", "environments"} <= json.loads(path.read_text()).keys()
+    except (OSError, ValueError, AttributeError):
+        ours = False
+    if not ours:
+        raise ValueError(
+            f"{path} is not there, damaged or of something else than several slices, so that it and {TABLE} are not "
+            "replaced; move both away, or give --out a new or an empty folder"
+        )

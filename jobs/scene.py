@@ -1,0 +1,163 @@
+"""Which scene a job simulates, and how: the record that passes whole through every verb; and who made a result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+from ..envs.registry import environment_class, make
+from .watch import Watch
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from torch import Tensor
+
+    from ..envs.base import Environment, Fidelity
+    from ..landscapes.objective import Objective
+    from ..landscapes.plane import Plane
+
+PACKAGES = (
+    *("numpy", "torch", "warp-lang", "taichi", "xarray", "zarr", "matplotlib"),
+    *("pyvista", "rerun-sdk", "botorch", "gpytorch", "cma", "typer", "rich"),
+)
+
+
+@dataclass(frozen=True)
+class SceneSpec:
+    """Say which scene is simulated, and how.
+
+    `name` is a registered name, FILE.py:Class, or an environment's class. `fidelity` is a name or a record, by default
+    the cheapest; `tolerance` chooses it by measured loss errors instead ("5%" of the losses' spread, or "0.05" in their
+    unit). `device` is auto, cpu or cuda, `engine` one of the scene's, and `options` are the scene's own.
+    """
+
+    name: str | type[Environment]
+    fidelity: str | Fidelity | None = None
+    tolerance: str | None = None
+    device: str = "auto"
+    engine: str = "warp"
+    deterministic: bool = False
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, env: Environment) -> SceneSpec:
+        """Return what makes an environment such as this one again."""
+        from dataclasses import asdict
+
+        from ..envs.registry import source_of
+
+        return cls(source_of(env), env.fidelity, None, env.device, env.engine, env.deterministic, asdict(env.options))
+
+    def resolve(self, watch: Watch) -> SceneSpec:
+        """Return the spec with the fidelity that its tolerance chooses.
+
+        Raises ValueError where both are given, and where no measured fidelity is within the tolerance.
+        """
+        if self.tolerance is None:
+            return self
+        from .tolerance import choose_fidelity
+
+        return replace(self, tolerance=None, fidelity=choose_fidelity(self, watch))
+
+    def make(self, watch: Watch | None = None, **changes: Any) -> Environment:
+        """Make the environment; `changes` are other options. Raises ValueError for what the scene does not have."""
+        spec = self.resolve(watch or Watch())
+        how: dict[str, Any] = {"fidelity": spec.fidelity, "device": spec.device, "engine": spec.engine}
+        return make(spec.name, **how, deterministic=spec.deterministic, **{**spec.options, **changes})
+
+
+def provenance(objective: Objective, command: str) -> dict[str, Any]:
+    """Return what else is worth keeping with results: how they came about, when, and with which versions."""
+    return {
+        "command": command,
+        "created": datetime.now(UTC).strftime("%Y-%m-%d"),
+        "versions": {package: installed_version(package) for package in PACKAGES},
+        "loss_unit": getattr(objective, "loss_unit", ""),
+    }
+
+
+def installed_version(package: str) -> str:
+    """Return the version of a package, or that it is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def environment_of(dataset: xr.Dataset, device: str) -> Environment:
+    """Return the environment that a slice was sampled from, on a device.
+
+    Raises ValueError where the slice is none of an environment, or of one that is not registered here.
+    """
+    from ..envs.base import Fidelity
+    from ..landscapes.identity import stored_identity
+
+    identity = stored_identity(dataset)
+    if missing := {"objective", "settings", "engine", "options", "deterministic"} - set(identity):
+        raise ValueError(
+            f"the slice is not one of an environment, its identity lacks {', '.join(sorted(missing))}; "
+            "`landscape slice ENV` samples one"
+        )
+    how = {"engine": identity["engine"], "deterministic": identity["deterministic"], **identity["options"]}
+    try:
+        kind = environment_class(identity["objective"])
+    except ValueError as error:
+        raise ValueError(f"{error}; of a class in a file, say where it is: --env FILE.py:Class") from None
+    return make(kind, fidelity=Fidelity(**identity["settings"]), device=device, **how)
+
+
+def point_of(env: Environment, text: str) -> Tensor:
+    """Return the parameters that `text` names: a point, as `envs.points` has it, or best:RUN, the best of a run.
+
+    Raises ValueError where there is no such point, or where the run searched another environment.
+    """
+    kind, _, run = text.partition(":")
+    if kind != "best":
+        from ..envs.points import point
+
+        return point(env, text)
+    from ..landscapes.identity import stored_identity
+    from ..landscapes.overlay import best_point
+    from .folder import run_tables
+
+    tables = run_tables([run])
+    searched = {str(stored_identity(table).get("objective")) for table in tables}
+    if searched != {env.name}:
+        raise ValueError(f"{run} holds no runs of {env.name} alone; it holds those of {', '.join(sorted(searched))}")
+    return best_point(tables)[0]
+
+
+def plane_through(
+    objective: Objective,
+    dims: Sequence[int | str],
+    *,
+    through: str | Tensor,
+    extent: float | tuple[float, float] | None,
+    resolution: int | Sequence[int],
+) -> Plane:
+    """Return the line or plane along one or two parameters through a point, which an environment may name.
+
+    Raises ValueError for parameters, points and extents that the objective's space does not have.
+    """
+    from ..landscapes.plane import Plane
+
+    point = _named_point(objective, through) if isinstance(through, str) else through
+    return Plane.through(objective.space, point, dims, resolution=resolution, extent=extent)
+
+
+def _named_point(objective: Objective, text: str) -> Tensor:
+    from ..envs.base import Environment
+    from ..landscapes.objective import name_of
+
+    if isinstance(objective, Environment):
+        return point_of(objective, text)
+    kind, _, seed = text.partition(":")
+    if text == "center":
+        return objective.space.center
+    if kind == "random" and seed.isdecimal():
+        return objective.space.uniform(1, seed=int(seed))[0]
+
+    raise ValueError(f"{name_of(objective)} can be cut through center, random:SEED or a tensor; got {text!r}")

@@ -1,0 +1,278 @@
+"""A run of an optimiser to fill in a folder: what it will cost, its picture, its summary."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypedDict
+
+import torch
+
+from ..landscapes.cost import duration, episode_cost
+from ..landscapes.objective import Objective, Status
+from ..landscapes.space import as_whole
+from ..landscapes.storage.files import clear, tidy, write_json
+from ..optim.base import Kind
+from ..optim.memory import SearchSize, require_method, require_runs
+from ..optim.registry import code_digest, optimizer_class
+from ..optim.runs.arrays import FORWARD_EQUIVALENTS, stored_record
+from ..optim.runs.run import Run
+from ..optim.runs.store import RunStore
+from ..optim.search import SearchProgress, search
+from .folder import ROOT, RUN, SUMMARY, folder_named
+from .scene import provenance
+from .watch import PREPARING, Watch, resumable
+
+if TYPE_CHECKING:
+    from ..envs.base import Environment
+    from ..optim.base import Optimizer
+
+STORE, PICTURE = RUN.store, RUN.picture
+
+
+class BestRecord(TypedDict):
+    """The best episode of a run, as its summary has it."""
+
+    loss: float
+    episode: int
+    x: list[float]
+
+
+@dataclass(frozen=True)
+class SearchSummary:
+    """Say what a run cost and found, as `summary.json` beside it has it; `best` is None where no episode succeeded."""
+
+    env: str
+    method: str
+    seed: int
+    budget: int
+    fidelity: str
+    device: str
+    options: dict[str, Any]
+    method_options: dict[str, Any]
+    episodes: int
+    resumed: int
+    seconds: float
+    forward_equivalents: float
+    gradient_cost: float | None
+    status: dict[str, int]
+    kinds: dict[str, int]
+    best: BestRecord | None
+    command: str
+    files: list[str]
+
+    def record(self) -> dict[str, Any]:
+        """Return the summary as its file has it."""
+        return stored_record(self)
+
+    def outcome(self) -> str:
+        """Say in a line what the run cost and found."""
+        best = self.best
+        found = f"best loss {best['loss']:.6g} at episode {best['episode']}" if best else "no episode succeeded"
+        failed = sum(count for status, count in self.status.items() if status != "ok")
+        failures = f"; {failed} failed" if failed else ""
+        return f"{self.episodes} episodes in {duration(self.seconds)}; {found}{failures}"
+
+
+@dataclass(frozen=True)
+class SearchJob:
+    """A run to fill in `folder`, and to draw for pages of the widths of `prints` [mm], too."""
+
+    env: Environment
+    optimizer: Optimizer
+    folder: Path
+    store: RunStore
+    budget: int
+    command: str
+    prints: Sequence[float] = ()
+
+    @classmethod
+    def of(
+        cls,
+        env: Environment,
+        optimizer: Optimizer,
+        *,
+        budget: int,
+        command: str,
+        out: Path | None = None,
+        force: bool = False,
+        prints: Sequence[float] = (),
+    ) -> SearchJob:
+        """Go on with the run in `out`, by default a folder named after it, or begin it there; `force` begins anew.
+
+        Raises ValueError where the folder holds something else, StoreMismatchError where it holds another run, and
+        TooLargeError where the run would not fit this machine.
+        """
+        budget, identity = as_whole(budget, "a budget", least=1), run_identity(env, optimizer)
+        folder = out or run_folder(identity)
+        require_runs(env.space.dim, budget, 1, folder)
+        require_method(type(optimizer), optimizer.options, SearchSize(env.space.dim, env.decisions, budget))
+        RUN.check(folder)
+        anew = force and (folder / STORE).exists()
+        store = open_run_store(env, optimizer, folder / STORE, budget=budget, command=command, force=force)
+        if anew:
+            clear(folder, (PICTURE, SUMMARY), PICTURE)
+        return cls(env, optimizer, folder, store, budget, command, prints)
+
+    def run(self, watch: Watch | None = None) -> SearchSummary:
+        """Search until the budget is spent, draw the run, write and return the summary.
+
+        Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
+        """
+        watch, start, resumed = watch or Watch(), time.monotonic(), self.store.count
+        with resumable(self.say_kept, lambda: self._on_disk().picture()), one_torch_thread():
+            if resumed < self.budget:
+                resumed = self._search(watch)
+            else:
+                watch.note(f"{self._place()}\nall {self.budget} episodes are there already")
+            self.picture()
+            files = [STORE, PICTURE, *self._print(), SUMMARY]
+            summary = self._summary(resumed, time.monotonic() - start, files)
+            write_json(self.folder / SUMMARY, summary.record())
+            tidy(self.folder)
+        return summary
+
+    def result(self) -> Run:
+        """Return the run as one works with it."""
+        return replace(self.store.read(), folder=self.folder)
+
+    def say_kept(self) -> str:
+        """Say how much of it is on disk."""
+        return f"{self._on_disk().store.count} of {self.budget} episodes are kept in {self.folder}"
+
+    def picture(self) -> None:
+        """Draw what there is of the run, if there is anything to draw."""
+        from ..landscapes.draw.figures.page import save
+
+        if self.store.count:
+            save(self.result().plot(), self.folder / PICTURE)
+
+    def _on_disk(self) -> SearchJob:
+        return replace(self, store=RunStore.open(self.folder / STORE), prints=())
+
+    def _search(self, watch: Watch) -> int:
+        """Search, and return how many episodes were there before."""
+        ratio, resumed = self._announce(watch), 0
+        with watch.progress(self.budget) as advance:
+
+            def follow(now: SearchProgress) -> None:
+                nonlocal resumed
+                resumed = now.resumed
+                failed = f", {now.failed} failed" if now.failed else ""
+                advance(now.done, f"best loss {now.best:.4g}{failed}")
+
+            search(self.env, self.optimizer, self.store, budget=self.budget, gradient_cost=ratio, progress=follow)
+        return resumed
+
+    def _announce(self, watch: Watch) -> float | None:
+        """Say what is left to compute, and return what a gradient costs, as far as the method asks for any."""
+        store, grad = self.store, self.optimizer.needs_grad
+        with watch.busy(f"{self.env.name}: {PREPARING}"):
+            cost = episode_cost(self.env, grad=grad and store.gradient_cost is None)
+        ratio, left = store.gradient_cost or cost.ratio, self.budget - store.told
+        kept = f", {store.told} are there already" if store.told else ""
+        forward = duration(left * cost.forward)
+        costs = f"{forward} without gradients, {duration(left * cost.forward * ratio)} with" if grad else forward
+        watch.note(
+            f"{self._place()}\n{left} episodes to compute{kept}: one by one {costs}, and what the method takes itself"
+        )
+        return ratio if grad else None
+
+    def _place(self) -> str:
+        return f"{self.env.name} · {self.env.fidelity.name} · {self.env.device} · {self.optimizer.name} · {self.folder}"
+
+    def _print(self) -> list[str]:
+        from ..landscapes.draw.figures.page import save_prints
+
+        path = self.folder / PICTURE  # the run is read only where it is printed
+        return save_prints(lambda width: self.result().plot(width=width), path, self.prints)
+
+    def _summary(self, resumed: int, seconds: float, files: list[str]) -> SearchSummary:
+        run, identity = self.store.read(), self.store.identity
+        data, best = run.data, None
+        if self.store.count > self.store.failed:
+            best = BestRecord(loss=run.best.loss, episode=run.best.episode, x=run.best.x.tolist())
+        return SearchSummary(
+            env=identity["objective"],
+            method=identity["method"],
+            seed=identity["seed"],
+            budget=self.store.budget,
+            fidelity=identity["fidelity"],
+            device=identity["device"],
+            options=identity["options"],
+            method_options=identity["method_options"],
+            episodes=self.store.count - resumed,
+            resumed=resumed,
+            seconds=round(seconds, 3),
+            forward_equivalents=float(data[FORWARD_EQUIVALENTS][-1]),
+            gradient_cost=self.store.gradient_cost,
+            status={kind.name.lower(): int((data["status"] == kind).sum()) for kind in Status if kind},
+            kinds={kind.name.lower(): int((data["kind"] == kind).sum()) for kind in Kind},
+            best=best,
+            command=self.command,
+            files=files,
+        )
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Let a method's numbers depend on its seed alone: how a model rounds depends on how many threads share its sums.
+
+    Models of a thousand points gain little by a second one, and wait long for it where other work runs.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@one_torch_thread()
+def make_optimizer(
+    method: str, objective: Objective, *, seed: int = 0, options: Mapping[str, Any] | None = None
+) -> Optimizer:
+    """Make a method for an objective; values of its options may be text.
+
+    Raises ValueError for a method, an option or a value that is not there, and TooLargeError for one that would not fit
+    this machine.
+    """
+    from ..landscapes.options import read_options
+
+    kind = optimizer_class(method)
+    chosen = read_options(method, kind.Options, options or {})
+    require_method(kind, chosen, SearchSize(objective.space.dim, getattr(objective, "decisions", 1)))
+    return kind.on(objective, seed=seed, options=chosen)
+
+
+def open_run_store(
+    env: Environment, optimizer: Optimizer, path: Path, *, budget: int, command: str, force: bool
+) -> RunStore:
+    """Open the run of an optimiser at `path`, or make it; `force` replaces one that is there.
+
+    Raises StoreMismatchError where another run is there.
+    """
+    identity, about = run_identity(env, optimizer), provenance(env, command)
+    if force and path.exists():
+        return RunStore.create(path, env.space, identity=identity, provenance=about, budget=budget, overwrite=True)
+    return RunStore.open_or_create(path, env.space, identity=identity, provenance=about, budget=budget)
+
+
+def run_identity(env: Environment, optimizer: Optimizer) -> dict[str, Any]:
+    """Return what decides a run's numbers; the budget does not, so that a run can be continued to a larger one."""
+    return {
+        **env.identity(),
+        "method": optimizer.name,
+        "method_options": asdict(optimizer.options),
+        "method_code": code_digest(type(optimizer)),
+        "seed": optimizer.seed,
+    }
+
+
+def run_folder(identity: dict[str, Any], root: Path = ROOT) -> Path:
+    """Return a folder of its own for every different run, the same for the same one."""
+    parts = [identity["objective"], identity["method"], identity["fidelity"], f"s{identity['seed']}"]
+    return folder_named(parts, identity, root)

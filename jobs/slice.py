@@ -1,0 +1,377 @@
+"""A slice to sample into a folder: what it will cost, its pictures on the way, its summary."""
+
+from __future__ import annotations
+
+import math
+import resource
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import torch
+import xarray as xr
+from jaxtyping import Float
+from torch import Tensor
+
+from ..landscapes.adapters import within_box
+from ..landscapes.capacity import size
+from ..landscapes.cost import duration, seconds_per_episode
+from ..landscapes.identity import plane_of
+from ..landscapes.objective import Objective, Status, name_of
+from ..landscapes.plane import Plane
+from ..landscapes.sampling.distribution import RemoteSite, Site, run_tasks, workers_of
+from ..landscapes.sampling.fill import Progress, sample
+from ..landscapes.sampling.memory import MemoryBound
+from ..landscapes.storage.arrays import need_of
+from ..landscapes.storage.files import clear, tidy, write_json
+from ..landscapes.storage.paths import slice_exists
+from ..landscapes.storage.store import SliceStore
+from ..landscapes.storage.tiles import Tile
+from .folder import ROOT, SLICE, SUMMARY, folder_named
+from .scene import provenance
+from .watch import PREPARING, Watch, resumable
+from .workers import recipe
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+STORE, PICTURE = SLICE.store, SLICE.picture
+PAUSE, DRAWING = 10.0, 0.1  # between pictures of an unfinished slice: least seconds, and most of the time for them
+Draw = Callable[..., "Figure"]  # draw(dataset, width=None): a slice for a screen, or for a page so wide [mm]
+
+
+@dataclass(frozen=True)
+class SliceCost:
+    """Say what is left of a slice to compute: episodes, seconds they should take, bytes of memory."""
+
+    episodes: int
+    seconds: float
+    memory: int
+
+
+@dataclass(frozen=True)
+class SliceSummary:
+    """Say what a slice cost, as `summary.json` beside it has it; `status` counts points, `flat` those without slope."""
+
+    env: str | None
+    dims: list[str]
+    fidelity: str | None
+    device: str | None
+    options: dict[str, Any] | None
+    resolution: list[int]
+    gradients: bool
+    episodes: int
+    resumed: int
+    seconds: float
+    status: dict[str, int]
+    loss: dict[str, float | None]
+    flat: int | None
+    command: str
+    files: list[str]
+
+    def outcome(self) -> str:
+        """Say in a line what the slice cost and what came out."""
+        counts = {kind: count for kind, count in self.status.items() if count}
+        ends = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+        low, high = self.loss["lowest"], self.loss["highest"]
+        losses = "no finite loss" if low is None else f"losses from {low:.4g} to {high:.4g}"
+        share = (self.flat or 0) / sum(counts.values())
+        flat = f"; gradient exactly zero at {share:.1%} of points" if share else ""
+        return f"{self.episodes} episodes in {duration(self.seconds)}; {ends}; {losses}{flat}"
+
+
+@dataclass(frozen=True)
+class SliceJob:
+    """A slice to sample into `folder`, and how to draw it; `executor` and `remake` are those of `sample`.
+
+    `prints` are widths of pages [mm] that it is also drawn for; `command` is how it is made again.
+    """
+
+    objective: Objective
+    plane: Plane
+    folder: Path
+    store: SliceStore
+    draw: Draw
+    command: str
+    executor: Executor | None = None
+    remake: Callable[[], Objective] | None = None
+    prints: Sequence[float] = ()
+
+    @classmethod
+    def open(
+        cls,
+        objective: Objective,
+        plane: Plane,
+        folder: Path,
+        draw: Draw,
+        *,
+        identity: Mapping[str, Any],
+        provenance: Mapping[str, Any],
+        command: str = "",
+        grad: bool = True,
+        force: bool = False,
+        executor: Executor | None = None,
+        remake: Callable[[], Objective] | None = None,
+        prints: Sequence[float] = (),
+    ) -> SliceJob:
+        """Go on with the slice in `folder`, or begin it there; `force` begins anew where another slice is.
+
+        Raises ValueError where the folder holds something else, StoreMismatchError where it holds another slice.
+        """
+        SLICE.check(folder)
+        path = folder / STORE
+        settings: dict[str, Any] = {"identity": identity, "provenance": provenance, "grad": grad}
+        if force and slice_exists(path):
+            store = SliceStore.create(path, plane, objective.space, overwrite=True, **settings)
+            clear(folder, (PICTURE, SUMMARY), PICTURE)
+        else:
+            store = SliceStore.open_or_create(path, plane, objective.space, **settings)
+        return cls(objective, plane, folder, store, draw, command, executor, remake, prints)
+
+    @classmethod
+    def of(
+        cls,
+        objective: Objective,
+        plane: Plane,
+        *,
+        command: str,
+        out: Path | None = None,
+        root: Path = ROOT,
+        grad: bool = True,
+        force: bool = False,
+        boxed: bool = False,
+        executor: Executor | None = None,
+        prints: Sequence[float] = (),
+    ) -> SliceJob:
+        """Open the slice of an environment, or of any objective, in `out`, by default a folder named after it.
+
+        That folder is under `root`.
+
+        `boxed` leaves out what lies beyond the parameters' bounds. With an `executor` its workers compute. Raises as
+        `open` does.
+        """
+        identity = identity_of(objective) | ({"boxed": True} if boxed else {})
+        return cls.open(
+            within_box(objective) if boxed else objective,
+            plane,
+            out or _default_folder(identity, plane, grad, root),
+            picture_of(objective, plane),
+            identity=identity,
+            provenance=provenance(objective, command),
+            command=command,
+            grad=grad,
+            force=force,
+            executor=executor,
+            remake=None if boxed else recipe(objective),
+            prints=prints,
+        )
+
+    def cost(self) -> SliceCost:
+        """Estimate what is left; workers that compute it do, which warms them, and leaves a GPU of theirs alone."""
+        if self.executor is None:
+            return cost_of(self.objective, self.store)
+        site = Site(MemoryBound(self.objective), self.store, self.remake)
+        costs = list(run_tasks(self.executor, _cost_there, [(site,)] * workers_of(self.executor)))
+        shares = [1 / cost.seconds for cost in costs if cost.seconds]
+        return replace(costs[0], seconds=1 / sum(shares) if shares else 0.0)
+
+    def run(self, watch: Watch | None = None) -> SliceSummary:
+        """Sample what is missing, draw each finer picture as it completes, write and return the summary.
+
+        Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
+        """
+        watch = watch or Watch()
+        with resumable(self.say_kept, self.picture):
+            self._announce(watch)
+            start = time.monotonic()
+            dataset, computed = self._sample(watch)
+            self._save(dataset)
+            files = [STORE, PICTURE, *self._print(dataset), SUMMARY]
+            summary = self._summary(dataset, computed, time.monotonic() - start, files)
+            write_json(self.folder / SUMMARY, asdict(summary))
+            tidy(self.folder)
+        return summary
+
+    def say_kept(self) -> str:
+        """Say how much of it is on disk."""
+        status = self.store.status()
+        return f"{int((status > 0).sum())} of {status.size} points are kept in {self.folder}"
+
+    def picture(self) -> None:
+        """Draw the finest complete picture of the whole so far, if there is one."""
+        if (coarse := self.store.coarse()) is not None:
+            self._save(coarse)
+
+    def _announce(self, watch: Watch) -> None:
+        """Say what is left to compute and what that costs."""
+        about = self.store.identity
+        env = str(about.get("objective"))
+        with watch.busy(f"{env}: {PREPARING}"):
+            cost = self.cost()
+        total = math.prod(self.plane.resolution)
+        kind = "episodes with gradients" if self.store.grad else "episodes"
+        watch.note(" · ".join([env, str(about.get("fidelity")), str(about.get("device")), str(self.folder)]))
+        if not cost.episodes:
+            watch.note(f"all {total} {kind} are there already")
+            return
+        kept = f", {total - cost.episodes} are there already" if cost.episodes < total else ""
+        watch.note(
+            f"{cost.episodes} {kind} to compute{kept}: about {duration(cost.seconds)}, "
+            f"{size(cost.memory)} of memory{_gpu_memory(self.objective)}"
+        )
+
+    def _sample(self, watch: Watch) -> tuple[xr.Dataset, int]:
+        """Sample what is missing; return the slice, and how many episodes were computed."""
+        drawn, pause, computed = -PAUSE, PAUSE, 0
+        with watch.progress(math.prod(self.plane.resolution)) as advance:
+
+            def follow(now: Progress) -> None:
+                nonlocal drawn, pause, computed
+                computed = now.done - now.resumed
+                failed = sum(count for status, count in now.statuses.items() if status != Status.OK)
+                advance(now.done, f"episodes, {failed} failed" if failed else "")
+                if now.level_complete and now.done < now.total and (began := time.monotonic()) - drawn > pause:
+                    self.picture()
+                    drawn = time.monotonic()
+                    pause = pause_after(drawn - began)
+
+            how: dict[str, Any] = {"grad": self.store.grad, "executor": self.executor, "made": self.remake}
+            return sample(self.objective, self.plane, self.store, progress=follow, **how), computed
+
+    def _save(self, dataset: xr.Dataset) -> None:
+        from ..landscapes.draw.figures.page import save
+
+        save(self.draw(dataset), self.folder / PICTURE)
+
+    def _print(self, dataset: xr.Dataset) -> list[str]:
+        from ..landscapes.draw.figures.page import save_prints
+
+        return save_prints(lambda width: self.draw(dataset, width=width), self.folder / PICTURE, self.prints)
+
+    def _summary(self, dataset: xr.Dataset, computed: int, seconds: float, files: list[str]) -> SliceSummary:
+        identity, status = self.store.identity, dataset["status"].to_numpy()
+        return SliceSummary(
+            env=identity.get("objective"),
+            dims=list(self.plane.names),
+            fidelity=identity.get("fidelity"),
+            device=identity.get("device"),
+            options=identity.get("options"),
+            resolution=list(self.plane.resolution),
+            gradients=self.store.grad,
+            episodes=computed,
+            resumed=int(status.size) - computed,
+            seconds=round(seconds, 3),
+            status=count_statuses(dataset),
+            loss=range_of(dataset),
+            flat=flat_points(dataset),
+            command=self.command,
+            files=files,
+        )
+
+
+def picture_of(objective: Objective, plane: Plane) -> Draw:
+    """Return how a slice is drawn: a map, or a profile over a line with the events of an environment's episodes."""
+
+    def surface(dataset: xr.Dataset, width: float | None = None) -> Figure:
+        from ..landscapes.draw.figures.contour import landscape_figure
+
+        return landscape_figure(dataset, width=width)
+
+    def profile(dataset: xr.Dataset, width: float | None = None) -> Figure:
+        from ..landscapes.draw.figures.profile import profile_figure
+
+        u, env = torch.tensor(dataset["u"].to_numpy()), cast(Any, objective)
+        return profile_figure(
+            dataset, events=env.events(plane.lift(u[:, None])) if hasattr(env, "events") else {}, width=width
+        )
+
+    return surface if plane.rank == 2 else profile
+
+
+def _default_folder(identity: dict[str, Any], plane: Plane, grad: bool, root: Path) -> Path:
+    """Return a folder of its own for every different slice, the same for the same one."""
+    aligned = all(len(row.nonzero()) == 1 for row in plane.basis)
+    axes = [str(int(row.nonzero()[0])) for row in plane.basis] if aligned else ["plane"]
+    points = "x".join(map(str, plane.resolution))
+    fidelity = [identity["fidelity"]] if "fidelity" in identity else []
+    parts = [identity["objective"], *axes, *fidelity, points]
+    return folder_named(parts, [identity, plane.record(), grad], root)
+
+
+def identity_of(objective: Objective) -> dict[str, Any]:
+    """Return what decides an objective's numbers, as far as it says: an environment all, any other its name."""
+    say: Callable[[], dict[str, Any]] = getattr(objective, "identity", lambda: {"objective": name_of(objective)})
+    return say()
+
+
+def _gpu_memory(objective: Objective) -> str:
+    if getattr(objective, "device", "cpu") != "cuda":
+        return ""
+    env: Any = objective
+    return f", {size(env.memory() * env.preferred_batch)} of it on the GPU at a time"
+
+
+def count_statuses(dataset: xr.Dataset) -> dict[str, int]:
+    """Count the points of a slice by how they ended."""
+    status = dataset["status"].to_numpy()
+    return {kind.name.lower(): int((status == kind).sum()) for kind in Status}
+
+
+def range_of(dataset: xr.Dataset) -> dict[str, float | None]:
+    """Return the lowest and the highest finite loss of a slice, None where there is none."""
+    loss = dataset["loss"].to_numpy()
+    if not np.isfinite(loss).any():
+        return {"lowest": None, "highest": None}
+    return {"lowest": float(np.nanmin(loss)), "highest": float(np.nanmax(loss))}
+
+
+def pause_after(seconds: float) -> float:
+    """Return how long no picture of an unfinished slice follows one that took so many seconds."""
+    return max(PAUSE, seconds / DRAWING)
+
+
+def cost_of(objective: Objective, store: SliceStore) -> SliceCost:
+    """Estimate what is left of a slice from its own first points, evaluated as they will be; that takes seconds."""
+    pending = store.pending()
+    left = sum(store.count(tile) for tile in pending)
+    if not left:
+        return SliceCost(0, 0.0, peak_memory())
+    getattr(objective, "prepare", lambda: None)()
+    batch = first_points(store, pending, getattr(objective, "preferred_batch", 1))
+    seconds = left * seconds_per_episode(objective, batch, grad=store.grad)
+    arrays = need_of(store.shape, store.plane.dim, grad=store.grad)
+    return SliceCost(left, seconds, peak_memory() + round(arrays.memory))
+
+
+def _cost_there(site: Site | RemoteSite) -> SliceCost:
+    here = site.here()
+    return cost_of(here.objective.objective, here.store)
+
+
+def first_points(store: SliceStore, tiles: Sequence[Tile], count: int) -> Float[Tensor, "point dim"]:
+    """Return the first points of tiles, or all there are where they are fewer."""
+    parts, size = list[Tensor](), 0
+    for tile in tiles:
+        if size < count:
+            parts.append(store.points(tile))
+            size += len(parts[-1])
+    return torch.cat(parts)[:count]
+
+
+def flat_points(dataset: xr.Dataset) -> int | None:
+    """Count the points whose gradient along the plane is exactly zero, none if gradients are not there."""
+    if "grad" not in dataset:
+        return None
+    slope = plane_of(dataset).slope(torch.from_numpy(dataset["grad"].to_numpy()))
+    return int((slope == 0).all(dim=-1).sum())
+
+
+def peak_memory() -> int:
+    """Return the most memory this process has held [bytes]."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak

@@ -1,0 +1,70 @@
+"""A slice to draw as a lit surface, with runs draped on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..landscapes.identity import stored_identity
+from ..landscapes.storage.files import tidy
+from .folder import SLICE_STORE, SURFACE, folder_named, run_tables, store_in
+from .watch import Watch
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+PICTURE, MODEL = SURFACE.files
+
+
+@dataclass(frozen=True)
+class SurfaceJob:
+    """A slice to draw as a surface into `folder`, with what `placed` has of runs over it."""
+
+    dataset: xr.Dataset
+    placed: Sequence[xr.Dataset]
+    folder: Path
+
+    @classmethod
+    def of(cls, slice_: Path, runs: Sequence[str], out: Path | None = None) -> SurfaceJob:
+        """Lay the runs over the slice in a folder; results go to `out`, by default to one named after all of them.
+
+        Raises ValueError where there is no slice or no run, where a run searched another landscape, and where `out`
+        holds something else.
+        """
+        from ..landscapes.overlay import overlay
+        from ..landscapes.storage.store import open_slice
+
+        dataset = open_slice(store_in(slice_, SLICE_STORE))
+        tables = run_tables(runs) if runs else []
+        for table in tables:
+            check_landscape(dataset, table)
+        placed = overlay(dataset, tables) if tables else []
+        ours = stored_identity(dataset)
+        content = [ours, [stored_identity(table) for table in tables]]
+        folder = out or folder_named(["surface", ours["objective"]], content)
+        SURFACE.check(folder)
+        return cls(dataset, placed, folder)
+
+    def run(self, watch: Watch | None = None, prints: Sequence[float] = ()) -> list[str]:
+        """Draw the surface, also for pages as wide as `prints` [mm]; return the names of the files."""
+        from ..landscapes.draw.figures.page import save_prints
+        from ..landscapes.draw.render.surface import save_surface, surface_figure
+
+        with (watch or Watch()).busy("drawing"):
+            picture = self.folder / PICTURE
+            save_surface(self.dataset, self.placed, picture, self.folder / MODEL)
+            printed = save_prints(lambda width: surface_figure(self.dataset, self.placed, width=width), picture, prints)
+        tidy(self.folder)
+        return [PICTURE, MODEL, *printed]
+
+
+def check_landscape(dataset: xr.Dataset, table: xr.Dataset) -> None:
+    """Raise ValueError where a run searched another landscape than the slice is of."""
+    ours, theirs = stored_identity(dataset), stored_identity(table)
+    if any(ours.get(one) != theirs.get(one) for one in ("objective", "options")):
+        raise ValueError(
+            f"the slice is of {ours.get('objective')} {ours.get('options')}, a run of {theirs.get('objective')} "
+            f"{theirs.get('options')}; lay runs over a slice of their own"
+        )

@@ -1,0 +1,302 @@
+"""A sweep to sample into a folder, slice by slice, and to film: what it will cost, its films, its summary."""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from concurrent.futures import Executor
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import xarray as xr
+
+from ..landscapes.capacity import size
+from ..landscapes.cost import duration
+from ..landscapes.objective import Status
+from ..landscapes.sampling.fill import Progress, sample
+from ..landscapes.storage.files import discard, tidy, visible_files, write_json
+from ..landscapes.storage.ownership import refuse_others
+from ..landscapes.storage.paths import check_replaceable, filling_path
+from ..landscapes.storage.store import SliceStore
+from .folder import ROOT, SWEEP, folder_named
+from .motion import HORIZON, SMOOTHING, Motion, refuse_too_large
+from .scene import provenance
+from .slice import SliceCost, SliceJob, count_statuses, flat_points, range_of
+from .watch import PREPARING, Advance, Watch, resumable
+from .workers import recipe
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ..envs.base import Environment
+    from ..landscapes.draw.figures.sweep import Sweep
+    from ..landscapes.plane import Plane
+
+FRAMES, ONLY, FILM, GIF, STREAM, SUMMARY = SWEEP.files
+FRAME = re.compile(r"\d{3,}(?:\.filling)?\.zarr")  # what the folder of a sweep's slices holds
+
+
+@dataclass(frozen=True)
+class FrameSummary:
+    """Say what a frame shows: the value of what moves, the ends of its losses, how many points ended how."""
+
+    value: float
+    loss: dict[str, float | None]
+    status: dict[str, int]
+    flat: int | None
+
+    @classmethod
+    def of(cls, value: float, dataset: xr.Dataset) -> FrameSummary:
+        """Count and measure what a frame's slice holds."""
+        return cls(value, range_of(dataset), count_statuses(dataset), flat_points(dataset))
+
+
+@dataclass(frozen=True)
+class SweepSummary:
+    """Say what a sweep cost and what each of its frames shows, as `summary.json` beside it has it."""
+
+    env: str
+    dims: list[str]
+    over: str
+    fidelity: str | None
+    device: str | None
+    options: dict[str, Any] | None
+    resolution: list[int]
+    gradients: bool
+    episodes: int
+    resumed: int
+    seconds: float
+    loss: dict[str, float | None]
+    frames: list[FrameSummary]
+    command: str
+    files: list[str]
+
+    def outcome(self) -> str:
+        """Say in a line what the sweep cost and what came out."""
+        failed = sum(count for frame in self.frames for kind, count in frame.status.items() if kind != "ok")
+        low, high = self.loss["lowest"], self.loss["highest"]
+        losses = "no finite loss" if low is None else f"losses from {low:.4g} to {high:.4g}"
+        failures = f"; {failed} failed" if failed else ""
+        done = f"{self.episodes} episodes in {duration(self.seconds)}"
+        return f"{done}; {len(self.frames)} frames; {losses}{failures}"
+
+
+@dataclass(frozen=True)
+class SweepJob:
+    """A sweep to sample into `folder`, slice by slice, and to film; `executor` is that of `sample`."""
+
+    env: Environment
+    motion: Motion
+    folder: Path
+    stores: tuple[SliceStore, ...]
+    command: str
+    executor: Executor | None = None
+
+    @classmethod
+    def open(
+        cls, env: Environment, motion: Motion, folder: Path, *, command: str, grad: bool = True, force: bool = False
+    ) -> SweepJob:
+        """Go on with the sweep in `folder`, or begin it there; `force` begins anew where another one is.
+
+        Raises ValueError where the folder holds something else, StoreMismatchError where it holds another sweep.
+        """
+        check_folder(folder)
+        if force:
+            _clear(folder)
+        how: dict[str, Any] = {"grad": grad, "provenance": provenance(env, command)}
+        stores = tuple(
+            SliceStore.open_or_create(folder / name, plane, env.space, identity=motion.env_at(number).identity(), **how)
+            for number, (name, plane) in enumerate(zip(motion.stores, motion.planes, strict=True))
+        )
+        return cls(env, motion, folder, stores, command)
+
+    @classmethod
+    def of(
+        cls,
+        env: Environment,
+        plane: Plane,
+        over: int | str,
+        frames: int,
+        *,
+        command: str,
+        out: Path | None = None,
+        grad: bool = True,
+        force: bool = False,
+    ) -> SweepJob:
+        """Open the sweep of an environment in `out`, by default a folder named after it under out/.
+
+        Raises ValueError for what cannot be swept, TooLargeError for what has no room here, and as `open` does.
+        """
+        if plane.rank != 2 or frames < 2:
+            dims = ", ".join(plane.names)
+            raise ValueError(f"a sweep has two dims and two frames or more; got {dims} and {frames} frames")
+        grad = grad and over != SMOOTHING  # of smoothed losses there are no gradients to show
+        refuse_too_large(plane, frames, out or ROOT, grad=grad, over=over)
+        motion = Motion.of(env, plane, over, frames)
+        folder = out or sweep_folder(env, motion, over, grad=grad)
+        return cls.open(env, motion, folder, command=command, grad=grad, force=force)
+
+    @cached_property
+    def total(self) -> int:
+        """Points in all slices."""
+        return sum(math.prod(store.shape) for store in self.stores)
+
+    def done(self) -> int:
+        """Count the points that are on disk."""
+        return sum(int((store.status() > 0).sum()) for store in self.stores)
+
+    def cost(self) -> SliceCost:
+        """Estimate what is left, by points of the last slice that is not finished."""
+        pending = {number: int((store.status() == 0).sum()) for number, store in enumerate(self.stores)}
+        work = {number: self.motion.env_at(number).work().count * count for number, count in pending.items() if count}
+        if not work:
+            return SliceCost(0, 0.0, 0)
+        last = max(work)
+        env, how = self.motion.env_at(last), (self.stores[last], _never_drawn, "", self.executor)
+        cost = SliceJob(env, self.motion.planes[last], self.folder, *how, recipe(env)).cost()
+        return SliceCost(sum(pending.values()), cost.seconds * sum(work.values()) / work[last], cost.memory)
+
+    def run(self, watch: Watch | None = None) -> SweepSummary:
+        """Sample what is missing, film it, write and return the summary.
+
+        Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
+        """
+        watch = watch or Watch()
+        with resumable(self.say_kept):
+            self._announce(watch)
+            start, resumed = time.monotonic(), self.done()
+            drawn = self.sample(watch)
+            with watch.busy("drawing"):
+                self._film(drawn)
+            summary = self._summary(drawn, resumed, time.monotonic() - start)
+            write_json(self.folder / SUMMARY, asdict(summary))
+            tidy(self.folder)
+        return summary
+
+    def sample(self, watch: Watch | None = None) -> Sweep:
+        """Sample what is missing, and return what there is to draw."""
+        with (watch or Watch()).progress(self.total) as advance:
+            count = _Count(advance, len(self.stores))
+            slices = [self._sample(number, count) for number in range(len(self.stores))]
+        from ..landscapes.draw.figures.sweep import Sweep
+
+        return Sweep(self.motion.label, self.motion.values, self.motion.slices(slices))
+
+    def say_kept(self) -> str:
+        """Say how much of it is on disk."""
+        return f"{self.done()} of {self.total} points are kept in {self.folder}"
+
+    @property
+    def _grad(self) -> bool:
+        return self.stores[0].grad
+
+    def _announce(self, watch: Watch) -> None:
+        """Say what is left to compute and what that costs."""
+        left, env, kind = self.total - self.done(), self.env, "episodes with gradients" if self._grad else "episodes"
+        watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {self.folder}")
+        if not left:
+            watch.note(f"all {self.total} {kind} of {len(self.stores)} slices are there already")
+            return
+        with watch.busy(f"{env.name}: {PREPARING}"):
+            cost = self.cost()
+        kept = f", {self.total - left} are there already" if left < self.total else ""
+        slices = f"{len(self.stores)} slices" if len(self.stores) > 1 else "one slice"
+        takes = f"about {duration(cost.seconds)}, {size(cost.memory)} of memory"
+        watch.note(f"{left} {kind} of {slices} to compute{kept}: {takes}")
+
+    def _sample(self, number: int, count: _Count) -> xr.Dataset:
+        env, store = self.motion.env_at(number), self.stores[number]
+        how: dict[str, Any] = {"grad": store.grad, "executor": self.executor, "made": recipe(env)}
+        dataset = sample(env, self.motion.planes[number], store, progress=count.follow, **how)
+        count.add(dataset)
+        return dataset
+
+    def _film(self, drawn: Sweep) -> None:
+        from ..landscapes.draw.figures.sweep import save_films
+        from ..landscapes.draw.recordings.sweep import save_stream
+
+        save_films(drawn, self.folder / FILM, self.folder / GIF)
+        save_stream(drawn, self.folder / STREAM)
+
+    def _summary(self, drawn: Sweep, resumed: int, seconds: float) -> SweepSummary:
+        first = self.stores[0]
+        frames = [FrameSummary.of(value, one) for value, one in zip(drawn.values, drawn.slices, strict=True)]
+        ends = [end for frame in frames for end in frame.loss.values() if end is not None]
+        return SweepSummary(
+            env=self.env.name,
+            dims=list(first.plane.names),
+            over=drawn.label,
+            fidelity=first.identity["fidelity"],
+            device=first.identity["device"],
+            options=first.identity["options"],
+            resolution=list(first.plane.resolution),
+            gradients=self._grad,
+            episodes=self.total - resumed,
+            resumed=resumed,
+            seconds=round(seconds, 3),
+            loss={"lowest": min(ends, default=None), "highest": max(ends, default=None)},
+            frames=frames,
+            command=self.command,
+            files=[*sorted({name.split("/")[0] for name in self.motion.stores}), FILM, GIF, STREAM, SUMMARY],
+        )
+
+
+@dataclass
+class _Count:
+    """Hold how much of a sweep is sampled, over all of its slices, and show it."""
+
+    advance: Advance
+    slices: int
+    number: int = 1
+    finished: int = 0
+    failed: int = 0
+
+    def follow(self, now: Progress) -> None:
+        """Show how far the slice under way is."""
+        failed = self.failed + now.done - now.statuses.get(Status.OK, 0)
+        said = f"slice {self.number} of {self.slices}" + (f", {failed} failed" if failed else "")
+        self.advance(self.finished + now.done, said)
+
+    def add(self, dataset: xr.Dataset) -> None:
+        """Count a slice that is finished."""
+        self.number += 1
+        self.finished += dataset["status"].size
+        self.failed += int((dataset["status"] != Status.OK).sum())
+
+
+def sweep_folder(env: Environment, motion: Motion, over: int | str, *, grad: bool = True) -> Path:
+    """Return a folder of its own for every different sweep, the same for the same one."""
+    planes = [plane.record() for plane in motion.planes]
+    axes = [int(row.nonzero()[0]) for row in motion.planes[0].basis]
+    what = over if over in (SMOOTHING, HORIZON) else env.space.index(over)
+    points = "x".join(map(str, (*planes[0]["resolution"], len(motion.values))))
+    parts = ["sweep", env.name, *axes, "over", what, env.fidelity.name, points]
+    return folder_named(parts, [env.identity(), planes, motion.values, grad])
+
+
+def check_folder(folder: Path) -> None:
+    """Raise ValueError where a folder holds anything but a sweep: its films without any slice are somebody else's."""
+    held = visible_files(folder)
+    begun = [file for file in held if file.name in (FRAMES, ONLY, filling_path(Path(ONLY)).name)]
+    strange = [file for file in visible_files(folder / FRAMES) if not FRAME.fullmatch(file.name)]
+    refuse_others(folder, strange if begun else held, SWEEP.kind)
+    SWEEP.check(folder, begun)
+
+
+def _clear(folder: Path) -> None:
+    """Remove the slices of a sweep, and what was made of them."""
+    places = [*visible_files(folder / FRAMES), folder / ONLY, filling_path(folder / ONLY)]
+    stores = [store for store in places if store.exists()]
+    for store in stores:
+        check_replaceable(store)
+    for store in stores:
+        discard(store)
+    for name in (FILM, GIF, STREAM, SUMMARY):
+        (folder / name).unlink(missing_ok=True)
+
+
+def _never_drawn(dataset: xr.Dataset) -> Figure:
+    raise NotImplementedError("a sweep draws all of its slices on one scale")

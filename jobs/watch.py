@@ -1,0 +1,75 @@
+"""What a job tells whoever watches it, and how it ends when it is stopped. A job itself prints nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+
+from ..landscapes.storage.disk import until_full
+
+Advance = Callable[..., None]  # advance(done, said=""): so much is done, and what is said beside the bar
+AdvanceOne = Callable[[str, int, str], None]  # advance(name, done, said): the same, of one of several
+Say = Callable[[str], None]  # say(text): what is being done now
+
+
+PREPARING = "preparing (kernels are compiled once, then kept)"
+
+
+class Stopped(KeyboardInterrupt):
+    """Say what is kept of a job that Ctrl-C has stopped; the same call, or the same command, goes on from there.
+
+    Where nothing is `kept`, it begins again.
+    """
+
+    def __init__(self, said: str, *, kept: bool = True) -> None:
+        super().__init__(said)
+        self.kept = kept
+
+
+@contextmanager
+def resumable(kept: Callable[[], str], leave: Callable[[], object] = lambda: None) -> Iterator[None]:
+    """Let Ctrl-C and a full disk end a job with what is `kept` of it; what is to be left behind is left before.
+
+    Raises Stopped for KeyboardInterrupt, and DiskFullError for a full disk.
+    """
+    try:
+        with until_full(kept):
+            yield
+    except KeyboardInterrupt as error:
+        said = kept()
+        leave()
+        raise Stopped(said) from error
+
+
+class Watch:
+    """Take no notice of what a job tells; a watch that shows it derives from this one and overrides its methods."""
+
+    def note(self, text: str) -> None:
+        """Take a line that is worth keeping: what a job will cost, a warning, what it has left out."""
+
+    @contextmanager
+    def busy(self, text: str) -> Iterator[Say]:
+        """Take what a job does that nothing can be counted of, as long as it does it; give what says it otherwise."""
+        yield _ignore_text
+
+    @contextmanager
+    def progress(self, total: int, what: str = "episodes") -> Iterator[Advance]:
+        """Give a function that takes how many of `total` are done, and in words what to say beside that."""
+        yield _ignore
+
+    @contextmanager
+    def progress_of(self, totals: Mapping[str, int]) -> Iterator[AdvanceOne]:
+        """Give a function that takes of which of several things how many of its total are done, and what to say."""
+        yield _ignore_one
+
+
+def _ignore(done: int, said: str = "") -> None:
+    """Take no notice."""
+
+
+def _ignore_one(name: str, done: int, said: str) -> None:
+    """Take no notice."""
+
+
+def _ignore_text(text: str) -> None:
+    """Take no notice."""

@@ -1,0 +1,169 @@
+"""Checks at the edges of an objective's domain: it returns a number or a status, never a silent NaN."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import combinations
+from math import comb
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..objective import Evaluation, Objective, Status
+from .finding import SKIP, Finding, verdict
+from .subject import Subject, difference
+
+CORNERS = 16  # a box of no more corners is checked at all of them
+OUTSIDE = (0.01, 0.1)  # how far outside the box, as shares of it
+ROWS = 2  # points that a variant is checked at
+RISE = 0.1  # of the energy there is at first: what semi-implicit steps may add for a while in a stiff contact
+KINDS = {"finite": Status.OK, "non-finite": Status.NONFINITE, "escaped": Status.ESCAPED, "error": Status.ERROR}
+
+
+@dataclass(frozen=True)
+class ExtremeCase:
+    """Push an objective another way: `make` returns it, or raises ValueError where it refuses that.
+
+    It is evaluated at `x`, or else at the first few of the points, and what was made has to answer there. `why` is
+    worth knowing beside the answer, or says why there is nothing to make.
+    """
+
+    name: str
+    make: Callable[[], Objective] | None = None
+    why: str = ""
+    x: Float[Tensor, "batch dim"] | None = None
+
+
+def checks(
+    subject: Subject, other: Callable[[], Subject] | None, variants: Sequence[ExtremeCase]
+) -> Iterator[tuple[str, Callable[[], Finding]]]:
+    """Yield the name of each extreme and what checks it."""
+    space, objective = subject.objective.space, subject.objective
+    ends = corners(space.dim)
+    some = f"{len(ends)} of 2^{space.dim} corners, every two parameters in all four combinations"
+    many = f"all {len(ends)} corners" if len(ends) == 2**space.dim else some
+    yield "corners", lambda: _check_at("corners", objective, space.from_unit(ends), many)
+    yield "centre", lambda: _check_at("centre", objective, space.center[None])
+    for share in OUTSIDE:
+        name, beyond = f"{share:.0%} outside the box", space.from_unit(ends + share * (2 * ends - 1))
+        yield name, partial(_check_beyond, name, objective, beyond)
+    yield "float32 against float64", lambda: _check_precisions(subject, "float32 against float64", other)
+    for variant in variants:
+        yield variant.name, partial(_check_variant, subject, variant)
+    yield "energy drift", lambda: _check_energy(subject, "energy drift")
+
+
+def corners(dim: int) -> Float[Tensor, "corner dim"]:
+    """Return all corners of the unit cube, or few where every two parameters meet in all four combinations.
+
+    Of n rows, the first all zero, columns are the different choices of ceil(n / 2) others (Kleitman and Spencer 1973,
+    Families of k-independent sets): two of them share a row, and each has one the other lacks.
+    """
+    if 2**dim <= CORNERS:
+        return torch.cartesian_prod(*[torch.tensor([0.0, 1.0], dtype=torch.float64)] * dim).view(-1, dim)
+    rows = next(n for n in range(3, dim + 3) if comb(n - 1, -(-n // 2)) >= dim)
+    found = torch.zeros(rows, dim, dtype=torch.float64)
+    for column, chosen in zip(range(dim), combinations(range(1, rows), -(-rows // 2)), strict=False):
+        found[list(chosen), column] = 1.0
+    return found
+
+
+def count_endings(found: Evaluation) -> tuple[dict[str, float | None], str]:
+    """Count how rows ended, and say what is wrong with them: loss and gradient are finite exactly where OK."""
+    status = found.status
+    counts: dict[str, float | None] = {kind: float((status == code).sum()) for kind, code in KINDS.items()}
+    finite = found.loss.isfinite()
+    if found.grad is not None:
+        finite = finite & found.grad.isfinite().all(dim=1)
+        sound = found.grad[finite].abs()
+        counts["largest_gradient"] = float(sound.max()) if sound.numel() else None
+    wrong = {
+        "rows have no status": int(sum(count or 0.0 for kind, count in counts.items() if kind in KINDS)) < len(status),
+        "rows of status OK are not finite": bool(((status == Status.OK) & ~finite).any()),
+        "rows that failed have a finite loss": bool(((status != Status.OK) & found.loss.isfinite()).any()),
+    }
+    return counts, "; ".join(what for what, so in wrong.items() if so)
+
+
+def describe_counts(counts: Mapping[str, float | None]) -> str:
+    """Say in a line how rows ended."""
+    ends = ", ".join(f"{counts[kind]:.0f} {kind}" for kind in KINDS if counts[kind])
+    largest = counts.get("largest_gradient")
+    return ends + ("" if largest is None else f"; largest |grad| {largest:.1e}")
+
+
+def _check_at(
+    name: str, objective: Objective, x: Float[Tensor, "batch dim"], what: str = "", *, may_refuse: bool = False
+) -> Finding:
+    try:
+        found = objective.evaluate(x)
+    except ValueError as refusal:
+        if not may_refuse:
+            raise
+        return verdict(name, True, f"refused: {' '.join(str(refusal).split())}")
+    return _judge(name, found, what)
+
+
+def _check_beyond(name: str, objective: Objective, x: Float[Tensor, "batch dim"]) -> Finding:
+    if not getattr(objective, "beyond_box", False):
+        return Finding(name, SKIP, "not asked", "it does not invite points beyond its box (beyond_box = True does)")
+    return _check_at(name, objective, x, may_refuse=True)
+
+
+def _judge(name: str, found: Evaluation, what: str = "") -> Finding:
+    counts, wrong = count_endings(found)
+    figure = f"{what}: {describe_counts(counts)}" if what else describe_counts(counts)
+    return replace(verdict(name, not wrong, figure, wrong), numbers=counts)
+
+
+def _check_variant(subject: Subject, variant: ExtremeCase) -> Finding:
+    if variant.make is None:
+        return Finding(variant.name, SKIP, "n/a", variant.why)
+    try:
+        objective = variant.make()
+    except ValueError as refusal:
+        return verdict(variant.name, True, f"refused: {' '.join(str(refusal).split())}")
+    if objective is subject.objective and variant.x is None:
+        found = _judge(variant.name, subject.rows(torch.arange(ROWS)))
+    else:
+        found = _check_at(variant.name, objective, subject.x[:ROWS] if variant.x is None else variant.x)
+    return replace(found, why="; ".join(filter(None, (found.why, variant.why))))
+
+
+def _check_energy(subject: Subject, name: str) -> Finding:
+    """Check that the energy of undriven motions does not rise, where the objective offers `energy`.
+
+    `energy(x)` returns it over time, shape (batch, step), counted from rest at the lowest place, or None.
+    """
+    offered = getattr(subject.objective, "energy", None)
+    found = None if offered is None else offered(subject.x[:ROWS])
+    if found is None:
+        return Finding(name, SKIP, "n/a", "the objective offers no energy")
+    first = found[:, :1]
+    rise = difference((found - found.cummin(dim=1).values) / first, torch.zeros_like(found))
+    left = float((found[:, -1:] / first).mean())
+    figure = f"rises by up to {rise:.1e} of what there is at first, of which {left:.4g} are left at the end"
+    judged = verdict(name, rise <= RISE, figure, f"at most {RISE:g} is wanted: the steps add energy")
+    return replace(judged, numbers={"rise": rise, "left": left, "limit": RISE})
+
+
+def _check_precisions(subject: Subject, name: str, other: Callable[[], Subject] | None) -> Finding:
+    """Hold an objective against itself in the other precision: gradients agree as a third of float32's digits."""
+    if other is None:
+        return Finding(name, SKIP, "n/a", f"it computes in {subject.precision} only")
+    twin = other()
+    both = (subject.first.status == Status.OK) & (twin.first.status == Status.OK)
+    loss = difference(subject.first.loss[both], twin.first.loss[both]) / subject.scale
+    numbers: dict[str, float | None] = {"both_finite": float(both.sum()), "loss": loss, "gradient": None}
+    figure = f"{int(both.sum())} of {len(both)} points finite in both, losses up to {loss:.1e} of their range apart"
+    if subject.first.grad is None or twin.first.grad is None or not bool(both.any()):
+        return Finding(name, SKIP, figure, "no gradients to compare", numbers)
+    gap = (subject.first.grad[both] - twin.first.grad[both]).norm(dim=1)
+    length = torch.maximum(subject.first.grad[both].norm(dim=1), twin.first.grad[both].norm(dim=1))
+    error = float((gap / length).nan_to_num(nan=0.0).quantile(0.5))  # nan: both are exactly zero
+    limit = 10 * max(subject.eps, twin.eps) ** (1 / 3)
+    found = verdict(name, error <= limit, f"{figure}, gradients {error:.1e} (median)", f"wanted: at most {limit:.0e}")
+    return replace(found, numbers={**numbers, "gradient": error, "limit": limit})

@@ -1,0 +1,73 @@
+"""The seconds that an episode takes, measured on the objective itself; everything that is announced uses it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from .objective import Objective
+
+MOMENT = 0.5  # seconds to spend on measuring what an episode alone costs
+LONG = 5.0  # seconds from which the first, which warms things up, must do
+ENOUGH = 1.0  # seconds that a batch must take to be an estimate
+WARM_UP = 10.0  # seconds from which a first batch, which may compile, is not repeated
+
+
+@dataclass(frozen=True)
+class EpisodeCost:
+    """Say what an episode costs [s], alone, without gradient and with it; the latter NaN where it was not measured."""
+
+    forward: float
+    gradient: float
+
+    @property
+    def ratio(self) -> float:
+        """What an episode with gradient costs, in episodes without."""
+        return self.gradient / self.forward
+
+
+def episode_cost(objective: Objective, *, grad: bool = True) -> EpisodeCost:
+    """Measure one random episode, without and with gradient in turn: the best of those that fit into a moment."""
+    getattr(objective, "prepare", lambda: None)()
+    x = objective.space.uniform(1, seed=0)
+    best = {False: float("inf"), True: float("inf") if grad else float("nan")}
+    began, rounds = time.perf_counter(), 0
+    while time.perf_counter() - began < (MOMENT if rounds > 1 else LONG):
+        for way in (False, True) if grad else (False,):
+            best[way] = min(best[way], measure_seconds(objective, x, grad=way))
+        rounds += 1
+    return EpisodeCost(best[False], best[True])
+
+
+def seconds_per_episode(objective: Objective, points: Float[Tensor, "batch dim"], *, grad: bool) -> float:
+    """Measure what an episode costs where many are computed, at points such as those that will be [s].
+
+    As many points as there are threads are timed, again (a first time is longer), then more until they take long. A GPU
+    takes a whole batch at once: of one point most would be launches.
+    """
+    whole = getattr(objective, "device", "cpu") == "cuda"
+    rows = len(points) if whole else min(len(points), getattr(objective, "threads", 1))
+    seconds = measure_seconds(objective, points[:rows], grad=grad)
+    if seconds < WARM_UP:
+        seconds = measure_seconds(objective, points[:rows], grad=grad)
+    while seconds < ENOUGH and rows < len(points):
+        rows = min(4 * rows, len(points))
+        seconds = measure_seconds(objective, points[:rows], grad=grad)
+    return seconds / rows
+
+
+def measure_seconds(objective: Objective, points: Float[Tensor, "batch dim"], *, grad: bool) -> float:
+    """Return how long one evaluation takes [s]."""
+    start = time.perf_counter()
+    objective.evaluate(points, grad=grad)
+    return time.perf_counter() - start
+
+
+def duration(seconds: float) -> str:
+    """Return a time in words, to about two digits."""
+    if seconds < 90:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -1,0 +1,1 @@
+"""Figures of matplotlib, one file for each kind."""

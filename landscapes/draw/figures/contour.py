@@ -1,0 +1,195 @@
+"""A slice as the loss map over its gradient arrows (matplotlib)."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+import torch
+import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
+from numpy.typing import NDArray
+
+from ...identity import plane_of
+from ...plane import Plane
+from .. import style
+from . import page, panel
+
+Grid = NDArray[np.float64]
+
+PITCH = 6.0  # room of a map with its colour bar on a screen [inch]
+
+
+def landscape_figure(dataset: xr.Dataset, *, width: float | None = None) -> page.Picture:
+    """Draw a slice of rank 2: the loss as colours above, its negated gradients as arrows below, or beside it.
+
+    Each cell is one sample, or for a coarse slice the part of the box nearest to it; nothing is interpolated. All
+    arrows are equally long and point down the steepest slope of the picture as it is seen, its axes scaled to the same
+    length; their colour is the magnitude of the gradient along the plane. Failures are hatched and counted. `width` is
+    that of a page for print [mm]; as for every picture, without it the picture is as large as suits a screen.
+
+    Raises ValueError where the slice is a line, or the page too narrow or too wide.
+    """
+    plane = plane_of(dataset)
+    if plane.rank != 2:
+        raise ValueError(f"landscape_figure draws planes; got a slice of rank {plane.rank}, so use profile_figure")
+    panels = 2 if "grad" in dataset else 1
+    sheet = style.Sheet.of(width, pitch=PITCH, panels=panels)
+    picture = page.Picture(sheet, panels / sheet.columns * sheet.pitch)
+    axes = panel.grid(picture, panels, share=True)
+    entries = loss_panel(axes[0], dataset)
+    entries += arrow_panel(axes[1], dataset) if panels == 2 else []
+    for ax in axes:
+        frame(ax, dataset, plane)
+        panel.name_outer(ax, *plane.labels)
+    page.head(picture, axes[0], dataset)
+    page.finish(picture, [*entries, *page.failure_key(dataset)])
+    return picture
+
+
+def frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
+    """Give a panel over a slice its limits, its ticks and its failures."""
+    panel.dress(ax)
+    ax.set_box_aspect(1)
+    ax.set_xlim(*_limits(plane, 0))
+    ax.set_ylim(*_limits(plane, 1))
+    panel.name_axes(ax, y=plane.labels[1])
+    status = dataset["status"].to_numpy()
+    edges = cell_edges(dataset)
+    for kind, look in style.STATUS_LOOKS.items():
+        if (where := status == kind).any():
+            patch = PathPatch(_cells(*edges, where), **look, zorder=1.5, antialiased=False, gid=kind.name)
+            ax.add_patch(patch)
+
+
+def _cells(u: Grid, v: Grid, where: NDArray[np.bool_]) -> Path:
+    """Return the outlines of the chosen cells as one path: hatching it costs as much as hatching one cell."""
+    corners = [
+        [(u[column], v[row]), (u[column + 1], v[row]), (u[column + 1], v[row + 1]), (u[column], v[row + 1])]
+        for row, column in np.argwhere(where)
+    ]
+    return Path.make_compound_path(*(Path([*corner, corner[0]], closed=True) for corner in corners))
+
+
+def loss_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> list[Artist]:
+    """Draw the loss map and its lowest sample, on the slice's own scale unless given; return the legend's entries."""
+    loss = dataset["loss"].to_numpy()
+    loss_map(ax, dataset, scale or style.Scale.of_loss(loss))
+    u, v = dataset["u"].to_numpy(), dataset["v"].to_numpy()
+    if not np.isfinite(loss).any():
+        return []
+    if np.nanmin(loss) == np.nanmax(loss):
+        return [Line2D([], [], linestyle="none", label=f"every sample: {style.number(np.nanmin(loss))}")]
+    row, column = np.unravel_index(np.nanargmin(loss), loss.shape)
+    look = page.sheet_of(ax).look(style.LOWEST_MARK)
+    (lowest,) = ax.plot(u[column], v[row], **look, label=f"lowest sample: {style.number(loss[row, column])}")
+    return [lowest]
+
+
+def loss_map(ax: Axes, dataset: xr.Dataset, scale: style.Scale) -> None:
+    """Draw every sample's loss as the colour of its cell, with the colour bar."""
+    loss = dataset["loss"].to_numpy()
+    mesh = ax.pcolormesh(
+        *cell_edges(dataset), np.ma.masked_invalid(loss), cmap=style.LOSS_MAP, norm=scale.norm, rasterized=True
+    )
+    panel.colour_bar(ax, mesh, page.loss_name(dataset), scale)
+
+
+def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> list[Artist]:
+    """Draw the negated gradients as arrows, on the slice's own scale unless given; return the legend's entries."""
+    plane = plane_of(dataset)
+    rows, columns = (pick_arrows(dataset.sizes[name]) for name in ("v", "u"))
+    slope = plane.slope(torch.from_numpy(dataset["grad"].to_numpy())).numpy()
+    size, label = magnitude(slope, plane, dataset["loss"].attrs.get("units", ""))
+    flat = size == 0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logarithm = np.where(flat, np.nan, np.log10(size))
+    scale = scale or style.Scale.of_magnitude(logarithm)
+    at = np.ix_(rows, columns)
+    u, v = np.meshgrid(dataset["u"].to_numpy()[columns], dataset["v"].to_numpy()[rows])
+    sides = _sides(plane)
+    length = _length(u[0] / sides[0], v[:, 0] / sides[1])
+    steps = length * sides * descent(slope[at], plane)
+    seen = np.isfinite(logarithm[at])
+    quiver = ax.quiver(
+        u[seen], v[seen], steps[seen, 0], steps[seen, 1], logarithm[at][seen],
+        cmap=style.SLOPE_MAP, norm=scale.norm, pivot="mid", angles="xy", scale_units="xy", scale=1.0, **style.ARROW,
+    )  # fmt: skip
+    bar = panel.colour_bar(ax, quiver, label, scale)
+    bar.ax.set_visible(bool(seen.any()))  # hidden rather than left out, so that both panels keep their width
+    if not flat.any():
+        return []
+    look = page.sheet_of(ax).look(style.FLAT_MARK)
+    ax.plot(u[flat[at]], v[flat[at]], **look, zorder=2.5)
+    return [Line2D([], [], **look, label=f"gradient exactly zero: {int(flat.sum())} of {flat.size}")]
+
+
+def log_magnitude(dataset: xr.Dataset) -> Grid:
+    """Return the decimal logarithm of the gradient's length along the plane; NaN where it is zero or unknown."""
+    plane = plane_of(dataset)
+    slope = plane.slope(torch.from_numpy(dataset["grad"].transpose("v", "u", "dim").to_numpy())).numpy()
+    size, _ = magnitude(slope, plane, "")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(size == 0, np.nan, np.log10(size))
+
+
+def descent(slope: Grid, plane: Plane) -> Grid:
+    """Return the direction of steepest descent as unit vectors in fractions of the picture's sides; NaN where flat."""
+    scaled = slope * _sides(plane)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scaled = scaled / np.abs(scaled).max(axis=-1, keepdims=True)  # no overflow, no underflow
+        direction: Grid = -scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)
+    return direction
+
+
+def magnitude(slope: Grid, plane: Plane, loss_unit: str) -> tuple[Grid, str]:
+    """Return the length of the gradient along the plane, and its label.
+
+    Where both axes have the same unit it is the gradient's projection on the plane. Otherwise lengths along them cannot
+    be added, and it is taken per width of the box instead.
+    """
+    if len(set(plane.units)) == 1:
+        along: Grid = slope @ torch.linalg.pinv(plane.basis).T.numpy()
+        unit = plane.units[0]
+        unit = f"{loss_unit or '1'}/({unit})" if "/" in unit else f"{loss_unit or '1'}/{unit}" if unit else loss_unit
+    else:
+        along = slope * (plane.upper - plane.lower).numpy()
+        unit = f"{loss_unit or 'loss'} per width of the box"
+    return np.linalg.norm(along, axis=-1), f"log₁₀ |gradient| [{unit}]" if unit else "log₁₀ |gradient|"
+
+
+def _limits(plane: Plane, axis: int) -> tuple[float, float]:
+    low, high = plane.cell_bounds()
+    return float(low[axis]), float(high[axis])
+
+
+def _sides(plane: Plane) -> Grid:
+    return np.diff([_limits(plane, axis) for axis in range(plane.rank)])[:, 0]
+
+
+def _length(*positions: Grid) -> float:
+    """Return the length of arrows at these places along each side, in fractions of it, so that few of them touch."""
+    closest = min(float(np.diff(places).min()) for places in positions)
+    densest = max(len(places) for places in positions)
+    return min(style.LONGEST_ARROW, max(0.86 * closest, 0.45 / densest))
+
+
+def cell_edges(dataset: xr.Dataset) -> tuple[Grid, Grid]:
+    """Return where the cells of a plane's samples end along u and v, from border to border of the picture."""
+    plane = plane_of(dataset)
+    u, v = (_edges(dataset[name].to_numpy(), *_limits(plane, axis)) for axis, name in enumerate("uv"))
+    return u, v
+
+
+def _edges(centers: Grid, low: float, high: float) -> Grid:
+    return np.concatenate([[low], (centers[1:] + centers[:-1]) / 2, [high]])
+
+
+def pick_arrows(points: int) -> NDArray[np.intp]:
+    """Return which of so many points along an axis keep their arrow."""
+    step = -(-points // style.ARROWS)
+    return cast("NDArray[np.intp]", np.arange((points - 1) % step // 2, points, step))

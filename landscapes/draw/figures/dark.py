@@ -1,0 +1,89 @@
+"""Pictures for dark pages: greys are inverted, and colours stay, so that a map agrees with its colour bar."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import to_rgba_array
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.ndimage import binary_dilation
+
+from ...storage.files import replacing
+from .. import style
+from .page import Picture
+
+Colours = NDArray[np.float64]
+
+COLOURS = ("color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor")  # that an artist may have
+PALE_GREY, GREY = (0.04, 0.12), (0.015, 0.04)  # up to which difference of its channels a colour is grey, and from which
+# on it is none, where it is pale and where it is not: cividis has colours that are nearly grey, and not pale
+MIDDLE = (0.40, 0.53)  # lightness of greys that stay: turned over they would hardly change, and cividis has them
+PAPER, PALE = 0.975, 0.6  # lightness of the page, and of colours that it shines through
+NEIGHBOURHOOD = 3  # pixels within which such colours are near the page
+
+
+def darken(picture: Picture) -> None:
+    """Recolour a picture, as it is drawn, for a dark page; arrows have the map that is seen there."""
+    for artist in picture.findobj(lambda one: not isinstance(one, Figure | Axes)):  # these have their patches' colours
+        if isinstance(artist, ScalarMappable) and artist.get_array() is not None:
+            if artist.get_cmap() == style.SLOPE_MAP:
+                artist.set_cmap(style.SLOPE_MAP_DARK)
+        else:
+            _darken(artist)
+
+
+def _darken(artist: Artist) -> None:
+    for name in COLOURS:
+        read, write = (getattr(artist, f"{verb}_{name}", None) for verb in ("get", "set"))
+        if read is None or write is None or (isinstance(value := read(), str) and value in ("none", "auto")):
+            continue
+        found = to_rgba_array(value)
+        if len(found):
+            write(invert_greys(found) if np.ndim(value) == 2 else tuple(invert_greys(found)[0]))
+    strokes = [_gc(effect) for effect in artist.get_path_effects() or [] if isinstance(effect, withStroke)]
+    if strokes:
+        grounds = [tuple(invert_greys(to_rgba_array(stroke["foreground"]))[0]) for stroke in strokes]
+        artist.set_path_effects(
+            [withStroke(**{**stroke, "foreground": ground}) for stroke, ground in zip(strokes, grounds, strict=True)]
+        )
+
+
+def _gc(effect: Any) -> dict[str, Any]:
+    found: dict[str, Any] = effect._gc
+    return found
+
+
+def invert_greys(colours: Colours) -> Colours:
+    """Return colours, shape (..., 3 or 4), greys among them as light on the dark ground as they were dark on white."""
+    rgb, rest = colours[..., :3], colours[..., 3:]
+    level, chroma = rgb.mean(axis=-1, keepdims=True), np.ptp(rgb, axis=-1, keepdims=True)
+    ground, ink = (to_rgba_array(name)[0, :3] for name in (style.NIGHT, style.NIGHT_INK))
+    least, most = (np.where(level > PALE, *ends) for ends in zip(PALE_GREY, GREY, strict=True))
+    grey = np.clip((most - chroma) / (most - least), 0.0, 1.0)
+    grey = np.where((level > MIDDLE[0]) & (level < MIDDLE[1]), 0.0, grey)
+    found: Colours = np.concatenate([grey * (ground + (1 - level) * (ink - ground)) + (1 - grey) * rgb, rest], axis=-1)
+    return found
+
+
+def save_dark(source: Path, target: Path) -> None:
+    """Write a picture that is there as PNG for a dark page: where a colour meets the paper, the paper is taken out."""
+    with Image.open(source) as picture:
+        light = np.asarray(picture.convert("RGB"), dtype=np.float64) / 255
+    level, chroma = light.mean(axis=-1), np.ptp(light, axis=-1)
+    paper, pale = (level > PAPER) & (chroma < PALE_GREY[0]), (level > PALE) & (chroma > PALE_GREY[0])
+    edge = binary_dilation(paper, iterations=NEIGHBOURHOOD) & pale
+    ground = to_rgba_array(style.NIGHT)[0, :3]
+    dark = invert_greys(light)
+    dark[edge] = light[edge] - light[edge].min(axis=-1, keepdims=True) * (1 - ground)
+    pixels = Image.fromarray(np.rint(255 * np.clip(dark, 0.0, 1.0)).astype(np.uint8))
+    with replacing(target) as partial:
+        few = pixels.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        few.save(partial, "PNG", optimize=True)

@@ -1,0 +1,278 @@
+"""Runs over a slice: their points on the loss map, and their losses against those of the map (matplotlib)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import to_rgba
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
+from numpy.typing import NDArray
+
+from ...identity import plane_of
+from ...objective import Status
+from ...overlay import improvements
+from ...plane import Plane
+from .. import style
+from . import contour, labels, page, panel
+
+Runs = Sequence[xr.Dataset]
+PITCH = 5.4  # room of a panel on a screen [inch]
+HEADING = "Marker size: distance from the plane; colour: the loss the point truly had"
+FEW = 24  # most improvements that are numbered, over all runs
+CROWD = 4  # runs from which on the lines that join them are thinner
+
+
+def overlay_figure(dataset: xr.Dataset, runs: Runs, *, width: float | None = None) -> page.Picture:
+    """Draw runs, as `overlay` lays them, over the loss map of their slice, and their losses against the map's.
+
+    The colour of a marker is the loss that the point truly had, on the map's own scale: where it differs from the
+    colour around it, the plane does not show the point. Markers get smaller, and descents fainter, with the distance
+    from the plane. A white line joins the improvements of a run, up to the star at its best point; numbers say in which
+    episodes they came, as far as there is room. Points beyond the map are hollow and at its border; failed episodes are
+    crosses. The panel on the right, or below on a narrow page, compares each point with the sample beneath it: points
+    on the diagonal have the loss that the map shows.
+
+    Raises ValueError where the page is too narrow or too wide.
+    """
+    plane, reach = plane_of(dataset), farthest_distance(runs)
+    sheet = style.Sheet.of(width, pitch=PITCH, columns=2)
+    picture = page.Picture(sheet, 2 / sheet.columns * sheet.pitch)
+    over, against = panel.grid(picture, 2)
+    scale = joint_scale(dataset, runs)
+    contour.loss_map(over, dataset, scale)
+    contour.frame(over, dataset, plane)
+    panel.name_axes(over, plane.labels[0])
+    for run in sorted(runs, key=lambda run: -run.sizes["evaluation"]):
+        _draw_run(over, run, plane, scale, reach, _count(runs))
+        _join_improvements(over, run, plane, len(runs))
+    _draw_against(against, dataset, runs, reach)
+    page.head(picture, over, dataset, f"{page.title(dataset)} · {_describe_runs(runs)}")
+    entries = [*_run_entries(sheet, runs), *_order_entries(sheet, runs), *_kind_entries(sheet, runs)]
+    entries += [*_distance_entries(sheet, runs, reach), *_count_entries(sheet, runs)]
+    page.finish(picture, [*entries, *page.failure_key(dataset)], heading=HEADING)
+    _number_improvements(over, runs, plane)
+    return picture
+
+
+def joint_scale(dataset: xr.Dataset, runs: Runs) -> style.Scale:
+    """Return the scale of the losses of a slice and of the runs over it.
+
+    The slice rules it, so that the map keeps its colours: it ends with the slice's own at the upper end, and at the
+    lower reaches down to the runs' best losses by no more than a decade, or by the slice's range where losses are not
+    positive. What is beyond has the colour of the end, which the colour bar shows open.
+    """
+    own = dataset["loss"].to_numpy().ravel()
+    values = np.concatenate([own, *(run["loss"].to_numpy() for run in runs)])
+    if not np.isfinite(own).any():
+        return style.Scale.of_loss(values)
+    low, high = style.Scale.of_loss(own).ends
+    floor = low / 10 if low > 0 else 2 * low - high
+    return style.Scale.of_loss(np.clip(values, floor, high)).over(values)
+
+
+def farthest_distance(runs: Runs) -> float:
+    """Return the greatest distance of any point from the plane [half-widths of the box], 0 where it is rounding."""
+    most = max((float(run["distance"].max()) for run in runs if run.sizes["evaluation"]), default=0.0)
+    return most if most > 1e-9 else 0.0
+
+
+def _draw_run(ax: Axes, run: xr.Dataset, plane: Plane, scale: style.Scale, reach: float, points: int) -> None:
+    color, sheet = style.method(run)["color"], page.sheet_of(ax)
+    place = _places(run, plane)
+    loss, distance, outside = (run[name].to_numpy() for name in ("loss", "distance", "outside"))
+    ax.add_collection(_descent_lines(run, place, reach, sheet))
+    areas = sheet.weight**2 * style.point_areas(distance, reach, points)
+    for name, here in by_kind(run):
+        look: dict[str, Any] = {"edgecolors": color, "marker": style.POINT_MARKS[name]["marker"]}
+        if (some := here & ~outside & np.isfinite(loss)).any():
+            u, v = place[some].T
+            ax.scatter(u, v, s=areas[some], marker=look["marker"], **sheet.look(style.HALO))
+            fill: dict[str, Any] = {"c": loss[some], "cmap": style.LOSS_MAP, "norm": scale.norm}
+            ax.scatter(u, v, s=areas[some], gid=name, **look, **fill, **sheet.look(style.OVERLAID))
+        if (some := here & outside).any():
+            u, v = place[some].T
+            ax.scatter(u, v, gid="outside", **look, **sheet.look(style.BORDER))
+    failed = (run["status"].to_numpy() != Status.OK) & ~outside
+    if failed.any():
+        ax.scatter(place[failed, 0], place[failed, 1], **sheet.look(style.FAILED_MARK), gid="failed")
+    if np.isfinite(loss).any():
+        row = int(np.nanargmin(loss))
+        inside = "none" if outside[row] else [style.LOSS_MAP(scale.norm(loss[row]))]
+        u, v = place[row]
+        best = sheet.look(style.BEST_MARK)
+        ax.scatter([u], [v], facecolors=inside, edgecolors=color, clip_on=False, gid="best", **best)
+
+
+def _places(run: xr.Dataset, plane: Plane) -> NDArray[np.float64]:
+    """Return where a run's points are drawn, shape (point, 2): those beyond the map at its border."""
+    low, high = (side.numpy() for side in plane.cell_bounds())
+    found: NDArray[np.float64] = np.clip(np.stack([run["u"], run["v"]], axis=1), low, high)
+    return found
+
+
+def by_kind(run: xr.Dataset) -> list[tuple[str, NDArray[np.bool_]]]:
+    """Return, for each kind of point a run has, its name and which rows are of it."""
+    about, kind = run["kind"].attrs, run["kind"].to_numpy()
+    pairs = zip(about["flag_values"], str(about["flag_meanings"]).split(), strict=True)
+    return [(name, kind == code) for code, name in pairs if (kind == code).any()]
+
+
+def _descent_lines(run: xr.Dataset, place: NDArray[np.float64], reach: float, sheet: style.Sheet) -> LineCollection:
+    rows = np.flatnonzero(run["previous"].to_numpy() >= 0)
+    before = run["previous"].to_numpy()[rows]
+    distance = run["distance"].to_numpy()
+    away = (distance[rows] + distance[before]) / 2 / (reach or 1.0)
+    colors = np.tile(to_rgba(style.method(run)["color"]), (len(rows), 1))
+    colors[:, 3] = 1 - (1 - style.FAINTEST) * away
+    lines = np.stack([place[before], place[rows]], axis=1)
+    return LineCollection(list(lines), colors=colors, gid="descents", **sheet.look(style.DESCENT_LINE))
+
+
+def _join_improvements(ax: Axes, run: xr.Dataset, plane: Plane, runs: int) -> None:
+    thinner = min(1.0, (CROWD / runs) ** 0.5)
+    for look in style.IMPROVEMENTS:
+        scaled = page.sheet_of(ax).look(look | {"linewidth": thinner * look["linewidth"]})
+        ax.plot(*_places(run, plane)[improvements(run)].T, gid="order", **scaled)
+
+
+def _number_improvements(ax: Axes, runs: Runs, plane: Plane) -> None:
+    """Write the episodes of improvements beside them, the last of each run first, as far as there is room."""
+    places = [_places(run, plane) for run in runs]
+    rows = [improvements(run)[::-1] for run in runs]
+    turns = range(max(map(len, rows), default=0))
+    picked = [(number, own[turn]) for turn in turns for number, own in enumerate(rows) if turn < len(own)][:FEW]
+    names = [labels.Name(str(row + 1), tuple(places[number][row])) for number, row in picked]
+    clear = np.concatenate([place[own] for place, own in zip(places, rows, strict=True)])
+    size = page.sheet_of(ax).small
+    labels.place(ax, names, clear, size=size, gaps=(0.7 * size,), gid="episode")
+
+
+def _draw_against(ax: Axes, dataset: xr.Dataset, runs: Runs, reach: float) -> None:
+    """Draw the loss of every point against that of the sample beneath it."""
+    panel.dress(ax)
+    ax.set_box_aspect(1)
+    sheet = page.sheet_of(ax)
+    pairs = [np.stack([run["beneath"], run["loss"]]) for run in runs]
+    known = [np.isfinite(pair).all(axis=0) for pair in pairs]
+    values = np.concatenate([pair[:, some].ravel() for pair, some in zip(pairs, known, strict=True)])
+    low, high = _square(ax, style.Scale.of_loss(values))
+    for run, (beneath, loss), some in zip(runs, pairs, known, strict=True):
+        areas = sheet.weight**2 * style.point_areas(run["distance"].to_numpy(), reach, _count(runs))
+        look = {"facecolors": style.method(run)["color"], "edgecolors": "white", **sheet.look(style.OVERLAID)}
+        for name, here in by_kind(run):
+            at = some & here
+            ax.scatter(beneath[at], loss[at], s=areas[at], marker=style.POINT_MARKS[name]["marker"], gid=name, **look)
+    unit = dataset["loss"].attrs.get("units", "")
+    per = f" [{unit}]" if unit else ""
+    panel.name_axes(ax, f"loss of the sample beneath{per}", f"loss of the point itself{per}")
+    off = int(((values < low) | (values > high)).sum())
+    said = f"{len(values) // 2} of {_count(runs)} points have a loss, and so has the sample beneath"
+    page.remark(ax, said + (f"; {off} values off scale" if off else ""))
+
+
+def _square(ax: Axes, scale: style.Scale) -> tuple[float, float]:
+    """Give both axes the range of a scale, and draw the diagonal."""
+    low, high = scale.ends
+    if scale.logarithmic:
+        low, high = low * (low / high) ** 0.03, high * (high / low) ** 0.03
+    else:
+        low, high = low - 0.03 * (high - low), high + 0.03 * (high - low)
+    ax.set(xlim=(low, high), ylim=(low, high))
+    for axis in (ax.xaxis, ax.yaxis) if scale.logarithmic else ():
+        style.log_axis(axis)
+    ax.plot([low, high], [low, high], color=style.FAINT, linewidth=page.sheet_of(ax).weight, zorder=1)
+    return low, high
+
+
+def _run_entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
+    """Return one entry per method, with its best run; per run where there is one of each."""
+    entries: list[Artist] = []
+    for method in dict.fromkeys(str(run.attrs["method"]) for run in runs):
+        own = [run for run in runs if run.attrs["method"] == method]
+        name = f"{method}, seed {own[0].attrs['seed']}" if len(own) == 1 else f"{method}, {len(own)} runs"
+        look = sheet.look({"linewidth": 1.6, "marker": "*", "markersize": 10, "markeredgewidth": 1.0})
+        look |= {"color": style.method(own[0])["color"], "markerfacecolor": "white"}
+        entries.append(Line2D([], [], **look, label=f"{name}: {_describe_best(own)}"))
+    return entries
+
+
+def _describe_best(runs: Runs) -> str:
+    found = [(float(run["best"][-1]), run) for run in runs if run.sizes["evaluation"] and run["best"][-1].notnull()]
+    if not found:
+        return "no episode succeeded"
+    loss, run = min(found, key=lambda pair: pair[0])
+    row = int(run["loss"].argmin("evaluation"))
+    away = float(run["distance"][row])
+    where = f", {half_widths(away)} off the plane" if away > 1e-9 else ""
+    beyond = ", outside the map" if bool(run["outside"][row]) else ""
+    unit = run["loss"].attrs.get("units", "")
+    return f"best {style.number(loss)}{f' {unit}' if unit else ''}{where}{beyond}"
+
+
+def half_widths(distance: float) -> str:
+    """Write a distance from the plane with its unit."""
+    said = style.number(distance, ".2g") if distance >= 1e-3 else "less than 0.001"
+    return f"{said} half-width{'' if said == '1' else 's'} of the box"
+
+
+def _order_entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
+    """Return the legend entry of the white lines, if there are any."""
+    if not any(len(improvements(run)) > 1 for run in runs):
+        return []
+    effects = [withStroke(linewidth=sheet.weight * style.IMPROVEMENTS[0]["linewidth"], foreground=style.INK)]
+    look = sheet.look(style.IMPROVEMENTS[1]) | {"path_effects": effects}
+    return [Line2D([], [], **look, label="white line: the best loss so far; numbers: episodes")]
+
+
+def _kind_entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
+    counts: dict[str, int] = {}
+    for run in runs:
+        for name, here in by_kind(run):
+            counts[name] = counts.get(name, 0) + int(here.sum())
+    look = _mark(sheet, markerfacecolor="white")
+    return [
+        Line2D([], [], marker=style.POINT_MARKS[name]["marker"], **look, label=f"{name} point: {count}")
+        for name, count in counts.items()
+    ]
+
+
+def _distance_entries(sheet: style.Sheet, runs: Runs, reach: float) -> list[Artist]:
+    if not reach:
+        return [Line2D([], [], linestyle="none", label="every point lies on the plane")]
+    steps = np.array([0.0, reach / 2, reach])
+    sizes = sheet.weight * np.sqrt(style.point_areas(steps, reach, _count(runs)))
+    look: dict[str, Any] = {"linestyle": "none", "marker": "o", "markerfacecolor": style.QUIET, "markeredgewidth": 0.0}
+    said = ("on the plane", *(f"{half_widths(float(away))} off it" for away in steps[1:]))
+    return [Line2D([], [], markersize=size, **look, label=text) for size, text in zip(sizes, said, strict=True)]
+
+
+def _count_entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
+    total = _count(runs)
+    outside = sum(int(run["outside"].sum()) for run in runs)
+    failed = sum(int((run["status"] != Status.OK).sum()) for run in runs)
+    hollow, cross = _mark(sheet, marker="o", markerfacecolor="none"), _mark(sheet, marker="x")
+    return [
+        Line2D([], [], **look, label=f"{name}: {count} of {total} points")
+        for look, name, count in ((hollow, "beyond the map", outside), (cross, "failed episode", failed))
+        if count
+    ]
+
+
+def _mark(sheet: style.Sheet, **look: Any) -> dict[str, Any]:
+    plain = {"linestyle": "none", "markeredgecolor": style.INK, "markersize": 5.5, "markeredgewidth": 1.0}
+    return sheet.look(plain | look)
+
+
+def _count(runs: Runs) -> int:
+    return sum(run.sizes["evaluation"] for run in runs)
+
+
+def _describe_runs(runs: Runs) -> str:
+    return f"{len(runs)} run{'s' if len(runs) != 1 else ''}, {_count(runs)} episodes"

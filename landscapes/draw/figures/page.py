@@ -1,0 +1,191 @@
+"""The page of a matplotlib picture: its size, title, provenance, legend and files."""
+
+from __future__ import annotations
+
+import io
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib import rc_context
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.patches import Patch
+from matplotlib.text import Text
+
+from ...identity import stored_identity, stored_provenance
+from ...objective import Status
+from ...storage.files import print_width, replacing, visible_files
+from .. import style
+from .typesetting import MARGIN, settle, title_room, wrap_text
+
+HANDLE = 4.5  # room of a legend's sign, in the height of its type
+# Type in a PDF can be selected and searched, its font goes with it. SVG cannot carry one: there type is outlines, which
+# look the same everywhere. Neither holds a clock or a random name, so that equal pictures are equal files.
+EMBEDDED: Any = {"pdf.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "gradscape"}
+DATED: dict[str, dict[str, Any]] = {"png": {}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
+_settings = threading.Lock()  # matplotlib's, which are of the whole process
+
+
+class Picture(Figure):
+    """A figure that knows its sheet, draws without a window or any global state, and shows in a notebook."""
+
+    def __init__(self, sheet: style.Sheet, height: float) -> None:
+        super().__init__(figsize=(sheet.width, height), layout="constrained")
+        self.sheet = sheet
+        self.fitted: dict[
+            Text, tuple[str, Callable[[], float]]
+        ] = {}  # what is wrapped to how much room there is [inch]
+        FigureCanvasAgg(self)
+
+    def _repr_png_(self) -> bytes:
+        """Return the picture as a notebook shows it."""
+        with io.BytesIO() as raw:
+            self.savefig(raw, format="png", dpi=style.DPI)
+            return raw.getvalue()
+
+
+def head(picture: Picture, ax: Axes, dataset: xr.Dataset, name: str | None = None) -> None:
+    """Write the title, a slice's unless named, over the figure and its provenance, small, over the uppermost panel."""
+    entitle(picture, name or title(dataset))
+    if line := provenance(dataset):
+        remark(ax, line)
+
+
+def entitle(picture: Picture, text: str) -> None:
+    """Write a title over the figure."""
+    sheet = picture.sheet
+    said = wrap_text(text, sheet.width - 2 * MARGIN, sheet.title)
+    picture.suptitle(said, size=sheet.title, color=style.INK, parse_math=False)
+
+
+def remark(ax: Axes, text: str) -> None:
+    """Write something small and quiet over a panel."""
+    write_over(ax, text, size=sheet_of(ax).small, color=style.QUIET)
+
+
+def write_over(ax: Axes, text: str, *, size: float, color: str) -> None:
+    """Write over a panel, each line in two at most."""
+    title = ax.set_title(text, size=size, color=color, parse_math=False)
+    picture_of(ax).fitted[title] = text, lambda: title_room(ax)
+
+
+def picture_of(ax: Axes) -> Picture:
+    """Return the picture that a panel is in.
+
+    Raises TypeError where it is in a figure that is no Picture.
+    """
+    picture = ax.get_figure(root=True)
+    if not isinstance(picture, Picture):
+        raise TypeError(f"panels are drawn in a Picture, which knows its sheet; got one in a {type(picture).__name__}")
+    return picture
+
+
+def sheet_of(ax: Axes) -> style.Sheet:
+    """Return the sheet of the picture that a panel is in."""
+    return picture_of(ax).sheet
+
+
+def title(dataset: xr.Dataset) -> str:
+    """Return objective, fidelity and resolution, and how much of it is sampled if not all."""
+    identity = stored_identity(dataset)
+    points = " \N{MULTIPLICATION SIGN} ".join(str(dataset.sizes[name]) for name in dataset["loss"].dims[::-1])
+    said = [str(identity[key]) for key in ("objective", "fidelity") if identity.get(key)]
+    whole = int(np.prod(identity["plane"]["resolution"]))
+    done = int((dataset["status"] != Status.MISSING).sum())
+    said.append(f"{points} points" if done == whole else f"{done} of {whole} points so far")
+    return " · ".join(said)
+
+
+def provenance(dataset: xr.Dataset) -> str:
+    """Return version, device, date and command, as far as they are known."""
+    known = {**stored_provenance(dataset), **stored_identity(dataset)}
+    said = [f"gradscape {known['gradscape']}"]
+    said += [str(known[key]) for key in ("device", "created", "command") if known.get(key)]
+    return " · ".join(said)
+
+
+def loss_name(dataset: xr.Dataset) -> str:
+    """Return what stands along an axis of losses: the word, and their unit if they have one."""
+    unit = dataset["loss"].attrs.get("units", "")
+    return f"loss [{unit}]" if unit else "loss"
+
+
+def failure_key(dataset: xr.Dataset) -> list[Patch]:
+    """Return one legend entry for each way of failing that occurs, with how often."""
+    status = dataset["status"].to_numpy()
+    names = style.FAILURES | {Status.MISSING: "not sampled yet"}
+    return [
+        Patch(**style.STATUS_LOOKS[kind], label=f"{name}: {count} of {status.size}")
+        for kind, name in names.items()
+        if (count := int((status == kind).sum()))
+    ]
+
+
+def finish(picture: Picture, entries: Sequence[Artist], *, columns: int = 2, heading: str = "") -> None:
+    """Put the legend, with a small quiet `heading` if it has one, under the panels, and fit the page's height."""
+    if entries:
+        _key(picture, entries, columns, heading)
+    settle(picture)
+
+
+def _key(picture: Picture, entries: Sequence[Artist], columns: int, heading: str) -> None:
+    """Put a legend under the panels, in fewer columns where it would be wider than the page."""
+    sheet, room = picture.sheet, picture.sheet.width - 2 * MARGIN
+    legend = picture.legend(
+        handles=list(entries),
+        labels=[
+            wrap_text(str(one.get_label()), room - HANDLE * sheet.tick / 72, sheet.tick, lines=3) for one in entries
+        ],
+        loc="outside lower center",
+        ncols=columns,
+        fontsize=sheet.tick,
+        frameon=False,
+        handlelength=1.8,
+        columnspacing=1.6,
+    )
+    for text in legend.get_texts():
+        text.set_parse_math(False)
+    if columns > 1 and legend.get_window_extent().width > room * picture.dpi:
+        legend.remove()
+        _key(picture, entries, columns - 1, heading)
+    elif heading:
+        legend.set_title(wrap_text(heading, room, sheet.small), prop=FontProperties(size=sheet.small))
+        legend.get_title().set(color=style.QUIET, parse_math=False)
+
+
+def save(figure: Figure, path: str | Path) -> None:
+    """Write a figure as PNG, PDF or SVG, by the file's ending, whole or not at all.
+
+    Raises ValueError where the ending is another.
+    """
+    path = Path(path)
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in DATED:
+        raise ValueError(f"a picture is saved as .png, .pdf or .svg; got {path.name!r}")
+    how: dict[str, Any] = {"format": kind, "dpi": style.DPI if kind == "png" else style.PRINT_DPI}
+    with replacing(path) as partial, _settings, rc_context(EMBEDDED):
+        figure.savefig(partial, metadata=DATED[kind], **how)
+
+
+def save_prints(draw: Callable[[float], Figure], path: Path, widths: Sequence[float]) -> list[str]:
+    """Write what `draw` draws for a page of so many millimetres as PDF and SVG beside `path`; return their names.
+
+    Those that are there from before are drawn anew, so that none is of something else.
+
+    Raises ValueError where a width is no page's.
+    """
+    before = {width for file in visible_files(path.parent) if (width := print_width(file.name, path.name))}
+    names = []
+    for width in dict.fromkeys([*sorted(before), *widths]):
+        figure = draw(width)
+        for kind in ("pdf", "svg"):
+            names.append(f"{path.stem}-{width:g}mm.{kind}")
+            save(figure, path.with_name(names[-1]))
+    return names

@@ -1,0 +1,141 @@
+"""A line through a landscape as a profile: loss, gradient, and where events change (matplotlib)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+
+import numpy as np
+import torch
+import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from numpy.typing import ArrayLike, NDArray
+
+from ...identity import plane_of
+from ...plane import Plane
+from .. import style
+from . import page, panel, typesetting
+
+WIDTH, LOSS, SLOPE, ROOM = 8.0, 2.6, 2.2, 1.2  # of the page, height of the panels, room beside them [inch]
+STRIP = 2.7  # height of a strip of event counts, in that of its type
+FLATTEST = 0.55  # of the panels, against those on a screen: narrow ones are drawn higher than they would be
+
+
+def profile_figure(
+    dataset: xr.Dataset, *, events: Mapping[str, ArrayLike] | None = None, width: float | None = None
+) -> page.Picture:
+    """Draw a slice of rank 1: the loss above, its derivative along the line below with central differences behind it.
+
+    `events` maps a name to a whole number per point (how many bounces, say): each is a strip on top, labelled where
+    there is room, and a thin line through the panels wherever it changes. Failures are hatched and counted.
+
+    Raises ValueError where the slice is a plane, or the page too narrow or too wide.
+    """
+    plane = plane_of(dataset)
+    if plane.rank != 1:
+        raise ValueError(f"profile_figure draws lines; got a slice of rank {plane.rank}, so use landscape_figure")
+    counted = {name: _counts(name, values, dataset.sizes["u"]) for name, values in (events or {}).items()}
+    sheet = style.Sheet.of(width, pitch=WIDTH)
+    heights = [STRIP * sheet.small / 72] * len(counted)
+    heights += [max(FLATTEST, sheet.zoom) * height for height in (LOSS, SLOPE)[: 1 + ("grad" in dataset)]]
+    picture = page.Picture(sheet, sum(heights) + 1.6)
+    grid = picture.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    for ax, height in zip(grid, heights, strict=True):
+        ax.set_box_aspect(height / (sheet.width - ROOM * sheet.type))
+    strips, panels = list(grid[: len(counted)]), list(grid[len(counted) :])
+    entries = _draw_loss(panels[0], dataset)
+    entries += _draw_slope(panels[1], dataset, plane) if "grad" in dataset else []
+    for ax in panels:
+        _frame(ax, dataset, plane)
+    for strip, (name, counts) in zip(strips, counted.items(), strict=True):
+        _draw_strip(strip, panels, dataset["u"].to_numpy(), name, counts)
+    panel.name_axes(panels[-1], plane.labels[0])
+    picture.align_ylabels(panels)
+    page.head(picture, [*strips, *panels][0], dataset)
+    page.finish(picture, [*entries, *page.failure_key(dataset)])
+    return picture
+
+
+def _counts(name: str, values: ArrayLike, points: int) -> NDArray[np.int64]:
+    counts = np.asarray(values)
+    if counts.shape != (points,) or not np.issubdtype(counts.dtype, np.integer):
+        raise ValueError(
+            f"event {name!r} needs {points} whole numbers, one per point; got {counts.dtype} of shape {counts.shape}"
+        )
+    return counts.astype(np.int64)
+
+
+def _draw_loss(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
+    u, loss = dataset["u"].to_numpy(), dataset["loss"].to_numpy()
+    sheet = page.sheet_of(ax)
+    ax.plot(u, loss, color=style.LOSS_LINE, **sheet.look(style.stroke(len(u))))
+    panel.name_axes(ax, y=page.loss_name(dataset))
+    if not np.isfinite(loss).any():
+        return []
+    lowest = int(np.nanargmin(loss))
+    (star,) = ax.plot(
+        u[lowest], loss[lowest], **sheet.look(style.LOWEST_MARK), zorder=4,
+        label=f"lowest sample: {style.number(loss[lowest])}",
+    )  # fmt: skip
+    return [star]
+
+
+def _draw_slope(ax: Axes, dataset: xr.Dataset, plane: Plane) -> list[Artist]:
+    u, loss = dataset["u"].to_numpy(), dataset["loss"].to_numpy()
+    slope = plane.slope(torch.from_numpy(dataset["grad"].to_numpy())).numpy()[:, 0]
+    differences = np.full_like(u, np.nan)
+    differences[1:-1] = (loss[2:] - loss[:-2]) / (u[2:] - u[:-2])
+    ax.axhline(0, color=style.FAINT, linewidth=0.8, zorder=0.5)
+    sheet, thin = page.sheet_of(ax), {"color": style.QUIET, "linewidth": 0.7}
+    (behind,) = ax.plot(u, differences, **sheet.look(thin), label="central difference of the loss")
+    (line,) = ax.plot(u, slope, color=style.SLOPE_LINE, **sheet.look(style.stroke(len(u))), label="gradient")
+    low, high = style.span_of_line(slope, differences)
+    ax.set_ylim(low, high)
+    panel.name_axes(ax, y=_slope_label(plane, dataset["loss"].attrs.get("units", "")))
+    for drawn, values in ((line, slope), (behind, differences)):
+        if off := int(((values < low) | (values > high)).sum()):
+            drawn.set_label(f"{drawn.get_label()} ({off} off scale)")
+    return [line, behind]
+
+
+def _slope_label(plane: Plane, loss_unit: str) -> str:
+    unit = plane.units[0]
+    per = f"({unit})" if "/" in unit else unit
+    return f"slope of the loss [{loss_unit or '1'}/{per}]" if unit else "slope of the loss"
+
+
+def _frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
+    panel.dress(ax)
+    ax.set_xlim(float(plane.lower[0]), float(plane.upper[0]))
+    u, status = dataset["u"].to_numpy(), dataset["status"].to_numpy()
+    edges = np.concatenate([u[:1], (u[1:] + u[:-1]) / 2, u[-1:]])
+    for kind, look in style.STATUS_LOOKS.items():
+        for start, stop in _runs(status == kind):
+            ax.axvspan(edges[start], edges[stop], **look, zorder=0.6, gid=kind.name)
+
+
+def _runs(where: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    changes = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]])))
+    return list(zip(changes[::2].tolist(), changes[1::2].tolist(), strict=True))
+
+
+def _draw_strip(strip: Axes, panels: list[Axes], u: NDArray[np.float64], name: str, counts: NDArray[np.int64]) -> None:
+    """Shade the stretches of equal count, label those that have room, and mark where they meet."""
+    sheet = page.sheet_of(strip)
+    meets = np.flatnonzero(np.diff(counts)) + 1
+    edges = [u[0], *((u[meets] + u[meets - 1]) / 2).tolist(), u[-1]]
+    labels = counts[[0, *meets.tolist()]].tolist()
+    for number, ((low, high), label) in enumerate(zip(pairwise(edges), labels, strict=True)):
+        strip.axvspan(low, high, color=style.BAND[number % 2], linewidth=0)
+        room = (high - low) / (u[-1] - u[0]) * (sheet.width - ROOM * sheet.type)
+        if room > typesetting.text_width(str(label), sheet.small) + sheet.small / 72:
+            strip.text((low + high) / 2, 0.5, str(label), size=sheet.small, color=style.INK, ha="center", va="center")
+    for edge in edges[1:-1]:
+        for ax in panels:
+            ax.axvline(edge, color=style.FAINT, linewidth=sheet.weight * style.hairline_width(len(meets)), zorder=0.7)
+    strip.set_ylim(0, 1)
+    strip.set_yticks([])
+    strip.tick_params(bottom=False, labelbottom=False)
+    strip.spines[:].set_visible(False)
+    strip.set_ylabel(name, size=sheet.small, rotation=0, ha="right", va="center", parse_math=False)

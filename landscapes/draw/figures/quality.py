@@ -1,0 +1,205 @@
+"""Gradient quality over a slice: cosines with finite differences by scale, and first against zeroth order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+from ...identity import plane_of
+from ...measures.gradient_quality import disagreement, find_bias, scale_table
+from ...measures.ruggedness import box_slopes
+from .. import style
+from . import contour, page, panel
+
+PITCH, LEAST = 4.4, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
+BELOW = 2.0  # room of a panel that has its colour bar under it [inch]
+FLAT = 0.3  # height of the line's panel, against its width
+LINE, SCALES, ORDERS = "line", "scales", ("narrow", "wide")
+
+
+def quality_figure(
+    dataset: xr.Dataset, steps: xr.Dataset, samples: xr.Dataset, smooth: xr.Dataset, *, width: float | None = None
+) -> page.Picture:
+    """Draw gradient quality: first over the slice's own samples, then by scale and under smoothing.
+
+    `steps` is of `gradients.ladder`, `samples` of `gradients.of_samples` and `smooth` of `gradients.smoothed_slopes`.
+    Panels that show the same by the same colours share a colour bar, beside the last of them. Six panels one below the
+    other would be higher than a printed page: on a narrow one they are in pairs.
+
+    Raises ValueError where the page is too narrow or too wide.
+    """
+    plane = plane_of(dataset)
+    sheet = style.Sheet.of(width, pitch=PITCH, columns=3, least=LEAST)
+    maps = [str(number) for number in range(samples.sizes["scale"])] if plane.rank == 2 else []
+    rows = _rows([*maps, SCALES, *ORDERS], sheet.columns)
+    if plane.rank == 1:
+        rows = [[LINE] * sheet.columns, *rows]
+    picture = page.Picture(sheet, len(rows) * sheet.pitch)
+    mosaic: Any = rows
+    axes: dict[str, Axes] = picture.subplot_mosaic(mosaic)
+    entries = _slope_lines(axes[LINE], dataset) if plane.rank == 1 else []
+    for number, name in enumerate(maps):
+        _cosine_map(axes[name], dataset, samples.isel(scale=number), last=name == maps[-1])
+    entries += _scales(axes[SCALES], steps, samples)
+    for number, name in enumerate(ORDERS):
+        draw = _disagreement_map if plane.rank == 2 else _two_orders
+        entries += draw(axes[name], dataset, smooth, number)
+    for kind in (maps, ORDERS):
+        _share_names(axes, rows, kind)
+    page.entitle(picture, f"{page.title(dataset)}: gradient quality")
+    entries = [*{str(one.get_label()): one for one in entries}.values(), *_signs(sheet, dataset)]
+    page.finish(picture, entries, columns=3, heading=page.provenance(dataset))
+    return picture
+
+
+def _rows(names: Sequence[str], columns: int) -> list[list[str]]:
+    """Lay panels in rows, nothing where there is none left."""
+    padded = [*names, *["."] * (-len(names) % columns)]
+    return [list(padded[start : start + columns]) for start in range(0, len(padded), columns)]
+
+
+def _share_names(axes: dict[str, Axes], rows: Sequence[Sequence[str]], kind: Sequence[str]) -> None:
+    """Leave the upright axis its name and numbers once, where panels of a kind stand side by side."""
+    for row in rows:
+        for left, name in pairwise(row):
+            if left in kind and name in kind and axes[left].get_ylim() == axes[name].get_ylim():
+                panel.name_axes(axes[name], y="")
+                axes[name].tick_params(labelleft=False)
+
+
+def _signs(sheet: style.Sheet, dataset: xr.Dataset) -> list[Artist]:
+    sure = Line2D([], [], **sheet.look(style.BIASED), label="first order is biased beyond chance (p < 0.001)")
+    unseen = Patch(**style.NO_SLOPE, label="no slope above the noise, or too close to the border")
+    return [sure, *([unseen] if dataset["loss"].ndim == 2 else []), *page.failure_key(dataset)]
+
+
+def _cosine_map(ax: Axes, dataset: xr.Dataset, found: xr.Dataset, *, last: bool) -> None:
+    plane, cosine = plane_of(dataset), found["cosine"].to_numpy()
+    ax.set_facecolor(style.NO_SLOPE["facecolor"])
+    drawn = ax.imshow(np.ma.masked_invalid(cosine), extent=_extent(dataset), **style.COSINE)
+    contour.frame(ax, dataset, plane)
+    panel.name_axes(ax, plane.labels[0])
+    seen = cosine[np.isfinite(cosine)]
+    mean = f"mean cosine {style.number(float(seen.mean()), '.2f')}" if seen.size else "none above the noise"
+    panel.caption(ax, f"differences over {_percent(found['scale'])} of the box\n{mean}")
+    if last:
+        _bar(ax, drawn, "cosine of gradient and difference")
+
+
+def _bar(ax: Axes, drawn: ScalarMappable, label: str) -> None:
+    """Put a colour bar beside a panel, or under it where there is little room beside."""
+    below: dict[str, Any] = {"location": "bottom", "fraction": 0.06, "pad": 0.04}
+    panel.colour_bar(ax, drawn, label, **(below if page.sheet_of(ax).pitch < BELOW else {}))
+
+
+def _slope_lines(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
+    plane, u = plane_of(dataset), dataset["u"].to_numpy()
+    slope, loss = box_slopes(dataset)[:, 0], dataset["loss"].to_numpy()
+    difference = np.full_like(loss, np.nan)
+    difference[1:-1] = (loss[2:] - loss[:-2]) * (len(loss) - 1) / 2
+    look = page.sheet_of(ax).look(style.stroke(len(u)))
+    lines = ax.plot(u, difference, color=style.LOSS_LINE, **look, label="difference over two samples")
+    lines += ax.plot(u, slope, color=style.SLOPE_LINE, **look, label="gradient", alpha=0.8)
+    panel.dress(ax)
+    ax.set_box_aspect(FLAT)
+    ax.set_xlim(float(u[0]), float(u[-1]))
+    ax.set_ylim(*style.span_of_line(difference, slope))
+    panel.name_axes(ax, plane.labels[0], _slope_label(dataset))
+    return list(lines)
+
+
+def _scales(ax: Axes, steps: xr.Dataset, samples: xr.Dataset) -> list[Artist]:
+    """Draw mean cosine and share of uphill gradients over the scale of the difference."""
+    sheet, entries = page.sheet_of(ax), list[Artist]()
+    for found, filled in ((steps, True), (samples, False)):
+        rows = [row for row in scale_table(found) if row["points"]]
+        scale = [row["scale"] for row in rows]
+        for name, colour, label in (("cosine", style.LOSS_LINE, "mean cosine"), ("uphill", style.SLOPE_LINE, "uphill")):
+            estimates = [row["cosine"] if name == "cosine" else row["uphill"] for row in rows]
+            value = np.array([one["value"] for one in estimates], dtype=float)
+            ends = np.array([(one["low"], one["high"]) for one in estimates], dtype=float).reshape(-1, 2)
+            reach = np.abs(np.nan_to_num(ends - value[:, None])).T
+            look = sheet.look({"linewidth": 1.1, "markersize": 4.5, "markeredgewidth": 1.0, "capsize": 2.0})
+            look |= {"color": colour, "marker": "o" if name == "cosine" else "v"}
+            look["markerfacecolor"] = colour if filled else "white"
+            where = "new evaluations" if filled else "the slice's samples"
+            ax.errorbar(scale, value, reach, **look)
+            del look["capsize"]
+            entries.append(Line2D([], [], **look, label=f"{label}, {where}"))
+    panel.dress(ax)
+    ax.set_xscale("log")
+    every = 1 if sheet.pitch > 3.0 else 2
+    ax.xaxis.set_major_locator(FixedLocator([10.0**power for power in range(-6, 0)][1 % every :: every]))
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: style.power(value, 0)))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.set_ylim(-1.05, 1.05)
+    ax.axhline(0, color=style.FAINT, linewidth=0.8 * sheet.weight, zorder=0)
+    ax.set_box_aspect(1)
+    panel.name_axes(ax, "width of the difference / box", "cosine; share pointing uphill")
+    panel.caption(ax, "gradient against differences,\nby scale")
+    return entries
+
+
+def _disagreement_map(ax: Axes, dataset: xr.Dataset, smooth: xr.Dataset, number: int) -> list[Artist]:
+    plane, place = plane_of(dataset), smooth["place"].to_numpy()
+    side = round(len(place) ** 0.5)
+    apart, sure = (of(smooth).isel(width=number).to_numpy() for of in (disagreement, find_bias))
+    low, high = plane.lower.tolist(), plane.upper.tolist()
+    ax.set_facecolor(style.NO_SLOPE["facecolor"])
+    drawn = ax.imshow(
+        np.ma.masked_invalid(apart.reshape(side, side)), extent=(low[0], high[0], low[1], high[1]), **style.DISAGREEMENT
+    )
+    ax.plot(*place[sure].T, **page.sheet_of(ax).look(style.BIASED))
+    panel.dress(ax)
+    ax.set_box_aspect(1)
+    panel.name_axes(ax, *plane.labels)
+    _say_smoothing(ax, smooth, number, sure)
+    if number == len(ORDERS) - 1:
+        _bar(ax, drawn, "|first \N{MINUS SIGN} zeroth order| / sum of both")
+    return []
+
+
+def _two_orders(ax: Axes, dataset: xr.Dataset, smooth: xr.Dataset, number: int) -> list[Artist]:
+    plane, place, found = plane_of(dataset), smooth["place"].to_numpy()[:, 0], smooth.isel(width=number)
+    sheet, entries = page.sheet_of(ax), list[Artist]()
+    for name, colour, marker in (("zeroth", style.LOSS_LINE, "s"), ("first", style.SLOPE_LINE, "o")):
+        error = found[f"{name}_error"].to_numpy()[:, 0]
+        look = sheet.look({"color": colour, "marker": marker, "markersize": 4.0, "linewidth": 0.9, "capsize": 2.0})
+        ax.errorbar(place, found[name].to_numpy()[:, 0], error, **look)
+        del look["capsize"]
+        entries.append(Line2D([], [], **look, label=f"{name} order"))
+    sure = find_bias(smooth).isel(width=number).to_numpy()
+    ax.plot(place[sure], found["first"].to_numpy()[sure, 0], **sheet.look(style.BIASED), zorder=4)
+    panel.dress(ax)
+    ax.set_box_aspect(1)
+    panel.name_axes(ax, plane.labels[0], _slope_label(dataset))
+    _say_smoothing(ax, smooth, number, sure)
+    return entries
+
+
+def _say_smoothing(ax: Axes, smooth: xr.Dataset, number: int, sure: np.ndarray[Any, Any]) -> None:
+    width = _percent(smooth["width"][number])
+    panel.caption(ax, f"smoothed over {width} of the box\nfirst order biased at {int(sure.sum())} of {len(sure)}")
+
+
+def _slope_label(dataset: xr.Dataset) -> str:
+    return f"slope [{dataset['loss'].attrs.get('units') or 'loss'} per side of the box]"
+
+
+def _percent(share: xr.DataArray) -> str:
+    return f"{style.number(100 * float(share), '.2g')}\N{NO-BREAK SPACE}%"
+
+
+def _extent(dataset: xr.Dataset) -> tuple[float, float, float, float]:
+    low, high = (end.tolist() for end in plane_of(dataset).cell_bounds())
+    return low[0], high[0], low[1], high[1]

@@ -1,0 +1,1 @@
+"""Recordings that play back in three dimensions (rerun)."""

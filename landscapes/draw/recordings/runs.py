@@ -1,0 +1,293 @@
+"""Runs over a slice as a rerun recording, which plays the evaluations back in three dimensions."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+import torch
+import xarray as xr
+from matplotlib.colors import to_rgba
+from numpy.typing import NDArray
+
+from ...identity import plane_of
+from ...objective import Status
+from ...overlay import improvements
+from ...plane import Plane
+from .. import style
+from ..figures import contour, page
+from ..figures.overlay import by_kind, farthest_distance, half_widths, joint_scale
+from ..render import relief
+from ..render.relief import HEIGHT, SIDE
+from .recording import recording
+
+Runs = Sequence[xr.Dataset]
+Grid = NDArray[np.float64]
+
+TIMELINE = "evaluation"
+SURFACE, ARROWS = "landscape/surface", "landscape/descent_directions"
+LIFT = 0.004  # of arrows above the surface
+AWAY, UP = 2.75, 1.85  # of the eye: nearer than the picture's, whose angle is smaller
+TICKS, NAMES, OVER = 0.06, 0.28, 1.12  # how far labels are from the frame; where along it the loss has its name
+RADIUS, LINE, DOT = 0.015, 0.003, 0.002  # of points on the plane, of lines, of what only carries a label
+
+
+def save_stream(dataset: xr.Dataset, runs: Runs, path: str | Path) -> None:
+    """Write a slice and runs laid over it, as `overlay` does, as a rerun recording with the view it opens in.
+
+    The surface's height and colour are the loss, on one scale for the slice and the runs; a sample that failed is a
+    hole. Every point stands at the loss it truly had, joined to the surface by a line where the two differ, and is
+    smaller the farther it lies off the plane. What is known after so many evaluations is what the timeline
+    `evaluation` shows there; nothing else, no clock, is recorded, so that equal runs give equal recordings.
+    """
+    scene = Scene.of(dataset, runs)
+    with recording(_digest(dataset, runs), Path(path), _blueprint(dataset, scene)) as stream:
+        _log(stream, SURFACE, surface(scene, dataset))
+        if "grad" in dataset:
+            _log(stream, ARROWS, descent_arrows(scene, dataset))
+        log_axes(stream, scene, dataset)
+        for run in runs:
+            _log_run(stream, scene, run)
+            _log_best(stream, scene, run)
+        _log_key(stream, scene, runs)
+        _log(stream, "about", rr.TextDocument(_about(dataset, runs, scene), media_type=rr.MediaType.MARKDOWN))
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Say where plane coordinates and losses are in the scene, which is centred on the slice's window."""
+
+    body: relief.Relief
+    reach: float
+    stand: relief.Stand
+
+    @classmethod
+    def of(cls, dataset: xr.Dataset, runs: Runs, scale: style.Scale | None = None) -> Scene:
+        """Return the scene of a slice and of runs laid over it, on the scale of their losses unless given."""
+        body = relief.Relief(plane_of(dataset), scale or joint_scale(dataset, runs))
+        return cls(body, farthest_distance(runs), relief.stand(body, dataset))
+
+    @property
+    def plane(self) -> Plane:
+        """The plane of the slice."""
+        return self.body.plane
+
+    @property
+    def scale(self) -> style.Scale:
+        """The scale of the losses."""
+        return self.body.scale
+
+    @property
+    def eye(self) -> rrb.EyeControls3D:
+        """From where it is seen at first."""
+        place, focus = self.stand.place(0.0, AWAY, UP), (0.0, 0.0, relief.FOCUS)
+        return rrb.EyeControls3D(position=place, look_target=focus, eye_up=(0.0, 0.0, 1.0))
+
+    def at(self, u: Grid, v: Grid, loss: Grid) -> Grid:
+        """Return positions, shape (..., 3); places beyond the window are moved to its border."""
+        (left, front), (right, back) = (side.numpy() for side in self.plane.cell_bounds())
+        return self.body.at(np.clip(u, left, right), np.clip(v, front, back), loss)
+
+    def tint(self, loss: Grid) -> NDArray[np.uint8]:
+        """Return the colour of a loss."""
+        return style.LOSS_MAP(self.body.shade(loss), bytes=True)
+
+
+def _log(stream: rr.RecordingStream, path: str, archetype: rr.AsComponents) -> None:
+    stream.log(path, archetype, static=True, strict=True)
+
+
+def surface(scene: Scene, dataset: xr.Dataset) -> rr.Mesh3D:
+    """Return a slice as flat cells whose height and colour are the loss."""
+    made = relief.cells(scene.body, dataset)
+    loss = dataset["loss"].transpose("v", "u").to_numpy().ravel()
+    return rr.Mesh3D(
+        vertex_positions=made.corners.reshape(-1, 3),
+        triangle_indices=made.triangles,
+        vertex_normals=np.repeat(made.normals, 4, axis=0),
+        vertex_colors=np.repeat(scene.tint(loss[made.sample]), 4, axis=0),
+    )
+
+
+def descent_arrows(scene: Scene, dataset: xr.Dataset, scale: style.Scale | None = None) -> rr.Arrows3D:
+    """Lay the directions of steepest descent on the cells, coloured by the gradient's magnitude."""
+    rows, columns = (contour.pick_arrows(dataset.sizes[name]) for name in ("v", "u"))
+    at = np.ix_(rows, columns)
+    slope = scene.plane.slope(torch.from_numpy(dataset["grad"].transpose("v", "u", "dim").to_numpy())).numpy()
+    logarithm = contour.log_magnitude(dataset)
+    norm = (scale or style.Scale.of_magnitude(logarithm)).norm
+    u, v = np.meshgrid(dataset["u"].to_numpy(), dataset["v"].to_numpy())
+    places = scene.at(u, v, dataset["loss"].transpose("v", "u").to_numpy())
+    origins = places[at]
+    flat = contour.descent(slope, scene.plane)[at] * 0.8 * SIDE / max(len(rows), len(columns))
+    vectors = np.concatenate([flat, np.zeros_like(flat[..., :1])], axis=-1)
+    seen = np.isfinite(vectors).all(axis=-1) & np.isfinite(origins).all(axis=-1)
+    return rr.Arrows3D(
+        vectors=vectors[seen],
+        origins=origins[seen] - vectors[seen] / 2 + [0.0, 0.0, LIFT],
+        colors=style.SLOPE_MAP(norm(logarithm[at][seen]), bytes=True),
+        radii=LINE,
+    )
+
+
+def log_axes(stream: rr.RecordingStream, scene: Scene, dataset: xr.Dataset) -> None:
+    """Frame the scene, with the ticks of both parameters and of the loss."""
+    frame = rr.LineStrips3D(scene.stand.frame(), colors=rgba(style.MID_GREY), radii=LINE / 2)
+    _log(stream, "landscape/axes/frame", frame)
+    for axis, name in enumerate((*scene.plane.labels, page.loss_name(dataset))):
+        ticks, share = scene.body.ticks(axis)
+        places = [scene.stand.beside(axis, part, TICKS) for part in share]
+        places.append(scene.stand.beside(axis, 0.5, NAMES) if axis < 2 else scene.stand.beside(axis, OVER, TICKS))
+        labels = [*map(style.number, ticks.tolist()), name]
+        points = rr.Points3D(places, labels=labels, show_labels=True, colors=rgba(style.MID_GREY), radii=DOT)
+        _log(stream, f"landscape/axes/{'uvz'[axis]}", points)
+
+
+def _log_key(stream: rr.RecordingStream, scene: Scene, runs: Runs) -> None:
+    """Label the colours of points, behind the scene: the labels themselves in one that is read on every ground."""
+    shown = {name: style.POINT_MARKS[name]["color"] for run in runs for name, _ in by_kind(run)}
+    if any(run["outside"].any() for run in runs):
+        shown["outside"] = style.BEYOND
+    if any((run["status"] != Status.OK).any() for run in runs):
+        shown["failed"] = style.LOST
+    behind, left = (np.array(scene.stand.place(turn, 1.0, -relief.FOCUS)) for turn in (180.0, -90.0))
+    high = np.array([0.0, 0.0, 1.25 * HEIGHT])
+    places = [SIDE / 2 * behind + 0.45 * (number - 0.5) * left + high for number in range(len(shown))]
+    colors = [rgba(color) for color in shown.values()]
+    _log(stream, "landscape/key", rr.Points3D(places, colors=colors, radii=RADIUS))
+    names = rr.Points3D(places, labels=list(shown), show_labels=True, colors=rgba(style.MID_GREY), radii=DOT)
+    _log(stream, "landscape/key/names", names)
+
+
+def _log_run(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None:
+    path, loss, outside = f"landscape/runs/{run.attrs['label']}", run["loss"].to_numpy(), run["outside"].to_numpy()
+    places = scene.at(run["u"].to_numpy(), run["v"].to_numpy(), np.nan_to_num(loss, nan=-np.inf))
+    radii = RADIUS * np.sqrt(style.point_areas(run["distance"].to_numpy(), scene.reach, 1) / style.MARK_AREAS[1])
+    failed = run["status"].to_numpy() != Status.OK
+    groups = [(name, here & ~outside & ~failed, style.POINT_MARKS[name]["color"]) for name, here in by_kind(run)]
+    groups += [("outside", outside & ~failed, style.BEYOND), ("failed", failed, style.LOST)]
+    for name, here, color in groups:
+        _log_points(stream, f"{path}/{name}", np.flatnonzero(here), places, radii, color)
+    rows = np.flatnonzero(run["previous"].to_numpy() >= 0)
+    steps = np.stack([places[run["previous"].to_numpy()[rows]], places[rows]], axis=1)
+    _log_lines(stream, f"{path}/descents", rows, steps, style.method(run)["color"])
+    _log_gaps(stream, scene, run, f"{path}/gaps", places)
+
+
+def _log_gaps(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset, path: str, places: Grid) -> None:
+    """Join each point to the surface below or above it, where its loss is another."""
+    feet = places.copy()
+    feet[:, 2] = scene.body.height(run["beneath"].to_numpy())
+    apart = np.isfinite(run["loss"].to_numpy()) & (np.abs(feet[:, 2] - places[:, 2]) > RADIUS)
+    rows = np.flatnonzero(apart)
+    _log_lines(stream, path, rows, np.stack([feet[rows], places[rows]], axis=1), style.MID_GREY)
+
+
+def _log_best(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None:
+    """Log the least loss so far as a curve and the points that lowered it in the scene."""
+    label, color, best = run.attrs["label"], style.method(run)["color"], run["best"].to_numpy()
+    known = np.flatnonzero(np.isfinite(best))
+    if not len(known):
+        return
+    curve = np.log10(best[known]) if scene.scale.logarithmic else best[known]
+    _log(stream, f"best/{label}", rr.SeriesLines(colors=rgba(color), names=label, widths=1.5))
+    stream.send_columns(f"best/{label}", _times(known), rr.Scalars.columns(scalars=curve), strict=True)
+    lowered = improvements(run)
+    places = scene.at(*(run[name].to_numpy()[lowered] for name in ("u", "v", "loss")))
+    spread = np.empty((run.sizes["evaluation"], 3))
+    spread[lowered] = places
+    _log_points(stream, f"landscape/runs/{label}/best", lowered, spread, np.full(len(spread), 1.6 * RADIUS), color)
+
+
+def _log_points(
+    stream: rr.RecordingStream, path: str, rows: NDArray[np.intp], places: Grid, radii: Grid, color: str
+) -> None:
+    if len(rows):
+        colors = np.tile(rgba(color), (len(rows), 1))
+        columns = rr.Points3D.columns(positions=places[rows], radii=radii[rows], colors=colors)
+        stream.send_columns(path, _times(rows), columns, strict=True)
+
+
+def _log_lines(stream: rr.RecordingStream, path: str, rows: NDArray[np.intp], strips: Grid, color: str) -> None:
+    if len(rows):
+        colors, radii = np.tile(rgba(color), (len(rows), 1)), np.full(len(rows), LINE / 2)
+        columns = rr.LineStrips3D.columns(strips=strips.astype(np.float32), colors=colors, radii=radii)
+        stream.send_columns(path, _times(rows), columns, strict=True)
+
+
+def _times(rows: NDArray[np.intp]) -> list[rr.TimeColumn]:
+    """Return when rows became known: after so many evaluations."""
+    return [rr.TimeColumn(TIMELINE, sequence=rows + 1)]
+
+
+def rgba(color: str) -> NDArray[np.uint8]:
+    """Return a colour as rerun takes it."""
+    found: NDArray[np.uint8] = np.rint(255 * np.array(to_rgba(color))).astype(np.uint8)
+    return found
+
+
+def _blueprint(dataset: xr.Dataset, scene: Scene) -> rrb.Blueprint:
+    so_far = rrb.VisibleTimeRange(
+        TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
+    )
+    space = rrb.Spatial3DView(
+        name=page.title(dataset), origin="landscape", time_ranges=so_far, eye_controls=scene.eye, line_grid=False
+    )
+    what = "best loss so far, log10" if scene.scale.logarithmic else "best loss so far"
+    curves = rrb.TimeSeriesView(name=what, origin="best", plot_legend=rrb.Corner2D.RightTop)
+    about = rrb.TextDocumentView(name="about", origin="about")
+    return rrb.Blueprint(
+        rrb.Horizontal(space, rrb.Vertical(curves, about), column_shares=[2.2, 1.0]),
+        rrb.TimePanel(timeline=TIMELINE, play_state="following", state="collapsed"),
+        collapse_panels=True,
+    )
+
+
+def _about(dataset: xr.Dataset, runs: Runs, scene: Scene) -> str:
+    """Say in Markdown what is to be seen, and where it comes from."""
+    low, high = map(style.number, scene.scale.ends)
+    kind = "logarithmic" if scene.scale.logarithmic else "linear"
+    unit = dataset["loss"].attrs.get("units", "")
+    distance = (
+        f"A point on the plane is largest; one {half_widths(scene.reach)} off it has "
+        f"{style.FARTHEST_SHARE**0.5:.0%} of that radius."
+        if scene.reach
+        else "Every point lies on the plane."
+    )
+    lines = [
+        f"# {page.title(dataset)}",
+        f"Height and colour of the surface: loss from {low} to {high}{f' {unit}' if unit else ''}, {kind}, "
+        f"{HEIGHT:g} high; the window is {SIDE:g} wide. What is beyond the scale is cut off there. Holes are samples "
+        "that failed. Arrows point down the steepest slope; their colour is the gradient's magnitude.",
+        "A point stands at the loss it truly had; a grey line joins it to the surface where the slice shows another. "
+        + distance,
+        "Points are coloured by what they were evaluated for, as the labels over the scene say; failed episodes are on "
+        "the floor, points beyond the window at its border. The large points are each run's best so far.",
+        "",
+        "| run | episodes | failed | beyond the window | best loss |",
+        "|---|---|---|---|---|",
+        *(_row(run) for run in runs),
+        "",
+        f"Best losses are plotted as {'their decimal logarithm' if scene.scale.logarithmic else 'they are'}.",
+        "",
+        page.provenance(dataset),
+    ]
+    return "\n\n".join(lines[:4]) + "\n" + "\n".join(lines[4:]) + "\n"
+
+
+def _row(run: xr.Dataset) -> str:
+    failed = int((run["status"] != Status.OK).sum())
+    best = float(run["best"][-1]) if run.sizes["evaluation"] else float("nan")
+    said = style.number(best) if np.isfinite(best) else "none"
+    return f"| {run.attrs['label']} | {run.sizes['evaluation']} | {failed} | {int(run['outside'].sum())} | {said} |"
+
+
+def _digest(dataset: xr.Dataset, runs: Runs) -> str:
+    """Return a name that equal recordings share."""
+    arrays = [dataset["loss"], *(run[name] for run in runs for name in ("x", "loss"))]
+    return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()[:16]

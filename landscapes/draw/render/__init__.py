@@ -1,0 +1,1 @@
+"""Lit pictures of surfaces and episodes (pyvista, off-screen)."""

@@ -1,0 +1,175 @@
+"""The geometry of a slice as a surface: its cells, its frame, and the azimuth that shows its valley."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from matplotlib.ticker import LogLocator, MaxNLocator
+from numpy.typing import NDArray
+
+from ...plane import Plane
+from .. import style
+from ..figures import contour
+
+Grid = NDArray[np.float64]
+
+SIDE, HEIGHT = 2.0, 0.9  # of the surface: the slice's window, and the scale of the losses
+FOCUS = 0.26  # how high the eye looks
+AWAY, UP = 4.83, 2.74  # of the eye from the middle of the surface, over the ground and up
+AZIMUTHS = (236.0, 304.0, 124.0, 56.0, 214.0, 326.0, 146.0, 34.0)  # of the eye [degrees]; no edge is seen end on
+TOP = ((0, 0), (1, 0), (1, 1), (0, 1))  # corners of a cell to the right and back, counterclockwise from above
+# from the way a wall looks to its two edges, counterclockwise from there
+WALLS = {(1, 0): ((1, 0), (1, 1)), (-1, 0): ((0, 1), (0, 0)), (0, 1): ((1, 1), (0, 1)), (0, -1): ((0, 0), (1, 0))}
+TRIANGLES = ((0, 1, 2), (0, 2, 3))  # of a cell's corners
+FOOT = 0.08  # share of the upright axis that has no ticks
+VALLEY_SHARE = 0.1  # share of the samples that are the valley
+SIGHT_STEPS = 160  # of a line of sight across the surface
+
+
+@dataclass(frozen=True, eq=False)
+class Relief:
+    """Say where plane coordinates and losses are: the slice's window is centred, each of its sides SIDE long."""
+
+    plane: Plane
+    scale: style.Scale
+
+    def at(self, u: Grid, v: Grid, loss: Grid) -> Grid:
+        """Return positions, shape (..., 3)."""
+        low, high = (side.numpy() for side in self.plane.cell_bounds())
+        flat = SIDE * ((np.stack([u, v], axis=-1) - low) / (high - low) - 0.5)
+        return np.concatenate([flat, self.height(loss)[..., None]], axis=-1)
+
+    def height(self, loss: Grid) -> Grid:
+        """Return the height of a loss, cut at both ends of the scale; NaN for none."""
+        return HEIGHT * self.shade(loss)
+
+    def shade(self, loss: Grid) -> Grid:
+        """Return where a loss is on the scale, 0 to 1; NaN for none."""
+        least = self.scale.ends[0] if self.scale.logarithmic else -np.inf
+        with np.errstate(invalid="ignore"):
+            return np.clip(np.asarray(self.scale.norm(np.maximum(loss, least)), dtype=np.float64), 0.0, 1.0)
+
+    def ticks(self, axis: int) -> tuple[Grid, Grid]:
+        """Return round values along u, v or the loss, and where they are along it, 0 to 1.
+
+        Of the loss none is at the foot, where another axis begins.
+        """
+        low, high = [*zip(*(side.tolist() for side in self.plane.cell_bounds()), strict=True), self.scale.ends][axis]
+        logarithmic = axis == 2 and self.scale.logarithmic
+        ticks = np.asarray((LogLocator(numticks=6) if logarithmic else MaxNLocator(5)).tick_values(low, high))
+        ticks = ticks[(ticks >= low) & (ticks <= high)]
+        if axis < 2:
+            return ticks, (ticks - low) / (high - low)
+        share = self.shade(ticks)
+        return ticks[share > FOOT], share[share > FOOT]
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Hold the cells of a slice as quadrilaterals: corners and outward normals, shape (face, 4, 3) and (face, 3).
+
+    `sample` is whose colour each has, a number of the flattened slice.
+    """
+
+    corners: Grid
+    normals: Grid
+    sample: NDArray[np.intp]
+
+    @property
+    def triangles(self) -> NDArray[np.intp]:
+        """Return two triangles for each cell, as numbers of the corners one after another."""
+        first = 4 * np.arange(len(self.corners))[:, None]
+        return np.concatenate([first + np.array(corners) for corners in TRIANGLES])
+
+
+def cells(relief: Relief, dataset: xr.Dataset) -> Cells:
+    """Return a flat top for every sample, over its cell of the map, and upright walls down to what is beside it.
+
+    Nothing is drawn between samples that was not sampled: a wall has the colour of the sample it belongs to, the higher
+    one. A sample that failed has no top, and like the border of the slice is walled down to the ground.
+    """
+    height = relief.height(dataset["loss"].transpose("v", "u").to_numpy())
+    rows, columns = np.nonzero(np.isfinite(height))
+    high = height[rows, columns]
+    u, v = (SIDE * ((at - at[0]) / (at[-1] - at[0]) - 0.5) for at in contour.cell_edges(dataset))
+    ground = np.pad(np.nan_to_num(height, nan=0.0), 1)  # also where there is nothing
+
+    def at(corner: tuple[int, int], z: Grid) -> Grid:
+        return np.stack([u[columns + corner[0]], v[rows + corner[1]], z], axis=-1)
+
+    corners = [np.stack([at(corner, high) for corner in TOP], axis=1)]
+    normals = [np.tile([0.0, 0.0, 1.0], (len(rows), 1))]
+    sample = [rows * height.shape[1] + columns]
+    for (right, back), (first, second) in WALLS.items():
+        low = ground[rows + 1 + back, columns + 1 + right]
+        wall = np.stack([at(first, low), at(second, low), at(second, high), at(first, high)], axis=1)
+        corners.append(wall[low < high])
+        normals.append(np.tile([float(right), float(back), 0.0], (int((low < high).sum()), 1)))
+        sample.append(sample[0][low < high])
+    return Cells(np.concatenate(corners), np.concatenate(normals), np.concatenate(sample))
+
+
+@dataclass(frozen=True)
+class Stand:
+    """Say from where the surface is seen: the azimuth of the eye [degrees]."""
+
+    azimuth: float
+
+    def place(self, turn: float, away: float, up: float) -> tuple[float, float, float]:
+        """Return a place so far from the middle, at an angle from the eye [degrees]."""
+        angle = np.radians(self.azimuth + turn)
+        return (float(away * np.cos(angle)), float(away * np.sin(angle)), FOCUS + up)
+
+    @property
+    def front(self) -> tuple[float, float]:
+        """On which side of the surface the edges in front are, -1 or 1 along u and v."""
+        x, y, _ = self.place(0.0, 1.0, 0.0)
+        return float(np.sign(x)), float(np.sign(y))
+
+    def beside(self, axis: int, share: float, away: float) -> tuple[float, float, float]:
+        """Return a place beside an axis: u and v along the edges in front, the loss up the edge at the right."""
+        (right, back), half, along = self.front, SIDE / 2, SIDE * (share - 0.5)
+        if axis == 0:
+            return (along, back * (half + away), 0.0)
+        if axis == 1:
+            return (right * (half + away), along, 0.0)
+        x, y, _ = self.place(90.0, 1.0, 0.0)  # to the right of who looks
+        corner = (-right * half, back * half) if x * right < y * back else (right * half, -back * half)
+        return (corner[0] + x * away, corner[1] + y * away, HEIGHT * share)
+
+    def frame(self) -> list[Grid]:
+        """Return the edges of the ground and of the two walls behind, as lines of shape (point, 3)."""
+        a, top, (right, back) = SIDE / 2, HEIGHT, self.front
+        x, y = -right * a, -back * a  # where the walls are
+        floor = [(-a, -a, 0), (a, -a, 0), (a, a, 0), (-a, a, 0), (-a, -a, 0)]
+        walls = [(-x, y, 0), (-x, y, top), (x, y, top), (x, y, 0)], [(x, y, top), (x, -y, top), (x, -y, 0)]
+        return [np.array(line, dtype=np.float64) for line in (floor, *walls)]
+
+
+def stand(relief: Relief, dataset: xr.Dataset) -> Stand:
+    """Return where most of the valley is seen from."""
+    return Stand(azimuth(relief, dataset))
+
+
+def azimuth(relief: Relief, dataset: xr.Dataset) -> float:
+    """Return from which of the azimuths [degrees] most of the valley is seen, over what stands in front of it."""
+    height = relief.height(dataset["loss"].transpose("v", "u").to_numpy())
+    if not np.isfinite(height).any():
+        return AZIMUTHS[0]
+    rows, columns = np.nonzero(height <= np.nanquantile(height, VALLEY_SHARE))
+    seen = [_visible_share(np.nan_to_num(height, nan=0.0), rows, columns, np.radians(angle)) for angle in AZIMUTHS]
+    return AZIMUTHS[int(np.argmax(np.round(seen, 6)))]  # the first of equals
+
+
+def _visible_share(height: Grid, rows: NDArray[np.intp], columns: NDArray[np.intp], angle: float) -> float:
+    """Return which share of the cells the eye sees: on the way to it, nothing is higher than the line of sight."""
+    way = np.linspace(0.0, 1.5 * SIDE, SIGHT_STEPS)[1:, None]
+    size = np.array(height.shape)
+    at = np.stack([rows, columns]) + 0.5
+    steps = np.array([np.sin(angle), np.cos(angle)]) / SIDE * size
+    row, column = (np.floor(at[axis] + way * steps[axis]).astype(int) for axis in (0, 1))
+    inside = (row >= 0) & (row < size[0]) & (column >= 0) & (column < size[1])
+    passed = np.where(inside, height[np.clip(row, 0, size[0] - 1), np.clip(column, 0, size[1] - 1)], 0.0)
+    return float((passed <= height[rows, columns] + way * UP / AWAY + 1e-9).all(axis=0).mean())

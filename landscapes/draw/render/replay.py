@@ -1,0 +1,271 @@
+"""An episode as pictures: its parts lit, on their ground, from its view (pyvista, off-screen)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyvista as pv
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
+
+from .. import style
+from ..figures import typesetting
+from ..film import picture as picture_of
+from ..film import save_film
+from . import materials
+from .solids import Grid, mesh, off_screen
+
+if TYPE_CHECKING:
+    from ...episode import Episode, Part, View
+
+Picture = NDArray[np.uint8]
+
+HEIGHT = 600  # of a frame [pixel]
+STRIP, STRIP_DPI = 0.4, 100  # height of what is over a film [inch], and how fine it is
+BAR = 0.25  # most of a frame's width that its scale takes
+LIKELY = (0.5, 1.6)  # narrowest and widest frame, its width per height
+AWAY_DISTANCE = 2.0  # from where on a target's surface is away from a body's particles, in their distances
+LONGEST, RATE = 100, 25  # most frames of a film, and how many of them a second
+EXTENT, CELLS = 3.0, 192  # of the ground in halves of the view's diagonal; of its shadow along each side
+SAMPLES = 40_000  # of the surfaces that throw it
+
+
+def save_replay(episode: Episode, mp4: str | Path, gif: str | Path, *, title: str = "", longest: int = LONGEST) -> int:
+    """Write evenly spaced frames, first and last among them, under a title as MP4 and GIF; return how many.
+
+    Raises ValueError where the episode has no `parts`, OSError where ffmpeg could not write.
+    """
+    count = min(longest, len(episode.time))
+    pictures = add_title(frames(episode, pick_frames(episode, count)), title)
+    save_film(pictures, Path(mp4), Path(gif), count=count, rate=RATE)
+    return count
+
+
+def add_title(pictures: Iterable[Picture], title: str) -> Iterator[Picture]:
+    """Put a title over pictures, in a strip of its own; none is put where there is no title."""
+    strip = None
+    for picture in pictures:
+        if title and strip is None:
+            strip = _strip(title, picture.shape[1])
+        yield picture if strip is None else np.concatenate([strip, picture])
+
+
+def _strip(title: str, width: int) -> Picture:
+    """Return a title on the background of a picture so wide [pixel]."""
+    figure = Figure(figsize=(width / STRIP_DPI, STRIP), facecolor=materials.BACKGROUND)
+    FigureCanvasAgg(figure)
+    room = width / STRIP_DPI - 2 * typesetting.MARGIN
+    fits = typesetting.text_width(title, style.Sheet.label) < room
+    size = style.Sheet.label if fits else style.Sheet.small  # of which there is room for two lines
+    said, left = typesetting.wrap_text(title, room, size), typesetting.MARGIN * STRIP_DPI / width
+    figure.text(left, 0.5, said, size=size, color=style.INK, va="center", parse_math=False)
+    return picture_of(figure, dpi=STRIP_DPI)
+
+
+def pick_frames(episode: Episode, count: int) -> list[int]:
+    """Return evenly spaced frames, first and last among them, the fewer the shorter the episode."""
+    found: list[int] = np.unique(np.linspace(0, len(episode.time) - 1, count).round().astype(int)).tolist()
+    return found
+
+
+def frames(episode: Episode, chosen: Sequence[int], *, height: int = HEIGHT, marked: bool = True) -> Iterator[Picture]:
+    """Yield pictures of the chosen frames, shape (height, width, 3); each has its time and a scale unless not `marked`.
+
+    The scale is right at the middle of the view: what is nearer is larger.
+
+    Raises ValueError where the episode has no `parts`.
+    """
+    if not episode.parts:
+        raise ValueError("the episode says not what its parts look like; give Episode its `parts`")
+    view = episode.viewpoint()
+    shot = Shot.of(view, height)
+    with _stage(view, shot) as plotter:
+        parts = [part for part in episode.parts if part not in goal_parts(episode)]
+        still = [part for part in parts if is_still(part)]
+        moving = [part for part in parts if part not in still]
+        bodies = [part for part in parts if part.shape == "lump"]
+        goals = [mesh(part, 0) for part in goal_parts(episode)]
+        _place(plotter, still, [mesh(part, 0) for part in still], "still")
+        if marked:
+            _write_scale(plotter, shot)
+        for frame in chosen:
+            _place(plotter, moving, [mesh(part, frame) for part in moving], "moving")
+            _place(plotter, goal_parts(episode), [missed_surface(goal, bodies, frame) for goal in goals], "sought")
+            if view.ground is not None:
+                _lay_ground(plotter, view, [mesh(part, frame) for part in episode.parts if materials.solid(part)])
+            if marked:
+                said = f"{style.number(float(episode.time[frame]), '.3g')} s"
+                _stamp(plotter, said, "time", materials.INSET)
+            plotter.render()
+            picture = np.array(plotter.screenshot(return_img=True))
+            if marked:
+                _draw_bar(picture, shot)
+            yield picture
+
+
+@dataclass(frozen=True)
+class Shot:
+    """Say how a view is seen: where the eye looks, and from how far away; `size` of the picture is width and height."""
+
+    center: Grid  # [m]
+    far: float  # [m]
+    half: float  # of what is seen above and below the middle at the front of the view [m]
+    size: tuple[int, int]  # [pixel]
+
+    @classmethod
+    def of(cls, view: View, height: int) -> Shot:
+        """Return how the whole box of a view is seen in a picture so high."""
+        low, high = np.array(view.lower), np.array(view.upper)
+        right, up, eye = axes(view)
+        corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+        center = (low + high) / 2
+        wide, tall = (np.ptp((corners - center) @ side) for side in (right, up))
+        width = round(height * float(np.clip(wide / tall, *LIKELY))) // 2 * 2
+        half = 1.06 * max(tall, wide * height / width) / 2
+        far = half / np.tan(np.radians(materials.ANGLE) / 2) + np.ptp((corners - center) @ eye) / 2
+        return cls(center, float(far), float(half), (width, height))
+
+    @property
+    def metre(self) -> float:
+        """How long a metre is at the middle of the view [pixel]."""
+        return float(self.size[1] / 2 / (self.far * np.tan(np.radians(materials.ANGLE) / 2)))
+
+    @property
+    def bar(self) -> float:
+        """A round length that a scale may have [m]."""
+        most = BAR * self.size[0] / self.metre
+        power = 10.0 ** np.floor(np.log10(most))
+        return float(next(step * power for step in (5, 2, 1) if step * power <= most))
+
+
+@contextmanager
+def _stage(view: View, shot: Shot) -> Iterator[pv.Plotter]:
+    """Give a plotter with lights and a camera that sees the view's box."""
+    center, (_, _, eye) = shot.center, axes(view)
+    diagonal = float(np.linalg.norm(np.array(view.upper) - np.array(view.lower)))
+    with off_screen(shot.size) as plotter:
+        for direction, strength in materials.LIGHTS:
+            light = pv.Light(position=tuple(center + direction), focal_point=tuple(center), intensity=strength)
+            light.positional = False
+            plotter.add_light(light)
+        plotter.camera.position, plotter.camera.focal_point = tuple(center + shot.far * eye), tuple(center)
+        plotter.camera.up, plotter.camera.view_angle = (0.0, 1.0, 0.0), materials.ANGLE
+        plotter.camera.clipping_range = (shot.far / 20, 20 * shot.far)
+        plotter.enable_ssao(radius=diagonal / 14, bias=0.002 * shot.half / 1.06, kernel_size=64, blur=True)
+        plotter.enable_anti_aliasing("ssaa")
+        yield plotter
+
+
+def _write_scale(plotter: pv.Plotter, shot: Shot) -> None:
+    """Write how long the scale's bar is, over its place at the lower right."""
+    right, lift = materials.INSET
+    over = (shot.size[0] - right - round(shot.bar * shot.metre), lift + 2 * materials.THICK)
+    _stamp(plotter, f"{style.number(shot.bar)} m", "scale", over)
+
+
+def _stamp(plotter: pv.Plotter, said: str, name: str, position: tuple[int, int]) -> None:
+    """Write on a picture, on a ground that lets little through."""
+    actor = plotter.add_text(said, name=name, position=position, **materials.STAMP)
+    actor.prop.background_color, actor.prop.background_opacity = materials.BACKGROUND, materials.VEIL
+
+
+def _draw_bar(picture: Picture, shot: Shot) -> None:
+    """Draw the scale's bar into a picture, at its lower right."""
+    right, bottom = (size - inset for size, inset in zip(shot.size, materials.INSET, strict=True))
+    color = pv.Color(materials.STAMP["color"]).int_rgb
+    picture[bottom - materials.THICK : bottom, right - round(shot.bar * shot.metre) : right] = color
+
+
+def axes(view: View) -> tuple[Grid, Grid, Grid]:
+    """Return the directions right, up and towards the eye of a view."""
+    eye = np.array(view.eye) / np.linalg.norm(view.eye)
+    right = np.cross([0.0, 1.0, 0.0], eye)
+    right /= np.linalg.norm(right)
+    return right, np.cross(eye, right), eye
+
+
+def goal_parts(episode: Episode) -> list[Part]:
+    """Return the targets that bodies are to become: of them, what is missed is drawn."""
+    return [part for part in episode.parts if part.shape == "lump" and part.material == "target"]
+
+
+def missed_surface(goal: pv.PolyData, bodies: Sequence[Part], frame: int) -> pv.PolyData:
+    """Return what of a target's surface bodies do not reach: what is away from their particles."""
+    pitch = max(part.size[0] for part in bodies)
+    every = np.concatenate([part.at[frame].numpy() for part in bodies])
+    away, _ = cKDTree(every).query(goal.points, distance_upper_bound=2 * AWAY_DISTANCE * pitch)
+    return goal.extract_points(away > AWAY_DISTANCE * pitch, adjacent_cells=False).extract_surface(algorithm=None)
+
+
+def _place(plotter: pv.Plotter, parts: Sequence[Part], surfaces: Sequence[pv.PolyData], label: str) -> None:
+    for number, (part, surface) in enumerate(zip(parts, surfaces, strict=True)):
+        look = materials.look(part)
+        if "side" in surface.point_data:
+            look["scalars"], look["cmap"] = "side", [materials.BACK[part.material], look.pop("color")]
+            look["show_scalar_bar"] = False
+        elif part.material in materials.BACK:
+            look["backface_params"] = {**look, "color": materials.BACK[part.material]}
+        smooth = part.shape != "box" and part.material != "sugar"
+        name = f"{label} {number}"
+        if not surface.n_cells:
+            plotter.remove_actor(name, reset_camera=False, render=False)
+            continue
+        plotter.add_mesh(surface, name=name, smooth_shading=smooth, reset_camera=False, render=False, **look)
+
+
+def is_still(part: Part) -> bool:
+    """Whether a part is the same in all frames."""
+    return part.shape != "trail" and all(
+        bool((rows == rows[:1]).all()) for rows in (part.at, part.turn) if rows is not None
+    )
+
+
+def _lay_ground(plotter: pv.Plotter, view: View, solids: Sequence[pv.PolyData]) -> None:
+    """Lay the ground under the view, darker where solids stand in the light, fading into the background."""
+    assert view.ground is not None  # the caller asked
+    low, high = np.array(view.lower), np.array(view.upper)
+    center, half = (low + high) / 2, EXTENT * float(np.linalg.norm(high - low)) / 2
+    x = center[0] + half * np.linspace(-1, 1, CELLS)
+    z = center[2] + half * np.linspace(-1, 1, CELLS)
+    dark = _shadow(solids, view.ground, x, z)
+    away = np.hypot((x[:, None] - center[0]) / half, (z[None, :] - center[2]) / half)
+    fade = np.clip((away - 0.45) / 0.5, 0.0, 1.0)[..., None]
+    ground, background = (np.array(pv.Color(name).float_rgb) for name in (materials.GROUND, materials.BACKGROUND))
+    color = ground * (1 - materials.SHADOW * dark[..., None]) * (1 - fade) + background * fade
+    grid = pv.StructuredGrid(*np.meshgrid(x, [view.ground], z, indexing="ij"))
+    rgb = (255 * color).round().astype(np.uint8).transpose(1, 0, 2).reshape(-1, 3)
+    plotter.add_mesh(
+        grid, scalars=rgb, rgb=True, lighting=False, name="ground", reset_camera=False, render=False, pickable=False
+    )
+
+
+def _shadow(solids: Sequence[pv.PolyData], ground: float, x: Grid, z: Grid) -> Grid:
+    """Return how much of the key light solids take from the ground, shape (x, z), 0 to 1."""
+    spots = np.concatenate([_scatter_points(solid) for solid in solids if solid.n_cells] or [np.zeros((0, 3))])
+    lift = spots[:, 1:2] - ground
+    shift = np.array(materials.KEY)
+    feet = (spots - lift * shift / shift[1])[lift[:, 0] > 0]
+    edges = [np.append(axis, 2 * axis[-1] - axis[-2]) - (axis[1] - axis[0]) / 2 for axis in (x, z)]
+    hits, *_ = np.histogram2d(feet[:, 0], feet[:, 2], bins=edges)
+    return np.clip(1.6 * gaussian_filter(np.minimum(hits / 3.0, 1.0), 1.6), 0.0, 1.0)
+
+
+def _scatter_points(solid: pv.PolyData) -> Grid:
+    """Return points spread evenly over a surface."""
+    corners = solid.points[solid.triangulate().regular_faces].astype(np.float64)
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    if not areas.sum() > 0:
+        return np.zeros((0, 3))
+    random = np.random.default_rng(0)
+    chosen = corners[random.choice(len(corners), SAMPLES, p=areas / areas.sum())]
+    share = np.sort(random.random((SAMPLES, 2)), axis=1)
+    weights = np.stack([share[:, 0], share[:, 1] - share[:, 0], 1 - share[:, 1]], axis=1)
+    return np.asarray(np.einsum("nk,nka->na", weights, chosen))

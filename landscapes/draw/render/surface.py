@@ -1,0 +1,235 @@
+"""A slice as a lit surface of flat cells, with runs draped on it (pyvista, off-screen; labels by matplotlib)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyvista as pv
+import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from ...identity import plane_of
+from ...objective import Status
+from ...storage.files import replacing
+from .. import style
+from ..figures import page, panel
+from ..figures.overlay import by_kind, joint_scale
+from . import relief
+from .relief import FOCUS, HEIGHT, SIDE, Relief, Stand
+from .solids import off_screen
+
+Runs = Sequence[xr.Dataset]
+Grid = NDArray[np.float64]
+
+PITCH = 8.6  # of the page on a screen [inch]
+PIXELS, FINE = (1500, 1100), 300  # of the picture; in print, so many per inch where that is more
+ANGLE = 28.0  # of the camera [degrees]
+LIGHTS = (((-100.0, 2.0, 4.0), 0.85), ((60.0, 3.2, 1.2), 0.35))  # from the eye's azimuth, away and up; strength
+MATTER: dict[str, Any] = {"ambient": 0.3, "diffuse": 0.78, "specular": 0.0}
+POINT, TRAIL, BEST, LIFT = 0.016, 0.006, 0.03, 0.004  # radii of points, descents and bests; how far they lie above
+FRAME = 0.003  # radius of its lines
+AWAY, OUT = (0.09, 0.09, 0.04), (0.31, 0.31, 0.28)  # of ticks and of names from the frame, for each axis
+ROOM = 0.02  # about the frame, in the picture
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """Hold a scene that is ready to be drawn in so many pixels, and how it is seen."""
+
+    plotter: pv.Plotter
+    relief: Relief
+    stand: Stand
+    pixels: tuple[int, int]
+    projection: Grid  # the matrix that takes positions to the picture
+
+    def on_picture(self, places: Grid) -> Grid:
+        """Return where positions, shape (point, 3), are in the picture [pixel], from its upper left corner."""
+        clip = np.concatenate([places, np.ones((len(places), 1))], axis=1) @ self.projection.T
+        flat = clip[:, :2] / clip[:, 3:]
+        return np.stack([flat[:, 0] + 1, 1 - flat[:, 1]], axis=1) / 2 * self.pixels
+
+
+def save_surface(dataset: xr.Dataset, runs: Runs, png: str | Path, gltf: str | Path) -> None:
+    """Write a slice, and runs laid over it as `overlay` does, as a picture and as a model to turn around.
+
+    The model is turned so that who opens it looks at it from where the picture does: in glTF y points up and z to who
+    looks.
+
+    Raises ValueError where the slice is a line.
+    """
+    page.save(surface_figure(dataset, runs), png)
+    with scene(dataset, runs) as shown, replacing(Path(gltf)) as partial:
+        for actor in shown.plotter.actors.values():
+            actor.rotate_x(-90.0)  # after what follows
+            actor.rotate_z(-90.0 - shown.stand.azimuth)
+        camera = shown.plotter.camera
+        camera.position, camera.focal_point = (0.0, FOCUS + relief.UP, relief.AWAY), (0.0, FOCUS, 0.0)
+        camera.up = (0.0, 1.0, 0.0)
+        shown.plotter.export_gltf(str(partial), inline_data=True, rotate_scene=False, save_normals=True)
+
+
+def surface_figure(dataset: xr.Dataset, runs: Runs = (), *, width: float | None = None) -> page.Picture:
+    """Draw a slice as a body whose height and colour are the loss: every sample is flat, those that failed are holes.
+
+    It is seen from the side, of eight, from which most of the valley is, its lowest tenth.
+
+    Raises ValueError where the slice is a line, or the page too narrow or too wide.
+    """
+    sheet = style.Sheet.of(width, pitch=PITCH)
+    fine = max(1.0, FINE * sheet.width / PIXELS[0]) if width else 1.0
+    picture = page.Picture(sheet, sheet.width)
+    ax = picture.add_subplot()
+    with scene(dataset, runs, pixels=(round(fine * PIXELS[0]), round(fine * PIXELS[1]))) as shown:
+        ax.imshow(np.asarray(shown.plotter.screenshot(return_img=True)), interpolation="antialiased", aspect="auto")
+        _crop(ax, shown)
+        _label(ax, dataset, shown)
+    page.head(picture, ax, dataset)
+    scale = shown.relief.scale
+    panel.colour_bar(
+        ax,
+        ScalarMappable(scale.norm, style.LOSS_MAP),
+        page.loss_name(dataset),
+        scale,
+        fraction=0.03,
+        pad=0.02,
+        shrink=0.8,
+    )
+    page.finish(picture, [*_entries(sheet, runs), *_holes(dataset)], columns=3)
+    return picture
+
+
+@contextmanager
+def scene(dataset: xr.Dataset, runs: Runs, *, pixels: tuple[int, int] = PIXELS) -> Iterator[Shown]:
+    """Give the scene of a slice and of runs laid over it.
+
+    Raises ValueError where the slice is a line.
+    """
+    plane = plane_of(dataset)
+    if plane.rank != 2:
+        raise ValueError(f"a surface shows a plane; got a slice of rank {plane.rank}, so vary two parameters")
+    body = Relief(plane, joint_scale(dataset, runs))
+    stand = relief.stand(body, dataset)
+    with off_screen(pixels) as plotter:
+        focus = (0.0, 0.0, FOCUS)
+        for (turn, away, up), strength in LIGHTS:
+            plotter.add_light(pv.Light(position=stand.place(turn, away, up), focal_point=focus, intensity=strength))
+        plotter.camera.position, plotter.camera.focal_point = stand.place(0.0, relief.AWAY, relief.UP), focus
+        plotter.camera.up, plotter.camera.view_angle = (0.0, 0.0, 1.0), ANGLE
+        _add_surface(plotter, body, dataset)
+        _add_frame(plotter, stand)
+        for run in runs:
+            _add_run(plotter, body, run)
+        plotter.camera.clipping_range = (0.5, 30.0)
+        plotter.enable_anti_aliasing("ssaa")
+        yield Shown(plotter, body, stand, pixels, _projection(plotter, pixels))
+
+
+def _projection(plotter: pv.Plotter, pixels: tuple[int, int]) -> Grid:
+    matrix = plotter.camera.GetCompositeProjectionTransformMatrix(pixels[0] / pixels[1], -1.0, 1.0)
+    return np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])
+
+
+def _add_surface(plotter: pv.Plotter, body: Relief, dataset: xr.Dataset) -> None:
+    made = relief.cells(body, dataset)
+    if not len(made.corners):
+        return
+    surface = pv.PolyData.from_regular_faces(made.corners.reshape(-1, 3), made.triangles)
+    colours = style.LOSS_MAP(body.shade(dataset["loss"].transpose("v", "u").to_numpy()).ravel(), bytes=True)[:, :3]
+    surface["color"] = np.repeat(colours[made.sample], 4, axis=0)
+    surface.point_data.active_normals = np.repeat(made.normals, 4, axis=0)
+    look = {"color": "white", "scalars": "color", "rgb": True, "smooth_shading": True, **MATTER}
+    plotter.add_mesh(surface, name="surface", reset_camera=False, **look)
+
+
+def _add_frame(plotter: pv.Plotter, stand: Stand) -> None:
+    for number, line in enumerate(stand.frame()):
+        lines = pv.lines_from_points(line).tube(radius=FRAME)
+        plotter.add_mesh(lines, color=style.FAINT, lighting=False, name=f"frame {number}", reset_camera=False)
+
+
+def _add_run(plotter: pv.Plotter, body: Relief, run: xr.Dataset) -> None:
+    """Drape a run's points on the surface, where its loss differs above or below it, and join its descents."""
+    places = body.at(*(run[name].to_numpy() for name in ("u", "v", "loss"))) + np.array([0.0, 0.0, LIFT])
+    shown = ~run["outside"].to_numpy() & np.isfinite(run["loss"].to_numpy())
+    label, color = run.attrs["label"], style.method(run)["color"]
+    for name, here in by_kind(run):
+        if (here & shown).any():
+            ball = pv.Sphere(radius=POINT, theta_resolution=16, phi_resolution=16)
+            points = pv.PolyData(places[here & shown]).glyph(geom=ball, scale=False, orient=False)
+            look = {"color": style.POINT_MARKS[name]["color"], "smooth_shading": True, **MATTER}
+            plotter.add_mesh(points, name=f"{label} {name}", reset_camera=False, **look)
+    previous = run["previous"].to_numpy()
+    rows = np.flatnonzero((previous >= 0) & shown & shown[previous])
+    if len(rows):
+        segments = np.stack([places[previous[rows]], places[rows]], axis=1).reshape(-1, 3)
+        tubes = pv.line_segments_from_points(segments).tube(radius=TRAIL)
+        plotter.add_mesh(tubes, color=color, name=f"{label} descents", reset_camera=False, **MATTER)
+    if shown.any():
+        best = places[shown][np.argmin(run["loss"].to_numpy()[shown])]
+        plotter.add_mesh(pv.Sphere(radius=BEST, center=best), color=color, name=f"{label} best", reset_camera=False)
+
+
+def _crop(ax: Axes, shown: Shown) -> None:
+    """Show what the frame takes up of the picture, and a little about it."""
+    a = SIDE / 2
+    box = np.array([(x, y, z) for x in (-a, a) for y in (-a, a) for z in (0.0, HEIGHT)])
+    spots = shown.on_picture(box)
+    low, high = spots.min(axis=0), spots.max(axis=0)
+    room = ROOM * (high - low)[0]
+    (left, upper), (right, lower) = low - room, high + room
+    ax.set(xlim=(left, right), ylim=(lower, upper))
+    ax.set_box_aspect((lower - upper) / (right - left))
+    ax.set_axis_off()
+
+
+def _label(ax: Axes, dataset: xr.Dataset, shown: Shown) -> None:
+    """Write ticks and names beside the frame's two lower edges in front and the one at the right."""
+    sheet, body = page.sheet_of(ax), shown.relief
+    room = sheet.type / sheet.zoom  # that type takes up of the scene
+    for axis, name in enumerate((*body.plane.labels, page.loss_name(dataset))):
+        ticks, share = body.ticks(axis)
+        logarithmic = axis == 2 and body.scale.logarithmic
+        spots = shown.on_picture(np.array([shown.stand.beside(axis, part, room * AWAY[axis]) for part in share]))
+        look: dict[str, Any] = {"size": sheet.tick, "color": style.INK, "va": "center"}
+        look["ha"] = "left" if axis == 2 else "center"
+        for tick, (x, y) in zip(ticks.tolist(), spots, strict=True):
+            ax.text(x, y, style.power(tick) if logarithmic else style.number(tick), **look)
+        _name(ax, shown, axis, name, room * OUT[axis])
+
+
+def _name(ax: Axes, shown: Shown, axis: int, name: str, away: float) -> None:
+    """Write an axis' name along it, farther out than its ticks."""
+    spots = shown.on_picture(np.array([shown.stand.beside(axis, part, away) for part in (0.0, 1.0, 0.5)]))
+    start, end, (x, y) = spots
+    slope = np.degrees(np.arctan2(start[1] - end[1], end[0] - start[0]))
+    slope -= 180.0 * round(slope / 180.0) if abs(slope) > 90.0 + 1e-6 else 0.0
+    look: dict[str, Any] = {"size": page.sheet_of(ax).label, "color": style.INK, "parse_math": False}
+    ax.text(x, y, name, rotation=slope, rotation_mode="anchor", ha="center", va="center", **look)
+
+
+def _entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
+    """Return legend entries of methods and of kinds of points."""
+    dot = sheet.look({"linestyle": "none", "marker": "o", "markersize": 6.0})
+    kinds = dict.fromkeys(name for run in runs for name, _ in by_kind(run))
+    found: list[Artist] = [Line2D([], [], color=style.POINT_MARKS[name]["color"], **dot, label=name) for name in kinds]
+    methods = {str(run.attrs["method"]): style.method(run)["color"] for run in runs}
+    large = dot | {"markersize": 10.0 * sheet.weight}
+    bests = [Line2D([], [], color=color, **large, label=f"{m}: best") for m, color in methods.items()]
+    outside = sum(int(run["outside"].sum()) for run in runs)
+    beyond = [Line2D([], [], linestyle="none", label=f"beyond the slice: {outside} points")] if outside else []
+    return [*found, *bests, *beyond]
+
+
+def _holes(dataset: xr.Dataset) -> list[Artist]:
+    status = dataset["status"].to_numpy()
+    failed = int((status != Status.OK).sum())
+    return [Line2D([], [], linestyle="none", label=f"holes: {failed} of {status.size} samples")] if failed else []

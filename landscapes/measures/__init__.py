@@ -1,0 +1,1 @@
+"""Measures of a landscape: ruggedness, noise, discontinuities, gradients, sensitivity, fidelity."""

@@ -1,0 +1,100 @@
+"""A landscape in words: rules with stated thresholds, from measures to what one says of a landscape.
+
+The thresholds were set on functions whose landscape is known, and on nothing else: the sphere, Rosenbrock's valley,
+Himmelblau's function, Branin's, Rastrigin's, Ackley's and Levy's, white noise, a step, a plateau, and a bowl with fine
+ripples, at 48 x 48 samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..plain import finite
+from ..statistics import Values
+from .discontinuities import Jumps
+from .records import WordRecord
+from .ruggedness import Ruggedness
+
+VERY_SMOOTH, SMOOTH, RUGGED, EXTREME = "very smooth", "smooth with local minima", "rugged", "extremely rugged"
+LARGE_FLAT, DISCONTINUOUS = "large flat regions", "discontinuous"
+GOOD, NOISY, OPPOSITE, ZERO = "gradients good", "gradients noisy", "gradients opposite", "gradients zero"
+WORDS = (VERY_SMOOTH, SMOOTH, RUGGED, EXTREME, LARGE_FLAT, DISCONTINUOUS, GOOD, NOISY, OPPOSITE, ZERO)
+
+FEW_TURNS = 0.1  # of the steps between samples: Himmelblau's function turns at 0.03, Levy's at 0.15 of them
+MANY_TURNS = 0.5  # Rastrigin's function turns at 0.45 of them, white noise at 0.65
+FEW_MINIMA = 10  # notable ones: Himmelblau's function has 4, Levy's 20
+MUCH = 0.2  # share of the samples from which flat regions are large and zero gradients are worth a word
+AGREE = 0.9  # mean cosine with the slope over two samples: Ackley's gradients have 0.96, those of fine ripples 0.3
+OFTEN = 1 / 3  # share of gradients that point uphill: fine ripples make it 0.3 to 0.4, random directions a half
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Hold the words for a landscape, each with the measure it comes from."""
+
+    reasons: dict[str, str]
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The words, in the order of `WORDS`."""
+        return tuple(word for word in WORDS if word in self.reasons)
+
+    def beside(self, said: Sequence[str]) -> list[WordRecord]:
+        """Return each word of somebody else's, and whether it was measured."""
+        return [{"word": word, "measured": word in self.reasons} for word in said]
+
+
+def classify(found: Ruggedness, jumps: Jumps | None, cosine: Values) -> Verdict:
+    """Put a landscape into words.
+
+    `cosine` is that of its gradients with differences over two samples, NaN where neither shows a slope. A gradient
+    of zero is no direction, so it counts for the word zero only. What jumps is not called very smooth.
+    """
+    reasons = dict([_surface(found)])
+    if found.level.value >= MUCH:
+        reasons[LARGE_FLAT] = f"{found.level.value:.0%} of the samples are level with their neighbours"
+    if jumps is not None and len(jumps.height):
+        share = jumps.share
+        reasons.pop(VERY_SMOOTH, None)
+        reasons[DISCONTINUOUS] = f"{len(jumps.height)} jumps found, between {share.value:.1%} of neighbouring samples"
+    return Verdict(reasons | _gradients(found, cosine))
+
+
+def _surface(found: Ruggedness) -> tuple[str, str]:
+    turns, count = found.turns.value, found.notable
+    said = f"minima deeper than 1 % of the range: {count}; steps between samples that turn back: {turns:.0%}"
+    if turns > MANY_TURNS:
+        return EXTREME, said
+    if turns > FEW_TURNS or count > FEW_MINIMA:
+        return RUGGED, said
+    return (SMOOTH if count > 1 else VERY_SMOOTH), said
+
+
+def _gradients(found: Ruggedness, cosine: Values) -> dict[str, str]:
+    reasons = {}
+    if found.flat is not None and found.flat.value >= MUCH:
+        reasons[ZERO] = f"effectively zero at {found.flat.value:.0%} of the samples"
+    known = cosine[np.isfinite(cosine) & (cosine != 0)]
+    if not len(known):
+        return reasons
+    average, uphill = float(known.mean()), float((known < 0).mean())
+    said = f"mean cosine {average:z.2f} with the slope over two samples"
+    reasons[GOOD if average >= AGREE else NOISY] = said
+    if uphill >= OFTEN:
+        reasons[OPPOSITE] = f"{uphill:.0%} of the gradients point up that slope"
+    return reasons
+
+
+def thresholds() -> dict[str, float | None]:
+    """Return the thresholds by name, to be stated with results."""
+    return {
+        "few turns": finite(FEW_TURNS),
+        "many turns": finite(MANY_TURNS),
+        "few minima": finite(FEW_MINIMA),
+        "large share": finite(MUCH),
+        "good cosine": finite(AGREE),
+        "often uphill": finite(OFTEN),
+    }

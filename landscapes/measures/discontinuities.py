@@ -1,0 +1,149 @@
+"""Discontinuities of a loss: differences between neighbouring samples that do not vanish on a finer look."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import xarray as xr
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..identity import plane_of
+from ..objective import Objective, evaluate
+from ..plain import finite
+from ..plane import Plane
+from ..statistics import Estimate, share
+from .records import JumpRecord, JumpsRecord
+
+HALVINGS = 12  # a gap between samples is looked into down to 1/4096 of it
+PERSISTS = 3  # halvings over which a jump keeps more than half of its height, and a slope an eighth
+Count = Callable[[Tensor], Mapping[str, Tensor]]
+
+
+@dataclass(frozen=True)
+class Jumps:
+    """Hold the jumps that were found, and how often they occur between neighbouring samples.
+
+    `place` [plane units], shape (count, rank), `height` [loss unit] and `counted`, whether some event happens more or
+    less often on the other side (None where the objective counts none), shape (count,). Of `neighbours` pairs of
+    samples `steep` differ by at least `least`; `checked` of these were looked into and `undecided` could not be, as an
+    evaluation there failed.
+    """
+
+    place: Float[Tensor, "count rank"]
+    height: Float[Tensor, " count"]
+    counted: Bool[Tensor, " count"] | None
+    least: float
+    neighbours: int
+    steep: int
+    checked: int
+    undecided: int
+
+    @property
+    def share(self) -> Estimate:
+        """Share of all pairs of neighbours with a jump between them; no interval where every steep one was checked."""
+        decided, part = self.checked - self.undecided, self.steep / self.neighbours if self.neighbours else math.nan
+        if self.steep == 0:
+            return Estimate(0.0, 0.0, 0.0)
+        found = share(len(self.height), decided)
+        if decided == self.steep:
+            return Estimate(found.value * part, found.value * part, found.value * part)
+        return Estimate(found.value * part, found.low * part, found.high * part)
+
+    @property
+    def share_explained(self) -> Estimate | None:
+        """Share of the jumps across which an event is counted differently."""
+        return None if self.counted is None else share(int(self.counted.sum()), len(self.counted))
+
+    def record(self) -> JumpsRecord:
+        """Return it as plain JSON, the highest jumps first."""
+        order = self.height.argsort(descending=True)
+        counted = [None] * len(order) if self.counted is None else self.counted[order].tolist()
+        rows = zip(self.place[order].tolist(), self.height[order].tolist(), counted, strict=True)
+        found: list[JumpRecord] = [{"place": place, "height": height, "event": event} for place, height, event in rows]
+        return {
+            "share": self.share.record(),
+            "explained_by_events": self.share_explained.record() if self.share_explained else None,
+            "least": finite(self.least),
+            "neighbours": self.neighbours,
+            "steep": self.steep,
+            "checked": self.checked,
+            "undecided": self.undecided,
+            "found": found,
+        }
+
+
+def find_jumps(
+    objective: Objective,
+    dataset: xr.Dataset,
+    *,
+    least: float,
+    most: int = 64,
+    seed: int = 0,
+    events: Count | None = None,
+) -> Jumps:
+    """Look for jumps of at least `least` [loss unit] between neighbouring samples, by new evaluations.
+
+    At most so many pairs, drawn at random from those that differ by as much, are bisected towards the larger half: a
+    jump keeps its height, a slope loses half of it every time.
+    """
+    plane = plane_of(dataset)
+    ends, neighbours = _steep_pairs(dataset, plane, least)
+    drawn = np.sort(np.random.default_rng(seed).permutation(len(ends))[:most])
+    low, high = (torch.from_numpy(ends[drawn][:, side]) for side in (0, 1))
+    low, high, gaps = _bisect(objective, plane, low, high)
+    decided = gaps.isfinite().all(dim=0)
+    last, earlier = gaps[-1], gaps[-1 - PERSISTS]
+    found = decided & (last >= least) & (last > earlier / 2)
+    place = (low + high)[found] / 2
+    counted = _differ(events, plane.lift(low[found]), plane.lift(high[found])) if events else None
+    return Jumps(
+        place, last[found], counted, least, neighbours, len(ends), len(drawn), int((~decided).sum())
+    )  # fmt: skip
+
+
+def _steep_pairs(dataset: xr.Dataset, plane: Plane, least: float) -> tuple[NDArray[np.float64], int]:
+    """Return the ends of pairs that differ so much, shape (pairs, 2, rank), and how many pairs there are."""
+    loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+    axes = [axis.numpy() for axis in plane.axes()]
+    places = np.stack(np.meshgrid(*axes[::-1], indexing="ij")[::-1], axis=-1)
+    pairs, neighbours = [np.zeros((0, 2, plane.rank))], 0
+    for axis in range(loss.ndim):
+        apart = np.abs(np.diff(loss, axis=axis))
+        neighbours += int(np.isfinite(apart).sum())
+        first, second = (np.delete(places, at, axis=axis) for at in (-1, 0))
+        with np.errstate(invalid="ignore"):
+            pairs.append(np.stack([first, second], axis=-2)[(apart >= least) & (apart > 0)])
+    return np.concatenate(pairs), neighbours
+
+
+def _bisect(
+    objective: Objective, plane: Plane, low: Float[Tensor, "pairs rank"], high: Float[Tensor, "pairs rank"]
+) -> tuple[Tensor, Tensor, Float[Tensor, "halvings pairs"]]:
+    """Halve every pair towards the larger difference; return its last ends and the difference after each halving."""
+
+    def losses(u: Float[Tensor, "pairs rank"]) -> Float[Tensor, " pairs"]:
+        return evaluate(objective, plane.lift(u), grad=False).loss
+
+    below, above = losses(low), losses(high)  # anew: a slice may come from another device
+    gaps = [(above - below).abs()]
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        between = losses(middle)
+        left = (between - below).abs() >= (above - between).abs()
+        high, above = torch.where(left[:, None], middle, high), torch.where(left, between, above)
+        low, below = torch.where(left[:, None], low, middle), torch.where(left, below, between)
+        gaps.append((above - below).abs() + 0 * between)  # NaN once a middle failed
+    return low, high, torch.stack(gaps)
+
+
+def _differ(events: Count, low: Float[Tensor, "jumps dim"], high: Float[Tensor, "jumps dim"]) -> Tensor | None:
+    before, after = events(low), events(high)
+    if not before:
+        return None
+    return torch.stack([before[name].cpu() != after[name].cpu() for name in before]).any(dim=0)

@@ -1,0 +1,337 @@
+"""Ruggedness of the losses of a slice: minima and basins, flatness, correlation, variation, information.
+
+Every measure takes losses, shape (u,) or (v, u), at evenly spaced samples of a box whose sides count as 1, NaN where an
+evaluation failed; what is missing is left out, never filled in.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+import torch
+import xarray as xr
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.spatial.distance import pdist
+
+from ..identity import plane_of
+from ..plain import plain
+from ..statistics import Estimate, Values, jackknife
+from .records import LossesRecord
+
+FLAT_SLOPE = 1e-3  # a slope below it is effectively zero [ranges of the losses per side of the box]
+NOTABLE = 0.01  # the least depth of a notable minimum, as a fraction of the range
+THRESHOLDS = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)  # depths that minima are counted by, as fractions of the range
+BEST_SHARE = 0.05  # share of the samples that dispersion calls the best
+PAIRED = 4096  # most samples whose pairs are gone through one by one, 8 million of them
+
+
+@dataclass(frozen=True)
+class Minima:
+    """Hold the local minima of a slice, deepest first: their depths [loss unit] and the samples they are at.
+
+    Depth is persistence: how far one must climb to get to a lower minimum. The lowest one's is the range of the losses.
+    """
+
+    depth: Values
+    sample: NDArray[np.intp]
+
+    def count(self, depth: float) -> int:
+        """Count minima deeper than `depth`."""
+        return int((self.depth > depth).sum())
+
+
+def minima(loss: Values) -> Minima:
+    """Find local minima, diagonal neighbours included, by persistence of the sublevel sets (cubical complex)."""
+    from gudhi import CubicalComplex
+
+    known = np.isfinite(loss)
+    if not known.any():
+        return Minima(np.zeros(0), np.zeros(0, np.intp))
+    filled = np.where(known, loss, np.inf)
+    complex_ = CubicalComplex(top_dimensional_cells=filled)
+    complex_.compute_persistence()
+    pairs, lasting = complex_.cofaces_of_persistence_pairs()
+    born, died = pairs[0].T if len(pairs) and len(pairs[0]) else np.zeros((2, 0), np.intp)
+    start = np.concatenate([lasting[0], born]).astype(np.intp)
+    value = filled.ravel(order="F")
+    depth = np.concatenate([np.full(len(lasting[0]), np.inf), value[died] - value[born]])
+    depth = np.where(np.isfinite(depth), depth, span(loss))  # the lowest, and what failures cut off from the rest
+    order = np.argsort(-depth, kind="stable")
+    places = np.ravel_multi_index(np.unravel_index(start[order], loss.shape, order="F"), loss.shape)
+    there = np.isfinite(loss.ravel()[places])
+    return Minima(depth[order][there], places[there])
+
+
+def basins(loss: Values, sample: NDArray[np.intp]) -> Values:
+    """Return the shares of the samples that drain to each of these minima (watershed)."""
+    from skimage.segmentation import watershed
+
+    markers = np.zeros(loss.shape, np.int32)
+    markers.ravel()[sample] = 1 + np.arange(len(sample))
+    known = np.isfinite(loss)
+    heights = np.where(known, loss, 0.0)
+    labels = watershed(heights, markers, mask=known, connectivity=loss.ndim)  # type: ignore[no-untyped-call]
+    shares: Values = np.bincount(labels[known], minlength=len(sample) + 1)[1:] / max(known.sum(), 1)
+    return shares
+
+
+def minima_of_halves(loss: Values, depth: float) -> tuple[int, int]:
+    """Return the fewest and the most minima deeper than `depth` that every second sample would have shown."""
+    starts = np.ndindex((2,) * loss.ndim)
+    counts = [minima(loss[tuple(slice(at, None, 2) for at in start)]).count(depth) for start in starts]
+    return min(counts), max(counts)
+
+
+def span(loss: Values) -> float:
+    """Return the range of the losses."""
+    known = loss[np.isfinite(loss)]
+    return float(known.max() - known.min()) if known.size else math.nan
+
+
+def level_samples(loss: Values, depth: float) -> Values:
+    """Return 1 for each sample that no neighbour along an axis differs from by more than `depth`, 0 for others."""
+    most = np.zeros_like(loss)
+    for axis in range(loss.ndim):
+        apart = np.nan_to_num(np.abs(np.diff(loss, axis=axis)))
+        before, after = ([(0, 0)] * loss.ndim for _ in range(2))
+        before[axis], after[axis] = (1, 0), (0, 1)
+        most = np.maximum(most, np.maximum(np.pad(apart, before), np.pad(apart, after)))
+    return np.where(np.isfinite(loss), (most <= depth).astype(float), np.nan)
+
+
+def correlation_length(loss: Values, axis: int) -> float:
+    """Return the distance at which the autocorrelation along lines of an axis falls to 1/e, in fractions of the box.
+
+    Each line varies about its own mean; lines count by their variance.
+    """
+    lines = _lines(loss, axis)
+    lines = lines[np.isfinite(lines).any(axis=1)]
+    lines = lines - np.nanmean(lines, axis=1, keepdims=True)
+    points, before = lines.shape[1], 1.0
+    variance = _mean(lines**2)
+    if not variance > 0:
+        return math.nan
+    for lag in range(1, points):
+        now = _mean(lines[:, :-lag] * lines[:, lag:]) / variance
+        if now < 1 / math.e:
+            return float((lag - (1 / math.e - now) / (before - now)) / (points - 1))
+        before = now if math.isfinite(now) else before
+    return 1.0
+
+
+def total_variation(loss: Values, axis: int) -> float:
+    """Return how many times lines along an axis go through their own range: 1 if monotone, 2 across a bowl."""
+    lines = _lines(loss, axis)
+    ranges = sum(span(line) for line in lines[np.isfinite(lines).any(axis=1)])
+    return float(np.nansum(np.abs(np.diff(lines, axis=1)))) / ranges if ranges > 0 else math.nan
+
+
+def information_content(loss: Values) -> tuple[float, float]:
+    """Return the information content h_max and log10 of the settling sensitivity eps_s, of walks along the axes.
+
+    Munoz, Kirley & Halgamuge 2015, IEEE Trans. Evol. Comput. 19(1), eqs. 6 to 9. Slopes are in ranges of the losses per
+    side of the box, so that slices compare.
+    """
+    walks = [_slopes(loss, axis) for axis in range(loss.ndim)]
+    sizes = np.concatenate([[0.0], np.logspace(-6.05, 3.95, 101)])  # none is 1, the slope of every ramp
+    entropy = np.array([_entropy(counts) for counts in _pair_counts(walks, sizes)])
+    if not np.isfinite(entropy).any():
+        return math.nan, math.nan
+    settled = sizes[(entropy < 0.05) & (sizes > 0)]
+    return float(entropy.max()), math.log10(settled[0]) if len(settled) else math.nan
+
+
+def turns(loss: Values) -> float:
+    """Return the share of steps between samples that turn back, small steps passed over.
+
+    Small is less than half the step of a ramp through the range of the losses. The partial information content M of
+    Munoz et al. 2015, eq. 10, but that a walk which never turns has none.
+    """
+    turned = steps = 0
+    for axis in range(loss.ndim):
+        small = span(loss) / (loss.shape[axis] - 1) / 2
+        for line in _lines(loss, axis):
+            difference = np.diff(line)
+            steps += int(np.isfinite(difference).sum())
+            way = np.sign(difference[np.abs(difference) > small])
+            turned += int((way[1:] != way[:-1]).sum())
+    return turned / steps if steps else math.nan
+
+
+def dispersion(loss: Values) -> float:
+    """Return how far apart the best 5 % of the samples are, against all: 1 scattered, 0 together.
+
+    Lunacek & Whitley 2006, GECCO, as a ratio of mean distances.
+    """
+    places, losses = np.argwhere(np.isfinite(loss)), loss[np.isfinite(loss)]
+    if len(losses) <= 2:
+        return math.nan
+    best = places[np.argsort(losses, kind="stable")[: max(2, round(BEST_SHARE * len(losses)))]]
+    return mean_distance(best, loss.shape) / mean_distance(places, loss.shape)
+
+
+def mean_distance(places: NDArray[np.intp], shape: tuple[int, ...]) -> float:
+    """Return the mean distance of all pairs of samples of a slice of this shape, shape (count, rank).
+
+    Of many there are more pairs than memory holds, but few steps that samples can be apart: how many pairs are each is
+    the autocorrelation of where the samples are, by the Fourier transform, rounded to the whole numbers it is made of.
+    """
+    if len(places) <= PAIRED:
+        return float(pdist(places / _sides(shape)).mean())
+    there = np.zeros(shape)
+    there[tuple(places.T)] = 1.0
+    padded = [fft.next_fast_len(2 * points - 1, real=True) for points in shape]  # so that no end meets the other
+    pairs = np.rint(fft.irfftn(np.abs(fft.rfftn(there, padded)) ** 2, padded))
+    steps = [np.minimum(np.arange(size), size - np.arange(size)) for size in padded]
+    squares = np.ix_(*[(step / side) ** 2 for step, side in zip(steps, _sides(shape), strict=True)])
+    return float((pairs * np.sqrt(sum(squares))).sum() / (len(places) * (len(places) - 1)))
+
+
+def fitness_distance(loss: Values) -> float:
+    """Return the correlation of losses with the distance to the lowest sample (Jones & Forrest 1995)."""
+    places, losses = np.argwhere(np.isfinite(loss)) / _sides(loss.shape), loss[np.isfinite(loss)]
+    if len(losses) < 3 or losses.min() == losses.max():
+        return math.nan
+    return float(np.corrcoef(losses, np.linalg.norm(places - places[losses.argmin()], axis=1))[0, 1])
+
+
+@dataclass(frozen=True)
+class Ruggedness:
+    """Hold the measures of a slice's losses; `floor` [loss unit] is the range that noise alone would give them.
+
+    `minima` counts those deeper than the floor, `minima_halved` what every second sample shows of them; `curve` counts
+    by depths in fractions of the range. `zero` and `flat` are shares of samples whose gradient along the plane is
+    exactly and effectively zero, `level` of those whose neighbours' losses differ by no more than the floor.
+    """
+
+    samples: int
+    failed: int
+    range: float
+    floor: float
+    minima: int
+    minima_halved: tuple[int, int]
+    notable: int
+    curve: dict[float, int]
+    largest_basin: float
+    lowest_basin: float
+    zero: Estimate | None
+    flat: Estimate | None
+    level: Estimate
+    correlation_length: tuple[Estimate, ...]
+    total_variation: tuple[Estimate, ...]
+    information: Estimate
+    settling: Estimate
+    turns: Estimate
+    dispersion: Estimate
+    fitness_distance: Estimate
+
+    def record(self) -> LossesRecord:
+        """Return it as plain JSON."""
+        return cast("LossesRecord", plain(vars(self)))
+
+
+def ruggedness(dataset: xr.Dataset, *, floor: float) -> Ruggedness:
+    """Measure the ruggedness of a slice."""
+    loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+    found, whole = minima(loss), span(loss)
+    notable = found.sample[found.depth > max(floor, NOTABLE * whole)]
+    shares = basins(loss, notable) if len(notable) else np.full(1, math.nan)
+    axes = range(loss.ndim)[::-1]  # u first
+    slopes = box_slopes(dataset) if "grad" in dataset else None
+    return Ruggedness(
+        samples=loss.size,
+        failed=int((~np.isfinite(loss)).sum()),
+        range=whole,
+        floor=floor,
+        minima=found.count(floor),
+        minima_halved=minima_of_halves(loss, floor),
+        notable=len(notable),
+        curve={part: found.count(part * whole) for part in THRESHOLDS},
+        largest_basin=float(shares.max()),
+        lowest_basin=float(shares[0]),
+        zero=None if slopes is None else jackknife(_mean, _below(slopes, 0.0), least=0.0, most=1.0),
+        flat=None if slopes is None else jackknife(_mean, _below(slopes, FLAT_SLOPE * whole), least=0.0, most=1.0),
+        level=jackknife(_mean, level_samples(loss, floor), least=0.0, most=1.0),
+        correlation_length=tuple(
+            jackknife(lambda part, axis=axis: correlation_length(part, axis), loss, least=0.0, most=1.0)  # type: ignore[misc]
+            for axis in axes
+        ),
+        total_variation=tuple(
+            jackknife(lambda part, axis=axis: total_variation(part, axis), loss, least=1.0)  # type: ignore[misc]
+            for axis in axes
+        ),
+        information=jackknife(lambda part: information_content(part)[0], loss, least=0.0, most=1.0),
+        settling=jackknife(lambda part: information_content(part)[1], loss),
+        turns=jackknife(turns, loss, least=0.0, most=1.0),
+        dispersion=jackknife(dispersion, loss, least=0.0),
+        fitness_distance=jackknife(fitness_distance, loss, least=-1.0, most=1.0),
+    )
+
+
+def box_slopes(dataset: xr.Dataset) -> Values:
+    """Return the derivatives along the plane's axes, axis last [loss unit per side of the box]."""
+    plane = plane_of(dataset)
+    grad = dataset["grad"].transpose("v", "u", "dim", missing_dims="ignore").to_numpy()
+    slopes: Values = (plane.slope(torch.from_numpy(grad)) * (plane.upper - plane.lower)).numpy()
+    return slopes
+
+
+def _below(slopes: Values, size: float) -> Values:
+    length = np.linalg.norm(slopes, axis=-1)
+    return np.where(np.isfinite(length), (length <= size).astype(float), np.nan)
+
+
+def _lines(loss: Values, axis: int) -> Values:
+    return np.moveaxis(loss, axis, -1).reshape(-1, loss.shape[axis])
+
+
+def _mean(values: Values) -> float:
+    with warnings.catch_warnings():  # of nothing at all it is NaN
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return float(np.nanmean(values))
+
+
+def _slopes(loss: Values, axis: int) -> Values:
+    whole = span(loss)
+    slopes: Values = np.diff(_lines(loss, axis), axis=1) * (loss.shape[axis] - 1)
+    return slopes / whole if whole > 0 else slopes
+
+
+def _pair_counts(walks: list[Values], sizes: Values) -> Values:
+    """Count pairs of successive steps by their symbols at each of ascending sizes, shape (size, symbol, symbol).
+
+    A step's symbol is its sign, but 0 at every size that it does not exceed (Munoz et al. 2015, eq. 6). One pass over
+    the steps does for all sizes: the symbols of a pair change where one of them becomes 0, and where the other does.
+    """
+    counts = np.zeros((len(sizes) + 1) * 9)
+    for walk in walks:
+        known = np.isfinite(walk[:, :-1]) & np.isfinite(walk[:, 1:])
+        steps = walk[:, :-1][known], walk[:, 1:][known]
+        first, second = (np.searchsorted(sizes, np.abs(step)) for step in steps)  # the symbols are 0 from there on
+        both = [np.sign(step).astype(int) for step in steps]
+        sooner, later = np.minimum(first, second), np.maximum(first, second)
+        one, none = [both[0] * (first == later), both[1] * (second == later)], [0, 0]
+        for start, end, symbols in ((0, sooner, both), (sooner, later, one), (later, len(sizes), none)):
+            for at, change in ((start, 1), (end, -1)):
+                place = np.broadcast_to(9 * at + 3 * (symbols[0] + 1) + symbols[1] + 1, later.shape)
+                counts += change * np.bincount(place, minlength=counts.size)
+    return counts.reshape(-1, 3, 3).cumsum(axis=0)[:-1]
+
+
+def _entropy(counts: Values) -> float:
+    """Return Munoz et al. 2015, eq. 7: the entropy of pairs of steps that differ, to base 6."""
+    if not counts.sum():
+        return math.nan
+    shares = counts[~np.eye(3, dtype=bool)] / counts.sum()
+    shares = shares[shares > 0]
+    return float(-(shares * np.log(shares)).sum() / math.log(6))
+
+
+def _sides(shape: tuple[int, ...]) -> NDArray[np.intp]:
+    """Return how many steps between samples make each side of the box."""
+    return np.array([max(points - 1, 1) for points in shape])

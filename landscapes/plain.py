@@ -1,0 +1,71 @@
+"""Values as plain JSON: what a report, a record or an identity may hold, and what becomes of all else."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+
+def finite(value: float) -> float | None:
+    """Return a number as JSON has it: None where it is NaN or infinite."""
+    return float(value) if math.isfinite(value) else None
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON has it, at any depth.
+
+    NaN and infinity become None; arrays, tensors and tuples become lists, numbers of numpy those of Python; whatever
+    has a `record` is what that returns. Raises TypeError for anything else that JSON does not know.
+    """
+    if hasattr(value, "record"):
+        return plain(value.record())
+    if isinstance(value, Mapping):
+        return {name: plain(inner) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(inner) for inner in value]
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, float):
+        return finite(value)
+    if value is None or isinstance(value, str | int):
+        return value
+    raise TypeError(f"{type(value).__name__} has no form in JSON; give numbers, strings, lists or dicts")
+
+
+def plain_json(settings: Mapping[str, Any], what: str) -> dict[str, Any]:
+    """Return settings exactly as they come back from JSON: tuples are lists, keys are strings.
+
+    Raises ValueError, which says `what` they are, where JSON would not keep them: NaN and infinity are refused, too.
+    """
+    try:
+        found: dict[str, Any] = json.loads(json.dumps(settings, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{what} must be plain JSON (numbers, strings, lists, dicts): {error}") from None
+    return found
+
+
+def text(value: Any) -> str:
+    """Return what has to be a string.
+
+    Raises TypeError where it is none.
+    """
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r} is no text")
+    return value
+
+
+def number(value: Any) -> float:
+    """Return what has to be a finite number, as it is.
+
+    Raises TypeError where it is none.
+    """
+    if not isinstance(value, int | float) or not math.isfinite(value):
+        raise TypeError(f"{value!r} is no number")
+    return value
+
+
+def optional(kind: Callable[[Any], Any], value: Any) -> Any:
+    """Return what has to be of a kind, or None."""
+    return None if value is None else kind(value)

@@ -1,0 +1,1 @@
+"""How a slice is filled: in which order, within which memory, by which workers."""

@@ -1,0 +1,156 @@
+"""Fill a slice: evaluate the points of its tiles, coarse to fine, and write down each tile whole."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import xarray as xr
+
+from ..identity import check_identity
+from ..objective import Objective, Status, name_of
+from ..plane import Plane
+from ..space import as_whole
+from ..storage.disk import full, is_full
+from ..storage.store import SliceStore
+from ..storage.tiles import Tile
+from .distribution import FilledTile, ReadBack, Site, WorkersLostError, distribute, equal_batches, workers_of
+from .memory import MemoryBound
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Hold how far a slice is.
+
+    `done` of `total` points are finished, `resumed` of them before this run began; `statuses` counts the finished ones.
+    `levels` coarse pictures are complete, each finer than the last, and `level_complete` says that one has just become
+    so: the time to draw `SliceStore.coarse()`.
+    """
+
+    done: int
+    total: int
+    resumed: int
+    statuses: Mapping[Status, int]
+    levels: int
+    level_complete: bool
+
+
+def sample(
+    objective: Objective,
+    plane: Plane,
+    store: SliceStore | None = None,
+    *,
+    grad: bool = True,
+    batch: int | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    executor: Executor | None = None,
+    made: Callable[[], Objective] | None = None,
+) -> xr.Dataset:
+    """Evaluate an objective on a plane and return the slice; what `store` holds already is not evaluated again.
+
+    Without a store the slice lives in memory. `batch` is the number of points per evaluation, rounded up to whole tiles
+    (default: the objective's `preferred_batch`, else one tile); `progress` is called once at the start and after every
+    tile. Stop it at any instant: the same call goes on, and the result is bit for bit that of an uninterrupted one,
+    given an objective whose rows do not depend on their batch. A batch that does not fit into memory is halved.
+
+    With an `executor` its workers evaluate batches and write them to the store, which processes must see at the same
+    path. Threads share the objective; in a process `made`, a function that can be pickled, makes it once, or else it is
+    pickled itself. Batches are equal then, and of at most `batch` points. Where workers are lost, `WorkersLostError`.
+
+    Raises StoreMismatchError where the store was made by other settings, TooLargeError where the slice does not fit
+    into memory, DiskFullError and WorkersLostError where filling ended early, which say what is kept, and MemoryError
+    where a single point is too much for the device.
+    """
+    if store is None:
+        store = SliceStore.in_memory(plane, objective.space, **_describe(objective), grad=grad)
+    _check_store(store, objective, plane, grad=grad)
+    batch = as_whole(getattr(objective, "preferred_batch", 1) if batch is None else batch, "sample's batch", least=1)
+    status = store.status()
+    counts: Counter[Status] = Counter({kind: int((status == kind).sum()) for kind in Status if kind != Status.MISSING})
+    resumed, pending = counts.total(), store.pending(status)
+    left = Counter(tile.level for tile in pending)  # tiles, by level
+    every = 1 + store.tiles()[-1].level
+    levels = min(left, default=every)
+    _warn_of_damage(store, pending)
+
+    def report() -> None:
+        nonlocal levels
+        before, levels = levels, min(left, default=every)
+        if progress is not None:
+            progress(Progress(counts.total(), status.size, resumed, dict(counts), levels, levels > before))
+
+    report()
+    back = ReadBack(store)
+    site = Site(MemoryBound(objective), store, made)
+    with _resumable(store, counts), closing(_fill(site, pending, batch, executor)) as tiles:
+        for filled in tiles:
+            for note in filled.notes:
+                warnings.warn(note, RuntimeWarning, stacklevel=2)
+            counts.update(filled.statuses)
+            left -= Counter([filled.tile.level])  # none is kept at zero
+            report()
+            if executor is not None:
+                back.look(filled.tile)
+        dataset = store.dataset(back.values())
+        if not bool((dataset["status"] == Status.MISSING).any()):
+            store.finish(dataset)
+    return dataset
+
+
+def _describe(objective: Objective) -> dict[str, dict[str, Any]]:
+    """Return what an objective says of itself: an environment its fidelity and options, any its name and unit."""
+    about: Callable[[], dict[str, Any]] = getattr(objective, "identity", lambda: {"objective": name_of(objective)})
+    return {"identity": about(), "provenance": {"loss_unit": getattr(objective, "loss_unit", "")}}
+
+
+def _fill(
+    site: Site, pending: Sequence[Tile], batch: int, executor: Executor | None
+) -> Generator[FilledTile, None, None]:
+    if executor is None:
+        for tiles in _batches(site.store, batch, set(pending)):
+            yield from site.fill(tiles)
+    elif pending:
+        yield from distribute(site, equal_batches(site.store, pending, batch, workers_of(executor)), executor)
+
+
+def _warn_of_damage(store: SliceStore, pending: Sequence[Tile]) -> None:
+    for tile in store.damaged_tiles(pending):
+        warnings.warn(f"{store.path}: tile {tile.index} is damaged and computed again", RuntimeWarning, stacklevel=3)
+
+
+@contextmanager
+def _resumable(store: SliceStore, counts: Counter[Status]) -> Iterator[None]:
+    """Say what is kept where the disk is full or the workers are lost."""
+    try:
+        yield
+    except OSError as error:
+        kept = f"{counts.total()} of {math.prod(store.shape)} points are kept in {store.path or 'memory'}"
+        if isinstance(error, WorkersLostError):
+            raise WorkersLostError(f"{error}; {kept}, and the same command goes on from there") from error
+        if is_full(error):
+            raise full(error, kept) from error
+        raise
+
+
+def _check_store(store: SliceStore, objective: Objective, plane: Plane, *, grad: bool) -> None:
+    wanted = {"plane": plane.record(), "parameters": list(objective.space.names), "gradients": grad}
+    check_identity(store.path, wanted=wanted, found={name: store.identity[name] for name in wanted})
+
+
+def _batches(store: SliceStore, batch: int, pending: set[Tile]) -> Iterator[list[Tile]]:
+    """Group all tiles the same way however many are pending, so that a resumed run repeats the same batches."""
+    group: list[Tile] = []
+    size = 0
+    for tile in store.tiles():
+        group.append(tile)
+        size += store.count(tile)
+        if size >= batch:
+            yield [member for member in group if member in pending]
+            group, size = [], 0
+    yield [member for member in group if member in pending]

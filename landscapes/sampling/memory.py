@@ -1,0 +1,86 @@
+"""Memory of the device: batches are halved where it runs out."""
+
+from __future__ import annotations
+
+import gc
+import re
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..objective import Evaluation, Objective, evaluate, name_of
+
+# What torch, Warp, Taichi and CUDA say; the first of them alone has a type of its own.
+SAID = re.compile(
+    r"out of memory|out of CUDA|fail\w* to allocate|can't allocate memory|not enough memory", re.IGNORECASE
+)
+
+
+class MemoryBound:
+    """Evaluate an objective at fewer points at a time once its device ran out of memory, down to one.
+
+    That changes no result, given an objective whose rows do not depend on their batch. One that holds memory for all
+    rows it takes at once, such as an environment, is told to hold less by its method `shrink(rows)`.
+    """
+
+    def __init__(self, objective: Objective) -> None:
+        self.objective = objective
+        self.space = objective.space
+        self.name = name_of(objective)
+        self._notes: list[str] = []
+        self._most: int | None = None
+
+    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
+        """Return losses, and gradients if asked, at points `x` in the parameters' own units.
+
+        Raises MemoryError where the device has too little memory for a single point.
+        """
+        parts: list[Evaluation] = []
+        start = 0
+        while start < len(x):
+            rows = x[start : start + (self._most or len(x))]
+            part = self._try(rows, grad=grad)
+            if part is None:
+                free_memory()  # the arrays of the attempt that failed
+                self._most = len(rows) // 2
+                getattr(self.objective, "shrink", _keep)(self._most)
+                self._notes.append(f"{self.name} ran out of memory at {len(rows)} points; going on with {self._most}")
+                continue
+            parts.append(part)
+            start += len(rows)
+        return Evaluation.join(parts, dim=x.shape[1], grad=grad)
+
+    def take_notes(self) -> tuple[str, ...]:
+        """Return what to warn of since this was called last."""
+        notes, self._notes = tuple(self._notes), []
+        return notes
+
+    def _try(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation | None:
+        """Return the evaluation, None where the device has too little memory for so many points."""
+        try:
+            return evaluate(self.objective, x, grad=grad)
+        except (RuntimeError, MemoryError) as error:
+            if not is_out_of_memory(error):
+                raise
+            if len(x) == 1:
+                raise MemoryError(
+                    f"{self.name} ran out of memory at a single point: {error}; end what else uses the device, "
+                    "or take a lower --fidelity or another --device"
+                ) from error
+            return None
+
+
+def free_memory() -> None:
+    """Collect garbage and empty the cache of GPU memory."""
+    gc.collect()  # some, such as a solver and its launches, refer to each other
+    torch.cuda.empty_cache()
+
+
+def _keep(rows: int) -> None:
+    """Leave an objective that holds no memory between evaluations as it is."""
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an error says that the host or a GPU has too little memory."""
+    return isinstance(error, MemoryError | torch.OutOfMemoryError) or bool(SAID.search(str(error)))

@@ -1,0 +1,146 @@
+"""A sampled slice of a landscape, as one works with it: its numbers, its plane, its picture, what is measured of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import torch
+import xarray as xr
+from numpy.typing import NDArray
+
+from .identity import stored_identity, stored_provenance
+from .objective import Objective, Status
+from .plane import Plane
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from .draw.figures.page import Picture
+    from .measures.profile import Profile
+
+
+class HasData(Protocol):
+    """A run, as far as a slice knows it: its table of evaluations."""
+
+    @property
+    def data(self) -> xr.Dataset:
+        """Every evaluation of the run."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Slice:
+    """Hold the samples of a slice.
+
+    `data` is an xarray dataset of loss(v, u), grad(v, u, dim) unless sampled without, and status(v, u); a line has no
+    v. `folder` is where its files are, None for one in memory. `remake` makes the objective again that it was sampled
+    from, for what has to be evaluated anew.
+    """
+
+    data: xr.Dataset
+    folder: Path | None = None
+    remake: Callable[[], Objective] | None = None
+
+    @cached_property
+    def identity(self) -> dict[str, Any]:
+        """What decides the numbers, as plain JSON: scene, options, fidelity, device, engine, code, plane."""
+        return stored_identity(self.data)
+
+    @cached_property
+    def provenance(self) -> dict[str, Any]:
+        """What else is known of how it was made: command, date, versions, the loss's unit."""
+        return stored_provenance(self.data)
+
+    @cached_property
+    def plane(self) -> Plane:
+        """The line or plane that was sampled."""
+        return Plane.from_record(self.identity["plane"])
+
+    @property
+    def slope(self) -> NDArray[np.float64]:
+        """The gradient along the plane's axes, shape (v, u, axis) or (u, axis) [loss unit per unit of the axis].
+
+        Raises ValueError for a slice that was sampled without gradients.
+        """
+        if "grad" not in self.data:
+            raise ValueError("this slice was sampled without gradients; sample it again with gradients=True")
+        found: NDArray[np.float64] = self.plane.slope(torch.from_numpy(self.data["grad"].to_numpy())).numpy()
+        return found
+
+    def minima(self, depth: float = 0.01) -> pd.DataFrame:
+        """Return the local minima deeper than a share of the range of the losses, deepest first, a row each.
+
+        The columns are the plane's coordinates, the loss there, and the depth: how far one must climb to get to a lower
+        minimum (persistence). The depth of the lowest is the range of the losses.
+        """
+        import pandas as pd
+
+        from .measures.ruggedness import minima, span
+
+        loss = self.data["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+        found = minima(loss)
+        deep = found.depth > depth * span(loss)
+        places = np.unravel_index(found.sample[deep], loss.shape)[::-1]  # u first
+        axes = (axis.numpy()[at] for axis, at in zip(self.plane.axes(), places, strict=True))
+        columns = dict(zip(self.plane.labels, axes, strict=True))
+        return pd.DataFrame({**columns, "loss": loss.ravel()[found.sample[deep]], "depth": found.depth[deep]})
+
+    def plot(self, runs: Sequence[HasData] = (), *, width: float | None = None) -> Picture:
+        """Draw the slice, a loss map over its gradients or a profile over a line, with runs laid over it.
+
+        The picture is matplotlib's figure, shown by a notebook as it is; `width` draws it for a page so wide [mm].
+        Raises ValueError where a run has other parameters than the slice.
+        """
+        if runs:
+            from .draw.figures.overlay import overlay_figure
+            from .overlay import overlay
+
+            return overlay_figure(self.data, overlay(self.data, [run.data for run in runs]), width=width)
+        if self.plane.rank == 2:
+            from .draw.figures.contour import landscape_figure
+
+            return landscape_figure(self.data, width=width)
+        from .draw.figures.profile import profile_figure
+
+        return profile_figure(self.data, events=self._events(), width=width)
+
+    def report(self, points: int = 6, seed: int = 0) -> Profile:
+        """Measure what the landscape is like here: ruggedness, noise, jumps, gradients at several scales, in words.
+
+        `points` x `points` places of the slice are evaluated anew, with points near them. Raises ValueError for a slice
+        without gradients, for one that is not finished, and for one whose objective cannot be made again.
+        """
+        from .adapters import within_box
+        from .measures.profile import PRECISION, measure_profile
+
+        if missing := int((self.data["status"] == Status.MISSING).sum()):
+            raise ValueError(f"{missing} samples of this slice are missing; let what samples it go on first")
+        if self.remake is None or "grad" not in self.data:
+            lacking = "the objective it was sampled from" if "grad" in self.data else "gradients"
+            raise ValueError(f"a report needs {lacking}, which this slice is without; sample it by gradscape.slice")
+        objective = self.remake()
+        rounding = PRECISION[self.identity.get("settings", {}).get("precision", "float64")]
+        return measure_profile(
+            within_box(objective) if self.identity.get("boxed") else objective,
+            self.data, rounding=rounding, points=points, seed=seed, events=getattr(objective, "events", None),
+        )  # fmt: skip
+
+    def __repr__(self) -> str:
+        """Return in a line what was sampled and what came out."""
+        about = [str(self.identity[name]) for name in ("objective", "fidelity") if name in self.identity]
+        points = " x ".join(map(str, self.plane.resolution))
+        loss = self.data["loss"]
+        low, high = float(loss.min()), float(loss.max())
+        finite = f"losses from {low:.4g} to {high:.4g}" if low <= high else "no finite loss"
+        where = f" in {self.folder}" if self.folder else ""
+        return f"<Slice of {' · '.join(about)} over {', '.join(self.plane.labels)}: {points} points, {finite}{where}>"
+
+    def _events(self) -> dict[str, Any]:
+        """Count what happens in the episodes along a line, where an environment says what does."""
+        env: Any = self.remake() if self.remake else None
+        counts = getattr(env, "events", None)
+        return dict(counts(self.plane.lift(self.plane.axes()[0][:, None]))) if counts else {}

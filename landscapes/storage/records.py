@@ -1,0 +1,66 @@
+"""JSON files that one verb writes and another reads; an error names the file that is damaged."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from ..identity import DamagedError
+from .files import write_json
+
+CHECKSUM = "checksum"  # of the rest of a record, which holds it under this name
+REASON_LENGTH = 160  # characters of what is wrong
+
+
+@contextmanager
+def reading(path: Path, todo: str) -> Iterator[None]:
+    """Read a file within this context: any error that its content leads to says that the file is damaged.
+
+    Raises DamagedError, which says what `todo`; that a file is missing or may not be read passes.
+    """
+    try:
+        yield
+    except (DamagedError, FileNotFoundError, PermissionError, IsADirectoryError):
+        raise
+    except Exception as error:  # a file of any content makes libraries raise anything at all
+        said = f"it has no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
+        raise DamagedError.of(path, said[:REASON_LENGTH] or type(error).__name__, todo) from error
+
+
+def write_record(path: Path, record: Mapping[str, Any]) -> None:
+    """Write what `read_json` reads again, with a checksum."""
+    write_json(path, sign(record))
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the JSON object that a file holds, held against its checksum if it has one.
+
+    Raises ValueError where it is no JSON or not what was written, TypeError where it is no object.
+    """
+    return verify(json.loads(path.read_text()))
+
+
+def sign(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record with its checksum."""
+    return {**record, CHECKSUM: _sum(json.loads(json.dumps(record)))}
+
+
+def verify(found: Any) -> dict[str, Any]:
+    """Return a record without its checksum; those of earlier versions have none.
+
+    Raises TypeError where it is no JSON object, ValueError where the checksum is not that of the rest.
+    """
+    if not isinstance(found, dict):
+        raise TypeError("it is no JSON object")
+    record = {name: value for name, value in found.items() if name != CHECKSUM}
+    if CHECKSUM in found and found[CHECKSUM] != _sum(record):
+        raise ValueError("it is not what was written")
+    return record
+
+
+def _sum(record: Mapping[str, Any]) -> int:
+    return zlib.crc32(json.dumps(record, sort_keys=True).encode())

@@ -1,0 +1,95 @@
+"""Bayesian optimisation, alone and followed by gradient descents."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from ..base import Kind, Optimizer, Points, Proposal
+from ..memory import SearchSize
+from .descent import Descent, DescentOptions
+from .surrogate import Surrogate, SurrogateOptions, surrogate_memory
+
+
+class BO(Optimizer):
+    """Evaluate where the lower confidence bound of a Gaussian process over all losses so far is least.
+
+    One point at a time, without gradients. The first `initial` are drawn at random: a process without data is the same
+    everywhere.
+    """
+
+    name = "bo"
+    Options = SurrogateOptions
+
+    @classmethod
+    def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
+        """Estimate what the process takes [bytes]."""
+        return surrogate_memory(options["max_points"], size)
+
+    def _setup(self) -> None:
+        self.surrogate = Surrogate(self.space.dim, self.options)
+
+    def _ask(self) -> Proposal:
+        kind = Kind.ACQUISITION if self.surrogate.informed else Kind.RANDOM
+        return Proposal(torch.from_numpy(self.surrogate.minimise(self.random)[None]), kind)
+
+    def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
+        self.surrogate.add(z, loss)
+
+    def _state(self) -> dict[str, Any]:
+        return {"surrogate": self.surrogate.state()}
+
+    def _restore(self, own: Mapping[str, Any]) -> None:
+        self.surrogate.restore(own["surrogate"])
+
+
+@dataclass(frozen=True)
+class BODescentsOptions(SurrogateOptions, DescentOptions):
+    """The options of the process and of each descent."""
+
+    method = "bo-descents"
+
+
+class BODescents(Optimizer):
+    """Descend from where the lower confidence bound is least; the process learns the loss of every iterate.
+
+    The first starts are drawn at random. Gradients steer the descents only: the process sees losses.
+    """
+
+    name = "bo-descents"
+    Options = BODescentsOptions
+    needs_grad = True
+
+    @classmethod
+    def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
+        """Estimate what the process takes [bytes]."""
+        return surrogate_memory(options["max_points"], size)
+
+    def _setup(self) -> None:
+        self.surrogate = Surrogate(self.space.dim, self.options)
+        self.descent: Descent | None = None
+
+    def _ask(self) -> Proposal:
+        kind = Kind.DESCENT
+        if self.descent is None:
+            kind = Kind.ACQUISITION if self.surrogate.informed else Kind.RANDOM
+            self.descent = Descent(self.surrogate.minimise(self.random), self.options)
+        return Proposal(torch.from_numpy(self.descent.at[None]), kind, grad=True)
+
+    def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
+        assert self.descent is not None  # as asked
+        assert grad is not None
+        self.surrogate.add(z, loss)
+        self.descent.tell(float(loss[0]), grad[0])
+        if self.descent.done:
+            self.descent = None
+
+    def _state(self) -> dict[str, Any]:
+        return {"surrogate": self.surrogate.state(), "descent": self.descent and self.descent.state()}
+
+    def _restore(self, own: Mapping[str, Any]) -> None:
+        self.surrogate.restore(own["surrogate"])
+        self.descent = own["descent"] and Descent.from_state(own["descent"], self.options)

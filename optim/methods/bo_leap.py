@@ -1,0 +1,192 @@
+"""BO-Leap: Bayesian optimisation proposes, a population looks around, gradient descent leaps, and so on from there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import cma
+import numpy as np
+import torch
+from cma.sigma_adaptation import CMAAdaptSigmaCSA
+
+from ..base import Kind, Optimizer, Points, Proposal
+from ..memory import SearchSize
+from ..options import MANY, number
+from .cmaes import Normal, population_memory
+from .descent import Descent, DescentOptions
+from .surrogate import Surrogate, SurrogateOptions, surrogate_memory
+
+LARGEST_LOSS = np.finfo(float).max / 4  # what a failure counts as: pycma adds two of them
+
+
+@dataclass(frozen=True)
+class BOLeapOptions(SurrogateOptions, DescentOptions):
+    """How the semi-local search goes.
+
+    Populations of `population` points (K) are drawn with step size `sigma` at first, in the box scaled to [-1, 1]; the
+    `best` of them with the least losses make the mean that descends. No new population is drawn once a semi-local
+    search has spent `local_budget` episodes, so that it may spend more by up to one population and one descent.
+    """
+
+    method = "bo-leap"
+
+    population: int = number(10, 2, 10_000)
+    best: int = number(5, 1, 9_999)
+    sigma: float = number(1.0, 1e-9, 1000)
+    local_budget: int = number(100, 1, MANY)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.best < self.population:
+            raise ValueError(
+                f"bo-leap option best takes 1 to {self.population - 1} of a population of {self.population}; "
+                f"got {self.best}"
+            )
+
+
+class BOLeap(Optimizer):
+    """Search as in algorithm 1 of "Rethinking Optimization with Differentiable Simulation from a Global Perspective".
+
+    Where the lower confidence bound of a Gaussian process is least, a semi-local search begins: draw a population from
+    N(mu, sigma^2 C), take the mean of its best points, descend from there, let the end of the descent be the next mu,
+    adapt sigma and C. The process learns the loss of every point, population and descent. Its proposal itself is not
+    evaluated; the first is drawn at random. Points beyond the box are moved to its border before they are evaluated,
+    and adapt sigma and C from where they were evaluated.
+    """
+
+    name = "bo-leap"
+    Options = BOLeapOptions
+    needs_grad = True
+
+    @classmethod
+    def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
+        """Estimate what process and populations take [bytes]."""
+        return surrogate_memory(options["max_points"], size) + population_memory(options["population"], size.dim)
+
+    def _setup(self) -> None:
+        if self.space.dim < 2:
+            raise ValueError(f"bo-leap searches two parameters or more; this space has {self.space.dim}")
+        self.surrogate = Surrogate(self.space.dim, self.options)
+        self.local: SemiLocal | None = None
+        self.descent: Descent | None = None
+        self.spent = 0  # episodes, by this semi-local search
+
+    def _ask(self) -> Proposal:
+        if self.descent is not None:
+            return Proposal(torch.from_numpy(self.descent.at[None]), Kind.DESCENT, grad=True)
+        if self.local is None or self.spent >= self.options.local_budget:
+            self.local, self.spent = SemiLocal(self.surrogate.minimise(self.random), self.options, self.random), 0
+        return Proposal(torch.from_numpy(self.local.draw()), Kind.POPULATION)
+
+    def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
+        assert self.local is not None  # as asked
+        self.surrogate.add(z, loss)
+        self.spent += len(z)
+        if self.descent is None:
+            self.descent = Descent(self.local.tell(z, loss), self.options)
+            return
+        assert grad is not None
+        self.descent.tell(float(loss[0]), grad[0])
+        if self.descent.done:
+            self.local.leap(self.descent.at)
+            self.descent = None
+
+    def _state(self) -> dict[str, Any]:
+        return {
+            "surrogate": self.surrogate.state(),
+            "local": self.local and self.local.state(),
+            "descent": self.descent and self.descent.state(),
+            "spent": self.spent,
+        }
+
+    def _restore(self, own: Mapping[str, Any]) -> None:
+        self.surrogate.restore(own["surrogate"])
+        self.local = own["local"] and SemiLocal.from_state(own["local"], self.options, self.random)
+        self.descent = own["descent"] and Descent.from_state(own["descent"], self.options)
+        self.spent = int(own["spent"])
+
+
+class SemiLocal:
+    """Adapt sigma and C to populations by equations 14-17 of Hansen & Ostermeier 2001; their mean leaps.
+
+    The paths of those equations see mean of the best - mu, where mu is what the population was drawn around: not the
+    leap, which says nothing of how a population was selected. pycma does it, cut back to 2001: equal weights, the
+    rank-one update alone and never stalled, the constants of table 1.
+    """
+
+    def __init__(self, mu: Points, options: BOLeapOptions, random: np.random.Generator) -> None:
+        self.count, self.best = options.population, options.best
+        self._began, self._start = random.bit_generator.state, mu
+        self._told: list[tuple[Points, Points]] = []  # populations as they were evaluated, and their losses
+        self._leaps: list[Points] = []
+        dim = len(mu)
+        self.es = cma.CMAEvolutionStrategy(
+            mu,
+            options.sigma,
+            {
+                "popsize": self.count,
+                "CMA_recombination_weights": [1.0 / self.best] * self.best + [0.0] * (self.count - self.best),
+                "CMA_rankmu": 0,
+                "CMA_active": False,
+                "CMA_diagonal_decoding": 0,
+                "AdaptSigma": PathLength,
+                "randn": Normal(random),
+                "seed": np.nan,  # leave numpy's own generator alone
+                "verbose": -10,  # no text, no files written or read
+            },
+        )
+        # Hansen & Ostermeier 2001, table 1: c_c, c_cov, c_sigma; d_sigma = 1 / c_sigma + 1 is pycma's damps / c_sigma
+        self.es.sp.cc = self.es.adapt_sigma.initialize(self.es).cs = c = 4.0 / (dim + 4.0)
+        self.es.adapt_sigma.damps = 1.0 + c
+        self.es.adapt_sigma.max_delta_log_sigma = np.inf
+        weights = self.es.sp.weights
+        self.es.sm.parameters(weights.mueff, weights.lambda_)["c1"] = 2.0 / (dim + np.sqrt(2.0)) ** 2
+
+    def draw(self) -> Points:
+        """Draw x_k ~ N(mu, sigma^2 C), shape (population, dim)."""
+        return np.stack(self.es.ask())
+
+    def tell(self, x: Points, loss: Points) -> Points:
+        """Adapt sigma and C to a population, and return the mean of its best points."""
+        self._told.append((x, loss))
+        self.es.tell(list(x), list(loss.clip(-LARGEST_LOSS, LARGEST_LOSS)), check_points=False)
+        return np.array(self.es.mean)
+
+    def leap(self, mu: Points) -> None:
+        """Let the next population be drawn around `mu`."""
+        self.es.mean = mu.copy()
+        self._leaps.append(mu)
+
+    def state(self) -> dict[str, Any]:
+        """Return what the library has been told, and where that began: its own state could only be pickled."""
+        points, losses = ([told[part] for told in self._told] for part in (0, 1))
+        return {
+            "began": self._began,
+            "start": self._start,
+            "points": np.array(points),
+            "losses": np.array(losses),
+            "leaps": np.array(self._leaps),
+        }
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any], options: BOLeapOptions, random: np.random.Generator) -> SemiLocal:
+        """Return the search that had this state, by telling it all again."""
+        random.bit_generator.state = state["began"]
+        local = cls(state["start"], options, random)
+        for turn, (points, loss) in enumerate(zip(state["points"], state["losses"], strict=True)):
+            local.draw()
+            local.tell(points, loss)
+            if turn < len(state["leaps"]):
+                local.leap(state["leaps"][turn])
+        return local
+
+
+class PathLength(CMAAdaptSigmaCSA):  # type: ignore[misc]
+    """Adapt sigma by the length of its path, and never stall the path of C, as was done only later."""
+
+    def hsig(self, es: cma.CMAEvolutionStrategy) -> bool:
+        """Bring the path up to date, and say that that of C is to be, too."""
+        self._update_ps(es)
+        return True

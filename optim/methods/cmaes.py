@@ -1,0 +1,128 @@
+"""CMA-ES, by the library cma."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import cma
+import numpy as np
+import torch
+from cma.sigma_adaptation import CMAAdaptSigmaCSA
+
+from ..base import Kind, Optimizer, Points, Proposal
+from ..memory import FLOAT, SearchSize
+from ..options import MethodOptions, number
+
+MATRICES = 8  # of dim x dim, that CMA-ES holds while it is written to disk: C, its eigenvectors, a pickle of both
+POPULATION = 7000  # bytes for each member of a population, beside its numbers (measured with pycma 4)
+
+OTHERS = (
+    "cma-es goes on with the points and losses that the run holds; cma or its linear algebra draws others here than "
+    "where the run began, so that it ends in other points than it would have there"
+)
+
+
+@dataclass(frozen=True)
+class CMAESOptions(MethodOptions):
+    """`sigma` is the first step size in the box scaled to [-1, 1]; `population` 0 means 4 + 3 ln(dim) of them.
+
+    A quarter of the box's width is what the library's author advises: the minimum is then expected within three
+    standard deviations of wherever in the box the search starts.
+    """
+
+    method = "cma-es"
+
+    sigma: float = number(0.5, 1e-9, 1000)
+    population: int = number(0, 0, 10_000)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if 0 < self.population < 3:
+            raise ValueError(f"cma-es option population takes 0 or at least 3; got {self.population}")
+
+
+class CMAES(Optimizer):
+    """Adapt a normal distribution's mean, step size and covariance to what its samples are worth.
+
+    The mean starts at random. The box is kept by the library's `BoundTransform`: the distribution lives on an unbounded
+    space that is folded, smoothly, into the box, so that every sample is inside and none is on the border by force.
+    When the library finds that the search has ended (converged, stagnated, a flat loss), it begins again from another
+    random point, for there is a budget to spend. A failed episode counts as the worst loss so far.
+    """
+
+    name = "cma-es"
+    Options: ClassVar[type[CMAESOptions]] = CMAESOptions
+
+    @classmethod
+    def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
+        """Estimate what the matrices of the distribution take, and its population [bytes]."""
+        return population_memory(options["population"], size.dim)
+
+    def _setup(self) -> None:
+        if self.space.dim < 2:
+            raise ValueError(f"cma-es searches two parameters or more; this space has {self.space.dim}")
+        self._start()
+
+    def _start(self) -> None:
+        self._began = self.random.bit_generator.state
+        self._told: list[tuple[Points, Points]] = []  # populations and their losses since then
+        options: dict[str, Any] = {
+            "bounds": [-1.0, 1.0],
+            "AdaptSigma": CMAAdaptSigmaCSA,  # in every dimension, as published
+            "randn": Normal(self.random),
+            "seed": np.nan,  # leave numpy's global generator alone
+            "verbose": -10,  # no text, no files written or read
+            "verb_log": 0,
+        }
+        if self.options.population:
+            options["popsize"] = self.options.population
+        start = self.random.uniform(-1.0, 1.0, self.space.dim)
+        self.strategy = cma.CMAEvolutionStrategy(start, self.options.sigma, options)
+
+    def _ask(self) -> Proposal:
+        self._asked = self.strategy.ask()
+        return Proposal(torch.from_numpy(np.stack(self._asked)), Kind.POPULATION)
+
+    def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
+        self._take(self.penalise(loss))
+        if self.strategy.stop():
+            self._start()
+
+    def _take(self, loss: Points) -> None:
+        self.strategy.tell(self._asked, loss.tolist())  # the very points, which it knows again
+        self._told.append((np.stack(self._asked), loss))
+
+    def _state(self) -> dict[str, Any]:
+        """Return what the library has been told since it began last: its own state could only be pickled."""
+        points, losses = ([told[part] for told in self._told] for part in (0, 1))
+        return {"began": self._began, "points": np.array(points), "losses": np.array(losses)}
+
+    def _restore(self, own: Mapping[str, Any]) -> None:
+        self.random.bit_generator.state = own["began"]
+        self._start()
+        for points, loss in zip(own["points"], own["losses"], strict=True):
+            self._asked = self.strategy.ask()
+            if not np.array_equal(self._asked, points):
+                warnings.warn(OTHERS, RuntimeWarning, stacklevel=2)
+                self._asked = list(points)
+            self._take(loss)
+            self.strategy.stop()
+
+
+def population_memory(population: int, dim: int) -> float:
+    """Return what a search by populations takes in so many dimensions [bytes]."""
+    return float(FLOAT * MATRICES * dim**2 + population * (POPULATION + 20 * FLOAT * dim))
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Draw standard normal numbers of a shape, as numpy.random.randn does, from a generator of one's own."""
+
+    random: np.random.Generator
+
+    def __call__(self, *shape: int) -> Points:
+        """Return numbers of shape `shape`."""
+        return self.random.standard_normal(shape)

@@ -1,0 +1,137 @@
+"""Gradient descent: one descent as a state machine, and a search by descents from random starts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+import torch
+
+from ..base import Kind, Optimizer, Points, Proposal
+from ..memory import FLOAT, SearchSize
+from ..options import MANY, MethodOptions, number
+
+
+@dataclass(frozen=True)
+class DescentOptions(MethodOptions):
+    """How a descent moves in the box scaled to [-1, 1], and when it ends.
+
+    `step` [scaled parameter^2 / loss unit] is what gradients are multiplied by. A move whose largest component exceeds
+    `max_step` is shortened to it; below that the step is plain. Both shrink by the factor `shrink` wherever the loss
+    has risen (1: never), or one step could not do for scenes whose gradients differ by a factor of a thousand. A
+    descent ends after `steps` iterates, or when the loss has failed more than `patience` times in a row to fall below
+    the best so far by `tolerance`, a fraction of it.
+    """
+
+    method = "a descent"
+
+    step: float = number(1.0, 1e-300, 1e300)
+    max_step: float = number(0.2, 1e-12, 1000)
+    shrink: float = number(0.5, 1e-12, 1)
+    steps: int = number(20, 1, MANY)
+    patience: int = number(3, 0, MANY)
+    tolerance: float = number(1e-4, 0, 1)
+
+
+class Descent:
+    """Follow gradients from `start`: `at` is the iterate to evaluate next, in the scaled box, until `done`.
+
+    Every iterate is evaluated once, loss and gradient, and both are used; the one that ends it stays in `at`, unless
+    its episode failed: then the one before, the last that has a loss.
+    """
+
+    def __init__(self, start: Points, options: DescentOptions) -> None:
+        self.options = options
+        self.at = np.clip(start, -1.0, 1.0)
+        self.best = math.inf
+        self.done = False
+        self._last, self._last_loss = self.at, math.inf
+        self._scale = 1.0
+        self._evaluated = self._stalled = 0
+
+    def tell(self, loss: float, grad: Points) -> None:
+        """Take in the iterate's loss, +inf where the episode failed, and gradient, shape (dim,); move on or end."""
+        if not math.isfinite(loss):
+            self.at, self.done = self._last, True
+            return
+        self._evaluated += 1
+        improved = math.isinf(self.best) or loss < self.best - self.options.tolerance * abs(self.best)
+        self._stalled = 0 if improved else self._stalled + 1
+        self._scale *= self.options.shrink if loss > self._last_loss else 1.0
+        self.best = min(self.best, loss)
+        moved = self._move(grad)
+        self.done = (
+            self._stalled > self.options.patience
+            or self._evaluated >= self.options.steps
+            or np.array_equal(moved, self.at)  # at a stationary point, or pushed against the border
+        )
+        if not self.done:
+            self._last, self._last_loss, self.at = self.at, loss, moved
+
+    def state(self) -> dict[str, Any]:
+        """Return where the descent stands, as data."""
+        return {name: value for name, value in vars(self).items() if name != "options"}
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any], options: DescentOptions) -> Self:
+        """Return the descent that had this state."""
+        descent = cls(state["at"], options)
+        for name in descent.state():
+            setattr(descent, name, state[name])
+        return descent
+
+    def _move(self, grad: Points) -> Points:
+        """Return z - step * gradient, kept inside the box."""
+        with np.errstate(over="ignore"):
+            move = -self.options.step * grad
+            excess = float(np.abs(move).max()) / self.options.max_step
+        if not math.isfinite(excess):  # too long to be counted: its direction is all that matters
+            finite = np.nan_to_num(grad)
+            move, excess = -self.options.max_step * (finite / np.abs(finite).max()), 1.0
+        return np.clip(self.at + self._scale * move / max(excess, 1.0), -1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class DescentsOptions(DescentOptions):
+    """`batch_size` descents are evaluated as one batch, 1 for one after the other."""
+
+    method = "descents"
+
+    batch_size: int = number(4, 1, 10_000)
+
+
+class Descents(Optimizer):
+    """Descend from uniformly random starts; where one descent ends the next begins, until the budget is spent."""
+
+    name = "descents"
+    Options = DescentsOptions
+    needs_grad = True
+
+    @classmethod
+    def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
+        """Estimate what the descents of a batch take [bytes]."""
+        return float(options["batch_size"] * (1000 + 20 * FLOAT * size.dim))
+
+    def _setup(self) -> None:
+        self.descents = [self._begin() for _ in range(self.options.batch_size)]
+
+    def _ask(self) -> Proposal:
+        return Proposal(torch.from_numpy(np.stack([one.at for one in self.descents])), Kind.DESCENT, grad=True)
+
+    def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
+        assert grad is not None  # as asked
+        for descent, one_loss, one_grad in zip(self.descents, loss, grad, strict=True):
+            descent.tell(float(one_loss), one_grad)
+        self.descents = [self._begin() if one.done else one for one in self.descents]
+
+    def _state(self) -> dict[str, Any]:
+        return {"descents": [one.state() for one in self.descents]}
+
+    def _restore(self, own: Mapping[str, Any]) -> None:
+        self.descents = [Descent.from_state(one, self.options) for one in own["descents"]]
+
+    def _begin(self) -> Descent:
+        return Descent(self.random.uniform(-1.0, 1.0, self.space.dim), self.options)

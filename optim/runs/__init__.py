@@ -1,0 +1,1 @@
+"""Runs: every point that an optimiser evaluated, in memory and on disk."""

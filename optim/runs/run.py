@@ -1,0 +1,105 @@
+"""A run of an optimiser, as one works with it: its episodes, the best of them, its picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+import xarray as xr
+from jaxtyping import Float
+from torch import Tensor
+
+from ...landscapes.identity import stored_identity, stored_provenance
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from ...landscapes.draw.figures.page import Picture
+
+LABELS = {"forwards": "forward equivalents"}  # of columns whose stored names say less
+
+
+@dataclass(frozen=True)
+class BestEpisode:
+    """The episode of least loss: its parameters `x`, each in its own unit, and its number, from 1 on."""
+
+    x: Float[Tensor, " dim"]
+    loss: float
+    episode: int
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Run:
+    """Hold the episodes of a run: `data` is an xarray dataset of x(evaluation, dim), loss(evaluation) and others.
+
+    `grad`(evaluation, dim) is the gradient where one was asked for, `status` how the episode ended, `kind` what it was
+    evaluated for; `episodes`, `forwards` and `seconds` [s] are what the run had cost by then, the second in forward
+    equivalents: episodes without gradient. `folder` is where its files are, None of one in memory.
+    """
+
+    data: xr.Dataset
+    folder: Path | None = None
+
+    @cached_property
+    def identity(self) -> dict[str, Any]:
+        """What decides the numbers, as plain JSON: scene, options, fidelity, device, engine, method, seed, code."""
+        return stored_identity(self.data)
+
+    @cached_property
+    def provenance(self) -> dict[str, Any]:
+        """What else is known of how it was made: command, date, versions, the loss's unit."""
+        return stored_provenance(self.data)
+
+    @property
+    def method(self) -> str:
+        """The name of the method."""
+        return str(self.data.attrs["method"])
+
+    @property
+    def seed(self) -> int:
+        """The seed of the method's random numbers."""
+        return int(self.data.attrs["seed"])
+
+    @cached_property
+    def best(self) -> BestEpisode:
+        """The episode of least loss. Raises ValueError where no episode has succeeded."""
+        loss = self.data["loss"].to_numpy()
+        if not np.isfinite(loss).any():
+            raise ValueError(f"{self._name()} has no best episode: none of {len(loss)} succeeded")
+        row = int(np.nanargmin(loss))
+        return BestEpisode(torch.from_numpy(self.data["x"].to_numpy()[row].copy()), float(loss[row]), row + 1)
+
+    def table(self) -> pd.DataFrame:
+        """Return a row for each episode: number, parameters, loss, status, kind, costs and gradient.
+
+        Columns are named with their units.
+        """
+        from ...landscapes.export import frame
+
+        return frame(self.data).rename(columns=LABELS)
+
+    def plot(self, *, width: float | None = None) -> Picture:
+        """Draw every loss and the best so far against episodes.
+
+        The picture is matplotlib's figure, shown by a notebook as it is; `width` draws it for a page so wide [mm].
+        Raises ValueError where there is no episode yet.
+        """
+        if not self.data.sizes["evaluation"]:
+            raise ValueError(f"{self._name()} has no episode to draw yet")
+        from ...landscapes.draw.figures.curve import run_figure
+
+        return run_figure(self.data, width=width)
+
+    def __repr__(self) -> str:
+        """Return in a line what searched and what it found."""
+        count = self.data.sizes["evaluation"]
+        found = f"best loss {self.best.loss:.6g}" if np.isfinite(self.data["loss"]).any() else "none succeeded"
+        where = f", in {self.folder}" if self.folder else ""
+        return f"<Run of {self._name()}: {count} of {self.data.attrs['budget']} episodes, {found}{where}>"
+
+    def _name(self) -> str:
+        return f"{self.method} on {self.data.attrs['env']}, seed {self.seed}"

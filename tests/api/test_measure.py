@@ -1,0 +1,109 @@
+"""`gs.report`, `gs.check`, `gs.tradeoff`, `gs.pairs`: what each promises."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import gradscape as gs
+from gradscape.landscapes import cost
+from gradscape.landscapes.measures import fidelity
+from gradscape.landscapes.storage.records import read_json
+
+
+@pytest.fixture(autouse=True)
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave results and what is kept for a tolerance in the test's own folder, and time little."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("gradscape.jobs.tolerance.user_data_path", lambda name: tmp_path / "data" / name)
+    for module, names in ((cost, ("MOMENT", "ENOUGH", "WARM_UP")), (fidelity, ("REPETITION", "LARGEST"))):
+        for name in names:
+            monkeypatch.setattr(module, name, 0.0)
+
+
+def test_a_slice_and_its_folder_have_the_same_report_which_is_read_again(tmp_path: Path) -> None:
+    cut = gs.slice("branin", (0, 1), resolution=24, out=tmp_path / "cut")
+    told = gs.report(cut, points=2, out=tmp_path / "told")
+    assert told.words == ("smooth with local minima", "gradients good")
+    assert told.profile["losses"]["notable"] == 3  # Branin's minima
+    assert told.table().loc["Local minima deeper than 1 % of the range", "value"] == "3"
+    assert told.record() == read_json(tmp_path / "told/report.json")
+    assert told.plot()._repr_png_().startswith(b"\x89PNG")
+    assert "smooth with local minima" in told._repr_html_()
+    before = (tmp_path / "told/report.json").stat().st_mtime_ns
+    assert gs.report(tmp_path / "cut", points=2, out=tmp_path / "told") == told
+    assert (tmp_path / "told/report.json").stat().st_mtime_ns == before
+
+
+def test_a_scene_without_a_slice_is_sampled_for_its_report() -> None:
+    told = gs.report("beale", points=2)
+    assert (told.env, told.key["points"]) == ("beale", 2)
+    assert told.store is not None
+    assert gs.open_slice(told.store.parent).plane.resolution == (24, 24)
+
+
+def test_a_report_of_another_slice_or_none_is_refused(tmp_path: Path) -> None:
+    plain = gs.slice("branin", (0, 1), resolution=4, gradients=False, out=tmp_path / "plain")
+    with pytest.raises(ValueError, match="report needs a slice with gradients"):
+        gs.report(plain)
+    with pytest.raises(ValueError, match="in memory alone"):
+        gs.report(gs.Slice(plain.data))
+    with pytest.raises(ValueError, match="did you mean branin"):
+        gs.report("brannin")
+
+
+class Bowl(gs.Environment):
+    """A bowl whose gradient is wrong where that is asked for."""
+
+    fidelities = {"only": gs.Fidelity("only", dt=0.1, precision="float64")}  # noqa: RUF012 -- of this test alone
+    space = gs.ParameterSpace.box(["a", "b"], -1.0, 2.0)
+    sign = 1.0
+
+    def _evaluate(self, x: torch.Tensor, *, grad: bool) -> gs.Evaluation:
+        return gs.Evaluation.from_results(x.square().sum(dim=1), 2 * self.sign * x if grad else None)
+
+
+class Hill(Bowl):
+    """Gradients that point downhill."""
+
+    sign = -1.0
+
+
+def test_a_class_is_checked_and_its_findings_are_a_table() -> None:
+    passed, failed = gs.check(Bowl), gs.check(Hill(), points=3)
+    assert passed.passed
+    assert not failed.passed
+    assert failed.points == 3
+    table = failed.table()
+    assert list(table.index) == [finding.check for finding in failed.findings]
+    assert table.loc["gradcheck", "outcome"] == "fail"
+    assert [one["check"] for one in failed.record()["checks"]] == list(table.index)
+
+
+def test_a_tradeoff_has_a_front_a_table_and_a_picture(tmp_path: Path) -> None:
+    how = {"points": 2, "variants": ("precision",), "device": "cpu", "options": {"horizon": 0.05}}
+    found = gs.tradeoff("bounce", **how, out=tmp_path / "trade")  # type: ignore[arg-type]
+    table = found.table()
+    assert table.index[table["front"]].tolist() == found.front
+    assert table["with_gradient"].is_monotonic_increasing
+    assert {"draft", "standard", "reference", "draft-float64"} <= set(table.index)
+    assert found.record() == read_json(tmp_path / "trade/tradeoff.json")
+    assert gs.tradeoff("bounce", **how, out=tmp_path / "trade") == found  # type: ignore[arg-type]
+    assert found.plot()._repr_png_().startswith(b"\x89PNG")
+    with pytest.raises(ValueError, match="there is nothing to trade"):
+        gs.tradeoff("branin")
+
+
+def test_pairs_are_ranked_and_need_two_parameters(tmp_path: Path) -> None:
+    ranked = gs.pairs("rastrigin", samples=4, out=tmp_path / "pairs", options={"dim": 3})
+    scores = ranked.table()["score"]
+    assert len(scores) == 3
+    assert scores.is_monotonic_decreasing
+    assert ranked.record() == read_json(tmp_path / "pairs/pairs.json")
+    with pytest.raises(ValueError, match="a pair takes two"):
+        gs.pairs("rastrigin", options={"dim": 1})
+
+
+def test_keywords_beside_an_environment_are_refused() -> None:
+    with pytest.raises(ValueError, match="is made already; got device too"):
+        gs.check(Bowl(), device="cpu")

@@ -1,0 +1,98 @@
+"""`gs.slice` and `gs.open_slice`: what they promise."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import gradscape as gs
+from gradscape.landscapes.identity import StoreMismatchError, stored_identity
+
+from ..command import Said
+
+BOX = gs.ParameterSpace.box(["a", "b"], -1.0, 1.0)
+
+
+def bowl() -> gs.Objective:
+    return gs.from_torch(lambda x: (x**2).sum(dim=1), BOX)
+
+
+def test_a_slice_of_python_is_the_command_s(run: Callable[..., Said], tmp_path: Path) -> None:
+    done = run(*["slice", "branin", "--dims", "0", "1", "--resolution", "6", "--json"], cwd=tmp_path)
+    folder = tmp_path / json.loads(done.stdout)["folder"]
+    theirs = gs.open_slice(folder)
+    ours = gs.slice("branin", (0, 1), resolution=6)  # finds it there, as the folder's name is the same
+    assert ours.folder is not None
+    assert ours.folder.resolve() == folder.resolve()
+    assert json.loads((folder / "summary.json").read_text())["episodes"] == 0
+    assert ours.identity == theirs.identity
+    again = gs.slice("branin", ("x0", "x1"), resolution=6, out=tmp_path / "again")
+    assert again.identity == theirs.identity
+    for name in ("loss", "grad", "status"):
+        np.testing.assert_array_equal(again.data[name], theirs.data[name])
+    assert run("export", "again", cwd=tmp_path).returncode == 0
+
+
+def test_another_slice_is_refused_and_replaced_by_force(tmp_path: Path) -> None:
+    gs.slice("branin", (0, 1), resolution=4, out=tmp_path / "cut")
+    with pytest.raises(StoreMismatchError, match="made by other settings"):
+        gs.slice("branin", (0, 1), resolution=5, out=tmp_path / "cut")
+    assert gs.slice("branin", (0, 1), resolution=5, out=tmp_path / "cut", force=True).data.sizes["u"] == 5
+
+
+def test_slope_and_minima_are_those_of_a_closed_form() -> None:
+    cut = gs.slice(bowl(), (0, 1), resolution=(5, 9))
+    u, v = np.meshgrid(cut.data["u"], cut.data["v"])
+    np.testing.assert_allclose(cut.slope, np.stack([2 * u, 2 * v], axis=-1), atol=1e-15)
+    (lowest,) = cut.minima().to_dict("records")
+    assert lowest == {"a": 0.0, "b": 0.0, "loss": 0.0, "depth": 2.0}
+    assert cut.folder is None
+    assert cut.plane.resolution == (5, 9)
+
+
+def test_a_point_and_an_extent_cut_what_they_say() -> None:
+    line = gs.slice(bowl(), ("b",), resolution=3, through=torch.tensor([0.5, 0.0]), extent=(-0.5, 0.5))
+    np.testing.assert_array_equal(line.data["loss"], [0.5, 0.25, 0.5])
+    assert "1 points" not in repr(line)
+    with pytest.raises(ValueError, match="can be cut through center, random:SEED or a tensor; got 'example:aim'"):
+        gs.slice(bowl(), (0,), through="example:aim")
+
+
+def test_a_report_has_words_and_needs_gradients() -> None:
+    cut = gs.slice(bowl(), (0, 1), resolution=16)
+    assert cut.report(points=2).verdict.words[0] == "very smooth"
+    with pytest.raises(ValueError, match="gradients"):
+        gs.slice(bowl(), (0, 1), resolution=8, gradients=False).report()
+
+
+def test_a_picture_shows_in_a_notebook_with_events_along_a_line(tmp_path: Path) -> None:
+    cut = gs.slice("branin", (0, 1), resolution=4, out=tmp_path / "cut")
+    assert cut.plot()._repr_png_().startswith(b"\x89PNG")
+    line = gs.slice("bounce", ("velocity y",), resolution=4, through="example:aim", out=tmp_path / "line")
+    assert any("bounces" in text.get_text() for ax in line.plot().axes for text in [*ax.texts, ax.yaxis.label])
+
+
+def test_a_stored_slice_knows_its_environment(tmp_path: Path) -> None:
+    made = gs.slice("branin", (0, 1), resolution=8, out=tmp_path / "cut")
+    opened = gs.open_slice(tmp_path / "cut")
+    assert opened.report(points=2).verdict == made.report(points=2).verdict
+    assert stored_identity(opened.data) == opened.identity
+    assert str(tmp_path / "cut") in repr(opened)
+
+
+def test_what_is_made_already_takes_no_keywords() -> None:
+    with pytest.raises(ValueError, match="is made already; got fidelity too"):
+        gs.slice(gs.make("branin"), (0, 1), fidelity="exact")
+    with pytest.raises(ValueError, match="no environment is called 'brannin'; did you mean branin"):
+        gs.slice("brannin", (0, 1))
+
+
+def test_environments_are_listed() -> None:
+    listed = gs.list_envs()
+    assert listed.loc["fluid", "dim"] == "10"
+    assert "draft" in listed.loc["fluid", "fidelities"]

@@ -1,0 +1,195 @@
+"""`landscape check`: ours and anyone's, what it prints, how it leaves."""
+
+import json
+import re
+import sys
+from collections.abc import Callable, Iterator
+from itertools import takewhile
+from pathlib import Path
+
+import pytest
+
+from gradscape.envs.registry import Entry, entries, environment_class
+from gradscape.jobs import check as job
+from gradscape.jobs.scene import SceneSpec
+from gradscape.landscapes.conformance import suite as conformance
+
+from ..command import Said
+
+FUNCTIONS = [name for name, entry in entries().items() if set(entry.fidelities) == {"exact"}]
+BENCHMARKS = Path(__file__).parent.parent.parent / "BENCHMARKS.md"
+
+# Another package's environment: its gradient is wrong where asked to be.
+BOWL = '''
+from dataclasses import dataclass
+import torch
+from gradscape.envs.base import Environment, Fidelity
+from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.space import ParameterSpace
+
+@dataclass(frozen=True)
+class Options:
+    wrong: bool = False
+    drifting: bool = False
+
+class Bowl(Environment):
+    """A bowl."""
+    name = "another-name"
+    fidelities = {"only": Fidelity("only", dt=0.1, precision="float64")}
+    Options = Options
+    calls = 0
+    space = ParameterSpace.box(["a", "b"], -1.0, 2.0)
+
+    def _evaluate(self, x, *, grad):
+        self.calls += 1
+        if self.options.drifting and self.calls % 2:
+            x = x + torch.nan
+        return Evaluation.from_results(x.square().sum(dim=1), (-x if self.options.wrong else 2 * x) if grad else None)
+'''
+
+
+@pytest.fixture
+def bowl(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    (tmp_path / "bowl_package.py").write_text(BOWL)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setitem(entries(), "bowl", Entry("bowl", "bowl_package:Bowl"))
+    yield
+    sys.modules.pop("bowl_package")
+
+
+def test_bounce_passes_at_draft(run: Callable[..., Said], tmp_path: Path) -> None:
+    done = run("check", "bounce", "--device", "cpu", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert (report["env"], report["fidelity"], report["passed"]) == ("bounce", "draft", True)
+    checks = {found["check"]: found for found in report["checks"]}
+    assert {found["outcome"] for found in checks.values()} == {"pass"}
+    assert 0 < checks["energy drift"]["numbers"]["rise"] < 0.1
+    ladder = checks["finite differences"]["table"]
+    assert [row["step"] for row in ladder] == [1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1]
+    assert ladder[0]["error"] < 1e-6  # a true gradient,
+    assert ladder[-1]["sign"] < 0.9  # of a landscape that misleads
+    assert checks["corners"]["numbers"]["finite"] == 8
+    for name in ("dt 8x", "horizon 8x", "ke 100000", "10% outside the box"):
+        assert sum(checks[name]["numbers"][kind] for kind in ("finite", "non-finite", "escaped", "error")) >= 2
+    assert "bounce · draft · cpu · warp · 4 points: some 148 episodes and" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", [*FUNCTIONS, "pinball-2", "pinball-16"])
+def test_quick_environments_pass_at_draft(name: str, run: Callable[..., Said], tmp_path: Path) -> None:
+    done = run("check", name, "--points", "2", "--device", "cpu", "--json", cwd=tmp_path)
+    assert [found for found in json.loads(done.stdout)["checks"] if found["outcome"] not in ("pass", "skip")] == []
+    assert done.returncode == 0
+
+
+@pytest.mark.parametrize("name", ["flip", "fluid"])
+def test_slow_environments_keep_their_promises_at_draft(name: str) -> None:
+    """For a quarter of an episode: what they promise does not depend on its length."""
+    scene = SceneSpec(name, device="cpu", options={"horizon": 0.25})
+    whole = job.CheckJob.open(scene, points=2).findings()
+    findings = takewhile(lambda found: found.check != "finite differences", whole)
+    assert {found.check: found.outcome for found in findings} == dict.fromkeys(
+        ["shapes", *conformance.PROMISES], "pass"
+    )
+
+
+def test_a_time_step_is_checked_once_however_it_is_called(run: Callable[..., Said], tmp_path: Path) -> None:
+    done = run("check", "cartpole", "--points", "2", "--device", "cpu", cwd=tmp_path)
+    nearest = "the nearest step that fits into a control step is that of dt 1x"
+    lines = [line for line in done.stdout.splitlines() if " dt " in line.partition("(")[0]]
+    assert [line.split("(")[-1].rstrip(")") for line in lines[1:]] == [nearest] * 3
+    assert lines[0].startswith("pass ")
+    assert done.returncode == 0
+
+
+def test_the_whole_check_of_every_environment_is_on_record() -> None:
+    """It takes minutes for the soft bodies: its results stand in BENCHMARKS.md, with the command."""
+    rows = re.findall(r"^\| `([\w-]+)` \| (passes|fails) \|", BENCHMARKS.read_text(), re.MULTILINE)
+    assert dict(rows) == dict.fromkeys(set(entries()) - set(FUNCTIONS), "passes")
+
+
+def test_anyone_s_environment_is_checked_and_each_check_has_a_line(
+    run: Callable[..., Said], tmp_path: Path, bowl: None
+) -> None:
+    done = run("check", "bowl", "--points", "3", "--seed", "5", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for shown in (
+        "pass      shapes                    loss (3,), grad (3, 2), status (3,)",
+        "pass      dt 8x                     2 finite",
+        "skip      horizon 1x to 8x          n/a (it has no option `horizon`)",
+        "relative error, median",
+        "passes: ",
+    ):
+        assert shown in done.stdout
+    assert "fail" not in done.stdout.replace("failed", "")
+
+
+def test_a_failure_is_exit_code_1_and_names_itself(run: Callable[..., Said], tmp_path: Path, bowl: None) -> None:
+    done = run("check", "bowl", "--set", "wrong=true", cwd=tmp_path)
+    assert done.returncode == 1
+    failed = [line.split("  ")[0] for line in done.stdout.splitlines() if line.startswith("fail ")]
+    assert len(failed) == 2
+    assert "sign right 0%" in done.stdout
+    assert done.stdout.splitlines()[-1].startswith("fails: ")
+    report = json.loads(run("check", "bowl", "--set", "wrong=true", "--json", cwd=tmp_path).stdout)
+    assert not report["passed"]
+    assert report["options"] == {"wrong": True, "drifting": False}
+
+
+def test_json_knows_no_infinity(run: Callable[..., Said], tmp_path: Path, bowl: None) -> None:
+    done = run("check", "bowl", "--set", "drifting=true", "--json", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "Infinity" not in done.stdout
+    found = {found["check"]: found for found in json.loads(done.stdout)["checks"]}["determinism"]
+    assert (found["outcome"], found["numbers"]["loss"]) == ("fail", None)
+
+
+def test_a_known_exception_is_printed_with_its_reason_until_it_is_none(
+    run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bowl: None
+) -> None:
+    reasons = dict.fromkeys(("finite differences", "gradcheck"), "its gradient points downhill")
+    monkeypatch.setattr(environment_class("bowl"), "known_failures", {"only": reasons})
+    excused = run("check", "bowl", "--set", "wrong=true", cwd=tmp_path)
+    assert excused.returncode == 0
+    assert excused.stdout.count("known: its gradient points downhill") == 2
+    no_longer = run("check", "bowl", cwd=tmp_path)
+    assert no_longer.returncode == 1
+    assert "it passes, so this is no longer true: its gradient points downhill" in no_longer.stdout
+
+
+def test_known_failures_are_of_fidelities_there_are() -> None:
+    for name in entries():
+        kind = environment_class(name)
+        assert set(kind.known_failures) <= set(kind.fidelities), name
+
+
+def test_an_interrupt_says_that_nothing_is_kept(
+    run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(conformance.PROMISES, "determinism", interrupted)
+    done = run("check", "branin", cwd=tmp_path)
+    assert done.returncode == 130
+    assert "stopped: 4 checks are done, and nothing is kept of them; the same command begins again" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["bonce"], "did you mean bounce?"),
+        (["bounce", "--points", "1"], "--points"),
+        (["bounce", "--fidelity", "best"], "bounce has fidelities draft, standard, reference; got 'best'"),
+        (["bounce", "--set", "wind=1"], "bounce has no option 'wind'"),
+    ],
+)
+def test_bad_input_gets_one_line_and_exit_code_2(
+    run: Callable[..., Said], tmp_path: Path, arguments: list[str], said: str
+) -> None:
+    done = run("check", *arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) == 1

@@ -1,0 +1,105 @@
+"""`landscape export`: slices and runs as files that other programs read."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from benchmarks.results import leave_blank
+
+import gradscape
+from gradscape.cli import main
+from gradscape.landscapes.export import SUFFIXES
+
+from ..command import Said
+
+READ = {"csv": pd.read_csv, "parquet": pd.read_parquet}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Leave a slice, a line and a run of the bouncing ball."""
+    folder = tmp_path_factory.mktemp("made")
+    how = ["--fidelity", "draft", "--device", "cpu"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        leave_blank(patch.setattr)
+        for verb, more, out in (
+            (["slice", "bounce", "--dims", "0", "2"], ["--resolution", "5"], "cut"),
+            (["bounce", "--axis", "y"], ["--resolution", "6"], "line"),
+            (["optimize", "bounce", "--method", "descents"], ["--budget", "7"], "searched"),
+        ):
+            with pytest.raises(SystemExit) as left:
+                main([*verb, *more, *how, "--out", out])
+            assert not left.value.code
+    return folder
+
+
+@pytest.fixture
+def results(made: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+
+
+@pytest.mark.parametrize("kind", list(READ))
+def test_a_table_has_a_row_for_each_sample_with_its_place_loss_status_and_gradient(
+    run: Callable[..., Said], results: Path, kind: str
+) -> None:
+    done = run("export", "cut", "--to", kind, cwd=results)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == f"cut/slice{SUFFIXES[kind]}: 25 samples\n"
+    table, slice_ = READ[kind](results / f"cut/slice{SUFFIXES[kind]}"), gradscape.open_slice(results / "cut").data
+    gradients = [f"gradient by velocity {axis} [m²/(m/s)]" for axis in "xyz"]
+    assert list(table) == ["velocity x [m/s]", "velocity z [m/s]", "loss [m²]", "status", *gradients]
+    for row in table.to_dict("records"):
+        node = slice_.sel(u=row["velocity x [m/s]"], v=row["velocity z [m/s]"])  # exactly: no digit is lost
+        assert row["loss [m²]"] == float(node["loss"])
+        assert [row[name] for name in gradients] == node["grad"].to_numpy().tolist()
+        assert row["status"] == "ok"
+
+
+@pytest.mark.parametrize("kind", list(READ))
+def test_a_run_has_a_row_for_each_episode(run: Callable[..., Said], results: Path, kind: str) -> None:
+    assert run("export", "searched", "--to", kind, "--out", f"my{kind}", cwd=results).returncode == 0
+    table, rows = READ[kind](results / f"my{kind}"), gradscape.open_run(results / "searched").data
+    assert table["episode"].tolist() == [1, 2, 3, 4, 5, 6, 7]
+    np.testing.assert_array_equal(table["loss [m²]"], rows["loss"])
+    np.testing.assert_array_equal(table[[f"velocity {axis} [m/s]" for axis in "xyz"]], rows["x"])
+    np.testing.assert_array_equal(table["gradient by velocity y [m²/(m/s)]"], rows["grad"].sel(dim="velocity y"))
+    assert set(table["kind"]) == {"descent"}
+    assert table["seconds [s]"].is_monotonic_increasing
+
+
+@pytest.mark.parametrize(("folder", "store"), [("cut", "slice"), ("line", "slice"), ("searched", "run")])
+def test_netcdf_keeps_arrays_names_and_units(run: Callable[..., Said], results: Path, folder: str, store: str) -> None:
+    assert run("export", folder, "--to", "netcdf", cwd=results).returncode == 0
+    ours = {"slice": gradscape.open_slice, "run": gradscape.open_run}[store](results / folder).data
+    with xr.open_dataset(results / folder / f"{store}.nc") as back:
+        for name in ours.data_vars:
+            np.testing.assert_array_equal(back[name], ours[name])
+            assert back[name].attrs.get("units") == ours[name].attrs.get("units")
+        assert back.attrs["identity"] == ours.attrs["identity"]
+        assert list(back["unit"].to_numpy()) == ["m/s"] * 3
+
+
+def test_what_is_there_is_not_replaced_unless_asked_for(run: Callable[..., Said], results: Path) -> None:
+    (results / "mine.csv").write_text("precious")
+    refused = run("export", "cut", "--out", "mine.csv", cwd=results)
+    assert refused.returncode == 2
+    assert "mine.csv exists already; write elsewhere with --out, or replace it with --force" in refused.stderr
+    assert (results / "mine.csv").read_text() == "precious"
+    assert run("export", "cut", "--out", "mine.csv", "--force", cwd=results).returncode == 0
+    assert len(pd.read_csv(results / "mine.csv")) == 25
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [(["cut", "--to", "excel"], "--to takes csv, parquet, netcdf; got 'excel'"), (["."], ". is no slice and no run")],
+)
+def test_bad_input_gets_one_line(run: Callable[..., Said], tmp_path: Path, arguments: list[str], said: str) -> None:
+    done = run("export", *arguments, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) == 1

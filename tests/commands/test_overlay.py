@@ -1,0 +1,158 @@
+"""`landscape overlay`: what it leaves, cuts anew, and refuses."""
+
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from benchmarks.results import leave_blank
+
+import gradscape
+from gradscape.cli import main
+from gradscape.landscapes.identity import plane_of
+from gradscape.landscapes.overlay import best_point, overlay
+from gradscape.landscapes.storage.store import open_slice
+from gradscape.optim.runs.store import RunStore
+
+
+@dataclass(frozen=True)
+class Said:
+    returncode: int
+    stderr: str
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make a slice of bounce off the runs' best point, two runs of it, and a slice and a run of another landscape."""
+    folder = tmp_path_factory.mktemp("results")
+    commands = (
+        "slice bounce --dims 0 1 --resolution 6 --out cut --device cpu",
+        "optimize bounce --method cma-es --budget 24 --out race/cma-es-0 --device cpu",
+        "optimize bounce --method descents --budget 16 --out race/descents-0 --device cpu",
+        "slice ackley --dims 0 1 --resolution 3 --set dim=3 --out other",
+        "optimize ackley --method random --budget 4 --out small",
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        leave_blank(patch.setattr)
+        for command in commands:
+            patch.setattr(sys, "argv", ["landscape", *command.split()])
+            with pytest.raises(SystemExit) as left:
+                main(command.split())
+            assert not left.value.code
+    return folder
+
+
+@pytest.fixture
+def run(
+    blank: None,
+    results: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> Callable[..., Said]:
+    shutil.copytree(results, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+
+    def command(text: str) -> Said:
+        monkeypatch.setattr(sys, "argv", ["landscape", *text.split()])
+        with pytest.raises(SystemExit) as left:
+            main(text.split())
+        return Said(int(left.value.code or 0), capsys.readouterr().err)
+
+    return command
+
+
+@pytest.mark.drawn
+def test_a_race_is_laid_over_a_slice(run: Callable[..., Said], tmp_path: Path) -> None:
+    done = run("overlay cut race --out over")
+    assert done.returncode == 0, done.stderr
+    assert sorted(file.name for file in Path("over").iterdir()) == ["overlay.png", "overlay.rrd"]
+    assert (tmp_path / "over/overlay.png").read_bytes().startswith(b"\x89PNG")
+    tables = [RunStore.open(path / "run.zarr").dataset() for path in sorted(Path("race").iterdir())]
+    away = max(float(laid["distance"].max()) for laid in overlay(open_slice("cut/slice.zarr"), tables))
+    assert f"2 runs, 40 points: 0 beyond the map, 0 failed; the farthest is {away:.2g} half-widths" in done.stderr
+    assert run("overlay cut race").returncode == 0
+    assert len(list(Path("out").glob("overlay-bounce-*"))) == 1
+
+
+def test_a_slice_cut_through_the_best_point_shows_its_loss(run: Callable[..., Said]) -> None:
+    done = run("overlay cut race/cma-es-0 race/descents-0/run.zarr --through best --out over --device cpu")
+    assert done.returncode == 0, done.stderr
+    (folder,) = (path for path in Path("over").iterdir() if path.is_dir())
+    dataset = open_slice(folder / "slice.zarr")
+    tables = [RunStore.open(path / "run.zarr").dataset() for path in sorted(Path("race").iterdir())]
+    x, loss = best_point(tables)
+    plane, before = plane_of(dataset), plane_of(open_slice("cut/slice.zarr"))
+    assert float(plane.distance(x)) < 1e-12
+    torch.testing.assert_close(plane.basis, before.basis, rtol=0, atol=0)
+    assert (plane.resolution, plane.labels) == (before.resolution, before.labels)
+    env = gradscape.make("bounce", fidelity="draft", device="cpu")
+    there = env.evaluate(plane.lift(plane.project(x))[None], grad=False)
+    np.testing.assert_allclose(there.loss, loss, rtol=1e-5)
+    again = run("overlay cut race --through best --out over --device cpu")
+    assert "all 36 episodes with gradients are there already" in again.stderr
+
+
+def test_a_principal_plane_lies_nearer_to_the_run_than_the_slice_did(run: Callable[..., Said]) -> None:
+    done = run("overlay cut race/cma-es-0 --plane pca --resolution 4 --out over --device cpu")
+    assert done.returncode == 0, done.stderr
+    (folder,) = (path for path in Path("over").iterdir() if path.is_dir())
+    table = RunStore.open("race/cma-es-0/run.zarr").dataset()
+    slices = (open_slice(path) for path in (folder / "slice.zarr", "cut/slice.zarr"))
+    principal, before = (overlay(dataset, [table])[0] for dataset in slices)
+    assert float((principal["distance"] ** 2).sum()) < float((before["distance"] ** 2).sum())
+    assert not principal["outside"].any()
+
+
+def test_samples_beyond_the_box_are_left_out_of_a_principal_plane(run: Callable[..., Said]) -> None:
+    assert run("overlay cut race --plane pca --resolution 7 --out over --device cpu").returncode == 0
+    (folder,) = (path for path in Path("over").iterdir() if path.is_dir())
+    dataset = open_slice(folder / "slice.zarr")
+    u, v = np.meshgrid(dataset["u"], dataset["v"])
+    space = gradscape.make("bounce", device="cpu").space
+    unit = space.to_unit(plane_of(dataset).lift(torch.from_numpy(np.stack([u, v], axis=-1))))
+    beyond = ((unit < -1e-9) | (unit > 1 + 1e-9)).any(dim=-1).numpy()
+    assert beyond.any()
+    np.testing.assert_array_equal(dataset["status"] == gradscape.Status.ESCAPED, beyond)
+
+
+def test_another_fidelity_is_drawn_with_a_warning(run: Callable[..., Said]) -> None:
+    run("optimize bounce --method random --budget 4 --fidelity standard --out fine --device cpu")
+    done = run("overlay cut fine --out over")
+    assert done.returncode == 0
+    assert "(bounce, random, seed 0) are simulated differently (fidelity 'draft' there, 'standard' here)" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("overlay other race", "objective is 'ackley' there and 'bounce' here"),
+        ("overlay other small", "options is {'dim': 3} there and {'dim': 2} here"),
+        ("overlay cut cut", "is no run"),
+        ("overlay cut nowhere", "there is no run at"),
+        ("overlay race race", "is no slice store"),
+        ("overlay cut race --plane tsne", "--plane takes pca, the runs' principal plane; got 'tsne'"),
+        ("overlay cut race --resolution 4", "give --through or --plane too"),
+        ("overlay cut race --through nowhere", "there is no run at"),
+        ("overlay cut race --out cut", "cut holds other files"),
+    ],
+)
+def test_what_does_not_belong_together_is_refused(run: Callable[..., Said], command: str, said: str) -> None:
+    done = run(command)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert said in done.stderr
+
+
+def test_a_missing_display_is_said_before_anything_is_sampled(run: Callable[..., Said]) -> None:
+    done = run("overlay cut race --through best --out over --spawn")
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert "there is no display here to open over/overlay.rrd on; leave out --spawn, or take --serve" in done.stderr
+    assert not Path("over").exists()

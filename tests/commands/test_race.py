@@ -1,0 +1,142 @@
+"""`landscape race`: what it computes, keeps, draws, says and refuses."""
+
+import json
+import signal
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gradscape.optim.runs.store import RunStore
+
+from ..command import Said
+from ..processes import Instant, alone, landscape
+
+RACE = ["race", "branin", "--methods", "random,cma-es", "--methods", "descents", "--budget", "40", "--seeds", "3"]
+
+
+@pytest.mark.drawn
+def test_race_leaves_runs_picture_and_figures(run: Callable[..., Said], tmp_path: Path) -> None:
+    done = run(*RACE, "--json", "--out", "r", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    said, kept = json.loads(done.stdout), json.loads((tmp_path / "r/race.json").read_text())
+    assert said == {key: kept[key] for key in kept if key not in ("curves", "ecdf")} | {"folder": "r"}
+    assert kept["methods"] == ["random", "cma-es", "descents"]
+    assert "360 episodes to compute" in done.stderr
+    assert (tmp_path / "r/race.png").read_bytes().startswith(b"\x89PNG")
+    for rank in kept["ranks"]:
+        runs = [RunStore.open(tmp_path / f"r/{rank['method']}-{seed}/run.zarr").dataset() for seed in range(3)]
+        assert [table.sizes["evaluation"] for table in runs] == [40, 40, 40]
+        assert rank["final"] == [float(table["loss"].min()) for table in runs]
+        for cost in ("episodes", "forwards", "seconds"):
+            mean = kept["curves"][cost][rank["method"]]["mean"]
+            assert mean or cost == "seconds"  # where a run may be over before another has begun to succeed
+            assert mean[-1:] <= mean[:1]
+        assert kept["curves"]["episodes"][rank["method"]]["mean"][-1] == pytest.approx(np.mean(rank["final"]))
+
+
+def test_more_seeds_methods_and_episodes_go_on_where_the_race_ended(run: Callable[..., Said], tmp_path: Path) -> None:
+    first = run("race", "branin", "--methods", "random", "--budget", "20", "--seeds", "2", cwd=tmp_path)
+    assert "40 episodes to compute" in first.stderr
+    again = run("race", "branin", "--methods", "random", "--budget", "20", "--seeds", "2", cwd=tmp_path)
+    assert "all 40 episodes are there already" in again.stderr
+    more = run("race", "branin", "--methods", "random,cma-es", "--budget", "30", "--seeds", "3", "--json", cwd=tmp_path)
+    assert "140 episodes to compute, 40 are there already" in more.stderr
+    less = run("race", "branin", "--methods", "random", "--budget", "20", "--seeds", "2", "--json", cwd=tmp_path)
+    assert json.loads(less.stdout)["folder"] == json.loads(more.stdout)["folder"]
+    assert len(list(tmp_path.glob("out/race-branin-exact-*/*/run.zarr"))) == 6
+    both = [
+        next(rank for rank in json.loads(said.stdout)["ranks"] if rank["method"] == "random") for said in (less, more)
+    ]
+    assert both[0]["final"][0] >= both[1]["final"][0]
+    assert both[0]["forwards"] == 20
+    anew = run("race", "branin", "--methods", "random", "--budget", "20", "--seeds", "2", "--force", cwd=tmp_path)
+    assert "40 episodes to compute:" in anew.stderr
+
+
+def test_race_prints_ranks_and_what_the_paper_claims(run: Callable[..., Said], tmp_path: Path) -> None:
+    done = run(*RACE, "--report", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for shown in (
+        "branin · exact · 40 episodes · 3 seeds",
+        "mean rank",
+        "3 seeds: too few",
+        "it claims nothing about it",
+    ):
+        assert shown in done.stdout
+
+
+def test_report_holds_the_papers_claims_against_the_race(run: Callable[..., Said], tmp_path: Path) -> None:
+    command = ["race", "cartpole", "--methods", "random,descents", "--budget", "8", "--seeds", "2"]
+    done = run(*command, "--report", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    lines = [line for line in done.stdout.splitlines() if " better than " in line and "│" in line]
+    by_claim = {line.split("│")[1].strip(): line.split("│")[2].strip() for line in lines}
+    assert by_claim["descents better than random"] in ("holds", "does not hold", "not decided")
+    assert by_claim["bo-leap better than cma-es"] == "not run"
+
+
+def test_options_of_a_method_reach_it_and_make_another_race(run: Callable[..., Said], tmp_path: Path) -> None:
+    short = ["race", "branin", "--methods", "cma-es", "--budget", "9", "--seeds", "1", "--json"]
+    plain = json.loads(run(*short, cwd=tmp_path).stdout)
+    other = json.loads(run(*short, "--option", "cma-es.population=9", cwd=tmp_path).stdout)
+    assert other["method_options"]["cma-es"]["population"] == 9
+    assert plain["folder"] != other["folder"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["race", "nothing"], "no environment is called 'nothing'"),
+        (["race", "branin", "--methods", "random,magic"], "no method is called 'magic'"),
+        (
+            ["race", "branin", "--methods", "random", "--option", "cma-es.sigma=1"],
+            "METHOD.NAME=VALUE for one of random",
+        ),
+        (["race", "branin", "--methods", "cma-es", "--option", "cma-es.speed=1"], "cma-es has no option 'speed'"),
+        (["race", "branin", "--seeds", "0"], "--seeds"),
+        (["race", "swing-velocity", "--engine", "taichi", "--workers", "2"], "engine taichi runs in one thread only"),
+    ],
+)
+def test_bad_input_gets_one_line_and_leaves_nothing(
+    run: Callable[..., Said], tmp_path: Path, arguments: list[str], said: str
+) -> None:
+    done = run(*arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_with_other_files_is_refused(run: Callable[..., Said], tmp_path: Path) -> None:
+    (tmp_path / "r").mkdir()
+    (tmp_path / "r/thesis.tex").write_text("mine")
+    done = run(*RACE, "--out", "r", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "holds other files and no race" in done.stderr
+
+
+LONG = ["race", "bounce", "--methods", "random,descents", "--fidelity", "draft", "--budget", "40", "--seeds", "2"]
+LONG += ["--json", "--out", "r"]
+
+
+def test_interrupt_says_how_to_go_on_and_the_result_is_the_same(run: Callable[..., Said], tmp_path: Path) -> None:
+    for name in ("whole", "stopped"):
+        (tmp_path / name).mkdir()
+    race = partial(landscape, *LONG, "--workers", "2")
+    whole = alone(race, tmp_path / "whole")
+    assert whole.returncode == 0, whole.stderr
+    stopped = alone(race, tmp_path / "stopped", Instant(9, of="status/c", by=signal.SIGINT))
+    assert (stopped.returncode, stopped.stdout) == (130, "")
+    assert "Traceback" not in stopped.stderr
+    assert "the same command goes on from there: landscape race bounce" in stopped.stderr
+    resumed = run(*LONG, cwd=tmp_path / "stopped")
+    assert "are there already" in resumed.stderr
+    assert "all 160 episodes" not in resumed.stderr
+    one, two = (json.loads(done.stdout) for done in (whole, resumed))
+    finals = [{rank["method"]: rank["final"] for rank in figures["ranks"]} for figures in (one, two)]
+    assert finals[0] == finals[1]
+    assert "The paper compares no optimisers here" in one["silence"]
+    assert one["loss_unit"] == "m²"

@@ -1,0 +1,224 @@
+"""`landscape report`: what it prints, leaves, refuses and goes on from."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gradscape.gallery.paper import read_paper
+from gradscape.jobs import report as job
+from gradscape.jobs.report_record import Report
+from gradscape.jobs.report_tables import environments_markdown
+from gradscape.landscapes.storage.records import read_json, write_record
+
+from ..command import Said
+
+Run = Callable[..., Said]
+
+
+@pytest.fixture
+def cut(run: Run, tmp_path: Path) -> Path:
+    run("slice", "branin", "--dims", "0", "1", "--resolution", "24", "--out", "cut", cwd=tmp_path)
+    return tmp_path / "cut"
+
+
+@pytest.mark.drawn
+def test_a_slice_is_reported_in_numbers_and_words(run: Run, cut: Path, tmp_path: Path) -> None:
+    done = run("report", "cut", "--points", "2", "--out", "told", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    record = json.loads(done.stdout)
+    assert record == {**read_json(tmp_path / "told/report.json"), "folder": "told"}
+    assert record["losses"]["notable"] == 3  # Branin's minima
+    assert record["verdict"]["words"] == ["smooth with local minima", "gradients good"]
+    assert record["noise"]["again"] == record["noise"]["batch"] == 0
+    assert record["paper"] is None
+    assert "with gradients: about" in done.stderr
+    assert re.search(r"s, and 1\.0 s to measure 576 samples; [\d.]+ [MG]B of memory\n", done.stderr)
+    named = read_json(tmp_path / "told/measures.json")
+    assert named["Local minima deeper than 1 % of the range"] == "3"
+    assert (tmp_path / "told/gradient-quality.png").read_bytes().startswith(b"\x89PNG")
+    again = run("report", "cut", "--points", "2", "--out", "told", cwd=tmp_path)
+    assert "there already" in again.stderr
+    assert "smooth with local minima: minima deeper than 1 % of the range: 3" in again.stdout
+    other = run("report", "cut", "--points", "3", "--out", "told", cwd=tmp_path)
+    assert other.returncode == 2
+    assert "holds another report (points 2 there, 3 here)" in other.stderr
+
+
+def test_an_environment_without_figures_is_sampled_first(run: Run, tmp_path: Path) -> None:
+    done = run("report", "beale", "--points", "2", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    record = json.loads(done.stdout)
+    assert record["env"] == "beale"
+    assert (tmp_path / record["folder"] / "report.json").exists()
+    assert "576 episodes with gradients to compute" in done.stderr
+
+
+def test_all_makes_a_table_with_the_papers_words(run: Run, tmp_path: Path) -> None:
+    line = ("bounce", "--axis", "x", "--resolution", "20", "--out", "data/bounce-x")
+    plane = ("slice", "pinball-2", "--dims", "0", "1", "--resolution", "5", "--out", "data/pinball-2-0-1")
+    for cut in (line, plane):
+        run(*cut, "--fidelity", "draft", "--device", "cpu", cwd=tmp_path)
+    command = ("report", "--all", "--data", "data", "--points", "2", "--out", "all", "--device", "cpu")
+    done = run(*command, "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout)
+    assert [record["name"] for record in summary["reports"]] == ["bounce-x", "pinball-2-0-1"]
+    assert summary["environments"]["pinball-2"]["slices"] == 1
+    assert set(summary["environments"]["pinball-2"]["paper"]) == set(read_paper().words["pinball-2"].words)
+    table = (tmp_path / "all/report.md").read_text().splitlines()
+    assert len({line.count("|") for line in table}) == 1
+    assert table[2].startswith("| bounce-x |")
+    shutil.rmtree(tmp_path / "all/pinball-2-0-1")
+    again = run(*command, cwd=tmp_path)
+    assert "all/bounce-x is there already" in again.stderr
+    assert (tmp_path / "all/pinball-2-0-1/report.json").exists()
+    assert "pinball-2-0-1" in again.stdout
+    measured = environments_markdown([Report.of_record(record) for record in summary["reports"]]).splitlines()
+    assert len({line.count("|") for line in measured}) == 1
+    assert measured[3].startswith("| `pinball-2` | 1 |")
+
+
+def test_one_slice_that_fails_does_not_lose_the_others(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("bounce-x", "bounce-y"):  # quick ones, in the places of figures
+        run("slice", "branin", "--dims", "0", "1", "--resolution", "4", "--out", f"data/{name}", cwd=tmp_path)
+    measure, calls = job.measure, iter((True, False))
+
+    def failing(*parts: Any) -> object:
+        if next(calls):
+            raise RuntimeError("out of\nmemory")
+        return measure(*parts)
+
+    monkeypatch.setattr(job, "measure", failing)
+    command = ("report", "--all", "--data", "data", "--points", "2", "--out", "all")
+    done = run(*command, "--json", cwd=tmp_path)
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1] == "not reported: bounce-x: RuntimeError: out of memory"
+    summary = json.loads(done.stdout)
+    assert [record["name"] for record in summary["reports"]] == ["bounce-y"]
+    assert list(summary["failed"]) == ["bounce-x"]
+    monkeypatch.setattr(job, "measure", measure)
+    again = run(*command, cwd=tmp_path)
+    assert again.returncode == 0
+    assert "all/bounce-y is there already" in again.stderr
+    assert "bounce-x" in again.stdout
+
+
+def test_a_report_measured_on_another_device_is_taken_and_named(run: Run, cut: Path, tmp_path: Path) -> None:
+    run("report", "cut", "--points", "2", "--out", "told", cwd=tmp_path)
+    file = tmp_path / "told/report.json"
+    write_record(file, {**read_json(file), "device": "cuda"})
+    done = run("report", "cut", "--points", "2", "--out", "told", cwd=tmp_path)
+    assert done.returncode == 0
+    assert "told is there already, measured on cuda" in done.stderr
+
+
+def test_a_report_beside_its_slice_is_copied_unless_it_is_another(run: Run, cut: Path, tmp_path: Path) -> None:
+    run("report", "cut", "--points", "2", "--out", "told", cwd=tmp_path)
+    for file in (tmp_path / "told").iterdir():
+        shutil.copyfile(file, cut / file.name)
+    same = run("report", "cut", "--points", "2", "--out", "same", cwd=tmp_path)
+    assert "same is copied from cut" in same.stderr
+    assert "episodes" not in same.stderr
+    for file in (tmp_path / "told").iterdir():
+        assert (tmp_path / "same" / file.name).read_bytes() == file.read_bytes()
+    other = run("report", "cut", "--points", "3", "--out", "other", cwd=tmp_path)
+    assert "copied" not in other.stderr
+    assert json.loads((tmp_path / "other/report.json").read_text())["key"]["points"] == 3
+
+
+def test_a_row_of_an_environment_spans_its_slices_and_says_whether_the_paper_agrees() -> None:
+    def report(notable: int, cosine: float, words: list[str]) -> Report:
+        def scale(points: int, value: float) -> dict[str, Any]:
+            return {"points": points, "cosine": {"value": value}}
+
+        own = dict.fromkeys(("name", "options", "fidelity", "device", "seconds", "command", "key"))
+        record = {
+            **own,
+            "env": "fluid",
+            "losses": {"notable": notable, "flat": {"value": notable / 100}},
+            "jumps": {"share": {"value": None}},
+            "differences": [scale(3, -1.0), scale(20, cosine), scale(36, 0.0)],  # the first: few show any slope
+            "differences_of_samples": [scale(30, cosine / 2)],
+            "verdict": {"words": words},
+            "paper": {"words": [{"word": word, "measured": word in words} for word in ("rugged", "gradients good")]},
+        }
+        return Report.of_record(record)
+
+    two = [report(2, 0.5, ["rugged"]), report(12, -0.25, ["rugged", "gradients good"])]
+    row = environments_markdown(two).splitlines()[2]
+    assert row == (
+        "| `fluid` | 2 | 2 to 12 | 2 to 12 % |  | −0.25 to 0.50 | −0.12 to 0.25 | "
+        "rugged, gradients good (1 of 2) | rugged, gradients good (1 of 2) | in part |"
+    )
+    assert environments_markdown(two[1:]).endswith("| yes |\n")
+    assert environments_markdown([report(0, 0.0, [])]).endswith("| no |\n")
+
+
+def test_a_stopped_report_says_what_is_kept(
+    run: Run, cut: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(job, "measure", stop)
+    done = run("report", "cut", "--out", "told", cwd=tmp_path)
+    assert done.returncode == 130
+    assert "stopped: 0 of 1 reports are kept" in done.stderr
+
+
+def test_a_slice_of_other_code_is_reported_with_a_warning(
+    run: Run, cut: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gradscape.envs.base.code_digest", lambda *_: "changed")
+    done = run("report", "cut", "--points", "2", "--out", "told", cwd=tmp_path)
+    assert "warning: cut was sampled otherwise (code" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "a slice's folder, an environment, or --all"),
+        (["branin", "--all"], "a slice's folder, an environment, or --all"),
+        (["brannin"], "did you mean branin?"),
+        (["--all", "--data", "nowhere"], "holds no figures yet"),
+        (["branin", "--points", "1"], "--points"),
+    ],
+)
+def test_bad_input_is_refused(run: Run, tmp_path: Path, arguments: list[str], said: str) -> None:
+    done = run("report", *arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+
+
+def test_a_slice_without_gradients_is_refused(run: Run, tmp_path: Path) -> None:
+    run("slice", "branin", "--dims", "0", "1", "--resolution", "5", "--no-gradients", "--out", "cut", cwd=tmp_path)
+    done = run("report", "cut", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "cut: report needs a slice with gradients" in done.stderr
+
+
+def test_a_folder_of_other_files_is_left_alone(run: Run, cut: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/notes.txt").write_text("precious")
+    done = run("report", "cut", "--out", "mine", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "holds other files" in done.stderr
+
+
+@pytest.mark.parametrize("cut", [["rastrigin", "--set", "dim=5"], ["branin"]])
+def test_a_function_whose_box_is_its_own_is_asked_beyond_it(
+    run: Callable[..., Said], tmp_path: Path, cut: list[str]
+) -> None:
+    done = run("slice", *cut, "--dims", "0", "1", "--resolution", "12", "--out", "cut", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = run("report", "cut", "--out", "told", "--json", cwd=tmp_path)
+    assert report.returncode == 0, report.stderr
+    beyond = json.loads(report.stdout)["beyond_the_box"]
+    assert beyond["cut"] == 0 < beyond["asked"]

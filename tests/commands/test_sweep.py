@@ -1,0 +1,184 @@
+"""`landscape sweep`: what it leaves, goes on from, and refuses."""
+
+import json
+import shutil
+import signal
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+
+import gradscape
+from gradscape.cli import main
+from gradscape.landscapes.identity import plane_of, stored_identity
+from gradscape.landscapes.sampling.fill import sample
+from gradscape.landscapes.smoothing import smooth
+from gradscape.landscapes.storage.store import open_slice
+
+from ..command import Said
+from ..processes import Instant, alone, landscape
+
+SWEEP = "sweep bounce --dims 0 1 --over 2 --frames 3 --resolution 5 --through example:aim --device cpu --out moved"
+FILES = ["frames", "summary.json", "sweep.gif", "sweep.mp4", "sweep.rrd"]
+Command = Callable[[str], Said]
+
+
+@pytest.fixture
+def run(blank: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Run the command in this process, in a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+
+    def command(text: str) -> Said:
+        monkeypatch.setattr(sys, "argv", ["landscape", *text.split()])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as left:
+            main(text.split())
+        return Said(int(left.value.code or 0), *capsys.readouterr())
+
+    return command
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(file.name for file in folder.iterdir())
+
+
+def test_each_frame_is_the_slice_at_its_value(run: Command, tmp_path: Path) -> None:
+    done = run(f"{SWEEP} --json")
+    assert done.returncode == 0, done.stderr
+    assert names(tmp_path / "moved") == FILES
+    summary = json.loads(done.stdout)
+    assert summary == {**json.loads((tmp_path / "moved/summary.json").read_text()), "folder": "moved"}
+    space, aim = gradscape.make("bounce", device="cpu").space, gradscape.make("bounce", device="cpu").example("aim")
+    low, high = float(space.lower[2]), float(space.upper[2])
+    assert [frame["value"] for frame in summary["frames"]] == [low, (low + high) / 2, high]
+    for number, frame in enumerate(summary["frames"]):
+        (tmp_path / "at.json").write_text(json.dumps([*aim.tolist()[:2], frame["value"]]))
+        cut = "slice bounce --dims 0 1 --resolution 5 --through at.json --device cpu --out"
+        assert run(f"{cut} cut{number}").returncode == 0
+        alone = open_slice(f"cut{number}/slice.zarr")
+        moved = open_slice(f"moved/frames/{number:03d}.zarr")
+        xr.testing.assert_identical(moved.drop_attrs(), alone.drop_attrs())
+        assert moved.attrs["identity"] == alone.attrs["identity"]
+        assert frame["loss"]["lowest"] == float(alone["loss"].min())
+    assert summary["loss"]["highest"] == max(frame["loss"]["highest"] for frame in summary["frames"])
+    assert summary["episodes"] == 75
+    assert "75 episodes with gradients of 3 slices to compute: about" in done.stderr
+
+
+def test_nothing_is_computed_twice(run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(SWEEP)
+    first = [open_slice(f"moved/frames/{number:03d}.zarr") for number in range(3)]
+    shutil.rmtree("moved/frames/001.zarr")
+    again = run(f"{SWEEP} --json")
+    assert (json.loads(again.stdout)["episodes"], json.loads(again.stdout)["resumed"]) == (25, 50)
+    assert "25 episodes with gradients of 3 slices to compute, 50 are there already" in again.stderr
+    for number, before in enumerate(first):
+        xr.testing.assert_equal(open_slice(f"moved/frames/{number:03d}.zarr"), before)
+    kind = type(gradscape.make("bounce", device="cpu"))
+    monkeypatch.setattr(kind, "evaluate", lambda *_, **__: pytest.fail("evaluated again"))
+    third = run(SWEEP)
+    assert "all 75 episodes with gradients of 3 slices are there already" in third.stderr
+    assert third.returncode == 0
+
+
+def test_force_begins_anew_and_another_sweep_is_not_overwritten(run: Command) -> None:
+    run(SWEEP)
+    before = {path: path.read_bytes() for path in Path("moved").rglob("*") if path.is_file()}
+    other = run(SWEEP.replace("--frames 3", "--frames 4"))
+    assert other.returncode == 2
+    assert "plane" in other.stderr
+    assert before == {path: path.read_bytes() for path in Path("moved").rglob("*") if path.is_file()}
+    done = run(SWEEP.replace("--frames 3", "--frames 2") + " --force --json")
+    assert json.loads(done.stdout)["episodes"] == 50
+    assert names(Path("moved/frames")) == ["000.zarr", "001.zarr"]
+
+
+@pytest.mark.drawn
+def test_smoothing_averages_one_slice(run: Command) -> None:
+    done = run("sweep branin --dims 0 1 --over smoothing --frames 3 --resolution 9 --out soft --json")
+    assert done.returncode == 0, done.stderr
+    summary, dataset = json.loads(done.stdout), open_slice("soft/slice.zarr")
+    assert [frame["value"] for frame in summary["frames"]] == [0.0, 12.5, 25.0]
+    assert summary["episodes"] == 81
+    for frame in summary["frames"]:
+        assert frame["loss"]["lowest"] == float(smooth(dataset, frame["value"] / 100)["loss"].min())
+    assert names(Path("soft")) == ["slice.zarr", *FILES[1:]]
+
+
+def test_over_the_horizon_each_frame_is_a_shorter_episode(run: Command) -> None:
+    sweep = (
+        "sweep bounce --dims 0 1 --over horizon --frames 2 --resolution 4 --through example:aim --device cpu --out late"
+    )
+    done = run(f"{sweep} --json")
+    assert done.returncode == 0, done.stderr
+    assert [frame["value"] for frame in json.loads(done.stdout)["frames"]] == [50.0, 100.0]
+    half, whole = (open_slice(f"late/frames/{number:03d}.zarr") for number in range(2))
+    assert [stored_identity(one)["options"]["horizon"] for one in (half, whole)] == [0.5, 1.0]
+    env = gradscape.make("bounce", device="cpu", horizon=0.5)
+    points = plane_of(half).lift(torch.tensor([[float(half["u"][1]), float(half["v"][2])]]).double())
+    assert float(half["loss"].sel(u=half["u"][1], v=half["v"][2])) == float(env.evaluate(points).loss[0])
+    assert not np.allclose(half["loss"], whole["loss"])
+    assert "all 32 episodes" in run(sweep).stderr
+    for wrong, said in (("--set horizon=2", "moves that option itself"), ("", "branin has no horizon")):
+        refused = run(
+            f"{sweep.replace('bounce', 'branin').replace('example:aim', 'center') if not wrong else sweep} {wrong}"
+        )
+        assert refused.returncode == 2
+        assert said in " ".join(refused.stderr.split())
+
+
+def test_without_out_each_sweep_has_a_folder_of_its_own(run: Command) -> None:
+    short = "sweep ackley --dims 0 1 --frames 2 --resolution 2 --set dim=4 --no-gradients --over"
+    for over in ("2", "x3", "smoothing"):
+        done = run(f"{short} {over}")
+        assert done.returncode == 0, done.stderr
+    assert len(names(Path("out"))) == 3
+    dataset = open_slice(next(Path("out").glob("*-over-3-*/frames/001.zarr")))
+    assert "grad" not in dataset
+    assert float(plane_of(dataset).origin[3]) == float(gradscape.make("ackley", dim=4).space.upper[3])
+
+
+@pytest.mark.parametrize(
+    ("over", "said"),
+    [
+        ("--dims 0 1 --over 1", "moves a third parameter, horizon or smoothing; got --over 1, which the slice varies"),
+        ("--dims 0 1 --over x0", "got --over x0, which the slice varies"),
+        ("--dims 0 1 --over 9", "numbered 0 to 2; got 9"),
+        ("--dims 0 1 --over speed", "no parameter is called 'speed'"),
+        ("--dims 0 0 --over 2", "two different parameters; got 0, 0"),
+        ("--dims 0 1 --over 2 --frames 1", "--frames"),
+        ("--dims 0 1 --over 2 --out mine", "mine holds other files and no sweep"),
+        ("--dims 0 1 --over 2 --out mine --force", "mine holds other files and no sweep"),
+    ],
+)
+def test_bad_input_is_one_line_and_writes_nothing(run: Command, over: str, said: str) -> None:
+    Path("mine").mkdir()
+    Path("mine/sweep.mp4").write_text("precious")
+    done = run(f"sweep ackley --set dim=3 {over}")
+    assert done.returncode == 2
+    assert said in " ".join(done.stderr.split())
+    assert names(Path()) == ["mine"]
+    assert Path("mine/sweep.mp4").read_text() == "precious"
+
+
+def test_a_sweep_that_is_stopped_goes_on_to_the_same_bits(run: Command, tmp_path: Path) -> None:
+    text = "sweep bounce --dims 0 1 --over 2 --frames 4 --resolution 8 --device cpu --out stopped"
+    sweep = partial(landscape, *text.split())
+    done = alone(sweep, tmp_path, Instant(20, of="status/c", by=signal.SIGINT))
+    assert done.returncode == 130
+    assert f"the same command goes on from there: landscape {text}" in done.stderr
+    kept = int(done.stderr.split("stopped: ")[1].split(" of 256 points")[0])
+    assert 0 < kept < 256
+    again = json.loads(run(f"{text} --json").stdout)
+    assert (again["resumed"], again["episodes"]) == (kept, 256 - kept)
+    env = gradscape.make("bounce", device="cpu")
+    for number in range(4):
+        stopped = open_slice(f"stopped/frames/{number:03d}.zarr")
+        whole = sample(env, plane_of(stopped))
+        for name in ("loss", "grad", "status"):
+            np.testing.assert_array_equal(stopped[name], whole[name])

@@ -1,0 +1,101 @@
+"""`landscape view`: what it opens, serves and refuses; and `overlay --spawn`, which opens what it has drawn."""
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from gradscape.commands import view
+from gradscape.landscapes.draw.recordings import viewer
+
+from ..command import Said
+
+
+@pytest.fixture
+def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of what verbs leave, as far as `view` looks at it, on a machine without a display."""
+    for name in view.DISPLAYS:
+        monkeypatch.delenv(name, raising=False)
+    for file in ("cut/landscape.png", "cut/slice.zarr/zarr.json", "run/progress.png", "site/index.html", "empty/a.txt"):
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).write_text("")
+    (tmp_path / "some.rrd").write_bytes(b"RRF2")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("view nothing.png", "there is no file nothing.png"),
+        ("view cut/slice.zarr/zarr.json", "view opens .png, .html, .mp4, .gif, .rrd and results folders"),
+        ("view cut/landscape.png", "there is no display here to open cut/landscape.png"),
+        ("view cut/slice.zarr", "there is no display here to open cut/landscape.png"),
+        ("view run", "there is no display here to open run/progress.png"),
+        ("view empty", "empty holds none of index.html, overlay.rrd, race.png"),
+        ("view cut --serve", "--serve shows recordings (.rrd)"),
+        ("view site --serve", "a site is served by: landscape gallery serve --out site"),
+    ],
+)
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
+def test_what_cannot_be_shown_is_refused_in_one_line(
+    run: Callable[..., Said], desk: Path, command: str, said: str
+) -> None:
+    done = run(*command.split(), cwd=desk)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert said in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "opened"), [("view cut", "cut/landscape.png"), ("view site/index.html", "site/index.html")]
+)
+def test_a_picture_opens_in_the_systems_own_program(
+    run: Callable[..., Said], desk: Path, monkeypatch: pytest.MonkeyPatch, command: str, opened: str
+) -> None:
+    monkeypatch.setenv("DISPLAY", ":1")
+    launched: list[str] = []
+    monkeypatch.setattr("typer.launch", lambda path: launched.append(path) or 0)
+    assert run(*command.split(), cwd=desk).returncode == 0
+    assert launched == [str((desk / opened).resolve())]
+    monkeypatch.setattr("typer.launch", lambda path: 1)
+    refused = run(*command.split(), cwd=desk)
+    assert (refused.returncode, "no program of this system opens" in refused.stderr) == (1, True)
+
+
+def test_a_recording_needs_a_display_or_is_served_until_it_is_stopped(
+    run: Callable[..., Said], desk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if sys.platform == "linux":
+        said = run("view", "some.rrd", cwd=desk).stderr
+        assert "look at it in a browser: landscape view some.rrd --serve" in said
+    served: list[str] = []
+
+    @contextmanager
+    def serve(path: Path) -> Iterator[str]:
+        served.append(path.name)
+        yield "http://127.0.0.1:1/?url=..."
+
+    def stopped(_: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(viewer, "serve_recording", serve)
+    monkeypatch.setattr("time.sleep", stopped)
+    done = run("view", "some.rrd", "--serve", cwd=desk)
+    assert (done.returncode, served) == (0, ["some.rrd"])
+    assert "some.rrd is at http://127.0.0.1:1/?url=... until Ctrl-C" in done.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
+def test_an_overlay_that_cannot_be_shown_is_refused_before_it_is_drawn(
+    run: Callable[..., Said], tmp_path: Path
+) -> None:
+    how = ["--device", "cpu", "--out"]
+    assert run("slice", "bounce", "--dims", "0", "1", "--resolution", "3", *how, "cut", cwd=tmp_path).returncode == 0
+    searched = run("optimize", "bounce", "--method", "random", "--budget", "3", *how, "found", cwd=tmp_path)
+    assert searched.returncode == 0, searched.stderr
+    refused = run("overlay", "cut", "found", "--spawn", "--through", "best", "--out", "over", cwd=tmp_path)
+    assert (refused.returncode, "there is no display here" in refused.stderr) == (2, True)
+    assert "--serve" in refused.stderr
+    assert not (tmp_path / "over").exists()

@@ -1,0 +1,107 @@
+"""What a grid velocity becomes at walls and ladle: slip, separation, Coulomb's law, and a tool between two steps."""
+
+import pytest
+import torch
+
+from gradscape.envs.engines.mpm.boundaries import LadleInTank, Open
+
+from ..bench import BoundaryBench, vectors
+
+TANK = LadleInTank(half_width=0.2, lid=0.6, radius=0.07, half_thickness=0.01, height=0.25, band=0.02, friction=0.25)
+RIM = torch.tensor([0.0, 0.15, 0.0], dtype=torch.float64)
+AWAY = torch.tensor([0.0, 10.0, 0.0], dtype=torch.float64)
+BELOW = RIM - torch.tensor([0.0, TANK.radius, 0.0])  # the bowl's lowest point, on its mid-surface
+RATE = 100.0  # 1 / length of a control step [1/s]
+
+
+def built(boundary):
+    bench = BoundaryBench(boundary, rate=RATE)
+
+    def met(p, v, *, start=AWAY, end=None, fraction=0.0):
+        tools = torch.stack([start, start if end is None else end])[:, None]
+        return bench(p, v.reshape(-1, 3), tools, fraction)
+
+    return met
+
+
+@pytest.fixture(scope="module")
+def tank():
+    return built(TANK)
+
+
+def random(count, size, seed):
+    return size * (2 * torch.rand((count, 3), generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 1)
+
+
+def test_empty_space_changes_nothing():
+    v = random(20, 3.0, seed=0)
+    assert torch.equal(built(Open())(random(20, 1.0, seed=1), v), v)
+
+
+@pytest.mark.parametrize(
+    ("place", "inward"),
+    [
+        ((-0.2, 0.1, 0.03), (1, 0, 0)),
+        ((0.2, 0.1, 0.03), (-1, 0, 0)),
+        ((0.03, 0.1, -0.2), (0, 0, 1)),
+        ((0.03, 0.1, 0.2), (0, 0, -1)),
+        ((0.03, 0.0, 0.03), (0, 1, 0)),
+        ((0.03, 0.61, 0.03), (0, -1, 0)),
+    ],
+)
+def test_walls_let_go_and_let_slide_but_let_nothing_in(tank, place, inward):
+    v, inward = random(50, 3.0, seed=2), vectors(inward)
+    through = (v * inward).sum(dim=1, keepdim=True).clamp_max(0)
+    torch.testing.assert_close(tank(vectors(place).expand(50, 3), v), v - through * inward)
+
+
+def test_inside_the_tank_velocities_are_free(tank):
+    p = vectors((0.19, 0.01, -0.19), (0.0, 0.3, 0.0), (-0.19, 0.59, 0.19))
+    v = random(3, 3.0, seed=3)
+    assert torch.equal(tank(p, v), v)
+
+
+def test_what_runs_into_the_ladle_is_rubbed_by_coulombs_law(tank):
+    p = (BELOW - vectors((0, TANK.half_thickness, 0))).expand(2, 3)  # on its outside, whose normal is down
+    fast, slow = (2.0, 1.0, 0.0), (0.1, 1.0, 0.1)
+    rubbed = tank(p, vectors(fast, slow), start=RIM)
+    torch.testing.assert_close(rubbed, vectors((2.0 - TANK.friction * 1.0, 0, 0), (0, 0, 0)), rtol=0, atol=1e-6)
+
+
+def test_what_leaves_the_ladle_is_free(tank):
+    p = (BELOW - vectors((0, TANK.half_thickness, 0))).expand(2, 3)
+    leaving = vectors((2.0, -0.5, 0.0), (0.0, -0.1, 1.0))
+    assert torch.equal(tank(p, leaving, start=RIM), leaving)
+
+
+def test_the_ladle_takes_along_what_it_hits(tank):
+    motion = vectors((0, -0.01, 0))[0]  # in one control step, so 1 m/s down
+    p = BELOW - vectors((0, TANK.half_thickness, 0))
+    met = tank(p, vectors((0, 0, 0)), start=RIM, end=RIM + motion)
+    torch.testing.assert_close(met, RATE * motion[None])
+
+
+def test_the_ladles_grip_fades_over_the_band(tank):
+    gaps = torch.linspace(0, 1.25, 6, dtype=torch.float64) * TANK.band
+    p = BELOW - vectors((0, 1, 0)) * (TANK.half_thickness + gaps[:, None])
+    rise = tank(p, vectors((0, 1, 0)).expand(6, 3), start=RIM)[:, 1]
+    s = (1 - gaps / TANK.band).clamp(0, 1)
+    torch.testing.assert_close(rise, 1 - s * s * (3 - 2 * s), rtol=0, atol=1e-6)
+
+
+def test_a_tool_is_where_its_step_has_taken_it(tank):
+    start, end = RIM + vectors((0, 0.1, 0))[0], RIM - vectors((0, 0.1, 0))[0]
+    p, into = BELOW - vectors((0, TANK.half_thickness, 0)), vectors((0, 1, 0))
+    met = {f: float(tank(p, into, start=start, end=end, fraction=f)[0, 1]) for f in (0.0, 0.5, 1.0)}
+    assert met[0.0] == 1.0  # the ladle is still above
+    assert met[0.5] == pytest.approx(RATE * -0.2)  # here, going down
+    assert met[1.0] == 1.0
+
+
+def test_the_handle_stands_on_the_rim(tank):
+    foot = RIM - vectors((TANK.radius, 0, 0))[0]
+    beside = foot + vectors((TANK.half_thickness, 0.2, 0))[0]
+    above = foot + vectors((TANK.half_thickness, TANK.height + TANK.half_thickness + TANK.band, 0))[0]
+    into = vectors((-1, 0, 0))
+    torch.testing.assert_close(tank(beside, into, start=RIM), vectors((0, 0, 0)), rtol=0, atol=1e-6)
+    assert torch.equal(tank(above, into, start=RIM), into)

@@ -1,0 +1,154 @@
+"""What MLS-MPM keeps of an episode changes no bit of it: parts of the grid, control steps whole or repeated, memory."""
+
+from dataclasses import fields, is_dataclass
+
+import pytest
+import torch
+import warp as wp
+
+from gradscape.envs.engines.mpm import solver as mpm
+from gradscape.envs.engines.mpm.checkpoints import Allocator, Tape
+from gradscape.envs.engines.mpm.model import Box, nodes_around
+from gradscape.envs.engines.mpm.solver import Solver
+from gradscape.envs.engines.runtime import cuda_available, to_torch
+from gradscape.envs.mpm.fluid import Fluid
+
+from .bodies import free_model, kneaded, kneading, over_time, solved, stirred, weights
+
+GPU = pytest.mark.skipif(not cuda_available(), reason="no CUDA device")
+
+
+def test_results_do_not_depend_on_what_else_is_in_the_batch():
+    """The others lie elsewhere and stray farther, so that another part of the grid is worked on."""
+    model, paths = kneading()
+    adj_x = weights(model, 3, 3)
+    lone = kneaded(model, paths[:1], {model.steps: adj_x[:1]})
+    solver = Solver(model, capacity=3, device="cpu")
+    to_torch(solver.checkpoints[0].x)[1:] += torch.tensor([[[0.25, 0.1, 0.05]], [[-0.2, 0.2, -0.1]]])
+    end, gradient = solver.run(paths), solver.gradient({model.steps: adj_x})
+    assert all(box.cells < more.cells for box, more in zip(lone[0].boxes, solver.boxes, strict=True))
+    assert torch.equal(end[:1], lone[1])
+    assert torch.equal(gradient[:1], lone[2])
+    assert gradient[0].abs().max() > 0
+
+
+def test_the_whole_grid_and_its_parts_give_the_same_bits(monkeypatch):
+    model, paths = kneading()
+    adj_x = {model.steps: weights(model, 3, 4)}
+    cropped = kneaded(model, paths, adj_x)
+    assert all(box.cells < model.cells / 2 for box in cropped[0].boxes)
+    monkeypatch.setattr(mpm, "BOX_MARGIN", 1000)
+    whole = kneaded(model, paths, adj_x)
+    assert whole[0].boxes == [Box((0, 0, 0), model.nodes)] * model.steps
+    assert torch.equal(whole[1], cropped[1])
+    assert torch.equal(whole[2], cropped[2])
+
+
+def test_an_episode_kept_whole_and_one_repeated_step_by_step_give_the_same_bits(monkeypatch):
+    model, paths = kneading()
+    adj_x = {2: weights(model, 3, 5), model.steps: weights(model, 3, 6)}
+    kept = kneaded(model, paths, adj_x)
+    monkeypatch.setattr(mpm, "WHOLE_EPISODE", 0)
+    repeated = kneaded(model, paths, adj_x)
+    assert len(kept[0].tapes) == model.steps > len(repeated[0].tapes) == 1
+    assert torch.equal(kept[1], repeated[1])
+    assert torch.equal(kept[2], repeated[2])
+
+
+@pytest.mark.parametrize("speed", [4.0, 18.0])  # [m/s], so 0.8 or 3.6 cells in a control step
+def test_the_grid_grows_where_a_particle_leaves_its_part(monkeypatch, speed):
+    """One cell of margin is enough for the slow; the quick make it repeat the step on more, with the same bits."""
+    model, velocity = free_model(steps=1), torch.zeros(1, 192, 3, dtype=torch.float64)
+    velocity[:, :64, 1], velocity[:, 64:128, 1] = speed, -speed
+    cropped = solved(model, 1, velocity)
+    assert (cropped.boxes[0] == nodes_around(model, *model.corners, mpm.BOX_MARGIN)) == (speed < 10)
+    monkeypatch.setattr(mpm, "BOX_MARGIN", 1000)
+    whole = solved(model, 1, velocity)
+    for solver in (cropped, whole):
+        assert not solver.read_escaped(1).any()
+    for name in "xvC":
+        assert torch.equal(over_time(cropped, name), over_time(whole, name))
+
+
+def test_a_tape_grows_by_the_bytes_it_says():
+    model, paths = kneading()
+    solver = Solver(model, capacity=len(paths), device="cpu")
+    solver.boxes[0] = nodes_around(model, *model.corners, mpm.BOX_MARGIN)
+    tape = Tape(solver.allocator)
+    for margin in (0, 3):  # the second time it has something to lose
+        box = solver.boxes[0] = nodes_around(model, *model.corners, mpm.BOX_MARGIN + margin)
+        before, growth = tape.bytes, tape.growth(box.cells)
+        tape.make_room(0, box)
+        assert tape.bytes - before == growth > 0
+    assert tape.growth(box.cells) == 0
+
+
+@pytest.mark.parametrize("warned", [True, False])
+def test_control_steps_are_given_up_for_memory_and_no_bit_is_lost(monkeypatch, warned):
+    """Either it is foreseen that a tape does not fit, or the allocation fails."""
+    model, paths = kneading()
+    adj_x = {2: weights(model, 3, 5), model.steps: weights(model, 3, 6)}
+    kept = kneaded(model, paths, adj_x)
+    grid, solvers = Allocator.grid, []
+
+    def scarce(allocator, cells):
+        if cells > 1 and any(len(solver.tapes) > 2 for solver in solvers if solver.allocator is allocator):
+            raise RuntimeError("Failed to allocate 1 bytes on device 'cuda:0'")
+        return grid(allocator, cells)
+
+    def remember(solver):
+        solvers.append(solver)
+        start(solver)
+
+    start = Solver._start
+
+    if warned:
+        monkeypatch.setattr(Solver, "_fits", lambda solver, step: len(solver.tapes) <= 2)
+    else:
+        monkeypatch.setattr(Solver, "_start", remember)
+        monkeypatch.setattr(Allocator, "grid", scarce)
+    fewer = kneaded(model, paths, adj_x)
+    assert (len(kept[0].tapes), len(fewer[0].tapes)) == (model.steps, 2)
+    assert torch.equal(kept[1], fewer[1])
+    assert torch.equal(kept[2], fewer[2])
+
+
+@GPU
+def test_memory_that_runs_short_is_foreseen(capfd):
+    """Another takes most of it once the batch has been chosen: results are the same, and nobody says it ran out."""
+    env = Fluid(fidelity="draft", device="cuda")
+    x = env.space.uniform(env.preferred_batch, seed=0)
+    wanted = env.evaluate(x, grad=True)
+    env = Fluid(fidelity="draft", device="cuda")
+    hoard = []
+    while wp.get_device("cuda").free_memory > 12 << 30:
+        hoard.append(torch.empty(1 << 30, dtype=torch.uint8, device="cuda"))
+    for _ in range(2):  # it keeps more from its second run on
+        found = env.evaluate(x, grad=True)
+        torch.testing.assert_close(found.loss, wanted.loss, rtol=1e-4, atol=1e-5)
+    assert "out of memory" not in "".join(capfd.readouterr())
+
+
+def arrays(thing, seen):
+    """Yield every array a solver holds that grows with its capacity."""
+    if isinstance(thing, wp.array):
+        if thing.ndim > 1 and thing.ptr not in seen:
+            seen.add(thing.ptr)
+            yield thing
+    elif is_dataclass(thing):
+        for field in fields(thing):
+            yield from arrays(getattr(thing, field.name), seen)
+    elif isinstance(thing, list | tuple):
+        for item in thing:
+            yield from arrays(item, seen)
+
+
+def test_the_memory_estimate_is_what_a_solver_takes():
+    solver, path = stirred()
+    solver.run(path)
+    solver.gradient({solver.model.steps: torch.ones((2, solver.model.particles, 3), dtype=torch.float64)})
+    seen = set()
+    held = [*vars(solver).values(), *vars(solver.adjoint).values()]
+    held += [part for tape in solver.tapes for part in vars(tape).values()]
+    taken = sum(array.capacity for thing in held for array in arrays(thing, seen))
+    assert taken / solver.capacity == pytest.approx(mpm.memory(solver.model, "cpu"), rel=0.25)  # grids as they come

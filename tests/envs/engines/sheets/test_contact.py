@@ -1,0 +1,198 @@
+"""Projection onto floor and pan: what velocities lose, and the pan's distance against samples of its surface."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from scipy.spatial import cKDTree
+
+from gradscape.envs.engines.runtime import precision, to_torch
+from gradscape.envs.engines.sheets.contact import Floor, Pan
+from gradscape.envs.engines.sheets.springs import Sheet, Solver
+
+DT = 1e-3
+PAN = Pan(flat=0.14, bend=0.07, sweep=math.asin(6 / 7), thickness=0.03)
+ARC = PAN.bend * PAN.sweep  # the length of the edge from bottom to rim [m]
+SPACING = 1e-3  # of sampled points [m]
+POSES = [(0.0, 0.0, 0.0), (0.04, -0.03, 0.5), (-0.07, 0.1, -0.6)]
+UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+
+
+def uniform(low, high, *shape, seed=0):
+    rng = torch.Generator().manual_seed(seed)
+    return low + (high - low) * torch.rand(shape, generator=rng, dtype=torch.float64)
+
+
+def touched(surface, x, velocity, poses=None):
+    """Return velocities after one step of vertices that no spring joins, and by how far they moved: (batch, vertex, 3).
+
+    All start at `velocity`, shape (batch, 3); `x` has shape (vertex, 3).
+    """
+    none = np.zeros(0)
+    sheet = Sheet(x.numpy(), np.zeros((0, 2), dtype=int), none, none, mass=1.0, damping=0.0, gravity=0.0)
+    solver = Solver(sheet, surface, dt=DT, steps=1, name="float64", capacity=len(velocity), device="cpu")
+    path = solver.run(velocity, torch.zeros(len(velocity), len(x)), poses)
+    return to_torch(solver.v[1]).clone(), path[1] - path[0]
+
+
+def hits(points, pose, name="float64"):
+    """Return the pan's (normals, distances) at points of shape (point, 3)."""
+    types = precision(name)
+    array = wp.array(points.to(types.torch).contiguous().numpy(), dtype=types.vec3)
+    out = wp.zeros(len(points), dtype=types.vec4)
+    wp.launch(probe(name), len(points), [PAN.data(name), array, types.vec3(*pose), out])
+    result = to_torch(out).double()
+    return result[:, :3], result[:, 3]
+
+
+@cache
+def probe(name):
+    function, Data = PAN.function(name)
+    vec3, vec4 = precision(name).vec3, precision(name).vec4
+
+    @wp.kernel(enable_backward=False, module=f"gradscape.tests.contact.{name}")
+    def measure(data: Data, p: wp.array[vec3], pose: vec3, out: wp.array[vec4]):
+        i = wp.tid()
+        out[i] = function(data, p[i], pose)
+
+    return measure
+
+
+def placed(local, pose):
+    """Return where points of the pan's own frame are when it has a pose."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    x, y, z = local.unbind(dim=-1)
+    return torch.stack([pose[0] + c * x - s * y, pose[1] + s * x + c * y, z], dim=-1)
+
+
+def beside(along, around, above):
+    """Return points `above` the pan's surface, `along` it from its centre and `around` its axis, in its own frame."""
+    angle = (along - PAN.flat).clamp_min(0) / PAN.bend
+    r = along.clamp_max(PAN.flat) + (PAN.bend - above) * angle.sin()
+    y = PAN.bend - (PAN.bend - above) * angle.cos()
+    return torch.stack([r * around.cos(), y, r * around.sin()], dim=-1)
+
+
+@pytest.fixture(scope="module")
+def samples():
+    """The whole surface, in the pan's own frame."""
+    rings = torch.linspace(0, PAN.flat + ARC, round((PAN.flat + ARC) / SPACING) + 1, dtype=torch.float64)
+    turns = [torch.arange(0, 2 * math.pi, SPACING / max(float(r), SPACING), dtype=torch.float64) for r in rings]
+    along = torch.cat([r.expand(len(turn)) for r, turn in zip(rings, turns, strict=True)])
+    return beside(along, torch.cat(turns), torch.zeros_like(along))
+
+
+def near_the_pan(count, low, high, seed=0):
+    """Return random points between two heights above the surface, in the pan's own frame."""
+    along = uniform(0.0, PAN.flat + ARC, count, seed=seed)
+    return beside(along, uniform(0.0, 2 * math.pi, count, seed=seed + 1), uniform(low, high, count, seed=seed + 2))
+
+
+def test_the_floor_takes_the_velocity_into_it_and_nothing_else():
+    x, v = uniform(-0.1, 0.1, 60, 3), uniform(-3.0, 3.0, 40, 3, seed=1)
+    after, moved = touched(Floor(height=0.02), x, v)
+    inside = (x[:, 1] < 0.02).expand(40, 60)
+    stopped = inside & (v[:, 1, None] < 0)
+    before = v[:, None].expand(40, 60, 3)
+    assert stopped.sum() > 400
+    assert torch.equal(after[~stopped], before[~stopped])
+    assert torch.equal(after[stopped], before[stopped] * torch.tensor([1.0, 0.0, 1.0]))
+    torch.testing.assert_close(moved, DT * after, rtol=0, atol=1e-15)
+
+
+def test_a_pan_that_moves_and_tilts_takes_the_velocity_into_its_material_and_nothing_else():
+    x = torch.cat([placed(near_the_pan(200, -0.02, 0.02), POSES[1]), uniform(-0.3, 0.3, 50, 3, seed=7)])
+    v = uniform(-2.0, 2.0, 30, 3, seed=8)
+    start = torch.tensor(POSES[1], dtype=torch.float64).expand(30, 3)
+    rate = uniform(-3.0, 3.0, 30, 3, seed=9)
+    after, _ = touched(PAN, x, v, torch.stack([start, start + DT * rate], dim=1))
+    n, distance = hits(x, POSES[1])
+    # The material's velocity by moving its points a moment before and after.
+    c, s = math.cos(-POSES[1][2]), math.sin(-POSES[1][2])
+    offset = x - torch.tensor([*POSES[1][:2], 0.0])
+    local = torch.stack([c * offset[:, 0] - s * offset[:, 1], s * offset[:, 0] + c * offset[:, 1], x[:, 2]], dim=1)
+    ends = [torch.stack([placed(local, pose.tolist()) for pose in start + t * rate]) for t in (1e-5, -1e-5)]
+    material = (ends[0] - ends[1]) / 2e-5
+
+    before = v[:, None].expand(30, 250, 3)
+    into = ((before - material) * n).sum(dim=2)
+    stopped = (distance < 0) & (into < 0)
+    assert 1000 < stopped.sum() < 6000
+    assert torch.equal(after[~stopped], before[~stopped])
+    left = ((after - material) * n).sum(dim=2)
+    torch.testing.assert_close(left[stopped], torch.zeros_like(left[stopped]), rtol=0, atol=1e-8)
+    lost = before - after
+    torch.testing.assert_close(lost, (lost * n).sum(dim=2, keepdim=True) * n, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_the_pans_distance_is_that_to_the_nearest_of_its_points(samples, pose):
+    local = near_the_pan(600, 0.002, 0.03)
+    gap, nearest = cKDTree(placed(samples, pose).numpy()).query(placed(local, pose).numpy())
+    gap, foot = torch.from_numpy(gap), placed(samples, pose)[nearest]
+    n, distance = hits(placed(local, pose), pose)
+    # The nearest sample is at most half a cell's diagonal beside the nearest point; the surface bends towards it.
+    assert (distance <= gap + 1e-9).all()
+    assert (gap - distance <= SPACING**2 / 4 / distance + 1e-9).all()
+    away = distance > 0.01
+    assert (((placed(local, pose) - foot) / gap[:, None] - n)[away].norm(dim=1) < SPACING / 0.01).all()
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_inside_the_pan_the_distance_is_the_depth(pose):
+    depth = uniform(-0.0299, 0.0, 300, seed=3)
+    local = beside(uniform(0.0, PAN.flat + ARC, 300), uniform(0.0, 2 * math.pi, 300, seed=1), depth)
+    torch.testing.assert_close(hits(placed(local, pose), pose)[1], depth, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_the_pans_normals_are_unit_vectors_and_the_slope_of_its_distance(pose):
+    points, step = placed(near_the_pan(400, -0.025, 0.03), pose), 1e-6
+    n, _ = hits(points, pose)
+    torch.testing.assert_close(n.norm(dim=1), torch.ones(400, dtype=torch.float64), rtol=0, atol=1e-14)
+    shifts = step * torch.eye(3, dtype=torch.float64)
+    ends = [[hits(points + sign * shift, pose)[1] for shift in shifts] for sign in (1, -1)]
+    slope = torch.stack([(up - down) / (2 * step) for up, down in zip(*ends, strict=True)], dim=1)
+    torch.testing.assert_close(n, slope, rtol=0, atol=1e-4)  # within a step of the joint the slope is between two
+    clear = (n - slope).abs().amax(dim=1) < 1e-8
+    assert clear.sum() > 395
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_nothing_is_beside_the_rim_or_beneath_the_pan(pose):
+    around = uniform(0.0, 2 * math.pi, 300, seed=1)
+    depth = uniform(-0.03, 0.03, 300)
+    past = beside(PAN.flat + ARC + uniform(1e-6, 0.05, 300, seed=2), around, depth)
+    beneath = beside(
+        uniform(0.0, PAN.flat + ARC, 300, seed=3), around, -PAN.thickness - uniform(1e-6, 0.5, 300, seed=4)
+    )
+    for local in (past, beneath):
+        assert (hits(placed(local, pose), pose)[1] > 0).all()
+
+
+def test_the_pans_bottom_passes_smoothly_into_its_edge():
+    around = uniform(0.0, 2 * math.pi, 100)
+    for above in (-0.02, 0.0, 0.03):
+        height = torch.full((100,), above, dtype=torch.float64)
+        (n, distance), (n_out, distance_out) = (
+            hits(beside(torch.full((100,), PAN.flat + shift, dtype=torch.float64), around, height), POSES[0])
+            for shift in (-1e-9, 1e-9)
+        )
+        torch.testing.assert_close(distance, distance_out, rtol=0, atol=1e-15)
+        torch.testing.assert_close(n, n_out, rtol=0, atol=1e-7)
+        torch.testing.assert_close(n, UP.expand(100, 3), rtol=0, atol=1e-12)
+
+
+def test_the_rim_is_where_the_pan_says_it_is(samples):
+    assert PAN.radius == pytest.approx(0.2)
+    assert samples[:, ::2].norm(dim=1).max() == pytest.approx(PAN.radius)
+    assert samples[:, 1].max() == pytest.approx(PAN.bend * (1 - math.cos(PAN.sweep)))
+
+
+def test_the_pan_is_the_same_in_float32_within_its_precision():
+    points = placed(near_the_pan(300, -0.025, 0.03), POSES[1])
+    for single, double in zip(hits(points, POSES[1], "float32"), hits(points, POSES[1]), strict=True):
+        torch.testing.assert_close(single, double, rtol=0, atol=1e-5)

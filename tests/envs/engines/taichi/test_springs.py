@@ -1,0 +1,193 @@
+"""The Taichi sheets against Warp's, which share no more than the scene's data."""
+
+import gc
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gradscape.envs.engines.sheets import springs
+from gradscape.envs.engines.sheets.contact import Floor, Pan
+from gradscape.envs.engines.sheets.springs import Sheet
+from gradscape.envs.engines.taichi import springs as taichi_springs
+from gradscape.envs.engines.taichi.runtime import start
+from gradscape.envs.sheets import lattice
+from gradscape.envs.sheets.swing import SwingVelocity
+
+PAN = Pan(flat=0.14, bend=0.07, sweep=math.asin(6 / 7), thickness=0.03)
+DT, STEPS, ROWS = 2e-3, 40, 3
+
+
+def crumpled(surface):
+    """Return a sheet of 4 x 4 cells, of which two corners are held, that crosses its surface.
+
+    It lies on the floor, or across the whole pan: one vertex starts on the axis, corners are beyond the rim.
+    """
+    points, pitch = lattice.square(4), 0.04 if isinstance(surface, Floor) else 0.08
+    pairs, rest, weight = lattice.springs(points, reach=2, bend=0.4)
+    x = np.stack([points[:, 0] - 2, np.zeros(len(points)), points[:, 1] - 2], axis=1) * pitch
+    x += 0.01 * np.random.default_rng(0).uniform(-1, 1, x.shape)
+    x[12] = 0.0, -0.002, 0.0
+    return Sheet(x, pairs, pitch * rest, weight, mass=0.01, damping=0.05, drag=0.5, held=(20, 24))
+
+
+def drive():
+    """Return random velocities, stiffness of every vertex and poses, and a random adjoint of the last positions."""
+    rng = torch.Generator().manual_seed(1)
+
+    def within(low, high, *shape):
+        return low + (high - low) * torch.rand(shape, generator=rng, dtype=torch.float64)
+
+    moved = within(-0.05, 0.05, ROWS, 1, 3) * torch.tensor([1.0, 1.0, 10.0])
+    poses = torch.linspace(0, 1, STEPS + 1, dtype=torch.float64)[:, None] * moved
+    return (within(-1.0, 0.0, ROWS, 3), within(5.0, 40.0, ROWS, 25), poses), within(-1.0, 1.0, ROWS, 25, 3)
+
+
+def made(engine, surface):
+    return engine.Solver(
+        crumpled(surface), surface, dt=DT, steps=STEPS, name="float64", capacity=ROWS + 1, device="cpu"
+    )
+
+
+@pytest.fixture(scope="module", params=[Floor(height=0.001), PAN], ids=["floor", "pan"])
+def surface(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def driven():
+    return drive()
+
+
+@pytest.fixture(scope="module")
+def solver(surface):
+    return made(taichi_springs, surface)
+
+
+@pytest.fixture(scope="module")
+def warp(surface, driven):
+    """Return Warp's path and gradient."""
+    inputs, adj_x = driven
+    solver = made(springs, surface)
+    return solver.run(*inputs).clone(), solver.gradient(adj_x)
+
+
+def assert_close(ours, theirs, tolerance):
+    """Compare by the largest value."""
+    torch.testing.assert_close(ours, theirs, rtol=0, atol=tolerance * float(theirs.abs().max()))
+
+
+def test_sheets_move_as_warps_do(solver, driven, warp):
+    x = solver.run(*driven[0])
+    assert x.shape == (STEPS + 1, ROWS, 25, 3)
+    assert_close(x, warp[0], 1e-13)
+
+
+def test_the_compilers_adjoint_is_the_one_written_by_hand(solver, driven, warp):
+    inputs, adj_x = driven
+    solver.run(*inputs)
+    for _ in range(2):  # nothing is added to the gradient before
+        for given, ours, theirs in zip(inputs, solver.gradient(adj_x), warp[1], strict=True):
+            assert ours.shape == given.shape
+            assert_close(ours, theirs, 1e-12)
+
+
+def test_a_surface_without_poses_stands_still(solver, driven):
+    velocity, stiffness, poses = driven[0]
+    assert torch.equal(solver.run(velocity, stiffness), solver.run(velocity, stiffness, torch.zeros_like(poses)))
+
+
+def one_step(engine, sheet):
+    return engine.Solver(sheet, Floor(), dt=DT, steps=1, name="float64", capacity=1, device="cpu")
+
+
+def test_ends_that_coincide_pull_in_no_direction(driven):
+    sheet = crumpled(Floor())
+    sheet.x[1] = sheet.x[0]
+    (velocity, stiffness, _), adj_x = driven
+    ends = []
+    for engine in (taichi_springs, springs):
+        solver = one_step(engine, sheet)
+        ends.append([solver.run(velocity[:1], stiffness[:1])[-1].clone(), *solver.gradient(adj_x[:1])])
+    for ours, theirs in zip(*ends, strict=True):
+        assert_close(ours, theirs, 1e-12)
+
+
+def test_what_does_not_fit_is_refused_since_kernels_check_no_index(solver, driven):
+    (velocity, stiffness, poses), adj_x = driven
+    more = [part[[0, 1, 2, 0, 1]] for part in driven[0]]
+    with pytest.raises(ValueError, match="up to 4 rows; got 5"):
+        solver.run(*more)
+    with pytest.raises(ValueError, match=r"stiffness of shape \(3, 25\); got \(3, 24\)"):
+        solver.run(velocity, stiffness[:, 1:], poses)
+    with pytest.raises(ValueError, match=r"poses of shape \(3, 41, 3\); got \(3, 40, 3\)"):
+        solver.run(velocity, stiffness, poses[:, 1:])
+    solver.run(velocity, stiffness, poses)
+    with pytest.raises(ValueError, match=r"adj_x of shape \(3, 25, 3\); got \(2, 25, 3\)"):
+        solver.gradient(adj_x[1:])
+
+
+def test_a_stopped_solver_raises_within_a_step_and_leaves_nothing_behind(solver, driven, warp, monkeypatch):
+    inputs, adj_x = driven
+    for simulate in (lambda: solver.run(*inputs), lambda: solver.gradient(adj_x)):
+        asked = iter([False] * 10 + [True])
+        monkeypatch.setattr(solver.stop, "is_set", lambda asked=asked: next(asked))
+        with pytest.raises(InterruptedError, match="the simulation was stopped"):
+            simulate()
+        monkeypatch.undo()
+        solver.run(*inputs)
+    for ours, theirs in zip(solver.gradient(adj_x), warp[1], strict=True):
+        assert_close(ours, theirs, 1e-12)
+
+
+def test_fields_go_with_their_solver():
+    trees = start("cpu").lang.impl.get_runtime().prog.get_snode_tree_size
+    counts = []
+    for _ in range(2):
+        one_step(taichi_springs, crumpled(Floor()))
+        gc.collect()
+        counts.append(trees())
+    assert counts[0] == counts[1]
+
+
+def cloth(name, steps, engines):
+    """Return solvers of a draft cloth, and four velocities and stiffnesses."""
+    env = SwingVelocity(fidelity=replace(SwingVelocity.fidelities["draft"], precision=name), device="cpu")
+    unit = torch.rand(4, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    given = dict(dt=env.fidelity.dt, steps=steps, name=name, capacity=4, device="cpu")
+    solvers = [engine.Solver(env.sheet, env.surface, **given) for engine in engines]
+    return *solvers, env._drive(env.space.from_unit(unit)).detach()[:2]
+
+
+@pytest.mark.parametrize(
+    ("name", "steps", "distance", "tolerance"),
+    [("float32", 150, 1e-5, 2e-3), ("float64", 400, 1e-11, 1e-8)],  # float32 agrees until contacts amplify rounding
+)
+def test_a_draft_cloth_swings_as_warps_does(name, steps, distance, tolerance):
+    ours, theirs, inputs = cloth(name, steps, (taichi_springs, springs))
+    x, target = ours.run(*inputs), theirs.run(*inputs)
+    assert target[-1, :, :, 1].min() < 0.001  # on the floor
+    torch.testing.assert_close(x, target, rtol=0, atol=distance)
+    adj_x = torch.ones(4, 64, 3)
+    for mine, hand in zip(ours.gradient(adj_x)[:2], theirs.gradient(adj_x)[:2], strict=True):
+        gap = (mine - hand).flatten(1).norm(dim=1) / hand.flatten(1).norm(dim=1)
+        assert gap.max() < tolerance
+
+
+def test_a_row_is_the_same_bit_for_bit_alone_and_among_others():
+    solver, inputs = cloth("float32", 150, [taichi_springs])
+    adj_x = torch.ones(4, 64, 3)
+    x, gradient = solver.run(*inputs), solver.gradient(adj_x)
+    for row in range(4):
+        one = slice(row, row + 1)
+        assert torch.equal(solver.run(*(part[one] for part in inputs)), x[:, one])
+        for alone, among in zip(solver.gradient(adj_x[one]), gradient, strict=True):
+            assert torch.equal(alone, among[one])
+
+
+def test_starting_taichi_leaves_subnormal_numbers_to_others():
+    start("cpu")
+    least = torch.tensor([5e-324], dtype=torch.float64)
+    assert torch.equal(least + 0, least)

@@ -1,0 +1,38 @@
+"""Every registered scene, cheap and in float64, for tests that take many episodes; a new one is found by its family."""
+
+from dataclasses import replace
+
+from gradscape.envs.base import Environment, Fidelity
+from gradscape.envs.functions import Function
+from gradscape.envs.mpm.fluid import Fluid
+from gradscape.envs.mpm.plasticine import Plasticine
+from gradscape.envs.registry import entries, environment_class
+from gradscape.envs.sheets.sheets import SheetScene
+
+COARSE = {  # families whose cheapest fidelity takes too long
+    Fluid: {"dt": Fluid.control_step / 2, "resolution": 6, "sampling": 1.5},
+    Plasticine: {"dt": Plasticine.control_step / 5, "resolution": 16, "particles": 100},
+    SheetScene: {"dt": 1 / 500, "resolution": 4},
+}
+
+
+def of_family(*families: type[Environment]) -> list[str]:
+    """Return the names of the registered scenes of some families."""
+    return [name for name in entries() if issubclass(environment_class(name), families)]
+
+
+def cheap(kind: type[Environment]) -> Fidelity:
+    """Return a fidelity in float64 that takes little time."""
+    for family, settings in COARSE.items():
+        if issubclass(kind, family):
+            return Fidelity("tiny", precision="float64", **settings)
+    return replace(next(iter(kind.fidelities.values())), precision="float64")
+
+
+SIMULATED = [name for name in entries() if not issubclass(environment_class(name), Function)]
+SETTINGS = {name: {"fidelity": cheap(environment_class(name))} for name in SIMULATED}
+SOFT = of_family(Plasticine)
+# Of these two fifths of an episode, in which every tool works: `test_plasticine` holds whole ones against slopes.
+SHORT = {name: {"horizon": 0.4} for name in SOFT}
+# Where vertices strike a surface their losses jump, by little but often: differences need a step between the jumps.
+SMALL_STEPS = dict.fromkeys(of_family(SheetScene), 1e-8)

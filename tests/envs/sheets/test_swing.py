@@ -1,0 +1,154 @@
+"""The swing scenes: cloth and anchors, losses against episodes, symmetry, the floor, and gradients as the paper saw."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gradscape.envs.sheets import sheets
+from gradscape.envs.sheets.swing import Swing, SwingStiffness, SwingVelocity
+from gradscape.landscapes.objective import Status
+
+DRAFT64 = replace(Swing.fidelities["draft"], precision="float64")
+LOSSES = ("single", "corner", "mesh")
+
+
+def made(cls, loss="single", fidelity=DRAFT64):
+    return cls(fidelity=fidelity, device="cpu", loss=loss)
+
+
+def last(env, x):
+    return env.episode(x).points["sheet"][-1]
+
+
+@pytest.fixture(scope="module")
+def velocity():
+    return made(SwingVelocity)
+
+
+@pytest.fixture(scope="module", params=[SwingVelocity, SwingStiffness])
+def cls(request):
+    return request.param
+
+
+@pytest.mark.parametrize("fidelity", ["draft", "standard"])
+def test_the_cloth_starts_level_and_held_at_its_two_right_corners(fidelity):
+    sheet = SwingVelocity(fidelity=fidelity, device="cpu").sheet
+    low, high = sheet.x.min(axis=0), sheet.x.max(axis=0)
+    assert low.tolist() == pytest.approx([-0.2, 0.1, -0.1])
+    assert high.tolist() == pytest.approx([0.0, 0.1, 0.1])
+    assert sheet.x[list(sheet.held)].ravel().tolist() == pytest.approx([0.0, 0.1, -0.1, 0.0, 0.1, 0.1])
+    assert sheet.mass * len(sheet.x) == pytest.approx(0.2 * 0.2**2)
+
+
+def test_an_episode_is_that_of_the_parameters_and_its_anchors_stand_still(cls):
+    env = made(cls)
+    episode = env.episode(env.example("target"))
+    frames, held = episode.points["sheet"], list(env.sheet.held)
+    assert torch.equal(frames[0], torch.from_numpy(env.sheet.x))
+    assert float(episode.time[-1]) == pytest.approx(0.8)
+    for number, place in zip(held, episode.tools.values(), strict=True):
+        assert torch.equal(frames[:, number], place)
+        assert torch.equal(place, place[:1].expand_as(place))
+    assert frames[:, :, 1].min() < 0.005  # it swings down onto the floor
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_the_target_is_where_its_own_example_brings_the_cloth(cls, loss):
+    env = made(cls, loss)
+    result = env.evaluate(env.example("target")[None])
+    assert float(result.loss) == 0.0
+    assert result.status.tolist() == [Status.OK]  # though a distance has no slope at 0
+
+
+def test_losses_are_distances_between_the_ends_of_episodes(cls):
+    envs = {loss: made(cls, loss) for loss in LOSSES}
+    env = envs["mesh"]
+    x = env.space.uniform(4, seed=3)
+    loss = {name: env.evaluate(x, grad=False).loss for name, env in envs.items()}
+    target, n = last(env, env.example("target")), env.fidelity.resolution
+    for row in range(4):
+        gap = last(env, x[row]) - target
+        lengths = gap.norm(dim=1).reshape(n + 1, n + 1)
+        torch.testing.assert_close(loss["mesh"][row], lengths.mean())
+        torch.testing.assert_close(loss["corner"][row], lengths[[0, 0, -1, -1], [0, -1, 0, -1]].mean())
+        torch.testing.assert_close(loss["single"][row], gap.mean(dim=0).norm())
+        assert lengths[-1, [0, -1]].tolist() == [0, 0]
+    assert (loss["single"] <= loss["mesh"]).all()  # the norm of a mean is at most the mean of norms
+    assert (loss["single"] > 1e-3).all()
+
+
+def test_both_scenes_swing_the_same_cloth(velocity):
+    stiffness = made(SwingStiffness)
+    uniform, throw = torch.full((16,), 10.0), torch.tensor([1.0, -0.5, 0.0])
+    assert torch.equal(stiffness.end(uniform), velocity.end(throw))
+
+
+@pytest.mark.parametrize("resolution", [7, 8, 19])
+def test_a_patch_is_as_large_as_the_next_and_lies_where_it_is_named(resolution):
+    env = made(SwingStiffness, fidelity=replace(DRAFT64, resolution=resolution))
+    numbers = torch.arange(16, dtype=torch.float64)[None]
+    patch = env._drive(numbers).stiffness[0].reshape(resolution + 1, resolution + 1)
+    place = torch.from_numpy(env.sheet.x).reshape(resolution + 1, resolution + 1, 3)
+    right, front = place[..., 0] / 0.2 + 1, place[..., 2] / 0.2 + 0.5
+    row, column = patch // 4, patch % 4
+    for share, number in ((right, row), (front, column)):
+        # A vertex stands for its cell, half of which may lie beyond the patch.
+        assert ((share - (number + 0.5) / 4).abs() <= 1 / 8 + 0.5 / (resolution + 1) + 1e-9).all()
+    for vertices in (row[:, 0].long().bincount(minlength=4), column[0].long().bincount(minlength=4)):
+        assert vertices.max() - vertices.min() <= 1
+
+
+def test_a_mirrored_throw_ends_mirrored(velocity):
+    """Up to rounding, which sums of forces in another order make and which touching the floor enlarges."""
+    throw = torch.tensor([1.0, -0.5, 0.7], dtype=torch.float64)
+    mirror = torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)
+    n = velocity.fidelity.resolution + 1
+    there, back = (velocity.episode(x).points["sheet"][:31] for x in (throw, mirror * throw))
+    turned = there.reshape(31, n, n, 3).flip(2).reshape(31, n * n, 3) * mirror
+    torch.testing.assert_close(back, turned, rtol=0, atol=1e-12)
+    assert (there[-1, :, 1] < 0.0).sum() > 5
+
+
+def test_the_floor_lets_no_vertex_deeper_than_it_falls_in_one_step(monkeypatch):
+    env = made(SwingVelocity, fidelity="draft")
+    dt = env.fidelity.dt
+    monkeypatch.setattr(sheets, "FRAME", dt)
+    for throw in ((2.0, -2.0, 2.0), (1.0, -0.5, 0.3)):
+        y = env.episode(torch.tensor(throw, dtype=torch.float64)).points["sheet"][:, :, 1]
+        fall = -y.diff(dim=0)
+        assert (fall[y[:-1] < 0] <= 0).all()
+        assert y.min() < 0
+        assert y.min() >= -fall.max()
+        assert fall.max() < 5 * dt
+
+
+def test_gradients_are_slopes_between_jumps_but_often_point_against_the_slope_of_a_decimetre_per_second(velocity):
+    """The paper's finding: gradients that are noisy and often opposite to the slope."""
+    x = velocity.space.uniform(64, seed=1)
+    gradient = velocity.evaluate(x).grad[:, 0]
+
+    def slope(step):
+        shift = torch.tensor([step, 0.0, 0.0], dtype=torch.float64)
+        ends = [velocity.evaluate(x + sign * shift, grad=False).loss for sign in (1, -1)]
+        return (ends[0] - ends[1]) / (2 * step)
+
+    near, far = slope(1e-8), slope(0.1)
+    assert ((near - gradient).abs() < 1e-4 * gradient.abs() + 1e-6).sum() > 58  # few have a jump even there
+    assert (far * gradient < 0).sum() > 64 / 5
+
+
+def test_an_unstable_simulation_is_a_failure_and_no_error(cls):
+    env = cls(fidelity=replace(Swing.fidelities["draft"], dt=1 / 100), device="cpu")
+    result = env.evaluate(env.space.uniform(3, seed=0))
+    assert (result.status == Status.NONFINITE).all()
+    assert result.loss.isnan().all()
+    assert result.grad.isnan().all()
+
+
+def test_the_corners_of_the_box_can_be_simulated(cls):
+    env = cls(fidelity="draft", device="cpu")
+    rng = torch.Generator().manual_seed(0)
+    corner = torch.randint(0, 2, (64, env.space.dim), generator=rng).bool()
+    result = env.evaluate(torch.where(corner, env.space.upper, env.space.lower))
+    assert (result.status == Status.OK).all()

@@ -1,0 +1,208 @@
+"""A small site with everything a page can have, and the browser that looks at it."""
+
+import json
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import imageio_ffmpeg
+import pytest
+import torch
+
+from gradscape.gallery.figures import Figure
+from gradscape.gallery.files import RUN_SUFFIX, RUNS
+from gradscape.gallery.paper import PaperCaption
+from gradscape.gallery.runs import save_run
+from gradscape.gallery.site.build import build_site
+from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.plane import Plane
+from gradscape.landscapes.sampling.fill import sample
+from gradscape.landscapes.space import ParameterSpace
+from gradscape.landscapes.storage.store import SliceStore
+from gradscape.optim.runs.store import RunStore
+from gradscape.optim.search import search
+
+from ...command import NO_BROWSER
+
+SPACE = ParameterSpace(
+    ("speed", "force", "mass"), torch.tensor([-1.0, 0, -10]).double(), torch.tensor([1.0, 20, 10]).double(),
+    ("m/s", "N", ""),
+)  # fmt: skip
+FIGURES = [
+    Figure("line", "bounce", (0,), PaperCaption("A line.", 8), resolution=33),
+    Figure("bare", "bounce", (0, 1), PaperCaption("Nothing but its slice."), resolution=9),
+    Figure("full", "fluid", (0, 1), PaperCaption("All of it <b>&</b> no network.", 10), resolution=12),
+]
+EPISODES = [
+    {"row": 6, "column": 5, "why": "lowest loss", "loss": 1.25, "status": "OK"},
+    {"row": 6, "column": 5, "why": "through the slice's point", "loss": 1.25, "status": "OK"},
+    {"row": 11, "column": 11, "why": "highest loss", "loss": None, "status": "NONFINITE"},
+]
+SWEEP = {
+    "over": "2", "label": "mass", "low": -10.0, "high": 10.0, "fidelity": "draft", "frames": 12,
+    "resolution": [24, 24], "command": "landscape sweep fluid --dims 0 1 --over 2",
+}  # fmt: skip
+PATIENCE = 600_000  # milliseconds until the browser is given up, and no measure of anything
+MEASURES = {"local minima": 7, "noise floor": "none"}
+
+
+def cosine(scale: float, points: int, value: float | None) -> dict[str, Any]:
+    return {"scale": scale, "points": points, "of": 36, "cosine": {"value": value, "low": value, "high": value}}
+
+
+REPORT: dict[str, Any] = {
+    "fidelity": "standard", "device": "cuda",
+    "verdict": {"words": ["rugged", "gradients noisy"], "reasons": {"rugged": "minima: 12", "gradients noisy": "0.5"}},
+    "paper": {"where": "A.2.1", "words": [
+        {"word": "rugged", "measured": True}, {"word": "gradients good", "measured": False}
+    ]},
+    "differences": [cosine(1e-6, 2, 0.1), cosine(1e-5, 30, 0.99)],
+    "differences_of_samples": [cosine(0.04, 36, -0.5)],
+    "smoothing": [{"width": 0.01, "points": 36, "biased": {"value": 0.25}}],
+}  # fmt: skip
+
+
+def rung(name: str, ladder: str, milliseconds: float, error: float | None) -> dict[str, Any]:
+    """Return what a trade-off says of a rung, its error in percent of the spread of 2 J."""
+    found = None if error is None else {"value": error / 100, "low": error / 200, "high": error / 50}
+    none = {"value": None, "low": None, "high": None}
+    return {
+        "name": name, "ladder": ladder, "loss_error": {"p95_relative": found or none, "p95": none},
+        "spearman": {"value": 0.987}, "gradient": {"cosine": {"value": 0.654}}, "diverged": 0.25,
+        "seconds": {"forward": milliseconds / 2e3, "with_gradient": milliseconds / 1e3}, "memory": 2_500_000,
+    }  # fmt: skip
+
+
+TRADEOFF = {
+    "env": "fluid", "reference": "reference", "points": 64, "spread": 2.0, "loss_unit": "J", "refused": [],
+    "command": "landscape tradeoff fluid", "identity": {"options": {"goal": "high"}, "device": "cuda"},
+    "rungs": [
+        rung("reference", "named", 400, 0), rung("draft", "named", 4, 9), rung("coarse", "dt", 2, None),
+        rung("standard", "named", 40, 3), rung("slow", "dt", 50, 4),
+    ],
+}  # fmt: skip
+
+
+class Bowl:
+    """The squared distance from a point of the scaled box, and a corner that is not finite."""
+
+    space = SPACE
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def evaluate(self, x, *, grad=True):  # type: ignore[no-untyped-def]
+        z = 2 * self.space.to_unit(x) - 1
+        loss, slope = 1 + (z + 0.1).square().sum(dim=1), 2 * (z + 0.1) * torch.tensor([1, 0.1, 0.1])
+        loss[(z[:, :2] > 0.75).all(dim=1)] = torch.nan
+        return Evaluation.from_results(loss, slope if grad else None)
+
+
+def keep(figure: Figure, folder: Path) -> None:
+    """Sample a figure's slice."""
+    bowl, identity = Bowl(figure.env), {"objective": figure.env, "options": {}, "fidelity": "standard"}
+    plane = Plane.through(SPACE, SPACE.center, figure.dims, resolution=figure.resolution)
+    path = folder / figure.id / "slice.zarr"
+    store = SliceStore.create(path, plane, SPACE, identity=identity, provenance={"loss_unit": "J"})
+    sample(bowl, plane, store)
+
+
+def picture(path: Path) -> None:
+    """Write a picture."""
+    program = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-f", "lavfi", "-i", "testsrc=size=160x120"]
+    subprocess.run([*program, "-frames:v", "1", str(path)], check=True)
+
+
+def film(path: Path) -> None:
+    """Write a short film and its last frame."""
+    program = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-f", "lavfi", "-i"]
+    test = "testsrc=size=160x120:rate=10:duration=1"
+    subprocess.run([*program, test, "-pix_fmt", "yuv420p", f"{path}.mp4"], check=True)
+    picture(Path(f"{path}.webp"))
+
+
+@pytest.fixture(scope="session")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Leave what `landscape gallery compute` does: a full figure, a line with searches, a bare one."""
+    folder = tmp_path_factory.mktemp("data")
+    for figure in FIGURES:
+        keep(figure, folder)
+    for env in ("bounce", "fluid"):
+        for method in ("random", "descents"):
+            identity = {"objective": env, "options": {}, "method": method, "seed": 0, "fidelity": "draft"}
+            provenance = {"command": f"landscape optimize {env} --method {method}"}
+            run = RunStore.create(
+                folder / "runs.tmp" / env / method, SPACE, identity=identity, provenance=provenance, budget=24
+            )
+            (folder / RUNS / env).mkdir(parents=True, exist_ok=True)
+            table = search(Bowl(env), method, run, budget=24, gradient_cost=2.0).dataset()
+            save_run(table, folder / RUNS / env / f"{method}-0{RUN_SUFFIX}")
+    full = folder / "full"
+    (full / "episodes.json").write_text(json.dumps(EPISODES))
+    (full / "sweep.json").write_text(json.dumps(SWEEP))
+    (full / "measures.json").write_text(json.dumps(MEASURES))
+    (full / "report.json").write_text(json.dumps(REPORT))
+    picture(full / "gradient-quality.png")
+    (folder / "tradeoff").mkdir()
+    for device in ("cuda", "cpu"):
+        identity = {**TRADEOFF["identity"], "device": device}
+        (folder / f"tradeoff/fluid-{device}.json").write_text(json.dumps({**TRADEOFF, "identity": identity}))
+        picture(folder / f"tradeoff/fluid-{device}.png")
+    for name in ("episode-6-5", "episode-11-11", "sweep"):
+        film(full / name)
+    (full / "episode-11-11.mp4").unlink()
+    return folder
+
+
+@pytest.fixture(scope="session")
+def site(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site") / "deep" / "gallery"
+    build_site([*FIGURES, Figure("later", "rope", (0, 1), PaperCaption("Not yet."))], data, folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def browser():  # type: ignore[no-untyped-def]
+    program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if not program:
+        pytest.skip(NO_BROWSER)
+    from playwright.sync_api import expect, sync_playwright
+
+    expect.set_options(timeout=PATIENCE)
+    with sync_playwright() as driver:
+        opened = driver.chromium.launch(executable_path=program, args=["--disable-gpu"], timeout=PATIENCE)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def visit(browser) -> Iterator[Callable]:  # type: ignore[no-untyped-def, type-arg]
+    """Open a page and, at the end, hold that it asked for nothing elsewhere and complained of nothing."""
+    contexts = []
+    complaints: list[str] = []
+    asked: list[str] = []
+    roots: list[str] = []
+
+    def go(root: str, path: str, *, width: int = 1100, **options):  # type: ignore[no-untyped-def]
+        context = browser.new_context(viewport={"width": width, "height": 900}, **options)
+        context.set_default_timeout(PATIENCE)
+        contexts.append(context)
+        page = context.new_page()
+        page.on("console", lambda message: complaints.append(message.text))
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("requestfailed", lambda request: complaints.append(f"{request.url} failed: {request.failure}"))
+        page.on("response", lambda response: complaints.append(response.url) if response.status >= 400 else None)
+        page.on("request", lambda request: asked.append(request.url))
+        roots.append(root)
+        page.goto(root + path, wait_until="load")
+        return page
+
+    yield go
+    aborted = "net::ERR_ABORTED"  # a film that is not played to its end is not loaded to its end
+    assert [said for said in complaints if not said.endswith(aborted)] == []
+    assert asked
+    assert not [url for url in asked if not url.startswith((*roots, "data:"))]
+    for context in contexts:
+        context.close()

@@ -1,0 +1,97 @@
+"""What `landscape gallery compute` makes beside slices: films, episodes at nodes, searches."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from gradscape.cli import main
+from gradscape.envs.bounce import Bounce
+from gradscape.gallery import episodes as gallery_episodes
+from gradscape.gallery import measures as gallery_measures
+from gradscape.gallery import parts as gallery_parts
+from gradscape.gallery.compute import PARTS
+from gradscape.gallery.figures import Figure
+from gradscape.gallery.paper import PaperCaption
+
+FIGURES = [
+    Figure("ball", "bounce", (0, 1), PaperCaption("It jumps."), through="example:aim", resolution=8, fidelity="draft"),
+    Figure("ball-y", "bounce", (1,), PaperCaption("It jumps."), through="example:aim", resolution=8, fidelity="draft"),
+    Figure("branin", "branin", (0, 1), PaperCaption("Three minima."), resolution=8, fidelity="exact", over=""),
+]
+
+
+@pytest.fixture
+def small(blank: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Let all there is to make be little, and steps of time long."""
+    monkeypatch.setattr("gradscape.gallery.figures.read_figures", lambda: list(FIGURES))
+    for name, value in (("FRAMES", 2), ("COARSE", 4), ("DPI", 40), ("METHODS", ("random", "cma-es")), ("BUDGET", 9)):
+        monkeypatch.setattr(gallery_parts, name, value)
+    for name, value in (("HEIGHT", 60), ("LONGEST", 2)):
+        monkeypatch.setattr(gallery_episodes, name, value)
+    for name, value in (("REPORT_POINTS", 2), ("TRADEOFF_POINTS", 4), ("TURNED", ["precision"])):
+        monkeypatch.setattr(gallery_measures, name, value)
+    for name in ("REPETITION", "LARGEST"):
+        monkeypatch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", 0.01)
+    longer = {name: replace(one, dt=4 * one.dt) for name, one in Bounce.fidelities.items()}
+    monkeypatch.setattr(Bounce, "fidelities", longer)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "data"
+
+
+def compute(data: Path, *arguments: str) -> int:
+    with pytest.raises(SystemExit) as left:
+        main(["gallery", "compute", "--device", "cpu", "--data", str(data), *arguments])
+    return int(left.value.code or 0)
+
+
+def test_everything_is_made_once(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert compute(small) == 0
+    for figure in ("ball", "ball-y"):
+        episodes = json.loads((small / figure / "episodes.json").read_text())
+        assert 3 <= len(episodes) <= 4
+        for episode in episodes:
+            name = small / figure / f"episode-{episode['row']}-{episode['column']}"
+            assert name.with_suffix(".mp4").stat().st_size > 0
+            assert name.with_suffix(".webp").stat().st_size > 0
+    sweep = json.loads((small / "ball/sweep.json").read_text())
+    assert sweep["label"] == "share of the scene's duration [%]"
+    assert (sweep["low"], sweep["high"], sweep["frames"]) == (50.0, 100.0, 2)
+    assert sweep["command"].startswith("landscape sweep bounce --dims 0 1 --over horizon")
+    assert not (small / "ball-y/sweep.mp4").exists()
+    kept = sorted(str(file.relative_to(small)) for file in small.glob("runs/*/*"))
+    methods = ("cma-es", "random")
+    assert kept == [f"runs/{env}/{method}-0.zarr.zip" for env in ("bounce", "branin") for method in methods]
+    assert not list((small / "branin").glob("episode*"))
+    for figure in ("ball", "ball-y", "branin"):
+        report = json.loads((small / figure / "report.json").read_text())
+        assert report["name"] == figure
+        assert (small / figure / "gradient-quality.png").read_bytes().startswith(b"\x89PNG")
+    assert sorted(file.name for file in (small / "tradeoff").iterdir()) == ["bounce-cpu.json", "bounce-cpu.png"]
+    rungs = {row["name"] for row in json.loads((small / "tradeoff/bounce-cpu.json").read_text())["rungs"]}
+    assert rungs > {"draft", "standard", "reference", "draft-float64"}
+    before = {file: file.stat().st_mtime_ns for file in small.rglob("*") if file.is_file()}
+    capsys.readouterr()
+    assert compute(small) == 0
+    assert {file: file.stat().st_mtime_ns for file in small.rglob("*") if file.is_file()} == before
+    said = capsys.readouterr().err
+    assert all(f"{part}: 3 of 3 are there already" in said for part in PARTS)
+
+
+def test_films_of_other_nodes_go_when_the_slice_changes(small: Path) -> None:
+    assert compute(small, "--only", "ball", "--part", "slices", "--part", "episodes") == 0
+    listed = json.loads((small / "ball/episodes.json").read_text())
+    (small / "ball/episodes.json").write_text(json.dumps([{**listed[0], "row": 5, "column": 5}, *listed[1:]]))
+    stale = small / "ball/episode-5-5.mp4"
+    stale.write_bytes(b"")
+    assert compute(small, "--only", "ball", "--part", "episodes") == 0
+    assert json.loads((small / "ball/episodes.json").read_text()) == listed
+    assert not stale.exists()
+
+
+def test_an_unknown_part_is_refused(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert compute(small, "--part", "films") == 2
+    assert "--part takes slices, sweeps, episodes, searches, reports, tradeoffs; got films" in " ".join(
+        capsys.readouterr().err.split()
+    )

@@ -1,0 +1,366 @@
+"""The conformance suite: what is sound passes, and each defect makes its own check fail, and no other."""
+
+import math
+
+import pytest
+import torch
+
+from gradscape.landscapes.adapters import from_torch
+from gradscape.landscapes.conformance.extremes import CORNERS, ExtremeCase, corners
+from gradscape.landscapes.conformance.suite import check
+from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.space import ParameterSpace
+
+SPACE = ParameterSpace.box(["a", "b", "c"], -1.0, 2.0)
+NAN = torch.nan
+
+
+def loss_of(x):
+    return (1 + torch.arange(x.shape[1])).mul(torch.sin(2 * x) + x.square()).sum(dim=1)
+
+
+def outcomes(objective, **settings):
+    return {found.check: found for found in check(objective, **settings)}
+
+
+def failures(objective, **settings):
+    return {name for name, found in outcomes(objective, **settings).items() if found.bad}
+
+
+class Sound:
+    """A smooth objective that keeps every promise; a defect overrides one part of it."""
+
+    name = "sound"
+    space = SPACE
+    beyond_box = True
+
+    def evaluate(self, x, *, grad=True):
+        if x.ndim != 2 or x.shape[1] != self.space.dim:
+            raise ValueError(f"x has shape {tuple(x.shape)}")
+        if not x.isfinite().all():
+            raise ValueError("x is not finite")
+        with torch.enable_grad():
+            x = x.detach().clone().requires_grad_()
+            losses = loss_of(x)
+            (slope,) = torch.autograd.grad(losses.sum(), x)
+        return self.spoil(
+            x.detach(), Evaluation.from_results(losses.detach(), self.slope(slope) if grad else None), grad
+        )
+
+    def slope(self, slope):
+        return slope
+
+    def spoil(self, x, found, grad):
+        return found
+
+
+def with_loss(found, loss):
+    return Evaluation(loss, found.grad, found.status)
+
+
+class TwiceTheGradient(Sound):
+    def slope(self, slope):
+        return 2 * slope
+
+
+class OneWrongSign(Sound):
+    def slope(self, slope):
+        return slope * torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
+
+
+class NoGradient(Sound):
+    def slope(self, slope):
+        return 0 * slope
+
+
+class LeakingRows(Sound):
+    def spoil(self, x, found, grad):
+        return with_loss(found, found.loss + 1e-3 * (x.mean(dim=0) - x[0]).sum()) if len(x) else found
+
+
+class OrderMatters(Sound):
+    """What a row gets depends on its place in a batch of four."""
+
+    def spoil(self, x, found, grad):
+        extra = torch.zeros_like(found.loss)
+        extra[1:3] = 1e-3 * x[1:3].sum(dim=1)
+        return with_loss(found, found.loss + extra) if len(x) == 4 else found
+
+
+class SilentNan(Sound):
+    """At one point of the sample only, so that the extremes have their say."""
+
+    def spoil(self, x, found, grad):
+        here = (x == SPACE.uniform(4, seed=0)[2]).all(dim=1)
+        return with_loss(found, found.loss.masked_fill(here, NAN))
+
+
+class Unsteady(Sound):
+    def __init__(self):
+        self.generator = torch.Generator().manual_seed(0)
+
+    def spoil(self, x, found, grad):
+        return with_loss(found, found.loss + 1e-3 * torch.randn(len(x), generator=self.generator))
+
+
+class AnotherLossWithGradient(Sound):
+    def spoil(self, x, found, grad):
+        return with_loss(found, found.loss + 1e-3) if grad else found
+
+
+class WrongShape(Sound):
+    def spoil(self, x, found, grad):
+        return with_loss(found, found.loss[:, None])
+
+
+class SinglePrecision(Sound):
+    def spoil(self, x, found, grad):
+        return with_loss(found, found.loss.float())
+
+
+class NoEmptyBatch(Sound):
+    def spoil(self, x, found, grad):
+        return with_loss(found, found.loss + 0 * found.loss[0])
+
+
+class TakesAnyShape(Sound):
+    def evaluate(self, x, *, grad=True):
+        return super().evaluate(torch.zeros(2, 3, dtype=torch.float64) if x.shape[-1] != 3 or x.ndim != 2 else x)
+
+
+class TakesNan(Sound):
+    def evaluate(self, x, *, grad=True):
+        return super().evaluate(x.nan_to_num(), grad=grad)
+
+
+class BadCorner(Sound):
+    def spoil(self, x, found, grad):
+        return with_loss(found, found.loss.masked_fill((x == SPACE.upper).all(dim=1), NAN))
+
+
+class BadCentre(Sound):
+    def spoil(self, x, found, grad):
+        return with_loss(found, found.loss.masked_fill((x == SPACE.center).all(dim=1), NAN))
+
+
+class OverTheEdge(Sound):
+    def spoil(self, x, found, grad):
+        return with_loss(found, found.loss.masked_fill((x > SPACE.upper + 0.1).any(dim=1), NAN))
+
+
+class Tape(torch.autograd.Function):
+    """Zero the tape in the backward, as some simulators do."""
+
+    @staticmethod
+    def forward(ctx, x, objective):
+        found = objective.evaluate(x)
+        ctx.tape = found.grad.clone()
+        return found.loss
+
+    @staticmethod
+    def backward(ctx, weight):
+        grad = weight[:, None] * ctx.tape
+        ctx.tape.zero_()
+        return grad, None
+
+
+class SpentTape(Sound):
+    def __call__(self, x):
+        return Tape.apply(x, self)
+
+
+GRADIENT = {"finite differences", "gradcheck"}
+
+
+@pytest.mark.parametrize("objective", [Sound(), from_torch(loss_of, SPACE)])
+def test_a_sound_objective_passes(objective):
+    found = outcomes(objective)
+    assert not [name for name, finding in found.items() if finding.bad]
+    skipped = {"float32 against float64", "energy drift"}
+    skipped |= set() if getattr(objective, "beyond_box", False) else {"1% outside the box", "10% outside the box"}
+    assert {name for name, finding in found.items() if finding.outcome == "skip"} == skipped
+    errors = [row["error"] for row in found["finite differences"].table]
+    assert errors[:3] == sorted(errors[:3]) or max(errors[:3]) < 1e-6  # central differences, exact to rounding
+    assert errors[4] / errors[3] == pytest.approx(100, rel=0.05)  # of second order
+
+
+@pytest.mark.parametrize(
+    ("defect", "checks"),
+    [
+        (TwiceTheGradient, GRADIENT),
+        (OneWrongSign, GRADIENT),
+        (NoGradient, GRADIENT),
+        (LeakingRows, {"rows alone"}),
+        (OrderMatters, {"rows in another order"}),
+        (SilentNan, {"status"}),
+        (Unsteady, {"determinism"}),
+        (AnotherLossWithGradient, {"loss without gradient"}),
+        (WrongShape, {"shapes"}),
+        (SinglePrecision, {"shapes"}),
+        (NoEmptyBatch, {"empty batch"}),
+        (TakesAnyShape, {"refusal of a wrong shape"}),
+        (TakesNan, {"refusal of nan"}),
+        (BadCorner, {"corners"}),
+        (BadCentre, {"centre"}),
+        (OverTheEdge, {"10% outside the box"}),
+        (SpentTape, {"second backward"}),
+    ],
+)
+def test_a_defect_makes_its_own_check_fail(defect, checks):
+    assert failures(defect()) == checks
+
+
+def test_an_objective_that_can_be_evaluated_once_only_fails():
+    class Once(Sound):
+        calls = 0
+
+        def spoil(self, x, found, grad):
+            self.calls += 1
+            if self.calls > 2:
+                raise RuntimeError("the tape is spent")
+            return found
+
+    *_, last = check(Once())
+    assert (last.check, last.outcome, last.why) == ("determinism", "fail", "the tape is spent")
+
+
+def test_what_cannot_be_judged_after_a_wrong_shape_is_skipped():
+    found = list(check(WrongShape()))
+    assert [finding.outcome for finding in found] == ["fail", "skip"]
+    assert "loss of shape (4,)" in found[0].why
+
+
+def test_a_single_wrong_sign_among_ninety_is_seen():
+    class Wide(Sound):
+        space = ParameterSpace.box([f"x{k}" for k in range(90)], -1.0, 2.0)
+
+        def slope(self, slope):
+            return slope * torch.cat([torch.ones(89), -torch.ones(1)])
+
+    assert failures(Wide()) == GRADIENT
+
+
+def test_in_float32_thresholds_follow_from_the_precision():
+    def rounded(x):
+        return loss_of(x.float()).double()
+
+    found = outcomes(from_torch(rounded, SPACE), precision="float32")
+    assert not [name for name, finding in found.items() if finding.bad]
+    ladder = found["finite differences"]
+    assert ladder.numbers["error"] > 1e-5  # float64's threshold would be too strict,
+    assert ladder.numbers["step"] >= 1e-4  # and small steps are lost in rounding
+    assert found["gradcheck"].outcome == "skip"
+
+
+def test_a_flat_objective_has_no_slope_to_compare():
+    found = outcomes(from_torch(lambda x: 0 * x.sum(dim=1), SPACE))
+    assert found["finite differences"].outcome == "skip"
+    assert not any(finding.bad for finding in found.values())
+
+
+def test_gradients_of_the_two_precisions_are_held_against_each_other():
+    same = outcomes(Sound(), twin=Sound)["float32 against float64"]
+    assert same.outcome == "pass"
+    assert same.numbers["gradient"] == 0.0
+    assert outcomes(Sound(), twin=TwiceTheGradient)["float32 against float64"].outcome == "fail"
+
+
+def refusing():
+    raise ValueError("no such time step")
+
+
+def broken():
+    raise RuntimeError("a kernel failed")
+
+
+class Escaping(Sound):
+    def spoil(self, x, found, grad):
+        return Evaluation.from_results(found.loss, found.grad, torch.full((len(x),), Status.ESCAPED))
+
+
+class HalfFailed(Sound):
+    """Status says failure, loss says nothing happened."""
+
+    def spoil(self, x, found, grad):
+        return Evaluation(found.loss, found.grad, torch.full((len(x),), Status.ESCAPED))
+
+
+@pytest.mark.parametrize(
+    ("make", "outcome", "figure"),
+    [
+        (Sound, "pass", "2 finite; largest |grad| "),
+        (refusing, "pass", "refused: no such time step"),
+        (Escaping, "pass", "2 escaped"),
+        (HalfFailed, "fail", "2 escaped"),
+        (SilentNan, "pass", "2 finite"),
+        (broken, "fail", "raised RuntimeError"),
+    ],
+)
+def test_a_variant_answers_with_a_number_a_status_or_a_refusal(make, outcome, figure):
+    found = outcomes(Sound(), variants=[ExtremeCase("dt 8x", make)])["dt 8x"]
+    assert found.outcome == outcome
+    assert found.figure.startswith(figure)
+
+
+def test_an_expected_failure_is_excused_until_it_passes():
+    reason = {"finite differences": "its gradient is a surrogate", "gradcheck": "the same"}
+    excused = outcomes(TwiceTheGradient(), expected=reason)
+    assert not any(finding.bad for finding in excused.values())
+    assert excused["gradcheck"].outcome == "known"
+    assert excused["gradcheck"].why.endswith("known: the same")
+    no_longer = outcomes(Sound(), expected=reason)
+    assert {name for name, finding in no_longer.items() if finding.bad} == GRADIENT
+    assert no_longer["gradcheck"].outcome == "unexpected"
+    assert no_longer["gradcheck"].why == "it passes, so this is no longer true: the same"
+
+
+def test_an_expectation_of_a_check_that_is_not_made_is_reported():
+    found = outcomes(Sound(), expected={"dt 9x": "it explodes"})["dt 9x"]
+    assert (found.outcome, found.bad) == ("unexpected", True)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 4, 5, 10, 15, 16, 90, 400])
+def test_corners_are_all_or_cover_every_pair(dim):
+    found = corners(dim)
+    assert found.shape[1] == dim
+    assert len(found) == (2**dim if 2**dim <= CORNERS else len(found)) <= CORNERS
+    assert len({tuple(row) for row in found.tolist()}) == len(found)
+    for first in ((0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1.0, 1.0)):
+        met = (found == first[0]).double().T @ (found == first[1]).double() > 0
+        assert (met | torch.eye(dim, dtype=torch.bool)).all()
+
+
+def test_the_same_seed_gives_the_same_figures_and_two_points_are_the_least():
+    first, again, other = (outcomes(Sound(), seed=seed)["finite differences"] for seed in (0, 0, 1))
+    assert first == again != other
+    with pytest.raises(ValueError, match="at least 2 points, to compare rows of a batch; got 1"):
+        list(check(Sound(), points=1))
+    assert math.isfinite(first.numbers["error"])
+
+
+class Oscillator(Sound):
+    """A unit oscillator let go at x0, its steps explicit or semi-implicit."""
+
+    explicit = False
+
+    def energy(self, x):
+        place, speed, found = x[:, 0].clone(), torch.zeros(len(x)).double(), []
+        for _ in range(400):
+            force = -place
+            speed, before = speed + 0.05 * force, speed
+            place = place + 0.05 * (before if self.explicit else speed)
+            found.append((place.square() + speed.square()) / 2)
+        return torch.stack(found, dim=1)
+
+
+class Explicit(Oscillator):
+    explicit = True
+
+
+def test_energy_that_rises_where_nothing_drives_is_a_failure():
+    kept, added = (outcomes(kind())["energy drift"] for kind in (Oscillator, Explicit))
+    assert kept.outcome == "pass"
+    assert 0.01 < kept.numbers["rise"] < 0.06  # of the order of the step, and not growing
+    assert added.outcome == "fail"
+    assert added.numbers["left"] == pytest.approx(1.0025**399, rel=0.01)  # explicit steps add dt^2 each
+    assert outcomes(Sound())["energy drift"].outcome == "skip"

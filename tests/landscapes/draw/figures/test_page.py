@@ -1,0 +1,214 @@
+"""Every figure function: shown in a notebook, drawn for print at a journal's widths, saved by its ending."""
+
+import itertools
+import json
+import pkgutil
+import re
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from matplotlib import rcParams
+from matplotlib.text import Text
+
+from gradscape.landscapes import draw
+from gradscape.landscapes.draw.figures import page, typesetting
+from gradscape.landscapes.draw.figures.contact import Caption, episode_figure
+from gradscape.landscapes.draw.figures.contour import landscape_figure
+from gradscape.landscapes.draw.figures.curve import run_figure
+from gradscape.landscapes.draw.figures.overlay import overlay_figure
+from gradscape.landscapes.draw.figures.profile import profile_figure
+from gradscape.landscapes.draw.figures.quality import quality_figure
+from gradscape.landscapes.draw.figures.race import race_figure
+from gradscape.landscapes.draw.figures.sweep import Scales, frame_figure
+from gradscape.landscapes.draw.figures.thumbnail import thumbnail_figure
+from gradscape.landscapes.draw.figures.tradeoff import tradeoff_figure
+from gradscape.landscapes.draw.render.surface import surface_figure
+from gradscape.landscapes.episode import Episode, Part, View
+from gradscape.landscapes.measures import gradient_quality as gradients
+from gradscape.landscapes.sampling.fill import sample
+from gradscape.landscapes.storage.files import print_width
+from gradscape.optim.registry import methods
+
+from ...measures.test_fidelity import REPORT
+from ...test_overlay import LAID, SLICE
+from .test_contour import BOUNCES, DATASET, LINE, Bowl, plane
+from .test_curve import table
+from .test_race import race
+from .test_sweep import SWEEP
+
+INCH, WIDTHS = 25.4, (85.0, 170.0)
+COMMAND = "landscape slice bowl --dims speed lift --resolution 16 --fidelity standard --through example:somewhere"
+
+
+def dated(dataset):
+    """Give a slice the provenance that one from the command has."""
+    return dataset.assign_attrs(provenance=json.dumps({"created": "2026-11-21", "command": COMMAND}))
+
+
+PLANE, LONG = dated(DATASET), dated(LINE)
+
+
+def quality(dataset):
+    flat = plane(*dataset["loss"].shape[::-1], dims=("speed", "lift")[: dataset["loss"].ndim])
+    places = gradients.subgrid(flat, 4 if flat.rank == 2 else 16)
+    steps, smooth = gradients.compare_differences(Bowl(), flat, places), gradients.smoothed_slopes(Bowl(), flat, places)
+    return dataset, steps, gradients.compare_samples(dataset), smooth
+
+
+EPISODE = Episode(
+    torch.arange(6) / 10, {}, {}, (Part("sphere", "rubber", torch.zeros(6, 1, 3), (0.3,)),),
+    View((-1.0,) * 3, (1.0,) * 3, ground=None),
+)  # fmt: skip
+CAPTION = Caption(
+    "plasticine · reference", "loss 1.2345 m", "best:out/race", {f"tool {n} x": "−0.25 m" for n in range(30)},
+    "episode.json", COMMAND,
+)  # fmt: skip
+FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
+    "landscape_figure": [
+        lambda width: landscape_figure(PLANE, width=width),
+        lambda width: landscape_figure(dated(sample(Bowl(), plane(9, 9), grad=False)), width=width),
+    ],
+    "profile_figure": [lambda width: profile_figure(LONG, events={"bounces": BOUNCES}, width=width)],
+    "run_figure": [
+        lambda width: run_figure(
+            table([9.0, 3.0, np.nan, 0.01], [0, 1, 2, 3]).assign_attrs(provenance=json.dumps({"command": COMMAND})),
+            width=width,
+        )
+    ],
+    "quality_figure": [
+        lambda width: quality_figure(*quality(PLANE), width=width),
+        lambda width: quality_figure(*quality(LONG), width=width),
+    ],
+    "overlay_figure": [
+        lambda width: overlay_figure(dated(SLICE), LAID, width=width),
+        lambda width: overlay_figure(dated(SLICE), LAID[:1] * 12, width=width),
+    ],
+    "race_figure": [lambda width: race_figure(race(tuple(methods())), width=width)],
+    "surface_figure": [
+        lambda width: surface_figure(dated(SLICE), LAID, width=width),
+        lambda width: surface_figure(PLANE, width=width),
+    ],
+    "tradeoff_figure": [lambda width: tradeoff_figure(REPORT, width=width)],
+    "frame_figure": [lambda width: frame_figure(SWEEP, 1, Scales.of(SWEEP), width=width)],
+    "episode_figure": [lambda width: episode_figure(EPISODE, caption=CAPTION, width=width)],
+    "thumbnail_figure": [lambda width: thumbnail_figure(DATASET, width=width)],
+}
+EACH = [pytest.param(make, id=f"{name}-{number}") for name, all_ in FIGURES.items() for number, make in enumerate(all_)]
+
+
+def test_every_figure_function_is_held_to_this() -> None:
+    found = set()
+    for module in pkgutil.walk_packages(draw.__path__, f"{draw.__name__}."):
+        names = vars(import_module(module.name))
+        found |= {name for name in names if name.endswith("_figure") and not name.startswith("_")}
+    assert found == set(FIGURES)
+
+
+def test_a_notebook_shows_a_picture() -> None:
+    assert thumbnail_figure(DATASET)._repr_png_().startswith(b"\x89PNG")
+
+
+def seen(picture: page.Picture) -> list[Text]:
+    """Return the texts that are there to read: not those of hidden panels, and of ticks those along the axis."""
+    hidden = set()
+    for ax in picture.axes:
+        low, high = ax.get_window_extent().min - 1, ax.get_window_extent().max + 1
+        for axis, ticks in enumerate((ax.get_xticklabels(which="both"), ax.get_yticklabels(which="both"))):
+            middles = [np.mean(text.get_window_extent().get_points(), axis=0)[axis] for text in ticks]
+            hidden |= {
+                text for text, at in zip(ticks, middles, strict=True)
+                if not ax.axison or not low[axis] <= at <= high[axis]
+            }  # fmt: skip
+        hidden |= set(ax.findobj(Text)) if not ax.get_visible() else set()
+    found = [text for text in picture.findobj(Text) if text not in hidden]
+    return [text for text in found if text.get_text().strip() and text.get_visible()]
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("make", EACH)
+def test_in_print_all_is_legible_on_the_page_and_apart(
+    make: Callable[..., page.Picture], width: float, tmp_path: Path
+) -> None:
+    picture = make(width)
+    assert isinstance(picture, page.Picture)  # which a notebook shows
+    picture.canvas.draw()
+    assert picture.get_size_inches()[0] * INCH == pytest.approx(width, abs=0.01)
+    assert picture.get_size_inches()[1] * INCH < 240, "higher than a page"
+    texts = seen(picture)
+    for text in texts:
+        assert text.get_fontsize() >= 6, text
+        assert "$" not in text.get_text(), "its exponents are smaller"
+    boxes = [Text.get_window_extent(text) for text in texts]  # without the line that leads to it
+    for text, box in zip(texts, boxes, strict=True):
+        assert min(box.x0, box.y0) >= -0.5, text
+        assert box.x1 <= picture.bbox.x1 + 0.5, text
+        assert box.y1 <= picture.bbox.y1 + 0.5, text
+    for (text, box), (other, another) in itertools.combinations(zip(texts, boxes, strict=True), 2):
+        apart = box.x1 <= another.x0 or another.x1 <= box.x0 or box.y1 <= another.y0 or another.y1 <= box.y0
+        assert apart or text.get_rotation() % 90 or other.get_rotation() % 90, (text, other)
+    if width > min(WIDTHS):
+        return  # fonts and width of the file are those of the picture, whichever it is
+    page.save(picture, tmp_path / "picture.pdf")
+    raw = (tmp_path / "picture.pdf").read_bytes()
+    left, _, right, _ = map(float, re.search(rb"/MediaBox \[ ([\d.]+) ([\d.]+) ([\d.]+) ([\d.]+) \]", raw).groups())
+    assert (right - left) / 72 * INCH == pytest.approx(width, abs=0.5)
+    assert b"/Type3" not in raw
+    assert (b"/FontFile2" in raw) == bool(texts)
+
+
+def test_panels_stand_one_below_the_other_in_a_column_and_side_by_side_on_a_page() -> None:
+    for make in (FIGURES["landscape_figure"][0], FIGURES["overlay_figure"][0], FIGURES["race_figure"][0]):
+        column, whole = (make(width).axes[:2] for width in WIDTHS)
+        assert column[0].get_position().y0 > column[1].get_position().y1
+        assert whole[0].get_position().x1 < whole[1].get_position().x0
+
+
+def test_only_known_endings_are_written_and_nothing_is_left_of_others(tmp_path: Path) -> None:
+    picture = thumbnail_figure(DATASET)
+    with pytest.raises(ValueError, match=r"a picture is saved as \.png, \.pdf or \.svg; got 'a\.jpeg'"):
+        page.save(picture, tmp_path / "a.jpeg")
+    assert not list(tmp_path.iterdir())
+
+
+def test_equal_pictures_are_equal_files_and_settings_stay_as_they_were(tmp_path: Path) -> None:
+    before = dict(rcParams)
+    for kind in ("png", "pdf", "svg"):
+        for name in ("one", "two"):
+            page.save(profile_figure(LONG, width=85), tmp_path / f"{name}.{kind}")
+        assert (tmp_path / f"one.{kind}").read_bytes() == (tmp_path / f"two.{kind}").read_bytes()
+    assert dict(rcParams) == before
+    assert re.search(r'<svg [^>]*width="240\.9\d*pt"', (tmp_path / "one.svg").read_text())
+
+
+@pytest.mark.parametrize("width", [20.0, 1000.0, float("nan")])
+def test_a_width_that_is_no_page_is_refused(width: float) -> None:
+    with pytest.raises(ValueError, match="a picture for print is 80 to 400 mm wide; got"):
+        landscape_figure(PLANE, width=width)
+
+
+def test_prints_are_named_by_their_width_and_those_there_are_drawn_anew(tmp_path: Path) -> None:
+    drawn = []
+
+    def draw_(width: float) -> page.Picture:
+        drawn.append(width)
+        return thumbnail_figure(DATASET, width=width)
+
+    picture = tmp_path / "landscape.png"
+    assert page.save_prints(draw_, picture, [85.0]) == ["landscape-85mm.pdf", "landscape-85mm.svg"]
+    names = page.save_prints(draw_, picture, [170.0])
+    assert drawn == [85.0, 85.0, 170.0]
+    assert sorted(names) == sorted(file.name for file in tmp_path.iterdir())
+    assert [print_width(name, "landscape.png") for name in names] == [85.0, 85.0, 170.0, 170.0]
+    assert print_width("landscape-notes.pdf", "landscape.png") is None
+
+
+def test_a_text_is_wrapped_by_its_width() -> None:
+    for width in (1.0, 2.5, 6.0):
+        lines = typesetting.wrap_text(COMMAND, width, 7.0, lines=3).split("\n")
+        assert max(typesetting.text_width(line, 7.0) for line in lines) <= width
+        assert len(lines) <= 3
+    assert typesetting.wrap_text("short", 6.0, 7.0) == "short"

@@ -1,0 +1,115 @@
+"""The words for landscapes whose character is known, and the picture of their gradients."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from gradscape import ParameterSpace, Plane, from_torch, sample
+from gradscape.landscapes.draw.figures.page import save
+from gradscape.landscapes.draw.figures.quality import quality_figure
+from gradscape.landscapes.measures import gradient_quality as gradients
+from gradscape.landscapes.measures.classify import WORDS
+from gradscape.landscapes.measures.profile import Profile, effort, measure_profile, named_measures
+
+Function = Callable[[torch.Tensor], torch.Tensor]
+
+
+def profile(fn: Function, low: float, high: float, dims: tuple[int, ...] = (0, 1)) -> Profile:
+    space = ParameterSpace.box(("x", "y"), low, high)
+    objective = from_torch(fn, space)
+    dataset = sample(objective, Plane.through(space, space.center, dims, resolution=48))
+    return measure_profile(objective, dataset, rounding=2**-52, points=2)
+
+
+def rastrigin(x: torch.Tensor) -> torch.Tensor:
+    return (x**2 - 10 * torch.cos(2 * math.pi * x) + 10).sum(1)
+
+
+def scrambled(x: torch.Tensor) -> torch.Tensor:
+    mixed = torch.sin(x[:, 0] * 12989.8 + x[:, 1] * 78233.0) * 43758.5453
+    return mixed - mixed.floor()
+
+
+@pytest.mark.parametrize(
+    ("fn", "box", "words"),
+    [
+        (lambda x: x.square().sum(1), (-1, 1), {"very smooth", "gradients good"}),
+        (
+            lambda x: (x[:, 0] ** 2 + x[:, 1] - 11) ** 2 + (x[:, 0] + x[:, 1] ** 2 - 7) ** 2,
+            (-5, 5),
+            {"smooth with local minima", "gradients good"},
+        ),
+        (rastrigin, (-5.12, 5.12), {"rugged", "gradients good"}),
+        (scrambled, (-1, 1), {"extremely rugged", "discontinuous", "gradients noisy", "gradients opposite"}),
+        (
+            lambda x: 1.0 * (x[:, 0] > 0.1) + 0 * x.sum(1),
+            (-1, 1),
+            {"large flat regions", "discontinuous", "gradients zero"},
+        ),
+        (
+            lambda x: -torch.relu(0.5 - x.square().sum(1)),
+            (-1, 1),
+            {"very smooth", "large flat regions", "gradients zero", "gradients good"},
+        ),
+        (lambda x: (x**2 + 1e-3 * torch.sin(3000 * x)).sum(1), (-1, 1), {"very smooth", "gradients noisy"}),
+    ],
+    ids=["bowl", "himmelblau", "rastrigin", "noise", "step", "plateau", "ripples"],
+)
+def test_words_fit_functions_that_are_known(fn: Function, box: tuple[float, float], words: set[str]) -> None:
+    found = profile(fn, *box)
+    assert set(found.verdict.words) == words
+    assert set(found.verdict.reasons) == words
+
+
+def test_somebody_elses_words_are_held_against_ours() -> None:
+    verdict = profile(lambda x: x.square().sum(1), -1, 1).verdict
+    assert verdict.beside(("very smooth", "rugged")) == [
+        {"word": "very smooth", "measured": True},
+        {"word": "rugged", "measured": False},
+    ]
+    assert list(verdict.words) == [word for word in WORDS if word in verdict.words]
+
+
+def test_a_character_is_the_same_again_and_has_plain_names() -> None:
+    found = [profile(rastrigin, -2, 2) for _ in range(2)]
+    assert found[0].record() == found[1].record()
+    named = named_measures(found[0].record())
+    assert (
+        named["Local minima deeper than 1 % of the range"] == "25"
+    )  # and at the borders, where it is lower than inside
+    assert named["Gradient effectively zero"] == "0.0 %"
+    assert "Jumps explained by an event" not in named
+
+
+def test_no_more_is_evaluated_than_is_announced() -> None:
+    counts = {True: 0, False: 0}
+
+    def counted(x: torch.Tensor) -> torch.Tensor:
+        counts[x.requires_grad] += len(x)
+        return scrambled(x)
+
+    space = ParameterSpace.box(("x", "y"), -1.0, 1.0)
+    objective = from_torch(counted, space)
+    dataset = sample(objective, Plane.through(space, space.center, (0, 1), resolution=10))
+    counts.update({True: 0, False: 0})
+    measure_profile(objective, dataset, rounding=2**-52, points=3)
+    assert (counts[False], counts[True]) == effort(2, 3)
+
+
+@pytest.mark.parametrize("dims", [(0, 1), (0,)])
+def test_the_picture_of_gradient_quality_is_written(tmp_path: Path, dims: tuple[int, ...]) -> None:
+    space = ParameterSpace.box(("x", "y"), -1.0, 1.0, "m")
+    objective = from_torch(lambda x: torch.where(x[:, 0] > 0.8, torch.nan, rastrigin(x)), space, name="half [a] $x$")
+    dataset = sample(objective, Plane.through(space, space.center, dims, resolution=12))
+    plane, points = Plane.through(space, space.center, dims, resolution=12), 3 if len(dims) == 2 else 9
+    places = gradients.subgrid(plane, points)
+    steps, smooth = (of(objective, plane, places) for of in (gradients.compare_differences, gradients.smoothed_slopes))
+    figure = quality_figure(dataset, steps, gradients.compare_samples(dataset), smooth)
+    save(figure, tmp_path / "quality.png")
+    assert (tmp_path / "quality.png").read_bytes().startswith(b"\x89PNG")
+    titles = [ax.get_title() for ax in figure.axes]
+    assert sum("of the box" in title for title in titles) == (5 if len(dims) == 2 else 2)
+    assert any(text.get_text().startswith("not finite") for text in figure.legends[0].get_texts())

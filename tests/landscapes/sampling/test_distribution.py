@@ -1,0 +1,283 @@
+import functools
+import math
+import pickle
+import shutil
+import sys
+import threading
+import uuid
+from collections import defaultdict
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from pathlib import Path
+
+import cloudpickle
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gradscape.landscapes.adapters import from_torch
+from gradscape.landscapes.identity import StoreError
+from gradscape.landscapes.objective import Objective
+from gradscape.landscapes.plane import Plane
+from gradscape.landscapes.sampling import distribution as spread
+from gradscape.landscapes.sampling.distribution import Site, WorkersLostError, equal_batches
+from gradscape.landscapes.sampling.fill import sample
+from gradscape.landscapes.sampling.memory import MemoryBound
+from gradscape.landscapes.space import ParameterSpace
+from gradscape.landscapes.storage.store import SliceStore
+
+from ...clock import Clock
+from ...processes import FORK
+
+cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers need not find the tests
+SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
+PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 16))
+
+
+def wave(x: torch.Tensor) -> torch.Tensor:
+    return (3 * x).sin().prod(dim=1) + x.exp().sum(dim=1)
+
+
+def store_at(path: Path) -> SliceStore:
+    return SliceStore.open_or_create(path, PLANE, SPACE, identity={"objective": "wave"})
+
+
+def same(one: SliceStore, other: SliceStore) -> bool:
+    a, b = one.dataset(), other.dataset()
+    return all(a[name].to_numpy().tobytes() == b[name].to_numpy().tobytes() for name in ("loss", "grad", "status"))
+
+
+@pytest.fixture(scope="module")
+def processes():
+    with ProcessPoolExecutor(2, mp_context=FORK) as pool:
+        yield pool
+
+
+@pytest.fixture
+def alone(tmp_path):
+    store = store_at(tmp_path / "alone.zarr")
+    sample(from_torch(wave, SPACE), PLANE, store)
+    return store
+
+
+def test_processes_write_the_bits_of_one_and_progress_counts_every_tile(tmp_path, alone, processes):
+    store, seen = store_at(tmp_path / "s.zarr"), []
+    sample(from_torch(wave, SPACE), PLANE, store, batch=40, executor=processes, progress=seen.append)
+    assert same(store, alone)
+    assert [now.done for now in seen] == sorted({now.done for now in seen})
+    assert (seen[-1].done, seen[-1].levels) == (288, 5)
+
+
+def test_threads_share_the_objective_and_a_slice_in_memory(alone):
+    asked, both = [], threading.Barrier(2)
+
+    def counted(x: torch.Tensor) -> torch.Tensor:
+        asked.append(threading.get_ident())
+        both.wait()
+        return wave(x)
+
+    with ThreadPoolExecutor(2) as threads:
+        dataset = sample(from_torch(counted, SPACE), PLANE, batch=40, executor=threads)
+    assert np.array_equal(dataset["loss"], alone.dataset()["loss"])
+    assert len(set(asked)) == 2
+    assert len(asked) == 8  # 288 points, batches of at most 40, as many for each
+
+
+def made_in(folder: Path) -> Objective:
+    (folder / uuid.uuid4().hex).touch()
+    return from_torch(wave, SPACE)
+
+
+def test_an_objective_is_made_once_in_each_worker(tmp_path, alone, processes):
+    store, made = store_at(tmp_path / "s.zarr"), tmp_path / "made"
+    made.mkdir()
+    how = functools.partial(made_in, made)
+    sample(from_torch(wave, SPACE), PLANE, store, batch=20, executor=processes, made=how)
+    assert same(store, alone)
+    assert 1 <= len(list(made.iterdir())) <= 2  # for some 16 batches
+
+
+def test_what_cannot_be_sent_is_refused_with_what_to_do(tmp_path, processes):
+    with pytest.raises(ValueError, match="share no memory; give sample a store on disk"):
+        sample(from_torch(wave, SPACE), PLANE, executor=processes)
+    lock = threading.Lock()
+    holding = from_torch(lambda x: wave(x) + lock.locked(), SPACE, name="locked")
+    with pytest.raises(ValueError, match=r"locked cannot be sent .* give sample made="):
+        sample(holding, PLANE, store_at(tmp_path / "s.zarr"), executor=processes)
+
+
+def test_a_function_of_a_notebook_travels(tmp_path, alone, processes):
+    store = store_at(tmp_path / "s.zarr")
+    sample(from_torch(lambda x: wave(x), SPACE, name="wave"), PLANE, store, executor=processes)
+    assert same(store, alone)
+
+
+def test_an_error_in_a_worker_comes_back_and_what_was_done_is_kept(tmp_path, alone, processes):
+    store = store_at(tmp_path / "s.zarr")
+    with pytest.raises(RuntimeError, match="broken cable"):
+        sample(from_torch(broken_in_a_corner, SPACE), PLANE, store, batch=1, executor=processes)
+    kept = len(store.tiles()) - len(store.pending())
+    assert kept < len(store.tiles())
+    sample(from_torch(wave, SPACE), PLANE, store, executor=processes)
+    assert same(store, alone)
+
+
+def broken_in_a_corner(x: torch.Tensor) -> torch.Tensor:
+    if bool((x > 1.9).any()):
+        raise RuntimeError("broken cable")
+    return wave(x)
+
+
+class Slow(Executor):
+    """Never do anything, and remember what was asked for."""
+
+    def __init__(self) -> None:
+        self.futures: list[Future] = []
+
+    def submit(self, fn, /, *args, **kwargs):
+        self.futures.append(Future())
+        if len(self.futures) == 2:
+            self.futures[0].set_result(fn(*args))
+        return self.futures[-1]
+
+
+def test_stopping_cancels_what_is_queued_and_the_slice_goes_on(tmp_path, alone):
+    store, slow = store_at(tmp_path / "s.zarr"), Slow()
+
+    def interrupt(now):
+        if now.done:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sample(from_torch(wave, SPACE), PLANE, store, batch=32, executor=slow, progress=interrupt)
+    assert len(slow.futures) > 5
+    assert all(future.cancelled() for future in slow.futures[1:])
+    sample(from_torch(wave, SPACE), PLANE, store)
+    assert same(store, alone)
+
+
+def test_workers_that_are_gone_end_it_with_what_is_kept(tmp_path):
+    store, slow = store_at(tmp_path / "s.zarr"), Slow()
+
+    def lose(now):
+        for future in slow.futures[1:]:
+            if now.done and not future.cancelled():
+                future.cancel()
+                future.set_running_or_notify_cancel()
+
+    said = r"the workers are gone.*; \d+ of 288 points are kept in .*s\.zarr.*goes on"
+    with pytest.raises(WorkersLostError, match=said):
+        sample(from_torch(wave, SPACE), PLANE, store, batch=32, executor=slow, progress=lose)
+
+
+class Deserted(Executor):
+    """Like Dask's, with a scheduler that answers and no worker."""
+
+    class _client:  # noqa: N801 -- Dask's name for it
+        nthreads = staticmethod(dict)
+
+    def submit(self, fn, /, *args, **kwargs):
+        return Future()
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(spread, "time", clock)
+    return clock
+
+
+def test_workers_that_never_come_back_are_given_up(tmp_path, clock, monkeypatch):
+    def wait(pending, timeout, return_when):
+        clock.sleep(timeout)
+        return set(), pending
+
+    monkeypatch.setattr(spread, "wait", wait)
+    store = store_at(tmp_path / "s.zarr")
+    with pytest.raises(WorkersLostError, match=r"none was there for 60 s.*0 of .* the same command goes on"):
+        sample(from_torch(wave, SPACE), PLANE, store, executor=Deserted())
+    assert spread.WITHOUT_WORKERS < clock.now <= spread.WITHOUT_WORKERS + spread.POLL
+
+
+def test_a_worker_of_another_store_or_without_the_file_system_says_so(tmp_path):
+    store = store_at(tmp_path / "s.zarr")
+    make, arguments = Site(
+        MemoryBound(from_torch(wave, SPACE)), store, functools.partial(from_torch, wave, SPACE)
+    ).__reduce__()
+    remote = make(*arguments)
+    (tmp_path / "s.filling.zarr").rename(tmp_path / "elsewhere.zarr")
+    with pytest.raises(StoreError, match=r"a worker finds no .*file system that they share"):
+        list(remote.fill(store.tiles()))
+    SliceStore.create(tmp_path / "s.zarr", PLANE, SPACE, identity={"objective": "hill"})
+    with pytest.raises(StoreError, match="objective: wanted 'wave', found 'hill'"):
+        list(remote.fill(store.tiles()))
+
+
+def test_a_batch_that_was_half_done_by_a_worker_that_died_is_not_done_again(tmp_path):
+    store = store_at(tmp_path / "s.zarr")
+    first = store.tiles()[0]
+    list(Site(MemoryBound(from_torch(wave, SPACE)), store).fill([first]))
+    make, arguments = Site(MemoryBound(from_torch(broken_in_a_corner, SPACE)), store).__reduce__()
+    remote = make(*arguments)
+    assert [filled.tile for filled in remote.fill([first])] == [first]  # found: evaluated it would break
+    with pytest.raises(RuntimeError, match="broken cable"):
+        list(remote.fill(store.tiles()))
+
+
+@pytest.fixture
+def hidden(monkeypatch):
+    """Return how often each tile is still looked for in vain, as on a file system that shows files late."""
+    finished, times = SliceStore.read_tile, defaultdict[object, float](lambda: 2)
+
+    def late(store, tile):
+        times[tile] -= 1
+        return None if times[tile] >= 0 else finished(store, tile)
+
+    monkeypatch.setattr(SliceStore, "read_tile", late)
+    return times
+
+
+def test_what_workers_wrote_is_waited_for(tmp_path, alone, hidden, clock):
+    store = store_at(tmp_path / "s.zarr")
+    with ThreadPoolExecutor(2) as threads:
+        dataset = sample(from_torch(wave, SPACE), PLANE, store, batch=40, executor=threads)
+    assert dataset["loss"].equals(alone.dataset()["loss"])
+    assert set(hidden.values()) == {-1}  # and read once
+    assert clock.slept == [spread.POLL]
+
+
+def test_what_workers_wrote_and_never_appears_is_an_error(tmp_path, hidden, clock):
+    store = store_at(tmp_path / "s.zarr")
+    hidden[store.tiles()[3]] = math.inf
+    with (
+        ThreadPoolExecutor(2) as threads,
+        pytest.raises(StoreError, match=r"s\.zarr: 1 tiles that workers finished have not appeared here"),
+    ):
+        sample(from_torch(wave, SPACE), PLANE, store, batch=40, executor=threads)
+    assert spread.LATE < clock.now <= spread.LATE + spread.POLL
+
+
+def test_a_worker_keeps_a_store_open_until_another_lies_there(tmp_path):
+    site = Site(MemoryBound(from_torch(wave, SPACE)), store_at(tmp_path / "s.zarr"), lambda: from_torch(wave, SPACE))
+    remote = pickle.loads(pickle.dumps(site))
+    tiles = site.store.tiles()
+    assert list(remote.fill(tiles[:1]))
+    assert remote.here().store is remote.here().store
+    shutil.rmtree(site.store.place)
+    again = store_at(site.store.path)
+    assert list(remote.fill(tiles[:1]))
+    assert again.statuses(tiles[0])
+
+
+@given(batch=st.integers(1, 400), workers=st.integers(1, 9))
+def test_batches_are_equal_and_as_many_for_every_worker(batch, workers):
+    store = SliceStore.in_memory(Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=32), SPACE)
+    groups = equal_batches(store, store.tiles(), batch, workers)
+    assert [tile for group in groups for tile in group] == store.tiles()
+    sizes = [sum(map(store.count, group)) for group in groups]
+    assert len(groups) == 64 or len(groups) % workers == 0
+    assert max(sizes) - min(sizes) <= 16  # a tile
+    assert max(sizes) < max(batch, 16) + 16
+    if len(groups) > workers and len(groups) < 64:
+        assert batch * (len(groups) - workers) < 1024  # no more than needed

@@ -1,0 +1,205 @@
+"""What goes wrong while a slice is filled: memory, disk, damaged files, another process."""
+
+import errno
+import os
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+
+from gradscape.envs.engines.sheets import springs
+from gradscape.envs.registry import make
+from gradscape.landscapes.adapters import from_torch
+from gradscape.landscapes.identity import StoreError
+from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.plane import Plane
+from gradscape.landscapes.sampling.fill import sample
+from gradscape.landscapes.sampling.memory import MemoryBound, is_out_of_memory
+from gradscape.landscapes.space import ParameterSpace
+from gradscape.landscapes.storage.paths import filling_path
+from gradscape.landscapes.storage.store import SliceStore
+
+from ...processes import FORK
+
+SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
+PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 16))
+MESSAGES = [
+    "CUDA out of memory. Tried to allocate 2.00 GiB",
+    "Failed to allocate 123456 bytes on device 'cuda:0'",
+    "DefaultCPUAllocator: can't allocate memory: you tried to allocate 8000000000000 bytes",
+    "Out of CUDA pre-allocated memory",
+]
+
+
+def wave(x: torch.Tensor) -> torch.Tensor:
+    return (3 * x).sin().prod(dim=1) + x.exp().sum(dim=1)
+
+
+class Small:
+    """A device with memory for so many points, the wave's."""
+
+    space, name = SPACE, "wave"
+
+    def __init__(self, room: int, error: Exception) -> None:
+        self.room, self.error = room, error
+        self.asked: list[int] = []
+
+    def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
+        self.asked.append(len(x))
+        if len(x) > self.room:
+            raise self.error
+        return from_torch(wave, SPACE).evaluate(x, grad=grad)
+
+
+def store_at(path: Path) -> SliceStore:
+    return SliceStore.open_or_create(path, PLANE, SPACE, identity={"objective": "wave"})
+
+
+def same(one, other) -> bool:
+    return all(
+        one[name].to_numpy().tobytes() == other[name].to_numpy().tobytes() for name in ("loss", "grad", "status")
+    )
+
+
+@pytest.fixture
+def kept(monkeypatch):
+    """Leave the tiles of a slice that is complete: as it is just before it is finished."""
+    monkeypatch.setattr(SliceStore, "finish", lambda *_: None)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return sample(from_torch(wave, SPACE), PLANE)
+
+
+@pytest.mark.parametrize("error", [*map(RuntimeError, MESSAGES), torch.OutOfMemoryError("x"), MemoryError()])
+def test_a_batch_that_does_not_fit_is_halved_with_a_warning_and_the_same_bits(whole, error):
+    small = Small(20, error)
+    with pytest.warns(RuntimeWarning, match="wave ran out of memory at") as said:
+        dataset = sample(small, PLANE, batch=60)
+    assert same(dataset, whole)
+    assert [str(one.message).split(" at ")[1] for one in said] == [
+        "64 points; going on with 32",
+        "32 points; going on with 16",
+    ]
+    assert small.asked[:3] == [64, 32, 16]
+    assert max(small.asked[2:]) == 16  # learnt
+
+
+def test_a_solver_that_does_not_fit_is_made_smaller(monkeypatch):
+    def sampled():
+        env = make("flip", fidelity="draft", device="cpu", horizon=0.1)
+        plane = Plane.through(env.space, env.space.center, [0, 1], resolution=4)
+        return env, sample(env, plane, batch=16)
+
+    _, wanted = sampled()
+    fitting, made = springs.Solver.__init__, []
+
+    def init(self, *args, capacity, **settings):
+        made.append(capacity)
+        if capacity > 2:
+            raise RuntimeError("Failed to allocate 1 bytes on device 'cuda:0'")
+        fitting(self, *args, capacity=capacity, **settings)
+
+    monkeypatch.setattr("gradscape.envs.sheets.sheets.capacity", lambda memory, device: 16)
+    monkeypatch.setattr(springs.Solver, "__init__", init)
+    with pytest.warns(RuntimeWarning, match="flip ran out of memory at"):
+        env, found = sampled()
+    assert same(found, wanted)
+    assert env.preferred_batch == 2 * env.threads
+    assert {16, 8, 4, 2} == set(made)
+
+
+def test_memory_for_no_point_at_all_ends_it_and_other_errors_pass():
+    with pytest.raises(MemoryError, match=r"wave ran out of memory at a single point: .*--fidelity"):
+        MemoryBound(Small(0, RuntimeError(MESSAGES[0]))).evaluate(SPACE.uniform(3, seed=0))
+    with pytest.raises(RuntimeError, match="broken cable"):
+        MemoryBound(Small(0, RuntimeError("broken cable"))).evaluate(SPACE.uniform(3, seed=0))
+    assert not is_out_of_memory(RuntimeError("the ball is out of the memory foam"))
+
+
+@pytest.mark.parametrize("damage", ["truncated", "altered", "empty"])
+@pytest.mark.parametrize("array", ["loss", "grad", "status"])
+def test_a_damaged_tile_is_named_and_computed_again(tmp_path, kept, whole, array, damage):
+    path = tmp_path / "s.zarr"
+    sample(from_torch(wave, SPACE), PLANE, store_at(path))
+    place = filling_path(path) / array / "c" / "2" / "3"
+    (file,) = place.rglob("*") if array == "grad" else [place]
+    sound = file.read_bytes()
+    torn = {"truncated": sound[: len(sound) // 2], "altered": bytes([*sound[:-1], sound[-1] ^ 1]), "empty": b""}
+    file.write_bytes(torn[damage])
+    small = Small(1000, MemoryError())
+    with pytest.warns(RuntimeWarning, match=r"s\.zarr: tile \(2, 3\) is damaged and computed again") as said:
+        assert same(sample(small, PLANE, store_at(path)), whole)
+    assert len(said) == 1
+    assert small.asked == [16]
+    assert file.read_bytes() == sound
+
+
+def test_a_tile_that_was_never_finished_is_no_damage(tmp_path, kept, whole):
+    path = tmp_path / "s.zarr"
+    sample(from_torch(wave, SPACE), PLANE, store_at(path))
+    (filling_path(path) / "status" / "c" / "2" / "3").unlink()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert same(sample(from_torch(wave, SPACE), PLANE, store_at(path)), whole)
+
+
+def test_a_damaged_finished_slice_is_named_and_computed_again(tmp_path, whole):
+    path = tmp_path / "s.zarr"
+    sample(from_torch(wave, SPACE), PLANE, store_at(path))
+    file = path / "loss" / "c" / "0" / "0"
+    file.write_bytes(file.read_bytes()[:-3])
+    with pytest.warns(RuntimeWarning, match=r"tile \(0, 0\) is damaged and computed again"):
+        assert same(sample(from_torch(wave, SPACE), PLANE, store_at(path)), whole)
+
+
+def test_a_damaged_axis_is_said_with_what_to_do(tmp_path):
+    path = tmp_path / "s.zarr"
+    store_at(path)
+    (file,) = (filling_path(path) / "u" / "c").iterdir()
+    file.write_bytes(b"")
+    with pytest.raises(StoreError, match=r"s\.filling\.zarr is damaged .*restore it, or sample the slice anew"):
+        store_at(path)
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
+def test_a_full_disk_ends_it_with_what_is_kept_and_the_slice_goes_on(tmp_path, whole, monkeypatch, code):
+    store, replace, room = store_at(tmp_path / "s.zarr"), os.replace, [20]
+
+    def full(source, target):
+        room[0] -= 1
+        if room[0] < 0:
+            raise OSError(code, os.strerror(code), str(target))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", full)
+    said = r"the disk is full; 80 of 288 points are kept in .*s\.zarr: make room, and the same command goes on"
+    with pytest.raises(OSError, match=said) as ended:
+        sample(from_torch(wave, SPACE), PLANE, store)
+    assert ended.value.errno == code
+    monkeypatch.undo()
+    assert not list(tmp_path.rglob("*.partial"))
+    small = Small(1000, MemoryError())
+    assert same(sample(small, PLANE, store_at(tmp_path / "s.zarr")), whole)
+    assert sum(small.asked) == 288 - 80
+
+
+def _fill(path: Path, barrier) -> None:
+    store = store_at(path)
+    barrier.wait()
+    sample(from_torch(wave, SPACE), PLANE, store)
+
+
+def test_two_processes_fill_the_same_store_and_harm_nothing(tmp_path, whole):
+    barrier = FORK.Barrier(2)
+    both = [FORK.Process(target=_fill, args=(tmp_path / "s.zarr", barrier)) for _ in range(2)]
+    for process in both:
+        process.start()
+    for process in both:
+        process.join()
+    assert [process.exitcode for process in both] == [0, 0]
+    store = store_at(tmp_path / "s.zarr")
+    assert not store.pending()
+    assert same(store.dataset(), whole)

@@ -1,0 +1,194 @@
+import contextlib
+import signal
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gradscape.landscapes.identity import StoreError
+from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.plane import Plane
+from gradscape.landscapes.sampling.fill import sample
+from gradscape.landscapes.space import ParameterSpace
+from gradscape.landscapes.storage.store import SliceStore
+
+from ...processes import Instant, alone
+
+SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
+PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 16))
+
+
+class Wave:
+    """A smooth wave that is not finite in one corner and escapes in another; it counts what it is asked."""
+
+    space = SPACE
+
+    def __init__(self, *, stop_after: int | None = None):
+        self.asked: list[tuple[float, ...]] = []
+        self.batches: list[int] = []
+        self.stop_after = stop_after
+
+    def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
+        if self.stop_after is not None and len(self.asked) >= self.stop_after:
+            raise KeyboardInterrupt
+        self.asked += map(tuple, x.tolist())
+        self.batches.append(len(x))
+        loss = (3 * x).sin().prod(dim=1) + x.exp().sum(dim=1)
+        loss[(x > 1).all(dim=1)] = torch.nan
+        failed = torch.where((x[:, 0] < -1) & (x[:, 2] < -1), Status.ESCAPED, Status.OK)
+        return Evaluation.from_results(loss, 3 * (3 * x).cos() if grad else None, failed)
+
+
+def store_at(path: Path, *, grad: bool = True) -> SliceStore:
+    return SliceStore.open_or_create(path, PLANE, SPACE, identity={"objective": "wave"}, grad=grad)
+
+
+def test_a_slice_holds_the_objective_at_its_own_points():
+    dataset = sample(Wave(), PLANE)
+    v, u = np.meshgrid(dataset["v"], dataset["u"], indexing="ij")
+    x = PLANE.lift(torch.from_numpy(np.stack([u.ravel(), v.ravel()], axis=1)))
+    wanted = Wave().evaluate(x)
+    np.testing.assert_array_equal(dataset["status"], wanted.status.reshape(16, 18))
+    np.testing.assert_allclose(dataset["loss"], wanted.loss.reshape(16, 18), rtol=1e-14)
+    np.testing.assert_allclose(dataset["grad"], wanted.grad.reshape(16, 18, 3), rtol=1e-14)
+    assert {int(s) for s in np.unique(dataset["status"])} == {Status.OK, Status.ESCAPED}
+
+
+@settings(max_examples=4)
+@given(stops=st.lists(st.integers(0, 120), max_size=4), batch=st.integers(1, 100))
+def test_interruptions_change_no_bit_and_cost_no_finished_tile(tmp_path_factory, stops, batch):
+    path = tmp_path_factory.mktemp("slice") / "s.zarr"
+    asked: list[tuple[float, ...]] = []
+    for stop in stops:
+        objective = Wave(stop_after=stop)
+        with contextlib.suppress(KeyboardInterrupt):
+            sample(objective, PLANE, store_at(path), batch=batch)
+        asked += objective.asked
+    last = Wave()
+    resumed = sample(last, PLANE, store_at(path), batch=batch)
+    asked += last.asked
+    assert len(asked) == len(set(asked)) == 18 * 16
+    whole = sample(Wave(), PLANE, batch=batch)
+    for name in ("loss", "grad", "status"):
+        assert resumed[name].values.tobytes() == whole[name].values.tobytes()
+
+
+def test_an_interruption_between_two_tiles_of_a_batch_keeps_the_first(tmp_path):
+    store = store_at(tmp_path / "s.zarr")
+
+    def interrupt(progress):
+        if progress.done:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sample(Wave(), PLANE, store, batch=100, progress=interrupt)
+    assert len(store.pending()) == len(store.tiles()) - 1
+    objective, first = Wave(), store.points(store.tiles()[0])
+    sample(objective, PLANE, store, batch=100)
+    assert len(objective.asked) == 18 * 16 - len(first)
+
+
+def sampling(path: Path) -> None:
+    sample(Wave(), PLANE, store_at(path))
+
+
+def test_sigkill_at_any_instant_changes_no_bit(tmp_path):
+    undisturbed, found = tmp_path / "undisturbed.zarr", []
+    instants, whole = alone(partial(sampling, undisturbed), tmp_path).changes, sample(Wave(), PLANE)
+    files = {file.relative_to(undisturbed): file for file in undisturbed.rglob("*") if file.is_file()}
+    for instant in range(1, instants + 1, 43):
+        path = tmp_path / f"{instant}.zarr"
+        assert alone(partial(sampling, path), tmp_path, Instant(instant)).returncode == -signal.SIGKILL
+        left = store_at(path)
+        pending = left.pending()
+        found.append(18 * 16 - sum(left.count(tile) for tile in pending))
+        objective = Wave()
+        resumed = sample(objective, PLANE, store_at(path))
+        assert len(objective.batches) == len(pending)
+        xr.testing.assert_equal(resumed, whole)
+        for name in ("loss", "grad", "status"):
+            assert resumed[name].values.tobytes() == whole[name].values.tobytes()
+        for name, file in files.items():
+            assert (path / name).read_bytes() == file.read_bytes()
+    assert found[0] == 0
+    assert found == sorted(found)
+    assert len(set(found)) > 3
+
+
+def test_progress_counts_up_by_status_and_announces_each_finer_picture(tmp_path):
+    store, seen, drawn = store_at(tmp_path / "s.zarr"), [], []
+
+    def watch(progress):
+        seen.append(progress)
+        if progress.level_complete:
+            drawn.append(store.coarse().sizes["u"])
+
+    dataset = sample(Wave(), PLANE, store, progress=watch)
+    assert [p.done for p in seen] == sorted({p.done for p in seen})
+    assert (seen[0].done, seen[-1].done, seen[-1].total) == (0, 288, 288)
+    assert drawn == [4, 8, 12, 16, 18]
+    for kind, count in seen[-1].statuses.items():
+        assert count == int((dataset["status"] == kind).sum())
+    again = []
+    sample(Wave(), PLANE, store, progress=again.append)
+    assert [(p.done, p.resumed, p.level_complete) for p in again] == [(288, 288, False)]
+
+
+def test_batches_are_as_large_as_the_objective_prefers():
+    objective = Wave()
+    objective.preferred_batch = 60
+    sample(objective, PLANE)
+    assert all(size >= 60 for size in objective.batches[:-1])
+    assert sum(objective.batches) == 288
+
+
+def test_without_gradients_none_is_asked_for_and_none_stored(tmp_path):
+    class Blind(Wave):
+        def evaluate(self, x, *, grad=True):
+            assert not grad
+            return super().evaluate(x, grad=grad)
+
+    assert "grad" not in sample(Blind(), PLANE, store_at(tmp_path / "s.zarr", grad=False), grad=False)
+    with pytest.raises(StoreError, match="gradients: wanted True, found False"):
+        sample(Wave(), PLANE, store_at(tmp_path / "s.zarr", grad=False))
+
+
+def test_another_plane_than_the_stores_is_refused(tmp_path):
+    other = Plane.through(SPACE, SPACE.center, ["x", "y"], resolution=16)
+    with pytest.raises(StoreError, match=r"plane\.basis"):
+        sample(Wave(), other, store_at(tmp_path / "s.zarr"))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda e: Evaluation(e.loss[:-1], e.grad, e.status), r"Bent must return loss of shape \(16,\).*got \(15,\)"),
+        (lambda e: Evaluation(e.loss, e.grad[:, :2], e.status), r"grad of shape \(16, 3\).*got \(16, 2\)"),
+        (lambda e: Evaluation(e.loss, None, e.status), "asked for gradients and returned none"),
+        (lambda e: Evaluation(e.loss, e.grad, 0 * e.status), "got status MISSING"),
+    ],
+)
+def test_an_objective_that_breaks_the_protocol_is_named(change, said):
+    class Bent(Wave):
+        def evaluate(self, x, *, grad=True):
+            return change(super().evaluate(x, grad=grad))
+
+    with pytest.raises(ValueError, match=said):
+        sample(Bent(), PLANE)
+
+
+def test_a_silent_nan_becomes_a_status():
+    class Silent(Wave):
+        def evaluate(self, x, *, grad=True):
+            gradient = torch.zeros_like(x)
+            gradient[0, 1] = torch.inf
+            return Evaluation(x[:, 0], gradient, torch.full((len(x),), Status.OK))
+
+    dataset = sample(Silent(), PLANE)
+    assert (dataset["status"] == Status.NONFINITE).sum() == len(SliceStore.in_memory(PLANE, SPACE).tiles())
+    assert dataset["loss"].isnull().sum() == (dataset["status"] != Status.OK).sum()

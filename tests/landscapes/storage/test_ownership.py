@@ -1,0 +1,224 @@
+"""What is replaced or removed is ours, all of it; what is being made is held, and what a kill left is not."""
+
+import os
+import signal
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from gradscape.landscapes.adapters import from_torch
+from gradscape.landscapes.identity import StoreError
+from gradscape.landscapes.plane import Plane
+from gradscape.landscapes.sampling.fill import sample
+from gradscape.landscapes.space import ParameterSpace
+from gradscape.landscapes.storage.checkpoint import Checkpoint
+from gradscape.landscapes.storage.files import discard, placing, replacing, tidy
+from gradscape.landscapes.storage.paths import filling_path
+from gradscape.landscapes.storage.store import SliceStore
+
+from ...processes import alone
+
+SPACE = ParameterSpace.box(("x", "y"), -1.0, 1.0)
+PLANE = Plane.through(SPACE, SPACE.center, ("x", "y"), resolution=9)
+MINE = ["notes.txt", "loss/notes.txt", "loss/c/0/notes.txt", ".git/HEAD", "mass/zarr.json"]
+
+
+def bowl(x: Tensor) -> Tensor:
+    return x.square().sum(dim=1)
+
+
+def make(path: Path, *, overwrite: bool = False) -> SliceStore:
+    return SliceStore.create(path, PLANE, SPACE, identity={"objective": "bowl"}, overwrite=overwrite)
+
+
+def finished(path: Path) -> Path:
+    sample(from_torch(bowl, SPACE), PLANE, make(path))
+    return path
+
+
+def unfinished(path: Path) -> Path:
+    store = make(path)
+    tile = store.tiles()[0]
+    store.write(tile, from_torch(bowl, SPACE).evaluate(store.points(tile)))
+    return filling_path(path)
+
+
+def own(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("mine", MINE)
+@pytest.mark.parametrize("made", [finished, unfinished])
+def test_a_slice_with_anything_else_in_it_is_not_replaced(
+    made: Callable[[Path], Path], mine: str, tmp_path: Path
+) -> None:
+    file = made(tmp_path / "slice.zarr") / mine
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text("precious")
+    with pytest.raises(ValueError, match=rf"is not replaced, as it holds files that are not of a slice: {mine}; move"):
+        make(tmp_path / "slice.zarr", overwrite=True)
+    assert file.read_text() == "precious"
+    file.unlink()
+    assert make(tmp_path / "slice.zarr", overwrite=True).pending()
+    assert own(tmp_path) == ["slice.filling.zarr"]
+
+
+def test_a_link_in_a_slice_is_not_ours(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (finished(tmp_path / "slice.zarr") / "loss/c/7").symlink_to(tmp_path / "mine")
+    with pytest.raises(ValueError, match="not of a slice: loss/c/7;"):
+        make(tmp_path / "slice.zarr", overwrite=True)
+
+
+@pytest.mark.parametrize("made", [finished, unfinished])
+@pytest.mark.parametrize("damage", [None, "", "{", "[1]", '{"attributes": 3}'])
+def test_a_slice_without_its_root_can_be_begun_anew_as_its_refusal_says(
+    made: Callable[[Path], Path], damage: str | None, tmp_path: Path
+) -> None:
+    root = made(tmp_path / "slice.zarr") / "zarr.json"
+    root.unlink() if damage is None else root.write_text(damage)
+    with pytest.raises(StoreError, match=r"zarr\.json is damaged .*; restore it, or sample the slice anew"):
+        SliceStore.open(tmp_path / "slice.zarr")
+    assert make(tmp_path / "slice.zarr", overwrite=True).pending()
+
+
+def test_another_zarr_store_of_our_names_is_not_replaced(tmp_path: Path) -> None:
+    root = finished(tmp_path / "slice.zarr") / "zarr.json"
+    root.write_text('{"zarr_format": 3, "node_type": "group", "attributes": {"title": "wind"}}')
+    with pytest.raises(StoreError, match="no slice store, so it is not replaced"):
+        make(tmp_path / "slice.zarr", overwrite=True)
+    with pytest.raises(StoreError, match="no slice store of format") as said:
+        SliceStore.open(tmp_path / "slice.zarr")
+    assert "--force" not in str(said.value)
+
+
+def test_what_somebody_put_among_the_tiles_stays_when_they_go(tmp_path: Path) -> None:
+    store = make(tmp_path / "slice.zarr")
+    mine = filling_path(tmp_path / "slice.zarr") / "status/notes.txt"
+    mine.write_text("precious")
+    sample(from_torch(bowl, SPACE), PLANE, store)
+    assert mine.read_text() == "precious"
+    assert [path for path in filling_path(tmp_path / "slice.zarr").rglob("*") if path.is_file()] == [mine]
+    assert not SliceStore.open(tmp_path / "slice.zarr").pending()
+
+
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("said", ["", "{", "[]", "{}", '{"kind": 3}', '{"editor.fontSize": 12}'])
+def test_settings_of_something_else_are_no_study(said: str, force: bool, tmp_path: Path) -> None:
+    (tmp_path / "settings.json").write_text(said)
+    (tmp_path / "pieces").mkdir()
+    (tmp_path / "pieces/queen.obj").write_text("precious")
+    with pytest.raises(ValueError, match=r"settings\.json is damaged \(.+\); .* write elsewhere with --out"):
+        Checkpoint.open(tmp_path, {"seed": 0}, what="pairs", force=force)
+    assert (tmp_path / "settings.json").read_text() == said
+    assert (tmp_path / "pieces/queen.obj").read_text() == "precious"
+
+
+def test_a_study_with_anything_else_among_its_pieces_is_not_begun_anew(tmp_path: Path) -> None:
+    pieces = Checkpoint.open(tmp_path, {"seed": 0}, what="pairs")
+    pieces.save("one", loss=torch.zeros(2).numpy())
+    (tmp_path / "pieces/queen.obj").write_text("precious")
+    with pytest.raises(ValueError, match=r"holds files that are not of a pairs: queen\.obj; move"):
+        Checkpoint.open(tmp_path, {"seed": 1}, what="pairs", force=True)
+    assert pieces.count() == 1
+    (tmp_path / "pieces/queen.obj").unlink()
+    assert Checkpoint.open(tmp_path, {"seed": 1}, what="pairs", force=True).count() == 0
+
+
+@pytest.mark.parametrize("content", [b"", b"PK", None])
+def test_a_damaged_piece_is_said_and_computed_again(content: bytes | None, tmp_path: Path) -> None:
+    pieces = Checkpoint.open(tmp_path, {"seed": 0}, what="pairs")
+    pieces.save("one", loss=torch.arange(99).numpy())
+    (file,) = (tmp_path / "pieces").iterdir()
+    torn = file.read_bytes()
+    file.write_bytes(torn[: len(torn) // 2] + b"?" + torn[len(torn) // 2 + 1 :] if content is None else content)
+    with pytest.warns(RuntimeWarning, match=rf"{file} is damaged \(.+\); it is computed again"):
+        assert pieces.load("one") is None
+
+
+def test_pieces_in_each_others_place_are_computed_again(tmp_path: Path) -> None:
+    pieces = Checkpoint.open(tmp_path, {"seed": 0}, what="pairs")
+    for name in ("one", "two"):
+        pieces.save(name, loss=np.arange(3.0))
+    files = [tmp_path / f"pieces/{name}.npz" for name in ("one", "two")]
+    contents = [file.read_bytes() for file in files]
+    for file, content in zip(files, reversed(contents), strict=True):
+        file.write_bytes(content)
+    for name in ("one", "two"):
+        with pytest.warns(
+            RuntimeWarning, match=rf"{name}\.npz is damaged \(it is another part\); it is computed again"
+        ):
+            assert pieces.load(name) is None
+
+
+def test_what_a_living_process_makes_is_held_and_nobody_clears_it_away(tmp_path: Path) -> None:
+    file, folder = tmp_path / "file", tmp_path / "folder"
+    with replacing(file) as half, placing(folder, overwrite=False) as new:
+        half.write_text("whole")
+        new.mkdir()
+        tidy(tmp_path)
+        with replacing(file) as other:
+            other.write_text("another's")
+        discard(folder)
+        assert (half.read_text(), new.is_dir()) == ("whole", True)
+    assert (file.read_text(), own(tmp_path)) == ("whole", ["file", "folder"])
+
+
+def test_what_is_cleared_away_before_it_is_held_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hold, early = os.open, [1]
+
+    def late(path: Path, *how: Any, **more: Any) -> int:
+        if early:
+            early.pop()
+            path.rmdir()
+        return hold(path, *how, **more)
+
+    monkeypatch.setattr(os, "open", late)
+    with replacing(tmp_path / "file") as half:
+        half.write_text("whole")
+    assert own(tmp_path) == ["file"]
+
+
+def killed(path: Path) -> None:
+    with replacing(path) as half:
+        half.write_text("half")
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_what_a_kill_leaves_goes_with_the_next_of_its_name_and_at_the_end_of_a_job(tmp_path: Path) -> None:
+    for name in ("file", "deep/other"):
+        assert alone(partial(killed, tmp_path / name), tmp_path).returncode == -signal.SIGKILL
+    (left,) = tmp_path.glob(".file.*")
+    with replacing(tmp_path / "file") as whole:
+        assert not left.exists()
+        whole.write_text("whole")
+    assert len(list(tmp_path.glob("deep/.*"))) == 1
+    tidy(tmp_path)
+    assert not list(tmp_path.glob("deep/.*"))
+
+
+def test_a_folder_that_cannot_be_put_in_its_place_leaves_the_one_that_is_there(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder/mine").write_text("precious")
+
+    def refuse() -> None:
+        raise ValueError("somebody has put a file there meanwhile")
+
+    with (
+        pytest.raises(ValueError, match="meanwhile"),
+        placing(tmp_path / "folder", overwrite=True, check=refuse) as new,
+    ):
+        new.mkdir()
+    assert (tmp_path / "folder/mine").read_text() == "precious"
+    with (
+        pytest.raises(FileNotFoundError),
+        placing(tmp_path / "folder", overwrite=True) as new,
+    ):
+        pass  # nothing is made
+    assert (tmp_path / "folder/mine").read_text() == "precious"

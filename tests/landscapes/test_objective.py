@@ -1,0 +1,135 @@
+"""Nothing is asked of an objective beyond its bounds unless it invites that."""
+
+import numpy as np
+import pytest
+import torch
+
+from gradscape import Evaluation, ParameterSpace, Plane, Status, from_numpy, sample
+from gradscape.landscapes.adapters import within_box
+from gradscape.landscapes.conformance.suite import check
+from gradscape.landscapes.measures.fidelity import measure
+from gradscape.landscapes.measures.gradient_quality import compare_differences, subgrid
+from gradscape.landscapes.measures.profile import measure_profile, named_measures
+from gradscape.landscapes.measures.sensitivity import Design, explore
+from gradscape.landscapes.objective import evaluate
+from gradscape.landscapes.storage.checkpoint import Checkpoint
+
+BOUNDS = torch.tensor([[-1.0, 0.1, -3.0], [2.0, 0.7, 3.0]], dtype=torch.float64)
+SPACE = ParameterSpace(("a", "b", "c"), *BOUNDS, ("", "m", "s"))
+
+
+class Strict:
+    """A bowl that refuses whatever lies beyond its bounds, by as little as one part in 10^12, as many functions do."""
+
+    space, name = SPACE, "strict"
+
+    def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
+        if x.shape[1:] != (3,):
+            raise ValueError(f"strict takes 3 parameters; got x of shape {tuple(x.shape)}")
+        unit = self.space.to_unit(x)
+        if bool(((unit < 0) | (unit > 1)).any()):
+            raise ValueError("Expected `x` to be within the bounds")
+        return Evaluation.from_results((x**2).sum(dim=1), 2 * x if grad else None)
+
+
+class Inviting(Strict):
+    """The same bowl, which is one beyond its bounds too."""
+
+    beyond_box = True
+
+    def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
+        return Evaluation.from_results((x**2).sum(dim=1), 2 * x if grad else None)
+
+
+def plane(*dims: str | int, **how) -> Plane:
+    return Plane.through(SPACE, SPACE.center, dims or ("a", "b"), **{"resolution": 9, **how})
+
+
+def test_points_beyond_have_left_the_domain_and_the_others_their_losses():
+    x = torch.stack([SPACE.lower, SPACE.center, SPACE.upper, SPACE.upper + 1e-3, SPACE.lower - 1])
+    found = evaluate(Strict(), x, grad=True)
+    assert found.status.tolist() == [Status.OK] * 3 + [Status.ESCAPED] * 2
+    torch.testing.assert_close(found.loss[:3], (x[:3] ** 2).sum(dim=1))
+    assert bool(found.loss[3:].isnan().all() & found.grad[3:].isnan().all())
+    assert evaluate(Strict(), x[3:], grad=False).status.tolist() == [Status.ESCAPED] * 2
+    assert evaluate(Inviting(), x, grad=True).status.tolist() == [Status.OK] * 5
+    assert evaluate(within_box(Inviting()), x, grad=True).status.tolist() == found.status.tolist()
+
+
+def test_a_window_beyond_the_box_shows_what_lies_in_it():
+    cut = sample(Strict(), plane(extent=((-1.0, 0.1), (2.0, 1.3))))
+    assert (cut["status"].sel(v=slice(0.75, None)) == Status.ESCAPED).all()
+    assert (cut["status"].sel(v=slice(None, 0.7)) == Status.OK).all()
+
+
+@pytest.mark.parametrize("dims", [("a", "b"), ("c",)])
+def test_a_report_leaves_out_what_it_may_not_ask_for_and_says_how_much(dims):
+    strict, free = (
+        measure_profile(one, sample(one, plane(*dims)), rounding=1e-16, points=8) for one in (Strict(), Inviting())
+    )
+    assert 0 < strict.cut < strict.asked / 10
+    assert strict.asked == free.asked
+    said = f"{strict.cut} of {strict.asked}"
+    assert named_measures(strict.record())["Probes beyond the bounds, left out"] == said
+    assert free.cut == 0
+    assert "Probes beyond the bounds, left out" not in named_measures(free.record())
+    assert strict.verdict.words == free.verdict.words
+    known = np.isfinite(strict.smooth["first"])
+    assert float(known.mean()) > 0.9
+    np.testing.assert_allclose(strict.smooth["first"].where(known), free.smooth["first"].where(known), atol=1.0)
+
+
+def test_differences_over_long_steps_are_there_where_both_ends_are():
+    u = subgrid(plane(), 12)  # closer to the border than half of the longest step
+    found = compare_differences(Strict(), plane(), u, scales=(1e-3, 1e-1))
+    share = np.isfinite(found["cosine"]).mean("point").to_numpy()
+    assert share[0] == 1
+    assert 0.5 < share[1] < 1
+    np.testing.assert_allclose(found["cosine"].where(np.isfinite(found["cosine"]), 1.0), 1.0, rtol=1e-6)
+
+
+def test_pairs_checks_and_trade_offs_ask_nothing_beyond(tmp_path):
+    design = Design.sobol(SPACE, 4, seed=0)
+    found = explore(Strict(), design, Checkpoint.open(tmp_path / "p", {}, what="pairs"))
+    assert found.failed == 0
+    assert (measure(Strict(), SPACE.sobol(4, seed=0)).status == Status.OK).all()
+    outcomes = {finding.check: finding for finding in check(Strict(), points=2)}
+    assert {finding.outcome for finding in outcomes.values()} <= {"pass", "skip"}
+    assert "it does not invite points beyond its box" in outcomes["10% outside the box"].why
+    invited = {finding.check: finding for finding in check(Inviting(), points=2)}
+    assert invited["10% outside the box"].outcome == "pass"
+
+
+def test_differences_of_a_function_stay_within_its_bounds():
+    def strict(x: np.ndarray) -> np.ndarray:
+        unit = SPACE.to_unit(torch.from_numpy(x))
+        assert bool(((unit >= 0) & (unit <= 1)).all())
+        return (x**2).sum(axis=1)
+
+    objective = from_numpy(strict, SPACE, differences=1e-4)
+    x = torch.stack([SPACE.lower, SPACE.center, SPACE.upper])
+    torch.testing.assert_close(objective.evaluate(x).grad, 2 * x, rtol=1e-3, atol=1e-3)
+
+
+def test_evaluations_of_several_batches_are_joined_in_order():
+    x = torch.tensor([[0.25, 0.5, 0.0], [9.0, 0.5, 0.0], [0.75, 0.5, 0.0]], dtype=torch.float64)
+    whole = evaluate(Strict(), x, grad=True)
+    parts = [evaluate(Strict(), rows, grad=True) for rows in x.split(2)]
+    joined = Evaluation.join(parts, dim=3, grad=True)
+    for name in ("loss", "grad", "status"):
+        assert torch.equal(getattr(joined, name).nan_to_num(-1.0), getattr(whole, name).nan_to_num(-1.0))
+    assert joined.rows(slice(1, 3)).status.tolist() == whole.status.tolist()[1:]
+    assert Evaluation.join(parts, dim=3, grad=False).grad is None
+    nothing = Evaluation.join([], dim=3, grad=True)
+    assert nothing.grad is not None
+    assert nothing.grad.shape == (0, 3)
+    blind = evaluate(Strict(), x, grad=False)
+    with pytest.raises(ValueError, match="1 of 3 evaluations to join have no gradients"):
+        Evaluation.join([*parts, blind], dim=3, grad=True)
+
+
+def test_the_first_name_of_raw_results_still_works() -> None:
+    loss = torch.tensor([1.0, torch.nan])
+    torch.testing.assert_close(
+        Evaluation.judged(loss, None).loss, Evaluation.from_results(loss, None).loss, equal_nan=True
+    )

@@ -1,0 +1,106 @@
+"""Scene options: read from values and from text, refused with what was wanted."""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Literal
+
+import pytest
+
+from gradscape.envs.options import EpisodeOptions
+from gradscape.envs.registry import entries, environment_class
+from gradscape.landscapes.options import NoOptions, describe, in_full, read_options
+from gradscape.optim.registry import methods, optimizer_class
+
+
+@dataclass(frozen=True)
+class Options:
+    goal: Literal["high", "low"] = "high"
+    mu: float = 0.5
+    count: int = 3
+    rough: bool = False
+
+
+def read(**given):
+    return read_options("scene", Options, given)
+
+
+def test_nothing_given_leaves_the_defaults():
+    assert read() == Options()
+    assert read_options("plain", NoOptions, {}) == NoOptions()
+
+
+def test_text_reads_as_the_value_it_names():
+    assert read(goal="low", mu="0.25", count="7", rough="true") == Options("low", 0.25, 7, True)
+    assert read(goal="low", mu=0.25, count=7, rough=True) == Options("low", 0.25, 7, True)
+    assert read(rough="False", mu=1) == Options(mu=1.0, rough=False)
+    assert isinstance(read(mu=1).mu, float)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "wanted"),
+    [
+        ("goal", "sideways", "high|low"),
+        ("mu", "slippery", "a number"),
+        ("mu", None, "a number"),
+        ("count", "many", "a whole number"),
+        ("count", "2.5", "a whole number"),
+        ("count", 2.5, "a whole number"),
+        ("rough", "maybe", "true|false"),
+        ("mu", "nan", "a number"),
+    ],
+)
+def test_a_wrong_value_is_refused_with_what_was_wanted(name, value, wanted):
+    with pytest.raises(ValueError, match=f"scene option {name} takes {wanted}; got".replace("|", r"\|")) as refusal:
+        read(**{name: value})
+    assert repr(value) in str(refusal.value)
+
+
+def test_an_unknown_option_is_refused_with_those_there_are():
+    with pytest.raises(ValueError, match="scene has no option 'wind'; it has goal=high"):
+        read(wind=3)
+    with pytest.raises(ValueError, match="plain has no option 'wind'; it has none"):
+        read_options("plain", NoOptions, {"wind": 3})
+
+
+def test_a_description_names_every_option_with_its_default():
+    line = describe(Options)
+    for part in ("goal=high|low (default high)", "mu=a number (default 0.5)", "count=a whole number (default 3)"):
+        assert part in line
+
+
+def test_an_episodes_horizon_stands_last_and_is_explained():
+    @dataclass(frozen=True)
+    class Scene(EpisodeOptions):
+        """`mu`: friction."""
+
+        mu: float = 0.5
+
+    assert Scene(0.1).mu == 0.1
+    assert describe(Scene) == "mu=a number (default 0.5), horizon=a number above 0, at most 8 (default 1.0)"
+    said = in_full(Scene)
+    assert "\n\n`mu`: friction.\n\n`horizon`: how long an episode lasts" in said
+    assert in_full(NoOptions) == "options: none"
+    assert read_options("scene", Scene, {"horizon": "0.5"}).count_steps(5) == 2
+    assert Scene(horizon=1e-3).count_steps(5) == 1
+
+
+OPTIONS = {name: environment_class(name).Options for name in entries()} | {
+    name: optimizer_class(name).Options for name in methods()
+}
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_every_option_of_every_scene_and_method_is_listed_and_explained(name: str) -> None:
+    said = in_full(OPTIONS[name])
+    for option in dataclasses.fields(OPTIONS[name]):
+        assert f"\n  {option.name}=" in said
+        assert f"`{option.name}`" in said, f"{name} explains no `{option.name}`"
+
+
+def test_what_dataclasses_make_up_is_no_explanation() -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Bare(EpisodeOptions):
+        wind: float = 0.0
+
+    assert "Bare(" not in in_full(Bare)
+    assert "wind=a number (default 0.0)" in in_full(Bare)

@@ -1,0 +1,234 @@
+"""What README and docs say to type: every command and every block of Python is run, with small sizes."""
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import typer
+
+from gradscape.cli import app, main
+from gradscape.commands import view
+from gradscape.gallery.figures import read_figures
+from gradscape.gallery.files import DATA
+from gradscape.jobs.report_record import Report
+from gradscape.jobs.report_tables import environments_markdown
+
+from .command import Said
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+README = PAGES[0].read_text()
+TEXT = "\n".join(page.read_text() for page in PAGES)
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+BLOCKS = [
+    block for block in re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL) if "dask_jobqueue" not in block
+]  # what a batch system needs is installed by no test
+PLACEHOLDER = re.compile(r"\.{3}|[\[\]|]|\b(?!CUDA)[A-Z]{1,}\b")  # in what a command may look like
+
+# What makes them small: words in the place of others, the values of options, and options that are added.
+WORDS = {"SLICE": "cut", "RUN": "run", "best:RUN": "best:run", "ADDRESS": "local:1", "local": "local:1", "cuda": "cpu"}
+WORDS |= {
+    "tls://10.0.0.5:8786": "local:1",
+    "throw": "cut",
+    "standard": "draft",
+    "gallery/data/flip-0-1": str(DATA / "flip-0-1"),
+    "triple-move": "bounce",
+}
+VALUES = {"--resolution": "2", "--budget": "3", "--seeds": "1", "--frames": "2"}
+ADDED = {
+    "race": ["--seeds", "1", "--budget", "3", "--device", "cpu"],
+    "tradeoff": ["--points", "2", "--variants", "precision"],
+    "replay": ["--no-film"],
+    "bounce": ["--resolution", "3"],
+    "slice": ["--resolution", "2"],
+    "sweep": ["--resolution", "2"],
+    "check": ["--points", "2"],
+    "pairs": ["--samples", "2"],
+    "gallery compute": ["--only", "bounce-y", "--part", "slices", "--fidelity", "draft", "--data", "made"],
+    "gallery build": ["--data", "few", "--out", "site"],
+    "gallery serve": ["--out", "served", "--port", "0"],
+}
+SCENES = {verb: {"fluid": "bounce", "flip": "bounce"} for verb in ("race", "optimize", "tradeoff")}
+SCENES["--tolerance"] = {"fluid": "bounce", "6": "0", "8": "1"}
+SHORT = {"slice": {"fluid", "assembly"}, "sweep": {"fluid"}, "replay": {"fluid"}, "plan": {"fluid"}}
+TENTH = ["--set", "horizon=0.1"]  # of an episode
+TAICHI = ["--no-gradients"]  # whose kernels take minutes to compile with gradients
+
+
+def typed() -> list[str]:
+    """Return every command that the README shows, in blocks and between words, comments left out."""
+    lines = re.findall(r"^    (landscape .*)$", TEXT, flags=re.MULTILINE)
+    spans = re.findall(r"`(landscape [^`]*)`", TEXT)
+    found = [line.partition(" #")[0].strip() for line in lines] + [" ".join(span.split()) for span in spans]
+    return list(dict.fromkeys(found))
+
+
+def verb_of(words: list[str]) -> str:
+    return " ".join(words[1:3]) if words[1] == "gallery" else words[1]
+
+
+def complete(command: str) -> bool:
+    """Say whether a command can be typed as it stands, but for folders and addresses."""
+    kept = re.sub(r"\b(best:)?(SLICE|RUN|ADDRESS)\b", "x", command)
+    return not PLACEHOLDER.search(kept) and len(kept.split()) > 2 + command.startswith("landscape gallery") * 0
+
+
+def small(command: str) -> list[str]:
+    """Return a command's words, as small as it can be and still be the same command."""
+    words = shlex.split(command)
+    verb = verb_of(words)
+    scenes = SCENES.get("--tolerance" if "--tolerance" in words else verb, {})
+    found = [scenes.get(word, WORDS.get(word, word)) for word in words[1:]]
+    for at, word in enumerate(found[:-1]):
+        found[at + 1] = VALUES.get(word, found[at + 1])
+    added = ADDED.get(verb, []) + (TAICHI if "taichi" in found else [])
+    pairs = [added[at : at + 2] for at in range(0, len(added), 2)] if verb != "replay" else [added]
+    short = TENTH if SHORT.get(verb, set()) & {*found} else []
+    return [*found, *(word for pair in pairs if pair[0] not in found for word in pair), *short]
+
+
+HELP = {"landscape --help", "landscape VERB --help"}  # which test_help.py reads
+FORMS = [command for command in typed() if not complete(command) and command not in HELP]
+RUN = [command for command in typed() if complete(command)]
+
+
+def test_there_are_commands_of_both_kinds() -> None:
+    assert len(RUN) > 35
+    assert len(FORMS) > 15
+    assert {verb_of(shlex.split(command)) for command in RUN} >= {*COMMANDS, "gallery build"} - {
+        "gallery", "envs", "info", "bench",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("command", FORMS)
+def test_forms_name_verbs_and_options_there_are(command: str) -> None:
+    words = re.split(r"[\s|\\]+", command)
+    verbs = (
+        [COMMANDS["gallery"].commands[verb] for verb in words[2:]] if words[1] == "gallery" else [COMMANDS[words[1]]]
+    )
+    for option in (word for word in words if word.startswith("--")):
+        assert option in {one for verb in verbs for param in verb.params for one in param.opts}
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a slice, a run, somebody's own class, two figures of the gallery, and a site to serve."""
+    folder = tmp_path_factory.mktemp("desk")
+    (mine,) = (block for block in BLOCKS if block.startswith("# my.py"))
+    (folder / "my.py").write_text(mine)
+    how = ["--fidelity", "draft", "--device", "cpu", "--out"]
+    for command in (
+        ["slice", "fluid", *TENTH, "--dims", "0", "1", "--resolution", "2", *how, str(folder / "cut")],
+        ["optimize", "fluid", *TENTH, "--method", "random", "--budget", "2", *how, str(folder / "run")],
+        ["overlay", str(folder / "cut"), str(folder / "run"), "--out", str(folder / "over")],
+    ):
+        with pytest.raises(SystemExit) as left:
+            main(command)
+        assert not left.value.code
+    for figure in ("bounce-y", "flip-0-1"):
+        shutil.copytree(DATA / figure, folder / "few" / figure)
+    (folder / "served").mkdir()
+    (folder / "served" / "index.html").write_text("<p>a site</p>")
+    return folder
+
+
+@pytest.mark.parametrize("command", RUN)
+def test_every_command_runs(
+    run: Callable[..., Said], desk: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    """What serves is stopped at once, what opens a viewer is kept from it."""
+    opened: list[Path] = []
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setenv("XDG_DATA_HOME", str(desk / "data"))
+    monkeypatch.setattr("http.server.ThreadingHTTPServer.serve_forever", stop)
+    monkeypatch.setattr(view, "show_recording", lambda path, bars, *, serve: opened.append(path))
+    for name, value in (("REPETITION", 0.01), ("LARGEST", 0.01), ("RESAMPLES", 9)):
+        monkeypatch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", value)
+    done = run(*small(command), cwd=desk)
+    assert done.returncode == 0, (small(command), done.stderr)
+    assert bool(opened) == ("view" in command)
+
+
+@pytest.mark.parametrize("number", range(len(BLOCKS)))
+def test_every_block_of_python_runs(desk: Path, number: int) -> None:
+    block = BLOCKS[number]
+    assert sum(bool(line.strip()) for line in block.splitlines()) < 40
+    done = subprocess.run([sys.executable, "-c", block], cwd=desk, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    if "throw.png" in block:
+        assert 0 <= float(done.stdout) < 0.1  # the target can be hit
+        assert (desk / "throw.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_two_commands_are_the_makefiles() -> None:
+    recipes = (ROOT / "Makefile").read_text()
+    said = re.search(r"make demo +# installs gradscape, then runs `(landscape [^`]*)`", README)
+    assert said
+    assert f"$(BIN)/{said[1]}" in recipes
+    assert re.search(r"^test: setup-test", recipes, flags=re.MULTILINE)
+
+
+def test_what_pip_is_told_to_install_is_there() -> None:
+    said = re.findall(r"pip install '?([^'`\n]+)'?", TEXT)
+    assert len(said) >= 3
+    extras = {name for one in said for name in re.findall(r"^\.\[(\w+)\]$", one)}
+    assert extras == {"rl", "distributed"} <= set(PROJECT["optional-dependencies"])
+    assert {one for one in said if "[" not in one} == {"."}
+
+
+def test_the_paper_is_named_with_its_address_before_it_is_called_the_paper() -> None:
+    first = README.index("the paper")
+    assert README.index("https://arxiv.org/abs/2207.00167") < first
+    assert README[first:].startswith("the paper from here on")
+
+
+def test_the_example_package_registers_an_environment(tmp_path: Path) -> None:
+    package = ROOT / "docs/example_package"
+    entry = re.search(r'gradscape.environments"\]\n(.*?)\n\n', (package / "pyproject.toml").read_text(), re.DOTALL)
+    assert entry
+    assert entry[1] in TEXT
+    info = tmp_path / "throw_env-0.1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: throw-env\nVersion: 0.1.0\n")
+    (info / "entry_points.txt").write_text("[gradscape.environments]\n" + entry[1].replace('"', "") + "\n")
+    command = [sys.executable, "-m", "gradscape", "slice", "throw", "--dims", "angle", "speed", "--resolution", "5"]
+    path = {"PYTHONPATH": f"{tmp_path}:{package}", "PATH": "/usr/bin:/bin", "HOME": str(tmp_path)}
+    done = subprocess.run(command, cwd=tmp_path, env=path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "25 ok" in done.stderr
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_picture_and_file_that_a_page_names_is_there(page: Path) -> None:
+    text, here = page.read_text(), page.parent
+    named = [name for name in re.findall(r"\]\(([^)]+)\)", text) if "://" not in name]
+    assert [name for name in named if not (here / name.partition("#")[0]).exists()] == []
+    headings = {
+        name: _headings(here / name.partition("#")[0] if name[0] != "#" else page) for name in named if "#" in name
+    }
+    assert [name for name, there in headings.items() if name.partition("#")[2] not in there] == []
+
+
+def _headings(file: Path) -> set[str]:
+    """Return the anchors that headings have on GitHub."""
+    titles = re.findall(r"^#+ (.+)$", file.read_text(), flags=re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def test_the_table_of_environments_is_what_the_reports_say() -> None:
+    """It stands between two marks, and nowhere without reports; a failure prints what has to stand there."""
+    files = [DATA / figure.id / "report.json" for figure in read_figures()]
+    reports = [Report.read(file) for file in files if file.exists()]
+    found = re.findall(r"<!-- measured -->\n\n(.*?)\n<!-- /measured -->", TEXT, flags=re.DOTALL)
+    wanted = [environments_markdown(reports)] if reports else []
+    assert found == wanted, "between <!-- measured --> and <!-- /measured --> has to stand:\n\n" + "\n".join(wanted)

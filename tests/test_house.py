@@ -1,0 +1,74 @@
+"""The house: what stands where, how long files get, what public functions say they raise, and what tests mirror."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+FOLDERS = ("api", "commands", "envs", "gallery", "jobs", "landscapes", "optim")
+SOURCES = sorted([ROOT / "cli.py", *(file for folder in FOLDERS for file in (ROOT / folder).rglob("*.py"))])
+LONGEST = 400  # lines of a file
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def test_the_package_s_own_folder_is_the_door_only() -> None:
+    held = {path.name for path in (ROOT / "src/gradscape").iterdir() if path.name != "__pycache__"}
+    assert held == {*FOLDERS, "cli.py", "__init__.py", "__main__.py", "py.typed"}
+
+
+def test_no_file_is_longer_than_one_reads_at_once() -> None:
+    assert len(SOURCES) > 150
+    tests = [file for file in (ROOT / "tests").rglob("*.py")]
+    long = {file.relative_to(ROOT).as_posix(): _lines(file) for file in [*SOURCES, *tests] if _lines(file) > LONGEST}
+    assert long == {}
+
+
+def test_tests_stand_in_folders_that_there_are() -> None:
+    folders = {path.parent.relative_to(ROOT / "tests") for path in (ROOT / "tests").rglob("test_*.py")}
+    assert [folder for folder in folders if not (ROOT / folder).is_dir()] == []
+
+
+@pytest.mark.parametrize("folder", [*FOLDERS, "cli.py"])
+def test_public_functions_that_raise_say_so(folder: str) -> None:
+    """Those of commands/ are the verbs, whose docstrings are their help."""
+    silent = [
+        f"{file.relative_to(ROOT)}:{node.lineno} {node.name}"
+        for file in SOURCES
+        if file.relative_to(ROOT).parts[0] == folder != "commands"
+        for node in _public_functions(ast.parse(file.read_text()))
+        if _raises(node) and "aise" not in (ast.get_docstring(node) or "") and "efuse" not in _docstring(node)
+    ]
+    assert silent == []
+
+
+def _lines(file: Path) -> int:
+    return len(file.read_text().splitlines())
+
+
+def _docstring(node: Function) -> str:
+    return ast.get_docstring(node) or ""
+
+
+def _public_functions(tree: ast.Module) -> Iterator[Function]:
+    """Yield the functions of a module, and the methods of its public classes, that have no underscore."""
+    for node in tree.body:
+        if isinstance(node, Function) and not node.name.startswith("_"):
+            yield node
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            yield from (one for one in node.body if isinstance(one, Function) and not one.name.startswith("_"))
+
+
+def _raises(node: Function) -> bool:
+    """Whether an error is raised in a function itself; one that is raised again is not its own."""
+    return any(isinstance(one, ast.Raise) and one.exc is not None for one in _own(node))
+
+
+def _own(node: ast.AST) -> Iterator[ast.AST]:
+    for child in ast.iter_child_nodes(node):
+        if not isinstance(child, Function | ast.Lambda):
+            yield child
+            yield from _own(child)
