@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import ast
 import hashlib
-import inspect
-import io
-import tokenize
 from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 
+from ..landscapes.code import bare, file_of
 from .engines import find_engine
 
 COMPUTES_LOSSES = False  # of this file too
@@ -24,16 +22,17 @@ HERE = Path(__file__).resolve().parent
 # Hooks of a scene that no loss depends on.
 DESCRIBING = frozenset({"about", "episode", "events", "memory", "work", "_energy", "_observe"})
 DRAWING = frozenset({"_parts", "_surroundings", "_body_names", "_view", "_watch", "_length_scale"})
+NO_LOSS = DESCRIBING | DRAWING
 
 
 @cache
 def code_digest(kind: type, engine: str = "warp") -> str:
     """Return a digest of the code that the numbers of an environment's class come from, on an engine."""
     family = kind.own_classes() if hasattr(kind, "own_classes") else (kind,)
-    own = dict.fromkeys(file for one in family if (file := _file(one)))
+    own = dict.fromkeys(file for one in family if (file := file_of(one)))
     ours = [file for file in own if file.is_relative_to(HERE)]
     others = [file for file in own if not file.is_relative_to(HERE)]
-    texts = [*map(strip, find_files(ours, HERE, engine)), *map(strip, others)] or [repr(family)]
+    texts = [bare(file, NO_LOSS) for file in (*find_files(ours, HERE, engine), *others)] or [repr(family)]
     return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:12]
 
 
@@ -59,39 +58,6 @@ def computes_losses(file: Path) -> bool:
         and node.value.value is False
         for node in ast.parse(file.read_text()).body
     )
-
-
-@cache
-def strip(file: Path) -> str:
-    """Return the code of a file that a loss may depend on, line by line, without comments and docstrings."""
-    text = file.read_text()
-    lines = text.splitlines()
-    for token in tokenize.generate_tokens(io.StringIO(text).readline):
-        if token.type == tokenize.COMMENT:
-            row, column = token.start
-            lines[row - 1] = lines[row - 1][:column]
-    for node in ast.walk(ast.parse(text)):
-        for silent in _find_silent(node):
-            lines[silent.lineno - 1 : silent.end_lineno] = [""] * ((silent.end_lineno or 0) - silent.lineno + 1)
-    return "\n".join(line.rstrip() for line in lines if line.strip())
-
-
-def _find_silent(node: ast.AST) -> Iterator[ast.stmt]:
-    """Yield what no loss depends on in a node of a file: imports, docstrings, hooks that compute none."""
-    if isinstance(node, ast.Import | ast.ImportFrom):
-        yield node
-    if isinstance(node, ast.FunctionDef) and node.name in DESCRIBING | DRAWING:
-        yield node
-    if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
-        yield node.body[0]
-
-
-def _file(kind: type) -> Path | None:
-    """Return the file a class is written in, None for one of a notebook."""
-    try:
-        return Path(inspect.getfile(kind)).resolve()
-    except (OSError, TypeError):
-        return None
 
 
 @cache

@@ -173,12 +173,7 @@ class SliceJob:
 
     def cost(self) -> SliceCost:
         """Estimate what is left; workers that compute it do, which warms them, and leaves a GPU of theirs alone."""
-        if self.executor is None:
-            return cost_of(self.objective, self.store)
-        site = Site(MemoryBound(self.objective), self.store, self.remake)
-        costs = list(run_tasks(self.executor, _cost_there, [(site,)] * workers_of(self.executor)))
-        shares = [1 / cost.seconds for cost in costs if cost.seconds]
-        return replace(costs[0], seconds=1 / sum(shares) if shares else 0.0)
+        return estimate_cost(self.objective, self.store, self.executor, self.remake)
 
     def run(self, watch: Watch | None = None) -> SliceSummary:
         """Sample what is missing, draw each finer picture as it completes, write and return the summary.
@@ -333,6 +328,21 @@ def range_of(dataset: xr.Dataset) -> dict[str, float | None]:
 def pause_after(seconds: float) -> float:
     """Return how long no picture of an unfinished slice follows one that took so many seconds."""
     return max(PAUSE, seconds / DRAWING)
+
+
+def estimate_cost(
+    objective: Objective,
+    store: SliceStore,
+    executor: Executor | None = None,
+    remake: Callable[[], Objective] | None = None,
+) -> SliceCost:
+    """Estimate what is left of a slice, here or, with an `executor`, on its workers."""
+    if executor is None:
+        return cost_of(objective, store)
+    site = Site(MemoryBound(objective), store, remake)
+    costs = list(run_tasks(executor, _cost_there, [(site,)] * workers_of(executor)))
+    shares = [1 / cost.seconds for cost in costs if cost.seconds]
+    return replace(costs[0], seconds=1 / sum(shares) if shares else 0.0)
 
 
 def cost_of(objective: Objective, store: SliceStore) -> SliceCost:

@@ -24,13 +24,11 @@ from ..landscapes.storage.store import SliceStore
 from .folder import ROOT, SWEEP, folder_named
 from .motion import HORIZON, SMOOTHING, Motion, refuse_too_large
 from .scene import provenance
-from .slice import SliceCost, SliceJob, count_statuses, flat_points, range_of
+from .slice import SliceCost, count_statuses, estimate_cost, flat_points, range_of
 from .watch import PREPARING, Advance, Watch, resumable
 from .workers import recipe
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from ..envs.base import Environment
     from ..landscapes.draw.figures.sweep import Sweep
     from ..landscapes.plane import Plane
@@ -155,8 +153,8 @@ class SweepJob:
         if not work:
             return SliceCost(0, 0.0, 0)
         last = max(work)
-        env, how = self.motion.env_at(last), (self.stores[last], _never_drawn, "", self.executor)
-        cost = SliceJob(env, self.motion.planes[last], self.folder, *how, recipe(env)).cost()
+        env = self.motion.env_at(last)
+        cost = estimate_cost(env, self.stores[last], self.executor, recipe(env))
         return SliceCost(sum(pending.values()), cost.seconds * sum(work.values()) / work[last], cost.memory)
 
     def run(self, watch: Watch | None = None) -> SweepSummary:
@@ -296,7 +294,3 @@ def _clear(folder: Path) -> None:
         discard(store)
     for name in (FILM, GIF, STREAM, SUMMARY):
         (folder / name).unlink(missing_ok=True)
-
-
-def _never_drawn(dataset: xr.Dataset) -> Figure:
-    raise NotImplementedError("a sweep draws all of its slices on one scale")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import io
 import tokenize
 from collections.abc import Collection, Iterator
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 
 
 @cache
@@ -34,3 +36,11 @@ def _silent(node: ast.AST, skipped: Collection[str]) -> Iterator[ast.stmt]:
         yield node
     if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
         yield node.body[0]
+
+
+def file_of(owner: type | ModuleType) -> Path | None:
+    """Return the file that a class or a module is written in, None for one of a notebook."""
+    try:
+        return Path(inspect.getfile(owner)).resolve()
+    except (OSError, TypeError):
+        return None

@@ -11,17 +11,15 @@ The class derives from `gradscape.optim.base.Optimizer`, and its `name` is that 
 from __future__ import annotations
 
 import hashlib
-import inspect
 import sys
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..landscapes.code import bare
+from ..landscapes.code import bare, file_of
 
 if TYPE_CHECKING:
     from .base import Optimizer
@@ -122,14 +120,6 @@ def code_digest(kind: type[Optimizer]) -> str:
         if name not in found and (name in own or name.startswith(f"{__package__}.")):
             found.add(name)
             left += [getattr(value, "__module__", None) or "" for value in vars(sys.modules[name]).values()]
-    files = sorted(file for name in found if (file := _file_of(name)))
+    files = sorted(file for name in found if (file := file_of(sys.modules[name])))
     texts = [bare(file, NO_NUMBERS) for file in files] or [repr(kind)]
     return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:12]
-
-
-def _file_of(module: str) -> Path | None:
-    """Return the file of a module, None for one of a notebook."""
-    try:
-        return Path(inspect.getfile(sys.modules[module])).resolve()
-    except (OSError, TypeError):
-        return None

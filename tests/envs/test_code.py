@@ -8,9 +8,10 @@ import pytest
 
 from gradscape.envs import code
 from gradscape.envs.base import Environment
-from gradscape.envs.code import code_digest, computes_losses, find_files, find_imports, strip
+from gradscape.envs.code import code_digest, computes_losses, find_files, find_imports
 from gradscape.envs.mpm.plasticine import Plasticine
 from gradscape.envs.registry import BUILTIN, environment_class, make
+from gradscape.landscapes.code import bare
 
 SCENES = [entry.name for entry in BUILTIN]
 SOFT = {name for name in SCENES if issubclass(environment_class(name), Plasticine)}
@@ -28,7 +29,7 @@ class Arm(Environment):
 def arm(folder: Path, text: str) -> type[Environment]:
     """Import the arm anew from a changed file."""
     (folder / "gradscape_code_arm.py").write_text(text)
-    strip.cache_clear()
+    bare.cache_clear()
     importlib.invalidate_caches()
     found: type[Environment] = importlib.reload(importlib.import_module("gradscape_code_arm")).Arm
     return found
@@ -113,10 +114,10 @@ def test_another_engine_is_other_code() -> None:
 )
 def test_a_change_is_told_to_the_scenes_it_may_matter_to(copy: Path, file: str, added: str, changes: set[str]) -> None:
     def texts(name: str) -> list[str]:
-        return [strip(copy / one) for one in sorted(files_of(name, folder=copy))]
+        return [bare(copy / one, code.NO_LOSS) for one in sorted(files_of(name, folder=copy))]
 
     before = {name: texts(name) for name in SCENES}
     (copy / file).write_text((copy / file).read_text() + added)
-    for remembered in (strip, find_imports, computes_losses):
+    for remembered in (bare, find_imports, computes_losses):
         remembered.cache_clear()
     assert {name for name in SCENES if texts(name) != before[name]} == changes
