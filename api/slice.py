@@ -52,7 +52,9 @@ def slice(
         return _sample_in_memory(objective, plane, gradients, watch)
     from ..jobs.slice import SliceJob
 
-    command = say_call("slice", scene, tuple(dims), resolution=resolution, extent=extent, **keywords)
+    point = through if isinstance(through, str) else through.tolist()
+    cut = {"through": None if point == "center" else point, "extent": extent, "gradients": None if gradients else False}
+    command = say_call("slice", scene, tuple(dims), resolution=resolution, **cut, **keywords)
     folder = Path(out) if out is not None else None
     job = SliceJob.of(objective, plane, command=command, out=folder, grad=gradients, force=force)
     job.run(watch)
