@@ -28,6 +28,7 @@ from .engines import find_engine
 from .engines.engine import Engine
 from .records import Fidelity as Fidelity
 from .records import MaterialRange as MaterialRange
+from .records import ModelPart as ModelPart
 from .records import Work as Work
 
 COMPUTES_LOSSES = False  # for `code`
@@ -60,6 +61,7 @@ class Environment(abc.ABC):
     known_failures: ClassVar[Mapping[str, Mapping[str, str]]] = {}  # fidelity -> check of `landscape check` -> reason
     contact_stiffness: ClassVar[str] = ""  # the option that says how stiff contact is, where it is by penalty
     material_range: ClassVar[MaterialRange | None] = None  # where an option sets what the scene is made of
+    model_parts: ClassVar[tuple[ModelPart, ...]] = ()  # what the model is made of, each with options that change it
 
     space: ParameterSpace
     _named: ClassVar[bool] = False

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 COMPUTES_LOSSES = False  # for `code`
 
@@ -39,3 +41,17 @@ class MaterialRange:
     option: str
     softest: float
     stiffest: float
+
+
+@dataclass(frozen=True)
+class ModelPart:
+    """Name a part of a scene's model, and the `options` of the scene that change it.
+
+    `change` says in a few words what they do ("no friction", "a rigid cube"). A part that is `missing` is one that the
+    scene leaves out by default: its options put it in.
+    """
+
+    name: str
+    options: Mapping[str, Any]
+    change: str
+    missing: bool = False
