@@ -12,6 +12,7 @@ from .scene import SceneKeywords, say_call, spec_of
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
+    from ..landscapes.measures.model import ModelStudy
     from ..landscapes.measures.tradeoff import Tradeoff
 
     Scene = str | type[Environment] | Environment | SceneSpec
@@ -29,6 +30,20 @@ def tradeoff(
     force: bool = False,
     **keywords: Unpack[SceneKeywords],
 ) -> Tradeoff: ...
+
+
+@overload
+def tradeoff(
+    scene: Scene,
+    *,
+    ladder: Literal["model"],
+    points: int = 64,
+    seed: int = 0,
+    variants: Sequence[str] = (),
+    out: str | Path | None = None,
+    force: bool = False,
+    **keywords: Unpack[SceneKeywords],
+) -> ModelStudy: ...
 
 
 @overload
@@ -60,7 +75,9 @@ def tradeoff(
 
     `ladder` says what varies. "fidelity": the scene's fidelities, and what `variants` names of dt, resolution,
     particles, precision, stiffness, engine, device, by default all that the scene has; its own fidelity does not
-    matter, its last one is the reference, and what is found is also kept for `tolerance`.
+    matter, its last one is the reference, and what is found is also kept for `tolerance`. "model": the parts of the
+    scene's model, each left out, or put in where it is missing; the reference is the full model at the scene's own
+    fidelity.
 
     The study lies in `out`, by default a folder under out/ named after it: the same call goes on there. The record has
     a `table()` and a `plot()`, a trade-off of fidelities also its `front`.
@@ -87,4 +104,13 @@ def _fidelity(spec: SceneSpec, variants: Sequence[str], how: dict[str, Any]) -> 
     return found
 
 
-LADDERS: dict[str, Callable[[SceneSpec, Sequence[str], dict[str, Any]], Any]] = {"fidelity": _fidelity}
+def _model(spec: SceneSpec, variants: Sequence[str], how: dict[str, Any]) -> ModelStudy:
+    from ..jobs.model import ModelJob
+
+    return ModelJob.open(spec, **how).run(default_watch())
+
+
+LADDERS: dict[str, Callable[[SceneSpec, Sequence[str], dict[str, Any]], Any]] = {
+    "fidelity": _fidelity,
+    "model": _model,
+}

@@ -10,11 +10,12 @@ import typer
 
 from ..jobs.scene import SceneSpec
 from .arguments import ForceStudy, Json, OutOfStudy, Print, Seed, takes_scene
-from .ladders import fidelity
+from .ladders import fidelity, model
 from .ladders.study import Study
 
 LADDERS: dict[str, Callable[[Study], None]] = {
     "fidelity": fidelity.run,
+    "model": model.run,
 }
 
 
@@ -23,7 +24,10 @@ def tradeoff(
     scene: SceneSpec,
     ladder: Annotated[
         str,
-        typer.Option(help="What is measured: fidelity, how far off cheaper and dearer variants are."),
+        typer.Option(
+            help="What is measured: fidelity, how far off cheaper and dearer variants are; model, what each part of "
+            "the scene's model is for."
+        ),
     ] = "fidelity",
     points: Annotated[int, typer.Option(min=2, help="Sobol points at which everything is measured.")] = 64,
     seed: Seed = 0,
@@ -42,8 +46,9 @@ def tradeoff(
     """Measure accuracy against speed: the same points in several variants of a scene, each against the reference.
 
     With --ladder fidelity the variants are fidelities and what is changed of them; the folder then holds tradeoff.json
-    and tradeoff.png, of which the former is also kept for --tolerance. Stop it at any moment: the same command goes on
-    with the next variant.
+    and tradeoff.png, of which the former is also kept for --tolerance. With --ladder model each changes one part of the
+    scene's model, leaves it out or puts it in; the reference is the full model at --fidelity, and the folder holds
+    model.json and model.png. Stop it at any moment: the same command goes on with the next variant.
 
     Example: landscape tradeoff bounce --variants dt,precision
     """

@@ -107,6 +107,15 @@ VARIANTS: dict[str, dict[str, Any]] = {  # which option was changed to make a va
 VARIANT_MARK: dict[str, Any] = {
     "linestyle": "none", "markersize": 6.5, "markeredgewidth": 0.7, "markeredgecolor": "white", "zorder": 3
 }  # fmt: skip
+EFFECTS: dict[str, dict[str, Any]] = {  # what a part of a model does, in the words of its verdict
+    "moves nothing beyond the noise": {"color": "#7f7f7f", "marker": "o"},
+    "changes gradients, not losses": {"color": "#cc79a7", "marker": "D"},
+    "changes losses, not their order": {"color": "#0072b2", "marker": "s"},
+    "changes the order": {"color": "#d55e00", "marker": "^"},
+    "fails where the full model does not": {"color": INK, "marker": "X"},
+}
+MISSING_MARK: dict[str, Any] = {"markerfacecolor": "white", "markeredgewidth": 1.3}  # of a part that is left out
+NOISE_LINE: dict[str, Any] = {"color": QUIET, "linewidth": 0.9, "linestyle": (0, (1, 1.5)), "zorder": 1}
 INTERVAL_LINE: dict[str, Any] = {"color": FAINT, "linewidth": 1.0, "zorder": 1.5, "solid_capstyle": "butt"}
 FRONT: dict[str, Any] = {"color": QUIET, "linewidth": 1.2, "zorder": 2}
 REFERENCE_LINE: dict[str, Any] = {"color": INK, "linewidth": 0.9, "linestyle": (0, (4, 2)), "zorder": 1}
