@@ -65,6 +65,11 @@ class TradeoffFiles:
         record = root / TRADEOFFS / f"{env}-{device}.json"
         return cls(record, record.with_suffix(".png"))
 
+    @classmethod
+    def of_model(cls, root: Path, env: str, device: str) -> TradeoffFiles:
+        """Return where the study of the parts of an environment's model is, beside its trade-off."""
+        return cls.of(root, env, f"{device}-model")
+
     def there(self) -> bool:
         """Say whether both are there."""
         return self.record.exists() and self.picture.exists()

@@ -127,7 +127,7 @@ class ModelJob:
 
     def estimate(self) -> float:
         """Return the seconds that what is left should take, by an episode of the full model and by the parts' work."""
-        from ..landscapes.measures.turns import LASTING, ROUNDS
+        from ..landscapes.measures.turns import ENOUGH, LASTING, ROUNDS
         from .variants import expected_work
 
         self.env.prepare()
@@ -138,8 +138,8 @@ class ModelJob:
         for part in self.parts_left():
             with suppress(ValueError, RuntimeError):  # it is refused when it is its turn
                 own = each * expected_work(self._changed(part)) / expected_work(self.env)
-                round_ = 4 / 3 * max(1, self.env.threads) * (each + own)  # both, without gradient and with it
-                seconds += len(self.x) * own + max(LASTING, ROUNDS * round_)
+                round_ = max(4 / 3 * max(1, self.env.threads) * (each + own), 8 * ENOUGH)  # both, both ways
+                seconds += len(self.x) * own + max(LASTING, ROUNDS * round_) + 2 * round_
         return seconds
 
     @property

@@ -42,9 +42,10 @@ def show(found: ModelStudy, console: Console) -> None:
     for part in (*found.present, *found.missing):
         console.print(f"{part.name}, {part.change}: {part.verdict}")
     console.print(
-        "median, 95 %: how far losses move, as a share of the spread (95 % interval); moved: points whose loss moves "
-        "beyond the noise; rank: Spearman's correlation of losses; cosine, slope: of gradients, median cosine and "
-        "relative error; time: of an episode with gradient, against the full model's, in turn with it"
+        "median, 95 %: how far losses move, as a share of the spread, at half and at 95 % of points (95 % interval); "
+        "moved: points whose loss moves beyond the noise; rank: Spearman's correlation of losses; cosine, slope: of "
+        "gradients, median cosine and relative error; time: of an episode with gradient, against the full model's, in "
+        "turn with it (95 % interval)"
     )
     for refused in found.refused:
         console.print(f"refused: {refused.name}: {refused.why}")
@@ -56,10 +57,11 @@ def _print_parts(console: Console, parts: Sequence[MeasuredPart], title: str) ->
     from ..terminal import table
 
     look: dict[str, Any] = {"box": SIMPLE, "padding": (0, 1), "collapse_padding": True, "title": title}
-    accuracy = ("part", "median", "95 % of points", "moved", "rank", "cosine", "slope", "failed")
-    rows = table(*accuracy, "time", "with grad", **look)
+    failed = any(part.comparison.diverged for part in parts)
+    headings = ("part", "median", "95 %", "moved", "rank", "cosine", "slope", *(["failed"] if failed else []), "time")
+    rows = table(*headings, **look)
     for part in parts:
-        rows.add_row(part.name, *_cells(part))
+        rows.add_row(part.name, *_cells(part, failed=failed))
     console.print(rows)
 
 
@@ -79,7 +81,7 @@ def _noise(found: ModelStudy) -> str:
     return f"losses move by {moves} 95 % of points, rank {rank}, cosine {cosine}"
 
 
-def _cells(part: MeasuredPart) -> list[str]:
+def _cells(part: MeasuredPart, *, failed: bool) -> list[str]:
     found = part.comparison
     median = found.loss_error.median_relative.value
     return [
@@ -89,8 +91,7 @@ def _cells(part: MeasuredPart) -> list[str]:
         number(found.spearman),
         number(found.gradient.cosine),
         number(found.gradient.relative_error),
-        "" if found.diverged is None else f"{found.diverged:.0%}",
-        f"{1e3 * found.seconds.with_gradient:.3g} ms",
+        *(["" if found.diverged is None else f"{found.diverged:.0%}"] if failed else []),
         _change(part.cost),
     ]
 
@@ -100,4 +101,4 @@ def _change(cost: Bootstrap) -> str:
     if cost.value is None or cost.low is None or cost.high is None:
         return ""
     value, low, high = (100 * (ratio - 1) for ratio in (cost.value, cost.low, cost.high))
-    return f"{value:+.0f}% ({low:+.0f} to {high:+.0f})"
+    return f"{value:+z.0f}% ({low:+z.0f}:{high:+z.0f})"

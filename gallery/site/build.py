@@ -33,8 +33,9 @@ from ...landscapes.storage.records import reading
 from ...landscapes.storage.store import SliceStore, open_slice
 from ..figures import Figure
 from ..files import MEASURES, PICTURE, QUALITY, REMAKE, REPORT, STORE, SURFACES, SWEEP_FILM
-from .manifest import SCHEMA, FigureEntry, Manifest, TradeoffEntry, as_json
+from .manifest import SCHEMA, FigureEntry, Manifest, ModelEntry, TradeoffEntry, as_json
 from .measured import dark_name, place_tradeoffs, read_report
+from .models import place_models
 from .page_data import count_numbers, read_episodes, read_measures, read_off_nodes, read_sweep
 from .trajectories import lay_runs, read_runs
 
@@ -60,7 +61,8 @@ def build_site(
     with placing(out, overwrite=True, check=partial(_check, out)) as new:
         follow(len(there))
         shutil.copytree(HERE / "static", new / "static")
-        site = _Site(new, _templates(), tables, place_tradeoffs(data, new, [figure.env for figure in there]))
+        envs = [figure.env for figure in there]
+        site = _Site(new, _templates(), tables, place_tradeoffs(data, new, envs), place_models(data, new, envs))
         shown = [site.write_page(figure, data / figure.id) for figure in there]
         return site.write_index(shown, [figure.id for figure in figures if figure not in there])
 
@@ -116,6 +118,7 @@ class _Site:
     pages: Environment
     tables: Sequence[xr.Dataset]
     tradeoffs: Mapping[str, Sequence[TradeoffEntry]]
+    models: Mapping[str, Sequence[ModelEntry]]
 
     def write_page(self, figure: Figure, source: Path) -> FigureEntry:
         """Write a slice's page and all it shows, and return its entry in the manifest."""
@@ -135,6 +138,7 @@ class _Site:
             episodes=episodes,
             runs=[run.search() for run in runs],
             tradeoffs=self.tradeoffs.get(figure.env, []),
+            models=self.models.get(figure.env, []),
         )
         about = {"entry": entry, "held": list(_held_parameters(dataset)), "scene": entries().get(figure.env)}
         (folder / "index.html").write_text(self.pages.get_template("slice.html").render(**about))
@@ -192,6 +196,7 @@ def _entry(figure: Figure, dataset: xr.Dataset, source: Path) -> FigureEntry:
         measures=read_measures(source),
         report=read_report(source),
         tradeoffs=[],
+        models=[],
     )
 
 

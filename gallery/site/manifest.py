@@ -211,6 +211,40 @@ class TradeoffEntry:
 
 
 @dataclass(frozen=True)
+class PartRow:
+    """A part of a model: how far changing it moves losses, what that costs as a ratio of times, and the verdict."""
+
+    name: str
+    change: str
+    missing: bool
+    error: Interval
+    spearman: float | None
+    cosine: float | None
+    diverged: float | None
+    cost: Interval
+    verdict: str
+
+
+@dataclass(frozen=True)
+class ModelEntry:
+    """What each part of an environment's model is for, on a device; `noise` is the full model's against itself."""
+
+    env: str
+    fidelity: str
+    loss_unit: str
+    command: str
+    points: float
+    spread: float | None
+    device: str
+    noise: float | None
+    refused: Sequence[Mapping[str, str]]
+    picture: str
+    file: str
+    alt: str
+    parts: Sequence[PartRow]
+
+
+@dataclass(frozen=True)
 class FigureEntry:
     """A slice of the gallery, and all that its page shows."""
 
@@ -235,6 +269,7 @@ class FigureEntry:
     measures: Mapping[str, str | float]
     report: ReportEntry | None
     tradeoffs: Sequence[TradeoffEntry]
+    models: Sequence[ModelEntry]
 
 
 @dataclass(frozen=True)

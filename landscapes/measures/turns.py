@@ -18,7 +18,7 @@ from ..objective import Evaluation, Objective, evaluate
 from .fidelity import Array, Bootstrap, Sample
 
 ROUNDS, MOST_ROUNDS = 9, 49  # least and most rounds in which two objectives are timed in turn
-LASTING = 4.0  # least seconds that the rounds take together, up to the most
+LASTING = 8.0  # least seconds that the rounds take together, up to the most
 ENOUGH = 0.2  # seconds that a batch should take to be timed
 
 

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 PITCH, SHAPE, NARROW = 7.2, 0.58, 0.9  # room on a screen [inch]; the panel's height against its width, there and narrow
 GAPS = (7.0, 12.0, 18.0, 25.0, 34.0, 44.0)  # of a name from its mark, on a screen [pt]
 ROOM, BESIDE = 2.0, 0.12  # what the axes reach beyond the outermost marks: as a ratio, and as a share of the width
-INTERVAL = "interval"
 LEAST = 4.0  # per cent of an episode that the axis of times spans at least, to either side
 
 
@@ -103,12 +102,13 @@ def _limits(ax: Axes, study: ModelStudy) -> dict[str, tuple[float, float]]:
 def _draw_parts(ax: Axes, study: ModelStudy, places: dict[str, tuple[float, float]]) -> list[Artist]:
     """Draw a mark for each part with its intervals; return the entries of the legend."""
     sheet = page.sheet_of(ax)
-    how, (bottom, top) = sheet.look(style.INTERVAL_LINE) | {"gid": INTERVAL}, ax.get_ylim()
+    how, (bottom, top) = sheet.look(style.INTERVAL_LINE), ax.get_ylim()
     for part in study.parts:
         (x, y), (_, left, right) = places[part.name], _saved(part)
         error = _error(part.comparison, study.spread is not None)
         if error.value is not None:
-            ax.plot([x, x], [max(error.low or bottom, bottom), error.high or top], **how)
+            ends = (error.low or 0.0, top if error.high is None else error.high)
+            ax.plot([x, x], [max(end, bottom) for end in ends], **how)
         ax.plot([left, right], [y, y], **how)
         ax.plot([x], [y], **_look(sheet, part), clip_on=False)
     shown = [effect for effect in style.EFFECTS if any(part.effect == effect for part in study.parts)]
@@ -151,7 +151,7 @@ def _name(ax: Axes, study: ModelStudy, numbers: dict[str, str], places: dict[str
     """
     sheet = page.sheet_of(ax)
     clear = np.array(list(places.values())).reshape(-1, 2)
-    rather = np.concatenate([labels.NOTHING, *(_along(ax, line) for line in ax.lines if line.get_gid() == INTERVAL)])
+    rather = np.concatenate([labels.NOTHING, *(_along(ax, line) for line in ax.lines)])
     parts = sorted(study.parts, key=lambda part: part.name not in numbers)
     names = [labels.Name(numbers.get(part.name, part.name), places[part.name]) for part in parts]
     gaps = [gap * sheet.type for gap in GAPS]
@@ -160,8 +160,8 @@ def _name(ax: Axes, study: ModelStudy, numbers: dict[str, str], places: dict[str
 
 
 def _along(ax: Axes, line: Line2D) -> NDArray[np.float64]:
-    """Return points along a line of two ends [data]; those of a line across the panel are on its edges."""
-    ends = np.asarray(line.get_transform().transform(np.asarray(line.get_xydata(), dtype=float)))
+    """Return points along a straight line [data]; one across the panel ends at its edges."""
+    ends = line.get_transform().transform(np.asarray(line.get_xydata(), dtype=float))
     between = ends[0] + np.linspace(0, 1, 64)[:, None] * (ends[-1] - ends[0])
     found: NDArray[np.float64] = ax.transData.inverted().transform(between)
     return found

@@ -1,0 +1,208 @@
+"""`--ladder model`: what it finds of parts whose effect and price are known, and how it goes on after a stop."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+import torch
+from benchmarks.results import leave_blank
+from torch import Tensor
+
+from gradscape.envs.base import Environment, ModelPart
+from gradscape.jobs.model import ModelJob
+from gradscape.jobs.scene import SceneSpec
+from gradscape.jobs.watch import Stopped
+from gradscape.landscapes import cost
+from gradscape.landscapes.measures import fidelity, turns
+from gradscape.landscapes.measures.model import Effect, MeasuredPart, ModelStudy, Price
+from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.space import ParameterSpace
+from gradscape.landscapes.storage.records import read_json
+
+from ..clock import Clock
+
+CLOCK = Clock()
+
+
+@dataclass(frozen=True)
+class Switches:
+    """`glass`: where the loss is not finite; `noise`: of every evaluation."""
+
+    wind: bool = True
+    offset: bool = True
+    paint: bool = True
+    slope: float = 1.0
+    glass: bool = False
+    gust: bool = False
+    tank: bool = True
+    motor: bool = True
+    noise: float = 0.0
+
+
+class Parted(Environment):
+    """A bowl with wind, whose parts do what their names say; painting takes as long as all the rest."""
+
+    name: ClassVar[str] = "parted"
+    Options: ClassVar[type[Any]] = Switches
+    loss_unit: ClassVar[str] = "J"
+    space = ParameterSpace.box(["x0", "x1"], 0.0, 1.0)
+    model_parts: ClassVar[tuple[ModelPart, ...]] = (
+        ModelPart("wind", {"wind": False}, "no wind"),
+        ModelPart("offset", {"offset": False}, "no constant"),
+        ModelPart("paint", {"paint": False}, "no paint"),
+        ModelPart("slope", {"slope": 0.5}, "half the gradient"),
+        ModelPart("tough glass", {"glass": True}, "glass that breaks"),
+        ModelPart("gust", {"gust": True}, "a gust", missing=True),
+        ModelPart("tank", {"tank": False}, "no tank"),
+        ModelPart("motor", {"motor": False}, "no motor"),
+        ModelPart("as it is", {"wind": True}, "wind"),
+    )
+    chance = torch.Generator()
+
+    def _setup(self) -> None:
+        if not self.options.tank:
+            raise ValueError("parted needs its tank")
+
+    def _evaluate(self, x: Tensor, *, grad: bool) -> Evaluation:
+        o = self.options
+        if not o.motor:
+            raise RuntimeError("the engine gives up")
+        CLOCK.sleep(len(x) * 1e-3 * (2 if o.paint else 1) * (2 if grad else 1) * (3 if o.gust else 1))
+        loss = x.square().sum(dim=1) + 2.0 * o.wind * torch.sin(9 * x[:, 0]) + 1.0 * o.offset
+        loss = loss + 0.2 * o.gust * x[:, 1]
+        loss = loss + o.noise * torch.rand(len(x), generator=self.chance, dtype=torch.float64)
+        slope = 2 * x
+        slope[:, 0] += 18.0 * o.wind * torch.cos(9 * x[:, 0])
+        slope[:, 1] += 0.2 * o.gust
+        if o.glass:
+            loss[x[:, 0] > 0.5] = torch.nan
+        return Evaluation.from_results(loss, o.slope * slope if grad else None)
+
+
+def study(folder: Path, **options: Any) -> ModelStudy:
+    """Make a study by the clock of the scene, in few rounds and without its picture."""
+    Parted.chance.manual_seed(0)
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (turns, cost):
+            patch.setattr(module, "time", CLOCK)
+        for name, value in (("ROUNDS", 3), ("LASTING", 0.0), ("ENOUGH", 0.0)):
+            patch.setattr(turns, name, value)
+        patch.setattr(fidelity, "RESAMPLES", 99)
+        leave_blank(patch.setattr)
+        return ModelJob.open(SceneSpec(Parted, options=options), points=64, out=folder).run()
+
+
+def by_name(found: ModelStudy) -> dict[str, MeasuredPart]:
+    return {part.name: part for part in found.parts}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return where the study of the scene as it is lies."""
+    path = tmp_path_factory.mktemp("study")
+    study(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def found(folder: Path) -> ModelStudy:
+    """Return that study."""
+    return ModelStudy.of_record(read_json(folder / "model.json"))
+
+
+@pytest.mark.parametrize(
+    ("name", "effect", "price"),
+    [
+        ("wind", Effect.ORDER, Price.NOTHING),
+        ("offset", Effect.LOSSES, Price.NOTHING),
+        ("paint", Effect.NOTHING, Price.SAVES),
+        ("slope", Effect.GRADIENTS, Price.NOTHING),
+        ("tough glass", Effect.FAILURE, Price.NOTHING),
+        ("gust", Effect.LOSSES, Price.COSTS),
+    ],
+)
+def test_each_part_is_judged_by_what_it_does(name: str, effect: Effect, price: Price, found: ModelStudy) -> None:
+    part = by_name(found)[name]
+    assert (part.effect, part.price) == (effect, price)
+    assert part.verdict == f"{effect}; {price}"
+
+
+def test_errors_and_times_are_those_of_the_parts(found: ModelStudy) -> None:
+    x, parts = Parted.space.sobol(64, seed=0), by_name(found)
+    offset, wind = parts["offset"].comparison, parts["wind"].comparison
+    assert offset.loss_error.median.value == pytest.approx(1.0)
+    assert offset.loss_error.p95.value == pytest.approx(1.0)
+    assert (offset.spearman.value, offset.gradient.cosine.value) == (pytest.approx(1.0), pytest.approx(1.0))
+    blown = (2 * torch.sin(9 * x[:, 0])).abs()
+    assert wind.loss_error.p95.value == pytest.approx(float(blown.quantile(0.95, interpolation="higher")))
+    assert parts["slope"].comparison.gradient.relative_error.value == pytest.approx(0.5)
+    assert parts["tough glass"].comparison.diverged == pytest.approx(float((x[:, 0] > 0.5).double().mean()))
+    for name, ratio in (("paint", 0.5), ("gust", 3.0), ("offset", 1.0)):
+        assert parts[name].cost.value == pytest.approx(ratio)
+        assert parts[name].cost_forward.value == pytest.approx(ratio)
+    assert (found.seconds.forward, found.seconds.with_gradient) == (pytest.approx(2e-3), pytest.approx(4e-3))
+
+
+def test_missing_parts_stand_apart_and_refused_ones_say_why(found: ModelStudy) -> None:
+    assert [part.name for part in found.missing] == ["gust"]
+    assert "gust" not in [part.name for part in found.present]
+    why = {refused.name: refused.why for refused in found.refused}
+    assert why == {
+        "tank": "parted needs its tank",
+        "motor": "the engine gives up",
+        "as it is": "the full model's options are those of 'wind' already",
+    }
+
+
+def test_a_part_below_the_noise_moves_nothing(tmp_path: Path, found: ModelStudy) -> None:
+    """The scene's repeats differ by up to 8: the constant is lost among them, the gust but for its gradients."""
+    noisy = study(tmp_path, noise=8.0)
+    assert found.noise.largest < 1e-6 < 5.0 < noisy.noise.largest <= 8.0 + 1e-6
+    assert [by_name(noisy)[name].effect for name in ("offset", "gust")] == [Effect.NOTHING, Effect.GRADIENTS]
+    assert [by_name(found)[name].effect for name in ("offset", "gust")] == [Effect.LOSSES, Effect.LOSSES]
+
+
+def test_options_of_the_full_model_are_kept_where_a_part_changes_others(tmp_path: Path) -> None:
+    calm = study(tmp_path, wind=False)
+    assert calm.identity["options"]["wind"] is False
+    assert {refused.name for refused in calm.refused} == {"wind", "tank", "motor"}
+    assert by_name(calm)["as it is"].effect == Effect.ORDER  # it brings the wind back
+
+
+def test_a_stopped_study_goes_on_with_the_next_part(
+    tmp_path: Path, found: ModelStudy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    take, timed = turns.take_turns, list[Any]()
+
+    def stopped(*given: Any) -> turns.Turns:
+        if len(timed) == 2:
+            raise KeyboardInterrupt
+        timed.append(given)
+        return take(*given)
+
+    monkeypatch.setattr(turns, "take_turns", stopped)
+    with pytest.raises(Stopped, match="2 of 9 parts are kept"):
+        study(tmp_path)
+    assert not (tmp_path / "model.json").exists()
+    kept = {path.name: path.read_bytes() for path in (tmp_path / "pieces").iterdir()}
+    assert len(kept) == 4  # the full model, its repeats, two parts
+    monkeypatch.setattr(turns, "take_turns", take)
+    resumed = study(tmp_path)
+    assert kept == {name: (tmp_path / "pieces" / name).read_bytes() for name in kept}
+    assert [(part.name, part.comparison.loss_error, part.verdict) for part in resumed.parts] == [
+        (part.name, part.comparison.loss_error, part.verdict) for part in found.parts
+    ]
+    assert resumed.refused == found.refused
+
+
+def test_the_table_has_a_row_for_each_part_and_the_record_is_what_is_read(folder: Path, found: ModelStudy) -> None:
+    assert found.record() == read_json(folder / "model.json")
+    table = found.table()
+    assert table.index.tolist() == [part.name for part in (*found.present, *found.missing)]
+    assert table.loc["paint", "price"] == "saves time"
+
+
+def test_a_scene_without_parts_is_refused() -> None:
+    with pytest.raises(ValueError, match="branin names no parts of its model"):
+        ModelJob.open(SceneSpec("branin"))
