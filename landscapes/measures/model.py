@@ -237,7 +237,7 @@ def judge_effect(found: Comparison, noise: Noise, moved: float | None) -> Effect
     rank correlation is below 0.99 and below the interval of the noise's own. It moves gradients where their median
     relative error is more than twice the noise's.
     """
-    if found.diverged is None or found.diverged > OFTEN:
+    if found.diverged is None or round(found.diverged, 9) > OFTEN:
         return Effect.FAILURE
     own = noise.comparison
     errors = [(found.loss_error.median, own.loss_error.median), (found.loss_error.p95, own.loss_error.p95)]

@@ -25,6 +25,7 @@ from gradscape.optim.runs.store import RunStore
 from gradscape.optim.search import search
 
 from ...command import NO_BROWSER
+from ...studies import study
 
 SPACE = ParameterSpace(
     ("speed", "force", "mass"), torch.tensor([-1.0, 0, -10]).double(), torch.tensor([1.0, 20, 10]).double(),
@@ -150,6 +151,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
         identity = {**TRADEOFF["identity"], "device": device}
         (folder / f"tradeoff/fluid-{device}.json").write_text(json.dumps({**TRADEOFF, "identity": identity}))
         picture(folder / f"tradeoff/fluid-{device}.png")
+    (folder / "tradeoff/fluid-cuda-model.json").write_text(json.dumps(study({"drag": 1.0, "wall": 0.2}).record()))
+    picture(folder / "tradeoff/fluid-cuda-model.png")
     for name in ("episode-6-5", "episode-11-11", "sweep"):
         film(full / name)
     (full / "episode-11-11.mp4").unlink()

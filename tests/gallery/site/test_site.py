@@ -85,6 +85,20 @@ def test_the_manifest_lists_everything_of_a_page(site: Path, data: Path) -> None
     assert [run["method"] for run in full["runs"]] == ["descents", "random"]
 
 
+def test_a_page_shows_what_each_part_of_the_model_is_for(site: Path) -> None:
+    bare, full = json.loads((site / "manifest.json").read_text())["figures"][1:]
+    assert bare["models"] == []
+    (study,) = full["models"]
+    assert (study["device"], study["fidelity"], study["file"]) == ("cuda", "draft", "tradeoff/fluid-cuda-model.json")
+    assert [(row["name"], row["missing"]) for row in study["parts"]] == [("drag", False), ("wall", True)]
+    drag = study["parts"][0]
+    assert drag["error"]["value"] == pytest.approx(1 / study["spread"])
+    assert drag["verdict"] == "changes losses, not their order; saves time"
+    assert study["refused"] == [{"name": "tank", "why": "fluid needs its tank"}]
+    page = (site / full["page"]).read_text()
+    assert all(said in page for said in ("What each part of the model is for", "wall (missing)", "no drag"))
+
+
 def test_words_are_beside_the_papers_and_a_trade_off_is_ranked(site: Path) -> None:
     bare, full = json.loads((site / "manifest.json").read_text())["figures"][1:]
     assert (bare["report"], bare["tradeoffs"]) == (None, [])
@@ -100,7 +114,8 @@ def test_words_are_beside_the_papers_and_a_trade_off_is_ranked(site: Path) -> No
     trade, another = full["tradeoffs"]
     assert (trade["device"], another["device"]) == ("cuda", "cpu")
     files = {path.name for path in (site / "tradeoff").iterdir()}
-    assert files == {f"fluid-{device}{kind}" for device in ("cuda", "cpu") for kind in (".json", ".png", "-dark.png")}
+    names = ("fluid-cuda", "fluid-cpu", "fluid-cuda-model")
+    assert files == {f"{name}{kind}" for name in names for kind in (".json", ".png", "-dark.png")}
     assert [(row["name"], row["front"]) for row in trade["rungs"]] == [
         ("coarse", False), ("draft", True), ("standard", True), ("slow", False), ("reference", False)
     ]  # fmt: skip
