@@ -68,8 +68,9 @@ def _print_parts(console: Console, parts: Sequence[MeasuredPart], title: str) ->
 def _subject(found: ModelStudy) -> str:
     scale = f"spread of the loss (5th to 95th percentile) {found.spread or 0:.4g} {found.loss_unit}".rstrip()
     failed = f"; {found.failed} points left out, the full model fails there" if found.failed else ""
-    seconds = f"{1e3 * found.seconds.with_gradient:.3g} ms an episode with gradient"
-    about = f"{found.env}: {found.points} points against the full model at {found.fidelity}, {seconds}"
+    about = f"{found.env}: {found.points} points against the full model at {found.fidelity}"
+    if found.parts:  # with which it was timed
+        about += f", {1e3 * found.seconds.with_gradient:.3g} ms an episode with gradient"
     return f"{about}; {scale if found.spread else 'no spread'}{failed}"
 
 
