@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Unpack, overload
 
@@ -12,6 +12,7 @@ from .scene import SceneKeywords, say_call, spec_of
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
+    from ..landscapes.measures.mixed import MixedTradeoff
     from ..landscapes.measures.tradeoff import Tradeoff
 
     Scene = str | type[Environment] | Environment | SceneSpec
@@ -35,6 +36,21 @@ def tradeoff(
 def tradeoff(
     scene: Scene,
     *,
+    ladder: Literal["mixed"],
+    points: int = 64,
+    seed: int = 0,
+    variants: Sequence[str] = (),
+    limits: Mapping[str, Any] | None = None,
+    out: str | Path | None = None,
+    force: bool = False,
+    **keywords: Unpack[SceneKeywords],
+) -> MixedTradeoff: ...
+
+
+@overload
+def tradeoff(
+    scene: Scene,
+    *,
     ladder: str,
     points: int = 64,
     seed: int = 0,
@@ -52,6 +68,7 @@ def tradeoff(
     points: int = 64,
     seed: int = 0,
     variants: Sequence[str] = (),
+    limits: Mapping[str, Any] | None = None,
     out: str | Path | None = None,
     force: bool = False,
     **keywords: Unpack[SceneKeywords],
@@ -61,6 +78,11 @@ def tradeoff(
     `ladder` says what varies. "fidelity": the scene's fidelities, and what `variants` names of dt, resolution,
     particles, precision, stiffness, engine, device, by default all that the scene has; its own fidelity does not
     matter, its last one is the reference, and what is found is also kept for `tolerance`.
+
+    "mixed": all settings together, in a search for what draft and standard should be; `limits` are its `at_most`, how
+    many times today's cost a variant may cost (4), its `budget`, how long it may measure [s] (600), and `chaotic`,
+    whether gradients are no criterion; what is found is kept for `tolerance`, too, and the record has `choices` and the
+    `lines` of Python that write them down.
 
     The study lies in `out`, by default a folder under out/ named after it: the same call goes on there. The record has
     a `table()` and a `plot()`, a trade-off of fidelities also its `front`.
@@ -72,9 +94,19 @@ def tradeoff(
     from ..jobs.variants import refuse_ladder
 
     refuse_ladder(ladder, LADDERS, variants)
-    chosen = {"ladder": ladder} if ladder != "fidelity" else {"variants": tuple(variants)}
+    if limits and ladder != "mixed":
+        raise ValueError(f"limits go with the ladder mixed; got them with {ladder}, leave them out")
+    chosen: dict[str, Any] = {"ladder": ladder} if ladder != "fidelity" else {"variants": tuple(variants)}
+    chosen |= {"limits": dict(limits)} if limits else {}
     command = say_call("tradeoff", scene, points=points, seed=seed, **chosen, **keywords)
-    how = {"points": points, "seed": seed, "out": Path(out) if out else None, "force": force, "command": command}
+    how = {
+        "points": points,
+        "seed": seed,
+        "out": Path(out) if out else None,
+        "force": force,
+        "command": command,
+        **(limits or {}),
+    }
     return LADDERS[ladder](spec_of(scene, keywords), variants, how)
 
 
@@ -87,4 +119,13 @@ def _fidelity(spec: SceneSpec, variants: Sequence[str], how: dict[str, Any]) -> 
     return found
 
 
-LADDERS: dict[str, Callable[[SceneSpec, Sequence[str], dict[str, Any]], Any]] = {"fidelity": _fidelity}
+def _mixed(spec: SceneSpec, variants: Sequence[str], how: dict[str, Any]) -> MixedTradeoff:
+    from ..jobs.mixed import MixedJob
+    from ..jobs.tolerance import keep
+
+    found = MixedJob.open(spec, **how).run(default_watch())
+    keep(found.tradeoff)
+    return found
+
+
+LADDERS: dict[str, Callable[[SceneSpec, Sequence[str], dict[str, Any]], Any]] = {"fidelity": _fidelity, "mixed": _mixed}

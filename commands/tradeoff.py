@@ -10,11 +10,12 @@ import typer
 
 from ..jobs.scene import SceneSpec
 from .arguments import ForceStudy, Json, OutOfStudy, Print, Seed, takes_scene
-from .ladders import fidelity
+from .ladders import fidelity, mixed
 from .ladders.study import Study
 
 LADDERS: dict[str, Callable[[Study], None]] = {
     "fidelity": fidelity.run,
+    "mixed": mixed.run,
 }
 
 
@@ -23,7 +24,10 @@ def tradeoff(
     scene: SceneSpec,
     ladder: Annotated[
         str,
-        typer.Option(help="What is measured: fidelity, how far off cheaper and dearer variants are."),
+        typer.Option(
+            help="What is measured: fidelity, how far off cheaper and dearer variants are; mixed, which draft and "
+            "standard should be, by a search with all settings changed together."
+        ),
     ] = "fidelity",
     points: Annotated[int, typer.Option(min=2, help="Sobol points at which everything is measured.")] = 64,
     seed: Seed = 0,
@@ -34,6 +38,18 @@ def tradeoff(
             "particles, precision, stiffness, engine, device; by default all that the scene has."
         ),
     ] = None,
+    at_most: Annotated[
+        float | None,
+        typer.Option(help="With --ladder mixed: how many times today's cost a variant may cost; by default 4."),
+    ] = None,
+    budget: Annotated[
+        float | None,
+        typer.Option(help="With --ladder mixed: seconds that the search may measure; by default 600."),
+    ] = None,
+    chaotic: Annotated[
+        bool,
+        typer.Option("--chaotic", help="With --ladder mixed: the motion is chaotic, so gradients are no criterion."),
+    ] = False,
     out: OutOfStudy = None,
     print_: Print = None,
     json_: Json = False,
@@ -42,8 +58,9 @@ def tradeoff(
     """Measure accuracy against speed: the same points in several variants of a scene, each against the reference.
 
     With --ladder fidelity the variants are fidelities and what is changed of them; the folder then holds tradeoff.json
-    and tradeoff.png, of which the former is also kept for --tolerance. Stop it at any moment: the same command goes on
-    with the next variant.
+    and tradeoff.png, of which the former is also kept for --tolerance. With --ladder mixed they are those that a search
+    of the front needs; it says what draft and standard should be, and leaves mixed.json and mixed.png. Stop it at any
+    moment: the same command goes on with the next variant.
 
     Example: landscape tradeoff bounce --variants dt,precision
     """
@@ -52,5 +69,9 @@ def tradeoff(
 
     settings = [part for text in variants or [] for part in text.split(",") if part]
     refuse_ladder(ladder, LADDERS, settings)
+    given = {"at_most": at_most, "budget": budget, "chaotic": chaotic or None}
+    limits = {name: value for name, value in given.items() if value is not None}
+    if limits and ladder != "mixed":
+        raise ValueError(f"--at-most, --budget and --chaotic go with --ladder mixed; got --ladder {ladder}")
     folder = Path(out) if out else None
-    LADDERS[ladder](Study(scene, points, seed, settings, folder, print_ or [], json_, force, command_line()))
+    LADDERS[ladder](Study(scene, points, seed, settings, folder, print_ or [], json_, force, command_line(), limits))

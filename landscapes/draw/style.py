@@ -110,9 +110,13 @@ VARIANT_MARK: dict[str, Any] = {
 }  # fmt: skip
 INTERVAL_LINE: dict[str, Any] = {"color": FAINT, "linewidth": 1.0, "zorder": 1.5, "solid_capstyle": "butt"}
 CHOSEN_MARK: dict[str, Any] = {  # a ring around a variant that a fidelity's name should mean
-    "linestyle": "none", "marker": "o", "markersize": 12.0, "markerfacecolor": "none", "markeredgewidth": 1.3, "zorder": 4
+    "linestyle": "none", "marker": "o", "markersize": 12.0, "markerfacecolor": "none", "markeredgewidth": 1.3,
+    "zorder": 4,
 }  # fmt: skip
-CHOSEN: dict[str, dict[str, Any]] = {"draft": {"markeredgecolor": "#d55e00"}, "standard": {"markeredgecolor": "#b5367a"}}
+CHOSEN: dict[str, dict[str, Any]] = {
+    "draft": {"markeredgecolor": "#d55e00"},
+    "standard": {"markeredgecolor": "#b5367a"},
+}
 FRONT: dict[str, Any] = {"color": QUIET, "linewidth": 1.2, "zorder": 2}
 REFERENCE_LINE: dict[str, Any] = {"color": INK, "linewidth": 0.9, "linestyle": (0, (4, 2)), "zorder": 1}
 NAME_TEXT: dict[str, Any] = {"color": INK, "zorder": 6, "path_effects": [withStroke(linewidth=2.0, foreground="white")]}

@@ -55,9 +55,14 @@ class Sample:
 
     def join(self, more: Sample) -> Sample:
         """Return it with further points of the same variant; seconds are the best of both."""
-        parts = {name: np.concatenate([getattr(self, name), getattr(more, name)]) for name in ("loss", "grad", "status")}
-        best = {name: min(getattr(self, name), getattr(more, name)) for name in ("forward", "with_gradient")}
-        return Sample(**parts, **best, batch=max(self.batch, more.batch))
+        return Sample(
+            np.concatenate([self.loss, more.loss]),
+            np.concatenate([self.grad, more.grad]),
+            np.concatenate([self.status, more.status]),
+            min(self.forward, more.forward),
+            min(self.with_gradient, more.with_gradient),
+            max(self.batch, more.batch),
+        )
 
 
 @dataclass(frozen=True)
