@@ -58,6 +58,7 @@ class MixedJob(TradeoffJob):
     chaotic: bool = False
     samples: dict[str, Sample] = field(default_factory=dict)
     rows: dict[str, MeasuredVariant] = field(default_factory=dict)
+    begun: dict[str, MeasuredVariant] = field(default_factory=dict)
     dismissed: dict[str, str] = field(default_factory=dict)
     took: dict[str, float] = field(default_factory=dict)
     works: dict[tuple[Any, ...], float] = field(default_factory=dict)
@@ -170,14 +171,19 @@ class MixedJob(TradeoffJob):
         rows = [self.rows[name] for name in found]
         limit = self.at_most * self.rows["standard"].seconds
         members = fronts(rows, self._costs(), chaotic=self.chaotic)
-        for name in sorted(members, key=lambda name: nearness(self.rows[name].comparison, chaotic=self.chaotic)):
-            beside = neighbours(found[name], self._standard, self.env)
-            fresh = [variant for variant in beside if variant.key() not in seen]
-            rate = self.rows[name].seconds / self._work(found[name])
-            costs = {variant.name: rate * self._work(variant) for variant in fresh}
-            able = [variant for variant in fresh if costs[variant.name] <= limit]
-            if able:
-                return sorted(able, key=lambda variant: costs[variant.name])
+        members = sorted(members, key=lambda name: nearness(self.rows[name].comparison, chaotic=self.chaotic))
+        for last in (False, True):  # the other precision, which is seldom what losses lack, comes last
+            for name in members:
+                of, rate = found[name], self.rows[name].seconds / self._work(found[name])
+                able = [
+                    variant
+                    for variant in neighbours(of, self._standard, self.env)
+                    if variant.key() not in seen
+                    and (variant.fidelity.precision != of.fidelity.precision) == last
+                    and rate * self._work(variant) <= limit
+                ]
+                if able:
+                    return sorted(able, key=self._work)
         return []
 
     @property
@@ -215,14 +221,17 @@ class MixedJob(TradeoffJob):
         row = self._compare(variant, sample, self._reference.first(points))
         if (failed := row.comparison.diverged) != 0:
             return f"fails at {failed or 1:.0%} of {points} points"
-        others = [
-            self._compare(one, self.samples[one.name].first(points), self._reference.first(points))
-            for one in self.variants[1:]
-            if self.rows[one.name].seconds < row.seconds
-        ]
+        others = [self._begun(one, points) for one in self.variants[1:] if self.rows[one.name].seconds < row.seconds]
         if surely_beaten(row, others, chaotic=self.chaotic):
             return f"quicker ones are surely nearer at {points} points"
         return ""
+
+    def _begun(self, variant: Variant, points: int) -> MeasuredVariant:
+        """Return what is known of a measured variant from its first points alone."""
+        if variant.name not in self.begun:
+            sample = self.samples[variant.name].first(points)
+            self.begun[variant.name] = self._compare(variant, sample, self._reference.first(points))
+        return self.begun[variant.name]
 
     @property
     def _reference(self) -> Sample:

@@ -177,14 +177,14 @@ def choose(
     """Choose the variant that a claim's name should mean, of those that cost at most so many times what it does today.
 
     It is the cheapest that keeps the claim; where none does, the one whose shortfall is the smallest, the cheaper one
-    of two that are equal. `cost` is by name; the variant of the claim's own name is among the variants.
+    of two that are equal in two digits. `cost` is by name; the variant of the claim's own name is among the variants.
     """
     short = {one.name: Shortfall.of(one.comparison, claim, chaotic=chaotic) for one in variants}
     limit, today = at_most * cost[claim.name], finite(short[claim.name].value)
     able = [name for name, found in short.items() if cost[name] <= limit and math.isfinite(found.value)]
     if not able:
         return Choice(claim, cost[claim.name], today, None, None, None, "", 0)
-    best = min(able, key=lambda name: (max(short[name].value, 1.0), cost[name]))
+    best = min(able, key=lambda name: (max(float(f"{short[name].value:.2g}"), 1.0), not short[name].kept, cost[name]))
     found = short[best]
     lacking = "" if found.kept else found.by
     return Choice(claim, cost[claim.name], today, best, cost[best], found.value, lacking, len(able))
