@@ -168,10 +168,8 @@ class MixedJob(TradeoffJob):
     def _ahead(self, seen: set[tuple[Any, ...]]) -> list[Variant]:
         """Return what to measure next: the affordable neighbours of the front's member next to a claim's limit."""
         found = {variant.name: variant for variant in self.variants[1:]}
-        rows = [self.rows[name] for name in found]
         limit = self.at_most * self.rows["standard"].seconds
-        members = fronts(rows, self._costs(), chaotic=self.chaotic)
-        members = sorted(members, key=lambda name: nearness(self.rows[name].comparison, chaotic=self.chaotic))
+        members = self._members()
         for last in (False, True):  # the other precision, which is seldom what losses lack, comes last
             for name in members:
                 of, rate = found[name], self.rows[name].seconds / self._work(found[name])
@@ -185,6 +183,18 @@ class MixedJob(TradeoffJob):
                 if able:
                     return sorted(able, key=self._work)
         return []
+
+    def _members(self) -> list[str]:
+        """Return the front of the variants with the scene's own options, then that of all, nearest to a limit first."""
+        rows = [self.rows[variant.name] for variant in self.variants[1:]]
+        found = list[str]()
+        for among in ([row for row in rows if self._has_own_options(row)], rows):
+            members = fronts(among, self._costs(), chaotic=self.chaotic)
+            found += sorted(members, key=lambda name: nearness(self.rows[name].comparison, chaotic=self.chaotic))
+        return list(dict.fromkeys(found))
+
+    def _has_own_options(self, one: MeasuredVariant | Variant) -> bool:
+        return one.options == self.variants[0].options
 
     @property
     def _standard(self) -> Variant:
@@ -221,7 +231,12 @@ class MixedJob(TradeoffJob):
         row = self._compare(variant, sample, self._reference.first(points))
         if (failed := row.comparison.diverged) != 0:
             return f"fails at {failed or 1:.0%} of {points} points"
-        others = [self._begun(one, points) for one in self.variants[1:] if self.rows[one.name].seconds < row.seconds]
+        others = [
+            self._begun(one, points)
+            for one in self.variants[1:]
+            if self.rows[one.name].seconds < row.seconds
+            and (self._has_own_options(one) or not self._has_own_options(variant))
+        ]
         if surely_beaten(row, others, chaotic=self.chaotic):
             return f"quicker ones are surely nearer at {points} points"
         return ""
@@ -354,7 +369,7 @@ class MixedJob(TradeoffJob):
         rows = [self.rows[variant.name] for variant in self.variants[1:]]
         how: dict[str, Any] = {"at_most": self.at_most, "chaotic": self.chaotic}
         pick = partial(self._pick, costs=costs, how=how)
-        own = pick(row for row in rows if row.options == self.variants[0].options)
+        own = pick(filter(self._has_own_options, rows))
         able = pick(rows)
         cpu = self.env.device == "cpu" or "cpu" not in self.env.devices
         return MixedTradeoff(

@@ -97,7 +97,7 @@ def beside(
     if not value or not middle:
         return []
     at = math.floor(math.log(value / middle, ratio))
-    near = [tidy(middle * ratio**k) for k in range(at - 2, at + 4)]
+    near = [tidy(middle * ratio**k) if k else middle for k in range(at - 2, at + 4)]
     below = [notch for notch in near if least <= notch < value * (1 - SAME)][-1:]
     above = [notch for notch in near if most >= notch > value * (1 + SAME)][:1]
     return below + above

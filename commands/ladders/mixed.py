@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from .study import Study, number, percent, share
+from .study import Study, number, share
 
 if TYPE_CHECKING:
     from ...landscapes.measures.choice import Choice
@@ -94,7 +94,7 @@ def _cells(found: MixedTradeoff, name: str | None, shortfall: float | None, seco
         _interval(measured.spearman),
         _interval(measured.gradient.cosine),
         share(measured.loss_error.p95_relative),
-        "not finite" if shortfall is None else f"{percent(shortfall)}%",
+        "not finite" if shortfall is None else f"{shortfall:.2g}",
         f"{1e3 * seconds:.3g}",
     ]
 

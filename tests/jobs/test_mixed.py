@@ -128,7 +128,7 @@ def test_the_known_optimum_is_found_and_nothing_dearer_than_the_limit_is_measure
     assert {settings(found, 0), settings(found, 1)}.isdisjoint({(10, 6), (50, 16)})  # neither is what it is today
     limit = 4 * found.variant("standard").seconds
     assert all(one.seconds <= 1.001 * limit for one in found.tradeoff.variants if one.name != "reference")
-    assert len(found.tradeoff.variants) + len(found.dismissed) < 60  # of 81 notches and their float64
+    assert len(found.tradeoff.variants) + len(found.dismissed) < 81  # notches, without their float64
     assert read_json(tmp_path / "s/mixed.json") == json.loads(json.dumps(found.record()))
     assert MixedTradeoff.of_record(found.record()) == found
     assert eval(found.lines[0].split(":", 1)[1].rstrip(","), {"Fidelity": Fidelity}).dt == 1 / settings(found, 0)[0]
@@ -198,9 +198,9 @@ def test_the_verb_prints_both_names_draws_and_goes_on_after_a_stop(
 def test_a_budget_ends_the_search_and_says_so(tmp_path: Path) -> None:
     found = search(tmp_path / "s", budget=1e-6)
     assert not found.complete
-    assert [one.name for one in found.tradeoff.variants] == ["reference", "draft", "standard"]
-    assert found.choices[0].variant == "draft"
-    assert not found.choices[0].kept
+    assert [one.name for one in found.tradeoff.variants][:3] == ["reference", "draft", "standard"]
+    assert len(found.tradeoff.variants) + len(found.dismissed) == 4  # one, which took longer than that
+    assert {found.choices[0].variant, found.choices[0].kept} == {"draft", False}
 
 
 @pytest.mark.usefixtures("blank")
@@ -215,13 +215,17 @@ def test_where_the_limit_leaves_none_the_nearest_is_taken(tmp_path: Path) -> Non
 
 
 @pytest.mark.usefixtures("blank")
-def test_gradients_count_unless_the_motion_is_chaotic(tmp_path: Path) -> None:
-    bent = {"bent": 1.0}
+def test_gradients_count_unless_the_motion_is_chaotic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    finer = Trading.fidelities | {"draft": Fidelity("draft", dt=1 / 10, resolution=8)}
+    monkeypatch.setattr(Trading, "fidelities", finer)
+    bent = {"bent": 0.4}
     strict = search(tmp_path / "strict", options=bent)
     loose = search(tmp_path / "loose", options=bent, chaotic=True)
     assert settings(strict, 0) == optimum("draft", **bent)
     assert settings(loose, 0) == optimum("draft", chaotic=True, **bent)
-    assert strict.choices[0].seconds > 1.2 * loose.choices[0].seconds  # type: ignore[operator]
+    assert strict.choices[0].kept
+    assert loose.choices[0].kept
+    assert strict.choices[0].seconds > loose.choices[0].seconds  # type: ignore[operator]
     assert loose.chaotic
 
 
@@ -232,7 +236,8 @@ def test_an_option_that_makes_it_cheaper_is_told_but_not_chosen(
     monkeypatch.setattr(Trading, "contact_stiffness", "ke")
     found = search(tmp_path / "s")
     own = asdict(TradingOptions())
-    assert all(found.variant(str(one.variant)).options == own for one in found.choices)
+    assert all(found.variant(str(one.variant)).options == own and one.kept for one in found.choices)
+    assert [settings(found, number) for number in (0, 1)] == [optimum("draft"), optimum("standard")]
     assert found.with_options
     for one in found.with_options:
         (same,) = (other for other in found.choices if other.claim == one.claim)
@@ -308,5 +313,5 @@ def test_notches_are_a_series_through_the_middle() -> None:
 def test_the_line_of_python_makes_the_same_fidelity(fidelity_: Fidelity, step: float, line: str) -> None:
     assert fidelity_line(fidelity_, "draft", step) == line
     made = eval(line.split(":", 1)[1].rstrip(","), {"Fidelity": Fidelity})
-    assert {**asdict(made), "name": "x"} == pytest.approx(asdict(fidelity_), rel=1e-12) or asdict(made)["dt"]
+    assert {**asdict(made), "name": "x", "dt": 0} == {**asdict(fidelity_), "dt": 0}
     assert made.dt == pytest.approx(fidelity_.dt, rel=1e-12)
