@@ -22,14 +22,13 @@ from ..landscapes.measures.choice import CLAIMS, Shortfall, choose, fronts, near
 from ..landscapes.storage.files import tidy
 from ..landscapes.storage.records import write_record
 from .folder import MIXED, ROOT, folder_named
-from .notches import fidelity_line, neighbours
+from .notches import fidelity_line, named_variant, neighbours
 from .scene import SceneSpec
 from .tradeoff import COPIES, TradeoffJob, reference_of
 from .variants import Variant, expected_work
 from .watch import Watch, resumable
 
 if TYPE_CHECKING:
-    from ..envs.base import Environment
     from ..landscapes.measures.choice import Choice, Claim
     from ..landscapes.measures.fidelity import Sample
     from ..landscapes.measures.mixed import MixedTradeoff
@@ -95,7 +94,7 @@ class MixedJob(TradeoffJob):
             if not 0 < limit < float("inf"):
                 raise ValueError(f"{what} takes a positive number; got {limit:g}")
         env = reference_of(scene)
-        named = [Variant.of(env)] + [_named(env, claim) for claim in CLAIMS]
+        named = [Variant.of(env)] + [named_variant(env, claim) for claim in CLAIMS]
         require("points", points, lambda count: Need(8.0 * COPIES * (1 + env.space.dim) * count))
         identity = {**env.identity(), "points": points, "seed": seed}
         identity |= {"at_most": at_most, "budget": budget, "chaotic": chaotic}
@@ -394,13 +393,3 @@ class MixedJob(TradeoffJob):
     def _line(self, one: Choice) -> str:
         fidelity = self._variant(str(one.variant)).fidelity
         return fidelity_line(fidelity, one.claim.name, self.env.control_step)
-
-
-def _named(env: Environment, claim: Claim) -> Variant:
-    """Return the variant that bears a claim's name. Raises ValueError where there is none beside the reference."""
-    if claim.name not in env.fidelities or claim.name == env.fidelity.name:
-        raise ValueError(
-            f"a search of mixed variants is for scenes with {' and '.join(one.name for one in CLAIMS)} beside their "
-            f"reference; {env.name} has {', '.join(env.fidelities)}"
-        )
-    return replace(Variant.of(env), name=claim.name, fidelity=env.fidelities[claim.name])

@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 from ..envs.base import Environment, Fidelity
+from ..landscapes.measures.choice import CLAIMS, Claim
 from .variants import Variant
 
 STEPS, CELLS, PARTICLES, STIFFNESS = 1.5, 1.25, 2.0, 2.0  # ratios of one notch to the next
@@ -40,6 +41,16 @@ def fidelity_line(fidelity: Fidelity, name: str, control_step: float) -> str:
     words += [f"particles={fidelity.particles:_}"] if fidelity.particles else []
     words += [f'precision="{fidelity.precision}"'] if fidelity.precision != "float32" else []
     return f'"{name}": Fidelity({", ".join(words)}),'
+
+
+def named_variant(env: Environment, claim: Claim) -> Variant:
+    """Return the variant that bears a claim's name. Raises ValueError where there is none beside the reference."""
+    if claim.name not in env.fidelities or claim.name == env.fidelity.name:
+        raise ValueError(
+            f"a search of mixed variants is for scenes with {' and '.join(one.name for one in CLAIMS)} beside their "
+            f"reference; {env.name} has {', '.join(env.fidelities)}"
+        )
+    return replace(Variant.of(env), name=claim.name, fidelity=env.fidelities[claim.name])
 
 
 def _named(of: Variant, standard: Variant, fidelity: Fidelity, options: dict[str, Any]) -> Variant:
