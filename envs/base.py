@@ -60,6 +60,7 @@ class Environment(abc.ABC):
     control_step: ClassVar[float] = 0.0  # how long a control is held [s], in whole time steps; 0 where any step does
     known_failures: ClassVar[Mapping[str, Mapping[str, str]]] = {}  # fidelity -> check of `landscape check` -> reason
     contact_stiffness: ClassVar[str] = ""  # the option that says how stiff contact is, where it is by penalty
+    accuracy_options: ClassVar[Mapping[str, tuple[float, ...]]] = {}  # of the same scene, but nearer or cheaper: to try
     material_range: ClassVar[MaterialRange | None] = None  # where an option sets what the scene is made of
     model_parts: ClassVar[tuple[ModelPart, ...]] = ()  # what the model is made of, each with options that change it
 

@@ -70,8 +70,7 @@ class TradeoffJob:
         from ..landscapes.storage.checkpoint import Checkpoint
         from .variants import SETTINGS, refuse_single, variants
 
-        kind = environment_class(scene.name) if isinstance(scene.name, str) else scene.name
-        env = replace(scene, fidelity=list(kind.fidelities)[-1], tolerance=None).make()
+        env = reference_of(scene)
         refuse_single(env)
         require("points", points, lambda count: Need(8.0 * COPIES * (1 + env.space.dim) * count))
         found = variants(env, settings or SETTINGS)
@@ -192,13 +191,18 @@ class TradeoffJob:
         The one before must be gone by then: a solver takes what memory a GPU has, and a variant that got the rest would
         seem slow.
         """
+        return self._sample_at(variant, self.x, follow)
+
+    def _sample_at(
+        self, variant: Variant, x: Tensor, follow: Callable[[int], None], patience: float | None = None
+    ) -> Sample | None:
         from ..landscapes.measures.fidelity import measure
         from ..landscapes.sampling.memory import free_memory
 
         free_memory()
         for _, env in self._make([variant]):
             try:
-                return measure(env, self.x, follow=follow)
+                return measure(env, x, follow=follow, **({} if patience is None else {"patience": patience}))
             except RuntimeError as error:  # no room for it, or an engine that gives up
                 self.refused[variant.name] = " ".join(str(error).split())
         return None
@@ -250,3 +254,9 @@ class TradeoffJob:
 
         with resumable(self.say_kept):
             return save_prints(lambda width: found.plot(width), self.folder / PICTURE, self.prints)
+
+
+def reference_of(scene: SceneSpec) -> Environment:
+    """Make the reference of a scene: its last fidelity."""
+    kind = environment_class(scene.name) if isinstance(scene.name, str) else scene.name
+    return replace(scene, fidelity=list(kind.fidelities)[-1], tolerance=None).make()

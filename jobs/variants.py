@@ -43,8 +43,9 @@ class Variant:
         """
         settings: dict[str, Any] = {"engine": self.engine, "device": self.device, **self.options}
         env = make(scene, fidelity=self.fidelity, **settings)
-        if self.changed == "dt" and self.base is not None:
-            longer = _length(env) / _length(self.base.make(scene))
+        if self.base is not None and self.fidelity.dt != self.base.fidelity.dt:
+            steps = replace(self.fidelity, dt=self.base.fidelity.dt)
+            longer = _length(env) / _length(make(scene, fidelity=steps, **settings))
             if abs(longer - 1) > 1e-3:
                 raise ValueError(
                     f"{env.name} cuts an episode into whole steps; with dt {self.fidelity.dt:.4g} s it would be "

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ...jobs.scene import SceneSpec
 
@@ -18,7 +18,8 @@ class Study:
     """Say what to measure of which scene, where to keep it, and how to tell it.
 
     `variants` are settings that the ladder `fidelity` changes; the others take none. `prints` are widths of pages [mm],
-    `json` prints the record on standard output, `command` is how it is made again.
+    `json` prints the record on standard output, `command` is how it is made again. `limits` are those of a search that
+    were given, which the ladder `mixed` takes.
     """
 
     scene: SceneSpec
@@ -30,6 +31,7 @@ class Study:
     json: bool
     force: bool
     command: str
+    limits: Mapping[str, Any] = field(default_factory=dict)
 
 
 def percent(value: float | None) -> str:

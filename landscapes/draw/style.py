@@ -102,6 +102,7 @@ VARIANTS: dict[str, dict[str, Any]] = {  # which option was changed to make a va
     "stiffness": {"color": "#d55e00", "marker": "v"},
     "engine": {"color": "#8455c9", "marker": "P"},
     "device": {"color": "#7f7f7f", "marker": "X"},
+    "mixed": {"color": "#0072b2", "marker": "o", "markersize": 4.5},
     "named": {"color": INK, "marker": "*", "markersize": 13.0},
 }
 VARIANT_MARK: dict[str, Any] = {
@@ -117,6 +118,14 @@ EFFECTS: dict[str, dict[str, Any]] = {  # what a part of a model does, in the wo
 MISSING_MARK: dict[str, Any] = {"markerfacecolor": "white", "markeredgewidth": 1.3}  # of a part that is left out
 NOISE_LINE: dict[str, Any] = {"color": QUIET, "linewidth": 0.9, "linestyle": (0, (1, 1.5)), "zorder": 1}
 INTERVAL_LINE: dict[str, Any] = {"color": FAINT, "linewidth": 1.0, "zorder": 1.5, "solid_capstyle": "butt"}
+CHOSEN_MARK: dict[str, Any] = {  # a ring around a variant that a fidelity's name should mean
+    "linestyle": "none", "marker": "o", "markersize": 12.0, "markerfacecolor": "none", "markeredgewidth": 1.3,
+    "zorder": 4,
+}  # fmt: skip
+CHOSEN: dict[str, dict[str, Any]] = {
+    "draft": {"markeredgecolor": "#d55e00"},
+    "standard": {"markeredgecolor": "#b5367a"},
+}
 FRONT: dict[str, Any] = {"color": QUIET, "linewidth": 1.2, "zorder": 2}
 REFERENCE_LINE: dict[str, Any] = {"color": INK, "linewidth": 0.9, "linestyle": (0, (4, 2)), "zorder": 1}
 NAME_TEXT: dict[str, Any] = {"color": INK, "zorder": 6, "path_effects": [withStroke(linewidth=2.0, foreground="white")]}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -49,6 +49,21 @@ class Sample:
         plain: dict[str, Any] = {name: value if value.ndim else value.item() for name, value in arrays.items()}
         return cls(**plain)
 
+    def first(self, points: int) -> Sample:
+        """Return what it says at the first points."""
+        return replace(self, loss=self.loss[:points], grad=self.grad[:points], status=self.status[:points])
+
+    def join(self, more: Sample) -> Sample:
+        """Return it with further points of the same variant; seconds are the best of both."""
+        return Sample(
+            np.concatenate([self.loss, more.loss]),
+            np.concatenate([self.grad, more.grad]),
+            np.concatenate([self.status, more.status]),
+            min(self.forward, more.forward),
+            min(self.with_gradient, more.with_gradient),
+            max(self.batch, more.batch),
+        )
+
 
 @dataclass(frozen=True)
 class Bootstrap:
@@ -84,18 +99,24 @@ class Bootstrap:
 
 
 def measure(
-    objective: Objective, x: Float[Tensor, "point dim"], *, follow: Callable[[int], None] = lambda done: None
+    objective: Objective,
+    x: Float[Tensor, "point dim"],
+    *,
+    follow: Callable[[int], None] = lambda done: None,
+    patience: float | None = None,
 ) -> Sample:
     """Evaluate an objective at the points of a study, then time it; `follow` hears how many points are done.
 
-    Seconds are the best of repetitions, of batches as large as the objective prefers, or as patience allows.
+    Seconds are the best of repetitions, of batches as large as the objective prefers, or as patience allows: both take
+    at most `patience` [s] beyond one evaluation, where that is given.
     """
+    repetition, largest = (REPETITION, LARGEST) if patience is None else (patience, patience)
     at_once = getattr(objective, "preferred_batch", 1)
     full = min(at_once, len(x))
     getattr(objective, "prepare", lambda: None)()
     began = time.perf_counter()
     evaluate(objective, x[:1], grad=True)  # what is made at first use is made now, a batch's threads too if quick
-    if (time.perf_counter() - began) * full < REPETITION:
+    if (time.perf_counter() - began) * full < repetition:
         evaluate(objective, x[:full], grad=True)
     parts, seconds, done = [], [], 0
     for part in torch.split(x, at_once):
@@ -103,29 +124,33 @@ def measure(
         parts.append(evaluate(objective, part, grad=True))
         seconds.append(time.perf_counter() - began)
         follow(done := done + len(part))
-    batch = _repeat_points(objective, x, full, at_once, seconds[0])
+    batch = _repeat_points(objective, x, full, at_once, seconds[0], largest)
     taken = min(seconds[: len(x) // full]) if len(batch) == full else np.inf
-    forward = _best(objective, batch, grad=False, known=np.inf)
-    with_gradient = _best(objective, batch, grad=True, known=taken)
+    forward = _best(objective, batch, grad=False, known=np.inf, repetition=repetition)
+    with_gradient = _best(objective, batch, grad=True, known=taken, repetition=repetition)
     widths = objective.space.upper - objective.space.lower
     whole = Evaluation.join(parts, dim=objective.space.dim, grad=True)
     grad = cast("Tensor", whole.grad) * widths
     return Sample(whole.loss.numpy(), grad.numpy(), whole.status.numpy(), forward, with_gradient, len(batch))
 
 
-def _repeat_points(objective: Objective, x: Tensor, rows: int, at_once: int, took: float) -> Float[Tensor, "batch dim"]:
-    """Return the points repeated to as many as are worth evaluating at once, or to what takes `LARGEST` seconds."""
-    while rows < at_once and took * (more := min(4 * rows, at_once)) / rows < LARGEST:
+def _repeat_points(
+    objective: Objective, x: Tensor, rows: int, at_once: int, took: float, largest: float
+) -> Float[Tensor, "batch dim"]:
+    """Return the points repeated to as many as are worth evaluating at once, or to what takes `largest` seconds."""
+    while rows < at_once and took * (more := min(4 * rows, at_once)) / rows < largest:
         began = time.perf_counter()
         objective.evaluate(x.repeat(-(-more // len(x)), 1)[:more], grad=True)
         rows, took = more, time.perf_counter() - began
     return x.repeat(-(-rows // len(x)), 1)[:rows]
 
 
-def _best(objective: Objective, batch: Float[Tensor, "batch dim"], *, grad: bool, known: float) -> float:
+def _best(
+    objective: Objective, batch: Float[Tensor, "batch dim"], *, grad: bool, known: float, repetition: float
+) -> float:
     """Return seconds per episode, the least of repetitions; `known` is what the batch took before."""
     best, start = known, time.perf_counter()
-    while not np.isfinite(best) or time.perf_counter() - start + best < REPETITION:
+    while not np.isfinite(best) or time.perf_counter() - start + best < repetition:
         began = time.perf_counter()
         objective.evaluate(batch, grad=grad)
         best = min(best, time.perf_counter() - began)

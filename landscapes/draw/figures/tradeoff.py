@@ -24,26 +24,31 @@ ROOM = 1.6  # what the axes reach beyond the outermost variants, as a ratio
 Rows = Sequence[Mapping[str, Any]]
 
 
-def tradeoff_figure(report: Mapping[str, Any], *, width: float | None = None) -> page.Picture:
+def tradeoff_figure(
+    report: Mapping[str, Any], *, width: float | None = None, chosen: Mapping[str, str] | None = None
+) -> page.Picture:
     """Draw the 95th percentile of each variant's loss errors, with its interval, over the time of an episode.
 
     The reference is a line at its time: its own error is zero by definition. Variants without a finite percentile are
     on the upper edge and counted in the legend; those without any error are on the lower edge. The mark of a variant
     says which option was changed, its name from which fidelity and to what. Where there is little room a line leads to
-    the name, or the name is in the legend, by number.
+    the name, or the name is in the legend, by number. Of mixed variants only those on the front have names, and those
+    that are `chosen`, by the names of fidelities that should be theirs: these have a ring.
 
     Raises ValueError where the page is too narrow or too wide.
     """
     sheet = style.Sheet.of(width, pitch=PITCH)
     keyed: list[str] = []
     while True:
-        picture, left = _draw(report, sheet, keyed)
+        picture, left = _draw(report, sheet, keyed, chosen or {})
         if set(left) <= set(keyed):  # only among dozens of variants in one place a number finds no room
             return picture
         keyed += [name for name in left if name not in keyed]
 
 
-def _draw(report: Mapping[str, Any], sheet: style.Sheet, keyed: Sequence[str]) -> tuple[page.Picture, list[str]]:
+def _draw(
+    report: Mapping[str, Any], sheet: style.Sheet, keyed: Sequence[str], chosen: Mapping[str, str]
+) -> tuple[page.Picture, list[str]]:
     """Draw the picture, with the `keyed` variants named by number; return it and the names that found no room."""
     report, time = _add_times(report)
     relative = report["spread"] is not None
@@ -55,6 +60,7 @@ def _draw(report: Mapping[str, Any], sheet: style.Sheet, keyed: Sequence[str]) -
     low, high = _limits(ax, report, rows, relative)
     entries = _draw_front(ax, report, rows, relative)
     entries += _draw_variants(ax, rows, relative, low, high)
+    entries += _draw_chosen(ax, rows, chosen, relative, low, high)
     entries += [
         Line2D([], [], **sheet.look(style.INTERVAL_LINE), label="95 % interval"),
         _draw_reference(ax, report, time),
@@ -66,7 +72,7 @@ def _draw(report: Mapping[str, Any], sheet: style.Sheet, keyed: Sequence[str]) -
     _write_head(picture, ax, report)
     numbers = {name: str(number) for number, name in enumerate(keyed, start=1)}
     page.finish(picture, [*entries, *_number_entries(sheet, rows, numbers)], columns=3)
-    return picture, _name(ax, rows, numbers, relative, low, high)
+    return picture, _name(ax, _worth_naming(report, rows, chosen, relative), numbers, relative, low, high)
 
 
 def _limits(ax: Axes, report: Mapping[str, Any], rows: Rows, relative: bool) -> tuple[float, float]:
@@ -127,19 +133,41 @@ def _draw_variants(ax: Axes, rows: Rows, relative: bool, low: float, high: float
     return entries
 
 
+def _draw_chosen(
+    ax: Axes, rows: Rows, chosen: Mapping[str, str], relative: bool, low: float, high: float
+) -> list[Artist]:
+    """Draw a ring around each variant that a fidelity's name should mean."""
+    entries: list[Artist] = []
+    sheet = page.sheet_of(ax)
+    for name, variant in chosen.items():
+        row = next(row for row in rows if row["name"] == variant)
+        mark = sheet.look(style.CHOSEN_MARK | style.CHOSEN.get(name, {}))
+        ax.plot([row["time"]], [_error(row, relative, low, high)], **mark, gid=f"chosen-{name}", clip_on=False)
+        entries.append(Line2D([], [], **mark, label=f"chosen as {name}"))
+    return entries
+
+
+def _worth_naming(report: Mapping[str, Any], rows: Rows, chosen: Mapping[str, str], relative: bool) -> Rows:
+    """Return the variants that have a name in the picture: of dozens of mixed ones, the front's and the chosen."""
+    front = {rows[k]["name"] for k in _front(report, rows, relative)}
+    return [row for row in rows if row["ladder"] != "mixed" or row["name"] in front | set(chosen.values())]
+
+
+def _front(report: Mapping[str, Any], rows: Rows, relative: bool) -> list[int]:
+    """Return the numbers of those quicker than the reference that no other beats, the quickest first."""
+    end = _reference(report)["time"]
+    errors = [np.inf if (off := _ends(row, relative)["value"]) is None or row["time"] >= end else off for row in rows]
+    return pareto_front([row["time"] for row in rows], errors)
+
+
 def _draw_front(ax: Axes, report: Mapping[str, Any], rows: Rows, relative: bool) -> list[Artist]:
     """Draw the Pareto front as steps: the least error that is to be had for at most so much time."""
-    end = _reference(report)["time"]
-    seconds = [row["time"] for row in rows]
-    errors = [
-        np.inf if (off := _ends(row, relative)["value"]) is None or time >= end else off
-        for time, row in zip(seconds, rows, strict=True)
-    ]
-    best = pareto_front(seconds, errors)
+    best = [rows[k] for k in _front(report, rows, relative)]
     if not best:
         return []
     bottom = ax.get_ylim()[0]
-    x, y = [*(seconds[k] for k in best), end], [*(max(errors[k], bottom) for k in best), bottom]
+    x = [*(row["time"] for row in best), _reference(report)["time"]]
+    y = [*(_error(row, relative, bottom, bottom) for row in best), bottom]
     look = page.sheet_of(ax).look(style.FRONT)
     return list(ax.step(x, y, where="post", **look, label="front", gid="front"))
 
@@ -191,7 +219,7 @@ def _name(ax: Axes, rows: Rows, numbers: Mapping[str, str], relative: bool, low:
 def short_name(row: Mapping[str, Any]) -> str:
     """Return a variant's name without what its mark says: of standard-dt-x0.5, standard \N{MULTIPLICATION SIGN}0.5."""
     base, *turned = str(row["name"]).replace(" on ", "-").split("-")
-    if row["ladder"] == "named" or not turned:
+    if row["ladder"] in ("named", "mixed") or not turned:
         return str(row["name"])
     return f"{base} " + re.sub(r"^x(?=[\d.])", "\N{MULTIPLICATION SIGN}", turned[-1])
 

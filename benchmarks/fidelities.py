@@ -1,0 +1,191 @@
+"""Write the table of what every fidelity claims and keeps, from the trade-offs that the gallery keeps.
+
+    python -m benchmarks.fidelities [--check] [--keep-before]
+
+The table in docs/fidelities.md holds, for every scene, draft and standard before they were set by measurement and as
+they are now: rank correlation, median cosine of gradients and 95 % loss error against the reference, and milliseconds.
+"Before" is `benchmarks/data/fidelities-before.json`, which --keep-before writes from the trade-offs that lie in
+gallery/data/tradeoff at that moment; "now" are those that lie there. With --check nothing is written: exit code 1 says
+that the page differs, that a fidelity was changed since it was measured, or that one without an exception breaks its
+claim.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from gradscape.envs.registry import entries, environment_class
+from gradscape.landscapes.measures.choice import CLAIMS, Claim, Shortfall
+from gradscape.landscapes.measures.fidelity import Comparison
+
+ROOT = Path(__file__).parents[1]
+DATA, PAGE = ROOT / "gallery" / "data" / "tradeoff", ROOT / "docs" / "fidelities.md"
+BEFORE = ROOT / "benchmarks" / "data" / "fidelities-before.json"
+DEVICES = ("cuda", "cpu")  # a trade-off of the first is shown, where there is one
+MARKS = ("<!-- fidelities -->", "<!-- /fidelities -->")
+CHAOTIC: dict[str, str] = {}  # scenes whose motion is, and by which measurement: their gradients promise nothing
+HEAD = ("scene", "fidelity", "device", "rank", "cosine", "95 % error", "ms", "claim")
+
+
+@dataclass(frozen=True)
+class Row:
+    """Hold what was measured of a named fidelity of a scene: `settings` by name, and `measured` as files have it."""
+
+    scene: str
+    device: str
+    name: str
+    settings: dict[str, Any]
+    measured: dict[str, Any]
+
+    @property
+    def comparison(self) -> Comparison:
+        """What was measured, as a record."""
+        return Comparison.of_record(self.measured)
+
+    def shortfall(self, claim: Claim) -> Shortfall:
+        """Return how far it falls short of a claim."""
+        return Shortfall.of(self.comparison, claim, chaotic=self.scene in CHAOTIC)
+
+
+def scenes() -> list[str]:
+    """Return the registered scenes that have draft and standard, by name."""
+    wanted = {claim.name for claim in CLAIMS}
+    return [name for name in sorted(entries()) if wanted <= set(environment_class(name).fidelities)]
+
+
+def kept(folder: Path = DATA) -> list[Row]:
+    """Return what the trade-offs in a folder say of draft and standard, of one device for each scene."""
+    return [row for name in scenes() for row in _rows(name, folder)]
+
+
+def _rows(name: str, folder: Path) -> Iterator[Row]:
+    path = next((path for device in DEVICES if (path := folder / f"{name}-{device}.json").is_file()), None)
+    if path is None:
+        return
+    record = json.loads(path.read_text())
+    for claim in CLAIMS:
+        for one in record["rungs"]:
+            if one["name"] == claim.name:
+                measured = {key: one[key] for key in MEASURED}
+                yield Row(name, one["device"], claim.name, one["fidelity"], measured)
+
+
+MEASURED = ("loss_error", "spearman", "gradient", "diverged", "compared", "seconds", "batch")
+
+
+def before(path: Path = BEFORE) -> list[Row]:
+    """Return what the fidelities kept before they were set by measurement."""
+    return [Row(**one) for one in json.loads(path.read_text())]
+
+
+def keep_before(folder: Path = DATA, path: Path = BEFORE) -> None:
+    """Keep what the trade-offs say now as what was before."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps([asdict(row) for row in kept(folder)], indent=1) + "\n")
+
+
+def table(old: Sequence[Row], new: Sequence[Row]) -> str:
+    """Return the table in Markdown: a row for each fidelity, each number before and now where they differ."""
+    past = {(row.scene, row.name): row for row in old}
+    lines = [HEAD, ["---"] * len(HEAD)]
+    for scene in scenes():
+        for claim in CLAIMS:
+            now = next((row for row in new if (row.scene, row.name) == (scene, claim.name)), None)
+            lines.append(_line(scene, claim, past.get((scene, claim.name)), now))
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _line(scene: str, claim: Claim, was: Row | None, now: Row | None) -> list[str]:
+    if was is None and now is None:
+        return [f"`{scene}`", claim.name, "", *[""] * 4, "not measured"]
+    cells = [[] if row is None else _cells(row) for row in (was, now)]
+    devices = " → ".join(dict.fromkeys(row.device for row in (was, now) if row is not None))
+    joined = [
+        _change(*pair) for pair in zip(*(cell or cells[not number] for number, cell in enumerate(cells)), strict=True)
+    ]
+    verdict = _change(*(None if row is None else _verdict(row, claim) for row in (was, now)))
+    return [f"`{scene}`", claim.name, devices, *joined, verdict]
+
+
+def _cells(row: Row) -> list[str]:
+    found, error = row.comparison, row.comparison.loss_error.p95_relative.value
+    numbers = [
+        "none" if value is None else f"{value:.3f}" for value in (found.spearman.value, found.gradient.cosine.value)
+    ]
+    return [*numbers, "none" if error is None else _percent(error), f"{1e3 * found.seconds.with_gradient:.3g}"]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"
+
+
+def _verdict(row: Row, claim: Claim) -> str:
+    lack = row.shortfall(claim)
+    said = "kept" if lack.kept else f"short in {lack.by}"
+    return said + (", chaotic" if row.scene in CHAOTIC else "")
+
+
+def _change(was: str | None, now: str | None) -> str:
+    return " → ".join(dict.fromkeys(one for one in (was, now) if one is not None))
+
+
+def changed(rows: Sequence[Row]) -> list[str]:
+    """Name the fidelities that are no longer what was measured."""
+    return [
+        f"{row.scene} {row.name}"
+        for row in rows
+        if asdict(environment_class(row.scene).fidelities[row.name]) != row.settings
+    ]
+
+
+def short(rows: Sequence[Row]) -> list[str]:
+    """Say which fidelities break their claim, and in what."""
+    claims: Mapping[str, Claim] = {claim.name: claim for claim in CLAIMS}
+    found = [(row, row.shortfall(claims[row.name])) for row in rows]
+    return [
+        f"{row.scene} {row.name}: {lack.value:.3g} times what may lack in {lack.by}"
+        for row, lack in found
+        if not lack.kept
+    ]
+
+
+def written(page: Path = PAGE) -> str:
+    """Return the table that the page holds."""
+    begin, end = map(re.escape, MARKS)
+    (found,) = re.findall(rf"{begin}\n\n(.*?)\n\n{end}", page.read_text(), flags=re.DOTALL)
+    return str(found)
+
+
+def write(text: str, page: Path = PAGE) -> None:
+    """Put a table into the page, in the place of the one there."""
+    page.write_text(page.read_text().replace(written(page), text))
+
+
+def main() -> int:
+    """Write the page, or say what is not so."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing, say what is not so")
+    parser.add_argument("--keep-before", action="store_true", help="keep the present trade-offs as what was before")
+    asked = parser.parse_args()
+    if asked.keep_before:
+        keep_before()
+    rows = kept()
+    text = table(before(), rows)
+    if not asked.check:
+        write(text)
+    wrong = [f"{name}: changed since it was measured" for name in changed(rows)]
+    wrong += [f"{line}" for line in short(rows)]
+    wrong += [f"{PAGE}: differs from the records" for _ in range(written() != text)]
+    print("\n".join(wrong) or f"all {len(rows)} fidelities keep what they claim")
+    return 1 if wrong and asked.check else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

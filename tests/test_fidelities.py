@@ -1,0 +1,89 @@
+"""docs/fidelities.md holds what the kept trade-offs say of every named fidelity, and of the fidelities as they are."""
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from benchmarks import fidelities
+from benchmarks.fidelities import Row, changed, kept, short, table
+
+from gradscape.landscapes.measures.choice import CLAIMS
+
+
+def test_the_page_holds_the_records() -> None:
+    wanted = table(fidelities.before(), kept())
+    assert fidelities.written() == wanted, "`python -m benchmarks.fidelities` writes the page"
+
+
+def test_every_scene_was_measured_before_and_is_now() -> None:
+    pairs = {(scene, claim.name) for scene in fidelities.scenes() for claim in CLAIMS}
+    assert len(pairs) == 32
+    assert {(row.scene, row.name) for row in fidelities.before()} == pairs
+    assert {(row.scene, row.name) for row in kept()} == pairs
+
+
+def test_every_fidelity_is_what_was_measured() -> None:
+    assert changed(kept()) == [], "`landscape tradeoff` measures them, and the gallery keeps that"
+
+
+@pytest.fixture
+def records(tmp_path: Path) -> dict[str, Any]:
+    """Return the record of a scene whose fidelities keep their claims, which `save` puts into a folder."""
+    found: dict[str, Any] = json.loads((fidelities.DATA / "torus-cuda.json").read_text())
+    return found
+
+
+def save(folder: Path, record: dict[str, Any]) -> list[Row]:
+    (folder / "torus-cuda.json").write_text(json.dumps(record))
+    return kept(folder)
+
+
+def test_a_claim_that_breaks_is_named_with_what_it_lacks(records: dict[str, Any], tmp_path: Path) -> None:
+    assert short(save(tmp_path, records)) == []
+    for rung in records["rungs"]:
+        if rung["name"] == "standard":
+            rung["loss_error"]["p95_relative"]["value"] = 0.06
+    assert short(save(tmp_path, records)) == ["torus standard: 2 times what may lack in error"]
+
+
+def test_settings_other_than_the_scenes_are_named(records: dict[str, Any], tmp_path: Path) -> None:
+    rows = save(tmp_path, records)
+    other = copy.deepcopy(records)
+    for rung in other["rungs"]:
+        rung["fidelity"]["dt"] *= 2
+    assert changed(save(tmp_path, other)) == ["torus draft", "torus standard"]
+    assert len(rows) == 2
+
+
+def test_a_number_that_moved_is_shown_before_and_now(records: dict[str, Any], tmp_path: Path) -> None:
+    old = save(tmp_path, records)
+    for rung in records["rungs"]:
+        rung["gradient"]["cosine"]["value"] = 0.5
+    lines = [line for line in table(old, save(tmp_path, records)).splitlines() if line.startswith("| `torus` | draft")]
+    (line,) = lines
+    assert "→ 0.500" in line
+    assert line.endswith("| kept → short in cosine |")
+    assert "| `assembly` | draft |  |  |  |  |  | not measured |" in table([], [])
+
+
+def test_a_chaotic_scenes_gradients_promise_nothing(
+    records: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for rung in records["rungs"]:
+        rung["gradient"]["cosine"]["value"] = -0.5
+    assert len(short(save(tmp_path, records))) == 2
+    monkeypatch.setitem(fidelities.CHAOTIC, "torus", "measured")
+    assert short(save(tmp_path, records)) == []
+    assert "kept, chaotic" in table([], save(tmp_path, records))
+
+
+def test_the_page_is_checked_and_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(fidelities.PAGE.read_text().replace("| `torus` |", "| `taurus` |"))
+    monkeypatch.setattr(fidelities, "PAGE", page)
+    wanted = table(fidelities.before(), kept())
+    assert fidelities.written(page) != wanted
+    fidelities.write(wanted, page)
+    assert fidelities.written(page) == wanted
