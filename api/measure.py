@@ -1,8 +1,7 @@
-"""`gs.report`, `gs.check`, `gs.tradeoff`, `gs.pairs`: what a scene's landscape is like, and what may be asked of it."""
+"""`gs.report`, `gs.check`, `gs.pairs`: what a scene's landscape is like, and what may be asked of it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Unpack
 
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
     from ..jobs.pairs import PairRanking
     from ..jobs.report import ReportedSlice
     from ..jobs.report_record import Report
-    from ..landscapes.measures.tradeoff import Tradeoff
     from ..landscapes.slice import Slice
 
     Scene = str | type[Environment] | Environment | SceneSpec
@@ -67,37 +65,6 @@ def check(scene: Scene, *, points: int = 4, seed: int = 0, **keywords: Unpack[Sc
     spec = spec_of(scene, keywords).resolve(watch)
     command = say_call("check", scene, points=points, seed=seed, **keywords)
     return CheckJob.open(spec, points=points, seed=seed, command=command).run(watch)
-
-
-def tradeoff(
-    scene: Scene,
-    *,
-    points: int = 64,
-    seed: int = 0,
-    variants: Sequence[str] = (),
-    out: str | Path | None = None,
-    force: bool = False,
-    **keywords: Unpack[SceneKeywords],
-) -> Tradeoff:
-    """Measure accuracy against speed: the same points in several variants of a scene, each against the reference.
-
-    `variants` names what is changed beside the scene's fidelities: dt, resolution, particles, precision, stiffness,
-    engine, device; by default all that the scene has. The scene's own fidelity does not matter: its last one is the
-    reference. The study lies in `out`, by default a folder under out/ named after it: the same call goes on there. What
-    is found is also kept for `tolerance`. The record has `front`, `table()` and `plot()`.
-
-    Raises ValueError where the scene has one fidelity only, StoreMismatchError where the folder holds another study,
-    which `force` replaces; Stopped where it is interrupted.
-    """
-    from ..jobs.tolerance import keep
-    from ..jobs.tradeoff import TradeoffJob
-
-    command = say_call("tradeoff", scene, points=points, seed=seed, variants=tuple(variants), **keywords)
-    spec, folder = spec_of(scene, keywords), _path(out)
-    job = TradeoffJob.open(spec, points=points, seed=seed, settings=variants, out=folder, force=force, command=command)
-    found = job.run(default_watch())
-    keep(found)
-    return found
 
 
 def pairs(

@@ -134,7 +134,7 @@ HALF = (  # each with what is on disk when it is interrupted
     ("sweep", "levy --set dim=3 --dims 0 1 --over 2 --frames 3 --resolution 4 --device cpu", "frames/000.zarr"),
     ("race", "levy --methods random,descents --seeds 2 --budget 12 --device cpu", "random-0/run.zarr/loss/c"),
     ("pairs", "bounce --samples 96 --fidelity draft --device cpu", "pieces/*.npz"),
-    ("tradeoff", "bounce --points 2 --ladder precision --device cpu", "pieces/*.npz"),
+    ("tradeoff", "bounce --points 2 --variants precision --device cpu", "pieces/*.npz"),
 )  # fmt: skip
 
 
@@ -303,9 +303,19 @@ def _checks(chance: random.Random, count: int, _: Sequence[Command]) -> list[Com
 def _tradeoffs(chance: random.Random, count: int, _: Sequence[Command]) -> list[Command]:
     found = []
     for number in range(count):
-        name, ladder = (("bounce", "precision"), ("pinball-2", "dt"))[number % 2]
+        name, setting = (("bounce", "precision"), ("pinball-2", "dt"))[number % 2]
         seed = ("--seed", str(chance.randint(0, 9)))
-        words = ("tradeoff", name, "--points", str(chance.randint(2, 5)), "--ladder", ladder, *seed, "--device", "cpu")
+        words = (
+            "tradeoff",
+            name,
+            "--points",
+            str(chance.randint(2, 5)),
+            "--variants",
+            setting,
+            *seed,
+            "--device",
+            "cpu",
+        )
         found.append(Command(f"tradeoff-{number}-{name}", "tradeoff", words, (name,)))
     return found
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from ..envs.base import Environment, Fidelity
 from ..envs.registry import make
 
+FIDELITY = "fidelity"  # the ladder whose variants are fidelities and what is changed of them
 SETTINGS = ("dt", "resolution", "particles", "precision", "stiffness", "engine", "device")
 STEPS, CELLS, PARTICLES, STIFFNESSES = (0.5, 2.0, 4.0), (2 / 3, 1.5), (0.5, 2.0), (0.25, 0.5, 2.0, 4.0)
 SLOWER = 1.5  # times what float32 takes, float64 is expected to take
@@ -87,6 +88,18 @@ def refuse_single(env: Environment) -> None:
     """Raise ValueError for a scene that has one fidelity only: nothing of it can be traded."""
     if len(env.fidelities) < 2:
         raise ValueError(f"{env.name} has fidelity {', '.join(env.fidelities)} only; there is nothing to trade")
+
+
+def refuse_ladder(ladder: str, known: Collection[str], settings: Collection[str]) -> None:
+    """Raise ValueError for a ladder that there is not, and for settings to change beside one that changes none."""
+    if ladder not in known:
+        raise ValueError(
+            f"--ladder takes {', '.join(known)}; got {ladder!r}, so choose one (--variants says what varies)"
+        )
+    if settings and ladder != FIDELITY:
+        raise ValueError(
+            f"--variants goes with --ladder {FIDELITY}; got it with --ladder {ladder}, leave out one of them"
+        )
 
 
 def expected_work(env: Environment) -> float:

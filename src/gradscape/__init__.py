@@ -7,11 +7,12 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from .api.environments import list_envs
-    from .api.measure import check, pairs, report, tradeoff
+    from .api.measure import check, pairs, report
     from .api.overlay import overlay
     from .api.search import open_run, optimize, race
     from .api.slice import open_slice, slice
     from .api.sweep import sweep
+    from .api.tradeoff import tradeoff
     from .envs.base import Environment, Fidelity
     from .envs.registry import make, register
     from .jobs.scene import SceneSpec
@@ -55,7 +56,7 @@ _HOMES = {
     "sample": "landscapes.sampling.fill",
     "slice": "api.slice",
     "sweep": "api.sweep",
-    "tradeoff": "api.measure",
+    "tradeoff": "api.tradeoff",
 }
 
 __all__ = [
