@@ -12,6 +12,7 @@ from .scene import SceneKeywords, say_call, spec_of
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
+    from ..landscapes.measures.convergence_record import Convergence
     from ..landscapes.measures.tradeoff import Tradeoff
 
     Scene = str | type[Environment] | Environment | SceneSpec
@@ -29,6 +30,20 @@ def tradeoff(
     force: bool = False,
     **keywords: Unpack[SceneKeywords],
 ) -> Tradeoff: ...
+
+
+@overload
+def tradeoff(
+    scene: Scene,
+    *,
+    ladder: Literal["convergence"],
+    points: int = 64,
+    seed: int = 0,
+    variants: Sequence[str] = (),
+    out: str | Path | None = None,
+    force: bool = False,
+    **keywords: Unpack[SceneKeywords],
+) -> Convergence: ...
 
 
 @overload
@@ -62,6 +77,9 @@ def tradeoff(
     particles, precision, stiffness, engine, device, by default all that the scene has; its own fidelity does not
     matter, its last one is the reference, and what is found is also kept for `tolerance`.
 
+    "convergence": every knob of the reference refined, or those that `variants` names of dt, resolution, particles,
+    joint, precision, to see whether the reference is one; 16 points are enough.
+
     The study lies in `out`, by default a folder under out/ named after it: the same call goes on there. The record has
     a `table()` and a `plot()`, a trade-off of fidelities also its `front`.
 
@@ -72,7 +90,8 @@ def tradeoff(
     from ..jobs.variants import refuse_ladder
 
     refuse_ladder(ladder, LADDERS, variants)
-    chosen = {"ladder": ladder} if ladder != "fidelity" else {"variants": tuple(variants)}
+    chosen: dict[str, Any] = {"ladder": ladder} if ladder != "fidelity" else {}
+    chosen |= {"variants": tuple(variants)} if variants or not chosen else {}
     command = say_call("tradeoff", scene, points=points, seed=seed, **chosen, **keywords)
     how = {"points": points, "seed": seed, "out": Path(out) if out else None, "force": force, "command": command}
     return LADDERS[ladder](spec_of(scene, keywords), variants, how)
@@ -87,4 +106,16 @@ def _fidelity(spec: SceneSpec, variants: Sequence[str], how: dict[str, Any]) -> 
     return found
 
 
-LADDERS: dict[str, Callable[[SceneSpec, Sequence[str], dict[str, Any]], Any]] = {"fidelity": _fidelity}
+def _convergence(spec: SceneSpec, variants: Sequence[str], how: dict[str, Any]) -> Convergence:
+    from ..jobs.convergence import ConvergenceJob
+    from ..jobs.tolerance import keep_convergence
+
+    found = ConvergenceJob.open(spec, settings=variants, **how).run(default_watch())
+    keep_convergence(found)
+    return found
+
+
+LADDERS: dict[str, Callable[[SceneSpec, Sequence[str], dict[str, Any]], Any]] = {
+    "fidelity": _fidelity,
+    "convergence": _convergence,
+}

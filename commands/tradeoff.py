@@ -10,11 +10,12 @@ import typer
 
 from ..jobs.scene import SceneSpec
 from .arguments import ForceStudy, Json, OutOfStudy, Print, Seed, takes_scene
-from .ladders import fidelity
+from .ladders import convergence, fidelity
 from .ladders.study import Study
 
 LADDERS: dict[str, Callable[[Study], None]] = {
     "fidelity": fidelity.run,
+    "convergence": convergence.run,
 }
 
 
@@ -23,7 +24,10 @@ def tradeoff(
     scene: SceneSpec,
     ladder: Annotated[
         str,
-        typer.Option(help="What is measured: fidelity, how far off cheaper and dearer variants are."),
+        typer.Option(
+            help="What is measured: fidelity, how far off cheaper and dearer variants are; convergence, whether the "
+            "reference is one."
+        ),
     ] = "fidelity",
     points: Annotated[int, typer.Option(min=2, help="Sobol points at which everything is measured.")] = 64,
     seed: Seed = 0,
@@ -31,7 +35,8 @@ def tradeoff(
         list[str] | None,
         typer.Option(
             help="With --ladder fidelity: what to change beside the named fidelities, a,b or repeated: dt, resolution, "
-            "particles, precision, stiffness, engine, device; by default all that the scene has."
+            "particles, precision, stiffness, engine, device; with convergence what to refine: dt, resolution, "
+            "particles, joint, precision; by default all that the scene has."
         ),
     ] = None,
     out: OutOfStudy = None,
@@ -44,6 +49,9 @@ def tradeoff(
     With --ladder fidelity the variants are fidelities and what is changed of them; the folder then holds tradeoff.json
     and tradeoff.png, of which the former is also kept for --tolerance. Stop it at any moment: the same command goes on
     with the next variant.
+
+    With --ladder convergence every knob of the reference is refined, to say by which order losses converge, what is
+    left to win, and whether neighbours part so fast that nothing converges point by point; 16 points are enough.
 
     Example: landscape tradeoff bounce --variants dt,precision
     """

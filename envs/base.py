@@ -61,6 +61,7 @@ class Environment(abc.ABC):
     known_failures: ClassVar[Mapping[str, Mapping[str, str]]] = {}  # fidelity -> check of `landscape check` -> reason
     contact_stiffness: ClassVar[str] = ""  # the option that says how stiff contact is, where it is by penalty
     material_range: ClassVar[MaterialRange | None] = None  # where an option sets what the scene is made of
+    designed_order: ClassVar[Mapping[str, float]] = {}  # of convergence in dt, resolution, joint (both at once)
     model_parts: ClassVar[tuple[ModelPart, ...]] = ()  # what the model is made of, each with options that change it
 
     space: ParameterSpace

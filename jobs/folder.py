@@ -61,6 +61,7 @@ REPORT = Results(
 )
 REPORTS = Results("set of reports", ("report.json", "report.md"))
 TRADEOFF = Results("trade-off", ("tradeoff.json", "tradeoff.png"), "tradeoff.png")
+CONVERGENCE = Results("study of convergence", ("convergence.json", "convergence.png"), "convergence.png")
 PAIRS = Results("study of pairs", ("pairs.json",))
 
 

@@ -102,6 +102,7 @@ VARIANTS: dict[str, dict[str, Any]] = {  # which option was changed to make a va
     "stiffness": {"color": "#d55e00", "marker": "v"},
     "engine": {"color": "#8455c9", "marker": "P"},
     "device": {"color": "#7f7f7f", "marker": "X"},
+    "joint": {"color": "#b5367a", "marker": "h"},
     "named": {"color": INK, "marker": "*", "markersize": 13.0},
 }
 VARIANT_MARK: dict[str, Any] = {

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -22,7 +23,8 @@ from .fidelity import RESAMPLES, Bootstrap
 
 Array = NDArray[np.float64]
 Verdict = Literal["converges", "does not converge", "unmoved", "too few levels"]
-HIGHEST, LOWEST = 16.0, -8.0  # orders that are looked for
+HIGHEST, LOWEST, TINY = 16.0, -8.0, 1e-9  # orders that are looked for, and what counts as zero
+ROUNDS = 30  # of correcting an order for levels that are not equally far apart
 UNMOVED = 1e-9  # of the losses' spread: less than that is rounding
 FEWEST = 3  # points that an interval needs
 
@@ -55,24 +57,26 @@ class Order:
 
 
 def measure_order(widths: Sequence[float], losses: Array, *, scale: float, seed: int) -> Order:
-    """Measure the order of the finest three levels of `losses`, shape (level, point), NaN where a point failed.
+    """Measure the order of `losses`, shape (level, point), NaN where a point failed.
 
-    `scale` is what differences are shares of, the spread of the losses. Intervals are percentile bootstraps over the
+    Counted are the points that succeed in the finest three levels, and the levels at which these points all do. `scale` is what differences are shares of, the spread of the losses. Intervals are percentile bootstraps over the
     points. It converges where the whole interval is above zero; where all differences are rounding, it is unmoved.
 
     Raises ValueError where the widths do not fall from level to level.
     """
-    if any(fine >= coarse for coarse, fine in zip(widths[:-1], widths[1:], strict=True)) or min(widths) <= 0:
+    if any(fine >= coarse for coarse, fine in pairwise(widths)) or min(widths) <= 0:
         raise ValueError(f"levels come from coarse to fine, with positive widths; got {list(widths)}")
     losses = losses[:, np.isfinite(losses[-3:]).all(axis=0)]
+    first = next(k for k in range(len(losses)) if np.isfinite(losses[k:]).all())
+    widths, losses = widths[first:], losses[first:]
     moves = np.abs(np.diff(losses, axis=0))
     shapes = _count_shapes(np.diff(losses[-3:], axis=0)) if len(losses) > 2 else Shapes(0, 0, 0, 0)
     per_point = np.array([point_order(widths[-3:], one) for one in losses[-3:].T]) if len(losses) > 2 else np.empty(0)
-    if losses.shape[1] and (moves[-2:] <= UNMOVED * scale).all():
+    if losses.shape[1] and (moves <= UNMOVED * scale).all():
         return Order("unmoved", Bootstrap(None, None, None), per_point, shapes)
     if len(losses) < 3 or losses.shape[1] < FEWEST:
         return Order("too few levels", Bootstrap(None, None, None), per_point, shapes)
-    pooled = _bootstrap_order(widths[-3:], moves[-2:], seed)
+    pooled = _bootstrap_order(widths, moves, seed)
     converges = pooled.low is not None and pooled.low > 0
     return Order("converges" if converges else "does not converge", pooled, per_point, shapes)
 
@@ -98,6 +102,24 @@ def solve_order(widths: Sequence[float], coarse: float, fine: float) -> float:
     if excess(LOWEST) > 0:
         return LOWEST
     return HIGHEST if excess(HIGHEST) < 0 else float(brentq(excess, LOWEST, HIGHEST, xtol=1e-9))
+
+
+def fit_order(widths: Sequence[float], moves: Array) -> Array:
+    """Fit the order p of moves a (h_k^p - h_k+1^p), shape (move, *batch), by least squares of logarithms.
+
+    Where all levels are as far apart, that is the slope of the moves over the widths; elsewhere the slope is corrected
+    until it stays. NaN where a move is not positive. Two moves give the order of `solve_order`.
+    """
+    steps = np.log(np.asarray(widths[:-1]) / np.asarray(widths[1:]))
+    at = np.log(np.asarray(widths[:-1]))
+    at = (at - at.mean()).reshape(-1, *[1] * (moves.ndim - 1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        heights = np.log(np.where(moves > 0, moves, np.nan))
+    order = np.ones(moves.shape[1:])
+    for _ in range(ROUNDS):
+        slope = (at * (heights - _log_share(order, steps))).sum(axis=0) / (at**2).sum()
+        order = np.clip(slope, LOWEST, HIGHEST)
+    return order
 
 
 def extrapolate(widths: Sequence[float], losses: Array, order: float) -> Array:
@@ -135,6 +157,12 @@ def choose_order(order: Order, designed: float | None) -> float | None:
     return designed if designed is not None and found.low <= designed <= high else found.value
 
 
+def _log_share(order: Array, steps: Array) -> Array:
+    """Return log of (1 - r^-p) / p for each step log r between levels, shape (move, *batch)."""
+    exponent = steps.reshape(-1, *[1] * order.ndim) * np.where(np.abs(order) < TINY, TINY, order)
+    return np.asarray(np.log(-np.expm1(-exponent) / exponent) + np.log(steps).reshape(-1, *[1] * order.ndim))
+
+
 def _log_move(order: float, step: float) -> float:
     """Return the logarithm of |e^(p s) - 1| / |p|, which has a limit where the order p is zero."""
     if abs(order * step) < 1e-12:
@@ -143,11 +171,10 @@ def _log_move(order: float, step: float) -> float:
 
 
 def _bootstrap_order(widths: Sequence[float], moves: Array, seed: int) -> Bootstrap:
-    """Return the order of the medians, shape of `moves` (2, point), and of those of points drawn again."""
+    """Return the order of the medians of `moves`, shape (move, point), and of those of points drawn again."""
     rows = np.random.default_rng(seed).integers(moves.shape[1], size=(RESAMPLES, moves.shape[1]))
-    medians = np.median(moves[:, rows], axis=-1)
-    again = np.array([solve_order(widths, float(coarse), float(fine)) for coarse, fine in medians.T])
-    value = solve_order(widths, *map(float, np.median(moves, axis=-1)))
+    again = fit_order(widths, np.median(moves[:, rows], axis=-1))
+    value = float(fit_order(widths, np.median(moves, axis=-1)))
     if not np.isfinite(value) or np.isnan(again).mean() > 1 - CONFIDENCE:
         return Bootstrap(finite(value), None, None)
     ends = np.nanquantile(again, ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))

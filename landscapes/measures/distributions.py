@@ -111,7 +111,7 @@ def compare_distributions(
     )
 
 
-def distances(a: Array, b: Array, scale: float) -> Float[NDArray[np.float64], "2"]:
+def distances(a: Array, b: Array, scale: float) -> Float[NDArray[np.float64], " distance"]:
     """Return Kolmogorov's distance of two samples and Wasserstein's, the latter in units of `scale`.
 
     Episodes that failed are left out; both distances are NaN where all did.
