@@ -14,6 +14,7 @@ from pathlib import Path
 from ..jobs.folder import REPORT as REPORT_FILES
 from ..jobs.folder import SLICE as SLICE_FILES
 from ..jobs.folder import TRADEOFF as TRADEOFF_FILES
+from ..jobs.tolerance import CONVERGED
 
 HERE = Path(__file__).parent
 FIGURES, PAPER = HERE / "figures.toml", HERE / "paper.toml"
@@ -68,3 +69,9 @@ class TradeoffFiles:
     def there(self) -> bool:
         """Say whether both are there."""
         return self.record.exists() and self.picture.exists()
+
+    @property
+    def convergence(self) -> TradeoffFiles:
+        """The files of the study of convergence of the same scene, which may be missing."""
+        record = self.record.with_suffix(CONVERGED)
+        return TradeoffFiles(record, record.with_suffix(".png"))

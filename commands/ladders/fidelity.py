@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from .convergence import show_remainders
 from .study import Study, number, percent, share
 
 if TYPE_CHECKING:
@@ -34,7 +33,8 @@ def run(study: Study) -> None:
     console = Console(stderr=study.json)
     show(found, console)
     if converged := find_convergence(found):
-        show_remainders(converged, console)
+        for said in (converged.rule.say(), *converged.say_remainders()):
+            console.print(said)
     bars.note(f"{job.folder}: {', '.join(files)}; kept for --tolerance: {kept}")
     if study.json:
         print_json(found.record(), folder=str(job.folder))

@@ -26,6 +26,7 @@ Verdict = Literal["converges", "does not converge", "unmoved", "too few levels"]
 HIGHEST, LOWEST, TINY = 16.0, -8.0, 1e-9  # orders that are looked for, and what counts as zero
 ROUNDS = 30  # of correcting an order for levels that are not equally far apart
 UNMOVED = 1e-9  # of the losses' spread: less than that is rounding
+STALLED = 0.2  # what two refinements have to win, or differences have stopped to fall
 FEWEST = 3  # points that an interval needs
 
 
@@ -59,8 +60,9 @@ class Order:
 def measure_order(widths: Sequence[float], losses: Array, *, scale: float, seed: int) -> Order:
     """Measure the order of `losses`, shape (level, point), NaN where a point failed.
 
-    Counted are the points that succeed in the finest three levels, and the levels at which these points all do. `scale` is what differences are shares of, the spread of the losses. Intervals are percentile bootstraps over the
-    points. It converges where the whole interval is above zero; where all differences are rounding, it is unmoved.
+    Counted are the points that succeed in the finest three levels, and the levels at which these points all do. `scale`
+    is what differences are shares of, the spread of the losses. Intervals are percentile bootstraps over the points. It
+    converges where the whole interval is above zero; where all differences are rounding, it is unmoved.
 
     Raises ValueError where the widths do not fall from level to level.
     """
@@ -136,13 +138,13 @@ def extrapolate(widths: Sequence[float], losses: Array, order: float) -> Array:
 def find_floor(differences: Sequence[float | None], verdict: Verdict) -> float | None:
     """Return the size that differences from level to level do not fall below, None where they still fall.
 
-    It is the least of them, if a finer level does no better or if nothing converges.
+    It is the least of them, where nothing converges, or where the last two refinements together win less than a fifth.
     """
     known = [one for one in differences if one is not None]
     if not known or verdict == "too few levels":
         return None
-    least = min(known)
-    return None if verdict == "converges" and known[-1] == least else least
+    stalled = len(known) > 2 and known[-1] > known[-3] * (1 - STALLED)
+    return min(known) if stalled or verdict == "does not converge" else None
 
 
 def choose_order(order: Order, designed: float | None) -> float | None:

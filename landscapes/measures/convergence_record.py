@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ..plain import number, optional, text
 from .convergence import Shapes, Verdict
 from .distributions import Distributions
-from .divergence import Divergence
+from .divergence import Divergence, interval
 from .fidelity import Bootstrap
 from .tradeoff import RefusedVariant
 
@@ -100,6 +100,22 @@ class KnobConvergence:
             record["met"],
             optional(text, record["met_from"]),
         )
+
+    def say(self) -> str:
+        """Say by which order it converges, or that it does not."""
+        said = [f"{self.knob}: {self.verdict}"]
+        if self.order.value is not None:
+            count = self.shapes
+            said[0] += f", order {interval(self.order)}"
+            said.append(f"{count.monotone} points monotone, {count.oscillating} oscillating, {count.growing} growing")
+        if self.designed is not None:
+            match = {True: "as observed", False: "not as observed", None: "not held against it"}[self.as_designed]
+            said.insert(1, f"designed {self.designed:g}, {match}")
+        if self.floor is not None:
+            said.append(f"differences do not fall below {_percent(self.floor)}")
+        if self.met_from is not None:
+            said.append(f"within a tenth of standard's error from {self.met_from} on")
+        return "; ".join(said)
 
     @property
     def as_designed(self) -> bool | None:
@@ -223,6 +239,23 @@ class Convergence:
 
         rows = [_columns(knob, move) for knob in self.knobs for move in knob.moves]
         return pd.DataFrame(rows).set_index(["knob", "coarse", "fine"])
+
+    def sentences(self) -> list[str]:
+        """Say what was found: by which order each knob converges, whether the reference is one, what is left to win."""
+        said = [*(knob.say() for knob in self.knobs), self.rule.say(), *self.say_remainders()]
+        said += [self.divergence.say()] if self.divergence else []
+        return said + ([self.distributions.say()] if self.distributions else [])
+
+    def say_remainders(self) -> list[str]:
+        """Say how far named fidelities are from Richardson's limit, or which knobs have none."""
+        if not self.remainders:
+            without = [one.knob for one in self.knobs if one.verdict in ("does not converge", "too few levels")]
+            return [f"there is no limit to extrapolate to: {', '.join(without)} shows none"]
+        return [
+            f"{one.name} is {_percent(one.median.value)} (median) and {_percent(one.p95.value)} (95 % of points, "
+            f"{_percent(one.p95.low)} to {_percent(one.p95.high)}) from Richardson's limit"
+            for one in self.remainders
+        ]
 
     def plot(self, width: float | None = None) -> Picture:
         """Draw what refinement moves over the width of the levels, for a screen, or for a page so wide [mm]."""

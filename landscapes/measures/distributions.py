@@ -6,7 +6,7 @@ less.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from scipy.stats import ks_2samp, wasserstein_distance
 
-from ..plain import number, optional, text
+from ..plain import finite, number, optional, text
 from ..statistics import CONFIDENCE
 from .fidelity import Bootstrap
 
@@ -80,6 +80,15 @@ class Distributions:
             tuple(map(ComparedDistribution.of_record, record["compared"])),
         )
 
+    def say(self) -> str:
+        """Say which fidelities can be told from the reference."""
+        told = [f"{one.name} (by {' and '.join(one.told)})" for one in self.compared if one.told]
+        others = [one.name for one in self.compared if not one.told]
+        said = [f"over {self.neighbourhoods} neighbourhoods of {self.points} points the losses of"]
+        said += [", ".join(told), "are distributed otherwise than the reference's"] if told else []
+        said += [*(["and those of"] if told else []), ", ".join(others), "are not told from it"] if others else []
+        return " ".join(said)
+
 
 def compare_distributions(
     reference: tuple[Array, Array], others: Mapping[str, Array], *, scale: float, radius: float, seed: int
@@ -106,7 +115,7 @@ def compare_distributions(
         first.shape[1],
         radius,
         _sum_up(_distances(first, second, scale), seed),
-        {"kolmogorov": float(limit[0]), "wasserstein": float(limit[1])},
+        {"kolmogorov": finite(float(limit[0])), "wasserstein": finite(float(limit[1]))},
         tuple(compared),
     )
 
@@ -126,9 +135,10 @@ def _distances(a: Array, b: Array, scale: float) -> Array:
     return np.array([distances(one, other, scale) for one, other in zip(a, b, strict=True)])
 
 
-def _shuffle(a: Array, b: Array, generator: np.random.Generator) -> Sequence[Array]:
+def _shuffle(a: Array, b: Array, generator: np.random.Generator) -> tuple[Array, Array]:
     both = generator.permuted(np.concatenate([a, b], axis=1), axis=1)
-    return np.split(both, 2, axis=1)
+    first, second = np.split(both, [a.shape[1]], axis=1)
+    return first, second
 
 
 def _sum_up(apart: Array, seed: int) -> Distance:

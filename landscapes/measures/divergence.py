@@ -131,7 +131,23 @@ class Divergence:
         """Return it as plain JSON."""
         return asdict(self)
 
+    def say(self) -> str:
+        """Say how neighbours part."""
+        moved = "no perturbation up to a thousandth of the box moves"
+        if self.saturates_at is not None:
+            moved = f"a perturbation of {self.saturates_at:g} of the box moves"
+        return (
+            f"neighbours part at {interval(self.rate)} 1/s; {self.chaotic} of {self.points} points are chaotic; "
+            f"{moved} losses by a tenth of their spread"
+        )
+
     @property
     def is_chaos(self) -> bool:
         """Whether half of the points or more are chaotic: then a scene is judged by distributions."""
         return self.points > 0 and 2 * self.chaotic >= self.points
+
+
+def interval(found: Bootstrap) -> str:
+    """Write a number with the ends of its interval."""
+    value, low, high = ("?" if end is None else f"{end:z.3g}" for end in (found.value, found.low, found.high))
+    return f"{value} ({low} to {high})"

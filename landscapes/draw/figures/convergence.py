@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from .. import style
 from . import page, panel
@@ -30,9 +32,10 @@ WIDTHS = {
 def convergence_figure(found: Convergence, *, width: float | None = None) -> page.Picture:
     """Draw a panel for each knob, and one for distributions where there are any.
 
-    A mark is the median over the points of how far losses move from a level to the next finer one, a line above it
-    leads to the 95th percentile, both with intervals. Dashed is the designed order, through the finest median; dotted
-    the floor; grey what the rule allows, a tenth of standard's error. Precision has two levels only and no panel.
+    Marks are the median over the points of how far losses move from a level to the next finer one, and paler the 95th
+    percentile, both with intervals. Dashed is the slope of the designed order, shaded those that the interval of the
+    observed one holds; dotted the floor; grey what the rule allows, a tenth of standard's error. Precision has two
+    levels only and no panel.
 
     Raises ValueError where the page is too narrow or too wide.
     """
@@ -47,8 +50,7 @@ def convergence_figure(found: Convergence, *, width: float | None = None) -> pag
     if found.distributions:
         _draw_distributions(axes[-1], found, entries)
     page.entitle(picture, f"{found.env} · self-convergence · {found.points} points")
-    _remark(axes[0], found)
-    page.finish(picture, list(entries.values()), columns=3)
+    page.finish(picture, list(entries.values()), columns=3, heading=_provenance(found))
     return picture
 
 
@@ -96,15 +98,21 @@ def _limit(ax: Axes, knob: KnobConvergence) -> None:
 
 
 def _draw_design(ax: Axes, knob: KnobConvergence, entries: dict[str, Artist]) -> None:
-    """Draw the slope of the designed order through the finest median."""
-    last = knob.moves[-1]
-    if knob.designed is None or not last.median.value:
+    """Draw the slope of the designed order, and those within the interval of the observed one, through the medians."""
+    known = [(move.width, move.median.value) for move in knob.moves if move.median.value]
+    if not known:
         return
-    widths = [move.width for move in knob.moves]
-    values = [max(last.median.value, LEAST) * (width / last.width) ** knob.designed for width in widths]
-    look = page.sheet_of(ax).look({"color": style.INK, "linewidth": 0.9, "linestyle": (0, (5, 2)), "zorder": 1})
-    ax.plot(widths, values, **look, gid="design", scaley=False)
-    entries.setdefault("design", Line2D([], [], **look, label="designed order, through the finest median"))
+    widths, values = np.array(known).T
+    middle, height = np.exp(np.log(widths).mean()), np.exp(np.log(values).mean())
+    span = np.geomspace(*ax.get_xlim(), 32)
+    if knob.order.low is not None and knob.order.high is not None and knob.verdict == "converges":
+        edges = [height * (span / middle) ** order for order in (knob.order.low, knob.order.high)]
+        ax.fill_between(span, *edges, color=style.BAND[0], linewidth=0.0, zorder=0, gid="observed")
+        entries.setdefault("observed", Patch(color=style.BAND[0], label="observed order, 95 %"))
+    if knob.designed is not None:
+        look = page.sheet_of(ax).look({"color": style.INK, "linewidth": 0.9, "linestyle": (0, (5, 2)), "zorder": 1})
+        ax.plot(span, height * (span / middle) ** knob.designed, **look, gid="design", scaley=False, scalex=False)
+        entries.setdefault("design", Line2D([], [], **look, label="designed order"))
 
 
 def _draw_levels(ax: Axes, knob: KnobConvergence, found: Convergence, entries: dict[str, Artist]) -> None:
@@ -158,9 +166,7 @@ def _draw_distributions(ax: Axes, found: Convergence, entries: dict[str, Artist]
     panel.caption(ax, f"losses over {apart.neighbourhoods} neighbourhoods")
 
 
-def _remark(ax: Axes, found: Convergence) -> None:
-    """Add to the caption of the first panel who measured it, and how."""
+def _provenance(found: Convergence) -> str:
+    """Say who measured it, and how."""
     known = {**found.provenance, **found.identity}
-    said = [f"{known[key]}" for key in ("device", "created", "command") if known.get(key)]
-    picture = page.picture_of(ax)
-    picture.supxlabel(" · ".join(said), size=page.sheet_of(ax).small, color=style.QUIET, parse_math=False)
+    return " · ".join(f"{known[key]}" for key in ("device", "created", "command") if known.get(key))
