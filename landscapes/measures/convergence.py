@@ -120,7 +120,9 @@ def fit_order(widths: Sequence[float], moves: Array) -> Array:
     order = np.ones(moves.shape[1:])
     for _ in range(ROUNDS):
         slope = (at * (heights - _log_share(order, steps))).sum(axis=0) / (at**2).sum()
-        order = np.clip(slope, LOWEST, HIGHEST)
+        before, order = order, np.clip(slope, LOWEST, HIGHEST)
+        if np.nanmax(np.abs(order - before), initial=0.0) < TINY:
+            break
     return order
 
 

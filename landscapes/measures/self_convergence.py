@@ -118,7 +118,8 @@ def _move(ladder: Ladder, place: int, scale: Scale) -> Move:
     both = np.isfinite(coarse.loss) & np.isfinite(fine.loss)
     cosine, off = gradient_error(coarse.grad[both], fine.grad[both])
     known = [Bootstrap.of(_median, one, seed=scale.seed) for one in (cosine, off)]
-    errors = error(coarse.loss, fine.loss)
+    either = np.isfinite(coarse.loss) | np.isfinite(fine.loss)
+    errors = np.nan_to_num(np.abs(coarse.loss - fine.loss)[either], nan=np.inf)
     return Move(
         *(level.name for level in levels),
         levels[0].width,
@@ -173,9 +174,13 @@ def estimate_remainders(
 def _left(
     every: Sequence[_Correction], rows: NDArray[np.int64], losses: Array, reference: Array, scale: Scale
 ) -> list[Bootstrap]:
+    known: dict[bytes, Array] = {}  # both statistics are of the same draws
+
     def errors(drawn: NDArray[np.int64]) -> Array:
-        limit = reference[drawn] + sum(one.at(drawn, drawn) for one in every)
-        return np.nan_to_num(np.abs(losses[drawn] - limit), nan=np.inf)
+        if drawn.tobytes() not in known:
+            limit = reference[drawn] + sum(one.at(drawn, drawn) for one in every)
+            known[drawn.tobytes()] = np.nan_to_num(np.abs(losses[drawn] - limit), nan=np.inf)
+        return known[drawn.tobytes()]
 
     def of(statistic: Any) -> Any:
         return lambda drawn: np.apply_along_axis(lambda one: statistic(errors(one)), -1, drawn)
