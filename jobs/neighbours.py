@@ -181,7 +181,8 @@ def _rms(shift: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _directions(count: int, dim: int, *, seed: int) -> Float[Tensor, "count dim"]:
     turns = torch.randn(count, dim, dtype=torch.float64, generator=_generator(seed))
-    return turns / turns.norm(dim=1, keepdim=True)
+    unit: Tensor = turns / turns.norm(dim=1, keepdim=True)
+    return unit
 
 
 def _generator(seed: int) -> torch.Generator:

@@ -55,8 +55,16 @@ class Move:
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> Move:
         """Read it from plain JSON; raises TypeError and KeyError for what is none."""
-        found = [Bootstrap.of_record(record[name]) for name in ("median", "p95", "cosine", "relative_error")]
-        return cls(text(record["coarse"]), text(record["fine"]), number(record["width"]), *found, record["compared"])
+        return cls(
+            text(record["coarse"]),
+            text(record["fine"]),
+            number(record["width"]),
+            Bootstrap.of_record(record["median"]),
+            Bootstrap.of_record(record["p95"]),
+            Bootstrap.of_record(record["cosine"]),
+            Bootstrap.of_record(record["relative_error"]),
+            record["compared"],
+        )
 
 
 @dataclass(frozen=True)
@@ -104,6 +112,8 @@ class KnobConvergence:
     def say(self) -> str:
         """Say by which order it converges, or that it does not."""
         said = [f"{self.knob}: {self.verdict}"]
+        if self.verdict == "too few levels" and self.moves:
+            said.append(f"losses move by {_percent(self.moves[-1].p95.value)} (95 % of points) to the finest")
         if self.order.value is not None:
             count = self.shapes
             said[0] += f", order {interval(self.order)}"
@@ -249,8 +259,8 @@ class Convergence:
     def say_remainders(self) -> list[str]:
         """Say how far named fidelities are from Richardson's limit, or which knobs have none."""
         if not self.remainders:
-            without = [one.knob for one in self.knobs if one.verdict in ("does not converge", "too few levels")]
-            return [f"there is no limit to extrapolate to: {', '.join(without)} shows none"]
+            without = [one.knob for one in self.knobs if one.verdict == "does not converge"] or ["too few levels"]
+            return [f"there is no limit to extrapolate to, because of {', '.join(without)}"]
         return [
             f"{one.name} is {_percent(one.median.value)} (median) and {_percent(one.p95.value)} (95 % of points, "
             f"{_percent(one.p95.low)} to {_percent(one.p95.high)}) from Richardson's limit"

@@ -120,13 +120,9 @@ def _move(ladder: Ladder, place: int, scale: Scale) -> Move:
     known = [Bootstrap.of(_median, one, seed=scale.seed) for one in (cosine, off)]
     either = np.isfinite(coarse.loss) | np.isfinite(fine.loss)
     errors = np.nan_to_num(np.abs(coarse.loss - fine.loss)[either], nan=np.inf)
-    return Move(
-        *(level.name for level in levels),
-        levels[0].width,
-        *sum_up(errors, scale.spread, scale.seed),
-        *known,
-        int(both.sum()),
-    )
+    median, p95 = sum_up(errors, scale.spread, scale.seed)
+    names = levels[0].name, levels[1].name
+    return Move(*names, levels[0].width, median, p95, known[0], known[1], int(both.sum()))
 
 
 def judge(knobs: Sequence[KnobConvergence], scale: Scale) -> ConvergenceRule:
@@ -168,7 +164,8 @@ def estimate_remainders(
     every = [one for one in corrections if one is not None]
     rows = np.flatnonzero(np.isfinite(np.array([reference, *(one.ladder.losses[-1] for one in every)])).all(axis=0))
     rows = rows[np.isfinite(np.array([one.at(rows, rows) for one in every])).all(axis=0)]
-    return tuple(Remainder(name, *_left(every, rows, losses, reference, scale)) for name, losses in named.items())
+    left = {name: _left(every, rows, losses, reference, scale) for name, losses in named.items()}
+    return tuple(Remainder(name, median, p95) for name, (median, p95) in left.items())
 
 
 def _left(
@@ -185,7 +182,8 @@ def _left(
     def of(statistic: Any) -> Any:
         return lambda drawn: np.apply_along_axis(lambda one: statistic(errors(one)), -1, drawn)
 
-    return [Bootstrap.of(of(one), rows, seed=scale.seed).share(scale.spread) for one in (_median, _p95)]
+    places: Any = rows  # of points, drawn as samples are
+    return [Bootstrap.of(of(one), places, seed=scale.seed).share(scale.spread) for one in (_median, _p95)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -87,7 +87,7 @@ def measured(run: Command, folder: Path, scene: str) -> tuple[Convergence, Said]
 @pytest.mark.drawn
 def test_a_scene_of_second_order_converges_and_its_limit_is_the_bowl(run: Command, tmp_path: Path) -> None:
     found, done = measured(run, tmp_path, "second")
-    assert found.record() == {**read_json(tmp_path / "study/convergence.json")}
+    assert found == Convergence.of_record(read_json(tmp_path / "study/convergence.json"))
     assert (tmp_path / "study/convergence.png").read_bytes().startswith(b"\x89PNG")
     (knob,) = [one for one in found.knobs if one.knob == "dt"]
     assert knob.order.value == pytest.approx(2, abs=0.01)

@@ -151,9 +151,9 @@ def _draw_distributions(ax: Axes, found: Convergence, entries: dict[str, Artist]
     look = sheet.look(style.VARIANT_MARK | {"color": style.LOSS_LINE, "marker": "o"})
     for place, one in enumerate(apart.compared):
         distance = one.distance.wasserstein
-        ends = [end if end is not None else distance.value for end in (distance.low, distance.high)]
         if distance.value is None:
             continue
+        ends = [distance.value if end is None else end for end in (distance.low, distance.high)]
         ax.plot(ends, [place, place], **sheet.look(style.INTERVAL_LINE), gid="interval")
         ax.plot([distance.value], [place], **look, gid="distance")
     if limit := apart.noise_limit["wasserstein"]:

@@ -100,7 +100,12 @@ def test_words_are_beside_the_papers_and_a_trade_off_is_ranked(site: Path) -> No
     trade, another = full["tradeoffs"]
     assert (trade["device"], another["device"]) == ("cuda", "cpu")
     files = {path.name for path in (site / "tradeoff").iterdir()}
-    assert files == {f"fluid-{device}{kind}" for device in ("cuda", "cpu") for kind in (".json", ".png", "-dark.png")}
+    studies = ("fluid-cuda", "fluid-cpu", "fluid-cuda.convergence")
+    assert files == {f"{study}{kind}" for study in studies for kind in (".json", ".png", "-dark.png")}
+    said = "the reference is not converged: refining its dt moves it by 4 % where standard is off by 10 %"
+    assert trade["convergence"]["says"][0].startswith(said)
+    assert said in " ".join((site / "full/index.html").read_text().split())
+    assert another["convergence"] is None
     assert [(row["name"], row["front"]) for row in trade["rungs"]] == [
         ("coarse", False), ("draft", True), ("standard", True), ("slow", False), ("reference", False)
     ]  # fmt: skip
