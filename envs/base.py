@@ -62,6 +62,7 @@ class Environment(abc.ABC):
     contact_stiffness: ClassVar[str] = ""  # the option that says how stiff contact is, where it is by penalty
     accuracy_options: ClassVar[Mapping[str, tuple[float, ...]]] = {}  # of the same scene, but nearer or cheaper: to try
     material_range: ClassVar[MaterialRange | None] = None  # where an option sets what the scene is made of
+    designed_order: ClassVar[Mapping[str, float]] = {}  # of convergence in dt, resolution, joint (both at once)
     model_parts: ClassVar[tuple[ModelPart, ...]] = ()  # what the model is made of, each with options that change it
 
     space: ParameterSpace

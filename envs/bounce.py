@@ -66,6 +66,7 @@ class Bounce(Environment):
     }
     loss_unit: ClassVar[str] = "m²"
     contact_stiffness: ClassVar[str] = "ke"
+    designed_order: ClassVar[dict[str, float]] = {"dt": 1.0}  # semi-implicit Euler
     material_range: ClassVar[MaterialRange] = MaterialRange("ke", 1e3, 1e5)  # a tenth and ten times the default
     Options: ClassVar[type[Any]] = BounceOptions
     examples: ClassVar[dict[str, tuple[float, ...]]] = {"aim": (6.12, -9.68, 0.0)}

@@ -75,6 +75,7 @@ class Cartpole(Environment):
     loss_unit: ClassVar[str] = "m"
     decisions: ClassVar[int] = CONTROLS
     control_step: ClassVar[float] = SPAN
+    designed_order: ClassVar[dict[str, float]] = {"dt": 4.0}  # classical Runge-Kutta; controls change between steps
     Options: ClassVar[type[Any]] = CartpoleOptions
     examples: ClassVar[dict[str, tuple[float, ...]]] = {
         "upright": tuple(float(np.interp(k, KNOTS, values)) for k in range(CONTROLS) for values in UPRIGHT)

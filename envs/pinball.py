@@ -71,6 +71,7 @@ class Pinball(Environment):
         "reference": Fidelity("reference", dt=1 / 1920, precision="float64"),
     }
     loss_unit: ClassVar[str] = "m"
+    designed_order: ClassVar[dict[str, float]] = {"dt": 2.0}  # chords of a parabola
     material_range: ClassVar[MaterialRange] = MaterialRange("restitution", 0.0, 1.0)
     Options: ClassVar[type[Any]] = PinballOptions
     pivots: ClassVar[tuple[tuple[float, float], ...]]

@@ -14,6 +14,7 @@ from pathlib import Path
 from ..jobs.folder import REPORT as REPORT_FILES
 from ..jobs.folder import SLICE as SLICE_FILES
 from ..jobs.folder import TRADEOFF as TRADEOFF_FILES
+from ..jobs.tolerance import CONVERGED
 
 HERE = Path(__file__).parent
 FIGURES, PAPER = HERE / "figures.toml", HERE / "paper.toml"
@@ -68,8 +69,14 @@ class TradeoffFiles:
     @classmethod
     def of_model(cls, root: Path, env: str, device: str) -> TradeoffFiles:
         """Return where the study of the parts of an environment's model is, beside its trade-off."""
-        return cls.of(root, env, f"{device}-model")
+        return cls.of(root, env, f"{device}.model")
 
     def there(self) -> bool:
         """Say whether both are there."""
         return self.record.exists() and self.picture.exists()
+
+    @property
+    def convergence(self) -> TradeoffFiles:
+        """The files of the study of convergence of the same scene, which may be missing."""
+        record = self.record.with_suffix(CONVERGED)
+        return TradeoffFiles(record, record.with_suffix(".png"))

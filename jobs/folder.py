@@ -63,6 +63,7 @@ REPORTS = Results("set of reports", ("report.json", "report.md"))
 TRADEOFF = Results("trade-off", ("tradeoff.json", "tradeoff.png"), "tradeoff.png")
 MODEL = Results("model study", ("model.json", "model.png"), "model.png")
 MIXED = Results("search of mixed variants", ("mixed.json", "mixed.png"), "mixed.png")
+CONVERGENCE = Results("study of convergence", ("convergence.json", "convergence.png"), "convergence.png")
 PAIRS = Results("study of pairs", ("pairs.json",))
 
 

@@ -18,10 +18,12 @@ from .variants import expected_work
 
 if TYPE_CHECKING:
     from ..envs.base import Environment, Fidelity
+    from ..landscapes.measures.convergence_record import Convergence
     from ..landscapes.measures.tradeoff import MeasuredVariant, Tradeoff
     from .scene import SceneSpec
     from .watch import Watch
 
+CONVERGED = ".convergence.json"  # how the file of a study of convergence ends, beside the trade-off's
 FARTHER = 2.0  # times the least expected work, beyond which a variant is no candidate
 ENOUGH, SHORTEST = 1e6, 0.05  # work of an episode that is timed, if it can be shortened so far; least share of it
 
@@ -33,6 +35,38 @@ def keep(found: Tradeoff) -> Path:
     path = _place(found.env, found.identity["options"], found.identity["device"])
     write_record(path, found.record())
     return path
+
+
+def keep_convergence(found: Convergence) -> Path:
+    """Keep a study of convergence beside the trade-off of the same scene, in the place of an earlier one."""
+    from ..landscapes.storage.records import write_record
+
+    path = _place(found.env, found.identity["options"], found.identity["device"]).with_suffix(CONVERGED)
+    write_record(path, found.record())
+    return path
+
+
+def find_convergence(found: Tradeoff) -> Convergence | None:
+    """Return the study of convergence that is kept of a trade-off's scene, None where none is of the same code.
+
+    Looks among the user's own studies, then in the gallery's; raises DamagedError where one cannot be read.
+    """
+    from ..landscapes.measures.convergence_record import Convergence
+    from ..landscapes.storage.records import read_json, reading
+
+    about = found.identity
+    devices = (about["device"], *({"cpu", "cuda"} - {about["device"]}))
+    places = [_place(found.env, about["options"], where) for where in devices]
+    gallery = Path(str(resources.files("gradscape.gallery"))) / "data" / "tradeoff"
+    for path in (*places, *(gallery / f"{found.env}-{where}.json" for where in devices)):
+        if (file := path.with_suffix(CONVERGED)).is_file():
+            with reading(
+                file, f"delete it, and `landscape tradeoff {found.env} --ladder convergence` measures it anew"
+            ):
+                study = Convergence.of_record(read_json(file))
+            if all(study.identity[key] == about[key] for key in ("code", "engine", "options")):
+                return study
+    return None
 
 
 def choose_fidelity(spec: SceneSpec, watch: Watch) -> Fidelity:

@@ -11,6 +11,7 @@ from ..envs.base import Environment, Fidelity
 from ..envs.registry import make
 
 FIDELITY = "fidelity"  # the ladder whose variants are fidelities and what is changed of them
+CHANGING = (FIDELITY, "convergence")  # the ladders that are told what to change
 SETTINGS = ("dt", "resolution", "particles", "precision", "stiffness", "engine", "device")
 STEPS, CELLS, PARTICLES, STIFFNESSES = (0.5, 2.0, 4.0), (2 / 3, 1.5), (0.5, 2.0), (0.25, 0.5, 2.0, 4.0)
 SLOWER = 1.5  # times what float32 takes, float64 is expected to take
@@ -97,9 +98,10 @@ def refuse_ladder(ladder: str, known: Collection[str], settings: Collection[str]
         raise ValueError(
             f"--ladder takes {', '.join(known)}; got {ladder!r}, so choose one (--variants says what varies)"
         )
-    if settings and ladder != FIDELITY:
+    if settings and ladder not in CHANGING:
         raise ValueError(
-            f"--variants goes with --ladder {FIDELITY}; got it with --ladder {ladder}, leave out one of them"
+            f"--variants goes with --ladder {' and '.join(CHANGING)}; got it with --ladder {ladder}, leave out one of "
+            "them"
         )
 
 

@@ -16,7 +16,7 @@ def run(study: Study) -> None:
 
     Raises ValueError where the scene is to be at a fidelity.
     """
-    from ...jobs.tolerance import keep
+    from ...jobs.tolerance import find_convergence, keep
     from ...jobs.tradeoff import PICTURE, RECORD, TradeoffJob
     from ..terminal import Bars, Console, print_json
 
@@ -30,7 +30,11 @@ def run(study: Study) -> None:
     bars, job = Bars(), TradeoffJob.open(study.scene, **how)
     found = job.run(bars)
     files, kept = [PICTURE, *job.print(found), RECORD], keep(found)
-    show(found, Console(stderr=study.json))
+    console = Console(stderr=study.json)
+    show(found, console)
+    if converged := find_convergence(found):
+        for said in (converged.rule.say(), *converged.say_remainders()):
+            console.print(said)
     bars.note(f"{job.folder}: {', '.join(files)}; kept for --tolerance: {kept}")
     if study.json:
         print_json(found.record(), folder=str(job.folder))

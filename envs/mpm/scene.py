@@ -36,6 +36,7 @@ class MpmScene(Environment):  # noqa: D101 -- `about` prints the docstrings of a
     beyond_box: ClassVar[bool] = True
     engines: ClassVar[tuple[str, ...]] = ("warp", "taichi")
     decisions: ClassVar[int] = SEGMENTS
+    designed_order: ClassVar[dict[str, float]] = {"dt": 1.0, "resolution": 2.0, "joint": 1.0}  # Euler; splines
     model: Model
     _solvers: Pool[Any]
 

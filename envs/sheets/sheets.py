@@ -50,6 +50,7 @@ class SheetScene(Environment):
     beyond_box: ClassVar[bool] = True
     engines: ClassVar[tuple[str, ...]] = ("warp", "taichi")
     loss_unit: ClassVar[str] = "m"
+    designed_order: ClassVar[dict[str, float]] = {"dt": 1.0, "resolution": 2.0, "joint": 1.0}  # Euler; springs
     Options: ClassVar[type[Any]] = EpisodeOptions
     duration: ClassVar[float]  # of an episode of horizon 1 [s]
     surface: ClassVar[Surface]

@@ -192,6 +192,18 @@ class Rung:
 
 
 @dataclass(frozen=True)
+class ConvergenceEntry:
+    """What `landscape tradeoff --ladder convergence` found, in sentences; `alt` says what its picture shows."""
+
+    says: Sequence[str]
+    converged: bool | None
+    command: str
+    picture: str
+    file: str
+    alt: str
+
+
+@dataclass(frozen=True)
 class TradeoffEntry:
     """What `landscape tradeoff` found of an environment on a device; `alt` says what its picture shows."""
 
@@ -208,6 +220,7 @@ class TradeoffEntry:
     file: str
     alt: str
     rungs: Sequence[Rung]
+    convergence: ConvergenceEntry | None
 
 
 @dataclass(frozen=True)

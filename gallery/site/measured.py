@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from ...landscapes.measures.classify import WORDS
+from ...landscapes.measures.convergence_record import Convergence
 from ...landscapes.measures.fidelity import cheapest, p95, pareto_front
 from ...landscapes.plain import number, optional, text
 from ...landscapes.storage.records import read_json, reading
 from ..files import DEVICES, REMAKE, REPORT, TRADEOFFS, TradeoffFiles
-from .manifest import Interval, ReportEntry, Rung, SecondsEntry, TradeoffEntry, Word
+from .manifest import ConvergenceEntry, Interval, ReportEntry, Rung, SecondsEntry, TradeoffEntry, Word
 
 Record = Mapping[str, Any]
 TOLERANCE = 0.05  # of the loss error that a picture's description names the quickest rung for
@@ -87,15 +88,38 @@ def place_tradeoffs(data: Path, out: Path, envs: Sequence[str]) -> dict[str, lis
         if not source.there():
             continue
         with reading(source.record, REMAKE.format("tradeoffs")):
-            placed.setdefault(env, []).append(_tradeoff(read_json(source.record), target))
+            record = read_json(source.record)
+            study = _read_convergence(source.convergence, record)
+            placed.setdefault(env, []).append(_tradeoff(record, target, study))
         target.record.parent.mkdir(exist_ok=True)
-        shutil.copyfile(source.record, target.record)
-        shutil.copyfile(source.picture, target.picture)
-        save_dark(source.picture, target.picture.with_name(dark_name(target.picture.name)))
+        for one, there in ((source, target), (source.convergence, target.convergence)):
+            if one.there():
+                shutil.copyfile(one.record, there.record)
+                shutil.copyfile(one.picture, there.picture)
+                save_dark(one.picture, there.picture.with_name(dark_name(there.picture.name)))
     return placed
 
 
-def _tradeoff(record: Record, files: TradeoffFiles) -> TradeoffEntry:
+def _read_convergence(files: TradeoffFiles, record: Record) -> ConvergenceEntry | None:
+    """Return what a study of convergence says, None where there is none of the code that the trade-off is of."""
+    if not files.there():
+        return None
+    with reading(files.record, "delete it, and `landscape tradeoff ENV --ladder convergence` makes it anew"):
+        found = Convergence.of_record(read_json(files.record))
+    if found.identity["code"] != record["identity"].get("code"):
+        return None
+    knobs = ", ".join(knob.knob for knob in found.knobs)
+    return ConvergenceEntry(
+        says=found.sentences(),
+        converged=found.rule.met,
+        command=found.command,
+        picture=f"{TRADEOFFS}/{files.picture.name}",
+        file=f"{TRADEOFFS}/{files.record.name}",
+        alt=f"How far losses of {found.env} move as {knobs} are refined: {found.rule.say()}",
+    )
+
+
+def _tradeoff(record: Record, files: TradeoffFiles, study: ConvergenceEntry | None) -> TradeoffEntry:
     rows = sorted(record["rungs"], key=_time)
     reference = next(row for row in rows if row["name"] == record["reference"])
     quicker = [row for row in rows if _time(row) < _time(reference)]
@@ -112,6 +136,7 @@ def _tradeoff(record: Record, files: TradeoffFiles) -> TradeoffEntry:
         file=f"{TRADEOFFS}/{files.record.name}",
         alt=_describe_accuracy(record, reference),
         rungs=[_rung(row, record, best) for row in rows],
+        convergence=study,
     )
 
 

@@ -103,6 +103,7 @@ VARIANTS: dict[str, dict[str, Any]] = {  # which option was changed to make a va
     "engine": {"color": "#8455c9", "marker": "P"},
     "device": {"color": "#7f7f7f", "marker": "X"},
     "mixed": {"color": "#0072b2", "marker": "o", "markersize": 4.5},
+    "joint": {"color": "#b5367a", "marker": "h"},
     "named": {"color": INK, "marker": "*", "markersize": 13.0},
 }
 VARIANT_MARK: dict[str, Any] = {

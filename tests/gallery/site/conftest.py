@@ -78,11 +78,22 @@ def rung(name: str, ladder: str, milliseconds: float, error: float | None) -> di
 
 TRADEOFF = {
     "env": "fluid", "reference": "reference", "points": 64, "spread": 2.0, "loss_unit": "J", "refused": [],
-    "command": "landscape tradeoff fluid", "identity": {"options": {"goal": "high"}, "device": "cuda"},
+    "command": "landscape tradeoff fluid",
+    "identity": {"options": {"goal": "high"}, "device": "cuda", "code": "c0de"},
     "rungs": [
         rung("reference", "named", 400, 0), rung("draft", "named", 4, 9), rung("coarse", "dt", 2, None),
         rung("standard", "named", 40, 3), rung("slow", "dt", 50, 4),
     ],
+}  # fmt: skip
+
+
+KNOWN = {"value": 0.04, "low": 0.03, "high": 0.05}
+CONVERGENCE = {
+    "env": "fluid", "reference": "reference", "points": 16, "seed": 0, "loss_unit": "J", "spread": 2.0, "knobs": [],
+    "rule": {"off": {**KNOWN, "value": 0.1}, "moved": KNOWN, "knob": "dt", "met": False, "failing": ["dt"]},
+    "remainders": [{"name": "standard", "median": KNOWN, "p95": KNOWN}], "divergence": None, "distributions": None,
+    "refused": [], "identity": {"code": "c0de", "engine": "warp", "device": "cuda"}, "provenance": {},
+    "command": "landscape tradeoff fluid --ladder convergence",
 }  # fmt: skip
 
 
@@ -151,8 +162,10 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
         identity = {**TRADEOFF["identity"], "device": device}
         (folder / f"tradeoff/fluid-{device}.json").write_text(json.dumps({**TRADEOFF, "identity": identity}))
         picture(folder / f"tradeoff/fluid-{device}.png")
-    (folder / "tradeoff/fluid-cuda-model.json").write_text(json.dumps(study({"drag": 1.0, "wall": 0.2}).record()))
-    picture(folder / "tradeoff/fluid-cuda-model.png")
+    (folder / "tradeoff/fluid-cuda.model.json").write_text(json.dumps(study({"drag": 1.0, "wall": 0.2}).record()))
+    picture(folder / "tradeoff/fluid-cuda.model.png")
+    (folder / "tradeoff/fluid-cuda.convergence.json").write_text(json.dumps(CONVERGENCE))
+    picture(folder / "tradeoff/fluid-cuda.convergence.png")
     for name in ("episode-6-5", "episode-11-11", "sweep"):
         film(full / name)
     (full / "episode-11-11.mp4").unlink()

@@ -89,7 +89,7 @@ def test_a_page_shows_what_each_part_of_the_model_is_for(site: Path) -> None:
     bare, full = json.loads((site / "manifest.json").read_text())["figures"][1:]
     assert bare["models"] == []
     (study,) = full["models"]
-    assert (study["device"], study["fidelity"], study["file"]) == ("cuda", "draft", "tradeoff/fluid-cuda-model.json")
+    assert (study["device"], study["fidelity"], study["file"]) == ("cuda", "draft", "tradeoff/fluid-cuda.model.json")
     assert [(row["name"], row["missing"]) for row in study["parts"]] == [("drag", False), ("wall", True)]
     drag = study["parts"][0]
     assert drag["error"]["value"] == pytest.approx(1 / study["spread"])
@@ -114,8 +114,12 @@ def test_words_are_beside_the_papers_and_a_trade_off_is_ranked(site: Path) -> No
     trade, another = full["tradeoffs"]
     assert (trade["device"], another["device"]) == ("cuda", "cpu")
     files = {path.name for path in (site / "tradeoff").iterdir()}
-    names = ("fluid-cuda", "fluid-cpu", "fluid-cuda-model")
-    assert files == {f"{name}{kind}" for name in names for kind in (".json", ".png", "-dark.png")}
+    studies = ("fluid-cuda", "fluid-cpu", "fluid-cuda.model", "fluid-cuda.convergence")
+    assert files == {f"{study}{kind}" for study in studies for kind in (".json", ".png", "-dark.png")}
+    said = "the reference is not converged: refining its dt moves it by 4 % where standard is off by 10 %"
+    assert trade["convergence"]["says"][0].startswith(said)
+    assert said in " ".join((site / "full/index.html").read_text().split())
+    assert another["convergence"] is None
     assert [(row["name"], row["front"]) for row in trade["rungs"]] == [
         ("coarse", False), ("draft", True), ("standard", True), ("slow", False), ("reference", False)
     ]  # fmt: skip

@@ -1,0 +1,172 @@
+"""Self-convergence: how far losses move from level to level, over the width of the levels (matplotlib)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from .. import style
+from . import page, panel
+
+if TYPE_CHECKING:
+    from ...measures.convergence_record import Convergence, KnobConvergence, Move
+    from ...measures.fidelity import Bootstrap
+
+PITCH, SHAPE = 5.2, 0.8  # room of a panel on a screen [inch]; its height, against its width
+ROOM = 1.8  # what the axes reach beyond the marks, as a ratio
+LEAST = 1e-16  # of the spread: what is drawn on the lower edge of rounding
+WIDTHS = {
+    "dt": "time step [s]",
+    "resolution": "width of a cell, against the reference's",
+    "particles": "distance of particles, against the reference's",
+    "joint": "width of a cell, against the reference's; step in proportion",
+}
+
+
+def convergence_figure(found: Convergence, *, width: float | None = None) -> page.Picture:
+    """Draw a panel for each knob, and one for distributions where there are any.
+
+    Marks are the median over the points of how far losses move from a level to the next finer one, and paler the 95th
+    percentile, both with intervals. Dashed is the slope of the designed order, shaded those that the interval of the
+    observed one holds; dotted the floor; grey what the rule allows, a tenth of standard's error. Precision has two
+    levels only and no panel.
+
+    Raises ValueError where the page is too narrow or too wide.
+    """
+    knobs = [knob for knob in found.knobs if knob.knob in WIDTHS and knob.moves]
+    count = len(knobs) + bool(found.distributions)
+    sheet = style.Sheet.of(width, pitch=PITCH, columns=min(2, max(1, count)), panels=max(1, count))
+    picture = page.Picture(sheet, sheet.width)
+    axes = panel.grid(picture, max(1, count))
+    entries: dict[str, Artist] = {}
+    for ax, knob in zip(axes, knobs, strict=False):
+        _draw_knob(ax, knob, found, entries)
+    if found.distributions:
+        _draw_distributions(axes[-1], found, entries)
+    page.entitle(picture, f"{found.env} · self-convergence · {found.points} points")
+    page.finish(picture, list(entries.values()), columns=3, heading=_provenance(found))
+    return picture
+
+
+def _draw_knob(ax: Axes, knob: KnobConvergence, found: Convergence, entries: dict[str, Artist]) -> None:
+    panel.dress(ax)
+    ax.set_box_aspect(SHAPE)
+    sheet, look = page.sheet_of(ax), style.VARIANTS[knob.knob]
+    for kind, alpha in (("p95", 0.45), ("median", 1.0)):
+        name = "95th percentile" if kind == "p95" else "median over the points"
+        _draw_moves(ax, knob.moves, kind, look | {"alpha": alpha})
+        mark = {"color": style.QUIET, "marker": look["marker"], "linestyle": "solid", "alpha": alpha, "linewidth": 1.0}
+        entries.setdefault(kind, Line2D([], [], **sheet.look(mark), label=name))
+    _limit(ax, knob)
+    _draw_design(ax, knob, entries)
+    _draw_levels(ax, knob, found, entries)
+    panel.name_axes(ax, WIDTHS[knob.knob], "loss moves [share of the spread]" if found.spread else "loss moves")
+    panel.caption(ax, _title(knob))
+
+
+def _draw_moves(ax: Axes, moves: Sequence[Move], kind: str, look: dict[str, object]) -> None:
+    sheet = page.sheet_of(ax)
+    known: list[tuple[float, Bootstrap]] = [(move.width, getattr(move, kind)) for move in moves]
+    drawn = [(width, one) for width, one in known if one.value is not None]
+    for width, one in drawn:
+        low, high = (end or one.value or 0.0 for end in (one.low, one.high))
+        ax.plot([width, width], [max(low, LEAST), max(high, LEAST)], **sheet.look(style.INTERVAL_LINE), gid="interval")
+    values = [max(one.value or 0.0, LEAST) for _, one in drawn]
+    ax.plot(
+        [width for width, _ in drawn],
+        values,
+        **sheet.look(style.VARIANT_MARK | look | {"linestyle": "solid"}),
+        gid=kind,
+    )
+
+
+def _limit(ax: Axes, knob: KnobConvergence) -> None:
+    """Span the marks, on logarithmic axes."""
+    ends = [end for move in knob.moves for one in (move.median, move.p95) for end in (one.value, one.low, one.high)]
+    values = [max(end, LEAST) for end in ends if end is not None] or [LEAST, 1.0]
+    widths = [move.width for move in knob.moves]
+    ax.set_xlim(min(widths) / ROOM**0.5, max(widths) * ROOM**0.5)
+    ax.set_ylim(min(values) / ROOM, max(values) * ROOM)
+    for axis in (ax.xaxis, ax.yaxis):
+        style.log_axis(axis)
+
+
+def _draw_design(ax: Axes, knob: KnobConvergence, entries: dict[str, Artist]) -> None:
+    """Draw the slope of the designed order, and those within the interval of the observed one, through the medians."""
+    known = [(move.width, move.median.value) for move in knob.moves if move.median.value]
+    if not known:
+        return
+    widths, values = np.array(known).T
+    middle, height = np.exp(np.log(widths).mean()), np.exp(np.log(values).mean())
+    span = np.geomspace(*ax.get_xlim(), 32)
+    if knob.order.low is not None and knob.order.high is not None and knob.verdict == "converges":
+        edges = [height * (span / middle) ** order for order in (knob.order.low, knob.order.high)]
+        ax.fill_between(span, *edges, color=style.BAND[0], linewidth=0.0, zorder=0, gid="observed")
+        entries.setdefault("observed", Patch(color=style.BAND[0], label="observed order, 95 %"))
+    if knob.designed is not None:
+        look = page.sheet_of(ax).look({"color": style.INK, "linewidth": 0.9, "linestyle": (0, (5, 2)), "zorder": 1})
+        ax.plot(span, height * (span / middle) ** knob.designed, **look, gid="design", scaley=False, scalex=False)
+        entries.setdefault("design", Line2D([], [], **look, label="designed order"))
+
+
+def _draw_levels(ax: Axes, knob: KnobConvergence, found: Convergence, entries: dict[str, Artist]) -> None:
+    """Draw the floor, what the rule allows, and what Richardson's limit leaves at the reference."""
+    sheet, off = page.sheet_of(ax), found.rule.off.value
+    left = next((one.median.value for one in found.remainders if one.name == found.reference), None)
+    lines = {
+        "rule": (0.1 * off if off else None, "solid", "a tenth of standard's error"),
+        "floor": (knob.floor, (0, (1, 1.5)), "floor"),
+        "limit": (left, (0, (6, 1.5, 1, 1.5)), "left at the reference by Richardson, median"),
+    }
+    for gid, (value, dashes, said) in lines.items():
+        low, high = ax.get_ylim()
+        if value and low / 30 < value < 30 * high:
+            look = sheet.look({"color": style.QUIET, "linewidth": 1.0, "linestyle": dashes, "zorder": 0.5})
+            ax.axhline(value, **look, gid=gid)
+            ax.set_ylim(min(low, value / ROOM), max(high, value * ROOM))
+            entries.setdefault(gid, Line2D([], [], **look, label=said))
+
+
+def _title(knob: KnobConvergence) -> str:
+    order = knob.order
+    if order.value is None:
+        return f"{knob.knob}: {knob.verdict}"
+    ends = " to ".join("?" if end is None else style.number(end, ".2g") for end in (order.low, order.high))
+    return f"{knob.knob}: {knob.verdict}, order {style.number(order.value, '.2g')} ({ends})"
+
+
+def _draw_distributions(ax: Axes, found: Convergence, entries: dict[str, Artist]) -> None:
+    """Draw Wasserstein's distance of each fidelity's losses over neighbourhoods from the reference's, and the noise."""
+    apart = found.distributions
+    assert apart is not None
+    panel.dress(ax)
+    ax.set_box_aspect(SHAPE)
+    sheet = page.sheet_of(ax)
+    look = sheet.look(style.VARIANT_MARK | {"color": style.LOSS_LINE, "marker": "o"})
+    for place, one in enumerate(apart.compared):
+        distance = one.distance.wasserstein
+        if distance.value is None:
+            continue
+        ends = [distance.value if end is None else end for end in (distance.low, distance.high)]
+        ax.plot(ends, [place, place], **sheet.look(style.INTERVAL_LINE), gid="interval")
+        ax.plot([distance.value], [place], **look, gid="distance")
+    if limit := apart.noise_limit["wasserstein"]:
+        ax.axvspan(0, limit, color=style.BAND[0], zorder=0, gid="noise")
+        entries["noise"] = Line2D([], [], color=style.BAND[0], linewidth=5, label="noise: the reference twice (95 %)")
+    ax.set_yticks(range(len(apart.compared)), [one.name.removeprefix("reference-") for one in apart.compared])
+    ax.set_xlim(left=0)
+    ax.margins(y=0.15)
+    panel.name_axes(ax, "Wasserstein's distance from the reference [share of the spread]")
+    panel.caption(ax, f"losses over {apart.neighbourhoods} neighbourhoods")
+
+
+def _provenance(found: Convergence) -> str:
+    """Say who measured it, and how."""
+    known = {**found.provenance, **found.identity}
+    return " · ".join(f"{known[key]}" for key in ("device", "created", "command") if known.get(key))
