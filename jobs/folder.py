@@ -61,6 +61,7 @@ REPORT = Results(
 )
 REPORTS = Results("set of reports", ("report.json", "report.md"))
 TRADEOFF = Results("trade-off", ("tradeoff.json", "tradeoff.png"), "tradeoff.png")
+EXTREMES = Results("study of extremes", ("extremes.json", "extremes.png"), "extremes.png")
 PAIRS = Results("study of pairs", ("pairs.json",))
 
 

@@ -107,6 +107,16 @@ VARIANTS: dict[str, dict[str, Any]] = {  # which option was changed to make a va
 VARIANT_MARK: dict[str, Any] = {
     "linestyle": "none", "markersize": 6.5, "markeredgewidth": 0.7, "markeredgecolor": "white", "zorder": 3
 }  # fmt: skip
+OUTCOMES: dict[str, dict[str, Any]] = {  # of a setting on a stability map; those of `FAILURES` by name
+    "accurate": {"facecolor": "#8fc1b5", "linewidth": 0.0},
+    "inaccurate": {"facecolor": "#f2cf7e", "linewidth": 0.0},
+    "not judged": {"facecolor": "#c9d3e0", "linewidth": 0.0},
+    "refused": {"facecolor": UNSAMPLED, "edgecolor": QUIET, "linewidth": 0.0, "hatch": ".."},
+    **{kind.name: STATUS_LOOKS[kind] for kind in FAILURES},
+}
+BOUNDARY: dict[str, Any] = {
+    "color": INK, "linewidth": 1.4, "marker": "o", "markersize": 3.2, "markerfacecolor": "white", "zorder": 3
+}  # fmt: skip
 INTERVAL_LINE: dict[str, Any] = {"color": FAINT, "linewidth": 1.0, "zorder": 1.5, "solid_capstyle": "butt"}
 FRONT: dict[str, Any] = {"color": QUIET, "linewidth": 1.2, "zorder": 2}
 REFERENCE_LINE: dict[str, Any] = {"color": INK, "linewidth": 0.9, "linestyle": (0, (4, 2)), "zorder": 1}
