@@ -112,6 +112,11 @@ def describe(limit: Limit) -> str:
     if limit.dearer:
         said.append(f"{limit.dearer} values too dear")
     if (error := last_error(limit.rungs)) is not None:
-        accurate = "nowhere accurate" if limit.accurate is None else f"accurate to {limit.accurate:.4g}"
-        said.append(f"{accurate}, at last {100 * error:.2g} % off")
+        said.append(f"{_accuracy(limit)}, at last {100 * error:.2g} % off")
     return "; ".join(said)
+
+
+def _accuracy(limit: Limit) -> str:
+    if limit.accurate is None:
+        return "not accurate"
+    return f"accurate to {limit.accurate:.4g}" + (f", not at {limit.wrong:.4g}" if limit.wrong is not None else "")

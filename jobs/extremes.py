@@ -16,7 +16,7 @@ from ..landscapes.measures.stability import Answer, Cell, ask, bisect, bracket, 
 from ..landscapes.storage.files import tidy
 from ..landscapes.storage.records import write_record
 from .folder import EXTREMES, ROOT, folder_named
-from .knobs import BOX, DEAREST, DT, RESOLUTION, Knob, Knobs, Settings, settings_key
+from .knobs import BOX, DEAREST, DT, RESOLUTION, Knob, Knobs, Pair, Settings, settings_key
 from .scene import SceneSpec, provenance
 from .variants import SLOWER
 from .watch import PREPARING, Watch, resumable
@@ -28,13 +28,10 @@ if TYPE_CHECKING:
     from ..landscapes.storage.checkpoint import Checkpoint
     from .watch import Advance
 
-PRECISIONS = ("float32", "float64")
 RECORD, PICTURE = EXTREMES.files
 COPIES = 20  # of the points: what an answer holds of each
 BEYOND = 2.0  # times the limit, or less by that, a map reaches; of an option, whose effect goes with its root:
 BEYOND_OPTION = 8.0
-
-Pair = tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -101,8 +98,8 @@ class ExtremesJob:
         judge_by = _find_reference(env, reference)
         identity = {**env.identity(), "points": points, "seed": seed, "reference": judge_by}
         folder = out or folder_named(["extremes", env.name, env.fidelity.name, points], identity, root)
-        wanted = _read_pairs(pairs, found) if pairs is not None else [] if knobs else found.usual_pairs
-        kinds = _pick_precisions(found, precisions)
+        wanted = found.pick_pairs(pairs) if pairs is not None else [] if knobs else found.usual_pairs
+        kinds = found.pick_precisions(precisions)
         pieces = Checkpoint.open(folder, identity, what="extremes", force=force)
         unit = spread_points(env.space.dim, points, seed)
         how = {"grid": grid, "width": width, "accuracy": accuracy, "pieces": pieces}
@@ -219,34 +216,51 @@ class ExtremesJob:
                 break
             cells.insert(0, self._cell([(knob, value)], precision, advance))
         values, fine = [cell.values[0] for cell in cells], [cell.stable for cell in cells]
-        stable, failed = bracket(values, fine)
-        if stable is not None and failed is not None:
-            stable, failed = bisect(
-                stable, failed, lambda value: self._cell([(knob, value)], precision, advance).stable, axis, self.width
-            )
+        stable, failed = self._end([(knob, value) for value in values], (), cells, "stable", precision, advance)
+        accurate, wrong = self._end([(knob, value) for value in values], (), cells, "accurate", precision, advance)
         beyond = "" if failed is None else self._cell([(knob, failed)], precision, advance).outcome
         return Limit(
-            knob.name, knob.unit, precision, end, knob.base, stable, failed, beyond, islands(values, fine),
-            tuple(cells), len(wanted) - len(rungs),
+            knob.name, knob.unit, precision, end, knob.base, stable, failed, beyond, accurate, wrong,
+            islands(values, fine), tuple(cells), len(wanted) - len(rungs),
         )  # fmt: skip
 
+    def _end(
+        self,
+        turned: Sequence[tuple[Knob, float]],
+        beside: Sequence[tuple[Knob, float]],
+        cells: Sequence[Cell],
+        what: str,
+        precision: str,
+        advance: Advance,
+    ) -> tuple[float | None, float | None]:
+        """Return the last value of a knob at which it is `what` (stable, accurate), and the first at which it is not.
+
+        They are bisected, accuracy only where no other reference is needed for that.
+        """
+        knob, axis = turned[0][0], self.knobs.axis(turned[0][0])
+        last, first = bracket([value for _, value in turned], [getattr(cell, what) for cell in cells])
+        if last is None or first is None or (what == "accurate" and knob.name not in (DT, RESOLUTION)):
+            return last, first
+
+        def holds(value: float) -> bool:
+            return bool(getattr(self._cell([(knob, value), *beside], precision, advance), what))
+
+        return bisect(last, first, holds, axis, self.width)
+
     def _map(self, pair: Pair, precision: str, advance: Advance) -> StabilityMap:
-        """Try a grid of two knobs around their base and their limits; then bisect the first failure along each row."""
+        """Try a grid of two knobs around their base and their limits; then bisect where each row ends."""
         x, y = (self.knobs.all[name] for name in pair)
         xs, ys = (self._values(knob, precision, advance) for knob in (x, y))
         rows = [[self._cell([(x, a), (y, b)], precision, advance) for a in xs] for b in ys]
-        axis, found = self.knobs.axis(x), list[tuple[float, float, float]]()
-        for b, row in zip(ys, rows, strict=True):
-            stable, failed = bracket(xs, [cell.stable for cell in row])
-            if stable is not None and failed is not None:
-                ends = bisect(
-                    stable, failed, lambda a, b=b: self._cell([(x, a), (y, b)], precision, advance).stable, axis,  # type: ignore[misc] # a default
-                    self.width,
-                )  # fmt: skip
-                found.append((b, *ends))
+        found: dict[str, list[tuple[float, float, float]]] = {"stable": [], "accurate": []}
+        for what, line in found.items():
+            for b, row in zip(ys, rows, strict=True):
+                last, first = self._end([(x, a) for a in xs], [(y, b)], row, what, precision, advance)
+                if last is not None and first is not None and (what == "stable" or x.name in (DT, RESOLUTION)):
+                    line.append((b, last, first))
         return StabilityMap(
             x.name, y.name, (x.unit, y.unit), precision, (x.base, y.base), tuple(xs), tuple(ys),
-            tuple(cell for row in rows for cell in row), tuple(found),
+            tuple(cell for row in rows for cell in row), tuple(found["stable"]), tuple(found["accurate"]),
         )  # fmt: skip
 
     def _values(self, knob: Knob, precision: str, advance: Advance) -> list[float]:
@@ -257,7 +271,8 @@ class ExtremesJob:
         limit = self._limit(knob, "largest", precision, advance)
         tried = [cell.values[0] for cell in limit.rungs]
         reach = BEYOND_OPTION if "smallest" in knob.ends and knob.name != RESOLUTION else BEYOND
-        high = max(knob.base, limit.failed or tried[-1]) * BEYOND
+        ends = [end for end in (limit.failed, limit.wrong and reach * limit.wrong) if end] or [tried[-1]]
+        high = max(knob.base, *ends) * BEYOND
         low = min(knob.base, limit.stable or knob.base) / (
             1.0 if knob.ends == ("largest",) and knob.name != DT else reach
         )
@@ -331,34 +346,6 @@ def _find_reference(env: Environment, name: str | None) -> str:
     if name is not None and name not in env.fidelities:
         raise ValueError(f"{env.name} has fidelities {', '.join(env.fidelities)} to be judged by; got {name!r}")
     return name or list(env.fidelities)[-1]
-
-
-def _pick_precisions(knobs: Knobs, names: Sequence[str]) -> list[str]:
-    """Return the precisions to try, the fidelity's own first unless they are named."""
-    if unknown := [name for name in names if name not in PRECISIONS]:
-        raise ValueError(f"--precisions takes {', '.join(PRECISIONS)}; got {', '.join(unknown)}")
-    own = knobs.base.fidelity
-    if names or not own.dt:
-        return list(names) or [own.precision]
-    return [own.precision, *(one for one in PRECISIONS if one != own.precision and _makes(knobs, one))]
-
-
-def _makes(knobs: Knobs, precision: str) -> bool:
-    try:
-        knobs.make({}, precision)
-    except ValueError:
-        return False
-    return True
-
-
-def _read_pairs(pairs: Sequence[str], knobs: Knobs) -> list[Pair]:
-    """Return pairs of knobs given as a:b. Raises ValueError for what is none."""
-    found = [tuple(pair.split(":")) for pair in pairs if pair != "none"]
-    for pair in found:
-        if len(set(pair)) != 2 or len(pair) != 2:
-            raise ValueError(f"--pairs takes two knobs as dt:{BOX}, or none; got {':'.join(pair)!r}")
-        knobs.pick(pair)
-    return [(a, b) for a, b in found]
 
 
 def _refuse_numbers(width: float, accuracy: float) -> None:

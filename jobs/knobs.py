@@ -23,7 +23,9 @@ OPTION_RUNGS = 7
 DEAREST = 16.0  # times the work of the base, beyond which a setting is left out
 MARGINAL = 1e-6  # of an episode's length, by which one of rounded steps may differ
 
+PRECISIONS = ("float32", "float64")
 Settings = Mapping[str, float]
+Pair = tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ class Knobs:
         return [name for name in self.all if name in {DT, RESOLUTION, BOX, HORIZON} | stiff]
 
     @property
-    def usual_pairs(self) -> list[tuple[str, str]]:
+    def usual_pairs(self) -> list[Pair]:
         """The pairs that are mapped unless others are named: the step against what limits it, three at most."""
         if DT not in self.all:
             return []
@@ -99,6 +101,29 @@ class Knobs:
         if unknown := [name for name in names if name not in self.all]:
             raise ValueError(f"{self.base.name} has knobs {', '.join(self.all) or 'none'}; got {', '.join(unknown)}")
         return [self.all[name] for name in names or self.usual]
+
+    def pick_pairs(self, pairs: Sequence[str]) -> list[Pair]:
+        """Return pairs of knobs given as a:b. Raises ValueError for what is none."""
+        found = list[Pair]()
+        for pair in pairs:
+            first, _, second = pair.partition(":")
+            if pair != "none":
+                if not second or first == second:
+                    raise ValueError(f"--pairs takes two knobs as dt:{BOX}, or none; got {pair!r}")
+                found.append((self.pick([first])[0].name, self.pick([second])[0].name))
+        return found
+
+    def pick_precisions(self, names: Sequence[str]) -> list[str]:
+        """Return the precisions of these names, or all there are, the base's own first.
+
+        Raises ValueError for one that there is not.
+        """
+        if unknown := [name for name in names if name not in PRECISIONS]:
+            raise ValueError(f"--precisions takes {', '.join(PRECISIONS)}; got {', '.join(unknown)}")
+        own = self.base.fidelity
+        if names or not own.dt:
+            return list(names) or [own.precision]
+        return [own.precision, *(one for one in PRECISIONS if one != own.precision and self._makes(one))]
 
     def make(self, settings: Settings, precision: str, fidelity: str | None = None) -> Environment:
         """Make the environment of a setting, at the base's fidelity, or at a named one if no knob is part of that.
@@ -141,6 +166,13 @@ class Knobs:
                 made = self.make({RESOLUTION: value}, self.base.fidelity.precision)
                 self._works[value] = made.work().count / self.base.work().count
         return self._works[value]
+
+    def _makes(self, precision: str) -> bool:
+        try:
+            self.make({}, precision)
+        except ValueError:
+            return False
+        return True
 
     def _option(self, name: str) -> Knob | None:
         """Return the knob that an option is: a number above zero, or what the scene's material ranges over."""

@@ -52,7 +52,8 @@ def _sentences(record: dict[str, Any], code: str) -> Iterator[str]:
         of += f", of another version of the code, {known['code']}, this is {code}"
     for limit in record["limits"]:
         if limit["knob"] == "dt":
-            yield f"stability: {_margin(record['fidelity'], limit)} ({limit['precision']}; {of})"
+            right = _accuracy(record, limit)
+            yield f"stability: {_margin(record['fidelity'], limit)}; {right} ({limit['precision']}; {of})"
 
 
 def _margin(fidelity: str, limit: dict[str, Any]) -> str:
@@ -63,6 +64,16 @@ def _margin(fidelity: str, limit: dict[str, Any]) -> str:
         return f"{fidelity}'s step is stable, and so is one {limit['stable'] / limit['base']:.3g} times as long"
     share = f"{fidelity}'s step is {limit['margin']:.2g} of the largest stable one, {limit['stable']:.3g} s"
     return f"{share} ({limit['beyond']} at {limit['failed']:.3g} s)"
+
+
+def _accuracy(record: dict[str, Any], limit: dict[str, Any]) -> str:
+    """Say in words up to which step losses are right."""
+    of = f"within {record['accuracy']:.0%} of the spread of {record['reference']}'s"
+    if limit["accurate"] is None:
+        return f"its losses are not {of}"
+    if limit["wrong"] is None:
+        return f"all losses are {of}"
+    return f"losses are {of} up to {limit['accurate']:.3g} s, of which it is {limit['accurate_margin']:.2g}"
 
 
 def _records(name: str) -> Iterator[tuple[Path, dict[str, Any]]]:

@@ -69,7 +69,8 @@ def tree(folder: Path) -> Path:
 
     def ignored(place: str, names: list[str]) -> set[str]:
         lost = shutil.ignore_patterns(*NOT_SENT, *LOST)(place, names)
-        return lost | ({name for name in names if name not in ("tradeoff", "extremes")} if place.endswith("gallery/data") else set())
+        figures = set(names) - {"tradeoff", "extremes"} if place.endswith("gallery/data") else set()
+        return lost | figures
 
     shutil.copytree(ROOT, folder, symlinks=True, ignore=ignored)
     return folder

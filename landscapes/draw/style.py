@@ -114,9 +114,11 @@ OUTCOMES: dict[str, dict[str, Any]] = {  # of a setting on a stability map; thos
     "refused": {"facecolor": UNSAMPLED, "edgecolor": QUIET, "linewidth": 0.0, "hatch": ".."},
     **{kind.name: STATUS_LOOKS[kind] for kind in FAILURES},
 }
-BOUNDARY: dict[str, Any] = {
-    "color": INK, "linewidth": 1.4, "marker": "o", "markersize": 3.2, "markerfacecolor": "white", "zorder": 3
-}  # fmt: skip
+_BOUNDARY: dict[str, Any] = {"color": INK, "linewidth": 1.4, "markersize": 3.6, "markerfacecolor": "white", "zorder": 3}
+BOUNDARIES: tuple[dict[str, Any], dict[str, Any]] = (  # of accuracy, of stability
+    _BOUNDARY | {"linestyle": (0, (3, 1.5)), "marker": "s"},
+    _BOUNDARY | {"marker": "o"},
+)
 INTERVAL_LINE: dict[str, Any] = {"color": FAINT, "linewidth": 1.0, "zorder": 1.5, "solid_capstyle": "butt"}
 FRONT: dict[str, Any] = {"color": QUIET, "linewidth": 1.2, "zorder": 2}
 REFERENCE_LINE: dict[str, Any] = {"color": INK, "linewidth": 0.9, "linestyle": (0, (4, 2)), "zorder": 1}

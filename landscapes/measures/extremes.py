@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from ..plain import number, optional, plain, text
-from .stability import ACCURATE, Cell
+from .stability import Cell
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -20,8 +20,10 @@ class Limit:
     """Hold how far one knob can be turned, in one precision, from `base`, where the scene has it.
 
     `end` says which way: largest or smallest. `stable` is the last value before the first failure, `failed` the first
-    one that was seen to fail, either None where there is none; `islands` are stable stretches beyond that. `rungs` are
-    the values that were scanned, in order, whatever happened at them; `dearer` counts those left out as too dear.
+    one that was seen to fail, either None where there is none; `islands` are stable stretches beyond that. In the same
+    way losses are right up to `accurate` and no more at `wrong`: bisected of a knob that the reference does not share,
+    else by rungs. `rungs` are the values that were scanned, in order, whatever happened at them; `dearer` counts those
+    left out as too dear.
     """
 
     knob: str
@@ -32,6 +34,8 @@ class Limit:
     stable: float | None
     failed: float | None
     beyond: str
+    accurate: float | None
+    wrong: float | None
     islands: tuple[tuple[float, float], ...]
     rungs: tuple[Cell, ...]
     dearer: int = 0
@@ -42,27 +46,11 @@ class Limit:
         return cls(
             **{name: text(record[name]) for name in ("knob", "unit", "precision", "end", "beyond")},
             base=number(record["base"]),
-            stable=optional(number, record["stable"]),
-            failed=optional(number, record["failed"]),
+            **{name: optional(number, record[name]) for name in ("stable", "failed", "accurate", "wrong")},
             islands=tuple((number(low), number(high)) for low, high in record["islands"]),
             rungs=_cells(record["rungs"]),
             dearer=int(number(record["dearer"])),
         )
-
-    @property
-    def farthest(self) -> float:
-        """The last value that was tried."""
-        return self.rungs[-1].values[0]
-
-    @property
-    def accurate(self) -> float | None:
-        """The last value, from the base on, up to which each rung is accurate; None where the base is not."""
-        last = None
-        for cell in self.rungs:
-            if cell.outcome != ACCURATE:
-                break
-            last = cell.values[0]
-        return last
 
     @property
     def margin(self) -> float | None:
@@ -70,9 +58,17 @@ class Limit:
 
         Below one the scene is stable; where nothing failed it is that share of the farthest value that was tried.
         """
-        if not self.stable or not self.base:
+        return self._share(self.stable)
+
+    @property
+    def accurate_margin(self) -> float | None:
+        """The base as a share of the largest accurate value, or of the smallest one its inverse; None without one."""
+        return self._share(self.accurate)
+
+    def _share(self, end: float | None) -> float | None:
+        if not end or not self.base:
             return None
-        return self.base / self.stable if self.end == "largest" else self.stable / self.base
+        return self.base / end if self.end == "largest" else end / self.base
 
 
 @dataclass(frozen=True)
@@ -81,6 +77,8 @@ class StabilityMap:
 
     `cells` go along `x` first, then along `y`. `boundary` has for values of `y` the last stable value along x and the
     first that failed, between which the limit lies; values of y at which nothing or all of x failed have none.
+    `accurate_boundary` is the same of the last accurate value and the first that is not, where the reference does not
+    share x.
     """
 
     x: str
@@ -92,6 +90,7 @@ class StabilityMap:
     ys: tuple[float, ...]
     cells: tuple[Cell, ...]
     boundary: tuple[tuple[float, float, float], ...]  # y, stable x, failed x
+    accurate_boundary: tuple[tuple[float, float, float], ...]
 
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> StabilityMap:
@@ -107,7 +106,8 @@ class StabilityMap:
             xs=tuple(map(number, record["xs"])),
             ys=tuple(map(number, record["ys"])),
             cells=_cells(record["cells"]),
-            boundary=tuple((number(y), number(low), number(high)) for y, low, high in record["boundary"]),
+            boundary=_boundary(record["boundary"]),
+            accurate_boundary=_boundary(record["accurate_boundary"]),
         )
 
 
@@ -162,7 +162,7 @@ class Extremes:
 
     def record(self) -> dict[str, Any]:
         """Return it as plain JSON, by the names of its fields; limits with their margin."""
-        limits = [{**asdict(one), "margin": one.margin, "accurate": one.accurate} for one in self.limits]
+        limits = [{**asdict(one), "margin": one.margin, "accurate_margin": one.accurate_margin} for one in self.limits]
         found: dict[str, Any] = plain({**asdict(self), "limits": limits})
         return found
 
@@ -175,14 +175,15 @@ class Extremes:
         """Return a row for each end of each knob in each precision, indexed by `knob`, `end` and `precision`.
 
         Columns: `base`; `stable` and `failed`, between which the limit lies; `margin`; `beyond`, what happens there;
-        `accurate`, up to where losses are right; `error`, at the last rung that is stable; `islands`.
+        `accurate` and `wrong`, up to where losses are right and where no more; `error`, at the last stable rung;
+        `islands`.
         """
         import pandas as pd
 
         rows = [
             {
                 **{name: getattr(one, name) for name in ("knob", "end", "precision", "base", "stable", "failed")},
-                **{name: getattr(one, name) for name in ("margin", "beyond", "accurate", "islands")},
+                **{name: getattr(one, name) for name in ("margin", "beyond", "accurate", "wrong", "islands")},
                 "error": last_error(one.rungs),
             }
             for one in self.limits
@@ -208,6 +209,10 @@ def last_error(rungs: Sequence[Cell]) -> float | None:
             break
         error = cell.error
     return error
+
+
+def _boundary(found: Sequence[Sequence[Any]]) -> tuple[tuple[float, float, float], ...]:
+    return tuple((number(y), number(low), number(high)) for y, low, high in found)
 
 
 def _cells(found: Sequence[Mapping[str, Any]]) -> tuple[Cell, ...]:

@@ -127,6 +127,11 @@ class Cell:
         """Whether every point has a finite loss and a finite gradient."""
         return self.outcome in STABLE
 
+    @property
+    def accurate(self) -> bool:
+        """Whether its losses are right, too."""
+        return self.outcome == ACCURATE
+
 
 def judge(values: Sequence[float], answer: Answer, reference: Answer | None, *, accuracy: float) -> Cell:
     """Say how a setting ended, and whether its finite losses are right: held against those of the reference there.

@@ -8,10 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, PathPatch
 from matplotlib.path import Path
-from matplotlib.ticker import FixedLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter
 from numpy.typing import NDArray
 
 from ...measures.extremes import Extremes, Limit, StabilityMap
@@ -23,6 +24,7 @@ PITCH, LEAST = 4.0, 40.0  # room of a panel: on a screen [inch], and at least in
 LOWEST, HIGHEST = 1e-4, 1e4  # of the error axis [% of the spread]; what is beyond stands on the edge
 NAMES = {ACCURATE: "accurate", INACCURATE: "finite, but wrong", UNJUDGED: "finite, not judged", REFUSED: "refused"}
 NAMES |= {kind.name: name for kind, name in style.FAILURES.items()}
+FEW, MOST = 1.5, 6  # decades: of an axis with more ticks than one in each, and of one that has one in each
 ROOM = 1.35  # what the axis of factors reaches beyond the outermost marks, as a ratio
 
 Grid = NDArray[np.float64]
@@ -81,7 +83,7 @@ def _draw_errors(ax: Axes, limits: Sequence[Limit], accuracy: float, precision: 
         ax.set_xlim(min(reach) / ROOM, max(reach) * ROOM)
     ax.set_ylim(LOWEST, HIGHEST)
     for axis in (ax.xaxis, ax.yaxis):
-        style.log_axis(axis)
+        _log_axis(axis)
     ax.yaxis.set_major_locator(FixedLocator([10.0**power for power in range(-4, 5, 2)]))
     _dress_errors(ax, accuracy, precision)
     return entries
@@ -117,12 +119,13 @@ def _draw_map(ax: Axes, found: StabilityMap) -> dict[str, Artist]:
         look = style.OUTCOMES[outcome]
         ax.add_patch(PathPatch(_cells(edges[0], edges[1], outcomes == outcome), **look, antialiased=False, gid=outcome))
         entries[outcome] = Patch(**look, label=NAMES[outcome])
-    if found.boundary:
-        y, low, high = np.array(sorted(found.boundary)).T
-        line = sheet.look(style.BOUNDARY)
-        middle = np.sqrt(low * high) if low.min() > 0 else (low + high) / 2
-        ax.plot(middle, y, **line, gid="boundary")
-        entries["boundary"] = Line2D([], [], **line, label="boundary, bisected")
+    lines = {"limit of accuracy, bisected": found.accurate_boundary, "limit of stability, bisected": found.boundary}
+    for label, ends in lines.items():
+        if ends:
+            y, low, high = np.array(sorted(ends)).T
+            line = sheet.look(style.BOUNDARIES[ends is found.boundary])
+            ax.plot(np.sqrt(low * high) if low.min() > 0 else (low + high) / 2, y, **line, gid=label, clip_on=False)
+            entries[label] = Line2D([], [], **line, label=label)
     star = sheet.look(style.LOWEST_MARK)
     ax.plot(*([one] for one in found.base), **star, gid="base", zorder=4)
     entries["base"] = Line2D([], [], **star, label="what the scene has")
@@ -130,11 +133,23 @@ def _draw_map(ax: Axes, found: StabilityMap) -> dict[str, Artist]:
     for axis, limits, values in ((ax.xaxis, edges[0], found.xs), (ax.yaxis, edges[1], found.ys)):
         (ax.set_xlim if axis is ax.xaxis else ax.set_ylim)(float(limits[0]), float(limits[-1]))
         if min(values) > 0:
-            style.log_axis(axis)
+            _log_axis(axis)
     ax.set_box_aspect(1)
     panel.name_axes(ax, *(_label(name, unit) for name, unit in zip((found.x, found.y), found.units, strict=True)))
     panel.caption(ax, f"{found.precision}: {found.x} against {found.y}")
     return entries
+
+
+def _log_axis(axis: Axis) -> None:
+    """Make an axis logarithmic, with decades alone where a panel has no room for more."""
+    style.log_axis(axis)
+    low, high = sorted(axis.get_view_interval())
+    decades = math.log10(high / low)
+    if decades > FEW:
+        every = math.ceil(decades / MOST)
+        powers = range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1)
+        axis.set_major_locator(FixedLocator([10.0**power for power in powers if power % every == 0]))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: style.power(value, 2)))
 
 
 def _label(name: str, unit: str) -> str:
