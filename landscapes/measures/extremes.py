@@ -44,9 +44,16 @@ class Limit:
     def of_record(cls, record: Mapping[str, Any]) -> Limit:
         """Read it from plain JSON; raises TypeError and KeyError for what is none."""
         return cls(
-            **{name: text(record[name]) for name in ("knob", "unit", "precision", "end", "beyond")},
+            knob=text(record["knob"]),
+            unit=text(record["unit"]),
+            precision=text(record["precision"]),
+            end=text(record["end"]),
+            beyond=text(record["beyond"]),
             base=number(record["base"]),
-            **{name: optional(number, record[name]) for name in ("stable", "failed", "accurate", "wrong")},
+            stable=optional(number, record["stable"]),
+            failed=optional(number, record["failed"]),
+            accurate=optional(number, record["accurate"]),
+            wrong=optional(number, record["wrong"]),
             islands=tuple((number(low), number(high)) for low, high in record["islands"]),
             rungs=_cells(record["rungs"]),
             dearer=int(number(record["dearer"])),
