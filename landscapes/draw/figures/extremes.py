@@ -16,7 +16,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter
 from numpy.typing import NDArray
 
 from ...measures.extremes import Extremes, Limit, StabilityMap
-from ...measures.stability import ACCURATE, INACCURATE, REFUSED, UNJUDGED
+from ...measures.stability import ACCURATE, INACCURATE, REFUSED, UNJUDGED, Cell
 from .. import style
 from . import page, panel
 
@@ -33,8 +33,8 @@ Grid = NDArray[np.float64]
 def extremes_figure(found: Extremes, *, width: float | None = None) -> page.Picture:
     """Draw for each precision loss errors over the knobs, and a map of each pair with its bisected boundary.
 
-    A cell of a map is one setting, coloured by how it ended; nothing is interpolated. A curve ends in a cross where the
-    scene first fails; errors too large or too small for the axis are on its edges.
+    A cell of a map is one setting, coloured by how it ended; nothing is interpolated. A curve breaks where the scene
+    fails, and a cross says where it first does; errors too large or too small for the axis are on its edges.
 
     Raises ValueError where the page is too narrow or too wide.
     """
@@ -68,9 +68,8 @@ def _draw_errors(ax: Axes, limits: Sequence[Limit], accuracy: float, precision: 
     looks = _looks(list(dict.fromkeys(limit.knob for limit in drawn)))
     for limit in drawn:
         look = sheet.look({"linewidth": 1.1, **style.VARIANT_MARK, "markersize": 5.0, **looks[limit.knob]})
-        cells = [cell for cell in limit.rungs if cell.stable and cell.error is not None]
-        factors = [cell.values[0] / limit.base for cell in cells]
-        errors = [float(np.clip(100 * (cell.error or 0.0), LOWEST, HIGHEST)) for cell in cells]
+        factors = [cell.values[0] / limit.base for cell in limit.rungs]
+        errors = [_error(cell) for cell in limit.rungs]
         ax.plot(factors, errors, **look | {"linestyle": "solid"}, gid=limit.knob, clip_on=False)
         entries[limit.knob] = Line2D([], [], **look | {"linestyle": "solid"}, label=limit.knob)
         if limit.failed is not None:
@@ -86,7 +85,15 @@ def _draw_errors(ax: Axes, limits: Sequence[Limit], accuracy: float, precision: 
         _log_axis(axis)
     ax.yaxis.set_major_locator(FixedLocator([10.0**power for power in range(-4, 5, 2)]))
     _dress_errors(ax, accuracy, precision)
-    return entries
+    line = sheet.look(style.REFERENCE_LINE)
+    return entries | {"accuracy": Line2D([], [], **line, label=f"accurate below {100 * accuracy:g} %")}
+
+
+def _error(cell: Cell) -> float:
+    """Return a stable rung's error within the axis [% of the spread], NaN where there is none: the curve breaks."""
+    if not cell.stable or cell.error is None:
+        return math.nan
+    return float(np.clip(100 * cell.error, LOWEST, HIGHEST))
 
 
 def _dress_errors(ax: Axes, accuracy: float, precision: str) -> None:
@@ -149,7 +156,7 @@ def _log_axis(axis: Axis) -> None:
         every = math.ceil(decades / MOST)
         powers = range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1)
         axis.set_major_locator(FixedLocator([10.0**power for power in powers if power % every == 0]))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: style.power(value, 2)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: style.power(value, 3)))
 
 
 def _label(name: str, unit: str) -> str:
