@@ -19,6 +19,7 @@ from .commands.check import check
 from .commands.dims import TakesDims
 from .commands.envs import envs
 from .commands.export import export
+from .commands.extremes import extremes
 from .commands.info import info
 from .commands.optimize import methods, optimize
 from .commands.overlay import overlay
@@ -61,7 +62,7 @@ _VERBS = (
     envs, info, slice_, sweep,
     methods, optimize, race, overlay,
     surface, replay, export, view, bounce,
-    plan, bench, check, tradeoff, pairs, report_,
+    plan, bench, check, tradeoff, extremes, pairs, report_,
 )  # fmt: skip
 
 for _verb in _VERBS:

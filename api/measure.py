@@ -1,4 +1,4 @@
-"""`gs.report`, `gs.check`, `gs.pairs`: what a scene's landscape is like, and what may be asked of it."""
+"""`gs.report`, `gs.check`, `gs.extremes`, `gs.pairs`: what a scene's landscape is like, and what may be asked of it."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ..jobs.pairs import PairRanking
     from ..jobs.report import ReportedSlice
     from ..jobs.report_record import Report
+    from ..landscapes.measures.extremes import Extremes
     from ..landscapes.slice import Slice
 
     Scene = str | type[Environment] | Environment | SceneSpec
@@ -65,6 +66,46 @@ def check(scene: Scene, *, points: int = 4, seed: int = 0, **keywords: Unpack[Sc
     spec = spec_of(scene, keywords).resolve(watch)
     command = say_call("check", scene, points=points, seed=seed, **keywords)
     return CheckJob.open(spec, points=points, seed=seed, command=command).run(watch)
+
+
+def extremes(
+    scene: Scene,
+    *,
+    points: int = 16,
+    seed: int = 0,
+    knobs: Sequence[str] = (),
+    pairs: Sequence[str] | None = None,
+    precisions: Sequence[str] = (),
+    grid: int = 8,
+    width: float = 0.05,
+    accuracy: float = 0.1,
+    against: str | None = None,
+    out: str | Path | None = None,
+    force: bool = False,
+    **keywords: Unpack[SceneKeywords],
+) -> Extremes:
+    """Find how far a scene's knobs can be turned before it fails: step, grid, stiffness, controls, length.
+
+    `knobs` are dt, resolution, box, horizon and options that are numbers above 0; `pairs` of them ("dt:ke") are mapped
+    on a `grid`. Limits are bisected to a relative `width`. Corners of the box and Sobol points decide, `points` in all;
+    finite losses are right where those of the fidelity `against`, by default the last, are within `accuracy` of their
+    spread. The fidelity is standard unless another is given. The study lies in `out`, by default a folder under out/
+    named after it: the same call goes on there. The record has `limits`, `maps`, `table()` and `plot()`.
+
+    Raises ValueError for what the scene does not have, StoreMismatchError where the folder holds another study, which
+    `force` replaces; Stopped where it is interrupted.
+    """
+    from ..jobs.extremes import ExtremesJob
+    from ..jobs.margins import keep
+
+    how = {"points": points, "seed": seed, "knobs": knobs, "pairs": pairs, "precisions": precisions, "grid": grid}
+    how |= {"width": width, "accuracy": accuracy}
+    command = say_call("extremes", scene, **how, against=against, **keywords)
+    spec = spec_of(scene, keywords)
+    job = ExtremesJob.open(spec, **how, reference=against, out=_path(out), force=force, command=command)  # type: ignore[arg-type] # each of its kind
+    found = job.run(default_watch())
+    keep(found)
+    return found
 
 
 def pairs(

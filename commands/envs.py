@@ -10,8 +10,8 @@ import typer
 def envs(name: Annotated[str | None, typer.Argument(help="One environment, to show it in full.")] = None) -> None:
     """List the environments: name, dimension, parameters, model and fidelities.
 
-    With NAME it shows one in full: what it models, bounds, fidelities, engines, options and examples. It writes no
-    file.
+    With NAME it shows one in full: what it models, bounds, fidelities, engines, options and examples, and how far its
+    step is from what is stable, where `landscape extremes` measured it. It writes no file.
 
     Example: landscape envs fluid
     """
@@ -37,6 +37,7 @@ def _describe(name: str) -> None:
 
     from ..envs.registry import make
     from ..gallery.paper import read_paper
+    from ..jobs.margins import say_margins
     from ..landscapes.options import in_full
     from .terminal import Console, table
 
@@ -51,6 +52,8 @@ def _describe(name: str) -> None:
     for fidelity in env.fidelities.values():
         console.print(f"fidelity {asdict(fidelity)}")
     console.print(f"engines: {', '.join(env.engines)}")
+    for said in say_margins(env) if any(one.dt for one in env.fidelities.values()) else ():
+        console.print(said)
     console.print(in_full(env.Options))
     console.print(f"examples: {', '.join(env.examples) or 'none'}")
     if words := read_paper().words.get(env.name):

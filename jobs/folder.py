@@ -64,6 +64,7 @@ TRADEOFF = Results("trade-off", ("tradeoff.json", "tradeoff.png"), "tradeoff.png
 MODEL = Results("model study", ("model.json", "model.png"), "model.png")
 MIXED = Results("search of mixed variants", ("mixed.json", "mixed.png"), "mixed.png")
 CONVERGENCE = Results("study of convergence", ("convergence.json", "convergence.png"), "convergence.png")
+EXTREMES = Results("study of extremes", ("extremes.json", "extremes.png"), "extremes.png")
 PAIRS = Results("study of pairs", ("pairs.json",))
 
 

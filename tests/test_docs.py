@@ -45,6 +45,7 @@ VALUES = {"--resolution": "2", "--budget": "3", "--seeds": "1", "--frames": "2"}
 ADDED = {
     "race": ["--seeds", "1", "--budget", "3", "--device", "cpu"],
     "tradeoff": ["--points", "2", "--variants", "precision"],
+    "extremes": ["--points", "4", "--knobs", "dt", "--device", "cpu", "--set", "horizon=0.05"],
     "replay": ["--no-film"],
     "bounce": ["--resolution", "3"],
     "slice": ["--resolution", "2"],
@@ -55,7 +56,7 @@ ADDED = {
     "gallery build": ["--data", "few", "--out", "site"],
     "gallery serve": ["--out", "served", "--port", "0"],
 }
-SCENES = {verb: {"fluid": "bounce", "flip": "bounce"} for verb in ("race", "optimize", "tradeoff")}
+SCENES = {verb: {"fluid": "bounce", "flip": "bounce"} for verb in ("race", "optimize", "tradeoff", "extremes")}
 SCENES["--tolerance"] = {"fluid": "bounce", "6": "0", "8": "1"}
 SHORT = {"slice": {"fluid", "assembly"}, "sweep": {"fluid"}, "replay": {"fluid"}, "plan": {"fluid"}}
 TENTH = ["--set", "horizon=0.1"]  # of an episode

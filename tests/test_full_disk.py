@@ -33,6 +33,10 @@ WRITING = {  # the command, the file for which there is no room any more, what i
         "tradeoff bounce --set horizon=0.05 --points 2 --variants precision --device cpu --out made", "tradeoff.json",
         "variants are kept in made",
     ),
+    "extremes": (
+        "extremes bounce --set horizon=0.05 --points 4 --knobs dt --precisions float64 --device cpu --out made",
+        "extremes.json", "settings are kept in made",
+    ),
     "pairs": ("pairs branin --samples 2 --out made", "pairs.json", "2 batches are kept in made"),
     "report": ("report cut --points 2 --out made", "report.json", "0 of 1 reports are kept in"),
     "overlay": ("overlay cut run --out made", "overlay.png", "each file in made is whole"),
@@ -56,7 +60,8 @@ def test_every_verb_that_writes_is_tried() -> None:
 def test_a_full_disk_says_what_is_kept_and_the_same_command_goes_on(
     run: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, verb: str
 ) -> None:
-    monkeypatch.setattr("gradscape.jobs.tolerance.user_data_path", lambda name: tmp_path / "data" / name)
+    for module in ("tolerance", "margins"):
+        monkeypatch.setattr(f"gradscape.jobs.{module}.user_data_path", lambda name: tmp_path / "data" / name)
     for name in ("REPETITION", "LARGEST"):
         monkeypatch.setattr(tradeoff, name, 0.002)
     monkeypatch.setattr(tradeoff, "RESAMPLES", 9)

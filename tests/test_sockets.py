@@ -40,6 +40,7 @@ plan bounce --resolution 2 --fidelity draft --device cpu
 bench bounce --batch 2 --seconds 0 --fidelity draft --device cpu
 check branin --points 2
 tradeoff cartpole --points 2 --variants precision --device cpu
+extremes bounce --points 4 --knobs dt --precisions float64 --fidelity draft --device cpu
 pairs bounce --samples 2 --fidelity draft --device cpu
 report cut --device cpu
 gallery compute --only bounce-y --part slices --resolution 4 --fidelity draft --device cpu --data data

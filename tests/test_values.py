@@ -42,6 +42,7 @@ plan branin
 bench branin --batch 2 --seconds 0
 check branin --points 2
 tradeoff bounce --points 2 --variants dt
+extremes bounce --points 4 --knobs dt
 pairs ackley --samples 2 --top 3
 report cut --points 2
 gallery compute --only bounce --part reports

@@ -69,7 +69,8 @@ def tree(folder: Path) -> Path:
 
     def ignored(place: str, names: list[str]) -> set[str]:
         lost = shutil.ignore_patterns(*NOT_SENT, *LOST)(place, names)
-        return lost | ({name for name in names if name != "tradeoff"} if place.endswith("gallery/data") else set())
+        figures = set(names) - {"tradeoff", "extremes"} if place.endswith("gallery/data") else set()
+        return lost | figures
 
     shutil.copytree(ROOT, folder, symlinks=True, ignore=ignored)
     return folder
@@ -136,7 +137,8 @@ def test_every_file_of_the_package_is_sent(built: dict[str, Path], kind: str) ->
         for place, _, names in os.walk(package, followlinks=True)
         for name in names
     }
-    pictures = {name for name in wanted if name.startswith("gallery/data/tradeoff/") and name.endswith(".png")}
+    measured = ("gallery/data/tradeoff/", "gallery/data/extremes/")
+    pictures = {name for name in wanted if name.startswith(measured) and name.endswith(".png")}
     assert names_of(built[kind]) == wanted - pictures
     assert "cli.py" in wanted
     assert len(pictures) > 10

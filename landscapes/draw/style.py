@@ -118,6 +118,18 @@ EFFECTS: dict[str, dict[str, Any]] = {  # what a part of a model does, in the wo
 }
 MISSING_MARK: dict[str, Any] = {"markerfacecolor": "white", "markeredgewidth": 1.3}  # of a part that is left out
 NOISE_LINE: dict[str, Any] = {"color": QUIET, "linewidth": 0.9, "linestyle": (0, (1, 1.5)), "zorder": 1}
+OUTCOMES: dict[str, dict[str, Any]] = {  # of a setting on a stability map; those of `FAILURES` by name
+    "accurate": {"facecolor": "#8fc1b5", "linewidth": 0.0},
+    "inaccurate": {"facecolor": "#f2cf7e", "linewidth": 0.0},
+    "not judged": {"facecolor": "#c9d3e0", "linewidth": 0.0},
+    "refused": {"facecolor": UNSAMPLED, "edgecolor": QUIET, "linewidth": 0.0, "hatch": ".."},
+    **{kind.name: STATUS_LOOKS[kind] for kind in FAILURES},
+}
+_BOUNDARY: dict[str, Any] = {"color": INK, "linewidth": 1.4, "markersize": 3.6, "markerfacecolor": "white", "zorder": 3}
+BOUNDARIES: tuple[dict[str, Any], dict[str, Any]] = (  # of accuracy, of stability
+    _BOUNDARY | {"linestyle": (0, (3, 1.5)), "marker": "s"},
+    _BOUNDARY | {"marker": "o"},
+)
 INTERVAL_LINE: dict[str, Any] = {"color": FAINT, "linewidth": 1.0, "zorder": 1.5, "solid_capstyle": "butt"}
 CHOSEN_MARK: dict[str, Any] = {  # a ring around a variant that a fidelity's name should mean
     "linestyle": "none", "marker": "o", "markersize": 12.0, "markerfacecolor": "none", "markeredgewidth": 1.3,

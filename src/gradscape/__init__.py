@@ -7,7 +7,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from .api.environments import list_envs
-    from .api.measure import check, pairs, report
+    from .api.measure import check, extremes, pairs, report
     from .api.overlay import overlay
     from .api.search import open_run, optimize, race
     from .api.slice import open_slice, slice
@@ -41,6 +41,7 @@ _HOMES = {
     "Slice": "landscapes.slice",
     "Status": "landscapes.objective",
     "check": "api.measure",
+    "extremes": "api.measure",
     "from_numpy": "landscapes.adapters",
     "from_torch": "landscapes.adapters",
     "list_envs": "api.environments",
@@ -74,6 +75,7 @@ __all__ = [
     "Status",
     "__version__",
     "check",
+    "extremes",
     "from_numpy",
     "from_torch",
     "list_envs",

@@ -1,0 +1,181 @@
+"""The extremes of a scene: loss errors over how far knobs are turned, and maps of pairs of them (matplotlib)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, PathPatch
+from matplotlib.path import Path
+from matplotlib.ticker import FixedLocator, FuncFormatter
+from numpy.typing import NDArray
+
+from ...measures.extremes import Extremes, Limit, StabilityMap
+from ...measures.stability import ACCURATE, INACCURATE, REFUSED, UNJUDGED, Cell
+from .. import style
+from . import page, panel
+
+PITCH, LEAST = 4.0, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
+LOWEST, HIGHEST = 1e-4, 1e4  # of the error axis [% of the spread]; what is beyond stands on the edge
+NAMES = {ACCURATE: "accurate", INACCURATE: "finite, but wrong", UNJUDGED: "finite, not judged", REFUSED: "refused"}
+NAMES |= {kind.name: name for kind, name in style.FAILURES.items()}
+FEW, MOST = 1.5, 6  # decades: of an axis with more ticks than one in each, and of one that has one in each
+ROOM = 1.35  # what the axis of factors reaches beyond the outermost marks, as a ratio
+
+Grid = NDArray[np.float64]
+
+
+def extremes_figure(found: Extremes, *, width: float | None = None) -> page.Picture:
+    """Draw for each precision loss errors over the knobs, and a map of each pair with its bisected boundary.
+
+    A cell of a map is one setting, coloured by how it ended; nothing is interpolated. A curve breaks where the scene
+    fails, and a cross says where it first does; errors too large or too small for the axis are on its edges.
+
+    Raises ValueError where the page is too narrow or too wide.
+    """
+    rows = [[one for one in found.maps if one.precision == precision] for precision in found.precisions]
+    columns = 1 + max(map(len, rows))
+    sheet = style.Sheet.of(width, pitch=PITCH, columns=columns, least=LEAST)
+    picture = page.Picture(sheet, len(rows) * math.ceil(columns / sheet.columns) * sheet.pitch)
+    axes = iter(panel.grid(picture, sum(1 + len(maps) for maps in rows)))
+    entries: dict[str, Artist] = {}
+    for precision, maps in zip(found.precisions, rows, strict=True):
+        limits = [one for one in found.limits if one.precision == precision]
+        entries |= _draw_errors(next(axes), limits, found.accuracy, precision)
+        for one in maps:
+            entries |= _draw_map(next(axes), one)
+    page.entitle(picture, f"{found.env} · {found.fidelity} · extremes · {found.points} points")
+    page.finish(picture, list(entries.values()), columns=4, heading=_provenance(found))
+    return picture
+
+
+def _provenance(found: Extremes) -> str:
+    known = {**found.provenance, **found.identity}
+    said = [f"judged by {found.reference}", *(str(known[key]) for key in ("device", "engine", "created") if known[key])]
+    return " · ".join([*said, found.command])
+
+
+def _draw_errors(ax: Axes, limits: Sequence[Limit], accuracy: float, precision: str) -> dict[str, Artist]:
+    """Draw the error of each knob's stable rungs over the factor it is turned by; return the legend's entries."""
+    sheet, entries = page.sheet_of(ax), dict[str, Artist]()
+    panel.dress(ax)
+    drawn = [limit for limit in limits if _has_factor(limit)]
+    looks = _looks(list(dict.fromkeys(limit.knob for limit in drawn)))
+    for limit in drawn:
+        look = sheet.look({"linewidth": 1.1, **style.VARIANT_MARK, "markersize": 5.0, **looks[limit.knob]})
+        factors = [cell.values[0] / limit.base for cell in limit.rungs]
+        errors = [_error(cell) for cell in limit.rungs]
+        ax.plot(factors, errors, **look | {"linestyle": "solid"}, gid=limit.knob, clip_on=False)
+        entries[limit.knob] = Line2D([], [], **look | {"linestyle": "solid"}, label=limit.knob)
+        if limit.failed is not None:
+            cross = sheet.look({"marker": "x", "markersize": 6.0, "markeredgewidth": 1.4, "linestyle": "none"})
+            at, top = [limit.failed / limit.base], [HIGHEST]
+            ax.plot(at, top, color=look["color"], **cross, gid="failed", clip_on=False, zorder=5)
+            entries["failed"] = Line2D([], [], color=style.INK, **cross, label="first failure, on the edge")
+    if drawn:
+        reach = [cell.values[0] / limit.base for limit in drawn for cell in limit.rungs]
+        ax.set_xlim(min(reach) / ROOM, max(reach) * ROOM)
+    ax.set_ylim(LOWEST, HIGHEST)
+    for axis in (ax.xaxis, ax.yaxis):
+        _log_axis(axis)
+    ax.yaxis.set_major_locator(FixedLocator([10.0**power for power in range(-4, 5, 2)]))
+    _dress_errors(ax, accuracy, precision)
+    line = sheet.look(style.REFERENCE_LINE)
+    return entries | {"accuracy": Line2D([], [], **line, label=f"accurate below {100 * accuracy:g} %")}
+
+
+def _error(cell: Cell) -> float:
+    """Return a stable rung's error within the axis [% of the spread], NaN where there is none: the curve breaks."""
+    if not cell.stable or cell.error is None:
+        return math.nan
+    return float(np.clip(100 * cell.error, LOWEST, HIGHEST))
+
+
+def _dress_errors(ax: Axes, accuracy: float, precision: str) -> None:
+    ax.axhline(100 * accuracy, **page.sheet_of(ax).look(style.REFERENCE_LINE))
+    ax.axvline(1.0, color=style.FAINT, linewidth=0.8 * page.sheet_of(ax).weight, zorder=0)
+    ax.set_box_aspect(1)
+    panel.name_axes(ax, "times what the scene has", "loss error, 95 % of the points [% of the spread]")
+    panel.caption(ax, f"{precision}: errors before it fails")
+
+
+def _has_factor(limit: Limit) -> bool:
+    """Say whether a knob is turned by factors: one that may be zero is not."""
+    return limit.base > 0 and all(cell.values[0] > 0 for cell in limit.rungs)
+
+
+def _looks(knobs: Sequence[str]) -> dict[str, dict[str, object]]:
+    """Return a colour and a marker for each knob: those of the trade-off where it has them."""
+    own = [style.VARIANTS[name] for name in ("stiffness", "engine", "particles", "precision", "device")]
+    known = {"dt": style.VARIANTS["dt"], "resolution": style.VARIANTS["resolution"]}
+    others = iter(own * len(knobs))
+    return {knob: known[knob] if knob in known else next(others) for knob in knobs}
+
+
+def _draw_map(ax: Axes, found: StabilityMap) -> dict[str, Artist]:
+    """Draw how each cell ended, the boundary and the base; return the legend's entries."""
+    sheet, entries = page.sheet_of(ax), dict[str, Artist]()
+    outcomes = np.array([cell.outcome for cell in found.cells]).reshape(len(found.ys), len(found.xs))
+    edges = _edges(found.xs), _edges(found.ys)
+    for outcome in [name for name in style.OUTCOMES if (outcomes == name).any()]:
+        look = style.OUTCOMES[outcome]
+        ax.add_patch(PathPatch(_cells(edges[0], edges[1], outcomes == outcome), **look, antialiased=False, gid=outcome))
+        entries[outcome] = Patch(**look, label=NAMES[outcome])
+    lines = {"limit of accuracy, bisected": found.accurate_boundary, "limit of stability, bisected": found.boundary}
+    for label, ends in lines.items():
+        if ends:
+            y, low, high = np.array(sorted(ends)).T
+            line = sheet.look(style.BOUNDARIES[ends is found.boundary])
+            ax.plot(np.sqrt(low * high) if low.min() > 0 else (low + high) / 2, y, **line, gid=label, clip_on=False)
+            entries[label] = Line2D([], [], **line, label=label)
+    star = sheet.look(style.LOWEST_MARK)
+    ax.plot(*([one] for one in found.base), **star, gid="base", zorder=4)
+    entries["base"] = Line2D([], [], **star, label="what the scene has")
+    panel.dress(ax)
+    for axis, limits, values in ((ax.xaxis, edges[0], found.xs), (ax.yaxis, edges[1], found.ys)):
+        (ax.set_xlim if axis is ax.xaxis else ax.set_ylim)(float(limits[0]), float(limits[-1]))
+        if min(values) > 0:
+            _log_axis(axis)
+    ax.set_box_aspect(1)
+    panel.name_axes(ax, *(_label(name, unit) for name, unit in zip((found.x, found.y), found.units, strict=True)))
+    panel.caption(ax, f"{found.precision}: {found.x} against {found.y}")
+    return entries
+
+
+def _log_axis(axis: Axis) -> None:
+    """Make an axis logarithmic, with decades alone where a panel has no room for more."""
+    style.log_axis(axis)
+    low, high = sorted(axis.get_view_interval())
+    decades = math.log10(high / low)
+    if decades > FEW:
+        every = math.ceil(decades / MOST)
+        powers = range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1)
+        axis.set_major_locator(FixedLocator([10.0**power for power in powers if power % every == 0]))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: style.power(value, 3)))
+
+
+def _label(name: str, unit: str) -> str:
+    return f"{name} [{unit}]" if unit else name
+
+
+def _edges(values: Sequence[float]) -> Grid:
+    """Return the borders of cells around ascending values: half way between them, by ratio unless one is zero."""
+    ratio = min(values) > 0
+    at = np.log(values) if ratio else np.asarray(values, dtype=float)
+    half = np.diff(at) / 2 if len(at) > 1 else np.array([0.5])
+    found: Grid = np.concatenate([[at[0] - half[0]], at[:-1] + half[: len(at) - 1], [at[-1] + half[-1]]])
+    return np.exp(found) if ratio else found
+
+
+def _cells(u: Grid, v: Grid, where: NDArray[np.bool_]) -> Path:
+    """Return the outlines of the chosen cells as one path."""
+    corners = [
+        [(u[column], v[row]), (u[column + 1], v[row]), (u[column + 1], v[row + 1]), (u[column], v[row + 1])]
+        for row, column in np.argwhere(where)
+    ]
+    return Path.make_compound_path(*(Path([*corner, corner[0]], closed=True) for corner in corners))

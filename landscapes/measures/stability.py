@@ -1,0 +1,230 @@
+"""Stability: how an objective answers at a setting, and up to which value of a knob it stays stable."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..objective import Evaluation, Objective, Status, evaluate
+
+ACCURATE, INACCURATE, UNJUDGED, REFUSED = "accurate", "inaccurate", "not judged", "refused"
+STABLE = (ACCURATE, INACCURATE, UNJUDGED)  # outcomes of a setting at which every point has a finite gradient
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """Hold what an objective says at the points of a study, at one setting.
+
+    `loss` [objective's unit], `slope`, the length of the gradient [loss unit / width of the box], and `status`, each of
+    shape (point,). Where the setting was refused it says why instead; `error` is what the first point raised that did.
+    """
+
+    loss: Array
+    slope: Array
+    status: NDArray[np.int8]
+    refused: str = ""
+    error: str = ""
+
+    @classmethod
+    def of_refusal(cls, why: str) -> Answer:
+        """Return the answer of a setting that was refused."""
+        none = np.zeros(0)
+        return cls(none, none, np.zeros(0, dtype=np.int8), refused=why)
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Answer:
+        """Rebuild an answer from its `arrays`."""
+        texts = {name: str(arrays[name]) for name in ("refused", "error")}
+        return cls(arrays["loss"], arrays["slope"], arrays["status"], **texts)
+
+    def arrays(self) -> dict[str, Any]:
+        """Return what a file keeps of it."""
+        return {name: np.asarray(getattr(self, name)) for name in self.__dataclass_fields__}
+
+    @property
+    def fine(self) -> NDArray[np.bool_]:
+        """Which points have a finite loss and a finite gradient, shape (point,)."""
+        found: NDArray[np.bool_] = self.status == Status.OK
+        return found
+
+    @property
+    def stable(self) -> bool:
+        """Whether all points are fine."""
+        return not self.refused and bool(self.fine.all())
+
+
+def ask(objective: Objective, x: Float[Tensor, "point dim"]) -> Answer:
+    """Evaluate an objective at the points of a study; whatever it raises is an answer, too.
+
+    A ValueError refuses the setting. Any other error is that of a point: points are then asked one by one.
+    """
+    try:
+        found, error = evaluate(objective, x, grad=True), ""
+    except ValueError as refusal:
+        return Answer.of_refusal(_line(refusal))
+    except OSError:  # of the system, not of the setting
+        raise
+    except Exception as raised:
+        error = _line(raised)
+        parts = [_ask_alone(objective, row[None]) for row in x] if len(x) > 1 else [_failed(x)]
+        found = Evaluation.join(parts, dim=x.shape[1], grad=True)
+    widths = objective.space.upper - objective.space.lower
+    slope = (cast("Tensor", found.grad) * widths).norm(dim=1)
+    return Answer(found.loss.numpy(), slope.numpy(), found.status.numpy().astype(np.int8), error=error)
+
+
+def _ask_alone(objective: Objective, row: Float[Tensor, "one dim"]) -> Evaluation:
+    try:
+        return evaluate(objective, row, grad=True)
+    except OSError:
+        raise
+    except Exception:
+        return _failed(row)
+
+
+def _failed(x: Tensor) -> Evaluation:
+    return Evaluation.from_results(x.new_full((len(x),), torch.nan), torch.full_like(x, torch.nan), _errors(len(x)))
+
+
+def _errors(count: int) -> Tensor:
+    return torch.full((count,), Status.ERROR, dtype=torch.int8)
+
+
+def _line(error: Exception) -> str:
+    said = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+    return " ".join(said.split())
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Say how a setting ended: `values` of knobs, in the order of their map or of a limit's one knob.
+
+    `outcome` is accurate, inaccurate or not judged where all points are fine, else the name of the commonest failure
+    (NONFINITE, ESCAPED, ERROR), or refused. `share` is that of the fine points; `error` the 95th percentile of
+    |loss - reference's|, as a share of the spread of the reference's losses there, over the points that are fine;
+    `loss` the median |loss| [objective's unit] and `slope` the largest gradient [loss unit / width of the box] of them.
+    """
+
+    values: tuple[float, ...]
+    outcome: str
+    share: float
+    error: float | None = None
+    loss: float | None = None
+    slope: float | None = None
+    why: str = ""
+
+    @property
+    def stable(self) -> bool:
+        """Whether every point has a finite loss and a finite gradient."""
+        return self.outcome in STABLE
+
+    @property
+    def accurate(self) -> bool:
+        """Whether its losses are right, too."""
+        return self.outcome == ACCURATE
+
+
+def judge(values: Sequence[float], answer: Answer, reference: Answer | None, *, accuracy: float) -> Cell:
+    """Say how a setting ended, and whether its finite losses are right: held against those of the reference there.
+
+    Accurate is what is off by no more than `accuracy` of the spread in 95 % of the points. Nothing is judged where
+    there is no reference, or where that one fails at half of the points or more.
+    """
+    if answer.refused:
+        return Cell(tuple(values), REFUSED, 0.0, why=answer.refused)
+    fine = answer.fine
+    error = None if reference is None else loss_error(answer, reference)
+    known: dict[str, Any] = {"share": float(fine.mean()), "error": error, "why": answer.error}
+    if fine.any():
+        known |= {"loss": float(np.median(np.abs(answer.loss[fine]))), "slope": float(answer.slope[fine].max())}
+    if not fine.all():
+        codes, counts = np.unique(answer.status[~fine], return_counts=True)
+        return Cell(tuple(values), Status(int(codes[counts.argmax()])).name, **known)
+    if error is None:
+        return Cell(tuple(values), UNJUDGED, **known)
+    return Cell(tuple(values), ACCURATE if error <= accuracy else INACCURATE, **known)
+
+
+def loss_error(answer: Answer, reference: Answer) -> float | None:
+    """Return the 95th percentile of loss errors as a share of the spread of the reference's losses.
+
+    It is of the points at which both are fine. None where there are none, where the reference fails at half of all
+    points or more, and where its losses have no spread to measure by.
+    """
+    if reference.refused or reference.fine.mean() <= 0.5:
+        return None
+    both = answer.fine & reference.fine
+    known = reference.loss[reference.fine]
+    width = float(np.subtract(*np.percentile(known, (95, 5))))
+    if not both.any() or not width:
+        return None
+    off = np.abs(answer.loss - reference.loss)[both] / width
+    return float(np.quantile(off, 0.95, method="higher"))
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Measure a knob on a logarithmic scale, or on a linear one over a `span`; `settle` is what it can be set to."""
+
+    settle: Callable[[float], float]
+    span: float = 0.0
+
+    def middle(self, a: float, b: float) -> float:
+        """Return the value half way between two."""
+        return self.settle((a + b) / 2 if self.span else math.sqrt(a * b))
+
+    def apart(self, a: float, b: float) -> float:
+        """Return how far two values are apart, as a share of the smaller one, or of the span."""
+        return abs(a - b) / self.span if self.span else max(a, b) / min(a, b) - 1
+
+    def spread(self, low: float, high: float, count: int) -> list[float]:
+        """Return so many values in a range, or fewer where there are none between, in ascending order."""
+        values = np.linspace(low, high, count) if self.span else np.geomspace(low, high, count)
+        return sorted({self.settle(float(value)) for value in values})
+
+
+def bisect(
+    stable: float, failed: float, is_stable: Callable[[float], bool], axis: Axis, width: float
+) -> tuple[float, float]:
+    """Return a stable and an unstable value no farther apart than a `width`, between two that are such.
+
+    It stops earlier where the knob has no value between them.
+    """
+    while axis.apart(stable, failed) > width:
+        middle = axis.middle(stable, failed)
+        if not min(stable, failed) < middle < max(stable, failed):
+            break
+        stable, failed = (middle, failed) if is_stable(middle) else (stable, middle)
+    return stable, failed
+
+
+def bracket(rungs: Sequence[float], stable: Sequence[bool]) -> tuple[float | None, float | None]:
+    """Return the last stable value before the first failure and that failure, each None where there is none.
+
+    `rungs` lead away from what is surely stable; where already the first one fails, nothing is.
+    """
+    failed = next((at for at, fine in enumerate(stable) if not fine), None)
+    if failed is None:
+        return rungs[-1], None
+    return (rungs[failed - 1] if failed else None), rungs[failed]
+
+
+def islands(rungs: Sequence[float], stable: Sequence[bool]) -> tuple[tuple[float, float], ...]:
+    """Return the stable stretches beyond the first failure, each by its first rung and its last."""
+    found: list[tuple[float, float]] = []
+    failed = next((at for at, fine in enumerate(stable) if not fine), len(rungs))
+    for at in range(failed, len(rungs)):
+        if stable[at]:
+            joins = bool(found) and stable[at - 1]
+            first = found.pop()[0] if joins else rungs[at]
+            found.append((first, rungs[at]))
+    return tuple(found)

@@ -1,0 +1,159 @@
+"""`landscape extremes` and what `landscape envs NAME` says of it: what they leave, say and refuse."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+import torch
+from torch import Tensor
+
+from gradscape.envs import registry
+from gradscape.envs.base import Environment, Fidelity, Work
+from gradscape.landscapes.measures.extremes import Extremes
+from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.space import ParameterSpace
+from gradscape.landscapes.storage.records import read_json, write_record
+
+from ..command import Said, modules
+
+Command = Callable[..., Said]
+TURN = ["extremes", "stepping", "--points", "4", "--device", "cpu", "--out", "turned"]
+
+
+class Stepping(Environment):
+    """A bowl that fails beyond a step of 0.35 s, or beyond three times its box; in float32 beyond 0.25 s."""
+
+    name: ClassVar[str] = "stepping"
+    fidelities: ClassVar[dict[str, Fidelity]] = {
+        "standard": Fidelity("standard", dt=0.1),
+        "reference": Fidelity("reference", dt=0.01, precision="float64"),
+    }
+    beyond_box: ClassVar[bool] = True
+    space = ParameterSpace.box(["x0", "x1"], -1.0, 1.0)
+
+    def work(self) -> Work:
+        return Work(max(1, round(10 / self.fidelity.dt)), "step")
+
+    def _evaluate(self, x: Tensor, *, grad: bool) -> Evaluation:
+        loss = x.square().sum(dim=1) + self.fidelity.dt**2
+        loss[x.abs().amax(dim=1) > 3] = torch.inf
+        if self.fidelity.dt > (0.25 if self.fidelity.precision == "float32" else 0.35):
+            loss[:] = torch.nan
+        return Evaluation.from_results(loss, 2 * x if grad else None)
+
+
+@pytest.fixture(autouse=True)
+def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr("gradscape.jobs.margins.user_data_path", lambda name: tmp_path / "data" / name)
+    monkeypatch.setitem(registry.entries(), "stepping", registry.Entry("stepping", f"{__name__}:Stepping"))
+    return tmp_path / "data"
+
+
+@pytest.mark.drawn
+def test_a_study_leaves_a_record_a_picture_and_the_margin(run: Command, tmp_path: Path) -> None:
+    assert (
+        "stability: not measured; `landscape extremes stepping` measures it"
+        in run("envs", "stepping", cwd=tmp_path).stdout
+    )
+    done = run(*TURN, "--grid", "3", "--json", "--print", "85", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert {**read_json(tmp_path / "turned/extremes.json"), "folder": "turned"} == report
+    assert (tmp_path / "turned/extremes.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "turned/extremes-85mm.pdf").read_bytes().startswith(b"%PDF")
+    assert report["provenance"]["command"] == report["command"]
+    limits = {(one["knob"], one["precision"]): one for one in report["limits"]}
+    for (knob, precision), truth in {
+        ("dt", "float32"): 0.25, ("dt", "float64"): 0.35, ("box", "float32"): 3.0, ("box", "float64"): 3.0,
+    }.items():  # fmt: skip
+        limit = limits[knob, precision]
+        assert limit["stable"] <= truth <= limit["failed"]
+        assert limit["beyond"] == "NONFINITE"
+    assert "some " in done.stderr
+    assert "at 4 points, judged by reference" in done.stderr
+    said = run("envs", "stepping", cwd=tmp_path).stdout
+    share = 0.1 / limits["dt", "float32"]["stable"]
+    assert f"standard's step is {share:.2g} of the largest stable one" in said
+    assert "float64; warp on cpu, 4 points" in said
+
+
+def test_envs_says_where_a_margin_is_of_other_code_and_of_other_options_nothing(
+    run: Command, tmp_path: Path, own_data: Path
+) -> None:
+    assert run(*TURN, "--knobs", "dt", "--precisions", "float32", cwd=tmp_path).returncode == 0
+    (path,) = own_data.rglob("*.json")
+    record = read_json(path)
+    write_record(path, {**record, "identity": {**record["identity"], "code": "older"}})
+    assert "of another version of the code, older" in run("envs", "stepping", cwd=tmp_path).stdout
+    write_record(path, {**record, "identity": {**record["identity"], "options": {"soft": 1.0}}})
+    assert "stability: not measured" in run("envs", "stepping", cwd=tmp_path).stdout
+    path.write_text("{}")
+    damaged = run("envs", "stepping", cwd=tmp_path)
+    assert damaged.returncode == 2
+    assert path.name in damaged.stderr
+
+
+def test_shipped_extremes_are_found_where_nothing_of_the_users_own_is(
+    run: Command, tmp_path: Path, own_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(*TURN, "--knobs", "dt", "--precisions", "float32", cwd=tmp_path)
+    (path,) = own_data.rglob("*.json")
+    shipped = tmp_path / "package" / "data" / "extremes" / "stepping-cpu.json"
+    shipped.parent.mkdir(parents=True)
+    path.rename(shipped)
+    monkeypatch.setattr("gradscape.jobs.margins.resources.files", lambda package: tmp_path / "package")
+    assert "of the largest stable one" in run("envs", "stepping", cwd=tmp_path).stdout
+
+
+def test_the_table_says_what_is_beyond(run: Command, tmp_path: Path) -> None:
+    said = run(*TURN, "--knobs", "dt,box", cwd=tmp_path, width=200).stdout
+    assert "stepping: standard on cpu, 4 points, judged by reference (accurate: 10% of the spread)" in said
+    assert "then NONFINITE" in " ".join(said.split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--knobs", "speed"], "stepping has knobs dt, box; got speed"),
+        (["--pairs", "dt"], "--pairs takes two knobs as dt:box, or none; got 'dt'"),
+        (["--accuracy", "-1"], "--accuracy takes a share"),
+        (["--against", "exact"], "to be judged by; got 'exact'"),
+    ],
+)
+def test_what_cannot_be_is_refused(arguments: list[str], said: str, run: Command, tmp_path: Path) -> None:
+    done = run(*TURN, *arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert not (tmp_path / "turned").exists()
+
+
+def test_another_study_is_not_overwritten(run: Command, tmp_path: Path) -> None:
+    run(*TURN, "--knobs", "dt", cwd=tmp_path)
+    before = (tmp_path / "turned/extremes.json").read_bytes()
+    other = run(*TURN, "--knobs", "dt", "--seed", "1", cwd=tmp_path)
+    assert other.returncode == 2
+    assert "seed: wanted 1, found 0" in other.stderr
+    assert (tmp_path / "turned/extremes.json").read_bytes() == before
+
+
+@pytest.mark.drawn
+def test_a_map_shows_each_outcome_the_boundary_and_the_base(run: Command, tmp_path: Path) -> None:
+    run(*TURN, "--grid", "4", cwd=tmp_path)
+    found = Extremes.of_record(read_json(tmp_path / "turned/extremes.json"))
+    picture = found.plot()
+    maps = [ax for ax in picture.axes if ax.get_title().endswith("dt against box")]
+    assert len(maps) == len(found.maps) == 2
+    for ax, one in zip(maps, found.maps, strict=True):
+        drawn: set[Any] = {patch.get_gid() for patch in ax.patches}
+        assert drawn - {None} == {cell.outcome for cell in one.cells}
+        (line,) = (line for line in ax.lines if line.get_gid() == "limit of stability, bisected")
+        assert sorted(line.get_ydata()) == sorted(y for y, _, _ in one.boundary)
+        (star,) = (line for line in ax.lines if line.get_gid() == "base")
+        assert (star.get_xdata()[0], star.get_ydata()[0]) == (0.1, 1.0)
+
+
+def test_envs_loads_nothing_that_measures_or_draws() -> None:
+    loaded = modules(["envs", "bounce"])
+    assert not loaded & {"matplotlib", "gradscape.landscapes.measures.extremes", "gradscape.jobs.extremes"}
