@@ -37,6 +37,12 @@ def ramp(
     return (1 - share) * corners[:, segment] + share * corners[:, segment + 1]
 
 
+def ease(velocity: Float[Tensor, "batch step axis"], steps: int) -> Float[Tensor, "batch step axis"]:
+    """Return velocities that change over so many control steps, from rest: the mean of the last ones."""
+    before = torch.cat([velocity.new_zeros(len(velocity), steps - 1, velocity.shape[2]), velocity], dim=1)
+    return before.unfold(1, steps, 1).mean(dim=3)
+
+
 def integrate_velocity(
     start: Float[Tensor, " axis"],
     velocity: Float[Tensor, "batch step axis"],

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from ...landscapes.episode import Part, View
 from ...landscapes.space import ParameterSpace
-from ..base import Fidelity, MaterialRange
-from ..controls import extend, hold, integrate_velocity
+from ..base import Fidelity, MaterialRange, ModelPart
+from ..controls import ease, extend, hold, integrate_velocity
 from ..engines.mpm.boundaries import LadleInTank
 from ..engines.mpm.materials import Elastic
 from ..engines.mpm.materials import Fluid as Liquid
@@ -23,14 +23,19 @@ from ..options import EpisodeOptions
 from ..outlines import skin
 from .scene import SEGMENTS, STEPS, MpmScene, Stage
 
-TANK_WIDTH, TANK_HEIGHT, FILL = 0.4, 0.2, 0.15  # the tank, and the depth of the syrup [m]
+TANK_WIDTH, TANK_HEIGHT, FILL = 0.4, 0.2, 0.175  # the tank, and the depth of the syrup [m]
 HEADROOM = 0.6  # what the grid covers above the floor [m]
-CUBE_EDGE, CUBE_CENTER = 0.05, (0.11, 0.122, 0.0)  # [m]
-BOWL, SHELL, HANDLE = 0.07, 0.01, 0.25  # the ladle: radius, half its thickness, its handle's height [m]
-RIM = (0.0, 0.09, 0.0)  # centre of the bowl's rim at the start [m]
-LOWEST, HIGHEST = 0.085, 0.3  # how far the rim can go [m]
-SYRUP_DENSITY, SPEED_OF_SOUND = 1330.0, 5.0  # [kg/m^3], [m/s]
-GRAVITY = 9.81  # [m/s^2]
+CUBE_EDGE, CUBE_CENTER = (
+    0.05,
+    (0.025, 0.15, 0.0),
+)  # faces lie between particles where 16 of these are a tank's width [m]
+BOWL, SHELL, HANDLE = 0.07, 0.008, 0.25  # the ladle: radius, half its thickness, its handle's height [m]
+GRIP = 0.01  # over which the ladle's grip fades outside it [m], or three quarters of a coarse cell
+RIM = (0.0, 0.13, 0.0)  # centre of the bowl's rim at the start [m]
+LOWEST, HIGHEST = 0.08, 0.35  # how far the rim can go [m]
+UNIT = 0.2  # speed of the ladle at a parameter of 1 [m/s]
+EASING = 4  # control steps over which the ladle's speed changes
+SYRUP_DENSITY, GRAVITY = 1330.0, 9.81  # [kg/m^3], [m/s^2]
 SPAN = 0.01  # length of a control step [s]
 MARGIN = 2  # nodes outside the walls
 VIEW = View((-0.2, 0.0, -0.2), (0.2, 0.42, 0.2), eye=(0.4, 0.55, 1.0))
@@ -40,13 +45,21 @@ VIEW = View((-0.2, 0.0, -0.2), (0.2, 0.42, 0.2), eye=(0.4, 0.55, 1.0))
 class FluidOptions(EpisodeOptions):
     """`goal`: high rewards a cube lifted above the tank's edge; printed is the sign the paper prints, for a low one.
 
-    `viscosity` of the syrup [Pa s], `cube_density` [kg/m^3], `friction` of the ladle (Coulomb).
+    `viscosity` of the syrup [Pa s], `cube_density` [kg/m^3], `friction` of the ladle (Coulomb). `handle`: whether the
+    ladle has one. `easing`: whether its speed changes over 0.04 s, or at once. `walls` slip or stick. `sound_speed` in
+    syrup and cube [m/s]: the slower, the more they are compressed. `smoothing` of the syrup's volume ratios before each
+    control step, from 0 to 1, without which it bears load like a solid.
     """
 
     goal: Literal["high", "printed"] = "high"
-    viscosity: float = 4.0
+    viscosity: float = 20.0
     cube_density: float = 1400.0
     friction: float = 0.1
+    handle: bool = True
+    easing: bool = True
+    walls: Literal["slip", "stick"] = "slip"
+    sound_speed: float = 8.0
+    smoothing: float = 1.0
 
 
 class Fluid(MpmScene):
@@ -70,9 +83,9 @@ class Fluid(MpmScene):
 
     name: ClassVar[str] = "fluid"
     fidelities: ClassVar[dict[str, Fidelity]] = {
-        "draft": Fidelity("draft", dt=SPAN / 3, resolution=12, sampling=1.4),
-        "standard": Fidelity("standard", dt=SPAN / 20, resolution=22),
-        "reference": Fidelity("reference", dt=SPAN / 40, resolution=22, precision="float64"),
+        "draft": Fidelity("draft", dt=SPAN / 7, resolution=14, sampling=16 / 14),
+        "standard": Fidelity("standard", dt=SPAN / 14, resolution=30, sampling=1.6),
+        "reference": Fidelity("reference", dt=SPAN / 28, resolution=60, sampling=1.6, precision="float64"),
     }
     examples: ClassVar[dict[str, tuple[float, ...]]] = {
         "scoop": (1.41, -0.77, 0.15, 0.74, 0.08, 1.13, -1.3, 1.41, 0.17, 0.27)
@@ -80,18 +93,31 @@ class Fluid(MpmScene):
     loss_unit: ClassVar[str] = "m"
     control_step: ClassVar[float] = SPAN
     Options: ClassVar[type[Any]] = FluidOptions
-    material_range: ClassVar[MaterialRange] = MaterialRange("viscosity", 0.4, 40.0)  # a tenth and ten times the default
+    material_range: ClassVar[MaterialRange] = MaterialRange(
+        "viscosity", 2.0, 40.0
+    )  # a tenth of the default and twice that
+    model_parts: ClassVar[tuple[ModelPart, ...]] = (
+        ModelPart("viscosity", {"viscosity": 0.0}, "none"),
+        ModelPart("cube's weight", {"cube_density": SYRUP_DENSITY}, "that of syrup"),
+        ModelPart("friction of the ladle", {"friction": 0.0}, "none"),
+        ModelPart("handle", {"handle": False}, "none"),
+        ModelPart("easing", {"easing": False}, "the ladle's speed jumps"),
+        ModelPart("sound speed", {"sound_speed": 4.0}, "half of it"),
+        ModelPart("smoothing of volume", {"smoothing": 0.0}, "none"),
+        ModelPart("sticky walls", {"walls": "stick"}, "floor and walls hold the syrup", missing=True),
+    )
     space = ParameterSpace.box(
         [f"ladle {axis} speed, segment {segment}" for segment in range(1, SEGMENTS + 1) for axis in "xy"],
         -2.0,
         2.0,
-        "m/s",
+        "0.2 m/s",
     )
 
     def tools(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 1 3"]:
         """Return where the centre of the ladle's rim is at the ends of control steps [m]."""
-        velocity = hold(x.view(len(x), SEGMENTS, 2), STEPS)
+        velocity = hold(UNIT * x.view(len(x), SEGMENTS, 2), STEPS)
         velocity = extend(velocity, self.model.steps, then=x.new_zeros(len(x), 1, 2))
+        velocity = ease(velocity, EASING) if self.options.easing else velocity
         reach = TANK_WIDTH / 2 - BOWL - SHELL
         start, lower, upper = (x.new_tensor(p) for p in (RIM[:2], (-reach, LOWEST), (reach, HIGHEST)))
         path = integrate_velocity(start, velocity, SPAN, lower=lower, upper=upper)
@@ -150,7 +176,7 @@ def _model(fidelity: Fidelity, options: FluidOptions) -> Model:
     return Model(
         precision=fidelity.precision,
         bodies=_bodies(dx / fidelity.sampling, options),
-        boundary=LadleInTank(TANK_WIDTH / 2, HEADROOM, BOWL, SHELL, HANDLE, band=0.75 * dx, friction=options.friction),
+        boundary=_boundary(dx, options),
         origin=(corner, -MARGIN * dx, corner),
         dx=dx,
         nodes=(across, int(np.ceil(HEADROOM / dx)) + 1 + 2 * MARGIN, across),
@@ -158,6 +184,19 @@ def _model(fidelity: Fidelity, options: FluidOptions) -> Model:
         substeps=round(SPAN / fidelity.dt),
         steps=options.count_steps(STEPS),
         gravity=GRAVITY,
+    )
+
+
+def _boundary(dx: float, options: FluidOptions) -> LadleInTank:
+    return LadleInTank(
+        half_width=TANK_WIDTH / 2,
+        lid=HEADROOM,
+        radius=BOWL,
+        half_thickness=SHELL,
+        height=HANDLE if options.handle else 0.0,
+        band=max(GRIP, 0.75 * dx),
+        friction=options.friction,
+        slip=1.0 if options.walls == "slip" else 0.0,
     )
 
 
@@ -169,8 +208,9 @@ def _bodies(pitch: float, options: FluidOptions) -> tuple[Body, Body]:
     volume = _volume_outside_cube(grid, np.divide(sides, counts))
     free = (np.abs(grid - CUBE_CENTER).max(axis=1) >= CUBE_EDGE / 2) & (_distance_to_bowl(grid - RIM) >= SHELL)
     edge = max(3, round(CUBE_EDGE / pitch))
-    syrup = Liquid(SYRUP_DENSITY, SYRUP_DENSITY * SPEED_OF_SOUND**2, options.viscosity)
-    sugar = Elastic.with_wave_speed(options.cube_density, SPEED_OF_SOUND, poisson=0.3)
+    speed = options.sound_speed
+    syrup = Liquid(SYRUP_DENSITY, SYRUP_DENSITY * speed**2, options.viscosity, options.smoothing)
+    sugar = Elastic.with_wave_speed(options.cube_density, speed, poisson=0.3)
     return (
         _body(syrup, grid[free], volume[free]),
         _body(sugar, _lattice((edge,) * 3, (CUBE_EDGE,) * 3) + CUBE_CENTER, np.full(edge**3, (CUBE_EDGE / edge) ** 3)),

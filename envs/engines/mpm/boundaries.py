@@ -50,11 +50,12 @@ class Open:
 
 @dataclass(frozen=True)
 class LadleInTank:
-    """A square tank with slippery walls, centred on x = z = 0, floor at y = 0, and a ladle that moves in it.
+    """A square tank, centred on x = z = 0, with its floor at y = 0, and a ladle that moves in it.
 
     Lengths in m: half the tank's width, the height of a `lid` that stops what flies highest, the bowl's mid-surface
     `radius`, `half_thickness` of its shell, the handle's `height`, and the `band` over which the ladle's grip fades to
-    nothing outside its surface. `friction` is Coulomb's.
+    nothing outside its surface. `friction` is Coulomb's; `slip` is what floor and walls leave of the velocity along
+    them, from 1 (they slip) to 0 (they stick).
     """
 
     half_width: float
@@ -64,6 +65,7 @@ class LadleInTank:
     height: float
     band: float
     friction: float
+    slip: float = 1.0
     slots: ClassVar[int] = 1
 
     def function(self, name: str) -> tuple[Any, Any]:
@@ -123,6 +125,7 @@ def _ladle_in_tank(name: str) -> tuple[Any, Any]:
         height: real
         band: real
         friction: real
+        slip: real
 
     @wp.func(module=module)
     def between(tools: wp.array3d[vec3], e: int, step: int, fraction: real) -> vec3:
@@ -144,6 +147,14 @@ def _ladle_in_tank(name: str) -> tuple[Any, Any]:
         speed = wp.sqrt(wp.dot(tangent, tangent) + real(1e-10))
         tangent = tangent * wp.max(real(0.0), real(1.0) + friction * normal / speed)
         return body + (real(1.0) - grip) * u + grip * tangent
+
+    @wp.func(module=module)
+    def along_wall(p: vec3, v: vec3, edge: real, slip: real) -> vec3:
+        """Return what floor and walls leave of a velocity along them; that towards them is not theirs to change."""
+        across = wp.where(wp.abs(p[0]) > edge, real(1.0), slip)
+        upwards = wp.where(p[1] < real(1e-6), real(1.0), slip)
+        deep = wp.where(wp.abs(p[2]) > edge, real(1.0), slip)
+        return vec3(across * v[0], upwards * v[1], deep * v[2])
 
     @wp.func(module=module)
     def boundary(
@@ -168,6 +179,8 @@ def _ladle_in_tank(name: str) -> tuple[Any, Any]:
             hit = rod_distance(foot, scene.height, scene.half_thickness)
             v = slide(v, rate * (tools[e, step + 1, 0] - tools[e, step, 0]), hit, scene.band, scene.friction)
         edge = scene.half_width - real(1e-6)  # a wall's own nodes belong to it
+        if wp.abs(p[0]) > edge or wp.abs(p[2]) > edge or p[1] < real(1e-6):
+            v = along_wall(p, v, edge, scene.slip)
         vx, vy, vz = v[0], v[1], v[2]
         if p[0] < -edge:
             vx = wp.max(vx, real(0.0))

@@ -1,6 +1,6 @@
 """What MLS-MPM stores of an episode: the particles of an instant, the grids of a substep, a control step whole."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import warp as wp
@@ -49,6 +49,14 @@ class Allocator:
         states = (self.array(b.material.state(self.model.precision), len(b.x)) for b in self.model.bodies)
         return Frame(x, v, C, tuple(states))
 
+    def smoothed(self) -> dict[int, wp.array]:
+        """Return zeros for the state of each body whose state is smoothed before a control step, by its number."""
+        return {
+            b: self.array(body.material.state(self.model.precision), len(body.x))
+            for b, body in enumerate(self.model.bodies)
+            if body.material.smoothing
+        }
+
     def grid(self, cells: int) -> Grid:
         """Return a grid of zeros."""
         return Grid(*(self.array(self.types.vec4, cells) for _ in range(2)))
@@ -70,6 +78,7 @@ class Tape:
         model = allocator.model
         self.step = -1
         self.frames = [allocator.frame() for _ in range(model.substeps - 1)]
+        self.smoothed = allocator.smoothed()
         self.A = [allocator.affine_momentum() for _ in range(model.substeps)]
         self.grids = [allocator.grid(cells) for _ in range(model.substeps)]
         self.lattice = place_grid(model)
@@ -80,7 +89,7 @@ class Tape:
         """What its arrays take."""
         grids = [array for grid in self.grids for array in (grid.m, grid.v)]
         frames = [array for frame in self.frames for array in frame.arrays()]
-        return sum(array.capacity for array in (*frames, *self.A, *grids))
+        return sum(array.capacity for array in (*frames, *self.smoothed.values(), *self.A, *grids))
 
     def growth(self, cells: int) -> int:
         """Return the bytes that grids of so many nodes take beyond those that are there, 0 where these suffice."""
@@ -89,6 +98,10 @@ class Tape:
         more = self._room(cells) - self._cells
         size = int(wp.types.type_size_in_bytes(self._allocator.types.vec4))
         return 2 * len(self.grids) * self._allocator.capacity * more * size
+
+    def start(self, checkpoint: Frame) -> Frame:
+        """Return the frame that the control step starts from: the checkpoint, with the states that are smoothed."""
+        return replace(checkpoint, S=tuple(self.smoothed.get(b, S) for b, S in enumerate(checkpoint.S)))
 
     def make_room(self, step: int, box: Box) -> None:
         """Become the place of a control step that runs on a box of nodes."""

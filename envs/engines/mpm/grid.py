@@ -6,7 +6,7 @@ from typing import Any, no_type_check
 import warp as wp
 
 from ..runtime import determinism, precision
-from .transfers import lattice
+from .stencil import lattice
 
 # A node is read once, so that its adjoint can be set, where Warp would add to it atomically.
 READ, ADJOINT_READ = "return wp::index(grid, e, i);", "wp::index(adj_grid, e, i) = adj_ret;"

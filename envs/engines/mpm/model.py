@@ -10,7 +10,7 @@ import warp as wp
 from ..runtime import precision
 from .boundaries import Boundary
 from .materials import Fluid, Material
-from .transfers import lattice
+from .stencil import lattice
 
 BOX_MARGIN = 1  # cells around the particles that a control step begins with
 EMPTY = 1e-8  # nodes lighter than this part of the lightest particle carry no velocity

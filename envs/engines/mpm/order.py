@@ -15,7 +15,7 @@ import warp as wp
 
 from ..runtime import load, precision, to_torch
 from .model import Model, place_grid
-from .transfers import lattice
+from .stencil import lattice
 
 
 @cache

@@ -9,7 +9,7 @@ One substep, state (x, v, C, S) of frame s to frame s + 1, S being each material
 
 Particles are kept at the ends of control steps; as many of the last control steps as fit are kept whole, with A and
 grids of every substep (on a CPU all or one). The gradient recomputes the others, one at a time. Between control steps
-particles are sorted (`order`).
+particles are sorted (`order`), and a fluid's volume ratios smoothed (`smoothing`).
 """
 
 import threading
@@ -28,7 +28,9 @@ from .checkpoints import Allocator, Frame, Tape
 from .grid import velocity_kernel
 from .model import BOX_MARGIN, EMPTY, Box, Model, nodes_around
 from .order import Order, Sorter
-from .transfers import lattice, transfers
+from .smoothing import Smoother
+from .stencil import lattice
+from .transfers import transfers
 
 CROWD = 8_000  # particles that hide what a launch costs on one core
 BUSY, FULL_CARD = 400_000, 1_000_000  # particles that keep a GPU busy; more than which gain nothing
@@ -83,6 +85,8 @@ class Solver:
         load([*transferring, self.velocity, *chain.from_iterable(self.materials)], device)
         self.first = np.concatenate([[0], np.cumsum([len(body.x) for body in model.bodies])]).tolist()
         self.empty = EMPTY * float(model.mass.min())
+        smooth = [b for b, body in enumerate(model.bodies) if body.material.smoothing]
+        self.smoothers = [Smoother(self, b, deterministic=deterministic) for b in smooth]
         self.boxes = [Box((0, 0, 0), model.nodes)] * model.steps
         self.margins = [BOX_MARGIN] * model.steps  # cells around the particles, as each step has needed so far
         self.checkpoints = [self.allocator.frame() for _ in range(model.steps + 1)]
@@ -141,7 +145,8 @@ class Solver:
 
     def frames(self, step: int) -> list[Frame]:
         """Return the frames of one control step, both ends included."""
-        return [self.checkpoints[step], *self.tape(step).frames, self.end]
+        tape = self.tape(step)
+        return [tape.start(self.checkpoints[step]), *tape.frames, self.end]
 
     def tape(self, step: int) -> Tape:
         """Return where a control step is stored whole, or another one at the moment."""
@@ -218,6 +223,8 @@ class Solver:
 
     def _substeps(self, step: int, batch: int) -> None:
         tape, frames = self.tape(step), self.frames(step)
+        for smoother in self.smoothers:
+            smoother.run(self, step, batch)
         for s in range(self.model.substeps):
             self._update(step, frames[s], frames[s + 1], tape.A[s], batch)
             self._fill_grid(frames[s], step, s, batch)
@@ -347,6 +354,8 @@ class _Adjoint:
             self._adjoint_p2g(step, frames[s], tape, s, batch)
             self._adjoint_update(step, frames[s], batch)
             self.new, self.old = self.old, self.new
+        for smoother in solver.smoothers:
+            smoother.run_back(solver, step, batch, self.new)
 
     def _adjoint_g2p(self, frame: Frame, tape: Tape, substep: int, batch: int) -> None:
         solver = self.solver

@@ -8,7 +8,7 @@ The adjoints are written out because they cost half of what reverse-mode AD of t
 them against it.
 """
 
-from functools import cache, partial
+from functools import cache
 from types import SimpleNamespace
 from typing import no_type_check
 
@@ -16,31 +16,7 @@ import warp as wp
 
 from ..runtime import determinism, precision
 from .aggregation import aggregation
-
-
-@cache
-@no_type_check
-def lattice(name: str) -> type:
-    """Return the struct that places a grid, in one precision."""
-    types = precision(name)
-    real, vec3 = types.real, types.vec3
-
-    @partial(wp.struct, module=f"gradscape.lattice.{name}")
-    class Lattice:
-        """Place the grid: node (0, 0, 0) at `origin` [m], spacing 1/`inv_dx` [m].
-
-        Arrays hold `nx, ny, nz` nodes from node `first` on. As long as they cover what a particle reads and writes, it
-        does not depend on them, to the last bit.
-        """
-
-        origin: vec3
-        inv_dx: real
-        first: wp.vec3i
-        nx: int
-        ny: int
-        nz: int
-
-    return Lattice
+from .stencil import lattice, stencil
 
 
 @cache
@@ -51,30 +27,10 @@ def transfers(name: str, *, deterministic: bool = False) -> SimpleNamespace:
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
     module = f"gradscape.transfers.{name}{'.deterministic' if deterministic else ''}"
     wp.set_module_options({"deterministic": determinism(deterministic)}, module)
-    Lattice = lattice(name)
+    Lattice, spline = lattice(name), stencil(name)
+    base_node, weights, weight_slopes = spline.base_node, spline.weights, spline.weight_slopes
     find_run, add = aggregation(name, module, native=name == "float32" and not deterministic)
     offset = wp.constant(vec3(0.0, 1.0, 2.0))  # real(i) on an unrolled index breaks the code generator in float64
-
-    @wp.func(module=module)
-    def base_node(s: vec3, lattice: Lattice):
-        # Clamped, so that a particle out of the grid (its episode is reported as escaped) touches no foreign memory.
-        return wp.vec3i(
-            wp.clamp(int(wp.floor(s[0] - real(0.5))), lattice.first[0], lattice.first[0] + lattice.nx - 3),
-            wp.clamp(int(wp.floor(s[1] - real(0.5))), lattice.first[1], lattice.first[1] + lattice.ny - 3),
-            wp.clamp(int(wp.floor(s[2] - real(0.5))), lattice.first[2], lattice.first[2] + lattice.nz - 3),
-        )
-
-    @wp.func(module=module)
-    def weights(f: real):
-        return vec3(
-            real(0.5) * (real(1.5) - f) * (real(1.5) - f),
-            real(0.75) - (f - real(1.0)) * (f - real(1.0)),
-            real(0.5) * (f - real(0.5)) * (f - real(0.5)),
-        )
-
-    @wp.func(module=module)
-    def weight_slopes(f: real):
-        return vec3(f - real(1.5), real(2.0) - real(2.0) * f, f - real(0.5))
 
     @wp.func(module=module)
     def column(a: mat33, k: int):

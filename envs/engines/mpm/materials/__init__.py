@@ -10,7 +10,7 @@ against differences of the first. tau is the Kirchhoff stress J sigma [Pa].
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -23,13 +23,15 @@ class Fluid:
     """A viscous, weakly compressible fluid: density [kg/m^3], bulk modulus [Pa], dynamic viscosity [Pa s].
 
     Its pressure grows with log J, so that however hard a droplet is hit it pushes back, and a lone particle oscillates
-    at sqrt(12) c/dx whatever its J (stable for c dt/dx < 0.57). It bears tension up to a tenth more than its volume,
-    then tears: J grows no further.
+    at sqrt(12) c/dx whatever its J (stable for c dt/dx < 0.57). It bears tension up to a volume larger by 4 %, then
+    tears: J grows no further. Before each control step a share `smoothing`, from 0 to 1, of what the J of a particle
+    differs from that of its neighbours is taken from it.
     """
 
     density: float
     bulk: float
     viscosity: float
+    smoothing: float = 0.0
 
     def volume_ratio(self, pressure: np.ndarray) -> np.ndarray:
         """Return J at which the fluid bears `pressure` [Pa], counted on its reference volume."""
@@ -60,6 +62,7 @@ class _Solid:
     density: float
     young: float
     poisson: float
+    smoothing: ClassVar[float] = 0.0
 
     @property
     def mu(self) -> float:

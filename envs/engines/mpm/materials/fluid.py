@@ -7,7 +7,7 @@ import warp as wp
 
 from ...runtime import precision
 
-TORN = 1.1  # volume ratio at which a fluid tears
+TORN = 1.04  # volume ratio at which a fluid tears
 
 
 @cache
