@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ...landscapes.episode import Part, View
 from ...landscapes.space import ParameterSpace
-from ..base import Fidelity
+from ..base import Fidelity, ModelPart
 from ..batching import Pool
 from ..code import code_digest
 from ..controls import extend, hold, integrate_velocity, roll
@@ -23,9 +23,8 @@ from ..engines.mpm.model import Model
 from ..engines.mpm.raster import Raster
 from ..engines.mpm.solver import Solver
 from ..engines.mpm.tools import Kind
-from ..options import EpisodeOptions
 from .plasticine_look import parts, view
-from .plasticine_model import SPAN, Scene, model, target
+from .plasticine_model import SPAN, PhysicsOptions, Scene, model, target
 from .scene import SEGMENTS, STEPS, MpmScene, Stage
 from .targets import Target, contact, load_or_make
 
@@ -35,7 +34,7 @@ REACH = 0.1  # what a policy measures lengths by [m]
 
 
 @dataclass(frozen=True)
-class PlasticineOptions(EpisodeOptions):
+class PlasticineOptions(PhysicsOptions):
     """`loss` is of the final frame, or summed over all control steps.
 
     `density`, `sdf` and `contact` are the weights of its terms: the body's density against the target's, its distance
@@ -84,6 +83,18 @@ class Plasticine(MpmScene):
         "reference": Fidelity("reference", dt=SPAN / 40, resolution=64, particles=10_000, precision="float64"),
     }
     Options: ClassVar[type[Any]] = PlasticineOptions
+    model_parts: ClassVar[tuple[ModelPart, ...]] = (
+        ModelPart("friction of tools", {"tool_friction": 0.0}, "tools slip"),
+        ModelPart("friction of the floor", {"floor_friction": 0.0}, "the floor slips"),
+        ModelPart("plasticity", {"yield_stress": 1e6}, "an elastic body"),
+        ModelPart("Poisson's ratio", {"poisson": 0.0}, "what is pressed does not bulge"),
+        ModelPart("gravity", {"gravity": 0.0}, "no weight"),
+        ModelPart("soft shell of tools", {"softness": 1e5}, "felt at their surface alone"),
+        ModelPart("walls", {"walls": False}, "an open room"),
+        ModelPart("density term", {"density": 0.0}, "not in the loss"),
+        ModelPart("sdf term", {"sdf": 0.0}, "not in the loss"),
+        ModelPart("contact term", {"contact": 0.0}, "not in the loss"),
+    )
     control_step: ClassVar[float] = SPAN
     scene: ClassVar[Scene]
     _solvers: Pool[JudgedStage]
@@ -135,7 +146,7 @@ class Plasticine(MpmScene):
         self._making = threading.Lock()
 
     def _model(self) -> Model:
-        return model(self.scene, self.fidelity, self.options.count_steps(STEPS))
+        return model(self.scene, self.fidelity, self.options.count_steps(STEPS), self.options)
 
     @staticmethod
     def _make_stage(
