@@ -71,8 +71,13 @@ class Plasticine(MpmScene):
     Simplifications: a tool that only translates carries no rotation; a slippery room ends where tools push nothing, or
     0.5 m beyond the bodies; particles are spread evenly whatever a body weighs (upstream, weight follows the number
     drawn). Departures from upstream: 20 substeps for 19, an exact distance field, softness 666 everywhere, no jump at
-    a shell's end nor on a sticky floor; only the closest particle has the contact's gradient, and undeformed bodies
-    have theirs.
+    a shell's end nor on a sticky floor; a shell acts per time, not per substep; only the closest particle has the
+    contact's gradient, and undeformed bodies have theirs.
+    Refine step and grid together. Velocities pass through the grid once per substep, which damps what is as short as a
+    few cells: on a given grid the shorter the step, the more. On 64 cells with 4000 particles the loss of one of
+    assembly's random episodes grows by 1.3, 1.5 and 1.5 % as the step halves from 2e-4 to 2.5e-5 s. That is no chaos:
+    with 2000 particles at 1e-4 s, parameters 1e-8 apart end at most 1.3e-8 m apart at four random points of table and
+    assembly.
     Source: PlasticineLab (Huang et al., ICLR 2021), as used in "Rethinking Optimization with Differentiable Simulation
     from a Global Perspective" (CoRL 2022).
     """
