@@ -65,7 +65,8 @@ class Plasticine(MpmScene):
     Loss at the end, or summed over control steps: 10 density + 10 sdf + 500 contact (options; `terms` has each alone).
     density = sum |m - m*| over the masses of grid nodes [kg]; sdf = sum m D* [kg m], D* the distance to the target's
     nearest node; contact = sum over tools of the squared distance to the closest particle [m^2]. The weight of contact
-    is ours: the paper raised it and does not say to what.
+    is ours: the paper raised it and does not say to what. At draft 64 random points of table lose 8 to 104 with it
+    (5 to 95 %), in the median 71 % of that contact; the paper's colour bar goes from 14 to 86.
     Targets are shapes, or what the scene's demonstration (an example) leaves at the same fidelity: at each of them a
     solution is known.
     Simplifications: a tool that only translates carries no rotation; a slippery room ends where tools push nothing, or
