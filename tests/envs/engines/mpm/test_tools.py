@@ -135,7 +135,7 @@ def test_what_a_shell_takes_in_a_time_does_not_depend_on_how_it_is_cut():
             shell, met = room(Tool(Kind.SPHERE, SIZES[Kind.SPHERE], 0.0), substeps=duration / count), v
             for _ in range(count):
                 met = shell(p, met, slots(Kind.SPHERE, PLACE))
-            torch.testing.assert_close(met[same], wanted[same], rtol=0, atol=1e-10)
+            torch.testing.assert_close(met[same], wanted[same], rtol=0, atol=1e-7)  # the normal is rounded by 1e-9
 
 
 def test_a_tool_is_where_its_step_has_taken_it():
