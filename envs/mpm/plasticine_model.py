@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from ..base import Fidelity
 from ..engines.mpm.materials import Plasticine
 from ..engines.mpm.model import Body, Model
 from ..engines.mpm.tools import Kind, Tool, ToolsInRoom
+from ..options import EpisodeOptions
 from .scene import STEPS
 from .shapes import Point, Shape, fill, shares
 
@@ -18,7 +19,34 @@ YOUNG, GRAVITY, SOFTNESS = 5000.0, 30.0, 666.0  # [Pa] at a density of 1 kg/m^3;
 PARTICLE = (1 / 128) ** 2  # PlasticineLab's particle mass [kg], which sets the scale of its losses
 FLOOR, WALLS = 2.5 / 64, (2.5 / 64, 61.5 / 64)  # nodes outside belong to floor and walls [m]
 ROOM = 0.15, 0.5  # least and most that the room extends beyond the bodies [m]
+BEYOND = 1e6  # where walls are that no body meets [m]
 MARGIN = 2  # nodes outside the walls
+
+
+@dataclass(frozen=True)
+class PhysicsOptions(EpisodeOptions):
+    """What the model's parts are multiplied by, 1 being the scene's own and 0 leaving the part out.
+
+    `tool_friction` and `floor_friction` (a sticky floor's is 10, and less than that rubs), `yield_stress` (1e6: an
+    elastic body), `poisson` (its ratio) and `gravity`. `softness` [1/m] is that of the shell through which tools are
+    felt (1e5: they are felt at their surface alone). Without `walls` the room has neither walls nor lid, and an episode
+    escapes where plasticine leaves the grid. Raises ValueError where one is below 0.
+    """
+
+    tool_friction: float = 1.0
+    floor_friction: float = 1.0
+    yield_stress: float = 1.0
+    poisson: float = 1.0
+    gravity: float = 1.0
+    softness: float = SOFTNESS
+    walls: bool = True
+
+    def __post_init__(self) -> None:
+        for field in fields(PhysicsOptions):
+            value = getattr(self, field.name)
+            if value < 0 or (field.name == "softness" and value == 0):
+                least = "above 0" if field.name == "softness" else "of at least 0"
+                raise ValueError(f"plasticine option {field.name} takes a number {least}; got {value:g}")
 
 
 @dataclass(frozen=True)
@@ -68,6 +96,17 @@ class Scene:
         """Every tool, in the order of their slots."""
         return (*(anchor.tool for anchor in self.anchors), *(tool for tool, _ in self.posts))
 
+    def altered(self, options: PhysicsOptions) -> Scene:
+        """Return the scene with its material and frictions as options say."""
+        return replace(
+            self,
+            yield_stress=self.yield_stress * options.yield_stress,
+            floor_friction=self.floor_friction * options.floor_friction,
+            poisson=self.poisson * options.poisson,
+            anchors=tuple(replace(a, tool=_rub(a.tool, options.tool_friction)) for a in self.anchors),
+            posts=tuple((_rub(tool, options.tool_friction), at) for tool, at in self.posts),
+        )
+
     def room(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the corners of what tools can push bodies through [m]: where walls stand."""
         corners = [shape.bounds for shape in (*(piece.shape for piece in self.pieces), *self.target)]
@@ -77,25 +116,24 @@ class Scene:
         return np.maximum(lower, [WALLS[0], 0.0, WALLS[0]]), np.minimum(upper, WALLS[1])
 
 
-def model(scene: Scene, fidelity: Fidelity, steps: int = STEPS) -> Model:
+def model(scene: Scene, fidelity: Fidelity, steps: int = STEPS, options: PhysicsOptions = PhysicsOptions()) -> Model:
     """Return a scene's model of so many control steps: bodies at rest, tools, and a grid that covers its room."""
     dx = 1.0 / fidelity.resolution
+    scene = scene.altered(options)
     lower, upper = scene.room()
     first = np.floor(lower / dx).astype(int) - MARGIN
     last = np.ceil(upper / dx).astype(int) + MARGIN
     return Model(
         precision=fidelity.precision,
         bodies=_bodies(scene, fidelity.particles, dx),
-        boundary=ToolsInRoom(
-            scene.tools, tuple(lower.tolist()), tuple(upper.tolist()), FLOOR, scene.floor_friction, SOFTNESS
-        ),
+        boundary=_boundary(scene, fidelity.dt, options),
         origin=tuple((first * dx).tolist()),
         dx=dx,
         nodes=tuple((last - first + 1).tolist()),
         dt=fidelity.dt,
         substeps=round(SPAN / fidelity.dt),
         steps=steps,
-        gravity=GRAVITY,
+        gravity=GRAVITY * options.gravity,
     )
 
 
@@ -103,6 +141,24 @@ def target(scene: Scene, particles: int) -> np.ndarray:
     """Return the particles of a target that is made of shapes [m], shape (particle, 3)."""
     counts = shares([piece.shape for piece in scene.pieces], particles)
     return np.concatenate([fill(shape, count) for shape, count in zip(scene.target, counts, strict=True)])
+
+
+def _boundary(scene: Scene, dt: float, options: PhysicsOptions) -> ToolsInRoom:
+    lower, upper = scene.room() if options.walls else (np.full(3, -BEYOND), np.full(3, BEYOND))
+    return ToolsInRoom(
+        scene.tools,
+        tuple(lower.tolist()),
+        tuple(upper.tolist()),
+        FLOOR,
+        scene.floor_friction,
+        options.softness,
+        dt,
+    )
+
+
+def _rub(tool: Tool, factor: float) -> Tool:
+    """Return the tool with so many times its friction."""
+    return replace(tool, friction=factor * tool.friction)
 
 
 def _bodies(scene: Scene, particles: int, dx: float) -> tuple[Body, ...]:

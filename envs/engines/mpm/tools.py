@@ -3,6 +3,12 @@
 Every tool is a signed distance. Grid velocities in its shell lose what goes into it and are rubbed (Coulomb), the less
 the farther off they are. Tools are moved, never pushed back.
 
+A tool's influence is a rate. PlasticineLab takes the share exp(-softness d) of what a node runs into it once per
+substep, so that with ever shorter substeps all of its shell becomes as hard as its surface: the effective surface moves
+out by ln(2)/softness (1 mm) whenever the step is halved, and losses grow with the logarithm of the number of steps.
+Here the share k that one of its substeps takes (UPSTREAM_DT) is 1 - (1 - k)^(dt/UPSTREAM_DT) of ours: its law at its
+step, and one that converges as the step goes to zero.
+
 Nothing here jumps as a node moves or a velocity changes sign, where PlasticineLab does twice: its influence
 exp(-softness d) ends at a tenth, ours falls to nothing there; its sticky floor lets what rises from it slide, ours lets
 it rise only. Each such jump is small and in no gradient, but an episode has thousands: over steps of 1e-3 they put
@@ -22,6 +28,7 @@ from ..runtime import precision
 from .sdf import capsule, cylinder, sphere, torus
 
 FAINTEST = 0.1  # exp(-softness d) at which a tool's shell ends
+UPSTREAM_DT = 1e-4  # the substep of PlasticineLab [s], for which its influence is meant
 STICKY = 10.0  # floor friction from which nothing slides
 
 
@@ -59,7 +66,8 @@ class ToolsInRoom:
     """Tools in a room with slippery walls and a floor.
 
     `lower`, `upper` [m]: walls stand there; nodes at or below `floor` [m] belong to the floor, whose Coulomb `friction`
-    is 0 where things slip freely and STICKY or more where they stick. `softness` [1/m] of the tools' shells.
+    is 0 where things slip freely and STICKY or more where they stick. `softness` [1/m] of the tools' shells; the
+    substep is `dt` [s] long.
     """
 
     tools: tuple[Tool, ...]
@@ -68,6 +76,7 @@ class ToolsInRoom:
     floor: float
     friction: float
     softness: float
+    dt: float = UPSTREAM_DT
 
     @property
     def slots(self) -> int:
@@ -85,6 +94,7 @@ class ToolsInRoom:
         data = self.function(name)[1]()
         data.lower, data.upper = types.vec3(*self.lower), types.vec3(*self.upper)
         data.floor, data.floor_friction, data.softness = self.floor, self.friction, self.softness
+        data.substeps = self.dt / UPSTREAM_DT
         sizes = [(*tool.size, 0.0)[:2] for tool in self.tools]
         rows = np.array([[*size, tool.friction] for size, tool in zip(sizes, self.tools, strict=True)])
         data.shape = wp.array(rows, dtype=types.vec3, device=device)
@@ -107,13 +117,14 @@ def _tools_in_room(name: str, count: int) -> tuple[Any, Any]:
 
     @partial(wp.struct, module=module)
     class Scene:
-        """The fields of ToolsInRoom; for each tool (size, size, friction)."""
+        """The fields of ToolsInRoom, dt in PlasticineLab's substeps; for each tool (size, size, friction)."""
 
         lower: vec3
         upper: vec3
         floor: real
         floor_friction: real
         softness: real
+        substeps: real
         shape: wp.array[vec3]
         kind: wp.array[wp.int32]
         slot: wp.array[wp.int32]
@@ -136,10 +147,17 @@ def _tools_in_room(name: str, count: int) -> tuple[Any, Any]:
         return t * (wp.max(real(0.0), speed + friction * normal) / speed)
 
     @wp.func(module=module)
-    def contact(hit: vec4, v: vec3, body: vec3, friction: real, softness: real) -> vec3:
+    def share(gap: real, softness: real, substeps: real) -> real:
+        """Return the part of what runs into a tool that a node at this distance loses in so many `substeps`."""
+        left = (real(1.0) - wp.exp(-softness * wp.max(gap, real(0.0)))) / (real(1.0) - real(FAINTEST))  # in one of them
+        if left <= real(0.0):  # inside, where log(left) has no value
+            return real(1.0)
+        return real(1.0) - wp.exp(substeps * wp.log(left))
+
+    @wp.func(module=module)
+    def contact(hit: vec4, v: vec3, body: vec3, friction: real, softness: real, substeps: real) -> vec3:
         """Return the velocity of a node at signed distance hit[3] from a tool whose matter moves at `body`."""
-        full = wp.exp(-softness * wp.max(hit[3], real(0.0)))
-        influence = (full - real(FAINTEST)) / (real(1.0) - real(FAINTEST))
+        influence = share(hit[3], softness, substeps)
         n = vec3(hit[0], hit[1], hit[2])
         u = v - body
         normal = wp.dot(u, n)
@@ -179,7 +197,7 @@ def _tools_in_room(name: str, count: int) -> tuple[Any, Any]:
             yaw = angles[1] + fraction * turn[1]
             axis = vec3(wp.sin(yaw), real(0.0), wp.cos(yaw))
             body += wp.cross(rate * (turn[0] * axis + turn[1] * up), local)
-        return contact(distance(kind, local, axis, shape), v, body, shape[2], scene.softness)
+        return contact(distance(kind, local, axis, shape), v, body, shape[2], scene.softness, scene.substeps)
 
     @wp.func(module=module)
     def apply_floor(v: vec3, friction: real) -> vec3:

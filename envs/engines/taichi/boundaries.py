@@ -14,7 +14,7 @@ from typing import Any, no_type_check
 
 from ..mpm.boundaries import Boundary, LadleInTank, Open
 from ..mpm.sdf import TINY
-from ..mpm.tools import FAINTEST, STICKY, Kind, Tool, ToolsInRoom
+from ..mpm.tools import FAINTEST, STICKY, UPSTREAM_DT, Kind, Tool, ToolsInRoom
 from .runtime import real as real_type
 from .runtime import ti
 
@@ -35,7 +35,8 @@ def boundary_contact(boundary: Boundary, name: str) -> Any:
     if isinstance(boundary, ToolsInRoom):
         slots = [sum(tool.slots for tool in boundary.tools[:j]) for j in range(len(boundary.tools))]
         contacts = [
-            _tool(tool, slot, boundary.softness, name) for tool, slot in zip(boundary.tools, slots, strict=True)
+            _tool(tool, slot, _influence(boundary, name), name)
+            for tool, slot in zip(boundary.tools, slots, strict=True)
         ]
         lower = (boundary.lower[0], -1e9, boundary.lower[2])  # below it has a floor
         return reduce(_apply_both, [*contacts, _floor(boundary, name), _walls(lower, boundary.upper, name)])
@@ -182,7 +183,7 @@ def _fade(band: float, name: str) -> Any:
 
 
 @no_type_check
-def _tool(tool: Tool, slot: int, softness: float, name: str) -> Any:
+def _tool(tool: Tool, slot: int, influence: Any, name: str) -> Any:
     real, laws, distance = real_type(name), _laws(name), _distance(tool, name)
     rolls = tool.kind is Kind.ROLLER
 
@@ -196,11 +197,24 @@ def _tool(tool: Tool, slot: int, softness: float, name: str) -> Any:
             axis = ti.Vector([ti.sin(angles[1]), real(0.0), ti.cos(angles[1])])
             body += (spin[0] * axis + spin[1] * up).cross(local)
         n, d = distance(local, axis)
-        full = ti.exp(-real(softness) * ti.max(d, real(0.0)))
-        share = ti.max((full - real(FAINTEST)) / real(1.0 - FAINTEST), real(0.0))
-        return laws.touch(v, body, n, share, real(tool.friction), TOOL_SLIP)
+        return laws.touch(v, body, n, influence(d), real(tool.friction), TOOL_SLIP)
 
     return contact
+
+
+@no_type_check
+def _influence(room: ToolsInRoom, name: str) -> Any:
+    """Return the share of what runs into a tool that a node at a distance loses in a substep."""
+    real, substeps = real_type(name), room.dt / UPSTREAM_DT
+
+    @ti.func
+    def influence(d):
+        left = (real(1.0) - ti.exp(-real(room.softness) * ti.max(d, real(0.0)))) / real(1.0 - FAINTEST)
+        inside = left <= real(0.0)
+        decay = ti.exp(real(substeps) * ti.log(ti.select(inside, real(1.0), left)))
+        return ti.select(inside, real(1.0), ti.max(real(1.0) - decay, real(0.0)))
+
+    return influence
 
 
 @no_type_check

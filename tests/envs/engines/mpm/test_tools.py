@@ -8,7 +8,7 @@ import warp as wp
 
 from gradscape.envs.controls import roll
 from gradscape.envs.engines.mpm.sdf import capsule, cylinder, sphere, torus
-from gradscape.envs.engines.mpm.tools import FAINTEST, STICKY, Kind, Tool, ToolsInRoom
+from gradscape.envs.engines.mpm.tools import FAINTEST, STICKY, UPSTREAM_DT, Kind, Tool, ToolsInRoom
 from gradscape.envs.engines.runtime import precision
 
 from ..bench import BoundaryBench, draw, vectors
@@ -28,8 +28,8 @@ AWAY = vectors((0.0, 50.0, 0.0))[0]
 KINDS = pytest.mark.parametrize("kind", SIZES, ids=lambda kind: kind.name.lower())
 
 
-def room(*tools, friction=0.0, floor=0.1):
-    scene = ToolsInRoom(tools, LOWER, UPPER, floor, friction, SOFTNESS)
+def room(*tools, friction=0.0, floor=0.1, substeps=1.0):
+    scene = ToolsInRoom(tools, LOWER, UPPER, floor, friction, SOFTNESS, substeps * UPSTREAM_DT)
     return BoundaryBench(scene, rate=RATE)
 
 
@@ -121,6 +121,21 @@ def test_the_grip_fades_in_the_shell(kind):
     influence = ((torch.exp(-SOFTNESS * gaps) - FAINTEST) / (1 - FAINTEST))[:, None]  # 1 at the surface, 0 at the end
     wanted = (1 - influence) * v + influence * rubbed(v, normal, FRICTION)
     torch.testing.assert_close(met[same], wanted[same], rtol=0, atol=1e-6)
+
+
+def test_what_a_shell_takes_in_a_time_does_not_depend_on_how_it_is_cut():
+    """The speed into a tool decays as (1 - k)^(t / UPSTREAM_DT), k being the share of one of PlasticineLab's steps."""
+    gaps = torch.linspace(0.01, 0.99, 300, dtype=torch.float64) * SHELL
+    p, normal, same = nodes_at(Kind.SPHERE, gaps)
+    v = -1.3 * normal + 0.2 * torch.linalg.cross(normal, vectors((0.3, 0.5, 0.8)).expand_as(normal))
+    share = (torch.exp(-SOFTNESS * gaps) - FAINTEST) / (1 - FAINTEST)
+    for duration, cuts in ((1.0, (1, 2, 5)), (2.5, (1, 10))):
+        wanted = v + 1.3 * (1 - (1 - share[:, None]) ** duration) * normal
+        for count in cuts:
+            shell, met = room(Tool(Kind.SPHERE, SIZES[Kind.SPHERE], 0.0), substeps=duration / count), v
+            for _ in range(count):
+                met = shell(p, met, slots(Kind.SPHERE, PLACE))
+            torch.testing.assert_close(met[same], wanted[same], rtol=0, atol=1e-7)  # the normal is rounded by 1e-9
 
 
 def test_a_tool_is_where_its_step_has_taken_it():
@@ -229,11 +244,11 @@ def test_a_node_in_two_shells_meets_both_in_turn():
 
 
 @KINDS
-@pytest.mark.parametrize("friction", [0.0, FRICTION])
-def test_adjoints_are_slopes(kind, friction):
+@pytest.mark.parametrize(("friction", "substeps"), [(0.0, 1.0), (FRICTION, 1.0), (FRICTION, 0.25)])
+def test_adjoints_are_slopes(kind, friction, substeps):
     """By the velocity and by the tool's place, motion and angles, in the shell and inside, rubbed or stuck."""
     count, fraction, step = 60, 0.3, 1e-6
-    bench = room(Tool(kind, SIZES[kind], friction), Tool(Kind.SPHERE, (0.02,), friction))
+    bench = room(Tool(kind, SIZES[kind], friction), Tool(Kind.SPHERE, (0.02,), friction), substeps=substeps)
     tools = torch.cat([slots(kind, PLACE, (0.001, -0.003, 0.002), 0.1, 0.05), slots(Kind.SPHERE, AWAY)], dim=1)
     gaps = SHELL * torch.linspace(-0.5, 0.8, count, dtype=torch.float64)
     p, normal, _ = nodes_at(kind, gaps, count, seed=13)
