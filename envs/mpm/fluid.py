@@ -83,8 +83,8 @@ class Fluid(MpmScene):
 
     name: ClassVar[str] = "fluid"
     fidelities: ClassVar[dict[str, Fidelity]] = {
-        "draft": Fidelity("draft", dt=SPAN / 7, resolution=14, sampling=16 / 14),
-        "standard": Fidelity("standard", dt=SPAN / 14, resolution=30, sampling=1.6),
+        "draft": Fidelity("draft", dt=SPAN / 6, resolution=12, sampling=16 / 12),
+        "standard": Fidelity("standard", dt=SPAN / 14, resolution=32, sampling=1.5),
         "reference": Fidelity("reference", dt=SPAN / 28, resolution=60, sampling=1.6, precision="float64"),
     }
     examples: ClassVar[dict[str, tuple[float, ...]]] = {

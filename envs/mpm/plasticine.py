@@ -24,7 +24,7 @@ from ..engines.mpm.raster import Raster
 from ..engines.mpm.solver import Solver
 from ..engines.mpm.tools import Kind
 from .plasticine_look import parts, view
-from .plasticine_model import SPAN, PhysicsOptions, Scene, model, target
+from .plasticine_model import SPAN, PhysicsOptions, Scene, fidelities, model, target
 from .scene import SEGMENTS, STEPS, MpmScene, Stage
 from .targets import Target, contact, load_or_make
 
@@ -83,11 +83,7 @@ class Plasticine(MpmScene):
     from a Global Perspective" (CoRL 2022).
     """
 
-    fidelities: ClassVar[dict[str, Fidelity]] = {
-        "draft": Fidelity("draft", dt=SPAN / 9, resolution=32, particles=800),
-        "standard": Fidelity("standard", dt=SPAN / 20, resolution=64, particles=10_000),
-        "reference": Fidelity("reference", dt=SPAN / 40, resolution=64, particles=10_000, precision="float64"),
-    }
+    fidelities: ClassVar[dict[str, Fidelity]] = fidelities(draft=(48, 1500, 14), standard=(80, 20_000, 25))
     Options: ClassVar[type[Any]] = PlasticineOptions
     model_parts: ClassVar[tuple[ModelPart, ...]] = (
         ModelPart("friction of tools", {"tool_friction": 0.0}, "tools slip"),

@@ -23,6 +23,25 @@ BEYOND = 1e6  # where walls are that no body meets [m]
 MARGIN = 2  # nodes outside the walls
 
 
+def fidelities(*, draft: tuple[int, int, int], standard: tuple[int, int, int]) -> dict[str, Fidelity]:
+    """Return a scene's fidelities, of (cells per metre, particles, substeps of a control step) each.
+
+    The reference has a finer grid than all standards and, as they have, about the longest step that is stable on it:
+    grid and step are refined together.
+    """
+    settings = {"draft": draft, "standard": standard, "reference": (96, 34_000, 30)}
+    return {
+        name: Fidelity(
+            name,
+            dt=SPAN / substeps,
+            resolution=cells,
+            particles=particles,
+            precision="float64" if name == "reference" else "float32",
+        )
+        for name, (cells, particles, substeps) in settings.items()
+    }
+
+
 @dataclass(frozen=True)
 class PhysicsOptions(EpisodeOptions):
     """What the model's parts are multiplied by, 1 being the scene's own and 0 leaving the part out.

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from ..base import ModelPart
+from ..base import Fidelity, ModelPart
 from ..engines.mpm.tools import STICKY, Kind, Tool
 from .plasticine import DEMONSTRATION, Plasticine
-from .plasticine_model import Anchor, Piece, Scene
+from .plasticine_model import Anchor, Piece, Scene, fidelities
 from .shapes import Ball, Box, Point, Ring
 
 SLAB = Piece(Box((0.5, 0.05, 0.5), (0.3, 0.1, 0.3)), 10_000)
@@ -56,6 +56,7 @@ class Pinch(Plasticine):
     """
 
     name: ClassVar[str] = "pinch"
+    fidelities: ClassVar[dict[str, Fidelity]] = fidelities(draft=(32, 800, 9), standard=(64, 5000, 20))
     examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
         0 0 1
@@ -89,6 +90,7 @@ class RollingPin(Plasticine):
     """
 
     name: ClassVar[str] = "rolling-pin"
+    fidelities: ClassVar[dict[str, Fidelity]] = fidelities(draft=(40, 1500, 12), standard=(64, 10_000, 20))
     examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
         0.6 0 -1
@@ -114,6 +116,7 @@ class Rope(Plasticine):
     """
 
     name: ClassVar[str] = "rope"
+    fidelities: ClassVar[dict[str, Fidelity]] = fidelities(draft=(40, 1500, 12), standard=(80, 20_000, 25))
     examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
         0.514 0.292 -0.463 -0.277 0.257 -0.624
@@ -170,6 +173,7 @@ class Torus(Plasticine):
     """
 
     name: ClassVar[str] = "torus"
+    fidelities: ClassVar[dict[str, Fidelity]] = fidelities(draft=(32, 800, 9), standard=(64, 5000, 20))
     examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
         -1 -1 -0.6
