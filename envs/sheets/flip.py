@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ...landscapes.episode import Part, View
 from ...landscapes.space import ParameterSpace
-from ..base import Fidelity
+from ..base import Fidelity, ModelPart
 from ..controls import extend, ramp
 from ..engines.sheets.contact import Floor, Pan, PanOverFloor
 from ..engines.sheets.springs import Sheet
@@ -54,13 +54,14 @@ class Flip(SheetScene):
     Model: the pancake (20 cm across, 3 kg/m^2, stretching resisted by 60 N/m, much softer for its weight than the
     cloth) starts at rest in the middle of the pan; x right, y up, z to the front. The pan has a radius of 0.2 m and an
     edge that bends up along an arc of 7 cm, to 3.4 cm; it moves in x and y and tilts about z, through the middle of its
-    bottom, whatever it carries. An episode is 1 s.
+    bottom, whatever it carries. A floor lies 0.25 m below where the pan starts, 5 cm below the lowest place that the pan's
+    underside reaches in the box. An episode is 1 s.
     Parameters: x [m], y [m] and tilt [rad] of the pan at the end of each of 5 segments of 0.2 s, from 0 and linear in
     between.
     Loss [m]: mean distance of the left-, right-, back- and frontmost vertices to where they were at the start, left and
     right exchanged. Example `flip` was found by CMA-ES at draft (2400 episodes) and flips at every fidelity.
-    Simplifications: the pan has no handle and no mass; the pancake is a sheet without thickness, and what misses the
-    pan falls on, since nothing else is there.
+    Simplifications: the pan has no handle and no mass; the pancake is a sheet without thickness; pan and floor are
+    smooth, as contact takes the normal part of a velocity alone.
     Source: task Flip of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL 2022),
     appendix A.2.3; geometry and material where it is silent are ours.
     """
@@ -77,6 +78,15 @@ class Flip(SheetScene):
             *(0.045, -0.012, -0.138, 0.074, 0.003, -0.005),
         )
     }
+    model_parts: ClassVar[tuple[ModelPart, ...]] = (
+        ModelPart("springs' damping", {"damping": 0.0}, "undamped springs"),
+        ModelPart("bending springs", {"bending": 0.0}, "a membrane"),
+        ModelPart("rim", {"rim": False}, "a flat pan of the same radius"),
+        ModelPart("floor", {"floor": False}, "what misses the pan falls on"),
+        ModelPart("exact contact", {"contact": "start"}, "vertices stop once they are inside"),
+        ModelPart("friction", {"friction": 0.3}, "friction of pan and floor", missing=True),
+        ModelPart("air", {"drag": 0.5}, "drag of the air", missing=True),
+    )
     decisions: ClassVar[int] = SEGMENTS
     duration: ClassVar[float] = 1.0
     Options: ClassVar[type[Any]] = FlipOptions

@@ -56,6 +56,48 @@ def springs(
     return pairs, rest, np.array([weights[first, second] for first, second in pairs.tolist()])
 
 
+def plate(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return pairs of lattice points and how they attract so that the sheet resists bending.
+
+    The energy of a plate of bending stiffness D [N m] without Poisson's effect, D / 2 times the integral of
+    |x_uu|^2 + 2 |x_uv|^2 + |x_vv|^2, is a sum of squares c |a_1 x_1 + a_2 x_2 + ...|^2 of second differences. Since
+    the a sum to 0, it is the sum over pairs of -c a_i a_j |x_i - x_j|^2: linear attractions, some of them negative,
+    that are to be multiplied by D over the square of a cell's width. Rotations do no work against them.
+    """
+    number = {tuple(point): i for i, point in enumerate(points.tolist())}
+    found: dict[tuple[int, int], float] = {}
+    for (i, j), area in zip(number, areas(points), strict=True):
+        for di, dj in ((1, 0), (0, 1)):
+            line = ((i - di, j - dj), (i, j), (i + di, j + dj))
+            if all(point in number for point in line):
+                _add_square(found, [number[point] for point in line], (1.0, -2.0, 1.0), float(area))
+    for corners in _cells(number):
+        if len(corners) == 4:
+            _add_square(found, corners, (1.0, -1.0, 1.0, -1.0), 2.0)
+    pairs = sorted(pair for pair, stiffness in found.items() if stiffness)
+    return np.array(pairs, dtype=int), np.array([found[pair] for pair in pairs])
+
+
+def _add_square(
+    found: dict[tuple[int, int], float], numbers: list[int], factors: tuple[float, ...], share: float
+) -> None:
+    for (i, a), (j, b) in combinations(zip(numbers, factors, strict=True), 2):
+        pair = min(i, j), max(i, j)
+        found[pair] = found.get(pair, 0.0) - share * a * b
+
+
+def merge(
+    points: np.ndarray, springs: tuple[np.ndarray, np.ndarray, np.ndarray], attractions: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return all pairs, their rest lengths in cells, weights as springs (or 0), and attractions (or 0)."""
+    weights = dict(zip(map(tuple, springs[0].tolist()), springs[2].tolist(), strict=True))
+    linear = dict(zip(map(tuple, attractions[0].tolist()), attractions[1].tolist(), strict=True))
+    pairs = np.array(sorted(weights.keys() | linear.keys()), dtype=int)
+    rest = np.linalg.norm(points[pairs[:, 1]] - points[pairs[:, 0]], axis=1)
+    both = [[known.get(tuple(pair), 0.0) for pair in pairs.tolist()] for known in (weights, linear)]
+    return pairs, rest, np.array(both[0]), np.array(both[1])
+
+
 def _cells(number: dict[tuple[int, ...], int]) -> list[list[int]]:
     """Return the corners of every cell that has at least three, in order around it."""
     places = sorted({(i - di, j - dj) for i, j in number for di in (0, 1) for dj in (0, 1)})

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ...landscapes.episode import Part, View
 from ...landscapes.space import ParameterSpace
-from ..base import Fidelity
+from ..base import Fidelity, ModelPart
 from ..engines.sheets.contact import Floor
 from ..engines.sheets.springs import Sheet
 from ..outlines import triangles
@@ -25,7 +25,7 @@ SIDE, HEIGHT = 0.2, 0.1  # the cloth's edge, and how far above the floor it is h
 AREAL_DENSITY = 0.2  # [kg/m^2]
 STIFFNESS, SWING = 10.0, (1.0, -0.5, 0.0)  # where they are no parameters [N/m], [m/s]
 PATCHES = 4  # along each edge
-BEND = 0.4  # the bending springs' share
+BEND = 1e-4  # bending stiffness [N m]
 DAMPING, DRAG, GRAVITY = 8e-3, 0.5, 9.81  # [N s/m], [1/s], [m/s^2]
 
 
@@ -33,8 +33,8 @@ DAMPING, DRAG, GRAVITY = 8e-3, 0.5, 9.81  # [N s/m], [1/s], [m/s^2]
 class SwingOptions(SheetOptions):
     """`loss`: the distance of the centre of mass (single), or the mean one of the corners or of the whole cloth (mesh).
 
-    `damping` is that of springs [N s/m], `drag` that of air [1/s], `gravity` [m/s^2]; `bending` is the bending springs'
-    share of the stiffness along the lattice, `shear` scales the shear springs; `friction` is the floor's coefficient.
+    `damping` is that of springs [N s/m], `drag` that of air [1/s], `gravity` [m/s^2]; `bending` is the stiffness
+    against it [N m], `shear` scales the shear springs; `friction` is the floor's coefficient.
     """
 
     loss: Literal["single", "corner", "mesh"] = "single"
@@ -50,7 +50,7 @@ class Swing(SheetScene):
     """The cloth swings down from where it is held and drags over the floor.
 
     Model: a cloth (20 cm x 20 cm, 0.2 kg/m^2) starts level, 10 cm above the floor, held fast at its two right corners;
-    x right, y up, z to the front. An episode is 0.8 s.
+    x right, y up, z to the front. It resists stretching by springs and bending as a plate of 1e-4 N m. An episode is 0.8 s.
     Loss [m] against where example `target` brings the cloth at the same fidelity: the centre of mass's distance
     (single), or the mean distance of the corners (corner) or of all vertices (mesh), by option.
     Simplifications: the anchors stand still, since what they hold is what makes the cloth swing; air is felt as a drag
@@ -60,11 +60,20 @@ class Swing(SheetScene):
     """
 
     fidelities: ClassVar[dict[str, Fidelity]] = {
-        "draft": Fidelity("draft", dt=1 / 500, resolution=7),
-        "standard": Fidelity("standard", dt=1 / 2000, resolution=19),
-        "reference": Fidelity("reference", dt=1 / 4000, resolution=19, precision="float64"),
+        "draft": Fidelity("draft", dt=1 / 1500, resolution=12),
+        "standard": Fidelity("standard", dt=1 / 2500, resolution=16),
+        "reference": Fidelity("reference", dt=1 / 5000, resolution=20, precision="float64"),
     }
     Options: ClassVar[type[Any]] = SwingOptions
+    model_parts: ClassVar[tuple[ModelPart, ...]] = (
+        ModelPart("springs' damping", {"damping": 0.0}, "undamped springs"),
+        ModelPart("air", {"drag": 0.0}, "no drag"),
+        ModelPart("bending", {"bending": 0.0}, "a membrane"),
+        ModelPart("shear", {"shear": 0.0}, "no shear springs"),
+        ModelPart("gravity", {"gravity": 0.0}, "no weight"),
+        ModelPart("exact contact", {"contact": "start"}, "vertices stop once they are inside"),
+        ModelPart("friction", {"friction": 0.3}, "friction of the floor", missing=True),
+    )
     duration: ClassVar[float] = 0.8
     view: ClassVar[View] = View((-0.2, 0.0, -0.11), (0.15, 0.12, 0.11), eye=(-0.45, 0.5, 1.0), ground=-0.003)
 
@@ -77,16 +86,23 @@ class Swing(SheetScene):
         cells, options = self.fidelity.resolution, self.options
         points = lattice.square(cells)
         pitch = SIDE / cells
-        pairs, rest, weight = lattice.springs(
-            points, reach=max(1, round(cells / 4)), bend=options.bending, shear=options.shear
-        )
+        springs = lattice.springs(points, reach=1, bend=0.0, shear=options.shear)
+        pairs, rest, weight, plate = lattice.merge(points, springs, lattice.plate(points))
         x = np.stack(
             [points[:, 0] * pitch - SIDE, np.full(len(points), HEIGHT), points[:, 1] * pitch - SIDE / 2], axis=1
         )
         mass = AREAL_DENSITY * pitch**2 * lattice.areas(points)
-        air = {"drag": options.drag, "gravity": options.gravity}
         return Sheet(
-            x, pairs, rest * pitch, weight, mass, damping=options.damping, held=self._corners()[2:], **air
+            x,
+            pairs,
+            rest * pitch,
+            weight,
+            mass,
+            damping=options.damping,
+            drag=options.drag,
+            gravity=options.gravity,
+            held=self._corners()[2:],
+            plate=options.bending / pitch**2 * plate,
         )
 
     def _energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"]:
@@ -100,7 +116,9 @@ class Swing(SheetScene):
         stretch = (frames[1:, :, ends[0]] - frames[1:, :, ends[1]]).norm(dim=3) - torch.from_numpy(sheet.rest)
         stiffness = drive.stiffness.detach()[:, ends].mean(dim=1) * torch.from_numpy(sheet.weight)
         height = sheet.gravity * frames[1:, :, :, 1]
-        found: Tensor = (speed / 2 + height) @ mass + (stiffness * stretch.square()).sum(dim=2) / 2
+        apart = (frames[1:, :, ends[0]] - frames[1:, :, ends[1]]).square().sum(dim=3)
+        bent = (torch.from_numpy(sheet.plates) * apart).sum(dim=2) / 2
+        found: Tensor = (speed / 2 + height) @ mass + (stiffness * stretch.square()).sum(dim=2) / 2 + bent
         return found.T
 
     def _corners(self) -> tuple[int, int, int, int]:
@@ -124,12 +142,12 @@ class Swing(SheetScene):
         return torch.from_numpy(self.sheet.masses / self.sheet.masses.sum())
 
     def _surroundings(self, poses: Float[Tensor, "frame 3"]) -> Mapping[str, Float[Tensor, "frame 3"]]:
-        held = torch.from_numpy(self.sheet.x[list(self.sheet.held)])
+        held = torch.from_numpy(self.sheet.x[list(self._corners()[2:])])
         return {f"anchor {number}": place.expand(len(poses), 3) for number, place in enumerate(held, start=1)}
 
     def _parts(self, frames: Float[Tensor, "frame vertex 3"], poses: Float[Tensor, "frame 3"]) -> tuple[Part, ...]:
         faces = triangles(lattice.square(self.fidelity.resolution))
-        held = frames[:, list(self.sheet.held)]
+        held = frames[:, list(self._corners()[2:])]
         return (
             Part("sheet", "cloth", frames, faces=faces),
             Part("sphere", "iron", held, (SIDE / 40,)),

@@ -60,7 +60,7 @@ class Floor:
 
     def stop(self, name: str, rule: Rule) -> Any:
         """Return the Warp function that takes velocities into the floor."""
-        return _stop(name, rule, *self.function(name))
+        return _stop_still(name, rule)
 
 
 @dataclass(frozen=True)
@@ -265,15 +265,30 @@ def _stop(name: str, rule: Rule, distance: Any, Data: Any) -> Any:
 
 @cache
 @no_type_check
+def _stop_still(name: str, rule: Rule) -> Any:
+    types = precision(name)
+    real, vec3 = types.real, types.vec3
+    distance, Level = _floor(name)
+    at_floor = _stop(name, rule, distance, Level)
+
+    @wp.func(module=f"gradscape.contact.{name}", name=f"stop_{rule}_still_{name}")
+    def stop(floor: Level, p: vec3, v: vec3, pose: vec3, following: vec3, dt: real) -> vec3:
+        return at_floor(floor, p, v, vec3(), vec3(), dt)  # whatever the poses are
+
+    return stop
+
+
+@cache
+@no_type_check
 def _stop_twice(name: str, rule: Rule) -> Any:
     types = precision(name)
     real, vec3 = types.real, types.vec3
-    at_pan, at_floor = _stop(name, rule, *_pan(name)), _stop(name, rule, *_floor(name))
+    at_pan, at_floor = _stop(name, rule, *_pan(name)), _stop_still(name, rule)
     _, Both = _nearer(name)
 
     @wp.func(module=f"gradscape.contact.{name}", name=f"stop_{rule}_both_{name}")
     def stop(both: Both, p: vec3, v: vec3, pose: vec3, following: vec3, dt: real) -> vec3:
-        return at_floor(both.floor, p, at_pan(both.pan, p, v, pose, following, dt), vec3(), vec3(), dt)
+        return at_floor(both.floor, p, at_pan(both.pan, p, v, pose, following, dt), pose, following, dt)
 
     return stop
 

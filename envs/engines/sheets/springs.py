@@ -27,7 +27,8 @@ class Sheet:
     `x` are the vertices at the start, shape (vertex, 3); `pairs` the two ends of each spring, shape (spring, 2); `rest`
     its length and `weight` its share of stiffness and damping, shape (spring,). A spring of weight w between vertices
     of stiffness s_i and s_j [N/m] pulls with w (s_i + s_j) / 2 times its elongation, and with w `damping` [N s/m] times
-    its rate. `mass` [kg] is that of each vertex, or of all alike; air takes `drag` [1/s] of its velocity; `held`
+    its rate. Where there is a `plate` [N/m], of shape (spring,) and of either sign, a pair also attracts by so much times its
+    distance: these linear forces are how sheets resist bending. `mass` [kg] is that of each vertex, or of all alike; air takes `drag` [1/s] of its velocity; `held`
     vertices never move.
     """
 
@@ -40,6 +41,12 @@ class Sheet:
     drag: float = 0.0
     gravity: float = 9.81
     held: tuple[int, ...] = ()
+    plate: np.ndarray | None = None
+
+    @property
+    def plates(self) -> np.ndarray:
+        """Each pair's linear attraction [N/m], shape (spring,)."""
+        return np.zeros(len(self.pairs)) if self.plate is None else self.plate
 
     @property
     def masses(self) -> np.ndarray:
@@ -200,6 +207,7 @@ def _network(sheet: Sheet, Network: Any, types: Any, device: str) -> Any:
     network.neighbor = wp.array(ends[order, 1], dtype=int, device=device)
     network.rest = wp.array(np.tile(sheet.rest, 2)[order], dtype=types.real, device=device)
     network.weight = wp.array(np.tile(sheet.weight, 2)[order], dtype=types.real, device=device)
+    network.plate = wp.array(np.tile(sheet.plates, 2)[order], dtype=types.real, device=device)
     network.mass = wp.array(sheet.masses, dtype=types.real, device=device)
     for name in ("damping", "drag", "gravity"):
         setattr(network, name, getattr(sheet, name))
@@ -222,6 +230,7 @@ def spring_kernels(name: str) -> SimpleNamespace:
         neighbor: wp.array[int]
         rest: wp.array[real]
         weight: wp.array[real]
+        plate: wp.array[real]
         mass: wp.array[real]
         damping: real
         drag: real
@@ -242,6 +251,7 @@ def spring_kernels(name: str) -> SimpleNamespace:
         for k in range(network.first[i], network.first[i + 1]):
             j = network.neighbor[k]
             d = x[row, j] - x_i
+            f += network.plate[k] * d
             length = wp.length(d)
             if length > real(0.0):  # ends that coincide have no direction
                 n = (real(1.0) / length) * d
@@ -273,12 +283,14 @@ def spring_kernels(name: str) -> SimpleNamespace:
         for k in range(network.first[i], network.first[i + 1]):
             j = network.neighbor[k]
             d = x[row, j] - x_i
+            difference = (real(1.0) / network.mass[j]) * adj_pulled[row, j] - mu_i
+            gx += network.plate[k] * difference
             length = wp.length(d)
             if length > real(0.0):
                 inverse = real(1.0) / length
                 n = inverse * d
                 w = v[row, j] - v_i
-                mu = network.weight[k] * ((real(1.0) / network.mass[j]) * adj_pulled[row, j] - mu_i)
+                mu = network.weight[k] * difference
                 s = real(0.5) * (s_i + stiffness[row, j])
                 along, rate = wp.dot(mu, n), wp.dot(w, n)
                 across = mu - along * n

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gradscape.envs.engines.sheets import springs
-from gradscape.envs.engines.sheets.contact import Floor, Pan
+from gradscape.envs.engines.sheets.contact import Floor, Pan, PanOverFloor
 from gradscape.envs.engines.sheets.springs import Sheet
 from gradscape.envs.engines.taichi import springs as taichi_springs
 from gradscape.envs.engines.taichi.runtime import start
@@ -30,7 +30,8 @@ def crumpled(surface):
     x = np.stack([points[:, 0] - 2, np.zeros(len(points)), points[:, 1] - 2], axis=1) * pitch
     x += 0.01 * np.random.default_rng(0).uniform(-1, 1, x.shape)
     x[12] = 0.0, -0.002, 0.0
-    return Sheet(x, pairs, pitch * rest, weight, mass=0.01, damping=0.05, drag=0.5, held=(20, 24))
+    mass = 0.0025 * (1 + np.arange(len(x)) % 4)
+    return Sheet(x, pairs, pitch * rest, weight, mass=mass, damping=0.05, drag=0.5, held=(20, 24))
 
 
 def drive():
@@ -45,14 +46,22 @@ def drive():
     return (within(-1.0, 0.0, ROWS, 3), within(5.0, 40.0, ROWS, 25), poses), within(-1.0, 1.0, ROWS, 25, 3)
 
 
-def made(engine, surface):
-    return engine.Solver(
-        crumpled(surface), surface, dt=DT, steps=STEPS, name="float64", capacity=ROWS + 1, device="cpu"
-    )
+def made(engine, surface, rule):
+    given = dict(dt=DT, steps=STEPS, name="float64", capacity=ROWS + 1, device="cpu", rule=rule)
+    return engine.Solver(crumpled(surface), surface, **given)
 
 
-@pytest.fixture(scope="module", params=[Floor(height=0.001), PAN], ids=["floor", "pan"])
-def surface(request):
+ROUGH = PanOverFloor(replace(PAN, friction=0.3), Floor(height=-0.02, friction=0.2))
+SURFACES = {
+    "floor": (Floor(height=0.001), "end"),
+    "pan": (PAN, "end"),
+    "pan once inside": (PAN, "start"),
+    "pan over floor, with friction": (ROUGH, "end"),
+}
+
+
+@pytest.fixture(scope="module", params=SURFACES.values(), ids=SURFACES.keys())
+def case(request):
     return request.param
 
 
@@ -62,15 +71,15 @@ def driven():
 
 
 @pytest.fixture(scope="module")
-def solver(surface):
-    return made(taichi_springs, surface)
+def solver(case):
+    return made(taichi_springs, *case)
 
 
 @pytest.fixture(scope="module")
-def warp(surface, driven):
+def warp(case, driven):
     """Return Warp's path and gradient."""
     inputs, adj_x = driven
-    solver = made(springs, surface)
+    solver = made(springs, *case)
     return solver.run(*inputs).clone(), solver.gradient(adj_x)
 
 
