@@ -54,8 +54,8 @@ class Flip(SheetScene):
     Model: the pancake (20 cm across, 3 kg/m^2, stretching resisted by 60 N/m, much softer for its weight than the
     cloth) starts at rest in the middle of the pan; x right, y up, z to the front. The pan has a radius of 0.2 m and an
     edge that bends up along an arc of 7 cm, to 3.4 cm; it moves in x and y and tilts about z, through the middle of its
-    bottom, whatever it carries. A floor lies 0.25 m below where the pan starts, 5 cm below the lowest place that the pan's
-    underside reaches in the box. An episode is 1 s.
+    bottom, whatever it carries. A floor lies 0.25 m below where the pan starts, 5 cm below the lowest place that the
+    pan's underside reaches in the box. An episode is 1 s.
     Parameters: x [m], y [m] and tilt [rad] of the pan at the end of each of 5 segments of 0.2 s, from 0 and linear in
     between.
     Loss [m]: mean distance of the left-, right-, back- and frontmost vertices to where they were at the start, left and

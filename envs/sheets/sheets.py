@@ -17,7 +17,7 @@ from ...landscapes.episode import Part, View
 from ...landscapes.objective import Evaluation, Status
 from ..base import Environment, Episode, Work
 from ..batching import Pool
-from ..engines.sheets.contact import Rule, Surface
+from ..engines.sheets.contact import Rule
 from ..engines.sheets.springs import Sheet, Solver, capacity
 from ..observation import describe_motion, watch
 from ..options import EpisodeOptions
@@ -53,10 +53,9 @@ class SheetOptions(EpisodeOptions):
 class SheetScene(Environment):
     """A sheet is a square lattice of vertices joined by damped springs, integrated by semi-implicit Euler.
 
-    Springs run along the lattice, along its diagonals, and further along it against bending, over a quarter of its
-    width: to the nearest cell, so that resolutions which are multiples of four are meshes of one material. Vertices
-    and springs weigh what their shares of the area are. A vertex that would be inside a surface at a step's end is
-    stopped on it: it loses what goes into it of its velocity, v -= min(v.n, 0) n, and keeps the rest, neither
+    Springs run along the lattice and along its diagonals. Vertices and springs weigh what their shares of the area are,
+    so that meshes of different resolutions are one material. A vertex that would be inside a surface at a step's end
+    is stopped on it: it loses what goes into it of its velocity, v -= min(v.n, 0) n, and keeps the rest, neither
     restitution nor, unless an option says so, friction. Sheets pass through themselves.
     """
 

@@ -25,7 +25,7 @@ SIDE, HEIGHT = 0.2, 0.1  # the cloth's edge, and how far above the floor it is h
 AREAL_DENSITY = 0.2  # [kg/m^2]
 STIFFNESS, SWING = 10.0, (1.0, -0.5, 0.0)  # where they are no parameters [N/m], [m/s]
 PATCHES = 4  # along each edge
-BEND = 1e-4  # bending stiffness [N m]
+BEND = 3e-4  # bending stiffness [N m]
 DAMPING, DRAG, GRAVITY = 8e-3, 0.5, 9.81  # [N s/m], [1/s], [m/s^2]
 
 
@@ -50,19 +50,21 @@ class Swing(SheetScene):
     """The cloth swings down from where it is held and drags over the floor.
 
     Model: a cloth (20 cm x 20 cm, 0.2 kg/m^2) starts level, 10 cm above the floor, held fast at its two right corners;
-    x right, y up, z to the front. It resists stretching by springs and bending as a plate of 1e-4 N m. An episode is 0.8 s.
+    x right, y up, z to the front. Springs resist stretching and shear; a plate's stiffness of 3e-4 N m resists bending.
+    An episode is 0.8 s.
     Loss [m] against where example `target` brings the cloth at the same fidelity: the centre of mass's distance
     (single), or the mean distance of the corners (corner) or of all vertices (mesh), by option.
-    Simplifications: the anchors stand still, since what they hold is what makes the cloth swing; air is felt as a drag
-    of 0.5/s; stretching is resisted by 10 N/m, softer than fabric, so that a step may be long.
+    Simplifications: the cloth bends less than fabric, so that its folds are wider than a few cells and meshes of
+    different cells fold alike; the anchors stand still, since what they hold is what makes the cloth swing; air is felt
+    as a drag of 0.5/s; stretching is resisted by 10 N/m, softer than fabric, so that a step may be long.
     Source: task Swing of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
     2022), appendix A.2.3; geometry and material are ours.
     """
 
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=1 / 1500, resolution=12),
-        "standard": Fidelity("standard", dt=1 / 2500, resolution=16),
-        "reference": Fidelity("reference", dt=1 / 5000, resolution=20, precision="float64"),
+        "standard": Fidelity("standard", dt=1 / 4000, resolution=20),
+        "reference": Fidelity("reference", dt=1 / 5000, resolution=24, precision="float64"),
     }
     Options: ClassVar[type[Any]] = SwingOptions
     model_parts: ClassVar[tuple[ModelPart, ...]] = (
@@ -185,8 +187,9 @@ class SwingVelocity(Swing):
 class SwingStiffness(Swing):
     """Choose how stiff the patches of a swinging cloth are, so that it ends like a target.
 
-    Parameters: stiffness [N/m] of 4 x 4 patches, from left to right and within that from back to front; a vertex
-    on the border between patches has the mean of theirs, and a spring that of its ends'. The swing is fixed: initial velocity (1, -0.5, 0) m/s.
+    Parameters: stiffness [N/m] of 4 x 4 patches, from left to right and within that from back to front; a vertex on the
+    border between patches has the mean of theirs, and a spring that of its ends'. The swing is fixed: initial velocity
+    (1, -0.5, 0) m/s.
     """
 
     name: ClassVar[str] = "swing-stiffness"

@@ -27,9 +27,9 @@ class Sheet:
     `x` are the vertices at the start, shape (vertex, 3); `pairs` the two ends of each spring, shape (spring, 2); `rest`
     its length and `weight` its share of stiffness and damping, shape (spring,). A spring of weight w between vertices
     of stiffness s_i and s_j [N/m] pulls with w (s_i + s_j) / 2 times its elongation, and with w `damping` [N s/m] times
-    its rate. Where there is a `plate` [N/m], of shape (spring,) and of either sign, a pair also attracts by so much times its
-    distance: these linear forces are how sheets resist bending. `mass` [kg] is that of each vertex, or of all alike; air takes `drag` [1/s] of its velocity; `held`
-    vertices never move.
+    its rate. Where there is a `plate` [N/m], shape (spring,), a pair also attracts with so much times its distance, or
+    repels where that is negative: such linear forces are how a sheet resists bending. `mass` [kg] is that of each
+    vertex, or of all alike; air takes `drag` [1/s] of its velocity; `held` vertices never move.
     """
 
     x: np.ndarray
@@ -69,8 +69,9 @@ def capacity(size: int, device: str) -> int:
 class Solver:
     """Integrate up to `capacity` sheets by semi-implicit Euler, and differentiate where they end.
 
-    In each step springs, gravity and air change velocities; the surface takes what goes into it, by a rule of `contact`;
-    then vertices move. The whole episode is kept. Setting `stop` ends it within a step, with InterruptedError.
+    In each step springs, gravity and air change velocities; the surface takes what goes into it, by a `rule` of
+    `contact`; then vertices move. The whole episode is kept. Sums have one order on every device. Setting `stop` ends
+    an episode within a step, with InterruptedError.
     """
 
     def __init__(

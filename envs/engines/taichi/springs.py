@@ -8,8 +8,9 @@ A step takes vertices' x and v from time t to time t + 1:
              x_t+1  = x_t + dt v_t+1
 
 A spring has d = x_j - x_i, w = v_j - v_i, n = d / |d|, s = (s_i + s_j) / 2, and adds its force to both its ends; a
-surface has the normal n, the distance d < 0 and material that moves with u, all where the vertex would be at the step's
-end, or by the rule `start` where it is, without d. Friction takes from what is left along the surface. Fields are [time, row, vertex] and hold the whole episode.
+surface has the normal n, the distance d < 0 and material that moves with u, all where the vertex would be at the end
+of the step, or by the rule `start` where it is, and then without d / dt. Friction takes from what is left along the
+surface. Fields are [time, row, vertex] and hold the whole episode.
 """
 
 import threading
@@ -21,7 +22,7 @@ import numpy as np
 import torch
 
 from ..runtime import precision
-from ..sheets.contact import Floor, Pan, PanOverFloor, Rule, Surface
+from ..sheets.contact import Floor, Pan, Rule, Surface
 from ..sheets.springs import Sheet
 from .runtime import real, start
 
