@@ -54,9 +54,11 @@ class Swing(SheetScene):
     An episode is 0.8 s.
     Loss [m] against where example `target` brings the cloth at the same fidelity: the centre of mass's distance
     (single), or the mean distance of the corners (corner) or of all vertices (mesh), by option.
-    Simplifications: the cloth bends less than fabric, so that its folds are wider than a few cells and meshes of
-    different cells fold alike; the anchors stand still, since what they hold is what makes the cloth swing; air is felt
-    as a drag of 0.5/s; stretching is resisted by 10 N/m, softer than fabric, so that a step may be long.
+    Simplifications: the anchors stand still, since what they hold is what makes the cloth swing; air is felt as a drag
+    of 0.5/s; stretching is resisted by 10 N/m, softer than fabric, so that a step may be long; the resistance to
+    bending is ours, so that folds are wider than a few cells. Meshes still differ: of 32 random points the losses of
+    standard (20 cells) and reference (24) have rank correlations of 0.94 (velocity) and 0.97 (stiffness), and 95 % are
+    within 17 and 16 % of the spread; draft's (12 cells) have 0.80 and 0.74, 53 and 61 %.
     Source: task Swing of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
     2022), appendix A.2.3; geometry and material are ours.
     """
