@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -13,20 +14,38 @@ from torch import Tensor
 
 from ...landscapes.episode import Part, View
 from ...landscapes.space import ParameterSpace
-from ..base import Fidelity
+from ..base import Fidelity, ModelPart
 from ..controls import extend, ramp
-from ..engines.sheets.contact import Pan
+from ..engines.sheets.contact import Floor, Pan, PanOverFloor
 from ..engines.sheets.springs import Sheet
 from ..outlines import rotate_about, triangles
 from . import lattice
-from .sheets import Drive, SheetScene
+from .sheets import Drive, SheetOptions, SheetScene
 
 ACROSS = 0.2  # the pancake's diameter [m]
 AREAL_DENSITY, STIFFNESS = 3.0, 60.0  # [kg/m^2], [N/m]
 THICK, MARK = 0.01, 0.009  # of the pancake and of the mark on its rim, as they are drawn [m]
 SEGMENTS = 5
-BEND = 0.8  # the bending springs' share
+BEND, DAMPING = 0.8, 0.02  # the bending springs' share, the springs' damping [N s/m]
+FLOOR = -0.25  # its height: the pan's underside comes down to -0.197 at most [m]
+PAN = Pan(flat=0.14, bend=0.07, sweep=math.asin(6 / 7), thickness=0.03)
 LOWER, UPPER = (-0.075, -0.075, -0.6), (0.075, 0.15, 0.6)  # of a waypoint [m], [m], [rad]
+
+
+@dataclass(frozen=True)
+class FlipOptions(SheetOptions):
+    """`damping` is that of springs [N s/m], `drag` that of air [1/s]; `bending` is the bending springs' share.
+
+    `rim` says whether the pan has its bent edge, or is a flat disc of its whole radius; `floor` whether there is one
+    beneath; `friction` is Coulomb's coefficient of both.
+    """
+
+    damping: float = DAMPING
+    drag: float = 0.0
+    bending: float = BEND
+    rim: bool = True
+    floor: bool = True
+    friction: float = 0.0
 
 
 class Flip(SheetScene):
@@ -35,13 +54,14 @@ class Flip(SheetScene):
     Model: the pancake (20 cm across, 3 kg/m^2, stretching resisted by 60 N/m, much softer for its weight than the
     cloth) starts at rest in the middle of the pan; x right, y up, z to the front. The pan has a radius of 0.2 m and an
     edge that bends up along an arc of 7 cm, to 3.4 cm; it moves in x and y and tilts about z, through the middle of its
-    bottom, whatever it carries. An episode is 1 s.
+    bottom, whatever it carries. A floor lies 0.25 m below where the pan starts, 5 cm below the lowest place that the
+    pan's underside reaches in the box. An episode is 1 s.
     Parameters: x [m], y [m] and tilt [rad] of the pan at the end of each of 5 segments of 0.2 s, from 0 and linear in
     between.
     Loss [m]: mean distance of the left-, right-, back- and frontmost vertices to where they were at the start, left and
     right exchanged. Example `flip` was found by CMA-ES at draft (2400 episodes) and flips at every fidelity.
-    Simplifications: the pan has no handle and no mass; the pancake is a sheet without thickness, and what misses the
-    pan falls on, since nothing else is there.
+    Simplifications: the pan has no handle and no mass; the pancake is a sheet without thickness; pan and floor are
+    smooth, as contact takes the normal part of a velocity alone.
     Source: task Flip of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL 2022),
     appendix A.2.3; geometry and material where it is silent are ours.
     """
@@ -58,10 +78,19 @@ class Flip(SheetScene):
             *(0.045, -0.012, -0.138, 0.074, 0.003, -0.005),
         )
     }
+    model_parts: ClassVar[tuple[ModelPart, ...]] = (
+        ModelPart("springs' damping", {"damping": 0.0}, "undamped springs"),
+        ModelPart("bending springs", {"bending": 0.0}, "a membrane"),
+        ModelPart("rim", {"rim": False}, "a flat pan of the same radius"),
+        ModelPart("floor", {"floor": False}, "what misses the pan falls on"),
+        ModelPart("exact contact", {"contact": "start"}, "vertices stop once they are inside"),
+        ModelPart("friction", {"friction": 0.3}, "friction of pan and floor", missing=True),
+        ModelPart("air", {"drag": 0.5}, "drag of the air", missing=True),
+    )
     decisions: ClassVar[int] = SEGMENTS
     duration: ClassVar[float] = 1.0
-    surface: ClassVar[Pan] = Pan(flat=0.14, bend=0.07, sweep=math.asin(6 / 7), thickness=0.03)
-    view: ClassVar[View] = View((-0.24, -0.12, -0.2), (0.24, 0.26, 0.2), eye=(0.2, 0.5, 1.0), ground=None)
+    Options: ClassVar[type[Any]] = FlipOptions
+    view: ClassVar[View] = View((-0.24, FLOOR, -0.2), (0.24, 0.26, 0.2), eye=(0.2, 0.5, 1.0), ground=FLOOR)
     space = ParameterSpace(
         tuple(f"pan {what}, segment {k}" for k in range(1, SEGMENTS + 1) for what in ("x", "y", "tilt")),
         torch.tensor(LOWER * SEGMENTS, dtype=torch.float64),
@@ -69,13 +98,25 @@ class Flip(SheetScene):
         ("m", "m", "rad") * SEGMENTS,
     )
 
+    @property
+    def pan(self) -> Pan:
+        """The pan, with its edge or without."""
+        flat = {} if self.options.rim else {"flat": PAN.radius, "sweep": 0.0}
+        return replace(PAN, friction=self.options.friction, **flat)
+
+    @property
+    def surface(self) -> Pan | PanOverFloor:
+        """The pan, above a floor unless there is none."""
+        return PanOverFloor(self.pan, Floor(FLOOR, self.options.friction)) if self.options.floor else self.pan
+
     def _sheet(self) -> Sheet:
-        cells = self.fidelity.resolution
+        cells, options = self.fidelity.resolution, self.options
         points, pitch = lattice.disc(cells), ACROSS / cells
-        pairs, rest, weight = lattice.springs(points, reach=max(1, round(cells / 4)), bend=BEND)
+        pairs, rest, weight = lattice.springs(points, reach=max(1, round(cells / 4)), bend=options.bending)
         x = np.stack([points[:, 0] * pitch, np.zeros(len(points)), points[:, 1] * pitch], axis=1)
-        mass = AREAL_DENSITY * math.pi * (ACROSS / 2) ** 2 / len(points)
-        return Sheet(x, pairs, rest * pitch, weight, mass, damping=0.02)
+        area = lattice.areas(points)
+        mass = AREAL_DENSITY * math.pi * (ACROSS / 2) ** 2 * area / area.sum()
+        return Sheet(x, pairs, rest * pitch, weight, mass, damping=options.damping, drag=options.drag)
 
     def _drive(self, x: Float[Tensor, "batch dim"]) -> Drive:
         course = ramp(x.new_zeros(3), x.view(len(x), SEGMENTS, 3), self.own_steps)
@@ -102,7 +143,7 @@ class Flip(SheetScene):
     def _parts(self, frames: Float[Tensor, "frame vertex 3"], poses: Float[Tensor, "frame 3"]) -> tuple[Part, ...]:
         faces = triangles(lattice.disc(self.fidelity.resolution))
         place = torch.cat([poses[:, :2], torch.zeros_like(poses[:, :1])], dim=1)[:, None]
-        size = (self.surface.flat, self.surface.bend, self.surface.sweep)
+        size = (self.pan.flat, self.pan.bend, self.pan.sweep)
         return (
             Part("sheet", "dough", frames, (THICK,), faces=faces),
             Part("pan", "iron", place, size, rotate_about(2, poses[:, 2])),

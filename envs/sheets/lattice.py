@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 
 
@@ -21,25 +23,115 @@ def disc(cells: int) -> np.ndarray:
     return np.asarray(points[(points**2).sum(axis=1) <= (cells / 2) ** 2])
 
 
-def springs(points: np.ndarray, *, reach: int, bend: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def areas(points: np.ndarray) -> np.ndarray:
+    """Return the area that each lattice point stands for, in cells, shape (vertex,).
+
+    A cell belongs to its four corners alike; one of which a corner is missing is the triangle of the others.
+    """
+    number = {tuple(point): i for i, point in enumerate(points.tolist())}
+    area = np.zeros(len(points))
+    for corners in _cells(number):
+        area[corners] += {4: 1 / 4, 3: 1 / 6}[len(corners)]
+    return area
+
+
+def springs(
+    points: np.ndarray, *, reach: int, bend: float, shear: float = 1.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return pairs, rest lengths in cells and weights of the springs between lattice points.
 
     Structural springs join neighbours along the lattice, shear springs those along its diagonals. Bending springs join
-    what is `reach` cells apart along the lattice and take the share `bend` of the structural springs' stiffness. The
-    membrane is isotropic then (Poisson's ratio 1/3), as stiff at every resolution, and at the same reach in metres its
-    bending is, too.
+    what is `reach` cells apart along the lattice and take the share `bend` of the structural springs' stiffness.
+    `shear` scales the shear springs. At 1 the membrane is isotropic (Poisson's ratio 1/3), as stiff at every
+    resolution, and at the same reach in metres its bending is, too: a spring weighs what its share of the sheet's area
+    is, so that those along an edge weigh half.
     """
-    along = [(1, 0), (0, 1)]
-    weights = dict.fromkeys(along, 1.0 - bend) | dict.fromkeys([(1, 1), (1, -1)], 0.5)
-    for i, j in along:  # those of reach 1 lie along structural springs
-        far = reach * i, reach * j
-        weights[far] = weights.get(far, 0.0) + bend / reach**2
     number = {tuple(point): i for i, point in enumerate(points.tolist())}
-    found = [
-        (i, number[other], float(np.hypot(*step)), weight)
-        for point, i in number.items()
-        for step, weight in weights.items()
-        if (other := (point[0] + step[0], point[1] + step[1])) in number
-    ]
-    first, second, rest, weight = zip(*found, strict=True)
-    return np.stack([first, second], axis=1), np.array(rest), np.array(weight)
+    weights: dict[tuple[int, int], float] = {}
+    _add_cells(weights, points, number, bend=bend, shear=shear)
+    for step in ((reach, 0), (0, reach)):
+        _add_bending(weights, points, number, step, share=bend / reach**2)
+    pairs = np.array(sorted(pair for pair, weight in weights.items() if weight > 0), dtype=int)
+    rest = np.linalg.norm(points[pairs[:, 1]] - points[pairs[:, 0]], axis=1)
+    return pairs, rest, np.array([weights[first, second] for first, second in pairs.tolist()])
+
+
+def plate(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return pairs of lattice points and how they attract so that the sheet resists bending.
+
+    The energy of a plate of bending stiffness D [N m] without Poisson's effect, D / 2 times the integral of
+    |x_uu|^2 + 2 |x_uv|^2 + |x_vv|^2, is a sum of squares c |a_1 x_1 + a_2 x_2 + ...|^2 of second differences. Since
+    the a sum to 0, it is the sum over pairs of -c a_i a_j |x_i - x_j|^2: linear attractions, some of them negative,
+    that are to be multiplied by D over the square of a cell's width. Rotations do no work against them.
+    """
+    number = {tuple(point): i for i, point in enumerate(points.tolist())}
+    found: dict[tuple[int, int], float] = {}
+    for (i, j), area in zip(number, areas(points), strict=True):
+        for di, dj in ((1, 0), (0, 1)):
+            line = ((i - di, j - dj), (i, j), (i + di, j + dj))
+            if all(point in number for point in line):
+                _add_square(found, [number[point] for point in line], (1.0, -2.0, 1.0), float(area))
+    for corners in _cells(number):
+        if len(corners) == 4:
+            _add_square(found, corners, (1.0, -1.0, 1.0, -1.0), 2.0)
+    pairs = sorted(pair for pair, stiffness in found.items() if stiffness)
+    return np.array(pairs, dtype=int), np.array([found[pair] for pair in pairs])
+
+
+def _add_square(
+    found: dict[tuple[int, int], float], numbers: list[int], factors: tuple[float, ...], share: float
+) -> None:
+    for (i, a), (j, b) in combinations(zip(numbers, factors, strict=True), 2):
+        pair = min(i, j), max(i, j)
+        found[pair] = found.get(pair, 0.0) - share * a * b
+
+
+def merge(
+    points: np.ndarray, springs: tuple[np.ndarray, np.ndarray, np.ndarray], attractions: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return all pairs, their rest lengths in cells, weights as springs (or 0), and attractions (or 0)."""
+    weights = dict(zip(map(tuple, springs[0].tolist()), springs[2].tolist(), strict=True))
+    linear = dict(zip(map(tuple, attractions[0].tolist()), attractions[1].tolist(), strict=True))
+    pairs = np.array(sorted(weights.keys() | linear.keys()), dtype=int)
+    rest = np.linalg.norm(points[pairs[:, 1]] - points[pairs[:, 0]], axis=1)
+    both = [[known.get(tuple(pair), 0.0) for pair in pairs.tolist()] for known in (weights, linear)]
+    return pairs, rest, np.array(both[0]), np.array(both[1])
+
+
+def _cells(number: dict[tuple[int, ...], int]) -> list[list[int]]:
+    """Return the corners of every cell that has at least three, in order around it."""
+    places = sorted({(i - di, j - dj) for i, j in number for di in (0, 1) for dj in (0, 1)})
+    around = [((i, j), (i, j + 1), (i + 1, j + 1), (i + 1, j)) for i, j in places]
+    cells = [[number[corner] for corner in corners if corner in number] for corners in around]
+    return [corners for corners in cells if len(corners) > 2]
+
+
+def _add_cells(
+    weights: dict[tuple[int, int], float],
+    points: np.ndarray,
+    number: dict[tuple[int, ...], int],
+    *,
+    bend: float,
+    shear: float,
+) -> None:
+    """Add what each cell gives its edges and its diagonals: half a spring each."""
+    for corners in _cells(number):
+        for first, second in combinations(sorted(corners), 2):
+            diagonal = (points[first] != points[second]).all()
+            share = 0.5 * (shear if diagonal else 1.0 - bend)
+            weights[first, second] = weights.get((first, second), 0.0) + share
+
+
+def _add_bending(
+    weights: dict[tuple[int, int], float],
+    points: np.ndarray,
+    number: dict[tuple[int, ...], int],
+    step: tuple[int, int],
+    *,
+    share: float,
+) -> None:
+    """Add the springs between points a `step` apart, by the area that their first ends stand for among themselves."""
+    starts = np.array([p for p in points.tolist() if (p[0] + step[0], p[1] + step[1]) in number], dtype=int)
+    for (i, j), area in zip(starts.tolist(), areas(starts), strict=True):
+        pair = number[i, j], number[i + step[0], j + step[1]]
+        weights[pair] = weights.get(pair, 0.0) + share * float(area)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -16,7 +17,7 @@ from ...landscapes.episode import Part, View
 from ...landscapes.objective import Evaluation, Status
 from ..base import Environment, Episode, Work
 from ..batching import Pool
-from ..engines.sheets.contact import Surface
+from ..engines.sheets.contact import Rule
 from ..engines.sheets.springs import Sheet, Solver, capacity
 from ..observation import describe_motion, watch
 from ..options import EpisodeOptions
@@ -38,12 +39,24 @@ class Drive:
         return self.velocity.detach(), self.stiffness.detach(), self.poses.detach()
 
 
+@dataclass(frozen=True)
+class SheetOptions(EpisodeOptions):
+    """`contact`: which vertices a surface stops, and so how exactly they are stopped where it is.
+
+    `end`: those that would be inside at the end of a step, which end on it. `start`: those that are inside when a step
+    starts, which leaves each as deep as it fell in a step, so that losses jump by what a vertex moves in a step.
+    """
+
+    contact: Rule = dataclasses.field(default="end", kw_only=True)
+
+
 class SheetScene(Environment):
     """A sheet is a square lattice of vertices joined by damped springs, integrated by semi-implicit Euler.
 
-    Springs run along the lattice, along its diagonals, and further along it against bending. A vertex inside a surface
-    loses the part of its velocity that goes into it, v -= min(v.n, 0) n, and keeps the rest: neither restitution nor
-    friction. Sheets pass through themselves.
+    Springs run along the lattice and along its diagonals. Vertices and springs weigh what their shares of the area are,
+    so that meshes of different resolutions are one material. A vertex that would be inside a surface at a step's end
+    is stopped on it: it loses what goes into it of its velocity, v -= min(v.n, 0) n, and keeps the rest, neither
+    restitution nor, unless an option says so, friction. Sheets pass through themselves.
     """
 
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
@@ -51,9 +64,9 @@ class SheetScene(Environment):
     engines: ClassVar[tuple[str, ...]] = ("warp", "taichi")
     loss_unit: ClassVar[str] = "m"
     designed_order: ClassVar[dict[str, float]] = {"dt": 1.0, "resolution": 2.0, "joint": 1.0}  # Euler; springs
-    Options: ClassVar[type[Any]] = EpisodeOptions
+    Options: ClassVar[type[Any]] = SheetOptions
     duration: ClassVar[float]  # of an episode of horizon 1 [s]
-    surface: ClassVar[Surface]
+    surface: Any  # a Surface: the solver's
     view: ClassVar[View]
     sheet: Sheet
     _solvers: Pool[Solver]
@@ -130,6 +143,7 @@ class SheetScene(Environment):
                 capacity=self._capacity,
                 device=self.device,
                 stop=self._stop,
+                rule=self.options.contact,
             )
         )
 

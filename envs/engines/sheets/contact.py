@@ -1,21 +1,32 @@
-"""Contact by projection: rigid surfaces that take from vertices inside them the velocity into them.
+"""Contact by projection: rigid surfaces that take from vertices the velocity into them.
 
 A surface is a Warp function (its data, a position, its pose) -> unit normal and signed distance, negative inside. A
-pose is (x [m], y [m], tilt about z [rad]).
+pose is (x [m], y [m], tilt about z [rad]). With n and d where a vertex of velocity v would be at the end of a step,
+and u the velocity of the surface's material there, a vertex that would be inside keeps
+
+    v - max(min((v - u).n, 0), d / dt) n
+
+One that was outside ends on the surface, and loses the rest of what goes into it in the next step; one that was inside
+goes no deeper. So where vertices end is continuous in where they begin. The rule `start` takes min((v - u).n, 0) from
+vertices that are inside when a step starts, by when each is as deep as it happened to come.
 """
 
 import math
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any, Protocol, no_type_check
+from typing import Any, ClassVar, Literal, Protocol, no_type_check
 
 import warp as wp
 
 from ..runtime import fill_struct, precision
 
+Rule = Literal["end", "start"]
+
 
 class Surface(Protocol):
     """What a solver asks of a surface."""
+
+    moves: ClassVar[bool]
 
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the Warp function of one precision, and the struct its data is in."""
@@ -23,12 +34,20 @@ class Surface(Protocol):
     def data(self, name: str) -> Any:
         """Return the function's data."""
 
+    def stop(self, name: str, rule: Rule) -> Any:
+        """Return the Warp function (data, position, velocity, pose, next pose, dt) -> velocity that contact leaves."""
+
 
 @dataclass(frozen=True)
 class Floor:
-    """The half-space below `height` [m], which does not move: its poses are zeros."""
+    """The half-space below `height` [m], which does not move: its poses are zeros.
+
+    `friction` is Coulomb's coefficient: of the velocity along the floor this share of what goes into it is taken.
+    """
 
     height: float = 0.0
+    friction: float = 0.0
+    moves: ClassVar[bool] = False
 
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the surface's Warp function and its struct."""
@@ -39,19 +58,26 @@ class Floor:
         """Return the function's data."""
         return fill_struct(self.function(name)[1](), self)
 
+    def stop(self, name: str, rule: Rule) -> Any:
+        """Return the Warp function that takes velocities into the floor."""
+        return _stop_still(name, rule)
+
 
 @dataclass(frozen=True)
 class Pan:
     """A round pan: a flat bottom whose edge bends up smoothly, along an arc.
 
     `flat` is the radius of the bottom, `bend` that of the arc, `thickness` how deep below its surface the pan still is
-    [m]; `sweep` is the arc's angle [rad], at most a right one. The pose is where the bottom's centre is.
+    [m]; `sweep` is the arc's angle [rad], at most a right one: at 0 the pan is a flat disc. `friction` is Coulomb's
+    coefficient. The pose is where the bottom's centre is.
     """
 
     flat: float
     bend: float
     sweep: float
     thickness: float
+    friction: float = 0.0
+    moves: ClassVar[bool] = True
 
     @property
     def radius(self) -> float:
@@ -67,6 +93,34 @@ class Pan:
         """Return the function's data."""
         return fill_struct(self.function(name)[1](), self)
 
+    def stop(self, name: str, rule: Rule) -> Any:
+        """Return the Warp function that takes velocities into the pan."""
+        return _stop(name, rule, *self.function(name))
+
+
+@dataclass(frozen=True)
+class PanOverFloor:
+    """A pan that moves above a floor that does not: the pan stops vertices first, then the floor."""
+
+    pan: Pan
+    floor: Floor
+    moves: ClassVar[bool] = True
+
+    def function(self, name: str) -> tuple[Any, Any]:
+        """Return the function of the nearer surface, and the struct of both."""
+        distance, Data = _nearer(name)
+        return distance, Data
+
+    def data(self, name: str) -> Any:
+        """Return the function's data."""
+        data = self.function(name)[1]()
+        data.pan, data.floor = self.pan.data(name), self.floor.data(name)
+        return data
+
+    def stop(self, name: str, rule: Rule) -> Any:
+        """Return the Warp function that takes velocities into the pan, then those into the floor."""
+        return _stop_twice(name, rule)
+
 
 @cache
 @no_type_check
@@ -80,6 +134,7 @@ def _floor(name: str) -> tuple[Any, Any]:
         """The fields of Floor."""
 
         height: real
+        friction: real
 
     @wp.func(module=module, name=f"floor_{name}")
     def distance(floor: Level, p: vec3, pose: vec3) -> vec4:
@@ -103,6 +158,7 @@ def _pan(name: str) -> tuple[Any, Any]:
         bend: real
         sweep: real
         thickness: real
+        friction: real
 
     @wp.func(module=module, name=f"edge_{name}")
     def edge(pan: Dish, out: real, height: real) -> vec3:
@@ -135,44 +191,167 @@ def _pan(name: str) -> tuple[Any, Any]:
 
 @cache
 @no_type_check
-def contact_kernel(name: str, distance: Any, Data: Any) -> Any:
-    """Return the kernel that takes the velocity into a surface from vertices inside it, and moves all vertices.
+def _nearer(name: str) -> tuple[Any, Any]:
+    types = precision(name)
+    vec3, vec4 = types.vec3, types.vec4
+    module = f"gradscape.contact.{name}"
+    (in_pan, Dish), (in_floor, Level) = _pan(name), _floor(name)
 
-    Within a step the surface moves steadily from one pose to the next. `held` vertices stay where they are.
+    @partial(wp.struct, module=module)
+    class Both:
+        """The fields of PanOverFloor."""
+
+        pan: Dish
+        floor: Level
+
+    @wp.func(module=module, name=f"nearer_{name}")
+    def distance(both: Both, p: vec3, pose: vec3) -> vec4:
+        above, below = in_pan(both.pan, p, pose), in_floor(both.floor, p, vec3())
+        if below[3] < above[3]:
+            return below
+        return above
+
+    return distance, Both
+
+
+@cache
+@no_type_check
+def _stop(name: str, rule: Rule, distance: Any, Data: Any) -> Any:
+    types = precision(name)
+    real, vec3 = types.real, types.vec3
+    module = f"gradscape.contact.{name}"
+
+    @wp.func(module=module, name=f"material_{name}")
+    def material(p: vec3, pose: vec3, rate: vec3) -> vec3:
+        """Return the velocity of the surface's material at a position."""
+        return vec3(rate[0] - rate[2] * (p[1] - pose[1]), rate[1] + rate[2] * (p[0] - pose[0]), real(0.0))
+
+    @wp.func(module=module, name=f"take_{name}")
+    def take(v: vec3, body: vec3, n: vec3, into: real, friction: real) -> vec3:
+        """Return what a velocity is without its part `into` the surface, and with less along it by friction."""
+        left = v - into * n
+        if friction > real(0.0):
+            slip = left - body
+            slip = slip - wp.dot(slip, n) * n
+            speed = wp.length(slip)
+            if speed > real(0.0):
+                left = left - wp.min(real(1.0), -friction * into / speed) * slip
+        return left
+
+    @wp.func(module=module, name=f"stop_end_{distance.key}")
+    def at_end(data: Data, p: vec3, v: vec3, pose: vec3, following: vec3, dt: real) -> vec3:
+        q = p + dt * v
+        hit = distance(data, q, following)
+        left = v + vec3()
+        if hit[3] < real(0.0):
+            n = vec3(hit[0], hit[1], hit[2])
+            body = material(q, following, (following - pose) / dt)
+            into = wp.max(wp.min(wp.dot(v - body, n), real(0.0)), hit[3] / dt)
+            left = take(v, body, n, into, data.friction)
+        return left
+
+    @wp.func(module=module, name=f"stop_start_{distance.key}")
+    def at_start(data: Data, p: vec3, v: vec3, pose: vec3, following: vec3, dt: real) -> vec3:
+        hit = distance(data, p, pose)
+        left = v + vec3()
+        if hit[3] < real(0.0):
+            n = vec3(hit[0], hit[1], hit[2])
+            body = material(p, pose, (following - pose) / dt)
+            left = take(v, body, n, wp.min(wp.dot(v - body, n), real(0.0)), data.friction)
+        return left
+
+    return at_end if rule == "end" else at_start
+
+
+@cache
+@no_type_check
+def _stop_still(name: str, rule: Rule) -> Any:
+    types = precision(name)
+    real, vec3 = types.real, types.vec3
+    distance, Level = _floor(name)
+    at_floor = _stop(name, rule, distance, Level)
+
+    @wp.func(module=f"gradscape.contact.{name}", name=f"stop_{rule}_still_{name}")
+    def stop(floor: Level, p: vec3, v: vec3, pose: vec3, following: vec3, dt: real) -> vec3:
+        return at_floor(floor, p, v, vec3(), vec3(), dt)  # whatever the poses are
+
+    return stop
+
+
+@cache
+@no_type_check
+def _stop_twice(name: str, rule: Rule) -> Any:
+    types = precision(name)
+    real, vec3 = types.real, types.vec3
+    at_pan, at_floor = _stop(name, rule, *_pan(name)), _stop_still(name, rule)
+    _, Both = _nearer(name)
+
+    @wp.func(module=f"gradscape.contact.{name}", name=f"stop_{rule}_both_{name}")
+    def stop(both: Both, p: vec3, v: vec3, pose: vec3, following: vec3, dt: real) -> vec3:
+        return at_floor(both.floor, p, at_pan(both.pan, p, v, pose, following, dt), pose, following, dt)
+
+    return stop
+
+
+@cache
+@no_type_check
+def contact_kernel(name: str, stop: Any, Data: Any) -> Any:
+    """Return the kernel that lets a surface stop vertices, and moves them.
+
+    Within a step the surface moves steadily from one pose to the next. `held` vertices stay where they are. Poses are
+    read by vertex, so that the adjoint of each vertex's own is a sum that no other thread adds to.
     """
     types = precision(name)
     real, vec3 = types.real, types.vec3
-    module = f"gradscape.contact.{distance.key}"
 
-    @wp.func(module=module)
-    def material(p: vec3, pose: vec3, change: vec3, rate: real) -> vec3:
-        """Return the velocity of the surface's material at a position."""
-        spin = rate * change[2]
-        return vec3(rate * change[0] - spin * (p[1] - pose[1]), rate * change[1] + spin * (p[0] - pose[0]), real(0.0))
-
-    @wp.kernel(module=module)
+    @wp.kernel(module=f"gradscape.contact.{stop.key}")
     def touch(
-        step: int,
         dt: real,
         data: Data,
         held: wp.array[bool],
-        poses: wp.array2d[vec3],
+        pose: wp.array2d[vec3],
+        following: wp.array2d[vec3],
         x: wp.array2d[vec3],
         pulled: wp.array2d[vec3],
         x_next: wp.array2d[vec3],
         v_next: wp.array2d[vec3],
     ):
         row, i = wp.tid()
-        p, pose = x[row, i], poses[step, row]
-        v = pulled[row, i] + vec3()  # a value: what is read from an array is a reference, which cannot be assigned to
-        hit = distance(data, p, pose)
-        if hit[3] < real(0.0):
-            n = vec3(hit[0], hit[1], hit[2])
-            body = material(p, pose, poses[step + 1, row] - pose, real(1.0) / dt)
-            v = v - wp.min(wp.dot(v - body, n), real(0.0)) * n
+        p = x[row, i] + vec3()  # a value: what is read from an array is a reference, which cannot be assigned to
+        v = stop(data, p, pulled[row, i], pose[row, i], following[row, i], dt)
         if held[i]:
             v = vec3(real(0.0), real(0.0), real(0.0))
         v_next[row, i] = v
         x_next[row, i] = p + dt * v
 
     return touch
+
+
+@cache
+@no_type_check
+def sum_kernels(name: str) -> tuple[Any, Any]:
+    """Return two kernels that sum over a row's vertices in one order on every device, without atomic adds.
+
+    The first takes [row, part] to the sum of every vertex whose number is `part` by the count of parts, the second adds
+    a row's parts to what is there. A row's sum does not depend on the rows beside it.
+    """
+    vec3 = precision(name).vec3
+    module = f"gradscape.contact.sums.{name}"
+
+    @wp.kernel(module=module, enable_backward=False)
+    def gather(by_vertex: wp.array2d[vec3], by_part: wp.array2d[vec3]):
+        row, part = wp.tid()
+        total = vec3()
+        for i in range(part, by_vertex.shape[1], by_part.shape[1]):
+            total += by_vertex[row, i]
+        by_part[row, part] = total
+
+    @wp.kernel(module=module, enable_backward=False)
+    def add(by_part: wp.array2d[vec3], by_row: wp.array[vec3]):
+        row = wp.tid()
+        total = vec3()
+        for part in range(by_part.shape[1]):
+            total += by_part[row, part]
+        by_row[row] = by_row[row] + total
+
+    return gather, add

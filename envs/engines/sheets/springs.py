@@ -5,6 +5,7 @@ twice, but no sum is atomic. The adjoint is written by hand in the same way: wit
 the adjoint of the force on i, a pair that pulls i by f and j by -f adds -(mu_j - mu_i) . df to the loss's change.
 """
 
+import math
 import threading
 from dataclasses import dataclass
 from functools import cache, partial
@@ -16,7 +17,7 @@ import torch
 import warp as wp
 
 from ..runtime import free_memory, load, precision, to_torch
-from .contact import Surface, contact_kernel
+from .contact import Rule, Surface, contact_kernel, sum_kernels
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,18 +27,31 @@ class Sheet:
     `x` are the vertices at the start, shape (vertex, 3); `pairs` the two ends of each spring, shape (spring, 2); `rest`
     its length and `weight` its share of stiffness and damping, shape (spring,). A spring of weight w between vertices
     of stiffness s_i and s_j [N/m] pulls with w (s_i + s_j) / 2 times its elongation, and with w `damping` [N s/m] times
-    its rate. `mass` [kg] is that of each vertex; air takes `drag` [1/s] of its velocity; `held` vertices never move.
+    its rate. Where there is a `plate` [N/m], shape (spring,), a pair also attracts with so much times its distance, or
+    repels where that is negative: such linear forces are how a sheet resists bending. `mass` [kg] is that of each
+    vertex, or of all alike; air takes `drag` [1/s] of its velocity; `held` vertices never move.
     """
 
     x: np.ndarray
     pairs: np.ndarray
     rest: np.ndarray
     weight: np.ndarray
-    mass: float
+    mass: np.ndarray | float
     damping: float
     drag: float = 0.0
     gravity: float = 9.81
     held: tuple[int, ...] = ()
+    plate: np.ndarray | None = None
+
+    @property
+    def plates(self) -> np.ndarray:
+        """Each pair's linear attraction [N/m], shape (spring,)."""
+        return np.zeros(len(self.pairs)) if self.plate is None else self.plate
+
+    @property
+    def masses(self) -> np.ndarray:
+        """The vertices' masses [kg], shape (vertex,)."""
+        return np.broadcast_to(np.asarray(self.mass, dtype=np.float64), len(self.x))
 
 
 def bytes_per_row(sheet: Sheet, steps: int, name: str) -> int:
@@ -55,8 +69,9 @@ def capacity(size: int, device: str) -> int:
 class Solver:
     """Integrate up to `capacity` sheets by semi-implicit Euler, and differentiate where they end.
 
-    In each step springs, gravity and air change velocities; the surface takes from vertices inside it what goes into
-    it; then vertices move. The whole episode is kept. Setting `stop` ends it within a step, with InterruptedError.
+    In each step springs, gravity and air change velocities; the surface takes what goes into it, by a `rule` of
+    `contact`; then vertices move. The whole episode is kept. Sums have one order on every device. Setting `stop` ends
+    an episode within a step, with InterruptedError.
     """
 
     def __init__(
@@ -70,13 +85,16 @@ class Solver:
         capacity: int,
         device: str,
         stop: threading.Event | None = None,
+        rule: Rule = "end",
     ) -> None:
         self.sheet, self.dt, self.steps, self.device = sheet, dt, steps, device
         self.stop = stop or threading.Event()
         self.types = precision(name)
         self.springs = spring_kernels(name)
-        self.touch = contact_kernel(name, *surface.function(name))
-        load([self.springs.pull, self.springs.adjoint, self.touch], device)
+        self.touch = contact_kernel(name, surface.stop(name, rule), surface.function(name)[1])
+        self.gather, self.add = sum_kernels(name)
+        load([self.springs.pull, self.springs.adjoint, self.touch, *([self.gather] if surface.moves else [])], device)
+        self.moves = surface.moves
         self.surface = surface.data(name)
         self.network = _network(sheet, self.springs.Network, self.types, device)
         self.held: Any = wp.array(np.isin(np.arange(len(sheet.x)), sheet.held), dtype=wp.bool, device=device)
@@ -118,10 +136,17 @@ class Solver:
         self.x_all = to_torch(states[0])
         self.x, self.v, self.pulled = ([array[step] for step in range(frames)] for array in states)
         self.poses, self.adj_poses = (wp.zeros((frames, capacity), **vec3) for _ in range(2))
+        self.pose = [self._of_every_vertex(pose) for pose in to_torch(self.poses)]
+        self.adj_pose = [wp.zeros((capacity, count), **vec3) if self.moves else None for _ in range(2)]
+        self.adj_parts = wp.zeros((capacity, math.isqrt(count)), **vec3)
         self.adj_x, self.adj_v, self.adj_here, self.adj_pulled = (wp.zeros((capacity, count), **vec3) for _ in range(4))
         self.stiffness, self.adj_stiffness = (
             wp.zeros((capacity, count), dtype=self.types.real, device=self.device) for _ in range(2)
         )
+
+    def _of_every_vertex(self, pose: torch.Tensor) -> Any:
+        """Return poses of rows as an array [row, vertex] of the same memory."""
+        return wp.from_torch(pose[:, None].expand(-1, len(self.sheet.x), 3), dtype=self.types.vec3)
 
     def _free(self) -> torch.Tensor:
         """Return 1 for vertices that can move and 0 for held ones, shape (vertex, 1)."""
@@ -130,19 +155,23 @@ class Solver:
         return free
 
     def _step_back(self, step: int, batch: int) -> None:
-        self.adj_here.zero_()
-        self.adj_pulled.zero_()
+        for array in (self.adj_here, self.adj_pulled, *self.adj_pose):
+            if array is not None:
+                array.zero_()
         wp.launch(
             self.touch,
             (batch, len(self.sheet.x)),
             self._touch_inputs(step),
             [self.x[step + 1], self.v[step + 1]],
-            adj_inputs=[None, None, type(self.surface)(), None, self.adj_poses, self.adj_here, self.adj_pulled],
+            adj_inputs=[None, type(self.surface)(), None, *self.adj_pose, self.adj_here, self.adj_pulled],
             adj_outputs=[self.adj_x, self.adj_v],
             device=self.device,
             adjoint=True,
             record_tape=False,
         )
+        for frame, by_vertex in zip((step, step + 1), self.adj_pose, strict=True):
+            if by_vertex is not None:
+                self._add_up(by_vertex, self.adj_poses[frame], batch)
         seeds = [self.adj_here, self.adj_pulled]
         self._launch(
             self.springs.adjoint,
@@ -151,11 +180,17 @@ class Solver:
             [self.adj_x, self.adj_v, self.adj_stiffness],
         )
 
+    def _add_up(self, by_vertex: Any, by_row: Any, batch: int) -> None:
+        size = (batch, self.adj_parts.shape[1])
+        wp.launch(self.gather, size, [by_vertex], [self.adj_parts], device=self.device, record_tape=False)
+        wp.launch(self.add, batch, [self.adj_parts], [by_row], device=self.device, record_tape=False)
+
     def _pull_inputs(self, step: int) -> list[Any]:
         return [self.network, self.dt, self.stiffness, self.x[step], self.v[step]]
 
     def _touch_inputs(self, step: int) -> list[Any]:
-        return [step, self.dt, self.surface, self.held, self.poses, self.x[step], self.pulled[step]]
+        poses = self.pose[step], self.pose[step + 1]
+        return [self.dt, self.surface, self.held, *poses, self.x[step], self.pulled[step]]
 
     def _launch(self, kernel: Any, batch: int, inputs: list[Any], outputs: list[Any]) -> None:
         if self.stop.is_set():
@@ -173,7 +208,9 @@ def _network(sheet: Sheet, Network: Any, types: Any, device: str) -> Any:
     network.neighbor = wp.array(ends[order, 1], dtype=int, device=device)
     network.rest = wp.array(np.tile(sheet.rest, 2)[order], dtype=types.real, device=device)
     network.weight = wp.array(np.tile(sheet.weight, 2)[order], dtype=types.real, device=device)
-    for name in ("mass", "damping", "drag", "gravity"):
+    network.plate = wp.array(np.tile(sheet.plates, 2)[order], dtype=types.real, device=device)
+    network.mass = wp.array(sheet.masses, dtype=types.real, device=device)
+    for name in ("damping", "drag", "gravity"):
         setattr(network, name, getattr(sheet, name))
     return network
 
@@ -194,7 +231,8 @@ def spring_kernels(name: str) -> SimpleNamespace:
         neighbor: wp.array[int]
         rest: wp.array[real]
         weight: wp.array[real]
-        mass: real
+        plate: wp.array[real]
+        mass: wp.array[real]
         damping: real
         drag: real
         gravity: real
@@ -214,13 +252,14 @@ def spring_kernels(name: str) -> SimpleNamespace:
         for k in range(network.first[i], network.first[i + 1]):
             j = network.neighbor[k]
             d = x[row, j] - x_i
+            f += network.plate[k] * d
             length = wp.length(d)
             if length > real(0.0):  # ends that coincide have no direction
                 n = (real(1.0) / length) * d
                 s = real(0.5) * (s_i + stiffness[row, j])
                 tension = s * (length - network.rest[k]) + network.damping * wp.dot(v[row, j] - v_i, n)
                 f += (network.weight[k] * tension) * n
-        a = f / network.mass - network.drag * v_i - vec3(real(0.0), network.gravity, real(0.0))
+        a = f / network.mass[i] - network.drag * v_i - vec3(real(0.0), network.gravity, real(0.0))
         pulled[row, i] = v_i + dt * a
 
     @wp.kernel(module=module, enable_backward=False)
@@ -238,18 +277,21 @@ def spring_kernels(name: str) -> SimpleNamespace:
     ):
         row, i = wp.tid()
         x_i, v_i, s_i, adj_i = x[row, i], v[row, i], stiffness[row, i], adj_pulled[row, i]
+        mu_i = (real(1.0) / network.mass[i]) * adj_i
         gx = vec3()
         gv = vec3()
         gs = real(0.0)
         for k in range(network.first[i], network.first[i + 1]):
             j = network.neighbor[k]
             d = x[row, j] - x_i
+            difference = (real(1.0) / network.mass[j]) * adj_pulled[row, j] - mu_i
+            gx += network.plate[k] * difference
             length = wp.length(d)
             if length > real(0.0):
                 inverse = real(1.0) / length
                 n = inverse * d
                 w = v[row, j] - v_i
-                mu = network.weight[k] * (adj_pulled[row, j] - adj_i)
+                mu = network.weight[k] * difference
                 s = real(0.5) * (s_i + stiffness[row, j])
                 along, rate = wp.dot(mu, n), wp.dot(w, n)
                 across = mu - along * n
@@ -258,9 +300,8 @@ def spring_kernels(name: str) -> SimpleNamespace:
                 gx += (network.damping * along * inverse) * (w - rate * n)
                 gv += (network.damping * along) * n
                 gs -= real(0.5) * along * (length - network.rest[k])
-        scale = dt / network.mass
-        adj_x[row, i] = adj_here[row, i] + scale * gx
-        adj_v[row, i] = (real(1.0) - dt * network.drag) * adj_i + scale * gv
-        adj_stiffness[row, i] += scale * gs
+        adj_x[row, i] = adj_here[row, i] + dt * gx
+        adj_v[row, i] = (real(1.0) - dt * network.drag) * adj_i + dt * gv
+        adj_stiffness[row, i] += dt * gs
 
     return SimpleNamespace(pull=pull, adjoint=adjoint, Network=Network)

@@ -2,13 +2,15 @@
 
 A step takes vertices' x and v from time t to time t + 1:
 
-    pull     f_t    = sum over a vertex's springs of weight (s (|d| - rest) + damping w.n) n
+    pull     f_t    = sum over a vertex's springs of weight (s (|d| - rest) + damping w.n) n + plate d
     advance  v'     = v_t + dt (f_t / m - drag v_t - g)
-             v_t+1  = v' - min((v' - u).n, 0) n inside the surface, v' outside, 0 where held
+             v_t+1  = v' - max(min((v' - u).n, 0), d / dt) n where x_t + dt v' is inside a surface, 0 where held
              x_t+1  = x_t + dt v_t+1
 
 A spring has d = x_j - x_i, w = v_j - v_i, n = d / |d|, s = (s_i + s_j) / 2, and adds its force to both its ends; a
-surface has the normal n and material that moves with u. Fields are [time, row, vertex] and hold the whole episode.
+surface has the normal n, the distance d < 0 and material that moves with u, all where the vertex would be at the end
+of the step, or by the rule `start` where it is, and then without d / dt. Friction takes from what is left along the
+surface. Fields are [time, row, vertex] and hold the whole episode.
 """
 
 import threading
@@ -20,7 +22,7 @@ import numpy as np
 import torch
 
 from ..runtime import precision
-from ..sheets.contact import Floor, Pan, Surface
+from ..sheets.contact import Floor, Pan, Rule, Surface
 from ..sheets.springs import Sheet
 from .runtime import real, start
 
@@ -49,6 +51,7 @@ class Solver:
         capacity: int,
         device: str,
         stop: threading.Event | None = None,
+        rule: Rule = "end",
     ) -> None:
         ti, R = start(device), real(name)
         self.steps, self.count, self.capacity = steps, len(sheet.x), capacity
@@ -57,7 +60,7 @@ class Solver:
         fields, tree = _fields(ti, R, sheet, frames=steps + 1, capacity=capacity)
         weakref.finalize(self, tree.destroy).atexit = False  # Taichi keeps fields that nothing refers to
         self.borders = _borders(ti, R, fields)
-        self.physics = _physics(ti, R, sheet, fields, _surface(ti, R, surface), dt=dt, device=device)
+        self.physics = _physics(ti, R, sheet, fields, _stops(ti, R, surface, rule, dt=dt), dt=dt, device=device)
         self._lay_out(sheet)
         self._compile()
 
@@ -111,7 +114,11 @@ class Solver:
     def _lay_out(self, sheet: Sheet) -> None:
         pairs = torch.from_numpy(sheet.pairs).to(self.kind["device"], torch.int32)
         free = ~np.isin(np.arange(self.count), sheet.held)
-        reals = (torch.from_numpy(part).to(**self.kind) for part in (sheet.rest, sheet.weight, sheet.x, free))
+        masses = sheet.masses.copy()
+        reals = (
+            torch.from_numpy(part).to(**self.kind)
+            for part in (sheet.rest, sheet.weight, sheet.plates, sheet.x, free, masses)
+        )
         self.borders.lay_out(pairs.contiguous(), *(part.contiguous() for part in reals))
 
     def _compile(self) -> None:
@@ -148,7 +155,9 @@ def _fields(ti: Any, R: Any, sheet: Sheet, *, frames: int, capacity: int) -> tup
         pairs=place(ti.Vector.field(2, ti.i32), springs),
         rest=place(ti.field(R), springs),
         weight=place(ti.field(R), springs),
+        plate=place(ti.field(R), springs),
         free=place(ti.field(R), count),
+        mass=place(ti.field(R), count),
         stiffness=place(ti.field(R, needs_grad=True), capacity, count),
         poses=place(ti.Vector.field(3, R, needs_grad=True), frames, capacity),
         x=states(),
@@ -159,12 +168,13 @@ def _fields(ti: Any, R: Any, sheet: Sheet, *, frames: int, capacity: int) -> tup
 
 
 @no_type_check
-def _physics(ti: Any, R: Any, sheet: Sheet, fields: Any, inside: Any, *, dt: float, device: str) -> SimpleNamespace:
+def _physics(ti: Any, R: Any, sheet: Sheet, fields: Any, stop: Any, *, dt: float, device: str) -> SimpleNamespace:
     """Return the kernels `pull` of springs' forces and `advance` of vertices against a surface."""
-    pairs, rest, weight, free = fields.pairs, fields.rest, fields.weight, fields.free
+    plate = fields.plate
+    pairs, rest, weight, free, mass = fields.pairs, fields.rest, fields.weight, fields.free, fields.mass
     x, v, f, stiffness, poses = fields.x, fields.v, fields.f, fields.stiffness, fields.poses
     count, springs = len(sheet.x), len(sheet.pairs)
-    mass, damping, drag, g = sheet.mass, sheet.damping, sheet.drag, sheet.gravity
+    damping, drag, g = sheet.damping, sheet.drag, sheet.gravity
     vec3 = ti.types.vector(3, R)
     pulling, advancing = (1, 1) if device == "cpu" else (springs, count)  # threads of a row
 
@@ -174,6 +184,8 @@ def _physics(ti: Any, R: Any, sheet: Sheet, fields: Any, inside: Any, *, dt: flo
             for k in range(part * (springs // pulling), (part + 1) * (springs // pulling)):
                 i, j = pairs[k][0], pairs[k][1]
                 d = x[t, row, j] - x[t, row, i]
+                f[t, row, i] += plate[k] * d
+                f[t, row, j] -= plate[k] * d
                 square = d.dot(d)
                 if square > R(0.0):  # ends that coincide have no direction
                     length = ti.sqrt(square)
@@ -188,16 +200,9 @@ def _physics(ti: Any, R: Any, sheet: Sheet, fields: Any, inside: Any, *, dt: flo
     def advance(t: ti.i32, batch: ti.i32):
         for row, part in ti.ndrange(batch, advancing):
             for i in range(part * (count // advancing), (part + 1) * (count // advancing)):
-                p, pose = x[t, row, i], poses[t, row]
-                a = f[t, row, i] / R(mass) - R(drag) * v[t, row, i] - vec3(0.0, g, 0.0)
-                pulled = v[t, row, i] + R(dt) * a
-                n, depth = inside(p, pose)
-                into = R(0.0)
-                if depth > R(0.0):
-                    rate = (poses[t + 1, row] - pose) / R(dt)
-                    material = vec3(rate[0] - rate[2] * (p[1] - pose[1]), rate[1] + rate[2] * (p[0] - pose[0]), 0.0)
-                    into = ti.min((pulled - material).dot(n), R(0.0))
-                v_next = free[i] * (pulled - into * n)
+                p = x[t, row, i]
+                a = f[t, row, i] / mass[i] - R(drag) * v[t, row, i] - vec3(0.0, g, 0.0)
+                v_next = free[i] * stop(p, v[t, row, i] + R(dt) * a, poses[t, row], poses[t + 1, row])
                 v[t + 1, row, i] = v_next
                 x[t + 1, row, i] = p + R(dt) * v_next
 
@@ -216,15 +221,17 @@ def _borders(ti: Any, R: Any, fields: Any) -> SimpleNamespace:
         pairs: arrays(dtype=ti.types.vector(2, ti.i32), ndim=1),
         rest: arrays(dtype=R, ndim=1),
         weight: arrays(dtype=R, ndim=1),
+        plate: arrays(dtype=R, ndim=1),
         start: arrays(dtype=vec3, ndim=1),
         moves: arrays(dtype=R, ndim=1),
+        masses: arrays(dtype=R, ndim=1),
     ):
         for k in rest:
-            fields.pairs[k], fields.rest[k], fields.weight[k] = pairs[k], rest[k], weight[k]
+            fields.pairs[k], fields.rest[k], fields.weight[k], fields.plate[k] = pairs[k], rest[k], weight[k], plate[k]
         for row, i in ti.ndrange(x.shape[1], x.shape[2]):
             x[0, row, i] = start[i]
         for i in moves:
-            free[i] = moves[i]
+            free[i], fields.mass[i] = moves[i], masses[i]
 
     @ti.kernel
     def begin(
@@ -260,9 +267,55 @@ def _borders(ti: Any, R: Any, fields: Any) -> SimpleNamespace:
 
 
 @no_type_check
-def _surface(ti: Any, R: Any, surface: Surface) -> Any:
-    """Return a surface as a function of a position and a pose to its normal and the depth below it."""
-    return {Floor: _floor, Pan: _pan}[type(surface)](ti, R, surface)
+def _stops(ti: Any, R: Any, surface: Surface, rule: Rule, *, dt: float) -> Any:
+    """Return what a surface, or a pan and then a floor, leaves of a velocity, as a function of place and poses."""
+    vec3 = ti.types.vector(3, R)
+    if isinstance(surface, Pan):
+        return _stop(ti, R, _pan(ti, R, surface), rule, dt=dt, friction=surface.friction)
+    if isinstance(surface, Floor):
+        still = _stop(ti, R, _floor(ti, R, surface), rule, dt=dt, friction=surface.friction)
+
+        @ti.func
+        def stop_still(p, v, pose, following):
+            return still(p, v, vec3(0.0), vec3(0.0))  # whatever the poses are
+
+        return stop_still
+    pan, floor = (_stops(ti, R, part, rule, dt=dt) for part in (surface.pan, surface.floor))
+
+    @ti.func
+    def stop(p, v, pose, following):
+        return floor(p, pan(p, v, pose, following), pose, following)
+
+    return stop
+
+
+@no_type_check
+def _stop(ti: Any, R: Any, inside: Any, rule: Rule, *, dt: float, friction: float) -> Any:
+    """Return the function of one surface."""
+    vec3 = ti.types.vector(3, R)
+    ahead = float(rule == "end")  # of the steps that a place is looked at
+
+    @ti.func
+    def stop(p, v, pose, following):
+        q, now = p + R(ahead * dt) * v, pose + R(ahead) * (following - pose)
+        n, depth = inside(q, now)
+        left = v
+        if depth > R(0.0):
+            rate = (following - pose) / R(dt)
+            material = vec3(rate[0] - rate[2] * (q[1] - now[1]), rate[1] + rate[2] * (q[0] - now[0]), 0.0)
+            into = ti.min((v - material).dot(n), R(0.0))
+            if ti.static(rule == "end"):
+                into = ti.max(into, -depth / R(dt))
+            left = v - into * n
+            if ti.static(friction > 0.0):
+                slip = left - material
+                slip = slip - slip.dot(n) * n
+                square = slip.dot(slip)
+                if square > R(0.0):
+                    left = left - ti.min(R(1.0), -R(friction) * into / ti.sqrt(square)) * slip
+        return left
+
+    return stop
 
 
 @no_type_check

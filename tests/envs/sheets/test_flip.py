@@ -1,6 +1,7 @@
 """The flip scene: the toss that was found, the pan at rest and lifted, and the path it takes."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -33,7 +34,7 @@ def test_the_pancake_is_as_large_heavy_and_soft_as_documented(fidelity):
     env = Flip(fidelity=fidelity, device="cpu")
     sheet = env.sheet
     assert [float(d) for d in sheet.x.max(axis=0) - sheet.x.min(axis=0)] == pytest.approx([0.2, 0.0, 0.2])
-    assert sheet.mass * len(sheet.x) == pytest.approx(3.0 * math.pi * 0.1**2)
+    assert sheet.masses.sum() == pytest.approx(3.0 * math.pi * 0.1**2)
     drive = env._drive(STILL[None])
     assert drive.stiffness.unique().tolist() == [60.0]
     assert drive.velocity.abs().max() == 0
@@ -113,3 +114,41 @@ def test_the_corners_of_the_box_can_be_simulated(draft):
     corner = torch.randint(0, 2, (64, 15), generator=rng).bool()
     result = draft.evaluate(torch.where(corner, draft.space.upper, draft.space.lower))
     assert (result.status == Status.OK).all()
+
+
+def test_a_pancake_that_misses_the_pan_comes_to_rest_on_the_floor(draft):
+    """The pan drops and tilts away, so that the pancake slides off; it ends flat on a floor of its own height."""
+    x = STILL.clone()
+    x[2::3], x[1::3] = 0.6, -0.07
+    end, floor = draft.end(x), draft.surface.floor.height
+    frames = Flip(fidelity="draft", device="cpu", horizon=2.0).episode(x).points["sheet"]
+    assert end[:, 1].min() >= floor - 1e-6
+    torch.testing.assert_close(frames[-1, :, 1], torch.full_like(frames[-1, :, 1], floor), rtol=0, atol=1e-3)
+    assert Flip(fidelity="draft", device="cpu", floor=False, horizon=2.0).end(x)[:, 1].max() < 4 * floor
+
+
+def test_the_floor_is_below_all_that_the_pan_reaches(draft):
+    """Points of its underside, at every corner of what a waypoint may be."""
+    pan, low = draft.pan, draft.space.lower[:3]
+    angle = torch.linspace(-pan.sweep, pan.sweep, 401, dtype=torch.float64)
+    deep = pan.bend + pan.thickness
+    out = torch.sign(angle) * pan.flat + deep * angle.sin()
+    up = pan.bend - deep * angle.cos()
+    for tilt in torch.linspace(float(low[2]), -float(low[2]), 41, dtype=torch.float64):
+        underside = low[1] + out * tilt.sin() + up * tilt.cos()
+        assert underside.min() > draft.surface.floor.height + 0.05
+
+
+@pytest.mark.parametrize(("option", "value"), [("floor", False), ("rim", False), ("bending", 0.0), ("friction", 0.4)])
+def test_a_part_of_the_model_changes_tosses_and_leaves_gradients_slopes(option, value):
+    """Along a random direction, over steps that are shorter than what lies between contacts."""
+    fidelity = replace(Flip.fidelities["draft"], precision="float64")
+    x, change = Flip.space.uniform(24, seed=3), 1e-7
+    way = torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    env = Flip(fidelity=fidelity, device="cpu", **{option: value})
+    result = env.evaluate(x)
+    ends = [env.evaluate(x + sign * change * way, grad=False).loss for sign in (1, -1)]
+    slope, ours = (ends[0] - ends[1]) / (2 * change), (result.grad * way).sum(dim=1)
+    assert ((slope - ours).abs() / ours.abs()).median() < 1e-6
+    whole = Flip(fidelity=fidelity, device="cpu").evaluate(x, grad=False).loss
+    assert ((result.loss - whole).abs() > 1e-3).sum() >= 5

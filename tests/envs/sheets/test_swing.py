@@ -38,7 +38,7 @@ def test_the_cloth_starts_level_and_held_at_its_two_right_corners(fidelity):
     assert low.tolist() == pytest.approx([-0.2, 0.1, -0.1])
     assert high.tolist() == pytest.approx([0.0, 0.1, 0.1])
     assert sheet.x[list(sheet.held)].ravel().tolist() == pytest.approx([0.0, 0.1, -0.1, 0.0, 0.1, 0.1])
-    assert sheet.mass * len(sheet.x) == pytest.approx(0.2 * 0.2**2)
+    assert sheet.masses.sum() == pytest.approx(0.2 * 0.2**2)
 
 
 def test_an_episode_is_that_of_the_parameters_and_its_anchors_stand_still(cls):
@@ -67,12 +67,15 @@ def test_losses_are_distances_between_the_ends_of_episodes(cls):
     x = env.space.uniform(4, seed=3)
     loss = {name: env.evaluate(x, grad=False).loss for name, env in envs.items()}
     target, n = last(env, env.example("target")), env.fidelity.resolution
+    share = torch.ones(n + 1, dtype=torch.float64) / n  # trapezoidal: edges weigh half
+    share[[0, -1]] /= 2
+    share = share[:, None] * share
     for row in range(4):
         gap = last(env, x[row]) - target
         lengths = gap.norm(dim=1).reshape(n + 1, n + 1)
-        torch.testing.assert_close(loss["mesh"][row], lengths.mean())
+        torch.testing.assert_close(loss["mesh"][row], (share * lengths).sum())
         torch.testing.assert_close(loss["corner"][row], lengths[[0, 0, -1, -1], [0, -1, 0, -1]].mean())
-        torch.testing.assert_close(loss["single"][row], gap.mean(dim=0).norm())
+        torch.testing.assert_close(loss["single"][row], (share.flatten() @ gap).norm())
         assert lengths[-1, [0, -1]].tolist() == [0, 0]
     assert (loss["single"] <= loss["mesh"]).all()  # the norm of a mean is at most the mean of norms
     assert (loss["single"] > 1e-3).all()
@@ -86,17 +89,16 @@ def test_both_scenes_swing_the_same_cloth(velocity):
 
 @pytest.mark.parametrize("resolution", [7, 8, 19])
 def test_a_patch_is_as_large_as_the_next_and_lies_where_it_is_named(resolution):
+    """Each patch's share of the cloth is a sixteenth, and its middle is a patch's, at every resolution."""
     env = made(SwingStiffness, fidelity=replace(DRAFT64, resolution=resolution))
-    numbers = torch.arange(16, dtype=torch.float64)[None]
-    patch = env._drive(numbers).stiffness[0].reshape(resolution + 1, resolution + 1)
-    place = torch.from_numpy(env.sheet.x).reshape(resolution + 1, resolution + 1, 3)
-    right, front = place[..., 0] / 0.2 + 1, place[..., 2] / 0.2 + 0.5
-    row, column = patch // 4, patch % 4
-    for share, number in ((right, row), (front, column)):
-        # A vertex stands for its cell, half of which may lie beyond the patch.
-        assert ((share - (number + 0.5) / 4).abs() <= 1 / 8 + 0.5 / (resolution + 1) + 1e-9).all()
-    for vertices in (row[:, 0].long().bincount(minlength=4), column[0].long().bincount(minlength=4)):
-        assert vertices.max() - vertices.min() <= 1
+    patch = env._drive(torch.eye(16, dtype=torch.float64)).stiffness
+    torch.testing.assert_close(patch.sum(dim=0), torch.ones(len(env.sheet.x), dtype=torch.float64))
+    area = torch.from_numpy(env.sheet.masses / env.sheet.masses.sum())
+    torch.testing.assert_close(patch @ area, torch.full((16,), 1 / 16, dtype=torch.float64))
+    middle = (16 * patch * area) @ torch.from_numpy(env.sheet.x)
+    number = torch.arange(16)
+    for found, place in ((middle[:, 0] / 0.2 + 1, number // 4), (middle[:, 2] / 0.2 + 0.5, number % 4)):
+        assert ((found - (place + 0.5) / 4).abs() < 0.3 / resolution).all()
 
 
 def test_a_mirrored_throw_ends_mirrored(velocity):
@@ -110,20 +112,30 @@ def test_a_mirrored_throw_ends_mirrored(velocity):
     assert (there[-1, :, 1] < 0.0).sum() > 5
 
 
-def test_the_floor_lets_no_vertex_deeper_than_it_falls_in_one_step(monkeypatch):
-    env = made(SwingVelocity, fidelity="draft")
-    dt = env.fidelity.dt
-    monkeypatch.setattr(sheets, "FRAME", dt)
+def test_the_floor_lets_no_vertex_in(monkeypatch):
+    env = made(SwingVelocity)
+    monkeypatch.setattr(sheets, "FRAME", env.fidelity.dt)
     for throw in ((2.0, -2.0, 2.0), (1.0, -0.5, 0.3)):
         y = env.episode(torch.tensor(throw, dtype=torch.float64)).points["sheet"][:, :, 1]
-        fall = -y.diff(dim=0)
-        assert (fall[y[:-1] < 0] <= 0).all()
-        assert y.min() < 0
-        assert y.min() >= -fall.max()
-        assert fall.max() < 5 * dt
+        assert y.min() > -1e-14
+        assert (y.abs() < 1e-14).any()
 
 
-def test_gradients_are_slopes_between_jumps_but_often_point_against_the_slope_of_a_decimetre_per_second(velocity):
+def test_a_cloth_whose_throw_changes_by_a_millionth_ends_a_little_elsewhere_since_contact_does_not_jump():
+    """With the rule `start` more of them jump."""
+    x = SwingVelocity.space.uniform(48, seed=5)
+    shift = 1e-7 * torch.tensor([1.0, 1.0, 1.0], dtype=torch.float64)
+    torn = {}
+    for rule in ("end", "start"):
+        env = SwingVelocity(fidelity=DRAFT64, device="cpu", contact=rule)
+        result = env.evaluate(x)
+        change = env.evaluate(x + shift, grad=False).loss - result.loss
+        torn[rule] = int(((change - result.grad @ shift).abs() > 1e-4 * (result.grad @ shift).abs() + 1e-9).sum())
+    assert torn["end"] <= 3
+    assert torn["start"] >= 2 * torn["end"] + 2
+
+
+def test_gradients_are_slopes_but_often_point_against_the_slope_of_a_decimetre_per_second(velocity):
     """The paper's finding: gradients that are noisy and often opposite to the slope."""
     x = velocity.space.uniform(64, seed=1)
     gradient = velocity.evaluate(x).grad[:, 0]
@@ -134,8 +146,8 @@ def test_gradients_are_slopes_between_jumps_but_often_point_against_the_slope_of
         return (ends[0] - ends[1]) / (2 * step)
 
     near, far = slope(1e-8), slope(0.1)
-    assert ((near - gradient).abs() < 1e-4 * gradient.abs() + 1e-6).sum() > 58  # few have a jump even there
-    assert (far * gradient < 0).sum() > 64 / 5
+    assert ((near - gradient).abs() < 1e-5 * gradient.abs() + 1e-6).sum() > 60
+    assert (far * gradient < 0).sum() > 64 / 6
 
 
 def test_an_unstable_simulation_is_a_failure_and_no_error(cls):

@@ -10,7 +10,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 
 from gradscape.envs.engines.runtime import precision, to_torch
-from gradscape.envs.engines.sheets.contact import Floor, Pan
+from gradscape.envs.engines.sheets.contact import Floor, Pan, PanOverFloor
 from gradscape.envs.engines.sheets.springs import Sheet, Solver
 
 DT = 1e-3
@@ -26,14 +26,15 @@ def uniform(low, high, *shape, seed=0):
     return low + (high - low) * torch.rand(shape, generator=rng, dtype=torch.float64)
 
 
-def touched(surface, x, velocity, poses=None):
+def touched(surface, x, velocity, poses=None, rule="start"):
     """Return velocities after one step of vertices that no spring joins, and by how far they moved: (batch, vertex, 3).
 
     All start at `velocity`, shape (batch, 3); `x` has shape (vertex, 3).
     """
     none = np.zeros(0)
     sheet = Sheet(x.numpy(), np.zeros((0, 2), dtype=int), none, none, mass=1.0, damping=0.0, gravity=0.0)
-    solver = Solver(sheet, surface, dt=DT, steps=1, name="float64", capacity=len(velocity), device="cpu")
+    given = dict(dt=DT, steps=1, name="float64", capacity=len(velocity), device="cpu", rule=rule)
+    solver = Solver(sheet, surface, **given)
     path = solver.run(velocity, torch.zeros(len(velocity), len(x)), poses)
     return to_torch(solver.v[1]).clone(), path[1] - path[0]
 
@@ -101,6 +102,63 @@ def test_the_floor_takes_the_velocity_into_it_and_nothing_else():
     assert torch.equal(after[~stopped], before[~stopped])
     assert torch.equal(after[stopped], before[stopped] * torch.tensor([1.0, 0.0, 1.0]))
     torch.testing.assert_close(moved, DT * after, rtol=0, atol=1e-15)
+
+
+def test_what_would_be_in_the_floor_ends_on_it_and_what_is_in_it_goes_no_deeper():
+    x, v = uniform(-5e-3, 5e-3, 60, 3), uniform(-3.0, 3.0, 40, 3, seed=1)
+    after, moved = touched(Floor(height=0.002), x, v, rule="end")
+    start, end = x[:, 1].expand(40, 60), (x + moved)[..., 1]
+    free = start + DT * v[:, 1, None]
+    lands, inside = (free < 0.002) & (start >= 0.002), (start < 0.002) & (v[:, 1, None] < 0)
+    assert min(lands.sum(), inside.sum()) > 100
+    assert (end[lands] - 0.002).abs().max() < 1e-15
+    assert torch.equal(end[inside], start[inside])
+    assert torch.equal(end[~lands & ~inside], free[~lands & ~inside])
+    assert torch.equal(after[..., ::2], v[:, None, ::2].expand(40, 60, 2))
+
+
+def fall(rule, height, dt):
+    """Return the heights of a vertex that falls from a height [m] onto the floor, over 0.4 s."""
+    none = np.zeros(0)
+    sheet = Sheet(np.array([[0.0, height, 0.0]]), np.zeros((0, 2), dtype=int), none, none, mass=1.0, damping=0.0)
+    given = dict(dt=dt, steps=round(0.4 / dt), name="float64", capacity=1, device="cpu", rule=rule)
+    solver = Solver(sheet, Floor(), **given)
+    return solver.run(torch.zeros(1, 3, dtype=torch.float64), torch.zeros(1, 1))[:, 0, 0, 1]
+
+
+def test_a_vertex_dropped_on_the_floor_stays_on_it_at_every_step():
+    for dt in (4e-3, 1e-3):
+        y = fall("end", 0.2, dt)
+        landed = round((2 * 0.2 / 9.81) ** 0.5 / dt) + 2
+        assert y[landed:].abs().max() < 1e-15
+        assert fall("start", 0.2, dt)[-1] < -1e-5  # once it is inside: as deep as it happened to come
+
+
+def test_friction_stops_what_slides_after_the_way_that_coulomb_says():
+    """A vertex of 1.2 m/s slides v^2 / (2 mu g) far, and by half a step's way more or less."""
+    none, mu = np.zeros(0), 0.6
+    sheet = Sheet(np.zeros((1, 3)), np.zeros((0, 2), dtype=int), none, none, mass=1.0, damping=0.0)
+    given = dict(dt=DT, steps=400, name="float64", capacity=1, device="cpu")
+    solver = Solver(sheet, Floor(friction=mu), **given)
+    velocity = torch.tensor([[0.72, 0.0, 0.96]], dtype=torch.float64)
+    path = solver.run(velocity, torch.zeros(1, 1))[:, 0, 0]
+    way = 1.2**2 / (2 * mu * sheet.gravity)
+    assert float(path[-1].norm()) == pytest.approx(way, abs=1.2 * DT)
+    torch.testing.assert_close(path[-1] / path[-1].norm(), velocity[0] / 1.2, rtol=0, atol=1e-12)
+    assert torch.equal(path[-1], path[-2])
+
+
+def test_what_misses_the_pan_lands_on_the_floor_beneath_and_a_floor_bears_the_pan_nothing():
+    """Its first place decides: one vertex begins over the pan and one beside it; the pan moves, the floor does not."""
+    x = torch.tensor([[0.0, 0.01, 0.0], [0.3, 0.01, 0.0]], dtype=torch.float64)
+    none = np.zeros(0)
+    sheet = Sheet(x.numpy(), np.zeros((0, 2), dtype=int), none, none, mass=1.0, damping=0.0)
+    both = PanOverFloor(PAN, Floor(height=-0.1))
+    given = dict(dt=DT, steps=300, name="float64", capacity=1, device="cpu")
+    poses = torch.zeros(1, 301, 3, dtype=torch.float64)
+    poses[0, :, 1] = torch.linspace(0.0, 0.03, 301, dtype=torch.float64)
+    end = Solver(sheet, both, **given).run(torch.zeros(1, 3), torch.zeros(1, 2), poses)[-1, 0]
+    torch.testing.assert_close(end[:, 1], torch.tensor([0.03, -0.1], dtype=torch.float64), rtol=0, atol=1e-12)
 
 
 def test_a_pan_that_moves_and_tilts_takes_the_velocity_into_its_material_and_nothing_else():

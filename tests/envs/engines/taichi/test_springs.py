@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gradscape.envs.engines.sheets import springs
-from gradscape.envs.engines.sheets.contact import Floor, Pan
+from gradscape.envs.engines.sheets.contact import Floor, Pan, PanOverFloor
 from gradscape.envs.engines.sheets.springs import Sheet
 from gradscape.envs.engines.taichi import springs as taichi_springs
 from gradscape.envs.engines.taichi.runtime import start
@@ -30,7 +30,8 @@ def crumpled(surface):
     x = np.stack([points[:, 0] - 2, np.zeros(len(points)), points[:, 1] - 2], axis=1) * pitch
     x += 0.01 * np.random.default_rng(0).uniform(-1, 1, x.shape)
     x[12] = 0.0, -0.002, 0.0
-    return Sheet(x, pairs, pitch * rest, weight, mass=0.01, damping=0.05, drag=0.5, held=(20, 24))
+    mass = 0.0025 * (1 + np.arange(len(x)) % 4)
+    return Sheet(x, pairs, pitch * rest, weight, mass=mass, damping=0.05, drag=0.5, held=(20, 24))
 
 
 def drive():
@@ -45,14 +46,22 @@ def drive():
     return (within(-1.0, 0.0, ROWS, 3), within(5.0, 40.0, ROWS, 25), poses), within(-1.0, 1.0, ROWS, 25, 3)
 
 
-def made(engine, surface):
-    return engine.Solver(
-        crumpled(surface), surface, dt=DT, steps=STEPS, name="float64", capacity=ROWS + 1, device="cpu"
-    )
+def made(engine, surface, rule):
+    given = dict(dt=DT, steps=STEPS, name="float64", capacity=ROWS + 1, device="cpu", rule=rule)
+    return engine.Solver(crumpled(surface), surface, **given)
 
 
-@pytest.fixture(scope="module", params=[Floor(height=0.001), PAN], ids=["floor", "pan"])
-def surface(request):
+ROUGH = PanOverFloor(replace(PAN, friction=0.3), Floor(height=-0.02, friction=0.2))
+SURFACES = {
+    "floor": (Floor(height=0.001), "end"),
+    "pan": (PAN, "end"),
+    "pan once inside": (PAN, "start"),
+    "pan over floor, with friction": (ROUGH, "end"),
+}
+
+
+@pytest.fixture(scope="module", params=SURFACES.values(), ids=SURFACES.keys())
+def case(request):
     return request.param
 
 
@@ -62,15 +71,15 @@ def driven():
 
 
 @pytest.fixture(scope="module")
-def solver(surface):
-    return made(taichi_springs, surface)
+def solver(case):
+    return made(taichi_springs, *case)
 
 
 @pytest.fixture(scope="module")
-def warp(surface, driven):
+def warp(case, driven):
     """Return Warp's path and gradient."""
     inputs, adj_x = driven
-    solver = made(springs, surface)
+    solver = made(springs, *case)
     return solver.run(*inputs).clone(), solver.gradient(adj_x)
 
 
@@ -170,7 +179,7 @@ def test_a_draft_cloth_swings_as_warps_does(name, steps, distance, tolerance):
     x, target = ours.run(*inputs), theirs.run(*inputs)
     assert target[-1, :, :, 1].min() < 0.001  # on the floor
     torch.testing.assert_close(x, target, rtol=0, atol=distance)
-    adj_x = torch.ones(4, 64, 3)
+    adj_x = torch.ones(4, ours.count, 3)
     for mine, hand in zip(ours.gradient(adj_x)[:2], theirs.gradient(adj_x)[:2], strict=True):
         gap = (mine - hand).flatten(1).norm(dim=1) / hand.flatten(1).norm(dim=1)
         assert gap.max() < tolerance
@@ -178,7 +187,7 @@ def test_a_draft_cloth_swings_as_warps_does(name, steps, distance, tolerance):
 
 def test_a_row_is_the_same_bit_for_bit_alone_and_among_others():
     solver, inputs = cloth("float32", 150, [taichi_springs])
-    adj_x = torch.ones(4, 64, 3)
+    adj_x = torch.ones(4, solver.count, 3)
     x, gradient = solver.run(*inputs), solver.gradient(adj_x)
     for row in range(4):
         one = slice(row, row + 1)
