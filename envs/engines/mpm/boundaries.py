@@ -53,9 +53,9 @@ class LadleInTank:
     """A square tank, centred on x = z = 0, with its floor at y = 0, and a ladle that moves in it.
 
     Lengths in m: half the tank's width, the height of a `lid` that stops what flies highest, the bowl's mid-surface
-    `radius`, `half_thickness` of its shell, the handle's `height`, and the `band` over which the ladle's grip fades to
-    nothing outside its surface. `friction` is Coulomb's; `slip` is what floor and walls leave of the velocity along
-    them, from 1 (they slip) to 0 (they stick).
+    `radius`, `half_thickness` of its shell, the handle's `height` (0: there is none), and the `band` over which the
+    ladle's grip fades to nothing outside its surface. `friction` is Coulomb's; `slip` is what floor and walls leave of
+    the velocity along them, from 1 (they slip) to 0 (they stick).
     """
 
     half_width: float
@@ -174,7 +174,8 @@ def _ladle_in_tank(name: str) -> tuple[Any, Any]:
         if wp.abs(local[2]) < near and wp.abs(local[0]) < near and wp.abs(local[1]) < near:
             hit = bowl_distance(p - between(tools, e, step, fraction), scene.radius, scene.half_thickness)
             v = slide(v, rate * (tools[e, step + 1, 0] - tools[e, step, 0]), hit, scene.band, scene.friction)
-        if wp.abs(local[2]) < beside and wp.abs(local[0] + scene.radius) < beside:
+        handle = scene.height > real(0.0)
+        if handle and wp.abs(local[2]) < beside and wp.abs(local[0] + scene.radius) < beside:
             foot = p - between(tools, e, step, fraction) + vec3(scene.radius, real(0.0), real(0.0))
             hit = rod_distance(foot, scene.height, scene.half_thickness)
             v = slide(v, rate * (tools[e, step + 1, 0] - tools[e, step, 0]), hit, scene.band, scene.friction)

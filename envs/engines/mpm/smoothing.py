@@ -10,12 +10,17 @@ Fluid at rest keeps its J to round-off, uneven J is taken to its neighbours', an
 """
 
 from functools import cache
+from itertools import product
 from types import SimpleNamespace
 from typing import Any, no_type_check
 
+import torch
 import warp as wp
+from jaxtyping import Float
+from torch import Tensor
 
 from ..runtime import determinism, precision
+from .model import Model
 from .stencil import lattice, stencil
 
 
@@ -29,6 +34,11 @@ def smoothing_kernels(name: str, *, deterministic: bool = False) -> SimpleNamesp
     wp.set_module_options({"deterministic": determinism(deterministic)}, module)
     Lattice, spline = lattice(name), stencil(name)
     base_node, weights, weight_slopes = spline.base_node, spline.weights, spline.weight_slopes
+
+    @wp.func(module=module)
+    def inverse(weight: real):
+        # A particle in the middle of a cell gives the farthest of its nodes nothing, and others may not meet these.
+        return wp.where(weight > real(0.0), real(1.0) / weight, real(0.0))
 
     @wp.kernel(module=module, enable_backward=False)
     def clear(values: wp.array2d[real]):
@@ -88,7 +98,7 @@ def smoothing_kernels(name: str, *, deterministic: bool = False) -> SimpleNamesp
             for j in range(3):
                 row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
                 for k in range(3):
-                    mean += wx[i] * wy[j] * wz[k] * (amount[e, row + k] / weight[e, row + k])
+                    mean += wx[i] * wy[j] * wz[k] * amount[e, row + k] * inverse(weight[e, row + k])
         here = wp.log(J[e, p])
         J_new[e, p] = wp.exp(here + share * (mean - (here - slope * x[e, q][1])))
 
@@ -120,7 +130,7 @@ def smoothing_kernels(name: str, *, deterministic: bool = False) -> SimpleNamesp
             for j in range(3):
                 row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
                 for k in range(3):
-                    mean = amount[e, row + k] / weight[e, row + k]
+                    mean = amount[e, row + k] * inverse(weight[e, row + k])
                     steep += mean * vec3(dx_[i] * wy[j] * wz[k], wx[i] * dy_[j] * wz[k], wx[i] * wy[j] * dz_[k])
                     wp.atomic_add(adj_mean, e, row + k, wx[i] * wy[j] * wz[k] * share * g)
         adj_x[e, q] = adj_x[e, q] + (share * g * lattice.inv_dx) * steep
@@ -157,8 +167,9 @@ def smoothing_kernels(name: str, *, deterministic: bool = False) -> SimpleNamesp
             for j in range(3):
                 row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
                 for k in range(3):
-                    a = adj_mean[e, row + k] / weight[e, row + k]
-                    off = a * (beyond - amount[e, row + k] / weight[e, row + k])
+                    share_of_one = inverse(weight[e, row + k])
+                    a = adj_mean[e, row + k] * share_of_one
+                    off = a * (beyond - amount[e, row + k] * share_of_one)
                     adj_s += wx[i] * wy[j] * wz[k] * a
                     steep += off * vec3(dx_[i] * wy[j] * wz[k], wx[i] * dy_[j] * wz[k], wx[i] * wy[j] * dz_[k])
         g = adj_J[e, p]
@@ -181,7 +192,7 @@ class Smoother:
     def __init__(self, solver: Any, body: int, *, deterministic: bool) -> None:
         model, material = solver.model, solver.model.bodies[body].material
         self.body, self.first, self.size = body, solver.first[body], solver.size(body)
-        self.slope, self.share = material.density * model.gravity / material.bulk, material.smoothing
+        self.slope, self.share = hydrostatic_slope(model, body), material.smoothing
         self.kernels = smoothing_kernels(model.precision, deterministic=deterministic)
         types = precision(model.precision)
         self.amount, self.weight, self.adj_mean = (solver.allocator.array(types.real, model.cells) for _ in range(3))
@@ -215,3 +226,47 @@ class Smoother:
         x, J = solver.checkpoints[step].x, solver.checkpoints[step].S[self.body]
         inputs = [solver.tape(step).lattice, self.first, self.slope, solver.orders[step].volume, x, J]
         solver.launch(self.kernels.spread, self.size, batch, [*inputs, self.amount, self.weight])
+
+
+def hydrostatic_slope(model: Model, body: int) -> float:
+    """Return by how much log J of a fluid at rest grows with height [1/m]."""
+    material: Any = model.bodies[body].material
+    return float(material.density * model.gravity / material.bulk)
+
+
+def smooth_volume_ratios(
+    model: Model, body: int, x: Float[Tensor, "batch particle 3"], J: Float[Tensor, "batch particle"]
+) -> Float[Tensor, "batch particle"]:
+    """Return the volume ratios J of one body whose particles are at `x` [m] in the model's order, smoothed.
+
+    This is what the kernels do, written in torch, which differentiates it by x and J.
+    """
+    slope, share = hydrostatic_slope(model, body), model.bodies[body].material.smoothing
+    volume = torch.from_numpy(model.bodies[body].volume).to(x)
+    node, weight = _stencil(model, x)
+    beyond = J.log() - slope * x[:, :, 1]
+    total = _sum_at_nodes(model, node, weight * volume[:, None])
+    amount = _sum_at_nodes(model, node, weight * (volume * beyond)[:, :, None])
+    mean = amount / torch.where(total > 0, total, 1.0)
+    averaged = (weight * mean.gather(1, node.flatten(1)).view_as(weight)).sum(dim=2)
+    return (J.log() + share * (averaged - beyond)).exp()
+
+
+def _stencil(model: Model, x: Float[Tensor, "batch particle 3"]) -> tuple[Tensor, Float[Tensor, "batch particle 27"]]:
+    """Return the numbers of the 27 nodes around each particle, and their weights."""
+    s = (x - x.new_tensor(model.origin)) / model.dx
+    nodes = torch.tensor(model.nodes, device=x.device)
+    base = (s.detach() - 0.5).floor().long().clamp_min(0).minimum(nodes - 3)
+    f = s - base
+    along = torch.stack([(1.5 - f) ** 2 / 2, 0.75 - (f - 1) ** 2, (f - 0.5) ** 2 / 2], dim=3)
+    weight = torch.einsum("bpi,bpj,bpk->bpijk", *along.unbind(dim=2)).flatten(2)
+    offsets = torch.tensor(list(product(range(3), repeat=3)), device=x.device)
+    i, j, k = (base[:, :, None] + offsets).unbind(dim=3)
+    return (i * model.nodes[1] + j) * model.nodes[2] + k, weight
+
+
+def _sum_at_nodes(
+    model: Model, node: Tensor, values: Float[Tensor, "batch particle 27"]
+) -> Float[Tensor, "batch node"]:
+    """Add up what particles give their nodes."""
+    return values.new_zeros(len(values), model.cells).scatter_add(1, node.flatten(1), values.flatten(1))

@@ -28,7 +28,8 @@ def boundary_contact(boundary: Boundary, name: str) -> Any:
     if isinstance(boundary, Open):
         return _free()
     if isinstance(boundary, LadleInTank):
-        contacts = [_bowl(boundary, name), _handle(boundary, name)]
+        handle = [_handle(boundary, name)] if boundary.height else []
+        contacts = [_bowl(boundary, name), *handle, _drag(boundary, name)]
         edge = boundary.half_width - ON_WALL
         lower, upper = (-edge, ON_WALL, -edge), (edge, boundary.lid, edge)
         return reduce(_apply_both, [*contacts, _walls(lower, upper, name)])
@@ -166,6 +167,23 @@ def _handle(ladle: LadleInTank, name: str) -> Any:
         up = ti.Vector([real(0.0), real(1.0), real(0.0)])
         n, d = capsule(p - middle, up, half, real(ladle.half_thickness))
         return laws.touch(v, body, n, fade(d), real(ladle.friction), LADLE_SLIP)
+
+    return contact
+
+
+@no_type_check
+def _drag(tank: LadleInTank, name: str) -> Any:
+    """Return what the tank's floor and walls leave of the velocity along them."""
+    real = real_type(name)
+    edge = tank.half_width - ON_WALL
+
+    @ti.func
+    def contact(p, v, e, tools: ti.template(), step, fraction, rate):
+        on = ti.Vector([ti.abs(p[0]) > real(edge), p[1] < real(ON_WALL), ti.abs(p[2]) > real(edge)])
+        w = v
+        for a, b in ti.static(((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))):
+            w[b] = ti.select(on[a] and not on[b], real(tank.slip) * v[b], w[b])
+        return w
 
     return contact
 

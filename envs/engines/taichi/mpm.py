@@ -8,6 +8,8 @@ One kernel per equation, time index first, gradients by the compiler. Substep s 
     g2p       v' = sum w v_i, C' = 4/dx^2 sum w v_i (x_i - x)^T
     move      x' = x + dt v'
 
+Before a control step a fluid's volume ratios are smoothed, by torch.
+
 Arrays are torch's, [substep, environment, particle] or [environment, node], and kernels work on their memory. Particles
 are kept at the ends of control steps, and for all substeps of one: the backward pass simulates each control step once
 more, and fills its one grid anew for each substep. Threads add in any order, so the last digits of results may differ.
@@ -24,6 +26,7 @@ import numpy as np
 import torch
 
 from ..mpm.model import EMPTY, Model
+from ..mpm.smoothing import smooth_volume_ratios
 from ..runtime import precision
 from .boundaries import boundary_contact
 from .materials import kernels, types
@@ -77,6 +80,7 @@ class Solver:
         self.volume = self._constant(np.concatenate([body.volume for body in model.bodies]))
         self.origin = ti.Vector(model.origin)
         self.empty = EMPTY * float(model.mass.min())
+        self.smooth = [b for b, body in enumerate(model.bodies) if body.material.smoothing]
         self.checkpoints = self._states(model.steps + 1)
         self.tape = self._states(model.substeps + 1)
         self.A = self._zeros(model.substeps, capacity, model.particles, 3, 3)
@@ -137,6 +141,8 @@ class Solver:
         for checkpoint, array in zip(self.checkpoints.arrays(), self.tape.arrays(), strict=True):
             array.detach()[0] = checkpoint[step]
             array.detach()[1:] = 0.0  # what g2p adds to
+        for b in self.smooth:
+            self.tape.S[b].detach()[0, :batch] = smooth_volume_ratios(self.model, b, *self._before(b, step, batch))
         for s in range(self.model.substeps):
             for (update, _), inputs in zip(self.materials, self._material_inputs(s, batch), strict=True):
                 update(*inputs)
@@ -163,10 +169,27 @@ class Solver:
             self.transfers.p2g.grad(*self._p2g_inputs(s, batch))
             for (_, adjoint), inputs in zip(self.materials, self._material_inputs(s, batch), strict=True):
                 adjoint(*inputs)
+        for b in self.smooth:
+            self._retreat_smoothing(b, step, batch)
         for array in self.tape.arrays():
             grad = _grad(array)
             grad[-1] = grad[0]
             grad[:-1] = 0.0
+
+    def _before(self, b: int, step: int, batch: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return x [m] and J of body b before a control step, and before J is smoothed."""
+        x = self.checkpoints.x[step, :batch, self.first[b] : self.first[b + 1]]
+        return x, self.checkpoints.S[b][step, :batch]
+
+    def _retreat_smoothing(self, b: int, step: int, batch: int) -> None:
+        """Turn the gradient of the tape's first J of body b into that of J before smoothing; add to that of x."""
+        x, J = (values.clone().requires_grad_() for values in self._before(b, step, batch))
+        grad_J = _grad(self.tape.S[b])[0, :batch]
+        with torch.enable_grad():
+            smoothed = smooth_volume_ratios(self.model, b, x, J)
+        found = torch.autograd.grad(smoothed, (x, J), grad_J)
+        _grad(self.tape.x)[0, :batch, self.first[b] : self.first[b + 1]] += found[0]
+        grad_J[:] = found[1]
 
     def _material_inputs(self, s: int, batch: int) -> list[tuple[Any, ...]]:
         model, tape = self.model, self.tape
