@@ -83,7 +83,7 @@ class Plasticine(MpmScene):
     from a Global Perspective" (CoRL 2022).
     """
 
-    fidelities: ClassVar[dict[str, Fidelity]] = fidelities(draft=(48, 1500, 14), standard=(80, 20_000, 25))
+    fidelities: ClassVar[dict[str, Fidelity]] = fidelities(draft=(48, 1500, 14), standard=(80, 10_000, 25))
     Options: ClassVar[type[Any]] = PlasticineOptions
     model_parts: ClassVar[tuple[ModelPart, ...]] = (
         ModelPart("friction of tools", {"tool_friction": 0.0}, "tools slip"),

@@ -116,7 +116,7 @@ class Rope(Plasticine):
     """
 
     name: ClassVar[str] = "rope"
-    fidelities: ClassVar[dict[str, Fidelity]] = fidelities(draft=(40, 1500, 12), standard=(80, 20_000, 25))
+    fidelities: ClassVar[dict[str, Fidelity]] = fidelities(draft=(40, 1500, 12), standard=(80, 10_000, 25))
     examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
         0.514 0.292 -0.463 -0.277 0.257 -0.624
