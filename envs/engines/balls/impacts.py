@@ -27,6 +27,7 @@ SLIDES, EDGE, LEAVES = (
     wp.constant(-5),
 )  # slip ends; a face or round end ends; lift-off
 HALVES = {"float32": 20, "float64": 50}  # bisections of an event's time around a round end
+SURE = wp.constant(2e-5)  # times [s] are known better than this where a ball does not graze
 ASK = 32  # iterations between two questions whether all rows are done
 
 
@@ -197,6 +198,8 @@ def impact_kernels(name: str) -> Kernels:
             side = real(1.0) - real(2.0) * real(k)
             t = plane(side * p[1] - R, side * v[1], side * a[1], least)
             where = p[0] + t * (v[0] + real(0.5) * t * a[0])
+            if t >= real(0.0) and wp.abs(v[1] + t * a[1]) <= least:  # it does not settle where it is just leaving
+                where += real(SURE) * v[0]
             if t >= real(0.0) and t < soonest and side * p[1] > real(0.0) and wp.abs(where) <= L:
                 soonest = t
                 met = wp.where(side > real(0.0), 0, 1)
@@ -347,7 +350,7 @@ def impact_kernels(name: str) -> Kernels:
     @wp.func(module=module)
     def correct(t: real, gap: real, speed: real, least: real) -> real:
         """Return Newton's next time of an event, found to rounding: its derivative is that of the event's time."""
-        if wp.abs(speed) <= least or wp.abs(gap) > real(LINGER) * wp.abs(speed):  # it grazes
+        if wp.abs(speed) <= least or wp.abs(gap) > real(SURE) * wp.abs(speed):  # it grazes
             return t
         return t - gap / speed
 

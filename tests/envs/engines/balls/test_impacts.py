@@ -219,8 +219,7 @@ def test_at_any_step_nothing_is_tunnelled_and_energy_never_grows(dt, restitution
 
 def on_parabolas(thrown, used, x, v):
     """Yield points on the parabolas between events: each from its first position and velocity to its last position."""
-    rest, step = (thrown.flight.tensor(f)[: len(used)] for f in ("rest", "step"))
-    lasting = torch.where(step[1:] > step[:-1], rest[:-1], rest[:-1] - rest[1:])[..., None]
+    lasting = thrown.flight.tensor("when")[: len(used) - 1, :, None]
     for share in (0.0, 0.3, 0.7, 1.0):
         straight = x[:-1] + share * lasting * v[:-1]
         yield straight + share**2 * (x[1:] - x[:-1] - lasting * v[:-1])
