@@ -200,7 +200,7 @@ def impact_kernels(name: str) -> Kernels:
             where = p[0] + t * (v[0] + real(0.5) * t * a[0])
             if t >= real(0.0) and wp.abs(v[1] + t * a[1]) <= least:  # it does not settle where it is just leaving
                 where += real(SURE) * v[0]
-            if t >= real(0.0) and t < soonest and side * p[1] > real(0.0) and wp.abs(where) <= L:
+            if t >= real(0.0) and t < soonest and wp.abs(where) <= L:
                 soonest = t
                 met = wp.where(side > real(0.0), 0, 1)
             t = disc(vec2(p[0] - side * L, p[1]), v, a, R, soonest, least)

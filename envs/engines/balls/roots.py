@@ -8,8 +8,9 @@ import warp as wp
 from ..runtime import precision
 
 NEVER = wp.constant(-1.0)
+BEYOND = wp.constant(1e-3)  # below a plane by more than this [m], a point is on its other side, not touching
 STEPS = wp.constant(200)  # towards a disc; ten are taken where the parabola does not graze it
-ROUND = {"float32": 1e-6, "float64": 1e-14}  # squared distances, by that of touching, that rounding cannot tell from 0
+ROUND = {"float32": 2e-5, "float64": 1e-12}  # squared distances, by that of touching, that rounding cannot tell from 0
 
 
 class Roots(NamedTuple):
@@ -33,6 +34,8 @@ def roots(name: str) -> Roots:
         """Return when h + u t + a t^2 / 2 falls below 0, faster than `least`."""
         square = u * u - real(2.0) * a * h
         if a >= real(0.0) and (u >= real(0.0) or square <= least * least):
+            return real(NEVER)
+        if h < real(-BEYOND) and (u <= real(0.0) or square <= least * least):
             return real(NEVER)
         root = wp.sqrt(wp.max(square, real(0.0)))
         if u < real(0.0):
@@ -74,10 +77,12 @@ def roots(name: str) -> Roots:
                     return t
                 return real(NEVER)
             root = wp.sqrt(slope * slope + real(2.0) * bend * wp.max(f, real(0.0)))
+            ahead = (slope + root) / bend
             if slope < real(0.0):
-                t += real(2.0) * f / (root - slope)
-            else:
-                t += (slope + root) / bend
+                ahead = real(2.0) * f / (root - slope)
+            if slope < real(-2.0) * reach * least and t + ahead == t:  # as near as numbers come
+                return t
+            t += ahead
             if t >= soonest:
                 return real(NEVER)
         return real(NEVER)
