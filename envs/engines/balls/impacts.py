@@ -183,7 +183,7 @@ def impact_kernels(name: str) -> Kernels:
     module, halves = f"gradscape.impacts.{name}", HALVES[name]
     Data, along, anchor, outward, distance, nearest, _, rebound, deflect = surfaces(name)
     plane, disc = roots(name)
-    Turn, regime, carry, start, advance, press, slip_rate = rolling(name)
+    Turn, regime, carry, start, advance, press, slip_rate, press_rate = rolling(name)
 
     @wp.func(module=module)
     def is_round(data: Data, surface: int) -> bool:
@@ -376,7 +376,7 @@ def impact_kernels(name: str) -> Kernels:
             axis = along(angle[e, support // 4])
             q = wp.dot(there - data.pivot[support // 4], axis)
             return correct(t, q - wp.sign(q) * data.half_length, wp.dot(axis, v), least)
-        if surface == SLIDES:
+        if surface == SLIDES or surface == LEAVES:
             return correct(t, slip, rate, data.graze)
         return t
 
@@ -389,6 +389,10 @@ def impact_kernels(name: str) -> Kernels:
         there = anchor(data, support, angle, e) + data.reach * n
         v = late.s * vec2(-n[1], n[0])
         slip, rate = late.s - data.radius * late.spin, slip_rate(data, mode, late)
+        if surface == LEAVES:
+            lift, fade = press(data, late), press_rate(data, mode, late)
+            gone = time_of_event(data, surface, support, angle, e, t, there, v, lift, fade)
+            return gone, advance(data, mode, turn, gone)
         exact = time_of_event(data, surface, support, angle, e, t, there, v, slip, rate)
         return exact, advance(data, mode, turn, exact)
 

@@ -26,6 +26,7 @@ class Rolling(NamedTuple):
     advance: Any
     press: Any
     slip_rate: Any
+    press_rate: Any
 
 
 @cache
@@ -84,7 +85,7 @@ def rolling(name: str) -> Rolling:
         n = here - anchor(data, support, angle, e)
         turn = Turn()
         turn.phi = wp.atan2(n[1], n[0])
-        turn.s = wp.dot(v, vec2(-wp.sin(turn.phi), wp.cos(turn.phi)))
+        turn.s = wp.dot(v, vec2(-n[1], n[0])) / wp.length(n)
         turn.spin = spin
         return turn
 
@@ -109,6 +110,11 @@ def rolling(name: str) -> Rolling:
         return found.s - data.radius * found.spin
 
     @wp.func(module=module)
+    def press_rate(data: Data, mode: real, turn: Turn) -> real:
+        found = rate(data, mode, turn)
+        return (data.gravity * wp.cos(turn.phi) - real(2.0) * found.s) * turn.s / data.reach
+
+    @wp.func(module=module)
     def moved(turn: Turn, t: real, by: Turn) -> Turn:
         found = Turn()
         found.phi = turn.phi + t * by.phi
@@ -126,4 +132,4 @@ def rolling(name: str) -> Rolling:
         ends = moved(moved(turn, t / real(6.0), k1), t / real(6.0), k4)
         return moved(moved(ends, t / real(3.0), k2), t / real(3.0), k3)
 
-    return Rolling(Turn, regime, carry, start, advance, press, slip_rate)
+    return Rolling(Turn, regime, carry, start, advance, press, slip_rate, press_rate)
