@@ -224,7 +224,7 @@ def impact_kernels(name: str) -> Kernels:
             axis = along(angle[e, support // 4])
             q = wp.dot(there - data.pivot[support // 4], axis)
             return correct(t, q - wp.sign(q) * data.half_length, wp.dot(axis, v), least)
-        if surface == SLIDES or surface == LEAVES:  # noqa: PLR1714 -- Warp has no `in`
+        if surface == SLIDES or surface == LEAVES:  # noqa: SIM109 -- Warp has no `in`
             return correct(t, slip, rate, data.graze)
         return t
 
