@@ -12,11 +12,8 @@ from .roots import roots
 
 JAM = wp.constant(8)  # events at once after which the rest of a step is dropped: the ball is stuck between surfaces
 LINGER = wp.constant(1e-3)  # a ball that would be back sooner [s] stays: it hops by a micrometre
-SLIDES, EDGE, LEAVES = (
-    wp.constant(-3),
-    wp.constant(-4),
-    wp.constant(-5),
-)  # slip ends; a face or round end ends; lift-off
+SLIDES, EDGE = wp.constant(-3), wp.constant(-4)  # slip ends; a face or round end ends
+LEAVES, SLIPS = wp.constant(-5), wp.constant(-6)  # lift-off; friction does not hold any more
 HALVES = {"float32": 20, "float64": 50}  # bisections of an event's time around a round end
 SURE = wp.constant(2e-5)  # times [s] are known better than this where a ball does not graze
 
@@ -31,7 +28,7 @@ def impact_kernels(name: str) -> Kernels:
     module, halves = f"gradscape.impacts.{name}", HALVES[name]
     Data, along, anchor, outward, distance, nearest, _, rebound, deflect = surfaces(name)
     plane, disc = roots(name)
-    Turn, regime, carry, start, advance, press, slip_rate, press_rate = rolling(name)
+    Turn, regime, carry, start, advance, press, slip_rate, press_rate, grip, grip_rate = rolling(name)
 
     @wp.func(module=module)
     def is_round(data: Data, surface: int) -> bool:
@@ -80,6 +77,8 @@ def impact_kernels(name: str) -> Kernels:
             return LEAVES
         n = vec2(wp.cos(turn.phi), wp.sin(turn.phi))
         v = turn.s * vec2(-n[1], n[0])
+        if mode == real(0.0) and grip(data, turn) < real(0.0):
+            return SLIPS
         if mode * (turn.s - data.radius * turn.spin) < real(0.0):
             return SLIDES
         side = real(1.0) - real(2.0) * real(support % 2)
@@ -224,7 +223,7 @@ def impact_kernels(name: str) -> Kernels:
             axis = along(angle[e, support // 4])
             q = wp.dot(there - data.pivot[support // 4], axis)
             return correct(t, q - wp.sign(q) * data.half_length, wp.dot(axis, v), least)
-        if surface == SLIDES or surface == LEAVES:  # noqa: SIM109 -- Warp has no `in`
+        if surface == SLIDES or surface == LEAVES or surface == SLIPS:  # noqa: SIM109 -- Warp has no `in`
             return correct(t, slip, rate, data.graze)
         return t
 
@@ -241,6 +240,8 @@ def impact_kernels(name: str) -> Kernels:
             lift, fade = press(data, late), press_rate(data, mode, late)
             gone = time_of_event(data, surface, support, angle, e, t, there, v, lift, fade)
             return gone, advance(data, mode, turn, gone)
+        if surface == SLIPS:
+            slip, rate = grip(data, late), grip_rate(data, mode, late)
         exact = time_of_event(data, surface, support, angle, e, t, there, v, slip, rate)
         return exact, advance(data, mode, turn, exact)
 
@@ -342,6 +343,11 @@ def impact_kernels(name: str) -> Kernels:
             v[i + 1, e] = arriving
             n = outward(data, carrier, angle, e, there)
             spin[i + 1, e] = wp.dot(arriving, vec2(-n[1], n[0])) / data.radius
+        elif surface == SLIPS:
+            v[i + 1, e] = arriving
+            n = outward(data, carrier, angle, e, there)
+            least = real(4.0) * data.graze * (wp.length(arriving) + data.radius * wp.abs(turning))
+            spin[i + 1, e] = (wp.dot(arriving, vec2(-n[1], n[0])) + wp.sign(n[0]) * least) / data.radius
         else:
             v[i + 1, e] = arriving
             spin[i + 1, e] = turning

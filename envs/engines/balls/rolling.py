@@ -27,6 +27,8 @@ class Rolling(NamedTuple):
     press: Any
     slip_rate: Any
     press_rate: Any
+    grip: Any
+    grip_rate: Any
 
 
 @cache
@@ -96,8 +98,9 @@ def rolling(name: str) -> Rolling:
 
     @wp.func(module=module)
     def rate(data: Data, mode: real, turn: Turn) -> Turn:
+        """Return what changes; past lift-off, which ends this motion, friction goes on smoothly below 0."""
         along = -data.gravity * wp.cos(turn.phi)
-        push = rub(data, mode, along, wp.max(press(data, turn), real(0.0)))
+        push = rub(data, mode, along, press(data, turn))
         found = Turn()
         found.phi = turn.s / data.reach
         found.s = along + push
@@ -113,6 +116,17 @@ def rolling(name: str) -> Rolling:
     def press_rate(data: Data, mode: real, turn: Turn) -> real:
         found = rate(data, mode, turn)
         return (data.gravity * wp.cos(turn.phi) - real(2.0) * found.s) * turn.s / data.reach
+
+    @wp.func(module=module)
+    def grip(data: Data, turn: Turn) -> real:
+        """Return by how much friction exceeds what rolling takes, below 0 where it does not hold."""
+        taken = data.gravity * wp.abs(wp.cos(turn.phi)) * data.inertia
+        return data.friction * press(data, turn) * (real(1.0) + data.inertia) - taken
+
+    @wp.func(module=module)
+    def grip_rate(data: Data, mode: real, turn: Turn) -> real:
+        taken = -data.gravity * wp.sign(wp.cos(turn.phi)) * wp.sin(turn.phi) * turn.s / data.reach * data.inertia
+        return data.friction * press_rate(data, mode, turn) * (real(1.0) + data.inertia) - taken
 
     @wp.func(module=module)
     def moved(turn: Turn, t: real, by: Turn) -> Turn:
@@ -132,4 +146,4 @@ def rolling(name: str) -> Rolling:
         ends = moved(moved(turn, t / real(6.0), k1), t / real(6.0), k4)
         return moved(moved(ends, t / real(3.0), k2), t / real(3.0), k3)
 
-    return Rolling(Turn, regime, carry, start, advance, press, slip_rate, press_rate)
+    return Rolling(Turn, regime, carry, start, advance, press, slip_rate, press_rate, grip, grip_rate)
