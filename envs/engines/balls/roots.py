@@ -27,7 +27,7 @@ def roots(name: str) -> Roots:
     types = precision(name)
     real, module = types.real, f"gradscape.roots.{name}"
     vec2 = wp.types.vector(2, real)
-    touching = ROUND[name]
+    touching, straight = ROUND[name], -1e3 * ROUND[name]
 
     @wp.func(module=module)
     def plane(h: real, u: real, a: real, least: real) -> real:
@@ -48,7 +48,7 @@ def roots(name: str) -> Roots:
         c2 = wp.dot(v, v) + wp.dot(m, a)
         c3 = wp.dot(v, a)
         c4 = real(0.25) * wp.dot(a, a)
-        if c2 < real(-1e3 * touching) * wp.dot(v, v):
+        if c2 < real(straight) * wp.dot(v, v):
             return real(0.0)
         square = c3 * c3 - real(4.0) * c2 * c4
         if c3 >= real(0.0) or square <= real(0.0):
@@ -65,6 +65,7 @@ def roots(name: str) -> Roots:
         small = real(touching) * reach * reach
         far = wp.length(m) + soonest * (wp.length(v) + soonest * wp.length(a))
         bend = real(2.0) * far * wp.length(a) + small
+        graze = real(2.0) * reach * least
         t = real(0.0)
         if wp.dot(m, m) - reach * reach < small and wp.abs(wp.dot(m, v)) <= least * reach:
             return again(m, v, a)
@@ -72,15 +73,18 @@ def roots(name: str) -> Roots:
             d = m + t * v + (real(0.5) * t * t) * a
             f = wp.dot(d, d) - reach * reach
             slope = real(2.0) * wp.dot(d, v + t * a)
-            if f <= small and slope < real(0.0):
-                if slope < real(-2.0) * reach * least:
+            if f <= small and slope < graze:
+                u = v + t * a
+                falls = wp.dot(u, u) + wp.dot(d, a) < real(straight) * wp.dot(u, u)
+                if slope < -graze or falls:
                     return t
-                return real(NEVER)
+                if slope < real(0.0):
+                    return real(NEVER)
             root = wp.sqrt(slope * slope + real(2.0) * bend * wp.max(f, real(0.0)))
             ahead = (slope + root) / bend
             if slope < real(0.0):
                 ahead = real(2.0) * f / (root - slope)
-            if slope < real(-2.0) * reach * least and t + ahead == t:  # as near as numbers come
+            if slope < -graze and t + ahead == t:  # as near as numbers come
                 return t
             t += ahead
             if t >= soonest:

@@ -211,16 +211,25 @@ def test_at_any_step_nothing_is_tunnelled_and_energy_never_grows(dt, restitution
     board = replace(CROWDED, restitution=restitution, friction=friction, gravity=gravity, half_length=half_length)
     thrown, angle, used = flights(board, dt, seed, duration=min(2.0, 120 * dt))
     x, v, spin = (thrown.flight.tensor(f)[: len(used)] for f in ("x", "v", "spin"))
+    assert float(clearance(board, angle, x)[used].min()) > -1e-9
+    flown = used[1:] & ~rolls_round(board, thrown)[: len(used) - 1]
     for between in on_parabolas(thrown, used, x, v):
-        assert float(clearance(board, angle, between)[used[1:]].min()) > -1e-7
-    gain = energy(board, x, v, spin).diff(dim=0)[used[1:]]
-    assert float(gain.max()) < 1e-9  # around a round end steps are Runge-Kutta's
+        assert float(clearance(board, angle, between)[flown].min()) > -1e-9
+    gain = energy(board, x, v, spin).diff(dim=0)
+    assert float(gain[flown].max()) < 1e-11
+    assert float(gain[used[1:]].max()) < 1e-9
+
+
+def rolls_round(board, thrown):
+    """Return which iterations follow a round end, where the path is no parabola."""
+    carrier = thrown.flight.tensor("support")
+    return (carrier >= 0) & (carrier < 4 * len(board.pivots)) & (carrier % 4 >= 2)
 
 
 def on_parabolas(thrown, used, x, v):
     """Yield points on the parabolas between events: each from its first position and velocity to its last position."""
     lasting = thrown.flight.tensor("when")[: len(used) - 1, :, None]
-    for share in (0.0, 0.3, 0.7, 1.0):
+    for share in (0.3, 0.7):
         straight = x[:-1] + share * lasting * v[:-1]
         yield straight + share**2 * (x[1:] - x[:-1] - lasting * v[:-1])
 
