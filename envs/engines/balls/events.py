@@ -195,9 +195,11 @@ def impact_kernels(name: str) -> Kernels:
         pick[i, e] = met
 
     @wp.func(module=module)
-    def correct(t: real, gap: real, speed: real, least: real) -> real:
+    def correct(data: Data, t: real, gap: real, speed: real, least: real) -> real:
         """Return Newton's next time of an event, found to rounding: its derivative is that of the event's time."""
         if wp.abs(speed) <= least or wp.abs(gap) > real(SURE) * wp.abs(speed):  # it grazes
+            return t
+        if t - gap / speed < -data.graze:  # it is wedged: going back in time would speed it up
             return t
         return t - gap / speed
 
@@ -218,13 +220,13 @@ def impact_kernels(name: str) -> Kernels:
         least = data.graze * (wp.length(v) + data.crawl)
         if surface >= 0:
             n = outward(data, surface, angle, e, there)
-            return correct(t, distance(data, surface, angle, e, there), wp.dot(n, v), least)
+            return correct(data, t, distance(data, surface, angle, e, there), wp.dot(n, v), least)
         if surface == EDGE:
             axis = along(angle[e, support // 4])
             q = wp.dot(there - data.pivot[support // 4], axis)
-            return correct(t, q - wp.sign(q) * data.half_length, wp.dot(axis, v), least)
+            return correct(data, t, q - wp.sign(q) * data.half_length, wp.dot(axis, v), least)
         if surface == SLIDES or surface == LEAVES or surface == SLIPS:  # noqa: SIM109 -- Warp has no `in`
-            return correct(t, slip, rate, data.graze)
+            return correct(data, t, slip, rate, data.graze)
         return t
 
     @wp.func(module=module)
