@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 from gradscape.envs.engines.balls.rigid import SMOOTHING, Ball
 
-TIGHT = {"method": "DOP853", "rtol": 1e-11, "atol": 1e-13}
+TIGHT = {"method": "DOP853", "rtol": 1e-9, "atol": 1e-11}
 
 
 @dataclass(frozen=True)
