@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -14,7 +14,7 @@ from torch import Tensor
 from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
-from .base import Environment, Episode, Fidelity, Work
+from .base import Environment, Episode, Fidelity, ModelPart, Work
 from .batching import Pool
 from .controls import extend, hold
 from .engines.chain import Chain, Solver
@@ -38,10 +38,17 @@ UPRIGHT = (
 
 @dataclass(frozen=True)
 class CartpoleOptions(EpisodeOptions):
-    """The tip is wanted at (`target_x`, `target_y`) [m]; the cart starts at (0, 0), its chain hangs down to (0, -3)."""
+    """The tip is wanted at (`target_x`, `target_y`) [m]; the cart starts at (0, 0), its chain hangs down to (0, -3).
+
+    `gravity` [m/s^2]; `taper`: each link has half the mass of the one before, or else all have the first's, 1 kg;
+    `joint_damping` [N m s/rad] of each of the three joints.
+    """
 
     target_x: float = 0.0
     target_y: float = 3.0
+    gravity: float = 9.81
+    taper: bool = True
+    joint_damping: float = 0.0
 
 
 class Cartpole(Environment):
@@ -76,6 +83,11 @@ class Cartpole(Environment):
     decisions: ClassVar[int] = CONTROLS
     control_step: ClassVar[float] = SPAN
     designed_order: ClassVar[dict[str, float]] = {"dt": 4.0}  # classical Runge-Kutta; controls change between steps
+    model_parts: ClassVar[tuple[ModelPart, ...]] = (
+        ModelPart("gravity", {"gravity": 0.0}, "weightless links"),
+        ModelPart("lighter outer links", {"taper": False}, "three links of 1 kg"),
+        ModelPart("joint damping", {"joint_damping": 0.02}, "joints brake by 0.02 N m s/rad", missing=True),
+    )
     Options: ClassVar[type[Any]] = CartpoleOptions
     examples: ClassVar[dict[str, tuple[float, ...]]] = {
         "upright": tuple(float(np.interp(k, KNOTS, values)) for k in range(CONTROLS) for values in UPRIGHT)
@@ -129,8 +141,11 @@ class Cartpole(Environment):
         dt = self.fidelity.dt
         self._capacity = 256 if self.device == "cpu" else 1 << 14
         settings: dict[str, Any] = {"capacity": self._capacity, "device": self.device, "name": self.fidelity.precision}
+        o = self.options
+        masses = CHAIN.masses if o.taper else 3 * CHAIN.masses[:1]
+        self.chain = replace(CHAIN, masses=masses, gravity=o.gravity, damping=o.joint_damping)
         self._solvers = Pool(
-            partial(Solver, CHAIN, dt=dt, hold=round(SPAN / dt), controls=self.control_steps, **settings)
+            partial(Solver, self.chain, dt=dt, hold=round(SPAN / dt), controls=self.control_steps, **settings)
         )
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:

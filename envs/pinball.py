@@ -15,10 +15,10 @@ from torch.nn.functional import normalize, pad
 from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
-from .base import Environment, Episode, Fidelity, MaterialRange, Work
+from .base import Environment, Episode, Fidelity, MaterialRange, ModelPart, Work
 from .batching import Pool
-from .engines.balls.board import Board
-from .engines.balls.impacts import Solver
+from .engines.balls.board import INERTIA, RIGID, Board
+from .engines.balls.impacts import ASK, Solver
 from .options import EpisodeOptions
 
 WIDTH, HEIGHT = 8.0, 10.0  # the board [m]
@@ -32,12 +32,15 @@ VIEW = View((0.0, -0.8, -0.5), (WIDTH, HEIGHT, 0.5), eye=(0.08, 0.1, 1.0), groun
 class PinballOptions(EpisodeOptions):
     """`contacts`: impact follows the ball to the time of impact, step reflects it in fixed steps, whose gradients err.
 
-    `restitution` and Coulomb's `friction` of walls and bars; the ball is wanted at (`goal_x`, `goal_y`) [m].
+    `restitution` and Coulomb's `friction` of walls and bars; restitution fades to zero below `crawl` [m/s]; `spin`: the
+    ball is a solid sphere, or else one that cannot spin. The ball is wanted at (`goal_x`, `goal_y`) [m].
     """
 
     contacts: Literal["impact", "step"] = "impact"
     restitution: float = 0.5
     friction: float = 0.2
+    crawl: float = 0.1
+    spin: bool = True
     goal_x: float = 7.0
     goal_y: float = 0.65
 
@@ -50,15 +53,22 @@ def angles(count: int) -> ParameterSpace:
 class Pinball(Environment):
     """Model: a solid sphere (0.25 m, 1 kg) that spins, on an upright board 8 m wide and 10 m high, walled in all round.
 
-    It is dropped at rest on a grid of bars, 0.2 m thick with round ends, each held at its angle on a pivot. Impacts are
-    instantaneous, with restitution 0.5 (fading below 0.1 m/s, so that a ball comes to rest) and Coulomb friction 0.2
-    (options); their times are found exactly, along the chord of the parabola in each step of 1/240 s at standard.
-    contacts=step reflects the velocity in steps that find the ball overlapping, as many simulators do: it can pass
-    through a bar, and its gradients lack the time of impact.
+    It is dropped at rest on a grid of bars, 0.2 m thick with round ends, each held at its angle on a pivot: from (3.75,
+    9.5) m on pivots at (2.2, 6), (5.8, 6) m, or from (3.5, 9.5) m on rows at 8.1, 6.7, 5.3, 3.9 m with pivots at 0.97,
+    2.99, 5.01, 7.03 m. Impacts are instantaneous, with restitution 0.5 (fading below 0.1 m/s, so that a ball comes to
+    rest) and Coulomb friction 0.2 (options). Flights and slides along faces are parabolas, whose times of impact are
+    exact: faces and walls in closed form, round ends by a root of the quartic, rolling around an end by Runge-Kutta
+    steps of 1/240 s. So the step only bounds how far one looks ahead. contacts=step reflects the velocity in steps that
+    find the ball overlapping, as many simulators do: it can pass through a bar, and its gradients lack the time of
+    impact.
+    Fidelity: of 100 random boards, with two bars and with sixteen, ends at steps of 1/15 and 1/240 s in float64 differ
+    by less than 1e-6 m in all. What remains is rounding, which impacts amplify: float32 at 1/30 s ends within 1e-3 m of
+    float64 in 100 and 63 %, within 0.1 m in 100 and 97 %.
     Parameters: angles of the bars [rad], row by row from the top, 0 horizontal, counterclockwise.
     Loss: distance of the ball's centre to the goal (7, 0.65) m at the end, after 4 s [m].
     Simplifications: bars are held, since their angles are the parameters; there is no drag and no rolling resistance,
-    since 4 s are short; a ball jammed between surfaces, at 8 impacts in a step, stays where it is until the next step.
+    since 4 s are short; a ball that would be back on its surface within 1 ms stays on it; one that is jammed between
+    surfaces, at 8 impacts at once, stays where it is until the next step.
     Source: task Pinball of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
     2022), appendix A.1.2; ball, bars, start, goal and duration are ours.
     """
@@ -66,12 +76,17 @@ class Pinball(Environment):
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
     beyond_box: ClassVar[bool] = True
     fidelities: ClassVar[dict[str, Fidelity]] = {
-        "draft": Fidelity("draft", dt=1 / 60),
-        "standard": Fidelity("standard", dt=1 / 240),
-        "reference": Fidelity("reference", dt=1 / 1920, precision="float64"),
+        "draft": Fidelity("draft", dt=1 / 30),
+        "standard": Fidelity("standard", dt=1 / 30, precision="float64"),
+        "reference": Fidelity("reference", dt=1 / 240, precision="float64"),
     }
     loss_unit: ClassVar[str] = "m"
-    designed_order: ClassVar[dict[str, float]] = {"dt": 2.0}  # chords of a parabola
+    model_parts: ClassVar[tuple[ModelPart, ...]] = (
+        ModelPart("friction", {"friction": 0.0}, "smooth walls and bars"),
+        ModelPart("spin", {"spin": False}, "a ball that cannot spin, which friction brakes"),
+        ModelPart("fading restitution", {"crawl": 1e-3}, "restitution fades below 1 mm/s instead of 0.1 m/s"),
+        ModelPart("time of impact", {"contacts": "step"}, "reflected in fixed steps"),
+    )
     material_range: ClassVar[MaterialRange] = MaterialRange("restitution", 0.0, 1.0)
     Options: ClassVar[type[Any]] = PinballOptions
     pivots: ClassVar[tuple[tuple[float, float], ...]]
@@ -92,7 +107,8 @@ class Pinball(Environment):
 
     def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
-        return 2 * self.steps * (2 * 6 * (8 if self.fidelity.precision == "float64" else 4) + 5 * 4)
+        iterations = 2 * self.steps + ASK
+        return iterations * ((2 * 6 + 1) * (8 if self.fidelity.precision == "float64" else 4) + 5 * 4)
 
     def work(self) -> Work:
         """Count steps of the ball."""
@@ -129,11 +145,12 @@ class Pinball(Environment):
     def _setup(self) -> None:
         o = self.options
         self._start = torch.tensor(self.start, dtype=torch.float64)
-        board = Board(WIDTH, HEIGHT, self.pivots, self.half_length, BAR, BALL, o.restitution, o.friction)
+        law: dict[str, Any] = {"crawl": o.crawl, "inertia": INERTIA if o.spin else RIGID}
+        self.board = Board(WIDTH, HEIGHT, self.pivots, self.half_length, BAR, BALL, o.restitution, o.friction, **law)
         self._capacity = max(1, min(256 if self.device == "cpu" else 1 << 14, SOLVER_BYTES // self.memory()))
         settings: dict[str, Any] = {"dt": self.fidelity.dt, "steps": self.steps, "name": self.fidelity.precision}
         settings |= {"capacity": self._capacity, "device": self.device, "contacts": o.contacts}
-        self._solvers = Pool(partial(Solver, board, **settings))
+        self._solvers = Pool(partial(Solver, self.board, **settings))
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         with self._solvers.lend() as solver:

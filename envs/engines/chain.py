@@ -14,6 +14,8 @@ from .runtime import load, precision, to_torch
 class Chain:
     """Three uniform rods of `masses` [kg] and `lengths` [m], the first hinged to the cart, under `gravity` [m/s^2].
 
+    `damping` [N m s/rad] of each joint brakes how fast the joint bends.
+
     Coordinates are the angles phi of the rods, each from where it hangs down, counter-clockwise. While the cart moves
     at u, T = w.M w / 2 + u b.w + m u^2 / 2 with w = phi', M_ij = C_ij cos(phi_i - phi_j), b_i = beta_i cos(phi_i) and m
     the mass of all rods; V = -g sum beta_i cos(phi_i).
@@ -22,6 +24,7 @@ class Chain:
     masses: tuple[float, float, float]
     lengths: tuple[float, float, float]
     gravity: float
+    damping: float = 0.0
 
     @property
     def beta(self) -> tuple[float, ...]:
@@ -57,7 +60,7 @@ class Solver:
         self.types = precision(name)
         self.kernel = step_kernel(name)
         load([self.kernel], device)
-        self.constants = [self.types.mat33(*chain.inertia), self.types.vec3(*chain.beta), chain.gravity]
+        self.constants = [self.types.mat33(*chain.inertia), self.types.vec3(*chain.beta), chain.gravity, chain.damping]
         shape, vec3, vec4 = (self.steps + 1, capacity), self.types.vec3, self.types.vec4
         self.phi, self.p, self.adj_phi, self.adj_p = (wp.zeros(shape, dtype=vec3, device=device) for _ in range(4))
         self.control, self.adj_control = (wp.zeros((controls, capacity), dtype=vec4, device=device) for _ in range(2))
@@ -127,12 +130,14 @@ def step_kernel(name: str) -> Any:
         return wp.inverse(M) * (p - u * wp.cw_mul(beta, c))
 
     @wp.func(module=module)
-    def force(C: mat33, beta: vec3, gravity: real, control: vec4, phi: vec3, w: vec3) -> vec3:
+    def force(C: mat33, beta: vec3, gravity: real, damping: real, control: vec4, phi: vec3, w: vec3) -> vec3:
         """Return p' = -dH/dphi + torques, where w = phi'."""
         c, s = cosines(phi), sines(phi)
         inertial = wp.cw_mul(w, wp.cw_mul(C, wp.outer(s, c) - wp.outer(c, s)) * w)
         outside = wp.cw_mul(wp.cw_mul(beta, s), control[0] * w + vec3(gravity, gravity, gravity))
-        return vec3(control[1] - control[2], control[2] - control[3], control[3]) - inertial - outside
+        bend = vec3(w[0], w[1] - w[0], w[2] - w[1])
+        motor = vec3(control[1], control[2], control[3]) - damping * bend
+        return vec3(motor[0] - motor[1], motor[1] - motor[2], motor[2]) - inertial - outside
 
     @wp.kernel(module=module)
     def advance(
@@ -142,6 +147,7 @@ def step_kernel(name: str) -> Any:
         C: mat33,
         beta: vec3,
         gravity: real,
+        damping: real,
         controls: wp.array2d[vec4],
         phi: wp.array2d[vec3],
         p: wp.array2d[vec3],
@@ -150,16 +156,16 @@ def step_kernel(name: str) -> Any:
         control, phi0, p0 = controls[k, e], phi[step, e], p[step, e]
         u, half = control[0], real(0.5) * dt
         v1 = velocity(C, beta, u, phi0, p0)
-        f1 = force(C, beta, gravity, control, phi0, v1)
+        f1 = force(C, beta, gravity, damping, control, phi0, v1)
         phi2 = phi0 + half * v1
         v2 = velocity(C, beta, u, phi2, p0 + half * f1)
-        f2 = force(C, beta, gravity, control, phi2, v2)
+        f2 = force(C, beta, gravity, damping, control, phi2, v2)
         phi3 = phi0 + half * v2
         v3 = velocity(C, beta, u, phi3, p0 + half * f2)
-        f3 = force(C, beta, gravity, control, phi3, v3)
+        f3 = force(C, beta, gravity, damping, control, phi3, v3)
         phi4 = phi0 + dt * v3
         v4 = velocity(C, beta, u, phi4, p0 + dt * f3)
-        f4 = force(C, beta, gravity, control, phi4, v4)
+        f4 = force(C, beta, gravity, damping, control, phi4, v4)
         sixth = dt / real(6.0)
         phi[step + 1, e] = phi0 + sixth * (v1 + real(2.0) * (v2 + v3) + v4)
         p[step + 1, e] = p0 + sixth * (f1 + real(2.0) * (f2 + f3) + f4)

@@ -142,3 +142,18 @@ def test_a_step_that_does_not_divide_the_time_of_a_control_is_refused():
     for dt in (0.03, 0.015, 0.04):
         with pytest.raises(ValueError, match=f"cartpole holds a control for 0.02 s.*got dt {dt} s"):
             exact(dt)
+
+
+def test_weightless_links_stay_where_they_are_and_uniform_links_are_heavier():
+    still = made("draft", gravity=0.0, horizon=0.5).evaluate(SPACE.center[None], grad=False)
+    assert float(still.loss) == 6
+    assert made("draft", taper=False).chain.masses == (1.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("part", Cartpole.model_parts, ids=lambda part: part.name)
+def test_every_part_of_the_model_has_a_gradient_that_is_the_slope(part):
+    env = Cartpole(fidelity=Fidelity("f", dt=0.02, precision="float64"), device="cpu", **part.options)
+    x, along = SPACE.uniform(4, seed=2), SPACE.uniform(4, seed=3)
+    got = (env.evaluate(x).grad * along).sum(dim=1)
+    torch.testing.assert_close(got, slopes(env, x, 1e-6 * along) / 1e-6, rtol=1e-6, atol=1e-8)
+    assert not torch.equal(env.evaluate(x).loss, exact(0.02).evaluate(x).loss)

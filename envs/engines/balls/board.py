@@ -13,7 +13,7 @@ import warp as wp
 from ..runtime import precision
 
 FREE, DONE = wp.constant(-1), wp.constant(-2)  # no surface; a row whose episode is over
-INERTIA = 0.4  # of a solid sphere, in units of mass and radius squared
+INERTIA, RIGID = 0.4, 1e9  # in units of mass and radius squared: of a solid sphere, of one that as good as never spins
 GRAZE = {"float32": 1e-6, "float64": 1e-12}  # cosines (squared, at round ends) that rounding cannot tell from 0
 
 
@@ -24,7 +24,7 @@ class Board:
     `pivots` [m] are the bars' centres, `half_length` [m] reaches to the centres of their round ends, `bar_radius` is
     half their thickness. A rebound is `restitution` times as fast as the impact, less below `crawl` [m/s], where the
     factor fades to zero; `friction` is Coulomb's. Masses cancel: impulses are per mass [m/s]. `gravity` [m/s^2] points
-    down.
+    down; `inertia` is in units of mass and radius squared.
     """
 
     width: float
@@ -37,6 +37,7 @@ class Board:
     friction: float
     crawl: float = 0.1
     gravity: float = 9.81
+    inertia: float = INERTIA
 
 
 def constants(board: Board, *, dt: float, steps: int, name: str, device: str) -> Any:
@@ -47,7 +48,7 @@ def constants(board: Board, *, dt: float, steps: int, name: str, device: str) ->
     data.width, data.height, data.half_length = board.width, board.height, board.half_length
     data.radius, data.reach = board.ball_radius, board.ball_radius + board.bar_radius
     data.restitution, data.friction, data.crawl = board.restitution, board.friction, board.crawl
-    data.gravity, data.inertia, data.graze = board.gravity, INERTIA, GRAZE[name]
+    data.gravity, data.inertia, data.graze = board.gravity, board.inertia, GRAZE[name]
     return data
 
 

@@ -37,6 +37,7 @@ def step_kernels(name: str) -> Kernels:
         support: Ints,
         pick: Ints,
         hits: Ints,
+        when: Reals,
     ):
         """Find the surface that is overlapped most, of those that are approached."""
         e = wp.tid()
@@ -74,6 +75,7 @@ def step_kernels(name: str) -> Kernels:
         support: Ints,
         pick: Ints,
         hits: Ints,
+        when: Reals,
     ):
         e = wp.tid()
         surface = pick[i, e]

@@ -1,13 +1,20 @@
-"""One ball against the ground by penalty contact with friction, after Warp's relaxed contact model."""
+"""One ball against the ground by penalty contact with friction, after Warp's relaxed contact model.
+
+Damping that sets in at once makes the force jump at touch. Steps of a fixed length cannot see when that is: derivatives
+of such a program are exact, and converge to those of a motion that always touches at the same time. Two remedies are
+here: a step that is split at the time of touch, and damping that grows with depth.
+"""
 
 from dataclasses import dataclass
-from functools import cache
-from typing import Any, no_type_check
+from functools import cache, partial
+from typing import Any, NamedTuple, no_type_check
 
 import torch
 import warp as wp
 
 from ..runtime import load, precision, to_torch
+
+SMOOTHING = 0.25  # depth at which growing damping is `kd`, in radii
 
 
 @dataclass(frozen=True)
@@ -16,7 +23,11 @@ class Ball:
 
     While it overlaps the ground by c = y - radius < 0, approaching at v_n = v_y < 0 where it does, it feels the normal
     force f_n = -(ke c + kd min(v_n, 0)) and the tangential force min(kf |v_t|, mu f_n) against sliding. The viscous
-    part is kept below what stops the ball within one step, mass |v_t| / dt: more would reverse it and add energy.
+    part is kept below what stops sliding within one step: more would reverse it and add energy. Where damping grows
+    with depth, kd is multiplied by -c / (radius / 4) (Hunt & Crossley 1975, the exponent being 1).
+
+    Against the air it feels the force `drag` [kg/m] times its speed squared. `turning`, mass radius^2 / inertia, says
+    how easily friction spins it: 2.5 for a solid sphere, 0 for one that cannot spin.
     """
 
     radius: float
@@ -26,23 +37,30 @@ class Ball:
     kd: float
     kf: float
     mu: float
+    drag: float = 0.0
+    turning: float = 0.0
 
 
 class Solver:
     """Integrate up to `capacity` flights by semi-implicit Euler, and differentiate their ends.
 
-    The whole flight is kept: six numbers a step need no checkpoints.
+    `contacts` is step (whole steps), touch (split at the time of touch) or smooth (damping grows with depth). The whole
+    flight is kept: nine numbers a step need no checkpoints. The third state `roll` [m/s] is how fast spin moves the
+    lowest point of the ball.
     """
 
-    def __init__(self, ball: Ball, *, dt: float, steps: int, name: str, capacity: int, device: str) -> None:
+    def __init__(
+        self, ball: Ball, *, dt: float, steps: int, name: str, capacity: int, device: str, contacts: str = "step"
+    ) -> None:
         self.ball, self.dt, self.steps, self.device = ball, dt, steps, device
         self.types = precision(name)
-        self.kernel = step_kernel(name)
+        self.kernel = step_kernel(name, contacts)
         load([self.kernel], device)
-        shape = (steps + 1, capacity)
-        self.x, self.v, self.adj_x, self.adj_v = (
-            wp.zeros(shape, dtype=self.types.vec3, device=device) for _ in range(4)
-        )
+        self.data = _constants(ball, dt, name)
+        shape, vec3 = (steps + 1, capacity), self.types.vec3
+        self.state = [wp.zeros(shape, dtype=vec3, device=device) for _ in range(3)]
+        self.adjoint = [wp.zeros(shape, dtype=vec3, device=device) for _ in range(3)]
+        self.x, self.v, self.roll = self.state
 
     def run(self, start: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
         """Fly from `start` [m], shape (3,), at `velocity` [m/s], shape (batch, 3); return x, (step + 1, batch, 3)."""
@@ -50,66 +68,157 @@ class Solver:
         to_torch(self.x)[0, :batch] = start.to(self.types.torch)
         to_torch(self.v)[0, :batch] = velocity.to(self.types.torch)
         for step in range(self.steps):
-            wp.launch(self.kernel, batch, self._inputs(step), device=self.device, record_tape=False)
+            inputs = [step, self.data, *self.state]
+            wp.launch(self.kernel, batch, inputs, device=self.device, record_tape=False)
         return to_torch(self.x)[:, :batch]
 
     def gradient(self, adj_x: torch.Tensor) -> torch.Tensor:
         """Return the adjoint of the first velocity from that of the last position, both of shape (batch, 3)."""
         batch = len(adj_x)
-        self.adj_x.zero_()
-        self.adj_v.zero_()
-        to_torch(self.adj_x)[-1, :batch] = adj_x.to(self.types.torch)
+        for adjoint in self.adjoint:
+            adjoint.zero_()
+        to_torch(self.adjoint[0])[-1, :batch] = adj_x.to(self.types.torch)
+        settings: dict[str, Any] = {"device": self.device, "adjoint": True, "record_tape": False}
+        settings["adj_inputs"] = [None, type(self.data)(), *self.adjoint]
         for step in reversed(range(self.steps)):
-            inputs = self._inputs(step)
-            adjoints = [None] * (len(inputs) - 2) + [self.adj_x, self.adj_v]
-            wp.launch(
-                self.kernel, batch, inputs, adj_inputs=adjoints, device=self.device, adjoint=True, record_tape=False
-            )
-        return to_torch(self.adj_v)[0, :batch].clone()
+            wp.launch(self.kernel, batch, [step, self.data, *self.state], **settings)
+        return to_torch(self.adjoint[1])[0, :batch].clone()
 
-    def _inputs(self, step: int) -> list[Any]:
-        b = self.ball
-        rubbing = min(b.kf, b.mass / self.dt), b.mu
-        return [step, self.dt, b.radius, b.mass, b.gravity, b.ke, b.kd, *rubbing, self.x, self.v]
+
+def _constants(ball: Ball, dt: float, name: str) -> Any:
+    """Return the struct that kernels read a ball from; `kf` stops sliding within a step at the most."""
+    data = ground(name).Data()
+    for field in ("radius", "gravity", "turning"):
+        setattr(data, field, getattr(ball, field))
+    for field in ("ke", "kd", "mu", "drag"):
+        setattr(data, field, getattr(ball, field) / (1.0 if field == "mu" else ball.mass))
+    data.dt, data.smoothing = dt, SMOOTHING * ball.radius
+    data.kf = min(ball.kf / ball.mass, 1 / (dt * (1 + ball.turning)))
+    return data
+
+
+class Ground(NamedTuple):
+    """What the kernels share: the struct `Data` of constants, by mass, and what pushes a ball."""
+
+    Data: Any
+    fly: Any
+    rub: Any
 
 
 @cache
 @no_type_check
-def step_kernel(name: str) -> Any:
-    """Return the kernel of one semi-implicit Euler step."""
-    types = precision(name)
+def ground(name: str) -> Ground:
+    """Return the Warp functions of one precision."""
+    types, module = precision(name), f"gradscape.ground.{name}"
     real, vec3 = types.real, types.vec3
 
-    @wp.kernel(module=f"gradscape.rigid.{name}")
-    def advance(
-        step: int,
-        dt: real,
-        radius: real,
-        mass: real,
-        gravity: real,
-        ke: real,
-        kd: real,
-        kf: real,
-        mu: real,
-        x: wp.array2d[vec3],
-        v: wp.array2d[vec3],
-    ):
-        e = wp.tid()
-        here, speed = x[step, e], v[step, e]
-        force = vec3(real(0.0), -mass * gravity, real(0.0))
-        c = here[1] - radius
-        if c < real(0.0):
-            f_n = -(ke * c + kd * wp.min(speed[1], real(0.0)))
-            v_t = vec3(speed[0], real(0.0), speed[2])
-            squared = speed[0] * speed[0] + speed[2] * speed[2]
-            limit = mu * f_n
-            force += vec3(real(0.0), f_n, real(0.0))
-            if kf * kf * squared <= limit * limit:
-                force -= kf * v_t
-            else:  # the root only here: at rest its derivative is infinite
-                force -= (limit / wp.sqrt(squared)) * v_t
-        after = speed + (dt / mass) * force
-        v[step + 1, e] = after
-        x[step + 1, e] = here + dt * after
+    @partial(wp.struct, module=module)
+    class Data:
+        """Those of Ball by mass, the step, and the depth [m] over which damping grows."""
 
-    return advance
+        dt: real
+        radius: real
+        gravity: real
+        ke: real
+        kd: real
+        kf: real
+        mu: real
+        drag: real
+        turning: real
+        smoothing: real
+
+    @wp.func(module=module)
+    def fly(data: Data, speed: vec3) -> vec3:
+        """Return the acceleration by gravity and air."""
+        return vec3(real(0.0), -data.gravity, real(0.0)) - data.drag * wp.length(speed) * speed
+
+    @wp.func(module=module)
+    def rub(data: Data, f_n: real, speed: vec3, roll: vec3) -> vec3:
+        """Return what friction adds to the acceleration under the normal force f_n."""
+        slip = vec3(speed[0] + roll[0], real(0.0), speed[2] + roll[2])
+        squared = wp.dot(slip, slip)
+        limit = data.mu * f_n
+        if data.kf * data.kf * squared <= limit * limit:
+            return -data.kf * slip
+        return -(limit / wp.sqrt(squared)) * slip  # the root only here: at rest its derivative is infinite
+
+    return Ground(Data, fly, rub)
+
+
+@cache
+@no_type_check
+def step_kernel(name: str, contacts: str) -> Any:
+    """Return the kernel of one semi-implicit Euler step, in which the ball may meet the ground as `contacts` says."""
+    types, module = precision(name), f"gradscape.rigid.{contacts}.{name}"
+    real, vec3, Vecs = types.real, types.vec3, wp.array2d[types.vec3]
+    Data, fly, rub = ground(name)
+
+    if contacts == "smooth":
+
+        @wp.func(module=module)
+        def press(data: Data, c: real, v_n: real) -> real:
+            return -(data.ke * c - data.kd * (c / data.smoothing) * wp.min(v_n, real(0.0)))
+
+    else:
+
+        @wp.func(module=module)
+        def press(data: Data, c: real, v_n: real) -> real:
+            return -(data.ke * c + data.kd * wp.min(v_n, real(0.0)))
+
+    @wp.func(module=module)
+    def push(data: Data, dt: real, depth: real, speed: vec3, roll: vec3):
+        """Return velocity and roll after a step under the ground's force at a depth."""
+        f_n = press(data, depth, speed[1])
+        f_t = rub(data, f_n, speed, roll)
+        force = fly(data, speed) + vec3(f_t[0], f_n, f_t[2])
+        return speed + dt * force, roll + (dt * data.turning) * f_t
+
+    @wp.kernel(module=module)
+    def advance(step: int, data: Data, x: Vecs, v: Vecs, roll: Vecs):
+        e = wp.tid()
+        here, speed, turn = x[step, e], v[step, e], roll[step, e]
+        c = here[1] - data.radius
+        if c < real(0.0):
+            after, turned = push(data, data.dt, c, speed, turn)
+            v[step + 1, e] = after
+            roll[step + 1, e] = turned
+            x[step + 1, e] = here + data.dt * after
+        else:
+            flown = speed + data.dt * fly(data, speed)
+            v[step + 1, e] = flown
+            roll[step + 1, e] = turn
+            x[step + 1, e] = here + data.dt * flown
+
+    @wp.func(module=module)
+    def time_to_touch(data: Data, c: real, v_n: real, a: real) -> real:
+        """Return when c + t (v_n + t a), where a step of length t would end, is 0; the step's end where it is not."""
+        if c < real(0.0):
+            return real(0.0)
+        if c + data.dt * (v_n + data.dt * a) >= real(0.0):
+            return data.dt
+        root = wp.sqrt(v_n * v_n - real(4.0) * a * c)
+        if v_n < real(0.0):
+            return real(2.0) * c / (root - v_n)
+        return (root + v_n) / (real(-2.0) * a)
+
+    @wp.kernel(module=module)
+    def advance_to_touch(step: int, data: Data, x: Vecs, v: Vecs, roll: Vecs):
+        e = wp.tid()
+        here, speed, turn = x[step, e], v[step, e], roll[step, e]
+        c = here[1] - data.radius
+        a = fly(data, speed)
+        t = time_to_touch(data, c, speed[1], a[1])
+        met = speed + t * a
+        there = here + t * met
+        left = data.dt - t
+        if left > real(0.0):
+            after, turned = push(data, left, wp.min(c, real(0.0)), met, turn)
+            v[step + 1, e] = after
+            roll[step + 1, e] = turned
+            x[step + 1, e] = there + left * after
+        else:
+            v[step + 1, e] = met
+            roll[step + 1, e] = turn
+            x[step + 1, e] = there
+
+    return advance_to_touch if contacts == "touch" else advance

@@ -1,6 +1,7 @@
 """The chain against mechanics written down independently: energies of rods, Euler and Lagrange, modes, kicks, work."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -165,3 +166,20 @@ def test_the_work_of_the_torques_is_the_energy_gained():
     done = (work(phi[1:], controls[0, :, 1:]) - work(phi[:-1], controls[0, :, 1:])).cumsum(dim=0)
     assert done.abs().max() > 1
     torch.testing.assert_close(energy(phi, p)[1:] - energy(phi, p)[0], done, rtol=0, atol=1e-7)
+
+
+def test_damped_joints_brake_how_fast_they_bend_and_nothing_else():
+    """The same step with torques of -c times the bending rate: p' differs by those torques' generalized forces."""
+    phi, p = random(ROWS, 3, scale=2.0), random(ROWS, 3, scale=3.0, seed=1)
+    c, dt = 0.3, 1e-6
+    w = torch.linalg.solve(mass_matrix(phi), p)
+    bend = w - torch.cat([torch.zeros_like(w[:, :1]), w[:, :-1]], dim=1)
+    wanted = vmap(grad(work))(phi, -c * bend)
+    ends = []
+    for damping, step in ((c, dt), (c, -dt), (0.0, dt), (0.0, -dt)):
+        chain = replace(CHAIN, damping=damping)
+        solver = Solver(chain, dt=step, hold=1, controls=1, name="float64", capacity=ROWS, device="cpu")
+        solver.run(phi, p, torch.zeros(ROWS, 1, 4, dtype=torch.float64))
+        ends.append(to_torch(solver.p)[1].clone())
+    change = (ends[0] - ends[1]) - (ends[2] - ends[3])
+    torch.testing.assert_close(change / (2 * dt), wanted, rtol=1e-6, atol=1e-6)
