@@ -88,7 +88,7 @@ class Fluid(MpmScene):
         "reference": Fidelity("reference", dt=SPAN / 28, resolution=60, sampling=1.6, precision="float64"),
     }
     examples: ClassVar[dict[str, tuple[float, ...]]] = {
-        "scoop": (1.41, -0.77, 0.15, 0.74, 0.08, 1.13, -1.3, 1.41, 0.17, 0.27)
+        "scoop": (1.68, -2.0, 1.54, 0.45, -0.68, 1.95, -1.9, 1.69, -1.89, 1.65)
     }
     loss_unit: ClassVar[str] = "m"
     control_step: ClassVar[float] = SPAN
