@@ -72,14 +72,14 @@ class Fluid(MpmScene):
     Loss at the end, after 0.5 s [m], cube's centre (x, y, z): max(0, 0.2 - y) + 3 |(x, z) - ladle| + |(x, z) - tank's
     axis|. The paper prints max(0, y - 0.2), which rewards a low cube although the goal is "as high as possible"; that
     is goal=printed.
-    Simplifications: sound travels at 8 m/s, 14 times as fast as the ladle at its fastest, so that a step may be long;
-    the syrup's own weight compresses it by 2.7 % at the floor. The ladle's speed changes over 0.04 s, because one that
-    jumps by dv sends a shock of pressure (density times speed of sound times dv) through the syrup. Before each control
-    step J is averaged over the grid, beyond hydrostatics: uneven J would bear load as a solid does. That leaves an error
-    of buoyancy, which a finer grid lessens (benchmarks/drag.py). Walls are slippery (walls=stick: not) and reach up to a
-    lid at 0.6 m, so that no syrup is lost; the ladle has no mass and stops where it would leave the tank; the cube is as
-    soft as that speed of sound makes it, and still stiff beside the loads on it; the shell is felt over a centimetre
-    outside it, or three quarters of a coarse grid's cell.
+    Simplifications: sound travels at 8 m/s, 14 times as fast as the ladle at its fastest, so that a step may be
+    long; the syrup's own weight compresses it by 2.7 % at the floor. The ladle's speed changes over 0.04 s, because
+    one that jumps by dv sends a shock of pressure (density times speed of sound times dv) through the syrup. Before
+    each control step J is averaged over the grid, beyond hydrostatics: uneven J would bear load as a solid does.
+    That leaves an error of buoyancy, which a finer grid lessens (benchmarks/drag.py). Walls are slippery
+    (walls=stick: not) and reach up to a lid at 0.6 m, so that no syrup is lost; the ladle has no mass and stops
+    where it would leave the tank; the cube is as soft as that speed of sound makes it, and still stiff beside the
+    loads on it; the shell is felt over a centimetre outside it, or three quarters of a coarse grid's cell.
     Source: task Fluid of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
     2022), appendix A.2.1; material and geometry where it is silent are ours.
     """
