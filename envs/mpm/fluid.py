@@ -112,7 +112,7 @@ class Fluid(MpmScene):
         [f"ladle {axis} speed, segment {segment}" for segment in range(1, SEGMENTS + 1) for axis in "xy"],
         -2.0,
         2.0,
-        "× 0.2 m/s",
+        "· 0.2 m/s",
     )
 
     def tools(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 1 3"]:
