@@ -1,5 +1,6 @@
 """The Fluid scene: the ladle's path, the loss, what floats and what is lifted, precision and failures."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -8,18 +9,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gradscape.envs.base import Fidelity
+from gradscape.envs.controls import ease, hold
 from gradscape.envs.engines.mpm.boundaries import LadleInTank
+from gradscape.envs.engines.runtime import to_torch
 from gradscape.envs.mpm import fluid
 from gradscape.envs.mpm.fluid import (
     BOWL,
     CUBE_CENTER,
+    EASING,
+    FILL,
+    GRAVITY,
     RIM,
     SEGMENTS,
     SHELL,
     SPAN,
     STEPS,
+    SYRUP_DENSITY,
     TANK_HEIGHT,
     TANK_WIDTH,
+    UNIT,
     Fluid,
 )
 from gradscape.landscapes.objective import Status
@@ -47,16 +55,105 @@ def test_ladle_lifts_the_cube(draft):
     assert float(scooped) < 0.5 * float(still)
 
 
-def test_the_cube_floats_or_sinks_as_its_density_says():
-    height = {}
-    for density in (800.0, 1330.0, 2500.0):  # the syrup's is 1330
-        height[density] = float(Fluid(device="cpu", cube_density=density).cube(STILL)[0, 1])
-    start = CUBE_CENTER[1]
-    assert height[800.0] > start + 0.005
-    assert height[2500.0] < start - 0.005
-    assert height[800.0] - height[1330.0] > 0.003
-    assert height[1330.0] - height[2500.0] > 0.003
-    assert abs(height[1330.0] - start) < 0.01  # a coarse grid moves it by millimetres
+def test_the_pressure_of_syrup_at_rest_is_hydrostatic(monkeypatch):
+    monkeypatch.setattr(fluid, "CUBE_CENTER", (0.025, 0.1, 0.0))  # where the syrup bears all of it
+    scene = Fluid(fidelity="draft", device="cpu", cube_density=SYRUP_DENSITY)
+    scene.evaluate(STILL, grad=False)
+    with scene._solvers.lend() as stage:
+        solver = stage.solver
+        J = to_torch(solver.checkpoints[STEPS].S[0])[0].double()
+        height = to_torch(solver.checkpoints[STEPS].x)[0, : len(J), 1].double()
+    pressure = -SYRUP_DENSITY * scene.options.sound_speed**2 * J.log()
+    floor = SYRUP_DENSITY * GRAVITY * FILL
+    for low in torch.arange(0, FILL - 0.01, 0.025):
+        layer = (height >= low) & (height < low + 0.025)
+        wanted = SYRUP_DENSITY * GRAVITY * (FILL - height[layer].mean())
+        assert abs(float(pressure[layer].mean() - wanted)) < 0.05 * floor  # nodes of the floor weigh on one side only
+        assert pressure[layer].std() < 0.06 * floor  # of it a layer's own slope is 0.04
+
+
+@pytest.fixture(scope="module")
+def speeds():
+    """Speeds upwards of cubes in the middle of a narrow tank without a ladle, by viscosity and density."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in {"RIM": (0.0, 10.0, 0.0), "FILL": 0.2, "TANK_WIDTH": 0.2}.items():
+            patch.setattr(fluid, name, value)
+        patch.setattr(fluid, "CUBE_CENTER", (0.0, 0.1, 0.0))
+        fidelity = Fidelity("narrow", dt=SPAN / 11, resolution=12, sampling=4 / 3)
+        cases = [(30.0, 1800.0), (30.0, 860.0), (60.0, 1800.0), (60.0, 860.0), (30.0, SYRUP_DENSITY)]
+        made = {case: Fluid(fidelity=fidelity, device="cpu", viscosity=case[0], cube_density=case[1]) for case in cases}
+        return {case: rising(scene) for case, scene in made.items()}
+
+
+def rising(scene, steps=20):
+    """Return (speed upwards over the last half of so many control steps [m/s], rise over all [m]) of the cube."""
+    away = STILL.new_tensor([0.0, 10.0, 0.0]).expand(1, steps + 1, 1, 3)
+    with scene._solvers.lend() as stage:
+        stage.solver.run(away)
+        height = [float(scene._center(stage.solver.read_positions(k, 1))[0, 1]) for k in (0, steps // 2, steps)]
+    return (height[2] - height[1]) / (SPAN * steps / 2), height[2] - height[0]
+
+
+def test_a_heavy_cube_sinks_and_a_light_one_rises(speeds):
+    for viscosity in (30.0, 60.0):
+        assert speeds[viscosity, 1800.0][0] < -0.001
+        assert speeds[viscosity, 860.0][0] > 0.001
+    assert abs(speeds[30.0, SYRUP_DENSITY][1]) < 0.002
+
+
+def test_the_cubes_speed_is_inversely_proportional_to_viscosity_and_less_than_stokes(speeds):
+    # Half the difference of the two is free of what a neutral cube drifts; the narrow tank slows both.
+    half = {mu: (speeds[mu, 860.0][0] - speeds[mu, 1800.0][0]) / 2 for mu in (30.0, 60.0)}
+    assert half[30.0] / half[60.0] == pytest.approx(2, rel=0.25)
+    radius = fluid.CUBE_EDGE * (3 / (4 * math.pi)) ** (1 / 3)
+    for viscosity, speed in half.items():
+        stokes = 2 / 9 * 470.0 * GRAVITY * radius**2 / viscosity
+        assert 0.2 < speed / stokes < 0.9
+
+
+def test_walls_that_stick_slow_the_syrup_along_them():
+    fidelity = replace(Fluid.fidelities["draft"], precision="float64")
+    x = STILL.clone()
+    x[0, 1::2] = 2.0  # the ladle goes up and takes syrup along
+    moved = {}
+    for walls in ("slip", "stick"):
+        scene = Fluid(fidelity=fidelity, device="cpu", walls=walls, horizon=0.2)
+        syrup = scene.episode(x[0]).points["syrup"]
+        near = syrup[0, :, 0].abs() > TANK_WIDTH / 2 - scene.model.dx
+        moved[walls] = float((syrup[-1, near] - syrup[0, near])[:, 1:].norm(dim=1).mean())
+    assert moved["slip"] > 1e-4
+    assert moved["stick"] < 0.5 * moved["slip"]
+
+
+def test_the_ladles_speed_eases(tiny):
+    x = STILL.clone()
+    x[0, 0], x[0, 2] = 0.5, -0.5
+    speed = tiny.tools(x)[0, :, 0, 0].diff() / SPAN / UNIT
+    ramp = torch.arange(1, EASING + 1, dtype=torch.float64) / EASING
+    steps = STEPS // SEGMENTS
+    torch.testing.assert_close(speed[:EASING], 0.5 * ramp)
+    torch.testing.assert_close(speed[steps : steps + EASING], 0.5 - ramp)
+    jumping = Fluid(fidelity=TINY, device="cpu", easing=False).tools(x)[0, :, 0, 0].diff() / SPAN / UNIT
+    torch.testing.assert_close(jumping[:steps], torch.full((steps,), 0.5, dtype=torch.float64))
+
+
+def test_a_wall_seldom_stops_the_ladle(tiny):
+    x = tiny.space.uniform(512, seed=0)
+    wanted = SPAN * ease(hold(UNIT * x.view(512, SEGMENTS, 2), STEPS), EASING)
+    stopped = ((tiny.tools(x)[:, :, 0, :2].diff(dim=1) - wanted).abs() > 1e-9).any(dim=2)
+    assert 0 < stopped.double().mean() < 0.15
+
+
+def test_the_gradient_of_the_whole_scene_is_the_slope():
+    scene = Fluid(fidelity=TINY, device="cpu", walls="stick", horizon=0.2)
+    assert scene.options.smoothing == 1.0
+    x = 0.3 * scene.space.uniform(1, seed=5)
+    way = torch.rand(x.shape, generator=torch.Generator().manual_seed(6), dtype=torch.float64) - 0.5
+    slope, errors = float((scene.evaluate(x).grad * way).sum()), []
+    for step in (1e-4, 1e-5, 1e-6):
+        ends = [float(scene.evaluate(x + s * step * way, grad=False).loss) for s in (1, -1)]
+        errors.append(abs((ends[0] - ends[1]) / (2 * step) - slope) / abs(slope))
+    assert min(errors) < 1e-6
 
 
 def test_a_still_scene_stays_symmetric_in_depth(draft):
@@ -91,12 +188,13 @@ def test_the_ladle_stays_in_the_tank(tiny, speeds):
     assert (z == RIM[2]).all()
 
 
-def test_away_from_its_limits_the_ladle_goes_speed_times_time(tiny):
+def test_away_from_its_limits_the_ladle_goes_speed_times_time():
     # From the rim's start: right 0.02 m a segment, up 0.01 m a segment.
-    speeds = torch.tensor([[0.2, 0.1] * SEGMENTS], dtype=torch.float64)
+    scene = Fluid(fidelity=TINY, device="cpu", easing=False)
+    speeds = torch.tensor([[1.0, 0.5] * SEGMENTS], dtype=torch.float64)
     time = SPAN * torch.arange(STEPS + 1, dtype=torch.float64)
     wanted = torch.tensor(RIM, dtype=torch.float64) + time[:, None] * torch.tensor([0.2, 0.1, 0.0])
-    torch.testing.assert_close(tiny.tools(speeds)[0, :, 0], wanted)
+    torch.testing.assert_close(scene.tools(speeds)[0, :, 0], wanted)
 
 
 def test_single_precision_gives_the_same_landscape(draft):
@@ -109,10 +207,12 @@ def test_single_precision_gives_the_same_landscape(draft):
 
 def test_syrup_thrown_out_of_the_grid_is_an_escape_and_spoils_no_other_row(monkeypatch):
     monkeypatch.setattr(fluid, "HEADROOM", 0.1)
+    monkeypatch.setattr(fluid, "FILL", 0.2)
+    monkeypatch.setattr(fluid, "HIGHEST", 9.0)
     monkeypatch.setattr(fluid, "LadleInTank", lambda *args, **kw: replace(LadleInTank(*args, **kw), lid=9.0))
     low = Fluid(fidelity=TINY, device="cpu")
     x = STILL.repeat(3, 1)
-    x[1, 1::2] = 2.0  # lift what is in the ladle over the top of a low grid
+    x[1, 1::2] = 6.0  # throw what is in the ladle over the top of a low grid
     result = low.evaluate(x)
     assert result.status.tolist() == [Status.OK, Status.ESCAPED, Status.OK]
     assert result.loss.isnan().tolist() == [False, True, False]
