@@ -80,12 +80,16 @@ def clear_halves(folder: Path) -> None:
 
 
 def _files(folder: Path) -> Iterator[tuple[Path, str]]:
-    """Yield the files of a folder at any depth, with their paths in it; a link to a folder is one of them."""
+    """Yield the files of a folder at any depth, with their paths in it; a link to a folder is one of them.
+
+    A folder that another process removes meanwhile has none.
+    """
 
     def unreadable(error: OSError) -> None:
-        raise error
+        if not isinstance(error, FileNotFoundError):
+            raise error
 
-    for parent, folders, files in os.walk(folder, onerror=unreadable if folder.exists() else None):
+    for parent, folders, files in os.walk(folder, onerror=unreadable):
         folders.sort()
         for name in sorted([*files, *(name for name in folders if Path(parent, name).is_symlink())]):
             path = Path(parent, name)

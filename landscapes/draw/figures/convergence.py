@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from ...measures.fidelity import Bootstrap
 
 PITCH, SHAPE = 5.2, 0.8  # room of a panel on a screen [inch]; its height, against its width
+COLUMN, LEAST_WIDTH = 3, 40.0  # panels that one column of a page has room for; how wide others are at least [mm]
 ROOM = 1.8  # what the axes reach beyond the marks, as a ratio
 LEAST = 1e-16  # of the spread: what is drawn on the lower edge of rounding
 WIDTHS = {
@@ -41,7 +42,8 @@ def convergence_figure(found: Convergence, *, width: float | None = None) -> pag
     """
     knobs = [knob for knob in found.knobs if knob.knob in WIDTHS and knob.moves]
     count = len(knobs) + bool(found.distributions)
-    sheet = style.Sheet.of(width, pitch=PITCH, columns=min(2, max(1, count)), panels=max(1, count))
+    least = style.NARROWEST if count <= COLUMN else LEAST_WIDTH
+    sheet = style.Sheet.of(width, pitch=PITCH, columns=min(2, max(1, count)), panels=max(1, count), least=least)
     picture = page.Picture(sheet, sheet.width)
     axes = panel.grid(picture, max(1, count))
     entries: dict[str, Artist] = {}
@@ -94,7 +96,7 @@ def _limit(ax: Axes, knob: KnobConvergence) -> None:
     ax.set_xlim(min(widths) / ROOM**0.5, max(widths) * ROOM**0.5)
     ax.set_ylim(min(values) / ROOM, max(values) * ROOM)
     for axis in (ax.xaxis, ax.yaxis):
-        style.log_axis(axis)
+        panel.log_axis(axis)
 
 
 def _draw_design(ax: Axes, knob: KnobConvergence, entries: dict[str, Artist]) -> None:

@@ -4,27 +4,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, PathPatch
 from matplotlib.path import Path
-from matplotlib.ticker import FixedLocator, FuncFormatter
+from matplotlib.ticker import FixedLocator
 from numpy.typing import NDArray
 
-from ...measures.extremes import Extremes, Limit, StabilityMap
 from ...measures.stability import ACCURATE, INACCURATE, REFUSED, UNJUDGED, Cell
 from .. import style
 from . import page, panel
+
+if TYPE_CHECKING:
+    from ...measures.extremes import Extremes, Limit, StabilityMap
 
 PITCH, LEAST = 4.0, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
 LOWEST, HIGHEST = 1e-4, 1e4  # of the error axis [% of the spread]; what is beyond stands on the edge
 NAMES = {ACCURATE: "accurate", INACCURATE: "finite, but wrong", UNJUDGED: "finite, not judged", REFUSED: "refused"}
 NAMES |= {kind.name: name for kind, name in style.FAILURES.items()}
-FEW, MOST = 1.5, 6  # decades: of an axis with more ticks than one in each, and of one that has one in each
 ROOM = 1.35  # what the axis of factors reaches beyond the outermost marks, as a ratio
 
 Grid = NDArray[np.float64]
@@ -82,7 +83,7 @@ def _draw_errors(ax: Axes, limits: Sequence[Limit], accuracy: float, precision: 
         ax.set_xlim(min(reach) / ROOM, max(reach) * ROOM)
     ax.set_ylim(LOWEST, HIGHEST)
     for axis in (ax.xaxis, ax.yaxis):
-        _log_axis(axis)
+        panel.log_axis(axis)
     ax.yaxis.set_major_locator(FixedLocator([10.0**power for power in range(-4, 5, 2)]))
     _dress_errors(ax, accuracy, precision)
     line = sheet.look(style.REFERENCE_LINE)
@@ -140,23 +141,11 @@ def _draw_map(ax: Axes, found: StabilityMap) -> dict[str, Artist]:
     for axis, limits, values in ((ax.xaxis, edges[0], found.xs), (ax.yaxis, edges[1], found.ys)):
         (ax.set_xlim if axis is ax.xaxis else ax.set_ylim)(float(limits[0]), float(limits[-1]))
         if min(values) > 0:
-            _log_axis(axis)
+            panel.log_axis(axis)
     ax.set_box_aspect(1)
     panel.name_axes(ax, *(_label(name, unit) for name, unit in zip((found.x, found.y), found.units, strict=True)))
     panel.caption(ax, f"{found.precision}: {found.x} against {found.y}")
     return entries
-
-
-def _log_axis(axis: Axis) -> None:
-    """Make an axis logarithmic, with decades alone where a panel has no room for more."""
-    style.log_axis(axis)
-    low, high = sorted(axis.get_view_interval())
-    decades = math.log10(high / low)
-    if decades > FEW:
-        every = math.ceil(decades / MOST)
-        powers = range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1)
-        axis.set_major_locator(FixedLocator([10.0**power for power in powers if power % every == 0]))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: style.power(value, 3)))
 
 
 def _label(name: str, unit: str) -> str:

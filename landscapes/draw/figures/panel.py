@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -16,6 +17,8 @@ from .page import Picture, picture_of, sheet_of, write_over
 from .typesetting import side_room, title_room
 
 NARROW = 1.8  # room of a panel that has fewer ticks [inch]
+FEW = 1.0, 1.5  # decades of a logarithmic axis that has more ticks than one in each, in a narrow panel and in another
+DECADES = 3, 6  # of one that has a tick in each
 
 
 def grid(picture: Picture, panels: int, *, share: bool = False) -> list[Axes]:
@@ -36,6 +39,18 @@ def dress(ax: Axes) -> None:
     ax.spines[:].set(color=style.QUIET, linewidth=max(0.4, 0.6 * sheet.weight))
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_locator(MaxNLocator(5 if sheet.pitch > NARROW else 3))
+
+
+def log_axis(axis: Axis) -> None:
+    """Make an axis logarithmic, with decades alone where a panel has no room for more."""
+    style.log_axis(axis)
+    low, high = sorted(axis.get_view_interval())
+    decades, wide = math.log10(high / low), sheet_of(axis.axes).pitch > NARROW
+    if decades > FEW[wide]:
+        every = math.ceil(decades / DECADES[wide])
+        powers = range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1)
+        axis.set_major_locator(FixedLocator([10.0**power for power in powers if power % every == 0]))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: style.power(value, 3)))
 
 
 def name_axes(ax: Axes, x: str | None = None, y: str | None = None) -> None:

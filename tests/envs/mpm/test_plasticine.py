@@ -37,11 +37,22 @@ def test_the_demonstration_is_far_better_than_doing_nothing(kind):
 
 
 @pytest.mark.parametrize("kind", SCENES, ids=scene_id)
-def test_a_standard_environment_takes_at_most_100_mb(kind):
+def test_memory_is_that_of_particles_and_grids_are_little_of_it(kind):
+    """A frame of each step (x, v, C, F), a tape of one with adjoints; grids and rasters are half as much at most."""
     env = kind(fidelity="standard", device="cpu")
-    assert env.model.particles == 10_000
-    assert env.model.steps * env.model.substeps == 1000
-    assert env.memory() <= 100e6
+    frame, model = 24, env.model
+    tape = (model.substeps + 1) * (frame + 9)
+    own = 4 * ((model.steps + 3) * frame + tape) * model.particles
+    assert own <= env.memory() <= 1.5 * own
+
+
+@pytest.mark.parametrize("kind", SCENES, ids=scene_id)
+def test_enough_standard_environments_fit_a_gpu_to_keep_it_busy(kind, monkeypatch):
+    monkeypatch.setattr(solver, "free_memory", lambda: FREE)
+    env = kind(fidelity="standard", device="cpu")
+    batch = solver.capacity(env.model, "cuda")
+    assert solver.BUSY <= batch * env.model.particles <= solver.FULL_CARD
+    assert batch * env.memory() < FREE
 
 
 @pytest.mark.parametrize("kind", SCENES, ids=scene_id)

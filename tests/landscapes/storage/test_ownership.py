@@ -19,6 +19,7 @@ from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.checkpoint import Checkpoint
 from gradscape.landscapes.storage.files import discard, placing, replacing, tidy
+from gradscape.landscapes.storage.ownership import remove
 from gradscape.landscapes.storage.paths import filling_path
 from gradscape.landscapes.storage.store import SliceStore
 
@@ -222,3 +223,16 @@ def test_a_folder_that_cannot_be_put_in_its_place_leaves_the_one_that_is_there(t
     ):
         pass  # nothing is made
     assert (tmp_path / "folder/mine").read_text() == "precious"
+
+
+@pytest.mark.parametrize("gone", ["status", "."])
+def test_what_another_process_removes_meanwhile_is_removed(gone: str, tmp_path: Path) -> None:
+    """Two processes that fill the same slice clear its tiles away at once: the other is first in the middle of it."""
+    folder = unfinished(tmp_path / "s.zarr")
+
+    def ours(name: str) -> bool:
+        discard(folder / gone)
+        return True
+
+    remove(folder, ours)
+    assert not folder.exists()

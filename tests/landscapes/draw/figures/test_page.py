@@ -18,7 +18,10 @@ from gradscape.landscapes import draw
 from gradscape.landscapes.draw.figures import page, typesetting
 from gradscape.landscapes.draw.figures.contact import Caption, episode_figure
 from gradscape.landscapes.draw.figures.contour import landscape_figure
+from gradscape.landscapes.draw.figures.convergence import convergence_figure
 from gradscape.landscapes.draw.figures.curve import run_figure
+from gradscape.landscapes.draw.figures.extremes import extremes_figure
+from gradscape.landscapes.draw.figures.model import model_figure
 from gradscape.landscapes.draw.figures.overlay import overlay_figure
 from gradscape.landscapes.draw.figures.profile import profile_figure
 from gradscape.landscapes.draw.figures.quality import quality_figure
@@ -33,8 +36,10 @@ from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.storage.files import print_width
 from gradscape.optim.registry import methods
 
+from ....studies import study
 from ...measures.test_fidelity import REPORT
 from ...test_overlay import LAID, SLICE
+from .records import convergence, extremes, mixed
 from .test_contour import BOUNCES, DATASET, LINE, Bowl, plane
 from .test_curve import table
 from .test_race import race
@@ -67,6 +72,9 @@ CAPTION = Caption(
     "plasticine · reference", "loss 1.2345 m", "best:out/race", {f"tool {n} x": "−0.25 m" for n in range(30)},
     "episode.json", COMMAND,
 )  # fmt: skip
+PARTS = {f"the walls' friction, number {number}": 0.01 * 1.5**number for number in range(12)}
+MIXED = mixed()
+CHOSEN = {"draft": MIXED["rungs"][-1]["name"], "standard": MIXED["rungs"][10]["name"]}
 FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
     "landscape_figure": [
         lambda width: landscape_figure(PLANE, width=width),
@@ -92,7 +100,13 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
         lambda width: surface_figure(dated(SLICE), LAID, width=width),
         lambda width: surface_figure(PLANE, width=width),
     ],
-    "tradeoff_figure": [lambda width: tradeoff_figure(REPORT, width=width)],
+    "tradeoff_figure": [
+        lambda width: tradeoff_figure(REPORT, width=width),
+        lambda width: tradeoff_figure(MIXED, width=width, chosen=CHOSEN),
+    ],
+    "convergence_figure": [lambda width: convergence_figure(convergence(), width=width)],
+    "model_figure": [lambda width: model_figure(study(PARTS, failing=True), width=width)],
+    "extremes_figure": [lambda width: extremes_figure(extremes(), width=width)],
     "frame_figure": [lambda width: frame_figure(SWEEP, 1, Scales.of(SWEEP), width=width)],
     "episode_figure": [lambda width: episode_figure(EPISODE, caption=CAPTION, width=width)],
     "thumbnail_figure": [lambda width: thumbnail_figure(DATASET, width=width)],

@@ -1,0 +1,111 @@
+"""Records of studies that fill their figures: each knob there is, in each precision, with long names and many rows."""
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from gradscape.landscapes.draw import style
+from gradscape.landscapes.measures.convergence import Shapes
+from gradscape.landscapes.measures.convergence_record import (
+    Convergence,
+    ConvergenceRule,
+    KnobConvergence,
+    Level,
+    Move,
+    Remainder,
+)
+from gradscape.landscapes.measures.distributions import ComparedDistribution, Distance, Distributions
+from gradscape.landscapes.measures.extremes import Extremes, Limit, StabilityMap
+from gradscape.landscapes.measures.fidelity import Bootstrap
+from gradscape.landscapes.measures.stability import STABLE, Cell
+
+from ...measures.test_fidelity import REPORT, rung
+
+MEASURED = {"device": "cuda", "engine": "warp", "created": "2026-11-21"}
+COMMAND = "landscape {} triple-move --fidelity reference --device cuda --points 64 --out studies/triple-move-reference"
+
+
+def near(value: float) -> Bootstrap:
+    return Bootstrap(value, 0.8 * value, 1.3 * value)
+
+
+def knob(name: str, widths: list[float]) -> KnobConvergence:
+    """Return a knob whose observed order is not the designed one, with a floor."""
+    levels = tuple(Level(f"reference-{name}-x{width:.3g}", width, {}, 1.0) for width in widths)
+    moves = tuple(
+        Move(coarse.name, fine.name, fine.width, near(coarse.width), near(9 * coarse.width), near(0.9), near(0.1), 64)
+        for coarse, fine in pairwise(levels)
+    )
+    shapes, verdict = Shapes(monotone=40, oscillating=12, growing=11, still=1), "converges"
+    order = Bootstrap(1.21, -0.35, 2.42)
+    return KnobConvergence(
+        name, levels, moves, verdict, order, (1.0,) * 64, shapes, 2.0, min(widths) / 3, near(0.02), False, None
+    )  # fmt: skip
+
+
+def convergence() -> Convergence:
+    """Return a study of every knob that has a panel, of a scene that is chaotic."""
+    steps = [2e-5 / 2**level for level in range(5)]
+    knobs = (knob("dt", steps), *(knob(one, [1.5, 1.0, 2 / 3, 0.5]) for one in ("resolution", "particles", "joint")))
+    names = ("draft", "standard", *(f"reference-{one.levels[-1].name}" for one in knobs), "reference-float32")
+    far = Distance(near(0.4), near(0.3))
+    apart = Distributions(
+        16, 64, 0.01, far, {"kolmogorov": 0.2, "wasserstein": 0.1},
+        tuple(ComparedDistribution(name, far, ("kolmogorov", "wasserstein")) for name in names),
+    )  # fmt: skip
+    return Convergence(
+        env="triple-move", reference="reference", points=64, seed=0, loss_unit="J", spread=12.3, knobs=knobs,
+        rule=ConvergenceRule(near(0.05), near(0.02), "resolution", False, ("dt", "resolution", "particles", "joint")),
+        remainders=(Remainder("standard", near(0.1), near(0.4)), Remainder("reference", near(0.004), near(0.02))),
+        divergence=None, distributions=apart, refused=(), identity={}, provenance=MEASURED,
+        command=COMMAND.format("tradeoff") + " --ladder convergence",
+    )  # fmt: skip
+
+
+def limit(name: str, precision: str, failed: float | None) -> Limit:
+    """Return a limit whose rungs span decades; `failed` is the factor from which they fail."""
+    factors = np.geomspace(1e-3, 1e3, 13)
+    rungs = [Cell((f,), "NONFINITE" if failed and f >= failed else "accurate", 1.0, error=f**2 / 50) for f in factors]
+    stable = max(cell.values[0] for cell in rungs if cell.stable)
+    return Limit(name, "s", precision, "largest", 1.0, stable, failed, "NONFINITE", 1.0, 2.0, (), tuple(rungs))
+
+
+def stability_map(x: str, y: str, precision: str) -> StabilityMap:
+    """Return a map in which every outcome occurs, over decades of both knobs."""
+    values, outcomes = tuple(np.geomspace(1e-6, 1e3, 9).tolist()), list(style.OUTCOMES)
+    cells = [
+        Cell((a, b), outcomes[(row + column) % len(outcomes)], 1.0)
+        for row, b in enumerate(values) for column, a in enumerate(values)
+    ]  # fmt: skip
+    assert {cell.outcome for cell in cells} > set(STABLE)
+    edge = tuple((b, 10.0, 11.0) for b in values[2:])
+    accurate = tuple((b, 0.1, 0.11) for b in values[2:])
+    return StabilityMap(x, y, ("s", "1/m"), precision, (1.0, 1.0), values, values, tuple(cells), edge, accurate)
+
+
+def extremes() -> Extremes:
+    """Return a study of as many knobs as a scene has, and of two pairs of them, in both precisions."""
+    knobs = {"dt": 10.0, "resolution": None, "particles": None, "tool_friction": 100.0, "yield_stress": 1e3,
+             "softness": 30.0, "gravity": 300.0}  # fmt: skip
+    pairs = (("dt", "resolution"), ("yield_stress", "tool_friction"))
+    both = ("float32", "float64")
+    return Extremes(
+        env="triple-move", fidelity="reference", reference="reference-dt-x0.5", points=64, seed=0, width=0.01,
+        accuracy=0.1, limits=tuple(limit(*one, failed) for *one, failed in
+                                   ((name, kind, failed) for kind in both for name, failed in knobs.items())),
+        maps=tuple(stability_map(*pair, kind) for kind in both for pair in pairs),
+        refused=(), identity={}, provenance=MEASURED, command=COMMAND.format("extremes"),
+    )  # fmt: skip
+
+
+def mixed() -> dict[str, Any]:
+    """Return the record of a search among dozens of mixed variants, half of which are on the front."""
+    settings = [
+        f"dt-x{2 ** (k % 5)} resolution-{64 - k} particles-x{1 / (1 + k):.2g} float32 on warp" for k in range(24)
+    ]
+    rows = [
+        rung(f"standard {said}", 10 * 0.8**k, 0.001 * 1.3**k * (1 + k % 2), "mixed") for k, said in enumerate(settings)
+    ]
+    named = [row for row in REPORT["rungs"] if row["ladder"] == "named"]
+    return {**REPORT, "env": "triple-move", "rungs": [*named, *rows]}
