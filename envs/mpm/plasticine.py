@@ -30,6 +30,7 @@ from .targets import Target, contact, load_or_make
 
 DEMONSTRATION = "demonstration"  # the example that solves a scene
 TERMS = ("density", "sdf", "contact")
+MOST_WORK = 1e8  # particle-substeps of a demonstration that a CPU makes, so that all devices have the same target
 REACH = 0.1  # what a policy measures lengths by [m]
 
 
@@ -205,9 +206,11 @@ class Plasticine(MpmScene):
         """Return where the target's particles are [m]."""
         if self.scene.target:
             return target(self.scene, self.model.particles)
+        device = "cpu" if self.model.particle_substeps <= MOST_WORK else self.device
         content = f"{self.scene} {self.fidelity} {self.examples[DEMONSTRATION]} {code_digest(type(self))}"
-        return load_or_make(f"{self.name}-{self.fidelity.name}", content, self._demonstrate)
+        content += "" if device == "cpu" else f" {device}"
+        return load_or_make(f"{self.name}-{self.fidelity.name}", content, lambda: self._demonstrate(device))
 
-    def _demonstrate(self) -> np.ndarray:
-        demonstration = type(self)(fidelity=self.fidelity, device="cpu").end(self.example(DEMONSTRATION))
+    def _demonstrate(self, device: str) -> np.ndarray:
+        demonstration = type(self)(fidelity=self.fidelity, device=device).end(self.example(DEMONSTRATION))
         return np.asarray(demonstration)
