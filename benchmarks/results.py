@@ -19,6 +19,9 @@ MADE, READ = "made-1", "read-1"  # what a kind is made into, and where a verb th
 CUT = "slice ackley --set dim=3 --dims 0 1 --resolution 6 --out"
 SEARCH = "optimize ackley --set dim=3 --method cma-es --budget 30 --seed 1 --out"
 BOUNCE = "bounce --fidelity draft --device cpu"
+TURN = (
+    "extremes bounce --fidelity draft --set horizon=0.05 --points 4 --knobs dt --precisions float64 --device cpu --out"
+)
 EXPORT = f"export {MADE} --out {READ}/table.csv"
 GALLERY = f"gallery compute --resolution 6 --fidelity draft --device cpu --data {MADE}"
 
@@ -101,6 +104,8 @@ KINDS = {
         (f"slice bounce --device cpu --tolerance 20% --set horizon=0.5 --dims 0 1 --resolution 3 --out {READ}",),
         where="home/gradscape",
     ),
+    "extremes": Kind(f"{TURN} {MADE} --json"),
+    "kept extremes": Kind(f"{TURN} {MADE}", ("envs bounce",), where="home/gradscape"),
     "report": Kind(
         f"report cut --points 2 --out {MADE} --json",
         (f"report cut --points 2 --out {MADE} --print 85",),

@@ -76,7 +76,7 @@ BUILTIN = (
         "fluid",
         "gradscape.envs.mpm.fluid:Fluid",
         "10",
-        "5 x (ladle speed x, ladle speed y) [m/s]",
+        "5 x (ladle speed x, ladle speed y) [· 0.2 m/s]",
         "MLS-MPM: viscous fluid, elastic cube, moving ladle",
         SCENE,
     ),

@@ -40,6 +40,7 @@ plan bounce --resolution 2 --fidelity draft --device cpu
 bench bounce --batch 2 --seconds 0 --fidelity draft --device cpu
 check branin --points 2
 tradeoff cartpole --points 2 --variants precision --device cpu
+tradeoff cartpole --set horizon=0.02 --points 2 --ladder mixed --chaotic --budget 1 --device cpu
 extremes bounce --points 4 --knobs dt --precisions float64 --fidelity draft --device cpu
 pairs bounce --samples 2 --fidelity draft --device cpu
 report cut --device cpu
@@ -49,7 +50,7 @@ gallery build --data data --out site
 gallery serve --out site --port 0
 """.strip().splitlines()
 # Flags of what results are like, and not of what is started.
-RESULTS = {"--json", "--force", "--no-gradients", "--deterministic", "--film", "--report", "--all"}
+RESULTS = {"--json", "--force", "--no-gradients", "--deterministic", "--film", "--report", "--all", "--chaotic"}
 NO_WINDOW = "rerun's viewer could not open a window"
 SERVED = "until Ctrl-C"  # what is said by all that serves
 

@@ -104,7 +104,8 @@ def _read_convergence(files: TradeoffFiles, record: Record) -> ConvergenceEntry 
     """Return what a study of convergence says, None where there is none of the code that the trade-off is of."""
     if not files.there():
         return None
-    with reading(files.record, "delete it, and `landscape tradeoff ENV --ladder convergence` makes it anew"):
+    todo = f"delete it, and `landscape tradeoff {record['env']} --ladder convergence` measures it anew"
+    with reading(files.record, todo):
         found = Convergence.of_record(read_json(files.record))
     if found.identity["code"] != record["identity"].get("code"):
         return None

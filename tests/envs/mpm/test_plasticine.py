@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from gradscape.envs.engines.mpm import solver
 from gradscape.envs.engines.mpm.tools import Kind
 from gradscape.envs.mpm.plasticine import DEMONSTRATION, SEGMENTS, TERMS, Plasticine
 from gradscape.envs.mpm.plasticine_model import PARTICLE
@@ -18,6 +19,7 @@ from ..scenes import SOFT, cheap
 
 SCENES = [environment_class(name) for name in SOFT]
 TINY = cheap(Plasticine)
+FREE = 60_000_000_000  # bytes that a GPU of 80 GB has for sure
 
 
 def made(kind, **options):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from gradscape.envs.base import Fidelity
 from gradscape.envs.engines.mpm.materials import Plasticine as Clay
 from gradscape.envs.engines.mpm.model import Body, Model
 from gradscape.envs.engines.mpm.raster import Raster
@@ -159,8 +160,12 @@ def test_a_press_moves_about_as_much_as_a_released_target(kind, released):
 
 
 def test_one_leg_is_bent_and_the_table_stays():
-    """PlasticineLab's targets: 8 to 65 mm of the bent leg, at most 2 mm of the others."""
-    bent = shifts(Table(device="cpu"), torch.tensor(Table.examples[DEMONSTRATION]).double()).norm(dim=1)
+    """PlasticineLab's targets, on as fine a grid: 8 to 65 mm of the bent leg, at most 2 mm of the others.
+
+    The draft's coarser grid smears the sphere over the other legs, which it moves by as much.
+    """
+    env = Table(fidelity=Fidelity("PlasticineLab's", dt=1e-4, resolution=64, particles=5000), device="cpu")
+    bent = shifts(env, torch.tensor(Table.examples[DEMONSTRATION]).double()).norm(dim=1)
     assert 0.01 < bent[2] < 0.05
     assert bent[[0, 1, 3]].max() < 2e-3
     assert bent[4] < 4e-3  # the top leans

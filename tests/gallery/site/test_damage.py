@@ -58,6 +58,12 @@ def refusal(data: Path, out: Path) -> str:
     return ""
 
 
+def maker(file: Path) -> str:
+    """Return the command that makes a file again: a study of a scene is none of the gallery's parts."""
+    scene, _, study = file.stem.partition("-cuda.")
+    return f"tradeoff {scene} --ladder {study}` measures it anew" if study else "gallery compute --part "
+
+
 def test_a_site_is_built_or_refused_by_the_damaged_files_name(undrawn: None, data: Path, tmp_path: Path) -> None:
     kept = shutil.copytree(data, tmp_path / "data", ignore=shutil.ignore_patterns("runs.tmp", "line", "bare"))
     files = [
@@ -72,7 +78,7 @@ def test_a_site_is_built_or_refused_by_the_damaged_files_name(undrawn: None, dat
             if said := refusal(kept, tmp_path / "site"):
                 refused[file] += 1
                 assert said.startswith(f"{file} is damaged (")
-                assert "; delete it, and `landscape gallery compute --part " in said
+                assert f"; delete it, and `landscape {maker(file)}" in said
         file.write_bytes(content)
     assert len(refused) == len(files) > 5
     assert not refusal(kept, tmp_path / "site")
