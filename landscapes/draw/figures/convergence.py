@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from ...measures.fidelity import Bootstrap
 
 PITCH, SHAPE = 5.2, 0.8  # room of a panel on a screen [inch]; its height, against its width
-COLUMN, LEAST_WIDTH = 3, 40.0  # panels that one column of a page has room for; how wide others are at least [mm]
+COLUMN, FLAT = 3, 0.34  # panels of that shape that a column of a page has room for, and the shape of more
+ROW = 0.07  # of a flat panel's width: what a name beside it takes
 ROOM = 1.8  # what the axes reach beyond the marks, as a ratio
 LEAST = 1e-16  # of the spread: what is drawn on the lower edge of rounding
 WIDTHS = {
@@ -42,15 +43,18 @@ def convergence_figure(found: Convergence, *, width: float | None = None) -> pag
     """
     knobs = [knob for knob in found.knobs if knob.knob in WIDTHS and knob.moves]
     count = len(knobs) + bool(found.distributions)
-    least = style.NARROWEST if count <= COLUMN else LEAST_WIDTH
-    sheet = style.Sheet.of(width, pitch=PITCH, columns=min(2, max(1, count)), panels=max(1, count), least=least)
+    sheet = style.Sheet.of(width, pitch=PITCH, columns=min(2, max(1, count)), panels=max(1, count))
     picture = page.Picture(sheet, sheet.width)
     axes = panel.grid(picture, max(1, count))
+    flat = sheet.columns == 1 and count > COLUMN
+    for ax in axes:
+        ax.set_box_aspect(FLAT if flat else SHAPE)
     entries: dict[str, Artist] = {}
     for ax, knob in zip(axes, knobs, strict=False):
         _draw_knob(ax, knob, found, entries)
     if found.distributions:
         _draw_distributions(axes[-1], found, entries)
+        axes[-1].set_box_aspect(max(FLAT, ROW * len(found.distributions.compared)) if flat else SHAPE)
     page.entitle(picture, f"{found.env} · self-convergence · {found.points} points")
     page.finish(picture, list(entries.values()), columns=3, heading=_provenance(found))
     return picture
@@ -58,7 +62,6 @@ def convergence_figure(found: Convergence, *, width: float | None = None) -> pag
 
 def _draw_knob(ax: Axes, knob: KnobConvergence, found: Convergence, entries: dict[str, Artist]) -> None:
     panel.dress(ax)
-    ax.set_box_aspect(SHAPE)
     sheet, look = page.sheet_of(ax), style.VARIANTS[knob.knob]
     for kind, alpha in (("p95", 0.45), ("median", 1.0)):
         name = "95th percentile" if kind == "p95" else "median over the points"
@@ -148,7 +151,6 @@ def _draw_distributions(ax: Axes, found: Convergence, entries: dict[str, Artist]
     apart = found.distributions
     assert apart is not None
     panel.dress(ax)
-    ax.set_box_aspect(SHAPE)
     sheet = page.sheet_of(ax)
     look = sheet.look(style.VARIANT_MARK | {"color": style.LOSS_LINE, "marker": "o"})
     for place, one in enumerate(apart.compared):

@@ -48,7 +48,7 @@ def convergence() -> Convergence:
     """Return a study of every knob that has a panel, of a scene that is chaotic."""
     steps = [2e-5 / 2**level for level in range(5)]
     knobs = (knob("dt", steps), *(knob(one, [1.5, 1.0, 2 / 3, 0.5]) for one in ("resolution", "particles", "joint")))
-    names = ("draft", "standard", *(f"reference-{one.levels[-1].name}" for one in knobs), "reference-float32")
+    names = ("draft", "standard", *(one.levels[-1].name for one in knobs), "reference-float32")
     far = Distance(near(0.4), near(0.3))
     apart = Distributions(
         16, 64, 0.01, far, {"kolmogorov": 0.2, "wasserstein": 0.1},
