@@ -70,7 +70,7 @@ class Flip(SheetScene):
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=1 / 400, resolution=8),
         "standard": Fidelity("standard", dt=1 / 1000, resolution=16),
-        "reference": Fidelity("reference", dt=1 / 2000, resolution=16, precision="float64"),
+        "reference": Fidelity("reference", dt=1 / 6000, resolution=24, precision="float64"),
     }
     examples: ClassVar[dict[str, tuple[float, ...]]] = {
         "flip": (

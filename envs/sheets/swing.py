@@ -56,17 +56,17 @@ class Swing(SheetScene):
     (single), or the mean distance of the corners (corner) or of all vertices (mesh), by option.
     Simplifications: the anchors stand still, since what they hold is what makes the cloth swing; air is felt as a drag
     of 0.5/s; stretching is resisted by 10 N/m, softer than fabric, so that a step may be long; the resistance to
-    bending is ours, so that folds are wider than a few cells. Meshes still differ: of 32 random points the losses of
-    standard (20 cells) and reference (24) have rank correlations of 0.94 (velocity) and 0.97 (stiffness), and 95 % are
-    within 17 and 16 % of the spread; draft's (12 cells) have 0.80 and 0.74, 53 and 61 %.
+    bending is ours, so that folds are wider than a few cells. Coarse meshes do not fold as fine ones do: of 64 points
+    against 28 cells (1/7500 s), standard's losses (24 cells) have rank correlations of 0.99 (velocity and stiffness)
+    and 95 % are within 7 and 9 % of the spread; draft's (10 cells) have 0.57 and 0.58, 77 and 61 %.
     Source: task Swing of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
     2022), appendix A.2.3; geometry and material are ours.
     """
 
     fidelities: ClassVar[dict[str, Fidelity]] = {
-        "draft": Fidelity("draft", dt=1 / 1500, resolution=12),
-        "standard": Fidelity("standard", dt=1 / 4000, resolution=20),
-        "reference": Fidelity("reference", dt=1 / 5000, resolution=24, precision="float64"),
+        "draft": Fidelity("draft", dt=1 / 1000, resolution=10),
+        "standard": Fidelity("standard", dt=1 / 5000, resolution=24),
+        "reference": Fidelity("reference", dt=1 / 7500, resolution=28, precision="float64"),
     }
     Options: ClassVar[type[Any]] = SwingOptions
     model_parts: ClassVar[tuple[ModelPart, ...]] = (

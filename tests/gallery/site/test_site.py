@@ -158,7 +158,7 @@ def test_a_search_of_other_options_is_not_laid_over_a_slice(data: Path) -> None:
 
 def test_counts_are_multiplied_and_axes_are_not(site: Path) -> None:
     page = (site / "full/index.html").read_text()
-    assert "5 × (ladle speed x, ladle speed y) [m/s]" in page
+    assert "5 × (ladle speed x, ladle speed y) [· 0.2 m/s]" in page
 
 
 def test_words_of_a_figure_are_escaped(site: Path) -> None:
