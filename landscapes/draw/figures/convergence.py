@@ -71,6 +71,8 @@ def _draw_knob(ax: Axes, knob: KnobConvergence, found: Convergence, entries: dic
     _limit(ax, knob)
     _draw_design(ax, knob, entries)
     _draw_levels(ax, knob, found, entries)
+    for axis in (ax.xaxis, ax.yaxis):  # whose ends are known now
+        panel.log_axis(axis)
     panel.name_axes(ax, WIDTHS[knob.knob], "loss moves [share of the spread]" if found.spread else "loss moves")
     panel.caption(ax, _title(knob))
 
@@ -99,7 +101,7 @@ def _limit(ax: Axes, knob: KnobConvergence) -> None:
     ax.set_xlim(min(widths) / ROOM**0.5, max(widths) * ROOM**0.5)
     ax.set_ylim(min(values) / ROOM, max(values) * ROOM)
     for axis in (ax.xaxis, ax.yaxis):
-        panel.log_axis(axis)
+        style.log_axis(axis)
 
 
 def _draw_design(ax: Axes, knob: KnobConvergence, entries: dict[str, Artist]) -> None:
