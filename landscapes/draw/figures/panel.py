@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
-from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from .. import style
 from .page import Picture, picture_of, sheet_of, write_over
@@ -51,6 +51,8 @@ def log_axis(axis: Axis) -> None:
         powers = range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1)
         axis.set_major_locator(FixedLocator([10.0**power for power in powers if power % every == 0]))
         axis.set_major_formatter(FuncFormatter(lambda value, _: style.power(value, 3)))
+    elif not wide:
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=9))
 
 
 def name_axes(ax: Axes, x: str | None = None, y: str | None = None) -> None:
