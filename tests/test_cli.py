@@ -164,8 +164,10 @@ def test_bench_prints_rates_ratios_and_memory_as_json(run: Callable[..., Said], 
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert (report["env"], report["fidelity"], report["engine"]) == ("swing-velocity", "draft", "warp")
-    assert report["work"] == {"count": 64 * 400, "unit": "vertex-step"}
-    assert report["memory"]["estimated"] == gradscape.make("swing-velocity", device="cpu").memory()
+    scene = gradscape.make("swing-velocity", device="cpu")
+    fidelity = scene.fidelity
+    assert report["work"] == {"count": (fidelity.resolution + 1) ** 2 * round(0.8 / fidelity.dt), "unit": "vertex-step"}
+    assert report["memory"]["estimated"] == scene.memory()
     assert report["command"] == f"landscape {' '.join(command)} --json"
     assert set(report["start"]) == {"warp", "taichi"}
     ours, theirs = report["rates"]
@@ -181,7 +183,8 @@ def test_bench_prints_tables(run: Callable[..., Said], tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     batches = [line.split()[1] for line in done.stdout.splitlines() if " warp " in line and line[2].isdigit()]
     assert batches == ["2", "4"]
-    for shown in ("480 body-steps", "episodes/s", "advance backward", "outside kernels", "the sampler's own"):
+    steps = round(2 / gradscape.make("bounce", device="cpu").fidelity.dt)
+    for shown in (f"{steps} body-steps", "episodes/s", "advance backward", "outside kernels", "the sampler's own"):
         assert shown in done.stdout
     assert not list(tmp_path.iterdir())
 
