@@ -5,9 +5,9 @@
 The table in docs/fidelities.md holds, for every scene, draft and standard before they were set by measurement and as
 they are now: rank correlation, median cosine of gradients and 95 % loss error against the reference, and milliseconds.
 "Before" is `benchmarks/data/fidelities-before.json`, which --keep-before writes from the trade-offs that lie in
-gallery/data/tradeoff at that moment; "now" are those that lie there. With --check nothing is written: exit code 1 says
-that the page differs, that a fidelity was changed since it was measured, or that one without an exception breaks its
-claim.
+gallery/data/tradeoff at that moment; "now" are those that lie there, where they are of the scene's present code and
+settings: of a scene that changed since, the table says so. With --check nothing is written: exit code 1 says that the
+page differs, that a scene was changed since it was measured, or that a fidelity without an exception breaks its claim.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from gradscape.envs.code import code_digest
 from gradscape.envs.registry import entries, environment_class
 from gradscape.landscapes.measures.choice import CLAIMS, Claim, Shortfall
 from gradscape.landscapes.measures.fidelity import Comparison
@@ -28,26 +29,38 @@ from gradscape.landscapes.measures.fidelity import Comparison
 ROOT = Path(__file__).parents[1]
 DATA, PAGE = ROOT / "gallery" / "data" / "tradeoff", ROOT / "docs" / "fidelities.md"
 BEFORE = ROOT / "benchmarks" / "data" / "fidelities-before.json"
-DEVICES = ("cuda", "cpu")  # a trade-off of the first is shown, where there is one
+ENGINE = "warp"  # which computed every kept trade-off
+DEVICES = ("cuda", "cpu")  # a trade-off of the first is shown, where there is one of the present scene
 MARKS = ("<!-- fidelities -->", "<!-- /fidelities -->")
 CHAOTIC: dict[str, str] = {}  # scenes whose motion is, and by which measurement: their gradients promise nothing
+UNMEASURED = "not measured since the scene changed"
 HEAD = ("scene", "fidelity", "device", "rank", "cosine", "95 % error", "ms", "claim")
 
 
 @dataclass(frozen=True)
 class Row:
-    """Hold what was measured of a named fidelity of a scene: `settings` by name, and `measured` as files have it."""
+    """Hold what was measured of a named fidelity of a scene: `settings` by name, and `measured` as files have it.
+
+    `code` is the digest of the scene's code, empty where it was not kept.
+    """
 
     scene: str
     device: str
     name: str
     settings: dict[str, Any]
     measured: dict[str, Any]
+    code: str = ""
 
     @property
     def comparison(self) -> Comparison:
         """What was measured, as a record."""
         return Comparison.of_record(self.measured)
+
+    @property
+    def present(self) -> bool:
+        """Whether that is what the scene is now."""
+        kind = environment_class(self.scene)
+        return asdict(kind.fidelities[self.name]) == self.settings and code_digest(kind, ENGINE) == self.code
 
     def shortfall(self, claim: Claim) -> Shortfall:
         """Return how far it falls short of a claim."""
@@ -65,16 +78,19 @@ def kept(folder: Path = DATA) -> list[Row]:
     return [row for name in scenes() for row in _rows(name, folder)]
 
 
-def _rows(name: str, folder: Path) -> Iterator[Row]:
-    path = next((path for device in DEVICES if (path := folder / f"{name}-{device}.json").is_file()), None)
-    if path is None:
-        return
-    record = json.loads(path.read_text())
+def _rows(name: str, folder: Path) -> list[Row]:
+    """Return the rows of the first device whose record is of the present scene, else of the first there is."""
+    paths = [path for device in DEVICES if (path := folder / f"{name}-{device}.json").is_file()]
+    found = [list(_read(name, json.loads(path.read_text()))) for path in paths]
+    return next((rows for rows in found if all(row.present for row in rows)), found[0] if found else [])
+
+
+def _read(name: str, record: dict[str, Any]) -> Iterator[Row]:
     for claim in CLAIMS:
         for one in record["rungs"]:
             if one["name"] == claim.name:
                 measured = {key: one[key] for key in MEASURED}
-                yield Row(name, one["device"], claim.name, one["fidelity"], measured)
+                yield Row(name, one["device"], claim.name, one["fidelity"], measured, record["identity"]["code"])
 
 
 MEASURED = ("loss_error", "spearman", "gradient", "diverged", "compared", "seconds", "batch")
@@ -105,12 +121,15 @@ def table(old: Sequence[Row], new: Sequence[Row]) -> str:
 def _line(scene: str, claim: Claim, was: Row | None, now: Row | None) -> list[str]:
     if was is None and now is None:
         return [f"`{scene}`", claim.name, "", *[""] * 4, "not measured"]
+    latest, now = now, now if now is not None and now.present else None
+    was = latest if was is None and now is None else was
     cells = [[] if row is None else _cells(row) for row in (was, now)]
     devices = " → ".join(dict.fromkeys(row.device for row in (was, now) if row is not None))
     joined = [
         _change(*pair) for pair in zip(*(cell or cells[not number] for number, cell in enumerate(cells)), strict=True)
     ]
     verdict = _change(*(None if row is None else _verdict(row, claim) for row in (was, now)))
+    verdict = verdict if now is not None else f"{verdict} → {UNMEASURED}"
     return [f"`{scene}`", claim.name, devices, *joined, verdict]
 
 
@@ -137,18 +156,14 @@ def _change(was: str | None, now: str | None) -> str:
 
 
 def changed(rows: Sequence[Row]) -> list[str]:
-    """Name the fidelities that are no longer what was measured."""
-    return [
-        f"{row.scene} {row.name}"
-        for row in rows
-        if asdict(environment_class(row.scene).fidelities[row.name]) != row.settings
-    ]
+    """Name the fidelities of scenes that are no longer what was measured."""
+    return [f"{row.scene} {row.name}" for row in rows if not row.present]
 
 
 def short(rows: Sequence[Row]) -> list[str]:
-    """Say which fidelities break their claim, and in what."""
+    """Say which fidelities that were measured of the present scene break their claim, and in what."""
     claims: Mapping[str, Claim] = {claim.name: claim for claim in CLAIMS}
-    found = [(row, row.shortfall(claims[row.name])) for row in rows]
+    found = [(row, row.shortfall(claims[row.name])) for row in rows if row.present]
     return [
         f"{row.scene} {row.name}: {lack.value:.3g} times what may lack in {lack.by}"
         for row, lack in found
@@ -180,7 +195,7 @@ def main() -> int:
     text = table(before(), rows)
     if not asked.check:
         write(text)
-    wrong = [f"{name}: changed since it was measured" for name in changed(rows)]
+    wrong = [f"{name}: {UNMEASURED}" for name in changed(rows)]
     wrong += [f"{line}" for line in short(rows)]
     wrong += [f"{PAGE}: differs from the records" for _ in range(written() != text)]
     print("\n".join(wrong) or f"all {len(rows)} fidelities keep what they claim")

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from ..plain import number, optional, text
-from .convergence import Shapes, Verdict
+from .convergence import UNMOVED, Shapes, Verdict
 from .distributions import Distributions
 from .divergence import Divergence, interval
 from .fidelity import Bootstrap
@@ -179,6 +179,8 @@ class ConvergenceRule:
         off, moved = (_percent(one.value if one else None) for one in (self.off, self.moved))
         if self.met is None:
             return f"whether the reference is converged is not known: it moves by {moved}, standard is off by {off}"
+        if self.met and self.moved is not None and (self.moved.value or 0.0) <= UNMOVED:
+            return f"the reference is converged to rounding: it moves by {moved} at most"
         if self.met:
             return f"the reference is converged: it moves by {moved} at most where standard is off by {off}"
         said = f"the reference is not converged: refining its {self.knob} moves it by {moved} where standard is off by"

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..plain import finite
-from .convergence import Order, choose_order, extrapolate, find_floor, fit_order, measure_order
+from .convergence import UNMOVED, Order, choose_order, extrapolate, find_floor, fit_order, measure_order
 from .convergence_record import ConvergenceRule, KnobConvergence, Level, Move, Remainder
 from .fidelity import Bootstrap, gradient_error
 
@@ -70,10 +70,10 @@ class Scale:
     seed: int
 
     def meets(self, moved: float | None) -> bool | None:
-        """Say whether a movement is within a tenth of standard's error, None where one of both is not known."""
+        """Say whether a movement is rounding or within a tenth of standard's error, None where one is not known."""
         if self.off.value is None:
             return None
-        return moved is not None and moved <= TENTH * self.off.value
+        return moved is not None and moved <= max(TENTH * self.off.value, UNMOVED)
 
 
 def error(values: Array, reference: Array) -> Array:
@@ -126,7 +126,7 @@ def _move(ladder: Ladder, place: int, scale: Scale) -> Move:
 
 
 def judge(knobs: Sequence[KnobConvergence], scale: Scale) -> ConvergenceRule:
-    """Apply the rule: a reference is one where no refinement moves losses by a tenth of what standard is off."""
+    """Apply the rule: no refinement of a reference moves losses by a tenth of what standard is off, but for rounding."""
     known = [one for one in knobs if one.knob != PRECISION and one.moved is not None]
     worst = max(known, key=_moved, default=None)
     met = [one.met for one in known]

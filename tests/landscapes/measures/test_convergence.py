@@ -180,6 +180,16 @@ def test_the_rule_is_a_tenth_of_what_standard_is_off(off: float, met: bool, star
     assert ("is converged" in rule.say()) == met
 
 
+@pytest.mark.parametrize(("moves", "met"), [(1e-10, True), (1e-8, False)])
+def test_a_reference_that_moves_by_rounding_alone_is_converged_however_right_standard_is(
+    moves: float, met: bool
+) -> None:
+    losses = np.arange(16.0) + moves * np.array([1, -1, 1, -1])[:, None]
+    knob, _ = conclude(ladder("dt", WIDTHS, losses), "reference", scale_of(1e-10))
+    rule = judge([knob], scale_of(1e-10))
+    assert (rule.met, "is converged to rounding" in rule.say()) == (met, met)
+
+
 def test_points_that_a_finer_level_fails_at_count_as_infinitely_far_off() -> None:
     losses = manufacture(WIDTHS, 1.0)
     losses[2, :3] = np.nan
