@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -26,12 +25,14 @@ from gradscape.envs.registry import entries, environment_class
 from gradscape.landscapes.measures.choice import CLAIMS, Claim, Shortfall
 from gradscape.landscapes.measures.fidelity import Comparison
 
+from .marked import markdown, write, written
+
 ROOT = Path(__file__).parents[1]
 DATA, PAGE = ROOT / "gallery" / "data" / "tradeoff", ROOT / "docs" / "fidelities.md"
 BEFORE = ROOT / "benchmarks" / "data" / "fidelities-before.json"
 ENGINE = "warp"  # which computed every kept trade-off
 DEVICES = ("cuda", "cpu")  # a trade-off of the first is shown, where there is one of the present scene
-MARKS = ("<!-- fidelities -->", "<!-- /fidelities -->")
+NAME = "fidelities"  # of the table in the page
 CHAOTIC: dict[str, str] = {}  # scenes whose motion is, and by which measurement: their gradients promise nothing
 UNMEASURED = "not measured since the scene changed"
 HEAD = ("scene", "fidelity", "device", "rank", "cosine", "95 % error", "ms", "claim")
@@ -110,12 +111,12 @@ def keep_before(folder: Path = DATA, path: Path = BEFORE) -> None:
 def table(old: Sequence[Row], new: Sequence[Row]) -> str:
     """Return the table in Markdown: a row for each fidelity, each number before and now where they differ."""
     past = {(row.scene, row.name): row for row in old}
-    lines = [HEAD, ["---"] * len(HEAD)]
+    lines = []
     for scene in scenes():
         for claim in CLAIMS:
             now = next((row for row in new if (row.scene, row.name) == (scene, claim.name)), None)
             lines.append(_line(scene, claim, past.get((scene, claim.name)), now))
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return markdown(HEAD, lines)
 
 
 def _line(scene: str, claim: Claim, was: Row | None, now: Row | None) -> list[str]:
@@ -171,18 +172,6 @@ def short(rows: Sequence[Row]) -> list[str]:
     ]
 
 
-def written(page: Path = PAGE) -> str:
-    """Return the table that the page holds."""
-    begin, end = map(re.escape, MARKS)
-    (found,) = re.findall(rf"{begin}\n\n(.*?)\n\n{end}", page.read_text(), flags=re.DOTALL)
-    return str(found)
-
-
-def write(text: str, page: Path = PAGE) -> None:
-    """Put a table into the page, in the place of the one there."""
-    page.write_text(page.read_text().replace(written(page), text))
-
-
 def main() -> int:
     """Write the page, or say what is not so."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -194,10 +183,10 @@ def main() -> int:
     rows = kept()
     text = table(before(), rows)
     if not asked.check:
-        write(text)
+        write(text, PAGE, NAME)
     wrong = [f"{name}: {UNMEASURED}" for name in changed(rows)]
     wrong += [f"{line}" for line in short(rows)]
-    wrong += [f"{PAGE}: differs from the records" for _ in range(written() != text)]
+    wrong += [f"{PAGE}: differs from the records" for _ in range(written(PAGE, NAME) != text)]
     print("\n".join(wrong) or f"all {len(rows)} fidelities keep what they claim")
     return 1 if wrong and asked.check else 0
 

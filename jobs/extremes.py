@@ -124,8 +124,7 @@ class ExtremesJob:
 
         watch = watch or Watch()
         with resumable(self.say_kept):
-            self._announce(watch)
-            found = self._measure(watch)
+            found = self._measure(watch, self._announce(watch))
             save(found.plot(), self.folder / PICTURE)
             write_record(self.folder / RECORD, found.record())
             tidy(self.folder)
@@ -169,8 +168,8 @@ class ExtremesJob:
         slower = sum(SLOWER if one == "float64" else 1.0 for one in self.precisions) / _slower(env)
         return round(len(works) * len(self.precisions) + references), base * (sum(works) * slower + references * dearer)
 
-    def _announce(self, watch: Watch) -> None:
-        """Say what is tried, and about how long that takes."""
+    def _announce(self, watch: Watch) -> int:
+        """Say what is tried, and about how long that takes; return about how many settings."""
         env = self.env
         watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {env.engine} · {self.folder}")
         with watch.busy(f"{env.name}: {PREPARING}"):
@@ -185,10 +184,10 @@ class ExtremesJob:
             f"about {duration(seconds)}, by the work of an episode, and less where steps are longer; compiling kernels "
             "comes on top; --points, --knobs, --pairs and --grid lower it"
         )
+        return count
 
-    def _measure(self, watch: Watch) -> Extremes:
-        rungs = sum(len(knob.rungs(end)) for knob in self.turned for end in knob.ends)
-        with watch.progress((rungs + len(self.pairs) * self.grid**2) * len(self.precisions), "settings") as advance:
+    def _measure(self, watch: Watch, count: int) -> Extremes:
+        with watch.progress(count, "settings") as advance:
             limits = [
                 self._limit(knob, end, precision, advance)
                 for precision in self.precisions
@@ -196,6 +195,7 @@ class ExtremesJob:
                 for end in knob.ends
             ]
             maps = [self._map(pair, precision, advance) for precision in self.precisions for pair in self.pairs]
+            advance(count, f"{len(self.answers)} tried")
         env = self.env
         return Extremes(
             env=env.name, fidelity=env.fidelity.name, reference=self.reference, points=len(self.unit), seed=self.seed,

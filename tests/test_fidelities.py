@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from benchmarks import fidelities
 from benchmarks.fidelities import UNMEASURED, Row, changed, kept, short, table
+from benchmarks.marked import write, written
 
 from gradscape.envs.code import code_digest
 from gradscape.envs.registry import environment_class
@@ -17,7 +18,7 @@ from gradscape.landscapes.measures.choice import CLAIMS
 
 def test_the_page_holds_the_records() -> None:
     wanted = table(fidelities.before(), kept())
-    assert fidelities.written() == wanted, "`python -m benchmarks.fidelities` writes the page"
+    assert written(fidelities.PAGE, fidelities.NAME) == wanted, "`python -m benchmarks.fidelities` writes the page"
 
 
 def test_every_scene_was_measured_before_and_is_now() -> None:
@@ -28,7 +29,7 @@ def test_every_scene_was_measured_before_and_is_now() -> None:
 
 
 def test_the_page_names_the_fidelities_that_were_not_measured_since_their_scene_changed() -> None:
-    said = [line.split(" | ")[:2] for line in fidelities.written().splitlines() if UNMEASURED in line]
+    said = [line.split(" | ")[:2] for line in written(fidelities.PAGE, fidelities.NAME).splitlines() if UNMEASURED in line]
     assert [" ".join((scene.strip("| `"), name)) for scene, name in said] == changed(kept())
 
 
@@ -101,11 +102,11 @@ def test_a_chaotic_scenes_gradients_promise_nothing(
     assert "kept, chaotic" in table([], save(tmp_path, records))
 
 
-def test_the_page_is_checked_and_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_page_is_checked_and_written(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text(fidelities.PAGE.read_text().replace("| `torus` |", "| `taurus` |"))
-    monkeypatch.setattr(fidelities, "PAGE", page)
     wanted = table(fidelities.before(), kept())
-    assert fidelities.written(page) != wanted
-    fidelities.write(wanted, page)
-    assert fidelities.written(page) == wanted
+    assert written(page, fidelities.NAME) != wanted
+    write(wanted, page, fidelities.NAME)
+    assert written(page, fidelities.NAME) == wanted
+    assert page.read_text() == fidelities.PAGE.read_text()

@@ -69,8 +69,8 @@ class Flip(SheetScene):
     name: ClassVar[str] = "flip"
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=1 / 400, resolution=8),
-        "standard": Fidelity("standard", dt=1 / 1000, resolution=16),
-        "reference": Fidelity("reference", dt=1 / 6000, resolution=24, precision="float64"),
+        "standard": Fidelity("standard", dt=1 / 1000, resolution=24),
+        "reference": Fidelity("reference", dt=1 / 8000, resolution=32, precision="float64"),
     }
     examples: ClassVar[dict[str, tuple[float, ...]]] = {
         "flip": (

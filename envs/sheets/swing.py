@@ -56,9 +56,9 @@ class Swing(SheetScene):
     (single), or the mean distance of the corners (corner) or of all vertices (mesh), by option.
     Simplifications: the anchors stand still, since what they hold is what makes the cloth swing; air is felt as a drag
     of 0.5/s; stretching is resisted by 10 N/m, softer than fabric, so that a step may be long; the resistance to
-    bending is ours, so that folds are wider than a few cells. Coarse meshes do not fold as fine ones do: of 64 points
-    against 28 cells (1/7500 s), standard's losses (24 cells) have rank correlations of 0.99 (velocity and stiffness)
-    and 95 % are within 7 and 9 % of the spread; draft's (10 cells) have 0.57 and 0.58, 77 and 61 %.
+    bending is ours, so that folds are wider than a few cells. Coarse meshes do not fold as fine ones do: of 32 points
+    against 40 cells (1/10000 s), losses of standard (28 cells) have rank correlations of 0.99 (velocity and stiffness)
+    and 95 % are within 5.5 and 7.5 % of the spread; of draft (12 cells) 0.97 and 0.63, within 19 and 75 %.
     Source: task Swing of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
     2022), appendix A.2.3; geometry and material are ours.
     """

@@ -1,0 +1,36 @@
+"""docs/parts.md has a row for every part that a scene names, with what the kept study says of it."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+from benchmarks import parts
+from benchmarks.marked import markdown, written
+from benchmarks.parts import DATA, HEAD, NAME, PAGE, UNMEASURED, rows, studies
+
+from gradscape.envs.registry import entries, environment_class
+
+
+def test_the_page_holds_the_studies() -> None:
+    wanted = markdown(HEAD, list(rows(studies())))
+    assert written(PAGE, NAME) == wanted, "`python -m benchmarks.parts` writes the page"
+
+
+def test_every_simulated_scene_names_its_parts_and_each_has_a_row() -> None:
+    named = {(name, part.name) for name in entries() for part in environment_class(name).model_parts}
+    assert {(line[0].strip("`"), line[1]) for line in rows({})} == named
+    assert {scene for scene, _ in named} == {name for name in entries() if len(environment_class(name).fidelities) > 1}
+
+
+def test_a_part_that_was_measured_otherwise_or_of_other_code_is_said_to_be_so(tmp_path: Path) -> None:
+    study = studies()["bounce"]
+    first, *others = study.parts
+    line = next(line for line in rows({"bounce": study}) if line[:2] == ["`bounce`", first.name])
+    assert line[-1] == first.verdict
+    other = replace(study, parts=(replace(first, options={"mu": 0.1}), *others))
+    line = next(line for line in rows({"bounce": other}) if line[:2] == ["`bounce`", first.name])
+    assert line[3:] == ["", "", "", "", UNMEASURED]
+    record = json.loads((DATA / "bounce-cpu.model.json").read_text())
+    record["identity"]["code"] = "000000000000"
+    (tmp_path / "bounce-cpu.model.json").write_text(json.dumps(record))
+    assert parts.studies(tmp_path) == {}
