@@ -1,4 +1,4 @@
-"""Tables that a program writes into a page of the documentation, between two marks: <!-- NAME --> and <!-- /NAME -->."""
+"""Tables that a program writes into a page of the docs, between two marks: <!-- NAME --> and <!-- /NAME -->."""
 
 from __future__ import annotations
 

@@ -29,7 +29,8 @@ def test_every_scene_was_measured_before_and_is_now() -> None:
 
 
 def test_the_page_names_the_fidelities_that_were_not_measured_since_their_scene_changed() -> None:
-    said = [line.split(" | ")[:2] for line in written(fidelities.PAGE, fidelities.NAME).splitlines() if UNMEASURED in line]
+    lines = written(fidelities.PAGE, fidelities.NAME).splitlines()
+    said = [line.split(" | ")[:2] for line in lines if UNMEASURED in line]
     assert [" ".join((scene.strip("| `"), name)) for scene, name in said] == changed(kept())
 
 

@@ -126,7 +126,7 @@ def _move(ladder: Ladder, place: int, scale: Scale) -> Move:
 
 
 def judge(knobs: Sequence[KnobConvergence], scale: Scale) -> ConvergenceRule:
-    """Apply the rule: no refinement of a reference moves losses by a tenth of what standard is off, but for rounding."""
+    """Apply the rule: refining a reference moves losses by rounding, or by less than a tenth of what standard is off."""
     known = [one for one in knobs if one.knob != PRECISION and one.moved is not None]
     worst = max(known, key=_moved, default=None)
     met = [one.met for one in known]
