@@ -126,7 +126,7 @@ def _move(ladder: Ladder, place: int, scale: Scale) -> Move:
 
 
 def judge(knobs: Sequence[KnobConvergence], scale: Scale) -> ConvergenceRule:
-    """Apply the rule: refining a reference moves losses by rounding, or by less than a tenth of what standard is off."""
+    """Apply the rule: refining a reference moves losses by rounding, or by less than a tenth of standard's error."""
     known = [one for one in knobs if one.knob != PRECISION and one.moved is not None]
     worst = max(known, key=_moved, default=None)
     met = [one.met for one in known]
