@@ -1,7 +1,9 @@
-"""Print how fast a cube sinks or rises in the syrup of `fluid`, beside Stokes' speed for the sphere of its volume.
+"""Print how fast a cube sinks or rises in the syrup of `fluid`, beside what is known of cubes between walls.
 
 The ladle is away, the tank 0.2 m full, and the cube in the middle of it. The mean of the speeds of a heavy and a light
-cube is free of what a neutral cube drifts, which is printed too.
+cube is free of what a neutral cube drifts, which is printed too. Known are Stokes' speed of the sphere of its volume,
+that a cube is 0.92 times as fast (Pettyjohn and Christiansen, Chemical Engineering Progress 44, 157, 1948), and what
+slippery walls and a surface change, by images (Happel and Brenner, Low Reynolds Number Hydrodynamics, 1965, chapter 7).
 
     python benchmarks/drag.py --resolution 24 --sampling 1.3333 --viscosity 30 60
 """
@@ -16,6 +18,10 @@ import torch
 from gradscape.envs.base import Fidelity
 from gradscape.envs.mpm import fluid
 
+DEPTH = 0.2  # of the syrup [m]
+SHAPE = 0.92  # a cube's speed, as a share of that of the sphere of its volume
+TERMS, BLUR = 40, 0.02  # of the sum over waves; how wide a force is spread [m], to the first order of no influence
+RADIUS = fluid.CUBE_EDGE * (3 / (4 * np.pi)) ** (1 / 3)  # of the sphere of the cube's volume [m]
 EXCESS = 470.0  # density of the heavy cube above the syrup's, and of the light one below [kg/m^3]
 
 
@@ -28,9 +34,10 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=30)
     parser.add_argument("--device", default="cpu")
     wanted = parser.parse_args()
-    fluid.RIM, fluid.FILL, fluid.CUBE_CENTER = (0.0, 10.0, 0.0), 0.2, (0.025, 0.1, 0.0)
+    fluid.RIM, fluid.FILL, fluid.CUBE_CENTER = (0.0, 10.0, 0.0), DEPTH, (0.025, DEPTH / 2, 0.0)
     substeps = max(7, round(0.46 * wanted.resolution))
     fidelity = Fidelity("drag", dt=fluid.SPAN / substeps, resolution=wanted.resolution, sampling=wanted.sampling)
+    print(f"known: {SHAPE * wall_factor(fluid.TANK_WIDTH):.2f} of Stokes' speed")
     for viscosity in wanted.viscosity:
         heavy, light, neutral = (
             fall(fidelity, viscosity, fluid.SYRUP_DENSITY + excess, wanted.steps, wanted.device)
@@ -58,8 +65,25 @@ def fall(fidelity: Fidelity, viscosity: float, density: float, steps: int, devic
 
 def stokes_speed(viscosity: float) -> float:
     """Return Stokes' speed of a sphere of the cube's volume and EXCESS [m/s]."""
-    radius = fluid.CUBE_EDGE * (3 / (4 * np.pi)) ** (1 / 3)
-    return float(2 / 9 * EXCESS * fluid.GRAVITY * radius**2 / viscosity)
+    return float(2 / 9 * EXCESS * fluid.GRAVITY * RADIUS**2 / viscosity)
+
+
+def wall_factor(width: float) -> float:
+    """Return how fast a small body sinks in the middle of a square tank of a width [m], as a share of without walls.
+
+    Slippery walls reflect: the body has images of the same force beside it, and of the opposite force below the floor
+    and above the surface. That is a lattice of forces, whose velocity is a sum over waves.
+    """
+    count = int(TERMS * 2 * DEPTH / width) + 1
+    across, up = (
+        2 * np.pi / length * np.arange(-most, most + 1) for length, most in ((width, TERMS), (2 * DEPTH, count))
+    )
+    kx, ky, kz = np.meshgrid(across, up, across, indexing="ij")
+    square = kx**2 + ky**2 + kz**2
+    square[square == 0] = np.inf
+    waves = (1 - np.cos(ky * DEPTH)) * (1 - ky**2 / square) / square * np.exp(-square * BLUR**2)
+    alone = 1 / (6 * np.pi**1.5 * BLUR)
+    return float(1 + 6 * np.pi * RADIUS * (waves.sum() / (2 * DEPTH * width**2) - alone))
 
 
 if __name__ == "__main__":
