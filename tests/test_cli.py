@@ -166,7 +166,8 @@ def test_bench_prints_rates_ratios_and_memory_as_json(run: Callable[..., Said], 
     assert (report["env"], report["fidelity"], report["engine"]) == ("swing-velocity", "draft", "warp")
     scene = gradscape.make("swing-velocity", device="cpu")
     fidelity = scene.fidelity
-    assert report["work"] == {"count": (fidelity.resolution + 1) ** 2 * round(0.8 / fidelity.dt), "unit": "vertex-step"}
+    vertices, steps = (fidelity.resolution + 1) ** 2, round(scene.duration / fidelity.dt)
+    assert report["work"] == {"count": vertices * steps, "unit": "vertex-step"}
     assert report["memory"]["estimated"] == scene.memory()
     assert report["command"] == f"landscape {' '.join(command)} --json"
     assert set(report["start"]) == {"warp", "taichi"}

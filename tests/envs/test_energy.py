@@ -52,7 +52,7 @@ def test_a_cloth_gains_energy_in_a_step_only_as_far_as_the_step_is_long(kind: ty
         env = kind(fidelity=fidelity, device="cpu")
         found = env.energy(env.space.uniform(3, seed=0))
         assert found is not None
-        assert (found[:, -1] < 0.5 * found[:, 0]).all()
+        assert (found[:, -1] < 0.7 * found[:, 0]).all()
         rises.append(rise(found))
     assert rises[0] < 2e-3
     assert rises[1] < rises[0] / 3 + 1e-6
