@@ -92,6 +92,7 @@ def small(command: str) -> list[str]:
     added = ADDED.get(verb, []) + (TAICHI if "taichi" in found else [])
     pairs = [added[at : at + 2] for at in range(0, len(added), 2)] if verb != "replay" else [added]
     pairs = [pair for pair in pairs if not (pair[0] == "--variants" and "--ladder" in found)]  # which go not together
+    pairs += [["--budget", "1"]] if "mixed" in found else []
     short = TENTH if SHORT.get(verb, set()) & {*found} else []
     return [*found, *(word for pair in pairs if pair[0] not in found for word in pair), *short]
 

@@ -136,8 +136,8 @@ def test_a_cloth_whose_throw_changes_by_a_millionth_ends_a_little_elsewhere_sinc
 
 
 def test_gradients_are_slopes_but_some_point_against_the_slope_over_two_decimetres_per_second(velocity):
-    """The paper finds gradients that are noisy and often opposite to the slope; here 10 to 16 of 64 are."""
-    x = velocity.space.uniform(64, seed=1)
+    """The paper finds gradients that are noisy and often opposite to the slope; here one in six to four is."""
+    x = velocity.space.uniform(32, seed=2)
     gradient = velocity.evaluate(x).grad[:, 0]
 
     def slope(step):
@@ -146,8 +146,8 @@ def test_gradients_are_slopes_but_some_point_against_the_slope_over_two_decimetr
         return (ends[0] - ends[1]) / (2 * step)
 
     near, far = slope(1e-8), slope(0.2)
-    assert ((near - gradient).abs() < 1e-5 * gradient.abs() + 1e-6).sum() > 60
-    assert (far * gradient < 0).sum() > 5
+    assert ((near - gradient).abs() < 1e-5 * gradient.abs() + 1e-6).sum() > 29
+    assert (far * gradient < 0).sum() > 2
 
 
 def test_an_unstable_simulation_is_a_failure_and_no_error(cls):
