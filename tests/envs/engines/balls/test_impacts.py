@@ -217,7 +217,7 @@ def test_at_any_step_nothing_is_tunnelled_and_energy_never_grows(dt, restitution
         assert float(clearance(board, angle, between)[flown].min()) > -1e-9
     gain = energy(board, x, v, spin).diff(dim=0)
     assert float(gain[flown].max()) < 1e-11
-    assert float(gain[used[1:]].max()) < 1e-8  # of some 100 J; around round ends: fifth-order errors of steps of 1/240 s
+    assert float(gain[used[1:]].max()) < 1e-8  # of 100 J; around round ends: fifth-order errors of 1/240 s
 
 
 def rolls_round(board, thrown):
