@@ -7,7 +7,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 .PHONY: demo test wheel setup setup-test check clean
 
 demo: setup
-	$(BIN)/landscape slice fluid --dims 6 8 --resolution 24
+	$(BIN)/landscape slice fluid --dims 6 8 --resolution 14
 
 # Two workers have two cores: a second thread of each would only wait for the other worker's. Each takes tests that are
 # next to one another, which share what they make. The many processes that tests start compile the sources once.
