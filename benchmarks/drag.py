@@ -19,6 +19,7 @@ from gradscape.envs.base import Fidelity
 from gradscape.envs.mpm import fluid
 
 DEPTH = 0.2  # of the syrup [m]
+LAST = 10  # control steps over which a speed is taken
 SHAPE = 0.92  # a cube's speed, as a share of that of the sphere of its volume
 TERMS, BLUR = 40, 0.02  # of the sum over waves; how wide a force is spread [m], to the first order of no influence
 RADIUS = fluid.CUBE_EDGE * (3 / (4 * np.pi)) ** (1 / 3)  # of the sphere of the cube's volume [m]
@@ -52,15 +53,19 @@ def main() -> None:
 
 
 def fall(fidelity: Fidelity, viscosity: float, density: float, steps: int, device: str) -> float:
-    """Return how fast a cube sinks over the last ten of so many control steps [m/s]."""
+    """Return how fast a cube sinks over the last of so many control steps [m/s]."""
     scene = fluid.Fluid(fidelity=fidelity, device=device, viscosity=viscosity, cube_density=density)
+    _, before, after = heights(scene, steps)
+    return (before - after) / (LAST * fluid.SPAN)
+
+
+def heights(scene: fluid.Fluid, steps: int) -> list[float]:
+    """Return how high the cube is, without a ladle, at first, LAST control steps before the end and at the end [m]."""
     away = torch.tensor([0.0, 10.0, 0.0], dtype=torch.float64).expand(1, steps + 1, 1, 3)
     with scene._solvers.lend() as stage:
-        stage.solver.run(away.to(device))
-        before, after = (
-            float(scene._center(stage.solver.read_positions(k, 1).double().cpu())[0, 1]) for k in (steps - 10, steps)
-        )
-    return (before - after) / (10 * fluid.SPAN)
+        stage.solver.run(away.to(scene.device))
+        found = (stage.solver.read_positions(step, 1).double().cpu() for step in (0, steps - LAST, steps))
+        return [float(scene._center(place)[0, 1]) for place in found]
 
 
 def stokes_speed(viscosity: float) -> float:

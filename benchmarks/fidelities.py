@@ -15,26 +15,22 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from gradscape.envs.code import code_digest
 from gradscape.envs.registry import entries, environment_class
+from gradscape.gallery.files import TradeoffFiles
+from gradscape.jobs.report_tables import markdown
 from gradscape.landscapes.measures.choice import CLAIMS, Claim, Shortfall
 from gradscape.landscapes.measures.fidelity import Comparison
 
-from .marked import markdown, write, written
+from .pages import DATA, DOCS, ROOT, UNMEASURED, is_present, records, settle
 
-ROOT = Path(__file__).parents[1]
-DATA, PAGE = ROOT / "gallery" / "data" / "tradeoff", ROOT / "docs" / "fidelities.md"
+PAGE, NAME = DOCS / "fidelities.md", "fidelities"
 BEFORE = ROOT / "benchmarks" / "data" / "fidelities-before.json"
-ENGINE = "warp"  # which computed every kept trade-off
-DEVICES = ("cuda", "cpu")  # a trade-off of the first is shown, where there is one of the present scene
-NAME = "fidelities"  # of the table in the page
 CHAOTIC: dict[str, str] = {}  # scenes whose motion is, and by which measurement: their gradients promise nothing
-UNMEASURED = "not measured since the scene changed"
 HEAD = ("scene", "fidelity", "device", "rank", "cosine", "95 % error", "ms", "claim")
 
 
@@ -60,8 +56,8 @@ class Row:
     @property
     def present(self) -> bool:
         """Whether that is what the scene is now."""
-        kind = environment_class(self.scene)
-        return asdict(kind.fidelities[self.name]) == self.settings and code_digest(kind, ENGINE) == self.code
+        same = asdict(environment_class(self.scene).fidelities[self.name]) == self.settings
+        return same and is_present(self.scene, self.code)
 
     def shortfall(self, claim: Claim) -> Shortfall:
         """Return how far it falls short of a claim."""
@@ -74,15 +70,14 @@ def scenes() -> list[str]:
     return [name for name in sorted(entries()) if wanted <= set(environment_class(name).fidelities)]
 
 
-def kept(folder: Path = DATA) -> list[Row]:
-    """Return what the trade-offs in a folder say of draft and standard, of one device for each scene."""
-    return [row for name in scenes() for row in _rows(name, folder)]
+def kept(data: Path = DATA) -> list[Row]:
+    """Return what the trade-offs in the gallery's data say of draft and standard, of one device for each scene."""
+    return [row for name in scenes() for row in _rows(name, data)]
 
 
-def _rows(name: str, folder: Path) -> list[Row]:
+def _rows(name: str, data: Path) -> list[Row]:
     """Return the rows of the first device whose record is of the present scene, else of the first there is."""
-    paths = [path for device in DEVICES if (path := folder / f"{name}-{device}.json").is_file()]
-    found = [list(_read(name, json.loads(path.read_text()))) for path in paths]
+    found = [list(_read(name, record)) for record in records(name, TradeoffFiles.of, data)]
     return next((rows for rows in found if all(row.present for row in rows)), found[0] if found else [])
 
 
@@ -102,10 +97,10 @@ def before(path: Path = BEFORE) -> list[Row]:
     return [Row(**one) for one in json.loads(path.read_text())]
 
 
-def keep_before(folder: Path = DATA, path: Path = BEFORE) -> None:
+def keep_before(data: Path = DATA, path: Path = BEFORE) -> None:
     """Keep what the trade-offs say now as what was before."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps([asdict(row) for row in kept(folder)], indent=1) + "\n")
+    path.write_text(json.dumps([asdict(row) for row in kept(data)], indent=1) + "\n")
 
 
 def table(old: Sequence[Row], new: Sequence[Row]) -> str:
@@ -120,18 +115,13 @@ def table(old: Sequence[Row], new: Sequence[Row]) -> str:
 
 
 def _line(scene: str, claim: Claim, was: Row | None, now: Row | None) -> list[str]:
-    if was is None and now is None:
+    current = now if now is not None and now.present else None
+    known = [row for row in (was, current) if row is not None] or [row for row in (now,) if row is not None]
+    if not known:
         return [f"`{scene}`", claim.name, "", *[""] * 4, "not measured"]
-    latest, now = now, now if now is not None and now.present else None
-    was = latest if was is None and now is None else was
-    cells = [[] if row is None else _cells(row) for row in (was, now)]
-    devices = " → ".join(dict.fromkeys(row.device for row in (was, now) if row is not None))
-    joined = [
-        _change(*pair) for pair in zip(*(cell or cells[not number] for number, cell in enumerate(cells)), strict=True)
-    ]
-    verdict = _change(*(None if row is None else _verdict(row, claim) for row in (was, now)))
-    verdict = verdict if now is not None else f"{verdict} → {UNMEASURED}"
-    return [f"`{scene}`", claim.name, devices, *joined, verdict]
+    devices, *numbers = (_change(column) for column in zip(*([row.device, *_cells(row)] for row in known), strict=True))
+    verdict = _change([_verdict(row, claim) for row in known])
+    return [f"`{scene}`", claim.name, devices, *numbers, verdict if current else f"{verdict} → {UNMEASURED}"]
 
 
 def _cells(row: Row) -> list[str]:
@@ -152,8 +142,8 @@ def _verdict(row: Row, claim: Claim) -> str:
     return said + (", chaotic" if row.scene in CHAOTIC else "")
 
 
-def _change(was: str | None, now: str | None) -> str:
-    return " → ".join(dict.fromkeys(one for one in (was, now) if one is not None))
+def _change(values: Iterable[str]) -> str:
+    return " → ".join(dict.fromkeys(values))
 
 
 def changed(rows: Sequence[Row]) -> list[str]:
@@ -182,13 +172,9 @@ def main() -> int:
         keep_before()
     rows = kept()
     text = table(before(), rows)
-    if not asked.check:
-        write(text, PAGE, NAME)
     wrong = [f"{name}: {UNMEASURED}" for name in changed(rows)]
-    wrong += [f"{line}" for line in short(rows)]
-    wrong += [f"{PAGE}: differs from the records" for _ in range(written(PAGE, NAME) != text)]
-    print("\n".join(wrong) or f"all {len(rows)} fidelities keep what they claim")
-    return 1 if wrong and asked.check else 0
+    wrong += short(rows)
+    return settle(text, PAGE, NAME, wrong, check=asked.check, fine=f"all {len(rows)} fidelities keep what they claim")
 
 
 if __name__ == "__main__":

@@ -12,36 +12,30 @@ is not measured.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from gradscape.envs.code import code_digest
 from gradscape.envs.records import ModelPart
 from gradscape.envs.registry import entries, environment_class
+from gradscape.gallery.files import TradeoffFiles
+from gradscape.jobs.report_tables import markdown
 from gradscape.landscapes.measures.fidelity import Bootstrap
 from gradscape.landscapes.measures.model import MeasuredPart, ModelStudy
 
-from .marked import markdown, write, written
+from .pages import DATA, DOCS, UNMEASURED, is_present, records, settle
 
-ROOT = Path(__file__).parents[1]
-DATA, PAGE, NAME = ROOT / "gallery" / "data" / "tradeoff", ROOT / "docs" / "parts.md", "parts"
-DEVICES = ("cuda", "cpu")  # a study of the first is shown, where there is one of the present scene
-UNMEASURED = "not measured since the scene changed"
+PAGE, NAME = DOCS / "parts.md", "parts"
 HEAD = ("scene", "part", "changed to", "95 % of losses move by", "rank", "cosine", "time", "verdict")
 
 
-def studies(folder: Path = DATA) -> dict[str, ModelStudy]:
+def studies(data: Path = DATA) -> dict[str, ModelStudy]:
     """Return the kept study of each scene whose code is still what was measured, by name."""
     found = {}
     for name in sorted(entries()):
-        kind = environment_class(name)
-        for path in (folder / f"{name}-{device}.model.json" for device in DEVICES):
-            if path.is_file() and name not in found:
-                study = ModelStudy.of_record(json.loads(path.read_text()))
-                if study.identity["code"] == code_digest(kind, study.identity["engine"]):
-                    found[name] = study
+        for study in map(ModelStudy.of_record, records(name, TradeoffFiles.of_model, data)):
+            if is_present(name, study.identity["code"], study.identity["engine"]):
+                found.setdefault(name, study)
     return found
 
 
@@ -77,13 +71,9 @@ def main() -> int:
     parser.add_argument("--check", action="store_true", help="write nothing, say what is not so")
     asked = parser.parse_args()
     lines = list(rows(studies()))
-    text = markdown(HEAD, lines)
-    if not asked.check:
-        write(text, PAGE, NAME)
     wrong = [f"{line[0]} {line[1]}: {UNMEASURED}" for line in lines if line[-1] == UNMEASURED]
-    wrong += [f"{PAGE}: differs from the studies" for _ in range(written(PAGE, NAME) != text)]
-    print("\n".join(wrong) or f"all {len(lines)} parts are measured")
-    return 1 if wrong and asked.check else 0
+    text, fine = markdown(HEAD, lines), f"all {len(lines)} parts are measured"
+    return settle(text, PAGE, NAME, wrong, check=asked.check, fine=fine)
 
 
 if __name__ == "__main__":

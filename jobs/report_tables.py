@@ -47,7 +47,7 @@ def slice_rows(reports: Sequence[Report]) -> list[tuple[str, ...]]:
 
 def slices_markdown(reports: Sequence[Report]) -> str:
     """Return a row for each slice, as Markdown."""
-    return _markdown(HEADINGS, slice_rows(reports))
+    return markdown(HEADINGS, slice_rows(reports))
 
 
 def environments_markdown(reports: Sequence[Report]) -> str:
@@ -56,7 +56,7 @@ def environments_markdown(reports: Sequence[Report]) -> str:
     The small step is the smallest that sees a slope above the noise at half as many points as any step does.
     """
     groups = groupby(reports, key=lambda report: report.env)
-    return _markdown(ENVIRONMENTS, (_environment(env, list(group)) for env, group in groups))
+    return markdown(ENVIRONMENTS, (_environment(env, list(group)) for env, group in groups))
 
 
 def _environment(env: str, reports: Sequence[Report]) -> tuple[str, ...]:
@@ -125,6 +125,7 @@ def _slice(report: Report) -> tuple[str, ...]:
     )
 
 
-def _markdown(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+def markdown(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
     lines = [headings, ("---",) * len(headings), *rows]
     return "".join(f"| {' | '.join(row)} |\n" for row in lines)

@@ -1,19 +1,19 @@
 """docs/fidelities.md holds what the kept trade-offs say of every named fidelity, and which scenes changed since."""
 
 import copy
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import pytest
 from benchmarks import fidelities
-from benchmarks.fidelities import UNMEASURED, Row, changed, kept, short, table
-from benchmarks.marked import write, written
+from benchmarks.fidelities import Row, changed, kept, short, table
+from benchmarks.pages import DATA, UNMEASURED, write, written
 
 from gradscape.envs.code import code_digest
 from gradscape.envs.registry import environment_class
 from gradscape.landscapes.measures.choice import CLAIMS
+from gradscape.landscapes.storage.records import read_json, write_record
 
 
 def test_the_page_holds_the_records() -> None:
@@ -37,7 +37,7 @@ def test_the_page_names_the_fidelities_that_were_not_measured_since_their_scene_
 @pytest.fixture
 def records(tmp_path: Path) -> dict[str, Any]:
     """Return a record of the present scene whose fidelities keep their claims, which `save` puts into a folder."""
-    found: dict[str, Any] = json.loads((fidelities.DATA / "torus-cuda.json").read_text())
+    found: dict[str, Any] = read_json(DATA / "tradeoff" / "torus-cuda.json")
     kind = environment_class("torus")
     found["identity"]["code"] = code_digest(kind)
     for rung in found["rungs"]:
@@ -47,7 +47,9 @@ def records(tmp_path: Path) -> dict[str, Any]:
 
 
 def save(folder: Path, record: dict[str, Any]) -> list[Row]:
-    (folder / "torus-cuda.json").write_text(json.dumps(record))
+    path = folder / "tradeoff" / "torus-cuda.json"
+    path.parent.mkdir(exist_ok=True)
+    write_record(path, record)
     return kept(folder)
 
 

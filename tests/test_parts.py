@@ -1,14 +1,15 @@
 """docs/parts.md has a row for every part that a scene names, with what the kept study says of it."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 from benchmarks import parts
-from benchmarks.marked import markdown, written
-from benchmarks.parts import DATA, HEAD, NAME, PAGE, UNMEASURED, rows, studies
+from benchmarks.pages import DATA, UNMEASURED, written
+from benchmarks.parts import HEAD, NAME, PAGE, rows, studies
 
 from gradscape.envs.registry import entries, environment_class
+from gradscape.jobs.report_tables import markdown
+from gradscape.landscapes.storage.records import read_json, write_record
 
 
 def test_the_page_holds_the_studies() -> None:
@@ -30,7 +31,8 @@ def test_a_part_that_was_measured_otherwise_or_of_other_code_is_said_to_be_so(tm
     other = replace(study, parts=(replace(first, options={"mu": 0.1}), *others))
     line = next(line for line in rows({"bounce": other}) if line[:2] == ["`bounce`", first.name])
     assert line[3:] == ["", "", "", "", UNMEASURED]
-    record = json.loads((DATA / "bounce-cpu.model.json").read_text())
+    record = read_json(DATA / "tradeoff" / "bounce-cpu.model.json")
     record["identity"]["code"] = "000000000000"
-    (tmp_path / "bounce-cpu.model.json").write_text(json.dumps(record))
+    (tmp_path / "tradeoff").mkdir()
+    write_record(tmp_path / "tradeoff" / "bounce-cpu.model.json", record)
     assert parts.studies(tmp_path) == {}

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from benchmarks.drag import SHAPE, stokes_speed, wall_factor
+from benchmarks.drag import LAST, SHAPE, heights, stokes_speed, wall_factor
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -85,13 +85,10 @@ def speeds():
         return {case: rising(scene) for case, scene in made.items()}
 
 
-def rising(scene, steps=20):
-    """Return (speed upwards over the last half of so many control steps [m/s], rise over all [m]) of the cube."""
-    away = STILL.new_tensor([0.0, 10.0, 0.0]).expand(1, steps + 1, 1, 3)
-    with scene._solvers.lend() as stage:
-        stage.solver.run(away)
-        height = [float(scene._center(stage.solver.read_positions(k, 1))[0, 1]) for k in (0, steps // 2, steps)]
-    return (height[2] - height[1]) / (SPAN * steps / 2), height[2] - height[0]
+def rising(scene):
+    """Return (speed upwards over the last half of 20 control steps [m/s], rise over all [m]) of the cube."""
+    start, before, end = heights(scene, 2 * LAST)
+    return (end - before) / (SPAN * LAST), end - start
 
 
 def test_a_heavy_cube_sinks_and_a_light_one_rises(speeds):
