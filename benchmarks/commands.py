@@ -57,7 +57,7 @@ bounce --axis y --resolution 3 --extent 0:1 --fidelity draft
 bench branin --batch 2 --seconds 0
 check branin --points 2
 tradeoff bounce --points 2 --variants precision
-extremes bounce --points 2 --knobs dt --pairs none --fidelity draft
+extremes bounce --points 4 --knobs dt --pairs none --fidelity draft
 pairs ackley --samples 2 --top 3 --set dim=3
 report cut --points 2
 report --all --data data --points 2

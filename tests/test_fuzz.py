@@ -36,6 +36,14 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_what_lines_are_made_from_is_valid() -> None:
+    known = commands.verbs()
+    for line in commands.VALID:
+        words = line.split()
+        verb = max((one for one in known if words[: len(one.split())] == one.split()), key=len)
+        known[verb].make_context(verb, words[len(verb.split()) :])
+
+
 @pytest.mark.parametrize("verb", commands.verbs())
 def test_whatever_is_said_ends_with_a_message(verb: str, desk: Path, tmp_path: Path) -> None:
     """Ctrl-C comes with the first episode or page, so that what is valid is stopped and not computed."""

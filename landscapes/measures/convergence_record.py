@@ -71,10 +71,10 @@ class Move:
 class KnobConvergence:
     """Hold what the levels of one knob show, from coarse to fine.
 
-    `order` is the observed one, `per_point` each point's, `designed` the one that the scene
-    is built for. `moved` is the 95th percentile of what refining the reference once moves, as a share of the spread,
-    and `met` whether that is within a tenth of standard's error; `met_from` names the first level from which it is.
-    `floor` is what the median of |difference| does not fall below, None where it still falls.
+    `order` is the observed one, `per_point` each point's, `designed` the one that the scene is built for. `moved` is
+    the 95th percentile of what refining the reference once moves, as a share of the spread, and `met` whether that is
+    rounding or within a tenth of standard's error; `met_from` names the first level from which it is. `floor` is what
+    the median of |difference| does not fall below, None where it still falls.
     """
 
     knob: str
@@ -123,7 +123,7 @@ class KnobConvergence:
             said.insert(1, f"designed {self.designed:g}, {match}")
         if self.floor is not None:
             said.append(f"differences do not fall below {_percent(self.floor)}")
-        if self.met_from is not None:
+        if self.met_from is not None and self.verdict != "unmoved":
             said.append(f"within a tenth of standard's error from {self.met_from} on")
         return "; ".join(said)
 
@@ -151,10 +151,10 @@ class Remainder:
 
 @dataclass(frozen=True)
 class ConvergenceRule:
-    """Say whether the reference is one: refining it moves losses by less than a tenth of what standard is `off`.
+    """Say whether the reference is one: refining it moves losses by rounding or less than a tenth of standard's error.
 
-    Both are 95th percentiles, as shares of the spread; `moved` is by the `knob` that moves them most, and `failing`
-    are the knobs that move them by more.
+    `off` is that error. Both are 95th percentiles, as shares of the spread; `moved` is by the `knob` that moves them
+    most, and `failing` are the knobs that move them by more.
     """
 
     off: Bootstrap

@@ -188,6 +188,7 @@ def test_a_reference_that_moves_by_rounding_alone_is_converged_however_right_sta
     knob, _ = conclude(ladder("dt", WIDTHS, losses), "reference", scale_of(1e-10))
     rule = judge([knob], scale_of(1e-10))
     assert (rule.met, "is converged to rounding" in rule.say()) == (met, met)
+    assert "within a tenth" not in knob.say()
 
 
 def test_points_that_a_finer_level_fails_at_count_as_infinitely_far_off() -> None:
