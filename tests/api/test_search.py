@@ -92,7 +92,10 @@ def test_where_nothing_succeeded_there_is_no_best_and_it_is_said() -> None:
         ({"method": "random", "fidelity": "best"}, "has fidelities exact; got 'best'"),
     ],
 )
-def test_what_a_search_does_not_have_is_refused(wrong: dict, said: str) -> None:
+def test_what_a_search_does_not_have_is_refused(
+    wrong: dict, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # a checkout has a folder `out` after `make demo`
     with pytest.raises(ValueError, match=said):
         gs.optimize("branin", **wrong)
     assert not Path("out").exists()
@@ -150,7 +153,10 @@ def test_a_race_has_a_table_a_picture_and_a_line(tmp_path: Path) -> None:
         ({"methods": "random", "workers": 0}, "a number of workers is a whole number of at least 1"),
     ],
 )
-def test_what_a_race_does_not_have_is_refused(wrong: dict, said: str) -> None:
+def test_what_a_race_does_not_have_is_refused(
+    wrong: dict, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # a checkout has a folder `out` after `make demo`
     with pytest.raises(ValueError, match=said):
         gs.race("branin", **wrong)
     assert not Path("out").exists()
