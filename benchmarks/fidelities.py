@@ -82,11 +82,15 @@ def _rows(name: str, data: Path) -> list[Row]:
 
 
 def _read(name: str, record: dict[str, Any]) -> Iterator[Row]:
+    """Yield what a record says of each claim's fidelity: of the variant with its settings, else of its name."""
+    known = record["identity"]
+    rungs = [one for one in record["rungs"] if all(one[key] == known[key] for key in ("device", "engine", "options"))]
     for claim in CLAIMS:
-        for one in record["rungs"]:
-            if one["name"] == claim.name:
-                measured = {key: one[key] for key in MEASURED}
-                yield Row(name, one["device"], claim.name, one["fidelity"], measured, record["identity"]["code"])
+        now = asdict(environment_class(name).fidelities[claim.name])
+        same = [one for one in rungs if {**one["fidelity"], "name": claim.name} == now]
+        for one in (same or [one for one in rungs if one["name"] == claim.name])[:1]:
+            settings, measured = {**one["fidelity"], "name": claim.name}, {key: one[key] for key in MEASURED}
+            yield Row(name, one["device"], claim.name, settings, measured, known["code"])
 
 
 MEASURED = ("loss_error", "spearman", "gradient", "diverged", "compared", "seconds", "batch")

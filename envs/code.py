@@ -2,7 +2,8 @@
 
 It is taken of the scene's own file and of every file of this folder that it imports, directly or not, without their
 comments, docstrings and import lines. Other scenes, the other engine, and what no loss depends on do not count: a file
-that says `COMPUTES_LOSSES = False`, and the hooks by which scenes are drawn and described.
+that says `COMPUTES_LOSSES = False`, and the hooks by which scenes are drawn and described. Nor do settings that a record
+holds beside the digest: fidelities, and by which options parts of the model are left out.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ HERE = Path(__file__).resolve().parent
 # Hooks of a scene that no loss depends on.
 DESCRIBING = frozenset({"about", "episode", "events", "memory", "work", "_energy", "_observe"})
 DRAWING = frozenset({"_parts", "_surroundings", "_body_names", "_view", "_watch", "_length_scale"})
-NO_LOSS = DESCRIBING | DRAWING
+SETTINGS = frozenset({"fidelities", "model_parts"})  # records say which they are of
+NO_LOSS = DESCRIBING | DRAWING | SETTINGS
 
 
 @cache

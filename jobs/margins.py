@@ -40,20 +40,27 @@ def say_margins(env: Environment) -> list[str]:
     for path, record in _records(env.name):
         with reading(path, f"delete it, and `landscape extremes {env.name}` measures it anew"):
             if record["identity"]["options"] == asdict(env.options):
-                said += _sentences(record, _code(env, record["identity"]["engine"]))
+                said += _sentences(record, env)
     return list(dict.fromkeys(said)) or [f"stability: not measured; `landscape extremes {env.name}` measures it"]
 
 
-def _sentences(record: dict[str, Any], code: str) -> Iterator[str]:
-    """Yield what a record says of the step in each precision, and where and of what code it was measured."""
+def _sentences(record: dict[str, Any], env: Environment) -> Iterator[str]:
+    """Yield what a record says of the step in each precision, and where and of what settings it was measured."""
     known = record["identity"]
     of = f"{known['engine']} on {known['device']}, {record['points']} points, {record['provenance']['created']}"
-    if known["code"] != code:
+    if known["code"] != (code := _code(env, known["engine"])):
         of += f", of another version of the code, {known['code']}, this is {code}"
+    now = env.fidelities.get(record["fidelity"])
+    if now is not None and asdict(now) != known["settings"]:
+        of += f", when {record['fidelity']} was {_settings(known['settings'])}"
     for limit in record["limits"]:
         if limit["knob"] == "dt":
             right = _accuracy(record, limit)
             yield f"stability: {_margin(record['fidelity'], limit)}; {right} ({limit['precision']}; {of})"
+
+
+def _settings(settings: dict[str, Any]) -> str:
+    return ", ".join(f"{name} {value:g}" for name, value in settings.items() if isinstance(value, int | float) and value)
 
 
 def _margin(fidelity: str, limit: dict[str, Any]) -> str:

@@ -148,11 +148,14 @@ def _time(env: Environment, variants: Sequence[Environment]) -> dict[str, float]
     if path.is_file():
         with reading(path, "delete it, and fidelities are timed anew"):
             known = {name: number(seconds) for name, seconds in read_json(path).items()}
+    timed = {}
     for variant in variants:
-        if variant.fidelity.name not in known:
-            known[variant.fidelity.name] = seconds_with_gradient(variant)
+        key = f"{variant.fidelity.name} {digest(asdict(variant.fidelity))}"
+        if key not in known:
+            known[key] = seconds_with_gradient(variant)
             write_json(path, known)
-    return known
+        timed[variant.fidelity.name] = known[key]
+    return timed
 
 
 def seconds_with_gradient(env: Environment) -> float:
@@ -176,7 +179,7 @@ def find_variant(env: Environment, device: str) -> tuple[MeasuredVariant, Path]:
     Raises ValueError where nothing was.
     """
     found = _find(env.name, asdict(env.options), device)
-    for row in _rows(found[0], env.engine, device) if found else []:
+    for row in _rows(found[0], env, device) if found else []:
         if found and row.device == device and row.fidelity == asdict(env.fidelity):
             return row, found[1]
     raise ValueError(
@@ -206,7 +209,7 @@ def _candidates(env: Environment, options: Mapping[str, Any]) -> tuple[Tradeoff,
     if found is None:
         said = f"no fidelities of {env.name} with these options are measured"
         raise ValueError(f"{said}; `{shlex.join(measuring)}` measures them")
-    rows = _rows(found[0], env.engine, env.device)
+    rows = _rows(found[0], env, env.device)
     if not rows:
         measuring += ["--engine", env.engine]
         raise ValueError(f"{found[1]} holds no variant of engine {env.engine}; `{shlex.join(measuring)}` measures them")
@@ -244,10 +247,14 @@ def _read(name: str, path: Path) -> Tradeoff:
     return found
 
 
-def _rows(found: Tradeoff, engine: str, device: str) -> Sequence[MeasuredVariant]:
-    """Return the variants that solve the same problem on an engine, on a device if there are any."""
-    options = found.identity["options"]
-    rows = [row for row in found.variants if row.engine == engine and row.options == options]
+def _rows(found: Tradeoff, env: Environment, device: str) -> Sequence[MeasuredVariant]:
+    """Return the variants that solve the same problem on the engine, on a device if there are any.
+
+    What had the name of a fidelity whose settings have changed since is left out.
+    """
+    options, named = found.identity["options"], {name: asdict(one) for name, one in env.fidelities.items()}
+    rows = [row for row in found.variants if row.engine == env.engine and row.options == options]
+    rows = [row for row in rows if named.get(row.name, row.fidelity) == row.fidelity]
     return [row for row in rows if row.device == device] or rows
 
 

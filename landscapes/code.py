@@ -14,9 +14,9 @@ from types import ModuleType
 
 @cache
 def bare(file: Path, skipped: Collection[str] = frozenset()) -> str:
-    """Return the code of a file line by line, without comments, docstrings, imports and functions that are `skipped`.
+    """Return the code of a file line by line, without comments, docstrings, imports and what is `skipped`.
 
-    `skipped` are names of functions; they must be hashable together, as a frozenset is.
+    `skipped` are names of functions, and of what is assigned; they must be hashable together, as a frozenset is.
     """
     text = file.read_text()
     lines = text.splitlines()
@@ -31,8 +31,10 @@ def bare(file: Path, skipped: Collection[str] = frozenset()) -> str:
 
 
 def _silent(node: ast.AST, skipped: Collection[str]) -> Iterator[ast.stmt]:
-    """Yield what no number depends on in a node of a file: imports, docstrings, functions that are skipped."""
+    """Yield what no number depends on in a node of a file: imports, docstrings, functions and names skipped."""
     if isinstance(node, ast.Import | ast.ImportFrom) or (isinstance(node, ast.FunctionDef) and node.name in skipped):
+        yield node
+    if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.target.id in skipped:
         yield node
     if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
         yield node.body[0]

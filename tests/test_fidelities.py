@@ -65,7 +65,7 @@ def test_settings_other_than_the_scenes_are_named(records: dict[str, Any], tmp_p
     assert changed(save(tmp_path, records)) == []
     other = copy.deepcopy(records)
     for rung in other["rungs"]:
-        rung["fidelity"]["dt"] *= 2
+        rung["fidelity"]["dt"] *= 1.7
     assert changed(save(tmp_path, other)) == ["torus draft", "torus standard"]
 
 

@@ -90,7 +90,7 @@ class RollingPin(Plasticine):
     """
 
     name: ClassVar[str] = "rolling-pin"
-    fidelities: ClassVar[dict[str, Fidelity]] = fidelities(draft=(40, 1500, 12), standard=(64, 10_000, 20))
+    fidelities: ClassVar[dict[str, Fidelity]] = fidelities(draft=(40, 1500, 12), standard=(64, 10_000, 10))
     examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
         0.6 0 -1
@@ -173,7 +173,7 @@ class Torus(Plasticine):
     """
 
     name: ClassVar[str] = "torus"
-    fidelities: ClassVar[dict[str, Fidelity]] = fidelities(draft=(32, 800, 9), standard=(64, 5000, 20))
+    fidelities: ClassVar[dict[str, Fidelity]] = fidelities(draft=(32, 800, 9), standard=(64, 5000, 10))
     examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
         -1 -1 -0.6

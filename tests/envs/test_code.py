@@ -108,6 +108,8 @@ def test_another_engine_is_other_code() -> None:
         ("bounce.py", "def episode(): ...", set()),
         ("base.py", "G = 9.8", set()),
         ("sheets/swing.py", "def _parts(): ...", set()),
+        ("sheets/swing.py", "fidelities: dict[str, int] = {}", set()),
+        ("mpm/plasticine_model.py", "def fidelities(): ...", set()),
         ("engines/mpm/raster.py", "COMPUTES_LOSSES = False", set(SOFT)),
         ("sheets/lattice.py", "G = 9.8", {"swing-velocity", "swing-stiffness", "flip"}),
     ],
