@@ -31,10 +31,10 @@ def shortened(model, tools, steps=20):
     return replace(model, steps=steps), tools[:, : steps + 1].contiguous()
 
 
-def scene():
-    """Return the coarsest fluid scene, and two paths of its ladle."""
+def scene(**options):
+    """Return the coarsest fluid scene with these options, and two paths of its ladle."""
     tiny = Fidelity("tiny", dt=fluid.SPAN / 2, precision="float64", resolution=6, sampling=1.5)
-    environment = fluid.Fluid(fidelity=tiny, device="cpu")
+    environment = fluid.Fluid(fidelity=tiny, device="cpu", **options)
     x = torch.stack([environment.example("scoop"), 2 * draw(10, seed=1)])
     return shortened(environment.model, environment.tools(x))
 
@@ -73,7 +73,13 @@ def crowded(friction=0.5, **changes):
     return replace(model, **changes), places + time * 0.02 * draw(2, 1, 6, 3, seed=3) - time * 0.004
 
 
-MODELS = {"fluid": scene, "rolling-pin": rolling, "crowded": crowded, "sticky": lambda: crowded(STICKY)}
+MODELS = {
+    "fluid": scene,
+    "bowl between sticky walls": lambda: scene(handle=False, walls="stick"),
+    "rolling-pin": rolling,
+    "crowded": crowded,
+    "sticky": lambda: crowded(STICKY),
+}
 
 
 @dataclass
