@@ -178,7 +178,7 @@ def cells(scene: str, fidelity: str, factor: float) -> str:
     ("scene", "wanted"),
     [
         ("bounce", {"draft-ke-x4", "draft-dt-x2", "draft-float64", "reference-float32", "draft on cuda"}),
-        ("fluid", {cells("fluid", "standard", 1.5), "draft-particles-x2", "draft on taichi", "standard-dt-x4"}),
+        ("fluid", {cells("fluid", "standard", 1.5), "draft-particles-x2", "draft on taichi", "standard-dt-x2"}),
         ("table", {"standard-particles-x0.5", cells("table", "draft", 2 / 3)}),
         ("flip", {cells("flip", "standard", 2 / 3), "draft on taichi"}),
     ],

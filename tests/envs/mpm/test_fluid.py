@@ -68,7 +68,8 @@ def test_the_pressure_of_syrup_at_rest_is_hydrostatic(monkeypatch):
     for low in torch.arange(0, FILL - 0.01, 0.025):
         layer = (height >= low) & (height < low + 0.025)
         wanted = SYRUP_DENSITY * GRAVITY * (FILL - height[layer].mean())
-        assert abs(float(pressure[layer].mean() - wanted)) < 0.05 * floor  # nodes of the floor weigh on one side only
+        allowed = 0.06 if low == 0 else 0.04  # nodes of the floor weigh on one side only
+        assert abs(float(pressure[layer].mean() - wanted)) < allowed * floor
         assert pressure[layer].std() < 0.06 * floor  # of it a layer's own slope is 0.04
 
 
