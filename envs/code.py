@@ -2,8 +2,8 @@
 
 It is taken of the scene's own file and of every file of this folder that it imports, directly or not, without their
 comments, docstrings and import lines. Other scenes, the other engine, and what no loss depends on do not count: a file
-that says `COMPUTES_LOSSES = False`, and the hooks by which scenes are drawn and described. Nor do settings that a record
-holds beside the digest: fidelities, and by which options parts of the model are left out.
+that says `COMPUTES_LOSSES = False`, and the hooks by which scenes are drawn and described. Nor do settings count that a
+record holds beside the digest: fidelities, and by which options parts of the model are left out.
 """
 
 from __future__ import annotations

@@ -50,17 +50,13 @@ def _sentences(record: dict[str, Any], env: Environment) -> Iterator[str]:
     of = f"{known['engine']} on {known['device']}, {record['points']} points, {record['provenance']['created']}"
     if known["code"] != (code := _code(env, known["engine"])):
         of += f", of another version of the code, {known['code']}, this is {code}"
-    now = env.fidelities.get(record["fidelity"])
-    if now is not None and asdict(now) != known["settings"]:
-        of += f", when {record['fidelity']} was {_settings(known['settings'])}"
+    now = asdict(env.fidelities[record["fidelity"]]) if record["fidelity"] in env.fidelities else known["settings"]
+    if others := [f"{name} {value}" for name, value in known["settings"].items() if value != now[name]]:
+        of += f", when {record['fidelity']} had {', '.join(others)}"
     for limit in record["limits"]:
         if limit["knob"] == "dt":
             right = _accuracy(record, limit)
             yield f"stability: {_margin(record['fidelity'], limit)}; {right} ({limit['precision']}; {of})"
-
-
-def _settings(settings: dict[str, Any]) -> str:
-    return ", ".join(f"{name} {value:g}" for name, value in settings.items() if isinstance(value, int | float) and value)
 
 
 def _margin(fidelity: str, limit: dict[str, Any]) -> str:

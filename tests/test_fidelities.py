@@ -69,6 +69,18 @@ def test_settings_other_than_the_scenes_are_named(records: dict[str, Any], tmp_p
     assert changed(save(tmp_path, other)) == ["torus draft", "torus standard"]
 
 
+def test_a_variant_with_the_settings_of_a_name_counts_as_it(records: dict[str, Any], tmp_path: Path) -> None:
+    for rung in records["rungs"]:
+        if rung["name"] == "draft":
+            rung["name"] = rung["fidelity"]["name"] = "draft-dt-x2"
+            rung["gradient"]["cosine"]["value"] = 0.5
+        elif rung["name"] == "standard-dt-x0.5":
+            rung["name"] = rung["fidelity"]["name"] = "draft"  # what had the name
+    (row,) = [row for row in save(tmp_path, records) if row.name == "draft"]
+    assert row.present
+    assert row.comparison.gradient.cosine.value == 0.5
+
+
 def test_a_scene_whose_code_is_another_is_named_and_its_numbers_are_not_shown(
     records: dict[str, Any], tmp_path: Path
 ) -> None:

@@ -284,6 +284,18 @@ def test_a_tolerance_that_nothing_meets_names_the_best(run: Command, tmp_path: P
     assert "warning: measured with another version of the code of converging, older" in some.stderr
 
 
+def test_a_name_whose_settings_changed_since_is_not_chosen(
+    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(*TRADE, cwd=tmp_path)
+    how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--tolerance", "50%"]
+    before = json.loads(run(*how, "--out", "before", "--json", cwd=tmp_path).stdout)["fidelity"]
+    monkeypatch.setattr(Converging, "fidelities", {**Converging.fidelities, "draft": Fidelity("draft", dt=0.125)})
+    after = json.loads(run(*how, "--out", "after", "--json", cwd=tmp_path).stdout)["fidelity"]
+    assert before == "draft"
+    assert after != "draft"
+
+
 def test_the_gallerys_rungs_of_the_same_problem_are_found_where_nothing_of_the_users_own_is(
     run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,7 +1,7 @@
 """`landscape extremes` on schemes whose stability is known in closed form."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -189,7 +189,9 @@ def test_islands_beyond_the_first_failure_are_reported(tmp_path: Path) -> None:
     assert limit.islands == ((pytest.approx(0.32), pytest.approx(0.64)),)
 
 
-def test_what_never_fails_is_stable_up_to_the_last_that_was_tried(tmp_path: Path) -> None:
+def test_what_never_fails_is_stable_up_to_the_last_that_was_tried(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     found = turn(Harmless, tmp_path, "dt")
     limit = limit_of(found, "dt")
     assert (limit.failed, limit.beyond) == (None, "")
@@ -197,6 +199,10 @@ def test_what_never_fails_is_stable_up_to_the_last_that_was_tried(tmp_path: Path
     (said,) = say_margins(Harmless(device="cpu"))
     assert "standard's step is stable, and so is one 64 times as long; all losses are within 10%" in said
     assert "(float64; warp on cpu, 4 points" in said
+    assert "when standard had" not in said
+    monkeypatch.setattr(Harmless, "fidelities", {"standard": replace(Harmless.fidelities["standard"], dt=0.01)})
+    (said,) = say_margins(Harmless(device="cpu"))
+    assert said.endswith(", when standard had dt 0.02)")
 
 
 def test_finite_losses_that_are_wrong_are_called_so(tmp_path: Path) -> None:
