@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from .. import style
-from . import page
+from . import page, panel
 
 if TYPE_CHECKING:
     from ...measures.census_record import Census
@@ -40,11 +40,10 @@ def census_figure(census: Census, *, width: float | None = None) -> page.Picture
     for empty in axes[len(census.slices) :]:
         empty.set_axis_off()
     unit = f" [{census.loss_unit}]" if census.loss_unit else ""
-    bar = picture.colorbar(drawn, ax=axes, fraction=0.05, pad=0.02, extend=scale.extend)
-    bar.set_label(f"loss{unit}", size=sheet.label, color=style.INK, parse_math=False)
-    bar.ax.tick_params(labelsize=sheet.tick, colors=style.INK)
-    _write_head(picture, census)
-    page.finish(picture, _words(census), columns=2)
+    panel.colour_bar(axes[0], drawn, f"loss{unit}", scale, beside=axes)
+    many = f"{len(census.slices)} slices, the least rugged first"
+    page.entitle(picture, f"{census.env} · census at {census.fidelity} · {many}")
+    page.finish(picture, _words(census), columns=2, heading=_made(census))
     return picture
 
 
@@ -58,9 +57,9 @@ def _draw(ax: Axes, loss: NDArray[np.float32], scale: style.Scale) -> AxesImage:
     )
 
 
-def _write_head(picture: page.Picture, census: Census) -> None:
-    many = f"{len(census.slices)} slices, the least rugged first"
-    page.entitle(picture, f"{census.env} · census at {census.fidelity} · {many}")
+def _made(census: Census) -> str:
+    known = (census.identity.get("device"), census.provenance.get("created"), census.command)
+    return " · ".join(str(one) for one in known if one)
 
 
 def _words(census: Census) -> list[Patch]:
