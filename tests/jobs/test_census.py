@@ -85,7 +85,22 @@ def test_what_cannot_be_is_refused(tmp_path: Path) -> None:
 
 def test_the_verb_and_python_say_the_same(run: Callable[..., Said], tmp_path: Path) -> None:
     said = run(
-        *["census", "ackley", "--set", "dim=3", "--slices", "4", "--resolution", "8", "--device", "cpu", "--out", "made", "--json"], cwd=tmp_path
+        *[
+            "census",
+            "ackley",
+            "--set",
+            "dim=3",
+            "--slices",
+            "4",
+            "--resolution",
+            "8",
+            "--device",
+            "cpu",
+            "--out",
+            "made",
+            "--json",
+        ],
+        cwd=tmp_path,
     )
     assert said.returncode == 0, said.stderr
     assert "slices that it fits" in said.stderr
