@@ -158,7 +158,10 @@ def survey(objective: Objective, plane: Plane, *, deviation: float, seed: int) -
 
 
 def sample(objective: Objective, plane: Plane) -> xr.Dataset:
-    """Evaluate a plane of an objective, in batches that it prefers; points outside its box are left out, as NaN."""
+    """Evaluate a plane of an objective, in batches that it prefers; points outside its box are left out, as NaN.
+
+    Raises ValueError where the objective has no gradients.
+    """
     u, v = plane.axes()
     grid = torch.stack(torch.meshgrid(v, u, indexing="ij")[::-1], dim=-1).reshape(-1, 2)
     batch = getattr(objective, "preferred_batch", len(grid))
