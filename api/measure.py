@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, Any, Literal, Unpack
 
 from ..jobs.scene import SceneSpec
 from ..jobs.watch import Watch
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from ..jobs.pairs import PairRanking
     from ..jobs.report import ReportedSlice
     from ..jobs.report_record import Report
+    from ..landscapes.measures.census_record import Census
     from ..landscapes.measures.extremes import Extremes
     from ..landscapes.slice import Slice
 
@@ -132,6 +133,35 @@ def pairs(
     command = say_call("pairs", scene, samples=samples, seed=seed, **keywords)
     job = PairsJob.open(spec.resolve(watch), samples=samples, seed=seed, out=_path(out), force=force, command=command)
     return job.run(watch)
+
+
+def census(
+    scene: Scene,
+    *,
+    slices: int = 64,
+    resolution: int = 24,
+    along: Literal["pairs", "random"] = "pairs",
+    also: str | None = None,
+    seed: int = 0,
+    out: str | Path | None = None,
+    force: bool = False,
+    **keywords: Unpack[SceneKeywords],
+) -> Census:
+    """Sample many slices through random points along random cuts, measure each, and say what they have in common.
+
+    Slices are of every one of some random base points along every one of as many cuts: `along` pairs of parameters or
+    random directions, with `resolution` points per axis. One slice of each base point is measured at the fidelity
+    `also`, too. The census lies in `out`, by default a folder under out/ named after it: the same call goes on there.
+
+    Raises ValueError where the scene has one parameter, StoreMismatchError where the folder holds another census, which
+    `force` replaces; Stopped where it is interrupted.
+    """
+    from ..jobs.census import CensusJob
+
+    watch, spec = default_watch(), spec_of(scene, keywords)
+    how: dict[str, Any] = {"slices": slices, "resolution": resolution, "along": along, "also": also, "seed": seed}
+    command = say_call("census", scene, **how, **keywords)
+    return CensusJob.open(spec.resolve(watch), **how, out=_path(out), force=force, command=command).run(watch)
 
 
 def _subject(what: Slice | Path | Scene, points: int, watch: Watch, keywords: SceneKeywords) -> ReportedSlice:

@@ -66,6 +66,7 @@ MIXED = Results("search of mixed variants", ("mixed.json", "mixed.png"), "mixed.
 CONVERGENCE = Results("study of convergence", ("convergence.json", "convergence.png"), "convergence.png")
 EXTREMES = Results("study of extremes", ("extremes.json", "extremes.png"), "extremes.png")
 PAIRS = Results("study of pairs", ("pairs.json",))
+CENSUS = Results("census", ("census.json", "census.npz", "census.png"), "census.png")
 
 
 def digest(settings: Any) -> str:

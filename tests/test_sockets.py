@@ -44,6 +44,7 @@ tradeoff cartpole --set horizon=0.02 --points 2 --ladder mixed --chaotic --budge
 extremes bounce --points 4 --knobs dt --precisions float64 --fidelity draft --device cpu
 pairs bounce --samples 2 --fidelity draft --device cpu
 report cut --device cpu
+census branin --slices 1 --resolution 6
 gallery compute --only bounce-y --part slices --resolution 4 --fidelity draft --device cpu --data data
 gallery list --data data
 gallery build --data data --out site

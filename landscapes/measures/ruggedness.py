@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import cast
 
@@ -235,8 +236,8 @@ class Ruggedness:
         return cast("LossesRecord", plain(vars(self)))
 
 
-def ruggedness(dataset: xr.Dataset, *, floor: float) -> Ruggedness:
-    """Measure the ruggedness of a slice."""
+def ruggedness(dataset: xr.Dataset, *, floor: float, estimate: Callable[..., Estimate] = jackknife) -> Ruggedness:
+    """Measure the ruggedness of a slice; `estimate` takes a statistic and samples, and gives its interval, too."""
     loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
     found, whole = minima(loss), span(loss)
     notable = found.sample[found.depth > max(floor, NOTABLE * whole)]
@@ -254,22 +255,20 @@ def ruggedness(dataset: xr.Dataset, *, floor: float) -> Ruggedness:
         curve={part: found.count(part * whole) for part in THRESHOLDS},
         largest_basin=float(shares.max()),
         lowest_basin=float(shares[0]),
-        zero=None if slopes is None else jackknife(_mean, _below(slopes, 0.0), least=0.0, most=1.0),
-        flat=None if slopes is None else jackknife(_mean, _below(slopes, FLAT_SLOPE * whole), least=0.0, most=1.0),
-        level=jackknife(_mean, level_samples(loss, floor), least=0.0, most=1.0),
+        zero=None if slopes is None else estimate(_mean, _below(slopes, 0.0), least=0.0, most=1.0),
+        flat=None if slopes is None else estimate(_mean, _below(slopes, FLAT_SLOPE * whole), least=0.0, most=1.0),
+        level=estimate(_mean, level_samples(loss, floor), least=0.0, most=1.0),
         correlation_length=tuple(
-            jackknife(lambda part, axis=axis: correlation_length(part, axis), loss, least=0.0, most=1.0)  # type: ignore[misc]
-            for axis in axes
+            estimate(lambda part, axis=axis: correlation_length(part, axis), loss, least=0.0, most=1.0) for axis in axes
         ),
         total_variation=tuple(
-            jackknife(lambda part, axis=axis: total_variation(part, axis), loss, least=1.0)  # type: ignore[misc]
-            for axis in axes
+            estimate(lambda part, axis=axis: total_variation(part, axis), loss, least=1.0) for axis in axes
         ),
-        information=jackknife(lambda part: information_content(part)[0], loss, least=0.0, most=1.0),
-        settling=jackknife(lambda part: information_content(part)[1], loss),
-        turns=jackknife(turns, loss, least=0.0, most=1.0),
-        dispersion=jackknife(dispersion, loss, least=0.0),
-        fitness_distance=jackknife(fitness_distance, loss, least=-1.0, most=1.0),
+        information=estimate(lambda part: information_content(part)[0], loss, least=0.0, most=1.0),
+        settling=estimate(lambda part: information_content(part)[1], loss),
+        turns=estimate(turns, loss, least=0.0, most=1.0),
+        dispersion=estimate(dispersion, loss, least=0.0),
+        fitness_distance=estimate(fitness_distance, loss, least=-1.0, most=1.0),
     )
 
 

@@ -7,7 +7,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from .api.environments import list_envs
-    from .api.measure import check, extremes, pairs, report
+    from .api.measure import census, check, extremes, pairs, report
     from .api.overlay import overlay
     from .api.search import open_run, optimize, race
     from .api.slice import open_slice, slice
@@ -50,6 +50,7 @@ _HOMES = {
     "open_slice": "api.slice",
     "optimize": "api.search",
     "overlay": "api.overlay",
+    "census": "api.measure",
     "pairs": "api.measure",
     "race": "api.search",
     "register": "envs.registry",
@@ -74,6 +75,7 @@ __all__ = [
     "Slice",
     "Status",
     "__version__",
+    "census",
     "check",
     "extremes",
     "from_numpy",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -80,11 +80,19 @@ def caption(ax: Axes, text: str) -> None:
     write_over(ax, text, size=sheet_of(ax).label, color=style.INK)
 
 
-def colour_bar(ax: Axes, drawn: ScalarMappable, label: str, scale: style.Scale | None = None, **how: Any) -> Colorbar:
-    """Put a colour bar beside a panel, with plain numbers where the scale is logarithmic."""
+def colour_bar(
+    ax: Axes,
+    drawn: ScalarMappable,
+    label: str,
+    scale: style.Scale | None = None,
+    *,
+    beside: Sequence[Axes] = (),
+    **how: Any,
+) -> Colorbar:
+    """Put a colour bar beside a panel, or several, with plain numbers where the scale is logarithmic."""
     sheet = sheet_of(ax)
     place: dict[str, Any] = {"fraction": 0.05, "pad": 0.02, "extend": scale.extend if scale else "neither"} | how
-    bar = ax.figure.colorbar(drawn, ax=ax, **place)
+    bar = ax.figure.colorbar(drawn, ax=[*beside] or ax, **place)
     lying = bar.orientation == "horizontal"
     _name(ax, bar.long_axis, label, (lambda: title_room(ax)) if lying else (lambda: side_room(ax)))
     bar.ax.tick_params(which="both", **_ticks(sheet))

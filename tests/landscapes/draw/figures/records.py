@@ -6,6 +6,9 @@ from typing import Any
 import numpy as np
 
 from gradscape.landscapes.draw import style
+from gradscape.landscapes.measures.census import MEASURES, CensusDesign, SurveyedSlice
+from gradscape.landscapes.measures.census_record import Census, conclude
+from gradscape.landscapes.measures.classify import WORDS
 from gradscape.landscapes.measures.convergence import Shapes
 from gradscape.landscapes.measures.convergence_record import (
     Convergence,
@@ -19,6 +22,7 @@ from gradscape.landscapes.measures.distributions import ComparedDistribution, Di
 from gradscape.landscapes.measures.extremes import Extremes, Limit, StabilityMap
 from gradscape.landscapes.measures.fidelity import Bootstrap
 from gradscape.landscapes.measures.stability import STABLE, Cell
+from gradscape.landscapes.space import ParameterSpace
 
 from ...measures.test_fidelity import REPORT, rung
 
@@ -109,3 +113,20 @@ def mixed() -> dict[str, Any]:
     ]
     named = [row for row in REPORT["rungs"] if row["ladder"] == "named"]
     return {**REPORT, "env": "triple-move", "rungs": [*named, *rows]}
+
+
+def census() -> Census:
+    """Return a census of 64 slices, one of which failed everywhere."""
+    space = ParameterSpace.box([f"x{n}" for n in range(6)], 0.0, 1.0)
+    design = CensusDesign.draw(space, 64, along="pairs", resolution=6, seed=0)
+    draw = np.random.default_rng(0)
+    found = [
+        SurveyedSlice(
+            draw.random((6, 6)) + 0.1 * number, draw.random(len(MEASURES)), draw.random(len(MEASURES)),
+            tuple(word for k, word in enumerate(WORDS) if number % (k + 2) == 0), 36,
+        )
+        for number in range(64)
+    ]  # fmt: skip
+    found[5].loss[:] = np.nan
+    about = {"env": "bowl", "fidelity": "draft", "other": "", "loss_unit": "m", "command": COMMAND.format("census")}
+    return conclude(design, found, {}, seed=0, **about, identity=MEASURED, provenance=MEASURED)

@@ -1,0 +1,242 @@
+"""The census of a scene: many slices of it, each sampled and measured by itself, here or by workers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cloudpickle
+import numpy as np
+
+from ..landscapes.capacity import Need, require
+from ..landscapes.cost import duration, seconds_per_episode
+from ..landscapes.sampling.distribution import make_objective, run_tasks
+from ..landscapes.storage.files import replacing, tidy
+from ..landscapes.storage.records import read_json, reading, write_record
+from .folder import CENSUS, ROOT, folder_named
+from .scene import SceneSpec, provenance
+from .watch import PREPARING, Watch, resumable
+from .workers import recipe
+
+if TYPE_CHECKING:
+    from ..envs.base import Environment
+    from ..landscapes.measures.census import CensusDesign, SurveyedSlice
+    from ..landscapes.measures.census_record import Census
+    from ..landscapes.plane import Plane
+    from ..landscapes.storage.checkpoint import Checkpoint
+
+RECORD, LOSSES, PICTURE = CENSUS.files
+SLICES, RESOLUTION = 64, 24
+NOISE_POINTS, REPEATS = 16, 4
+COPIES = 4  # of the losses and gradients of a slice, beside the losses of all
+
+
+@dataclass(frozen=True)
+class Task:
+    """Hold a slice to survey: the name of its piece, its number in the design, and of which environment it is."""
+
+    piece: str
+    number: int
+    other: bool
+
+
+@dataclass(frozen=True)
+class CensusJob:
+    """The slices of `design` to survey for `env`; a piece on disk for each.
+
+    Some of them, one for each base point as far as cuts go, are surveyed for `other`, too: the scene at another
+    fidelity, None for none. `prints` are widths of pages [mm] that the census is also drawn for; with an `executor` its
+    workers survey, a slice each.
+    """
+
+    env: Environment
+    other: Environment | None
+    design: CensusDesign
+    seed: int
+    pieces: Checkpoint
+    command: str
+    prints: Sequence[float] = ()
+    executor: Executor | None = None
+
+    @classmethod
+    def open(
+        cls,
+        scene: SceneSpec,
+        *,
+        slices: int = SLICES,
+        resolution: int = RESOLUTION,
+        along: str = "pairs",
+        also: str | None = None,
+        seed: int = 0,
+        out: Path | None = None,
+        root: Path = ROOT,
+        force: bool = False,
+        prints: Sequence[float] = (),
+        command: str = "",
+    ) -> CensusJob:
+        """Go on with the census in its folder, by default one named after it under `root`, or begin it there.
+
+        Raises ValueError for what the scene does not have, for fewer than six samples along an axis, and where the
+        scene has one parameter; TooLargeError for more slices than there is memory for; StoreMismatchError where the
+        folder holds another census.
+        """
+        from ..landscapes.measures.census import CensusDesign
+        from ..landscapes.storage.checkpoint import Checkpoint
+
+        env = scene.make()
+        if resolution < 6:
+            raise ValueError(
+                f"a census measures every second sample, too, so it takes 6 along an axis; got {resolution}"
+            )
+        bytes_each = 8.0 * resolution**2
+        require("slices", slices, lambda count: Need(bytes_each * (count + COPIES * env.space.dim), bytes_each * count))
+        design = CensusDesign.draw(env.space, slices, along=along, resolution=resolution, seed=seed)
+        other = replace(scene, fidelity=also, tolerance=None).make() if also else None
+        identity = {**env.identity(), "slices": slices, "resolution": resolution, "along": along, "seed": seed}
+        identity["other"] = other.identity()["settings"] if other else None
+        folder = out or folder_named(["census", env.name, env.fidelity.name, slices], identity, root)
+        pieces = Checkpoint.open(folder, identity, what="census", force=force)
+        return cls(env, other, design, seed, pieces, command, prints)
+
+    @property
+    def folder(self) -> Path:
+        """Where it is kept."""
+        return self.pieces.folder
+
+    @property
+    def tasks(self) -> list[Task]:
+        """What is to be surveyed: every slice, then those of the other fidelity."""
+        whole = [Task(f"slice-{number}", number, False) for number in range(len(self.design.places))]
+        many = len(self.design.cuts)
+        again = [Task(f"other-{n}", n, True) for n, (b, c) in enumerate(self.design.places) if c == b % many]
+        return whole + (again if self.other else [])
+
+    def run(self, watch: Watch | None = None) -> Census:
+        """Survey what is missing; draw, write and return the census.
+
+        Raises Stopped where it is interrupted, and DiskFullError; the same job goes on with the next slice then.
+        """
+        from ..landscapes.draw.figures.page import save, save_prints
+
+        watch = watch or Watch()
+        with resumable(self.say_kept):
+            deviation = self._noise(watch)
+            self._announce(watch)
+            found = self._conclude(self._survey(deviation, watch))
+            picture = self.folder / PICTURE
+            save(found.plot(), picture)
+            save_prints(lambda width: found.plot(width), picture, self.prints)
+            with replacing(self.folder / LOSSES) as partial, partial.open("wb") as file:
+                np.savez_compressed(file, loss=found.losses)
+            write_record(self.folder / RECORD, found.record())
+            tidy(self.folder)
+        return found
+
+    def say_kept(self) -> str:
+        """Say how much of it is on disk."""
+        return f"{len(self.tasks) - len(self.left())} of {len(self.tasks)} slices are kept in {self.folder}"
+
+    def left(self) -> list[Task]:
+        """Return what is not surveyed yet."""
+        return [task for task in self.tasks if self.pieces.load(task.piece) is None]
+
+    def _noise(self, watch: Watch) -> float:
+        """Return the deviation of the losses' noise [loss unit], measured at random points of the box."""
+        from ..landscapes.measures.noise import noise
+        from ..landscapes.measures.profile import PRECISION
+
+        if (kept := self.pieces.load("noise")) is None:
+            with watch.busy(f"{self.env.name}: {PREPARING}, then its noise"):
+                self.env.prepare()
+                x = self.env.space.uniform(NOISE_POINTS, seed=self.seed)
+                rounding = PRECISION[self.env.fidelity.precision]
+                found = noise(self.env, x, rounding=rounding, repeats=REPEATS, seed=self.seed)
+            kept = {"deviation": np.array(found.deviation)}
+            self.pieces.save("noise", **kept)
+        return float(np.nan_to_num(kept["deviation"]))
+
+    def _announce(self, watch: Watch) -> None:
+        left, samples = self.left(), self.design.resolution**2
+        bases, cuts = len(self.design.bases), len(self.design.cuts)
+        watch.note(f"{self.env.name} · {self.env.fidelity.name} · {self.env.device} · {self.folder}")
+        what = (
+            f"{len(self.design.places)} slices: {bases} base points, each along {cuts} cuts, {samples} samples a slice"
+        )
+        kept = f"; {len(self.tasks) - len(left)} are there already" if len(left) < len(self.tasks) else ""
+        watch.note(f"{what}{kept}")
+        if left:
+            x = self.env.space.uniform(min(self.env.preferred_batch, samples), seed=0)
+            each = seconds_per_episode(self.env, x, grad=True)
+            watch.note(f"about {duration(len(left) * samples * each)} here; --slices and --resolution lower it")
+
+    def _survey(self, deviation: float, watch: Watch) -> dict[str, SurveyedSlice]:
+        from ..landscapes.measures.census import SurveyedSlice
+
+        left = self.left()
+        with watch.progress(len(self.tasks), "slices") as advance:
+            done = len(self.tasks) - len(left)
+            advance(done)
+            for piece, arrays in self._do(left, deviation):
+                self.pieces.save(piece, **arrays)
+                advance(done := done + 1)
+        pieces = {task.piece: self.pieces.load(task.piece) for task in self.tasks}
+        return {name: SurveyedSlice.of_arrays(arrays) for name, arrays in pieces.items() if arrays is not None}
+
+    def _do(self, tasks: Sequence[Task], deviation: float) -> Iterator[tuple[str, Mapping[str, Any]]]:
+        """Survey slices, here one after another or by workers, and yield what each one's piece holds."""
+        for other in (False, True):
+            env = self.other if other else self.env
+            chosen = [task for task in tasks if task.other == other]
+            todo = [(task.piece, self.design.plane(*self.design.places[task.number])) for task in chosen]
+            if env is None or not todo:
+                continue
+            if self.executor is None:
+                for piece, plane in todo:
+                    yield _survey(env, piece, plane, deviation, self.seed)
+                continue
+            there = cloudpickle.dumps(recipe(env))
+            yield from run_tasks(self.executor, _survey_there, [(there, *one, deviation, self.seed) for one in todo])
+
+    def _conclude(self, found: Mapping[str, SurveyedSlice]) -> Census:
+        from ..landscapes.measures.census_record import conclude
+
+        whole = [found[task.piece] for task in self.tasks if not task.other]
+        others = {task.number: found[task.piece] for task in self.tasks if task.other}
+        return conclude(
+            self.design,
+            whole,
+            others,
+            seed=self.seed,
+            env=self.env.name,
+            fidelity=self.env.fidelity.name,
+            other=self.other.fidelity.name if self.other else "",
+            loss_unit=self.env.loss_unit,
+            identity=self.env.identity(),
+            provenance=provenance(self.env, self.command),
+            command=self.command,
+        )
+
+
+def open_census(folder: Path) -> Census:
+    """Read the census in a folder. Raises DamagedError where it holds none that is whole."""
+    from ..landscapes.measures.census_record import Census
+
+    todo = "delete it, and `landscape census` goes on from the slices that are kept"
+    with reading(folder / LOSSES, todo), np.load(folder / LOSSES, allow_pickle=False) as arrays:
+        losses = arrays["loss"]
+    with reading(folder / RECORD, todo):
+        return Census.of_record(read_json(folder / RECORD), losses)
+
+
+def _survey(env: Any, piece: str, plane: Plane, deviation: float, seed: int) -> tuple[str, dict[str, Any]]:
+    from ..landscapes.measures.census import survey
+
+    return piece, survey(env, plane, deviation=deviation, seed=seed).arrays()
+
+
+def _survey_there(there: bytes, piece: str, plane: Plane, deviation: float, seed: int) -> tuple[str, dict[str, Any]]:
+    """Survey a slice on a worker, which keeps the environment that it has made."""
+    return _survey(make_objective(there).objective, piece, plane, deviation, seed)

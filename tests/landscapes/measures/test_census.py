@@ -1,0 +1,116 @@
+"""The census: what is cut, what is asked, and how variance and words are shared out."""
+
+import numpy as np
+import pytest
+import torch
+
+from gradscape.landscapes.measures.census import MEASURES, CensusDesign, survey, thin_out
+from gradscape.landscapes.measures.census import sample as sample_plane
+from gradscape.landscapes.measures.census_statistics import bootstrap, divide, spread, word_shares
+from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.plane import Plane
+from gradscape.landscapes.space import ParameterSpace
+
+BOX = ParameterSpace.box([f"x{n}" for n in range(5)], -1.0, 3.0)
+
+
+class Bowl:
+    """A bowl that nobody may ask beyond its box."""
+
+    space = BOX
+    asked = 0
+
+    def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
+        assert bool(((x >= BOX.lower) & (x <= BOX.upper)).all())
+        self.asked += len(x)
+        return Evaluation.from_results(x.square().sum(dim=1), 2 * x if grad else None)
+
+
+def test_every_cut_goes_through_every_point_and_none_is_drawn_twice() -> None:
+    design = CensusDesign.draw(BOX, 64, along="pairs", resolution=8, seed=1)
+    assert (len(design.bases), len(design.cuts)) == (8, 8)
+    assert len({cut.dims for cut in design.cuts}) == 8
+    assert len(set(design.places)) == 64
+    plane = design.plane(3, 2)
+    axes = list(design.cuts[2].dims or ())
+    assert plane.lower.tolist() == [-1.0, -1.0]
+    held = [k for k in range(5) if k not in axes]
+    assert plane.origin[held].tolist() == design.bases[3][held].tolist()
+    again = CensusDesign.draw(BOX, 64, along="pairs", resolution=8, seed=1)
+    assert torch.equal(again.bases, design.bases)
+    assert again.cuts == design.cuts
+
+
+def test_few_pairs_leave_more_points_and_two_parameters_one_slice() -> None:
+    three = CensusDesign.draw(ParameterSpace.box(["a", "b", "c"], 0.0, 1.0), 16, along="pairs", resolution=8, seed=0)
+    assert (len(three.bases), len(three.cuts)) == (5, 3)
+    two = CensusDesign.draw(ParameterSpace.box(["a", "b"], 0.0, 1.0), 16, along="pairs", resolution=8, seed=0)
+    assert (len(two.bases), len(two.cuts)) == (1, 1)
+    with pytest.raises(ValueError, match="takes two parameters"):
+        CensusDesign.draw(ParameterSpace.box(["a"], 0.0, 1.0), 16, along="pairs", resolution=8, seed=0)
+    with pytest.raises(ValueError, match="along pairs or random; got 'rows'"):
+        CensusDesign.draw(BOX, 16, along="rows", resolution=8, seed=0)
+
+
+def test_random_directions_are_orthonormal_in_widths_of_the_box_and_nothing_is_asked_outside() -> None:
+    space = ParameterSpace({f"x{n}": (0.0, 10.0**n, "m") for n in range(4)})
+    design = CensusDesign.draw(space, 9, along="random", resolution=8, seed=0)
+    for cut in range(3):
+        unit = design.plane(0, cut).basis / (space.upper - space.lower)
+        torch.testing.assert_close(unit @ unit.T, torch.eye(2, dtype=torch.float64))
+    bowl = Bowl()
+    planes = CensusDesign.draw(BOX, 9, along="random", resolution=8, seed=0)
+    found = [survey(bowl, planes.plane(*place), deviation=0.0, seed=0) for place in planes.places]
+    outside = sum(np.isnan(one.loss).sum() for one in found)
+    assert 0 < outside < 9 * 64
+    assert bowl.asked == sum(one.episodes for one in found)
+
+
+def test_every_second_sample_is_what_half_the_resolution_would_sample() -> None:
+    plane = Plane.through(BOX, BOX.center, (0, 3), resolution=9)
+    thin = thin_out(sample_plane(Bowl(), plane))
+    wanted = sample_plane(Bowl(), Plane.through(BOX, BOX.center, (0, 3), resolution=5))
+    np.testing.assert_allclose(thin["loss"], wanted["loss"])
+    np.testing.assert_allclose(thin["grad"], wanted["grad"])
+    even = thin_out(sample_plane(Bowl(), Plane.through(BOX, BOX.center, (0, 3), resolution=8)))
+    np.testing.assert_allclose(even["loss"], sample_plane(Bowl(), Plane.through(BOX, BOX.center, (0, 3), resolution=8))["loss"][::2, ::2])  # fmt: skip # noqa: E501
+
+
+def test_a_bowls_slices_are_very_smooth_with_good_gradients() -> None:
+    design = CensusDesign.draw(BOX, 4, along="pairs", resolution=12, seed=0)
+    found = [survey(Bowl(), design.plane(*place), deviation=0.0, seed=0) for place in design.places]
+    assert {one.words for one in found} == {("very smooth", "gradients good")}
+    assert all(one.measures[MEASURES.index("cosine")] > 0.99 for one in found)
+    assert len({one.measures[MEASURES.index("notable minima")] for one in found}) == 1
+
+
+def test_variance_is_shared_out_as_it_was_put_in() -> None:
+    """Rows of variance 4, columns of 1, the rest of 0.25, and a noise of 0.25 between the two resolutions."""
+    draw = np.random.default_rng(0)
+    parts = []
+    for _ in range(200):
+        table = 2 * draw.standard_normal((8, 1)) + draw.standard_normal((1, 8)) + 0.5 * draw.standard_normal((8, 8))
+        halved = table + np.sqrt(0.5) * draw.standard_normal((8, 8))
+        places = [(row, column) for row in range(8) for column in range(8)]
+        parts.append(divide(table, halved, {9: float(table[1, 1]) + 1.0}, places))
+    assert np.mean([one.base for one in parts]) == pytest.approx(4 / 5.25, abs=0.06)
+    assert np.mean([one.cut for one in parts]) == pytest.approx(1 / 5.25, abs=0.06)
+    assert all(one.base + one.cut + one.both == pytest.approx(1) for one in parts)
+    assert np.median([one.resolution for one in parts]) == pytest.approx(0.25 / 5.25, abs=0.02)
+    flat = divide(np.full((3, 3), 0.6) + 1e-14 * draw.standard_normal((3, 3)), np.ones((3, 3)), {}, places[:3])
+    assert np.isnan(flat.base)  # of rounding
+
+
+def test_intervals_hold_the_truth_about_as_often_as_they_say() -> None:
+    """Words that go with the point: of 8 points there are 8 independent draws, not 64."""
+    draw, places = np.random.default_rng(0), [(base, cut) for base in range(8) for cut in range(8)]
+    held, drawn = 0, bootstrap(places, seed=0)
+    for _ in range(200):
+        rugged = draw.random(8) < 0.5
+        words = [("rugged",) if rugged[base] else () for base, _ in places]
+        share = word_shares(words, drawn)["rugged"]
+        held += share.low <= 0.5 <= share.high
+    assert 150 <= held <= 200  # a percentile interval of 8 draws is somewhat short
+    found = spread(np.arange(64.0), drawn)
+    assert found.quantiles[2] == found.median.value == pytest.approx(31.5)
+    assert found.median.low < 31.5 < found.median.high
