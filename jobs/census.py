@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 RECORD, LOSSES, PICTURE = CENSUS.files
 SLICES, RESOLUTION = 64, 24
 NOISE_POINTS, REPEATS = 16, 4
-COPIES = 4  # of the losses and gradients of a slice, beside the losses of all
+COPIES = 4  # of the losses and gradients of a slice
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,8 @@ class CensusJob:
             raise ValueError(
                 f"a census measures every second sample, too, so it takes 6 along an axis; got {resolution}"
             )
-        bytes_each = 8.0 * resolution**2
-        require("slices", slices, lambda count: Need(bytes_each * (count + COPIES * env.space.dim), bytes_each * count))
+        require("resolution", resolution, lambda side: Need(8.0 * COPIES * (1 + env.space.dim) * side**2))
+        require("slices", slices, lambda count: Need(8.0 * count * resolution**2, 8.0 * count * resolution**2))
         design = CensusDesign.draw(env.space, slices, along=along, resolution=resolution, seed=seed)
         other = replace(scene, fidelity=also, tolerance=None).make() if also else None
         identity = {**env.identity(), "slices": slices, "resolution": resolution, "along": along, "seed": seed}
