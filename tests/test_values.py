@@ -44,6 +44,7 @@ check branin --points 2
 tradeoff bounce --points 2 --variants dt
 extremes bounce --points 4 --knobs dt
 pairs ackley --samples 2 --top 3
+census ackley --slices 1 --resolution 6
 report cut --points 2
 gallery compute --only bounce --part reports
 gallery list
