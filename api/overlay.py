@@ -10,16 +10,28 @@ from .progress import default_watch
 from .slice import open_slice
 
 if TYPE_CHECKING:
-    import xarray as xr
+    from typing import Protocol, TypeAlias
+
+    import pandas as pd
 
     from ..jobs.overlay import Overlay
     from ..landscapes.slice import Slice
     from ..optim.runs.run import Run
 
+    class Study(Protocol):
+        """An Optuna study, as far as an overlay knows it."""
+
+        study_name: str
+
+        def trials_dataframe(self, attrs: tuple[str, ...]) -> pd.DataFrame:
+            """Return its trials as a table."""
+
+    Points: TypeAlias = str | Path | Run | pd.DataFrame | Study
+
 
 def overlay(
     slice: str | Path | Slice,
-    runs: str | Path | Run | Sequence[str | Path | Run],
+    runs: Points | Sequence[Points],
     *,
     through: str | None = None,
     plane: str | None = None,
@@ -30,20 +42,24 @@ def overlay(
     """Lay runs over a slice of a plane: where their points lie, how far off it, and what the slice shows there.
 
     Slice and runs are folders, a race's for all of its runs, or what `gradscape.slice` and `gradscape.optimize` return.
+    Points that another program evaluated are a CSV or Parquet file or a pandas table, with a column for each parameter,
+    called as it is, and one called loss, which is missing where an evaluation failed; or an Optuna study.
     The slice is cut anew `through` the best point of all runs (best) or of one run's folder, and along the runs' two
     principal directions with `plane` pca, with `resolution` points along each axis, on `device`. The files lie in the
     folder `out`, by default one under out/ named after the overlay.
 
     Raises ValueError for runs of other landscapes than the slice's, for a slice of a line, where there is no slice or
-    run, and where the folder holds something else; Stopped where it is interrupted.
+    run, where a table lacks a column, and where the folder holds something else; Stopped where it is interrupted.
     """
+    from ..jobs.foreign import tables_over
     from ..jobs.overlay import Cut, OverlayJob
 
     watch, cut = default_watch(), Cut.of(through, plane, resolution)
     several = [runs] if isinstance(runs, str | Path) or not isinstance(runs, Sequence) else list(runs)
+    beneath = open_slice(slice) if isinstance(slice, str | Path) else slice
     job = OverlayJob.of(
-        open_slice(slice) if isinstance(slice, str | Path) else slice,
-        _tables(several),
+        beneath,
+        tables_over(beneath, several),
         command="gradscape.overlay(...)",
         cut=cut,
         device=device,
@@ -51,15 +67,3 @@ def overlay(
         watch=watch,
     )
     return job.run(watch)
-
-
-def _tables(runs: Sequence[str | Path | Run]) -> list[xr.Dataset]:
-    """Return what runs evaluated, first of those on disk; those without an episode are left out."""
-    from ..jobs.folder import run_tables
-
-    paths = [str(run) for run in runs if isinstance(run, str | Path)]
-    given = [run.data for run in runs if not isinstance(run, str | Path)]
-    tables = [*(run_tables(paths) if paths else []), *(data for data in given if data.sizes["evaluation"])]
-    if not tables:
-        raise ValueError("there are no episodes yet in these runs; `gradscape.optimize` evaluates them")
-    return tables

@@ -12,7 +12,14 @@ from .arguments import Device, Of, Print
 
 def overlay(
     slice_: Annotated[str, typer.Argument(metavar="SLICE", help="A slice's folder.")],
-    runs: Annotated[list[str], typer.Argument(metavar="RUN", help="Folders of runs; a race's for all of it.")],
+    runs: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="RUN",
+            help="Folders of runs, a race's for all of it, or CSV and Parquet files of points: a column for each "
+            "parameter, called as it is, and one called loss.",
+        ),
+    ],
     env: Of = None,
     out: Annotated[
         str | None, typer.Option(help="Folder for the results; by default one under out/ named after the overlay.")
@@ -37,7 +44,7 @@ def overlay(
     """
     from ..api.slice import open_slice
     from ..envs.registry import environment_class
-    from ..jobs.folder import run_tables
+    from ..jobs.foreign import tables_over
     from ..jobs.overlay import STREAM, Cut, OverlayJob
     from .terminal import Bars, command_line
     from .view import check_display, show_recording
@@ -46,7 +53,8 @@ def overlay(
         environment_class(env)  # which registers it
     bars, cut = Bars(), Cut.of(through, plane, resolution)
     how: dict[str, Any] = {"out": Path(out) if out else None, "prints": print_ or [], "watch": bars, "device": device}
-    job = OverlayJob.of(open_slice(slice_), run_tables(runs), command=command_line(), cut=cut, **how)
+    beneath = open_slice(slice_)
+    job = OverlayJob.of(beneath, tables_over(beneath, runs), command=command_line(), cut=cut, **how)
     recording = job.folder / STREAM
     if spawn and not serve:
         check_display(recording, "leave out --spawn, or take --serve to look at it in a browser")

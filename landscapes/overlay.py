@@ -67,6 +67,12 @@ def lay(dataset: xr.Dataset, table: xr.Dataset, label: str) -> xr.Dataset:
     return table.assign(added).assign_attrs(label=label)
 
 
+def run_name(table: xr.Dataset, between: str = ", seed ") -> str:
+    """Return a run's method and seed, or what points of another program are called, which have none."""
+    method, seed = table.attrs["method"], table.attrs.get("seed")
+    return f"{method}{between}{seed}" if seed is not None else str(method)
+
+
 def improvements(run: xr.Dataset) -> NDArray[np.intp]:
     """Return the rows of a run laid over a slice that lowered its least loss so far, in the order of evaluation."""
     best = run["best"].to_numpy()
@@ -139,7 +145,7 @@ def _is_aligned(step: NDArray[np.float64], slope: NDArray[np.float64], inside: N
 
 
 def _labels(tables: Sequence[xr.Dataset]) -> list[str]:
-    named = [f"{table.attrs['method']}-s{table.attrs['seed']}" for table in tables]
+    named = [run_name(table, "-s") for table in tables]
     seen: Counter[str] = Counter()
     labels = []
     for name in named:

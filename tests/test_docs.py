@@ -123,7 +123,7 @@ def test_forms_name_verbs_and_options_there_are(command: str) -> None:
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a slice, a run, somebody's own class, two figures of the gallery, and a site to serve."""
+    """A folder with a slice, a run, its points as a table, somebody's own class, two figures, and a site to serve."""
     folder = tmp_path_factory.mktemp("desk")
     (mine,) = (block for block in BLOCKS if block.startswith("# my.py"))
     (folder / "my.py").write_text(mine)
@@ -132,6 +132,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ["slice", "fluid", *TENTH, "--dims", "0", "1", "--resolution", "2", *how, str(folder / "cut")],
         ["optimize", "fluid", *TENTH, "--method", "random", "--budget", "2", *how, str(folder / "run")],
         ["overlay", str(folder / "cut"), str(folder / "run"), "--out", str(folder / "over")],
+        ["export", str(folder / "run"), "--to", "csv", "--out", str(folder / "points.csv")],
     ):
         with pytest.raises(SystemExit) as left:
             main(command)

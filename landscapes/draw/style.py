@@ -70,6 +70,7 @@ POINT_MARKS: dict[str, dict[str, Any]] = {  # what a run evaluated a point for
     "descent": {"color": "#b5367a", "marker": "v"},
     "acquisition": {"color": "#009e73", "marker": "D"},
     "policy": {"color": "#5b2a86", "marker": "s"},
+    "given": {"color": "#c47a00", "marker": "^"},  # by another program
 }
 METHOD_BAND: dict[str, Any] = {"alpha": 0.12, "linewidth": 0.0}
 OVERLAID: dict[str, Any] = {"linewidths": 0.6, "zorder": 3, "rasterized": True}  # the points of a run over a map

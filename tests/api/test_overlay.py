@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
+import torch
 
 import gradscape as gs
+from gradscape.landscapes.export import save_as
 
 
 @pytest.fixture
@@ -44,3 +48,87 @@ def test_what_does_not_belong_together_is_refused(cut: gs.Slice, tmp_path: Path)
     with pytest.raises(ValueError, match="--plane takes pca"):
         gs.overlay(cut, other, plane="tsne")
     assert not Path("out/overlay").exists()
+
+
+def test_points_of_other_programs_lie_where_a_run_lies(cut: gs.Slice, tmp_path: Path) -> None:
+    run = gs.optimize("branin", "random", budget=8, out=tmp_path / "run")
+    expected = gs.overlay(cut, run, out=tmp_path / "over").runs[0]
+    table = pd.DataFrame({"loss": run.data["loss"], "x1": run.data["x"][:, 1], "x0": run.data["x"][:, 0], "note": "a"})
+    table = table.rename(columns=dict(zip(("x0", "x1"), map(str, run.data["dim"].to_numpy()), strict=True)))
+    table.to_csv(tmp_path / "my points.csv", index=False)
+    table.to_parquet(tmp_path / "points.parquet")
+    for number, given in enumerate((table, tmp_path / "my points.csv", str(tmp_path / "points.parquet"))):
+        laid = gs.overlay(cut, given, out=tmp_path / str(number))
+        for name in ("u", "v", "distance", "outside", "beneath", "best"):
+            np.testing.assert_allclose(laid.runs[0][name], expected[name], atol=1e-12)
+        assert laid.runs[0].attrs["label"] == ("table", "my-points", "points")[number]
+    both = gs.overlay(cut, [table, run], out=tmp_path / "both")
+    assert [one.attrs["label"] for one in both.runs] == ["random-s0", "table"]
+
+
+def test_what_export_writes_of_a_run_can_be_laid_over_a_slice(tmp_path: Path) -> None:
+    cut = gs.slice("bounce", (0, 1), resolution=4, out=tmp_path / "cut", device="cpu")
+    run = gs.optimize("bounce", "random", budget=4, out=tmp_path / "run", device="cpu")
+    save_as(run.data, tmp_path / "run.csv", "csv")
+    laid = gs.overlay(cut, tmp_path / "run.csv", out=tmp_path / "over")
+    np.testing.assert_allclose(laid.runs[0]["x"], run.data["x"])
+    np.testing.assert_allclose(laid.runs[0]["loss"], run.data["loss"])
+
+
+def test_a_point_without_a_loss_has_failed(cut: gs.Slice, tmp_path: Path) -> None:
+    first, second = map(str, cut.data["dim"].to_numpy())
+    table = pd.DataFrame({first: [0.0, 1.0, 2.0], second: [3.0, 4.0, 500.0], "loss": [1.0, None, np.inf]})
+    laid = gs.overlay(cut, table, out=tmp_path / "over")
+    assert (laid.summary.points, laid.summary.failed, laid.summary.outside) == (3, 2, 1)
+
+
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [
+        ({"a": [1.0], "loss": [1.0]}, "has no column"),
+        ({0: [1.0], 1: [1.0]}, "has no column 'loss'"),
+        ({0: ["low"], 1: [1.0], "loss": [1.0]}, "holds no numbers"),
+        ({0: [1.0, None], 1: [1.0, 2.0], "loss": [1.0, 2.0]}, "has no number in row 2"),
+        ({0: [], 1: [], "loss": []}, "holds no point"),
+    ],
+)
+def test_a_table_that_lacks_something_is_refused(
+    cut: gs.Slice, columns: dict[object, list[object]], said: str, tmp_path: Path
+) -> None:
+    names = dict(enumerate(map(str, cut.data["dim"].to_numpy())))
+    with pytest.raises(ValueError, match=said):
+        gs.overlay(cut, pd.DataFrame(columns).rename(columns=names), out=tmp_path / "over")
+    assert not (tmp_path / "over").exists()
+
+
+@pytest.mark.parametrize("name", ["none.csv", "none.parquet"])
+def test_files_that_are_no_tables_are_refused(cut: gs.Slice, name: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="there is no table of points"):
+        gs.overlay(cut, tmp_path / name)
+    (tmp_path / name).write_bytes(b"\xff\x00\x01")
+    with pytest.raises(ValueError, match=r"cannot be read as a table|has no column"):
+        gs.overlay(cut, tmp_path / name)
+    with pytest.raises(ValueError, match="what is laid over a slice are runs"):
+        gs.overlay(cut, 3)  # type: ignore[arg-type]
+
+
+def test_a_study_of_optuna_is_laid_over_a_slice(cut: gs.Slice, tmp_path: Path) -> None:
+    optuna = pytest.importorskip("optuna")
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    env, names = gs.make("branin"), tuple(map(str, cut.data["dim"].to_numpy()))
+    sides = list(zip(names, env.space.lower.tolist(), env.space.upper.tolist(), strict=True))
+
+    def loss(trial: Any) -> float:
+        x = [trial.suggest_float(*side) for side in sides]
+        if trial.number == 2:
+            raise optuna.TrialPruned
+        return float(env.evaluate(torch.tensor([x], dtype=torch.float64), grad=False).loss[0])
+
+    study = optuna.create_study(study_name="of branin", sampler=optuna.samplers.RandomSampler(seed=0))
+    study.optimize(loss, n_trials=6)
+    laid = gs.overlay(cut, study, out=tmp_path / "over")
+    assert (laid.summary.points, laid.summary.failed) == (6, 1)
+    assert laid.runs[0].attrs["label"] == "optuna-of-branin"
+    np.testing.assert_allclose(float(laid.runs[0]["best"][-1]), study.best_value)
+    with pytest.raises(ValueError, match="MAXIMIZE"):
+        gs.overlay(cut, optuna.create_study(direction="maximize"))

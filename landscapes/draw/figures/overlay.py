@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...identity import plane_of
 from ...objective import Status
-from ...overlay import improvements
+from ...overlay import improvements, run_name
 from ...plane import Plane
 from .. import style
 from . import contour, labels, page, panel
@@ -196,7 +196,7 @@ def _run_entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
     entries: list[Artist] = []
     for method in dict.fromkeys(str(run.attrs["method"]) for run in runs):
         own = [run for run in runs if run.attrs["method"] == method]
-        name = f"{method}, seed {own[0].attrs['seed']}" if len(own) == 1 else f"{method}, {len(own)} runs"
+        name = run_name(own[0]) if len(own) == 1 else f"{method}, {len(own)} runs"
         look = sheet.look({"linewidth": 1.6, "marker": "*", "markersize": 10, "markeredgewidth": 1.0})
         look |= {"color": style.method(own[0])["color"], "markerfacecolor": "white"}
         entries.append(Line2D([], [], **look, label=f"{name}: {_describe_best(own)}"))

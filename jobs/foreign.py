@@ -1,0 +1,61 @@
+"""What is laid over a slice: runs and races on disk, runs in memory, and points that other programs evaluated."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import xarray as xr
+
+from ..landscapes.foreign import SUFFIXES, plain_name, points_table, read_points, study_frame
+from .folder import run_tables
+from .scene import environment_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from ..landscapes.slice import Slice
+
+TABLE, STUDY = "table", "optuna"  # what points in memory are called
+
+
+def tables_over(slice: Slice, given: Sequence[Any]) -> list[xr.Dataset]:
+    """Return what runs evaluated, and tables of points, as they are laid over a slice: first runs on disk, then others.
+
+    Each is the folder of a run or a race, a CSV or Parquet file, a `Run`, a pandas table or an Optuna study. Runs
+    without an episode are left out.
+
+    Raises ValueError where a path holds none of these, a table lacks a column, or there is no episode at all.
+    """
+    tables = [one for one in given if _is_table(one)]
+    paths = [str(one) for one in given if isinstance(one, str | Path) and not _is_table(one)]
+    runs = [one for one in given if not isinstance(one, str | Path) and not _is_table(one)]
+    for one in runs:
+        if not isinstance(getattr(one, "data", None), xr.Dataset):
+            raise ValueError(
+                "what is laid over a slice are runs, their folders, CSV and Parquet files, pandas tables and Optuna "
+                f"studies; got {one!r}"
+            )
+    found = [*(run_tables(paths) if paths else []), *(run.data for run in runs if run.data.sizes["evaluation"])]
+    if tables:
+        space = (slice.remake() if slice.remake else environment_of(slice.data, "cpu")).space
+        found += [points_table(frame, slice.data, space, name) for frame, name in map(_frame, tables)]
+    if not found:
+        raise ValueError("there are no episodes yet in these runs; `gradscape.optimize` evaluates them")
+    return found
+
+
+def _is_table(one: Any) -> bool:
+    if isinstance(one, str | Path):
+        return Path(one).suffix.lower() in SUFFIXES
+    return hasattr(one, "trials_dataframe") or hasattr(one, "columns")
+
+
+def _frame(one: Any) -> tuple[pd.DataFrame, str]:
+    """Return a table of points, and what a picture calls it."""
+    if isinstance(one, str | Path):
+        return read_points(Path(one)), plain_name(Path(one).stem)
+    if hasattr(one, "trials_dataframe"):
+        return study_frame(one), plain_name(f"{STUDY}-{one.study_name}")
+    return one, TABLE

@@ -1,0 +1,130 @@
+"""Points that other programs evaluated, as a table laid over a slice like a run: CSV, Parquet, pandas, Optuna."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from enum import IntEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from .identity import stored_identity
+from .objective import Status
+from .plain import plain_json
+from .space import ParameterSpace
+from .storage.layout import flags
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SUFFIXES = (".csv", ".parquet")
+LOSS = "loss"
+LISTED = 8  # columns that a message names
+
+
+class GivenKind(IntEnum):
+    """Say what a point of another program was evaluated for, which is not known."""
+
+    GIVEN = 0
+
+
+def read_points(path: Path) -> pd.DataFrame:
+    """Return the table in a CSV or Parquet file.
+
+    Raises ValueError where the file cannot be read as one.
+    """
+    import pandas as pd
+
+    try:
+        return pd.read_csv(path) if path.suffix.lower() == ".csv" else pd.read_parquet(path)
+    except FileNotFoundError:
+        raise ValueError(f"there is no table of points at {path}") from None
+    except Exception as error:  # whatever pandas or Arrow raise of a file that is no table
+        raise ValueError(f"{path} cannot be read as a table: {' '.join(str(error).split())}") from None
+
+
+def study_frame(study: Any) -> pd.DataFrame:
+    """Return the trials of an Optuna study that have ended, a column for each parameter and one for the loss.
+
+    A trial that failed or was pruned has no loss.
+
+    Raises ValueError where the study has several goals, or looks for the greatest value.
+    """
+    directions = [direction.name for direction in study.directions]
+    if directions != ["MINIMIZE"]:
+        raise ValueError(
+            f"Optuna's study {study.study_name!r} has the directions {', '.join(directions)}; a loss is one value that "
+            "is minimised, so give a table with a column loss instead"
+        )
+    trials = study.trials_dataframe(attrs=("value", "params", "state"))
+    ended = trials[trials["state"].isin(["COMPLETE", "PRUNED", "FAIL"])]
+    values = ended["value"].where(ended["state"] == "COMPLETE")
+    names = [str(name) for name in ended.columns if str(name).startswith("params_")]
+    return ended[names].rename(columns=lambda name: name.removeprefix("params_")).assign(**{LOSS: values})
+
+
+def points_table(frame: pd.DataFrame, dataset: xr.Dataset, space: ParameterSpace, name: str) -> xr.Dataset:
+    """Return the points of a table, a row each in the order of evaluation, as `landscapes.overlay.overlay` takes a run.
+
+    The columns are called as the parameters of the slice `dataset`, with or without their units in brackets, or as
+    "loss"; others do not count. A loss that is missing or not finite says that the evaluation failed. `space` is what
+    the points are of, `name` what a picture calls them. Gradients are not known.
+
+    Raises ValueError where a column is missing or holds no numbers, and where there is no point.
+    """
+    columns = [_column(frame, *names, name=name) for names in zip(space.names, space.labels, strict=True)]
+    unit = str(dataset["loss"].attrs.get("units", ""))
+    x, loss = np.stack(columns, axis=1), _column(frame, LOSS, f"{LOSS} [{unit}]", name=name, gaps=True)
+    if not len(x):
+        raise ValueError(f"{name} holds no point")
+    ended = np.where(np.isfinite(loss), Status.OK, Status.NONFINITE).astype(np.int8)
+    number = np.arange(1, len(x) + 1)
+    deep, flat = ("evaluation", "dim"), "evaluation"
+    data = {
+        "x": (deep, x),
+        "loss": (flat, np.where(ended == Status.OK, loss, np.nan), {"units": unit}),
+        "grad": (deep, np.full_like(x, np.nan)),
+        "kind": (flat, np.zeros(len(x), np.int8), flags(GivenKind)),
+        "episodes": (flat, number),
+        "status": (flat, ended, flags(Status)),
+    }
+    own = {"method": name, "points": hashlib.sha256(x.tobytes() + loss.tobytes()).hexdigest()[:12]}
+    identity = {key: value for key, value in stored_identity(dataset).items() if key != "plane"} | own
+    about = {
+        "method": own["method"],
+        "lower": space.lower.tolist(),
+        "upper": space.upper.tolist(),
+        "identity": json.dumps(plain_json(identity, "a table's identity")),
+    }
+    return xr.Dataset(data, {"dim": dataset["dim"].to_numpy()}, about)
+
+
+def plain_name(text: str) -> str:
+    """Return a name of letters, digits, dots, dashes and underscores, as recordings have them."""
+    return re.sub(r"[^A-Za-z0-9_.-]+", "-", text).strip("-.") or "points"
+
+
+def _column(frame: pd.DataFrame, *names: str, name: str, gaps: bool = False) -> NDArray[np.float64]:
+    """Return the first column that has one of the names, as numbers, which must be finite unless `gaps`."""
+    import pandas as pd
+
+    found = next((one for one in names if one in frame.columns), None)
+    if found is None:
+        there = ", ".join(map(str, frame.columns[:LISTED])) + (", ..." if len(frame.columns) > LISTED else "")
+        raise ValueError(
+            f"{name} has no column {names[0]!r}; its columns are {there or 'none'}. There must be one for each "
+            f"parameter, called as it is, and {LOSS}"
+        )
+    try:
+        values: NDArray[np.float64] = pd.to_numeric(frame[found]).to_numpy(np.float64, na_value=np.nan)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"the column {found!r} of {name} holds no numbers: {error}") from None
+    if not gaps and not np.isfinite(values).all():
+        row = int(np.flatnonzero(~np.isfinite(values))[0])
+        raise ValueError(f"the column {found!r} of {name} has no number in row {row + 1}")
+    return values
