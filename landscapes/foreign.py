@@ -83,20 +83,18 @@ def points_table(frame: pd.DataFrame, dataset: xr.Dataset, space: ParameterSpace
     if not len(x):
         raise ValueError(f"{name} holds no point")
     ended = np.where(np.isfinite(loss), Status.OK, Status.NONFINITE).astype(np.int8)
-    number = np.arange(1, len(x) + 1)
     deep, flat = ("evaluation", "dim"), "evaluation"
     data = {
         "x": (deep, x),
         "loss": (flat, np.where(ended == Status.OK, loss, np.nan), {"units": unit}),
         "grad": (deep, np.full_like(x, np.nan)),
         "kind": (flat, np.zeros(len(x), np.int8), flags(GivenKind)),
-        "episodes": (flat, number),
         "status": (flat, ended, flags(Status)),
     }
     own = {"method": name, "points": hashlib.sha256(x.tobytes() + loss.tobytes()).hexdigest()[:12]}
     identity = {key: value for key, value in stored_identity(dataset).items() if key != "plane"} | own
     about = {
-        "method": own["method"],
+        "method": name,
         "lower": space.lower.tolist(),
         "upper": space.upper.tolist(),
         "identity": json.dumps(plain_json(identity, "a table's identity")),
