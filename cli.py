@@ -108,6 +108,8 @@ def main(arguments: list[str] | None = None) -> Any:
         code = _fail(str(error), 2)
     except OSError as error:
         code = _fail(_system(error), 1)
+    except (MemoryError, RuntimeError) as error:
+        code = _fail(_memory(error), 1)
     except (KeyboardInterrupt, typer.Abort) as stop:
         code = _stop(stop) or _fail("stopped before anything was computed; the same command begins again", 130)
     sys.exit(code)
@@ -154,6 +156,16 @@ def _system(error: OSError) -> str:
         return str(error)
     name = os.fsdecode(error.filename2 or error.filename)
     return f"{name if len(name) < LONG else name[:LONG] + '...'}: {error.strerror.lower()}; give another path"
+
+
+def _memory(error: Exception) -> str:
+    """Return what to say where the host or a GPU ran out of memory; raise any other error again."""
+    from .landscapes.sampling.memory import ADVICE, is_out_of_memory
+
+    if not is_out_of_memory(error):
+        raise error
+    said = str(error) or "the host has no more"
+    return said if ADVICE in said else f"out of memory: {said}; {ADVICE}"
 
 
 def _fail(message: str, code: int) -> int:

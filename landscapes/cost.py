@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .objective import Objective
+from .sampling.memory import MemoryBound
 
 MOMENT = 0.5  # seconds to spend on measuring what an episode alone costs
 LONG = 5.0  # seconds from which the first, which warms things up, must do
@@ -46,16 +47,18 @@ def seconds_per_episode(objective: Objective, points: Float[Tensor, "batch dim"]
     """Measure what an episode costs where many are computed, at points such as those that will be [s].
 
     As many points as there are threads are timed, again (a first time is longer), then more until they take long. A GPU
-    takes a whole batch at once: of one point most would be launches.
+    takes a whole batch at once: of one point most would be launches. Where its memory does not hold the batch, parts of
+    it are timed, as they will be computed; raises MemoryError where it does not hold one point.
     """
+    bound = MemoryBound(objective)
     whole = getattr(objective, "device", "cpu") == "cuda"
     rows = len(points) if whole else min(len(points), getattr(objective, "threads", 1))
-    seconds = measure_seconds(objective, points[:rows], grad=grad)
+    seconds = measure_seconds(bound, points[:rows], grad=grad)
     if seconds < WARM_UP:
-        seconds = measure_seconds(objective, points[:rows], grad=grad)
+        seconds = measure_seconds(bound, points[:rows], grad=grad)
     while seconds < ENOUGH and rows < len(points):
         rows = min(4 * rows, len(points))
-        seconds = measure_seconds(objective, points[:rows], grad=grad)
+        seconds = measure_seconds(bound, points[:rows], grad=grad)
     return seconds / rows
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import gradscape
+from gradscape.envs.bounce import Bounce
 
 from .command import Said, modules
 from .processes import Instant, alone, landscape
@@ -134,6 +135,25 @@ def test_bad_input_gets_one_line_and_exit_code_2(
     assert len(done.stderr.splitlines()) == 1
     assert said in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("verb", [("slice",), ("tradeoff", "--ladder", "convergence"), ("check",)])
+def test_a_device_without_memory_for_a_point_is_one_line_and_exit_code_1(
+    run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: tuple[str, ...]
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise RuntimeError("Failed to allocate 18792000 bytes on device 'cuda:0'")
+
+    monkeypatch.setattr(Bounce, "_evaluate", full)
+    name, *options = verb
+    dims = ["--dims", "0", "1", "--resolution", "4"] if name == "slice" else []
+    done = run(name, "bounce", *dims, *options, cwd=tmp_path)
+    assert done.returncode == 1
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("landscape: ")
+    assert "out of memory" in last
+    assert "Failed to allocate 18792000 bytes" in last
+    assert last.endswith("take a lower --fidelity or another --device")
 
 
 @pytest.mark.parametrize(("name", "text"), [("p.json", "[1.5, 2.5]"), ("p.txt", "1.5 2.5\n"), ("p.csv", "1.5,2.5\n")])

@@ -15,6 +15,7 @@ from ..objective import Evaluation, Objective, evaluate, name_of
 SAID = re.compile(
     r"out of memory|out of CUDA|fail\w* to allocate|can't allocate memory|not enough memory", re.IGNORECASE
 )
+ADVICE = "end what else uses the device, or take a lower --fidelity or another --device"
 
 
 class MemoryBound:
@@ -64,10 +65,7 @@ class MemoryBound:
             if not is_out_of_memory(error):
                 raise
             if len(x) == 1:
-                raise MemoryError(
-                    f"{self.name} ran out of memory at a single point: {error}; end what else uses the device, "
-                    "or take a lower --fidelity or another --device"
-                ) from error
+                raise MemoryError(f"{self.name} ran out of memory at a single point: {error}; {ADVICE}") from error
             return None
 
 

@@ -11,6 +11,7 @@ import torch
 from gradscape.envs.engines.sheets import springs
 from gradscape.envs.registry import make
 from gradscape.landscapes.adapters import from_torch
+from gradscape.landscapes.cost import seconds_per_episode
 from gradscape.landscapes.identity import StoreError
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.plane import Plane
@@ -39,7 +40,7 @@ def wave(x: torch.Tensor) -> torch.Tensor:
 class Small:
     """A device with memory for so many points, the wave's."""
 
-    space, name = SPACE, "wave"
+    space, name, device = SPACE, "wave", "cpu"
 
     def __init__(self, room: int, error: Exception) -> None:
         self.room, self.error = room, error
@@ -117,6 +118,15 @@ def test_memory_for_no_point_at_all_ends_it_and_other_errors_pass():
     with pytest.raises(RuntimeError, match="broken cable"):
         MemoryBound(Small(0, RuntimeError("broken cable"))).evaluate(SPACE.uniform(3, seed=0))
     assert not is_out_of_memory(RuntimeError("the ball is out of the memory foam"))
+
+
+def test_what_an_episode_costs_is_measured_with_the_memory_that_is_there():
+    small = Small(4, RuntimeError(MESSAGES[1]))
+    small.device = "cuda"
+    assert seconds_per_episode(small, SPACE.uniform(16, seed=0), grad=True) > 0
+    assert small.asked[:3] == [16, 8, 4]
+    with pytest.raises(MemoryError, match="wave ran out of memory at a single point"):
+        seconds_per_episode(Small(0, RuntimeError(MESSAGES[1])), SPACE.uniform(16, seed=0), grad=True)
 
 
 @pytest.mark.parametrize("damage", ["truncated", "altered", "empty"])
