@@ -33,7 +33,7 @@ def from_torch(
     Gradients come by autograd. Each loss may depend on its own row only. With `vectorized=False` the function takes a
     single point, shape (dim,), and returns one loss.
     """
-    return _TorchObjective(fn if vectorized else _Pointwise(fn, _stack), space, name or _name(fn), loss_unit)
+    return _TorchObjective(fn if vectorized else _Pointwise(fn, _stack), space, name or function_name(fn), loss_unit)
 
 
 def from_numpy(
@@ -55,7 +55,9 @@ def from_numpy(
     Raises ValueError where `differences` is no fraction of the bounds, or lost in rounding beside them.
     """
     differences = None if differences is None else _step(differences, space)
-    return _NumpyObjective(fn if vectorized else _Pointwise(fn, list), space, name or _name(fn), loss_unit, differences)
+    return _NumpyObjective(
+        fn if vectorized else _Pointwise(fn, list), space, name or function_name(fn), loss_unit, differences
+    )
 
 
 def within_box(objective: Objective) -> Objective:
@@ -93,14 +95,14 @@ class _TorchObjective:
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
         """Return losses, and gradients if asked, at points `x` in the parameters' own units."""
-        x = _points(x, self.space, self.name).clone().requires_grad_(grad)
+        x = check_points(x, self.space, self.name).clone().requires_grad_(grad)
         if len(x) == 0:
             return Evaluation.empty(self.space.dim, grad=grad)
         with torch.set_grad_enabled(grad):
             loss = self.fn(x)
         if not isinstance(loss, Tensor):
             raise ValueError(f"{self.name} must return a tensor; got {type(loss).__name__}")
-        _check_shape(tuple(loss.shape), (len(x),), "losses", self.name)
+        check_shape(tuple(loss.shape), (len(x),), "losses", self.name)
         losses = as_tensor(loss, f"the loss of {self.name}")
         return Evaluation.from_results(losses, self._gradient(loss, x) if grad else None)
 
@@ -124,7 +126,7 @@ class _NumpyObjective:
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
         """Return losses, and gradients if asked, at points `x` in the parameters' own units."""
-        points = _points(x, self.space, self.name)
+        points = check_points(x, self.space, self.name)
         if len(points) == 0:
             return Evaluation.empty(self.space.dim, grad=grad)
         loss, gradient = self._call(points)
@@ -136,10 +138,10 @@ class _NumpyObjective:
         result = self.fn(x.numpy().copy())
         loss, gradient = result if isinstance(result, tuple) else (result, None)
         losses = as_tensor(loss, f"the loss of {self.name}")
-        _check_shape(tuple(losses.shape), (len(x),), "losses", self.name)
+        check_shape(tuple(losses.shape), (len(x),), "losses", self.name)
         slope = None if gradient is None else as_tensor(gradient, f"the gradient of {self.name}")
         if slope is not None:
-            _check_shape(tuple(slope.shape), tuple(x.shape), "gradients", self.name)
+            check_shape(tuple(slope.shape), tuple(x.shape), "gradients", self.name)
         return losses, slope
 
     def _differences(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch dim"]:
@@ -173,7 +175,7 @@ class _BoxedObjective:
         return getattr(self.objective, name)
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
-        return evaluate_inside(self.objective, _points(x, self.space, name_of(self.objective)), grad=grad)
+        return evaluate_inside(self.objective, check_points(x, self.space, name_of(self.objective)), grad=grad)
 
 
 def _step(differences: object, space: ParameterSpace) -> float:
@@ -196,18 +198,21 @@ def _stack(found: Sequence[Any]) -> Any:
     return torch.stack(list(found)) if all(isinstance(one, Tensor) for one in found) else found[0]
 
 
-def _name(fn: Callable[..., object]) -> str:
+def function_name(fn: Callable[..., object]) -> str:
+    """Return what a function is called, or its type where it has no name."""
     return str(getattr(fn, "__name__", type(fn).__name__))
 
 
-def _points(x: object, space: ParameterSpace, name: str) -> Float[Tensor, "batch dim"]:
+def check_points(x: object, space: ParameterSpace, name: str) -> Float[Tensor, "batch dim"]:
+    """Return points as a tensor. Raises ValueError where they are no points of the space."""
     points = as_tensor(x, name)
     if points.ndim != 2 or points.shape[1] != space.dim:
         raise ValueError(f"{name} takes {space.dim} parameters; got x of shape {tuple(points.shape)}")
     return points
 
 
-def _check_shape(got: tuple[int, ...], wanted: tuple[int, ...], what: str, name: str) -> None:
+def check_shape(got: tuple[int, ...], wanted: tuple[int, ...], what: str, name: str) -> None:
+    """Raise ValueError where what a function returned has another shape than it must have."""
     if got != wanted:
         raise ValueError(
             f"{name} must return {what} of shape {wanted}; got shape {got} (a function of one point: vectorized=False)"

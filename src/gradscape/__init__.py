@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from .api.sweep import sweep
     from .api.tradeoff import tradeoff
     from .envs.base import Environment, Fidelity
+    from .envs.engines.jax_functions import from_jax
+    from .envs.engines.warp_functions import from_warp
     from .envs.registry import make, register
     from .jobs.scene import SceneSpec
     from .landscapes.adapters import from_numpy, from_torch
@@ -42,8 +44,10 @@ _HOMES = {
     "Status": "landscapes.objective",
     "check": "api.measure",
     "extremes": "api.measure",
+    "from_jax": "envs.engines.jax_functions",
     "from_numpy": "landscapes.adapters",
     "from_torch": "landscapes.adapters",
+    "from_warp": "envs.engines.warp_functions",
     "list_envs": "api.environments",
     "make": "envs.registry",
     "open_run": "api.search",
@@ -78,8 +82,10 @@ __all__ = [
     "census",
     "check",
     "extremes",
+    "from_jax",
     "from_numpy",
     "from_torch",
+    "from_warp",
     "list_envs",
     "make",
     "open_run",
