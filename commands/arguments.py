@@ -42,7 +42,13 @@ Deterministic = Annotated[
     bool, typer.Option("--deterministic", help="Bitwise reproducible GPU results (about 10x slower).")
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Random seed.")]
-Engine = Annotated[str, typer.Option(help="warp, or taichi where a scene has it: the reference, to hold Warp against.")]
+Engine = Annotated[
+    str | None,
+    typer.Option(
+        help="One of the scene's engines, by default its first: warp, or taichi where a scene has it, the reference to "
+        "hold Warp against."
+    ),
+]
 Set = Annotated[list[str] | None, typer.Option("--set", help="A scene option, name=value; may be repeated.")]
 Out = Annotated[
     str | None, typer.Option(help="Folder for the results; by default one under out/ named after the slice.")
@@ -95,7 +101,7 @@ SCENE: dict[str, tuple[Any, Any]] = {
     "fidelity": (Fidelity, None),
     "tolerance": (Tolerance, None),
     "device": (Device, "auto"),
-    "engine": (Engine, "warp"),
+    "engine": (Engine, None),
     "deterministic": (Deterministic, False),
     "set_": (Set, None),
 }  # the options that make a SceneSpec, with their defaults

@@ -19,15 +19,22 @@ def envs(name: Annotated[str | None, typer.Argument(help="One environment, to sh
 
 
 def _list() -> None:
-    """Print every registered environment as a row of a table; none of ours is imported for that."""
-    from ..envs.registry import complete_entry, entries
+    """Print every registered environment as a row of a table; none of ours is imported for that.
+
+    One whose engine is not installed is grey, and below is what installs it.
+    """
+    from ..envs.registry import complete_entry, entries, installs
     from .terminal import Console, table
 
     found = table("name", "dim", "parameters", "model", "fidelities", title="environments")
     for entry in map(complete_entry, entries().values()):
-        found.add_row(entry.name, entry.dim, entry.parameters, entry.model, ", ".join(entry.fidelities))
+        style = "dim" if installs(entry) else None
+        found.add_row(entry.name, entry.dim, entry.parameters, entry.model, ", ".join(entry.fidelities), style=style)
     console = Console()
     console.print(found)
+    for line in sorted({installs(entry) for entry in entries().values()} - {""}):
+        names = ", ".join(entry.name for entry in entries().values() if installs(entry) == line)
+        console.print(f"not installed: {names}; {line}", markup=False, soft_wrap=True)
     console.print("`landscape envs NAME` shows one in full: bounds, options, examples, fidelities, what it models.")
 
 

@@ -26,6 +26,7 @@ from .batching import Pool, map_parts
 from .code import code_digest
 from .engines import find_engine
 from .engines.engine import Engine
+from .installed import install_line
 from .records import Fidelity as Fidelity
 from .records import MaterialRange as MaterialRange
 from .records import ModelPart as ModelPart
@@ -43,9 +44,9 @@ class Environment(abc.ABC):
     A scene is written by deriving from this class: the class attributes say what it is, `_evaluate` simulates; needed
     are `space` and `_evaluate`. An environment is an `Objective`, and a torch function: `env(x)` returns losses, shape
     (batch,), that can be differentiated. `fidelity` is a name from `fidelities`, the first unless said otherwise, or a
-    record of one's own; `device` is auto, cpu or cuda; `engine` is one of `engines`; options are those of the class's
-    `Options`. On a GPU two runs may differ by round-off, because atomic adds come in any order, unless `deterministic`
-    says otherwise.
+    record of one's own; `device` is auto, cpu or cuda; `engine` is one of `engines`, the first unless said otherwise;
+    options are those of the class's `Options`. On a GPU two runs may differ by round-off, because atomic adds come in
+    any order, unless `deterministic` says otherwise.
     """
 
     name: ClassVar[str]  # of a class that says none, its own in lower case
@@ -84,14 +85,14 @@ class Environment(abc.ABC):
         *,
         fidelity: str | Fidelity | None = None,
         device: str = "auto",
-        engine: str = "warp",
+        engine: str | None = None,
         deterministic: bool = False,
         **options: Any,
     ) -> None:
         self.fidelity = self._find_fidelity(fidelity)
         self._refuse_broken_steps()
         self.device = self._find_device(device)
-        self.engine = self.check_engine(engine)
+        self.engine = self.check_engine(engine or self.engines[0])
         self.deterministic = deterministic
         if deterministic and not self.capabilities.deterministic:
             able = " and ".join(name for name in self.engines if find_engine(name).deterministic)
@@ -305,7 +306,9 @@ class Environment(abc.ABC):
         try:
             return import_module(f".engines.{module}", __package__)
         except ImportError as error:
-            raise ValueError(f"{self.name} cannot run on engine {self.engine} here: {error}") from error
+            extra = self.capabilities.extra
+            there = f"; {install_line(extra)}" if extra else ""
+            raise ValueError(f"{self.name} cannot run on engine {self.engine} here: {error}{there}") from error
 
     @final
     def _limit_rows(self, capacity: int) -> int:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..landscapes.storage.files import resolve
 from .importing import IN_FILE, import_named
+from .installed import install_line, is_installed
 
 if TYPE_CHECKING:
     from .base import Environment, Fidelity
@@ -26,6 +27,7 @@ COMPUTES_LOSSES = False  # for `code`
 
 Kind = TypeVar("Kind", bound="Environment")
 GROUP = "gradscape.environments"
+EXTRAS = {"mjx": ("mujoco", "mujoco-mjx", "jax")}  # of this package, and what each brings
 SCENE = ("draft", "standard", "reference")
 
 
@@ -34,7 +36,8 @@ class Entry:
     """Say what an environment is without importing it.
 
     `target` is "module:Class", "FILE.py:Class" or the class itself. What another package's entry point cannot say is
-    empty; `complete_entry` asks the class.
+    empty; `complete_entry` asks the class. An environment whose engine is not always installed comes with an `extra`
+    of this package.
     """
 
     name: str
@@ -43,6 +46,11 @@ class Entry:
     parameters: str = ""
     model: str = ""
     fidelities: tuple[str, ...] = ()
+    extra: str = ""
+
+
+def _mjx_entry(name: str, target: str, dim: str, parameters: str, model: str) -> Entry:
+    return Entry(name, f"gradscape.envs.mjx.scenes:{target}", dim, parameters, f"MuJoCo in JAX: {model}", SCENE, "mjx")
 
 
 def _function_entry(name: str, target: str, model: str, dim: str = "2") -> Entry:
@@ -128,6 +136,16 @@ BUILTIN = (
     _plasticine_entry("torus", "Torus", "15", "ring", "press a ring into a slab"),
     _plasticine_entry("triple-move", "TripleMove", "90", "6 spheres", "carry three blocks"),
     _plasticine_entry("writer", "Writer", "15", "pen", "write into a slab"),
+    _mjx_entry("mjx-drop", "Drop", "3", "initial velocity x, y, z [m/s]", "a ball on a plane"),
+    _mjx_entry("mjx-bounce", "MjxBounce", "3", "initial velocity x, y, z [m/s]", "bounce's ball and target"),
+    _mjx_entry(
+        "mjx-cartpole",
+        "MjxCartpole",
+        "400",
+        "100 x (cart velocity [m/s], 3 torques [N m])",
+        "cartpole's chain and target",
+    ),
+    _mjx_entry("mjx-push", "Push", "10", "5 x (ball velocity x, y) [m/s]", "a box pushed across friction"),
     _function_entry("ackley", "Ackley", "many shallow minima around a funnel", "any"),
     _function_entry("beale", "Beale", "flat plain with sharp corner peaks"),
     _function_entry("branin", "Branin", "three equal minima in a smooth valley"),
@@ -175,6 +193,11 @@ def register(kind: type[Kind]) -> type[Kind]:
         )
     entries()[kind.name] = Entry(kind.name, kind, model="registered by this program")
     return kind
+
+
+def installs(entry: Entry) -> str:
+    """Return the line that installs what an environment needs, empty where that is there."""
+    return "" if all(is_installed(package) for package in EXTRAS.get(entry.extra, ())) else install_line(entry.extra)
 
 
 def complete_entry(entry: Entry) -> Entry:
@@ -260,14 +283,14 @@ def make(
     *,
     fidelity: str | Fidelity | None = None,
     device: str = "auto",
-    engine: str = "warp",
+    engine: str | None = None,
     deterministic: bool = False,
     **options: Any,
 ) -> Environment:
     """Make an environment by its registered name, by FILE.py:Class, or of a class.
 
-    `fidelity` defaults to its cheapest, `device` is auto, cpu or cuda. Raises ValueError where the environment does not
-    exist, or has no such fidelity, device, engine or option.
+    `fidelity` defaults to its cheapest, `engine` to its first; `device` is auto, cpu or cuda. Raises ValueError where
+    the environment does not exist, or has no such fidelity, device, engine or option.
     """
     kind = name if isinstance(name, type) else environment_class(name)
     settings: dict[str, Any] = {"fidelity": fidelity, "device": device, "engine": engine}

@@ -172,7 +172,7 @@ class BenchJob:
         def make(engine: str) -> Environment:
             return replace(scene, engine=engine, deterministic=scene.deterministic and engine != against).make()
 
-        return cls(make, scene.engine, **how)
+        return cls(make, scene.engine or scene.kind.engines[0], **how)
 
     def run(self, watch: Watch | None = None) -> Bench:
         """Measure it, and return what was found.

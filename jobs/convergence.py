@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..envs.registry import environment_class
 from ..landscapes.capacity import Need, require
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.storage.files import tidy
@@ -75,7 +74,7 @@ class ConvergenceJob:
         """
         from ..landscapes.storage.checkpoint import Checkpoint
 
-        kind = environment_class(scene.name) if isinstance(scene.name, str) else scene.name
+        kind = scene.kind
         env = replace(scene, fidelity=list(kind.fidelities)[-1], tolerance=None).make()
         refuse_single(env)
         require("points", points, lambda count: Need(8.0 * COPIES * (1 + env.space.dim) * count))

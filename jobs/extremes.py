@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..envs.registry import environment_class
 from ..landscapes.capacity import Need, require
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.measures.extremes import Extremes, Limit, RefusedSetting, StabilityMap
@@ -338,7 +337,7 @@ def _with_fidelity(scene: SceneSpec) -> SceneSpec:
     """Return a scene at standard, or at its first fidelity, unless it has another."""
     if scene.fidelity is not None:
         return scene
-    named = (environment_class(scene.name) if isinstance(scene.name, str) else scene.name).fidelities
+    named = scene.kind.fidelities
     return replace(scene, fidelity="standard" if "standard" in named else next(iter(named)), tolerance=None)
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from ..envs.registry import environment_class
 from ..landscapes.capacity import TooLargeError
 from .motion import SMOOTHING, Motion, need_of
 from .scene import SceneSpec
@@ -176,7 +175,7 @@ def make_here(scene: SceneSpec) -> tuple[Environment, str]:
     """
     from ..envs.engines.runtime import cuda_available
 
-    kind = environment_class(scene.name) if isinstance(scene.name, str) else scene.name
+    kind = scene.kind
     if scene.device not in DEVICES:
         raise ValueError(f"--device takes {', '.join(DEVICES)}; got {scene.device!r}")
     if scene.device == "cuda" and "cuda" in kind.devices and not cuda_available():

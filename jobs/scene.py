@@ -31,14 +31,15 @@ class SceneSpec:
 
     `name` is a registered name, FILE.py:Class, or an environment's class. `fidelity` is a name or a record, by default
     the cheapest; `tolerance` chooses it by measured loss errors instead ("5%" of the losses' spread, or "0.05" in their
-    unit). `device` is auto, cpu or cuda, `engine` one of the scene's, and `options` are the scene's own.
+    unit). `device` is auto, cpu or cuda, `engine` one of the scene's, by default its first, and `options` are
+    the scene's own.
     """
 
     name: str | type[Environment]
     fidelity: str | Fidelity | None = None
     tolerance: str | None = None
     device: str = "auto"
-    engine: str = "warp"
+    engine: str | None = None
     deterministic: bool = False
     options: Mapping[str, Any] = field(default_factory=dict)
 
@@ -50,6 +51,11 @@ class SceneSpec:
         from ..envs.registry import source_of
 
         return cls(source_of(env), env.fidelity, None, env.device, env.engine, env.deterministic, asdict(env.options))
+
+    @property
+    def kind(self) -> type[Environment]:
+        """The environment's class. Raises ValueError where there is none of that name."""
+        return environment_class(self.name) if isinstance(self.name, str) else self.name
 
     def resolve(self, watch: Watch) -> SceneSpec:
         """Return the spec with the fidelity that its tolerance chooses.

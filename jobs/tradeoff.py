@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..envs.registry import environment_class
 from ..landscapes.capacity import Need, require
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.storage.files import tidy
@@ -258,5 +257,5 @@ class TradeoffJob:
 
 def reference_of(scene: SceneSpec) -> Environment:
     """Make the reference of a scene: its last fidelity."""
-    kind = environment_class(scene.name) if isinstance(scene.name, str) else scene.name
+    kind = scene.kind
     return replace(scene, fidelity=list(kind.fidelities)[-1], tolerance=None).make()

@@ -1,9 +1,9 @@
-"""Simulation engines: the only place that knows Warp or Taichi."""
+"""Simulation engines: the only place that knows Warp, Taichi or MuJoCo."""
 
-from . import taichi, warp
+from . import mjx, taichi, warp
 from .engine import Engine
 
-ENGINES = {engine.name: engine for engine in (warp.ENGINE, taichi.ENGINE)}
+ENGINES = {engine.name: engine for engine in (warp.ENGINE, taichi.ENGINE, mjx.ENGINE)}
 
 
 def find_engine(name: str) -> Engine:

@@ -85,7 +85,7 @@ class JaxObjective:
 
         size = next(size for size in _sizes(self.preferred_batch) if size >= len(x))
         padded = torch.cat([x, x[-1:].expand(size - len(x), -1)]).numpy()
-        with _precision(self.precision), self._explained():
+        with computing_in(self.precision), self._explained():
             found = self._function(grad)(jnp.asarray(padded, dtype=self.precision))
         loss, slope = found if grad else (found, None)
         return Evaluation.from_results(_tensor(loss)[: len(x)], None if slope is None else _tensor(slope)[: len(x)])
@@ -160,14 +160,11 @@ def _value_and_tangents(fn: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 @contextmanager
-def _precision(name: str) -> Iterator[None]:
-    """Let JAX compute in double precision where that is asked for, and as it is configured elsewhere."""
+def computing_in(name: str) -> Iterator[None]:
+    """Let JAX compute in a precision, whatever it is configured to."""
     import jax
 
-    if name == "float32":
-        yield
-        return
-    with jax.enable_x64(True):
+    with jax.enable_x64(name == "float64"):
         yield
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 from gradscape.envs.base import Environment, Fidelity
 from gradscape.envs.functions import Function
+from gradscape.envs.mjx.scene import MjxScene
 from gradscape.envs.mpm.fluid import Fluid
 from gradscape.envs.mpm.plasticine import Plasticine
 from gradscape.envs.registry import entries, environment_class
@@ -13,6 +14,7 @@ COARSE = {  # families whose cheapest fidelity takes too long
     Fluid: {"dt": Fluid.control_step / 2, "resolution": 6, "sampling": 1.5},
     Plasticine: {"dt": Plasticine.control_step / 5, "resolution": 16, "particles": 100},
     SheetScene: {"dt": 1 / 500, "resolution": 4},
+    MjxScene: {"dt": 1 / 50},
 }
 
 

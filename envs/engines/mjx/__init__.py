@@ -1,0 +1,5 @@
+"""The engine MJX: MuJoCo in JAX."""
+
+from ..engine import Engine
+
+ENGINE = Engine("mjx", {"rollout": "mjx.rollout"}, concurrent=False, extra="mjx")

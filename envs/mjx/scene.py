@@ -1,0 +1,170 @@
+"""A MuJoCo model as an environment: which of its numbers are parameters, and what the loss is."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...landscapes.episode import Part, View
+from ...landscapes.objective import Evaluation
+from ...landscapes.space import ParameterSpace
+from ..base import Environment, Episode, Fidelity, Work
+from ..options import EpisodeOptions
+
+ROWS = 16
+FRAMES = 240  # of an episode that is drawn, at most
+MATERIALS = ("wood", "rubber", "steel", "iron")  # of geoms, in turn
+Mode = Literal["forward", "reverse"]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """Say which number of a MuJoCo model a parameter is, and its bounds [`unit`].
+
+    `field` is qpos or qvel (of the state at first), ctrl (held over each segment of the episode), or a field of the
+    model: body_mass, geom_friction, dof_damping and others. `index` says which of its numbers: a row, or the name of
+    the body, geom, joint or actuator it belongs to; of a field with columns a pair of row and column.
+    """
+
+    name: str
+    field: str
+    index: int | str | Sequence[int | str]
+    lower: float
+    upper: float
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class MjxOptions(EpisodeOptions):
+    """How gradients come, and how contacts are solved.
+
+    `mode`: forward differentiates forward, which the solver's loops need; reverse is cheaper for many parameters, and
+    with contacts works with `iterations=1` alone. `solver` of the constraints, its `iterations`, and those of its line
+    search, `ls_iterations`; 0 takes the model's own.
+    """
+
+    mode: Mode = "forward"
+    solver: Literal["newton", "cg"] = "newton"
+    iterations: int = 0
+    ls_iterations: int = 0
+
+
+class MjxScene(Environment):
+    """A scene that MuJoCo simulates in JAX.
+
+    A scene derives from this class and says: `mjcf`, a file of MuJoCo's or the text of one; `parameters`, which of its
+    numbers are varied; `duration` [s]; `segments`, how many times controls are held; and `loss_of(state)`, the loss of
+    the last state, a JAX number, from its `qpos`, `qvel`, `xpos` and others. A row that ends in numbers that are not
+    finite has failed. Loss and gradient come from two programs, so that losses are the same with gradients and without.
+    """
+
+    mjcf: ClassVar[str]
+    parameters: ClassVar[tuple[Parameter, ...]]
+    duration: ClassVar[float]
+    segments: ClassVar[int] = 1
+    engines: ClassVar[tuple[str, ...]] = ("mjx",)
+    fidelities: ClassVar[dict[str, Fidelity]] = {
+        "draft": Fidelity("draft", dt=1 / 250, precision="float64"),
+        "standard": Fidelity("standard", dt=1 / 500, precision="float64"),
+        "reference": Fidelity("reference", dt=1 / 4000, precision="float64"),
+    }
+    Options: ClassVar[type[Any]] = MjxOptions
+
+    @abc.abstractmethod
+    def loss_of(self, state: Any) -> Any:
+        """Return the loss of the last state, traced by JAX: `mujoco.mjx.Data` of one row."""
+
+    @property
+    def preferred_batch(self) -> int:
+        """Number of points worth evaluating at once."""
+        return min(ROWS, self._max_rows)
+
+    @property
+    def steps(self) -> int:
+        """Number of time steps of an episode."""
+        return self._course.held * self._course.steps
+
+    def work(self) -> Work:
+        """Count steps of bodies."""
+        return Work(self.steps * max(1, self._rollout.host.nbody - 1), "body-step")
+
+    def episode(self, x: Float[Tensor, " dim"]) -> Episode:
+        """Return where geoms are during the episode at one point."""
+        at, turn = self._rollout.frames(self._row(x)[0].numpy(), self._course)
+        rows = np.unique(np.linspace(0, len(at) - 1, FRAMES).round().astype(int))
+        time = torch.from_numpy(rows * self.fidelity.dt)
+        return draw(time, torch.from_numpy(at[rows]), torch.from_numpy(turn[rows]), self._rollout.geoms())
+
+    def act(self, model: Any, state: Any, control: Any) -> Any:
+        """Return the state at the start of a segment with its controls, shape (actuator,)."""
+        return state.replace(ctrl=control)
+
+    def _setup(self) -> None:
+        o, solver = self.options, self._engine("rollout")
+        settings = solver.Settings(self.fidelity.dt, o.solver, o.iterations, o.ls_iterations)
+        self._rollout = solver.Rollout(self.mjcf, settings, self.fidelity.precision, name=self.name)
+        first = [one for one in self.parameters if one.field != "ctrl"]
+        held = [one for one in self.parameters if one.field == "ctrl"]
+        named = [(one.name, one) for one in first]
+        named += [(f"t{k} {one.name}", one) for k in range(self.segments) for one in held]
+        self.space = ParameterSpace({name: (one.lower, one.upper, one.unit) for name, one in named})
+        places = tuple(self._rollout.find(one.field, one.index) for one in (*first, *held))
+        each = round(self.duration / self.segments / self.fidelity.dt)
+        count, steps = (1, o.count_steps(each)) if self.segments == 1 else (o.count_steps(self.segments), each)
+        self._course = solver.Course(places, self.segments, count, steps, self.act)
+        how: dict[str, Any] = {"mode": o.mode, "precision": self.fidelity.precision, "rows": self.preferred_batch}
+        self._objective = solver.from_jax(self._loss, self.space, name=self.name, **how)
+
+    def _loss(self, x: Any) -> Any:
+        return self.loss_of(self._rollout.end(x, self._course))
+
+    def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+        """Evaluate batches of one size only: programs for other sizes round in another order."""
+        whole = torch.cat([x, x[-1:].expand(-len(x) % self.preferred_batch, -1)])
+        alone = self._objective.evaluate(whole, grad=False).rows(slice(len(x)))
+        if not grad:
+            return alone
+        both = self._objective.evaluate(whole, grad=True).rows(slice(len(x)))
+        return Evaluation.from_results(alone.loss, both.grad, alone.status)
+
+
+def draw(
+    time: Float[Tensor, " frame"],
+    at: Float[Tensor, "frame geom 3"],
+    turn: Float[Tensor, "frame geom 3 3"],
+    geoms: Sequence[Mapping[str, Any]],
+) -> Episode:
+    """Return the episode of geoms that move; MuJoCo's z is upwards, ours y."""
+    up = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
+    at, turn = at @ up.T, up @ turn @ up.T
+    parts, points = list[Part](), dict[str, Tensor]()
+    for number, geom in enumerate(geoms):
+        place, size = at[:, number : number + 1], geom["size"]
+        material: Any = MATERIALS[number % len(MATERIALS)]
+        if geom["shape"] == "sphere":
+            parts.append(Part("sphere", material, place, (size[0],), turn[:, number]))
+        elif geom["shape"] == "box":
+            parts.append(Part("box", material, place, (2 * size[0], 2 * size[2], 2 * size[1]), turn[:, number]))
+        elif geom["shape"] in ("capsule", "cylinder"):
+            half = size[1] * turn[:, number, :, 1][:, None]  # along the geom's own z, which is our y
+            parts.append(Part("path", material, torch.cat([place - half, place + half], dim=1), (size[0],)))
+        else:
+            continue
+        points[f"{geom['shape']} {number}"] = place
+    ground = any(geom["shape"] == "plane" for geom in geoms)
+    return Episode(time, points, {}, tuple(parts), _view(at, geoms, ground))
+
+
+def _view(at: Tensor, geoms: Sequence[Mapping[str, Any]], ground: bool) -> View:
+    """Return what all that moves is seen in, with some room around."""
+    moving = [number for number, geom in enumerate(geoms) if geom["shape"] != "plane"]
+    room = max(max(geoms[number]["size"]) for number in moving) * 2
+    lower, upper = at[:, moving].amin(dim=(0, 1)) - room, at[:, moving].amax(dim=(0, 1)) + room
+    return View(tuple(lower.tolist()), tuple(upper.tolist()), ground=0.0 if ground else None)  # type: ignore[arg-type]

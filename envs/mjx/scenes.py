@@ -1,0 +1,202 @@
+"""Four scenes of MuJoCo: a drop, a bounce, a chain on a cart, and a push across friction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from ..base import Fidelity
+from .scene import MjxOptions, MjxScene, Mode, Parameter
+
+BALL = """
+<mujoco>
+  <option timestep="0.004" gravity="0 0 -9.8"/>
+  <worldbody>
+    <geom type="plane" size="20 20 0.1" {contact}/>
+    <body name="ball" pos="{place}">
+      <freejoint name="ball"/>
+      <geom name="ball" type="sphere" size="0.1" mass="1" {contact}/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+TARGET = (2.0, 0.0, 1.0)  # of mjx-bounce [m]
+AHEAD = 0.5  # where mjx-drop's ball is wanted [m]
+GOAL = (0.6, 0.15)  # of mjx-push [m]
+SPEED = ("velocity x", "velocity y", "velocity z")
+
+
+def _speeds(bound: float) -> tuple[Parameter, ...]:
+    return tuple(Parameter(name, "qvel", axis, -bound, bound, "m/s") for axis, name in enumerate(SPEED))
+
+
+class Drop(MjxScene):
+    """Drop a ball onto the ground, so that it lies 0.5 m ahead after 0.6 s.
+
+    Model: MuJoCo's, in JAX: a ball of radius 0.1 m and mass 1 kg falls from 1 m onto a plane, with MuJoCo's own soft
+    contact and friction (coefficient 1); semi-implicit Euler, dt 1/500 s at standard.
+    Parameters: initial velocity x, y, z [m/s], z upwards.
+    Loss: squared distance on the ground to (0.5, 0) m at the end [m^2]. A ball that is dropped straight down (example
+    `straight`) does not slide when it touches, which is where gradients of such contacts are worth a look.
+    """
+
+    name: ClassVar[str] = "mjx-drop"
+    mjcf: ClassVar[str] = BALL.format(place="0 0 1", contact="")
+    parameters: ClassVar[tuple[Parameter, ...]] = _speeds(2.0)
+    duration: ClassVar[float] = 0.6
+    loss_unit: ClassVar[str] = "m²"
+    examples: ClassVar[dict[str, tuple[float, ...]]] = {"straight": (0.0, 0.0, 0.0)}
+
+    def loss_of(self, state: Any) -> Any:
+        """Return the squared distance to the target on the ground [m^2]."""
+        return (state.qpos[0] - AHEAD) ** 2 + state.qpos[1] ** 2
+
+
+class MjxBounce(MjxScene):
+    """Throw a ball so that it is at the target after 2 s, as in `bounce`, by MuJoCo.
+
+    Model: MuJoCo's, in JAX: a ball of radius 0.1 m and mass 1 kg flies from (-0.5, 0, 1) m under gravity; the plane
+    pushes back by MuJoCo's contact with the stiffness 1e4 and the damping 10 of `bounce` for each kg, and rubs
+    (coefficient 0.25), which spins the ball; semi-implicit Euler, dt 1/500 s at standard.
+    Parameters: initial velocity x, y, z [m/s], z upwards; `bounce` has y upwards.
+    Loss: squared distance of the ball's centre to the target (2, 0, 1) m after 2 s [m^2].
+    """
+
+    name: ClassVar[str] = "mjx-bounce"
+    mjcf: ClassVar[str] = BALL.format(
+        place="-0.5 0 1", contact='solref="-10000 -10" solimp="0.999 0.999 0.001" friction="0.25 0 0"'
+    )
+    parameters: ClassVar[tuple[Parameter, ...]] = _speeds(10.0)
+    duration: ClassVar[float] = 2.0
+    loss_unit: ClassVar[str] = "m²"
+
+    def loss_of(self, state: Any) -> Any:
+        """Return the squared distance to the target [m^2]."""
+        return sum((state.qpos[axis] - at) ** 2 for axis, at in enumerate(TARGET))
+
+
+LINK = """
+<body name="link {k}" pos="0 0 {z}">
+  <joint name="joint {k}" type="hinge" axis="0 -1 0"/>
+  <geom name="link {k}" type="capsule" fromto="0 0 0 0 0 -1" size="0.03" contype="0" conaffinity="0"/>
+  <inertial pos="0 0 -0.5" mass="{mass}" diaginertia="{inertia} {inertia} 1e-6"/>
+  {inner}
+</body>
+"""
+
+
+def _chain() -> str:
+    """Return a cart so heavy that no torque moves it, and three uniform rods of 1 m that hang from it."""
+    inner = ""
+    for k, mass in ((3, 0.25), (2, 0.5), (1, 1.0)):
+        inner = LINK.format(k=k, z=0 if k == 1 else -1, mass=mass, inertia=mass / 12, inner=inner)
+    motors = "".join(f'<motor name="torque {k}" joint="joint {k}"/>' for k in (1, 2, 3))
+    return f"""
+<mujoco>
+  <option timestep="0.01" gravity="0 0 -9.81" integrator="RK4"/>
+  <worldbody>
+    <body name="cart">
+      <joint name="cart" type="slide" axis="1 0 0"/>
+      <geom name="cart" type="box" size="0.35 0.1 0.15" mass="1e8" contype="0" conaffinity="0"/>
+      {inner}
+    </body>
+  </worldbody>
+  <actuator><motor name="cart velocity" joint="cart" gear="0"/>{motors}</actuator>
+</mujoco>
+"""
+
+
+@dataclass(frozen=True)
+class ChainOptions(MjxOptions):
+    """Nothing touches anything, so the chain is differentiated in reverse unless told otherwise."""
+
+    mode: Mode = "reverse"
+
+
+class MjxCartpole(MjxScene):
+    """Swing up a chain of three links, as in `cartpole`, by MuJoCo.
+
+    Model: MuJoCo's, in JAX: three uniform rods of 1 m with masses 1, 0.5 and 0.25 kg hang from a cart, at rest at
+    first, under gravity and the torques of three motors; the cart takes each velocity at once, as by an impulse, and
+    is so heavy that nothing else moves it. Classical Runge-Kutta, dt 0.01 s at standard.
+    Parameters and loss are those of `cartpole`, which this scene was made to be held against.
+    """
+
+    name: ClassVar[str] = "mjx-cartpole"
+    mjcf: ClassVar[str] = _chain()
+    duration: ClassVar[float] = 2.0
+    segments: ClassVar[int] = 100
+    decisions: ClassVar[int] = 100
+    control_step: ClassVar[float] = 0.02
+    loss_unit: ClassVar[str] = "m"
+    Options: ClassVar[type[Any]] = ChainOptions
+    fidelities: ClassVar[dict[str, Fidelity]] = {
+        "draft": Fidelity("draft", dt=0.02, precision="float64"),
+        "standard": Fidelity("standard", dt=0.01, precision="float64"),
+        "reference": Fidelity("reference", dt=0.0025, precision="float64"),
+    }
+    parameters: ClassVar[tuple[Parameter, ...]] = tuple(
+        Parameter(name, "ctrl", name, -bound, bound, unit)
+        for name, bound, unit in (
+            ("cart velocity", 2.0, "m/s"),
+            ("torque 1", 10.0, "N m"),
+            ("torque 2", 4.0, "N m"),
+            ("torque 3", 1.0, "N m"),
+        )
+    )
+
+    def act(self, model: Any, state: Any, control: Any) -> Any:
+        """Return the state whose cart has its velocity and whose motors their torques."""
+        return self._engine("rollout").kick(model, state, 0, control[0]).replace(ctrl=control)
+
+    def loss_of(self, state: Any) -> Any:
+        """Return the distance of the tip to the target (0, 3) m [m]; the links hang along their own -z."""
+        tip = state.xpos[-1] - state.xmat[-1][:, 2]
+        return (tip[0] ** 2 + (tip[2] - 3.0) ** 2) ** 0.5
+
+
+class Push(MjxScene):
+    """Push a box across a rough floor with a ball, so that it lies at (0.6, 0.15) m after 1 s.
+
+    Model: MuJoCo's, in JAX: a box of 0.2 m and 1 kg lies at the origin on a plane (friction 0.5); a ball of radius
+    0.05 m on two rails pushes it, whose velocity follows its control. Semi-implicit Euler, dt 1/500 s at standard.
+    Parameters: five times the wanted velocity x and y of the ball [m/s], each held for 0.2 s.
+    Loss: squared distance of the box's centre on the floor to (0.6, 0.15) m [m^2].
+    """
+
+    name: ClassVar[str] = "mjx-push"
+    mjcf: ClassVar[str] = """
+<mujoco>
+  <option timestep="0.004"/>
+  <worldbody>
+    <geom type="plane" size="5 5 0.1" friction="0.5 0.005 0.0001"/>
+    <body name="box" pos="0 0 0.1">
+      <freejoint name="box"/>
+      <geom name="box" type="box" size="0.1 0.1 0.1" mass="1" friction="0.5 0.005 0.0001"/>
+    </body>
+    <body name="ball" pos="-0.2 0 0.1">
+      <joint name="rail x" type="slide" axis="1 0 0"/>
+      <joint name="rail y" type="slide" axis="0 1 0"/>
+      <geom name="ball" type="sphere" size="0.05" mass="1" friction="0.5 0.005 0.0001"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <velocity name="velocity x" joint="rail x" kv="100"/>
+    <velocity name="velocity y" joint="rail y" kv="100"/>
+  </actuator>
+</mujoco>
+"""
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("velocity x", "ctrl", "velocity x", -2.0, 2.0, "m/s"),
+        Parameter("velocity y", "ctrl", "velocity y", -2.0, 2.0, "m/s"),
+    )
+    duration: ClassVar[float] = 1.0
+    segments: ClassVar[int] = 5
+    decisions: ClassVar[int] = 5
+    control_step: ClassVar[float] = 0.2
+    loss_unit: ClassVar[str] = "m²"
+    examples: ClassVar[dict[str, tuple[float, ...]]] = {"straight": (0.8, 0.0) * 5}
+
+    def loss_of(self, state: Any) -> Any:
+        """Return the squared distance to the goal on the floor [m^2]."""
+        return (state.qpos[0] - GOAL[0]) ** 2 + (state.qpos[1] - GOAL[1]) ** 2
