@@ -143,7 +143,7 @@ BUILTIN = (
         "MjxCartpole",
         "400",
         "100 x (cart velocity [m/s], 3 torques [N m])",
-        "cartpole's chain and target",
+        "cartpole's chain",
     ),
     _mjx_entry("mjx-push", "Push", "10", "5 x (ball velocity x, y) [m/s]", "a box pushed across friction"),
     _function_entry("ackley", "Ackley", "many shallow minima around a funnel", "any"),

@@ -125,8 +125,8 @@ def test_forms_name_verbs_and_options_there_are(command: str) -> None:
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a slice, a run, its points as a table, somebody's own class, two figures, and a site to serve."""
     folder = tmp_path_factory.mktemp("desk")
-    (mine,) = (block for block in BLOCKS if block.startswith("# my.py"))
-    (folder / "my.py").write_text(mine)
+    for name, text in re.findall(r"```python\n# (\w+\.py)\n(.*?)```", TEXT, flags=re.DOTALL):
+        (folder / name).write_text(text)
     how = ["--fidelity", "draft", "--device", "cpu", "--out"]
     for command in (
         ["slice", "fluid", *TENTH, "--dims", "0", "1", "--resolution", "2", *how, str(folder / "cut")],

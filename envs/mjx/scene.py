@@ -89,7 +89,8 @@ class MjxScene(Environment):
     @property
     def steps(self) -> int:
         """Number of time steps of an episode."""
-        return self._course.held * self._course.steps
+        count: int = self._course.held * self._course.steps
+        return count
 
     def work(self) -> Work:
         """Count steps of bodies."""
@@ -128,7 +129,7 @@ class MjxScene(Environment):
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         """Evaluate batches of one size only: programs for other sizes round in another order."""
         whole = torch.cat([x, x[-1:].expand(-len(x) % self.preferred_batch, -1)])
-        alone = self._objective.evaluate(whole, grad=False).rows(slice(len(x)))
+        alone: Evaluation = self._objective.evaluate(whole, grad=False).rows(slice(len(x)))
         if not grad:
             return alone
         both = self._objective.evaluate(whole, grad=True).rows(slice(len(x)))
@@ -167,4 +168,4 @@ def _view(at: Tensor, geoms: Sequence[Mapping[str, Any]], ground: bool) -> View:
     moving = [number for number, geom in enumerate(geoms) if geom["shape"] != "plane"]
     room = max(max(geoms[number]["size"]) for number in moving) * 2
     lower, upper = at[:, moving].amin(dim=(0, 1)) - room, at[:, moving].amax(dim=(0, 1)) + room
-    return View(tuple(lower.tolist()), tuple(upper.tolist()), ground=0.0 if ground else None)  # type: ignore[arg-type]
+    return View(tuple(lower.tolist()), tuple(upper.tolist()), ground=0.0 if ground else None)

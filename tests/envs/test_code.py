@@ -60,15 +60,17 @@ def copy(tmp_path: Path) -> Path:
     return tmp_path / "envs"
 
 
-def files_of(name: str, engine: str = "warp", folder: Path = code.HERE) -> set[str]:
-    return {str(file.relative_to(folder)) for file in find_files([folder / home_of(name)], folder, engine)}
+def files_of(name: str, engine: str = "", folder: Path = code.HERE) -> set[str]:
+    own = engine or environment_class(name).engines[0]
+    return {str(file.relative_to(folder)) for file in find_files([folder / home_of(name)], folder, own)}
 
 
 # What scenes import, or lies beside them, and computes no loss: it says so itself.
 SILENT = {"base.py", "batching.py", "code.py", "registry.py", "observation.py", "outlines.py", "engines/runtime.py"}
-SILENT |= {"records.py", "mpm/plasticine_look.py"}
+SILENT |= {"installed.py", "records.py", "mpm/plasticine_look.py"}
 # What no scene imports.
 ELSEWHERE = {"importing.py", "points.py", "engines/profiling.py", "engines/engine.py", "engines/warp.py"}
+ELSEWHERE |= {"engines/warp_functions.py"}  # what it makes of a function is no scene
 
 
 def home_of(name: str) -> str:

@@ -1,4 +1,4 @@
-"""MuJoCo's scenes: against our own chain and closed forms, what parameters set, and what a model without sense is told."""
+"""MuJoCo's scenes: against our own chain and closed forms, what parameters set, what a model without sense is told."""
 
 from dataclasses import replace
 
@@ -121,7 +121,7 @@ def test_a_shorter_horizon_ends_earlier_and_a_longer_one_goes_on(dart):
     ("changed", "said"),
     [
         (
-            {"mjcf": "<mujoco><worldbody><bod/></worldbody></mujoco>"},
+            {"mjcf": "<mujoco><bod/></mujoco>"},
             "wrong has a model that MuJoCo cannot read: .*bod",
         ),
         ({"mjcf": "nowhere.xml"}, "wrong has a model that MuJoCo cannot read: there is no file nowhere.xml"),

@@ -19,7 +19,7 @@ from platformdirs import user_cache_dir
 from ..jax_functions import computing_in
 from ..jax_functions import from_jax as from_jax
 
-if jax.config.jax_compilation_cache_dir is None:  # compiling a scene takes longer than many episodes of it
+if jax.config.values.get("jax_compilation_cache_dir") is None:  # a scene takes long to compile
     jax.config.update("jax_compilation_cache_dir", user_cache_dir("gradscape") + "/jax")
 
 AT_FIRST = ("qpos", "qvel")  # fields of the state that parameters set before the first step
@@ -97,9 +97,9 @@ class Rollout:
 
     def _shape(self, field: str) -> tuple[int, ...]:
         if field in (*AT_FIRST, CONTROL):
-            return tuple(getattr(self.start, field).shape)
-        value = getattr(self.model, field, None)
-        if not hasattr(value, "shape") or not jnp.issubdtype(getattr(value, "dtype", int), jnp.floating):
+            return tuple(np.shape(getattr(self.start, field)))
+        value: Any = getattr(self.model, field, None)
+        if not hasattr(value, "shape") or not jnp.issubdtype(value.dtype, jnp.floating):
             raise ValueError(
                 f"{self.name} has no numbers {field!r} to vary; MuJoCo's are qpos, qvel, ctrl, and of the model "
                 "body_mass, geom_friction, dof_damping and others"
