@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .page import Picture
 
 MARGIN = 0.1  # between type and the edge of the page [inch]
+HINTED = 1.06  # small type whose letters are moved to whole pixels is up to so much wider
 MORE, LEAST = " …", 3  # what stands for the rest of a text; characters of a line
 BESIDE = 1.2  # length of what is written up a panel's side, against it, at most
 AMPLE = 3.0  # height to begin with that no legend or title uses up [inch]
@@ -114,6 +115,6 @@ def _break_lines(text: str, fits: int, lines: int) -> list[str]:
 
 
 def text_width(text: str, size: float) -> float:
-    """Return how much room type of a size [pt] takes [inch]."""
+    """Return how much room type of a size [pt] takes at most [inch], on a screen or on paper."""
     width, _, _ = text_to_path.get_text_width_height_descent(text, FontProperties(size=size), ismath=False)
-    return float(width) / 72
+    return HINTED * float(width) / 72
