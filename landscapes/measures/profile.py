@@ -149,6 +149,7 @@ def named_measures(record: ProfileRecord) -> dict[str, str]:
         "Neighbours with a jump between them": _shares(jumps["share"]),
         "Jumps explained by an event": _shares(jumps["explained_by_events"]),
         "Correlation length, of the box": ", ".join(map(_shares, losses["correlation_length"])),
+        "Hölder exponent": ", ".join(map(_number, losses.get("holder", []))),
         "Total variation, in ranges": ", ".join(map(_number, losses["total_variation"])),
         "Information content": _number(losses["information"]),
         "Dispersion of the best 5 %": _number(losses["dispersion"]),

@@ -24,6 +24,7 @@ class LossesRecord(TypedDict):
     flat: EstimateRecord | None
     level: EstimateRecord
     correlation_length: list[EstimateRecord]
+    holder: NotRequired[list[EstimateRecord]]  # reports of early versions do not have it
     total_variation: list[EstimateRecord]
     information: EstimateRecord
     settling: EstimateRecord

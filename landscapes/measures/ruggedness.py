@@ -18,6 +18,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import fft
 from scipy.spatial.distance import pdist
+from scipy.stats import linregress
 
 from ..identity import plane_of
 from ..plain import plain
@@ -28,6 +29,7 @@ FLAT_SLOPE = 1e-3  # a slope below it is effectively zero [ranges of the losses 
 NOTABLE = 0.01  # the least depth of a notable minimum, as a fraction of the range
 THRESHOLDS = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)  # depths that minima are counted by, as fractions of the range
 BEST_SHARE = 0.05  # share of the samples that dispersion calls the best
+LAGS, WIDEST = 3, 4  # fewest that an exponent is fitted to; the widest is this part of the side
 PAIRED = 4096  # most samples whose pairs are gone through one by one, 8 million of them
 
 
@@ -123,6 +125,24 @@ def correlation_length(loss: Values, axis: int) -> float:
             return float((lag - (1 / math.e - now) / (before - now)) / (points - 1))
         before = now if math.isfinite(now) else before
     return 1.0
+
+
+def holder_exponent(loss: Values, axis: int, floor: float) -> float:
+    """Return the exponent by which losses along an axis differ with distance: |f(x + h) - f(x)| ~ h^exponent.
+
+    The slope of the logarithm of the root mean square of differences over 1, 2, 4, ... steps, up to a quarter of the
+    side, against that of the distance: Wang et al. 2023, *Fractal landscapes in policy optimization* (NeurIPS), section
+    5, with differences of samples in the place of a Gaussian's. Differences no larger than `floor` are left out; NaN
+    where fewer than three distances are left.
+    """
+    lines, known = _lines(loss, axis), list[tuple[float, float]]()
+    lag = 1
+    while WIDEST * lag < lines.shape[1]:
+        apart = math.sqrt(_mean((lines[:, lag:] - lines[:, :-lag]) ** 2))
+        if apart > floor:
+            known.append((math.log(lag), math.log(apart)))
+        lag *= 2
+    return float(linregress(*zip(*known, strict=True)).slope) if len(known) >= LAGS else math.nan
 
 
 def total_variation(loss: Values, axis: int) -> float:
@@ -224,6 +244,7 @@ class Ruggedness:
     flat: Estimate | None
     level: Estimate
     correlation_length: tuple[Estimate, ...]
+    holder: tuple[Estimate, ...]
     total_variation: tuple[Estimate, ...]
     information: Estimate
     settling: Estimate
@@ -260,6 +281,9 @@ def ruggedness(dataset: xr.Dataset, *, floor: float, estimate: Callable[..., Est
         level=estimate(_mean, level_samples(loss, floor), least=0.0, most=1.0),
         correlation_length=tuple(
             estimate(lambda part, axis=axis: correlation_length(part, axis), loss, least=0.0, most=1.0) for axis in axes
+        ),
+        holder=tuple(
+            estimate(lambda part, axis=axis: holder_exponent(part, axis, floor), loss, least=0.0) for axis in axes
         ),
         total_variation=tuple(
             estimate(lambda part, axis=axis: total_variation(part, axis), loss, least=1.0) for axis in axes

@@ -52,6 +52,43 @@ def test_a_diagonal_valley_is_one_minimum_and_a_failure_is_no_hill() -> None:
     assert ruggedness.minima(np.full((3, 3), np.nan)).count(0.0) == 0
 
 
+def weierstrass(u: np.ndarray, a: float, b: float) -> np.ndarray:
+    """Its Hölder exponent is -ln a / ln b at every point; terms finer than a sample are left out."""
+    return sum(a**n * np.cos(b**n * np.pi * u + n) for n in range(40) if b**n < 4 / abs(u[1] - u[0]))
+
+
+@pytest.mark.parametrize(("a", "b"), [(0.5, 4.0), (0.5, 3.0), (0.7, 3.0), (0.8, 2.0)])
+@pytest.mark.parametrize("scale", [1.0, 1e-6])
+def test_the_exponent_of_weierstrass_function_is_its_own(a: float, b: float, scale: float) -> None:
+    u = np.linspace(0, 1, 1025)
+    wanted = -math.log(a) / math.log(b)
+    loss = scale * weierstrass(u, a, b)
+    assert ruggedness.holder_exponent(loss, 0, 0.0) == pytest.approx(wanted, abs=0.07)
+    plane = loss[::2, None] + loss[None, ::2] ** 2 / scale
+    assert ruggedness.holder_exponent(plane, 0, 0.0) == pytest.approx(wanted, abs=0.1)
+
+
+def test_the_exponent_of_what_is_smooth_is_one_of_a_jump_a_half_and_of_noise_none() -> None:
+    u = np.linspace(-1, 1, 513)
+    assert ruggedness.holder_exponent(3 * u, 0, 0.0) == pytest.approx(1.0)
+    assert ruggedness.holder_exponent(u**2, 0, 0.0) == pytest.approx(1.0, abs=0.1)
+    assert ruggedness.holder_exponent((u > 0.1).astype(float), 0, 0.0) == pytest.approx(0.5, abs=0.03)
+    noise = np.random.default_rng(0).standard_normal(513)
+    assert ruggedness.holder_exponent(noise, 0, 0.0) == pytest.approx(0.0, abs=0.05)
+
+
+def test_no_exponent_comes_from_too_few_distances_failures_or_noise() -> None:
+    u = np.linspace(-1, 1, 513)
+    assert math.isnan(ruggedness.holder_exponent(u[:16], 0, 0.0))  # 1 and 2 steps
+    assert math.isnan(ruggedness.holder_exponent(np.zeros(99), 0, 0.0))
+    assert math.isnan(ruggedness.holder_exponent(np.full(99, np.nan), 0, 0.0))
+    torn = u.copy()
+    torn[::7] = np.nan
+    assert ruggedness.holder_exponent(torn, 0, 0.0) == pytest.approx(1.0)
+    quiet = 1e-3 * u + 1e-5 * np.random.default_rng(0).standard_normal(513)
+    assert ruggedness.holder_exponent(quiet, 0, 0.0) < 0.9 < ruggedness.holder_exponent(quiet, 0, 6e-5)
+
+
 def test_basins_are_the_parts_that_drain_to_each_minimum() -> None:
     u = np.linspace(0, 1, 101)
     loss = np.minimum((u - 0.2) ** 2, 0.01 + (u - 0.7) ** 2)  # they meet at 0.46
