@@ -79,9 +79,16 @@ def _open(path: Path, remake: Callable[[], Objective] | None) -> Slice:
 
 
 def _sample_in_memory(objective: Objective, plane: Plane, grad: bool, watch: Watch) -> Slice:
+    from ..jobs.slice import look_between
     from ..landscapes.sampling.fill import sample
     from ..landscapes.slice import Slice
 
     with watch.progress(math.prod(plane.resolution), "evaluations") as advance:
-        dataset = sample(objective, plane, grad=grad, progress=lambda now: advance(now.done))
+        dataset = sample(
+            objective,
+            plane,
+            grad=grad,
+            progress=lambda now: advance(now.done),
+            conclude=lambda whole: look_between(objective, whole),
+        )
     return Slice(dataset, None, lambda: objective)

@@ -6,6 +6,7 @@ import math
 import resource
 import sys
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
@@ -22,9 +23,17 @@ from ..landscapes.adapters import within_box
 from ..landscapes.capacity import size
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.identity import plane_of
+from ..landscapes.measures.unresolved import (
+    UnresolvedRecord,
+    attribute_of,
+    find_unresolved,
+    probes,
+    say_unresolved,
+    stored_unresolved,
+)
 from ..landscapes.objective import Objective, Status, name_of
 from ..landscapes.plane import Plane
-from ..landscapes.sampling.distribution import RemoteSite, Site, run_tasks, workers_of
+from ..landscapes.sampling.distribution import RemoteSite, Site, evaluator, run_tasks, workers_of
 from ..landscapes.sampling.fill import Progress, sample
 from ..landscapes.sampling.memory import MemoryBound
 from ..landscapes.storage.arrays import need_of
@@ -56,7 +65,11 @@ class SliceCost:
 
 @dataclass(frozen=True)
 class SliceSummary:
-    """Say what a slice cost, as `summary.json` beside it has it; `status` counts points, `flat` those without slope."""
+    """Say what a slice cost, as `summary.json` beside it has it; `status` counts points, `flat` those without slope.
+
+    `episodes` are those of the samples; `unresolved` has those that looked between them, and what they found, None
+    where nothing is known of it.
+    """
 
     env: str | None
     dims: list[str]
@@ -71,6 +84,7 @@ class SliceSummary:
     status: dict[str, int]
     loss: dict[str, float | None]
     flat: int | None
+    unresolved: UnresolvedRecord | None
     command: str
     files: list[str]
 
@@ -82,7 +96,8 @@ class SliceSummary:
         losses = "no finite loss" if low is None else f"losses from {low:.4g} to {high:.4g}"
         share = (self.flat or 0) / sum(counts.values())
         flat = f"; gradient exactly zero at {share:.1%} of points" if share else ""
-        return f"{self.episodes} episodes in {duration(self.seconds)}; {ends}; {losses}{flat}"
+        hidden = f"; {said}" if (said := say_unresolved(self.unresolved)) else ""
+        return f"{self.episodes} episodes in {duration(self.seconds)}; {ends}; {losses}{flat}{hidden}"
 
 
 @dataclass(frozen=True)
@@ -217,7 +232,8 @@ class SliceJob:
         kept = f", {total - cost.episodes} are there already" if cost.episodes < total else ""
         watch.note(
             f"{cost.episodes} {kind} to compute{kept}: about {duration(cost.seconds)}, "
-            f"{size(cost.memory)} of memory{_gpu_memory(self.objective)}"
+            f"{size(cost.memory)} of memory{_gpu_memory(self.objective)}; then up to "
+            f"{probes(total, grad=self.store.grad)} losses between them"
         )
 
     def _sample(self, watch: Watch) -> tuple[xr.Dataset, int]:
@@ -235,8 +251,13 @@ class SliceJob:
                     drawn = time.monotonic()
                     pause = pause_after(drawn - began)
 
+            def conclude(dataset: xr.Dataset) -> dict[str, Any]:
+                advance(dataset["status"].size, "looking between them")
+                return look_between(evaluator(self.objective, self.store, self.executor, self.remake), dataset)
+
             how: dict[str, Any] = {"grad": self.store.grad, "executor": self.executor, "made": self.remake}
-            return sample(self.objective, self.plane, self.store, progress=follow, **how), computed
+            how |= {"progress": follow, "conclude": conclude}
+            return sample(self.objective, self.plane, self.store, **how), computed
 
     def _save(self, dataset: xr.Dataset) -> None:
         from ..landscapes.draw.figures.page import save
@@ -264,9 +285,25 @@ class SliceJob:
             status=count_statuses(dataset),
             loss=range_of(dataset),
             flat=flat_points(dataset),
+            unresolved=stored_unresolved(dataset),
             command=self.command,
             files=files,
         )
+
+
+def look_between(objective: Objective, dataset: xr.Dataset) -> dict[str, Any]:
+    """Return the attribute of a slice that says how much of it is finer than its samples.
+
+    An objective that raises between them has been sampled all the same: that is warned of, and nothing is said.
+    """
+    try:
+        return attribute_of(find_unresolved(objective, dataset))
+    except (OSError, MemoryError):  # lost workers, a full disk: the slice is finished once they are there again
+        raise
+    except Exception as error:
+        said = f"{name_of(objective)} raised between the samples, so what they hide is not known: {error}"
+        warnings.warn(said, RuntimeWarning, stacklevel=2)
+        return {}
 
 
 def picture_of(objective: Objective, plane: Plane) -> Draw:

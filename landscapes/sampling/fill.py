@@ -51,6 +51,7 @@ def sample(
     progress: Callable[[Progress], None] | None = None,
     executor: Executor | None = None,
     made: Callable[[], Objective] | None = None,
+    conclude: Callable[[xr.Dataset], Mapping[str, Any]] | None = None,
 ) -> xr.Dataset:
     """Evaluate an objective on a plane and return the slice; what `store` holds already is not evaluated again.
 
@@ -62,6 +63,9 @@ def sample(
     With an `executor` its workers evaluate batches and write them to the store, which processes must see at the same
     path. Threads share the objective; in a process `made`, a function that can be pickled, makes it once, or else it is
     pickled itself. Batches are equal then, and of at most `batch` points. Where workers are lost, `WorkersLostError`.
+
+    `conclude` is called with the slice when it is complete, and returns attributes of it that are kept, too. Of one
+    that was finished before it is not called.
 
     Raises StoreMismatchError where the store was made by other settings, TooLargeError where the slice does not fit
     into memory, DiskFullError and WorkersLostError where filling ended early, which say what is kept, and MemoryError
@@ -99,6 +103,8 @@ def sample(
                 back.look(filled.tile)
         dataset = store.dataset(back.values())
         if not bool((dataset["status"] == Status.MISSING).any()):
+            if conclude is not None and not store.ascending:
+                dataset = dataset.assign_attrs(conclude(dataset))
             store.finish(dataset)
     return dataset
 

@@ -20,6 +20,7 @@ from matplotlib.patches import Patch
 from matplotlib.text import Text
 
 from ...identity import stored_identity, stored_provenance
+from ...measures.unresolved import say_unresolved, stored_unresolved
 from ...objective import Status
 from ...storage.files import print_width, replacing, visible_files
 from .. import style
@@ -126,6 +127,12 @@ def failure_key(dataset: xr.Dataset) -> list[Patch]:
         for kind, name in names.items()
         if (count := int((status == kind).sum()))
     ]
+
+
+def unresolved_key(dataset: xr.Dataset) -> list[Patch]:
+    """Return a legend entry of how much of a slice is finer than its samples, where that is known."""
+    said = say_unresolved(stored_unresolved(dataset))
+    return [Patch(facecolor="none", edgecolor="none", label=said)] if said else []
 
 
 def finish(picture: Picture, entries: Sequence[Artist], *, columns: int = 2, heading: str = "") -> None:

@@ -53,7 +53,7 @@ def profile_figure(
     panel.name_axes(panels[-1], plane.labels[0])
     picture.align_ylabels(panels)
     page.head(picture, [*strips, *panels][0], dataset)
-    page.finish(picture, [*entries, *page.failure_key(dataset)])
+    page.finish(picture, [*entries, *page.failure_key(dataset), *page.unresolved_key(dataset)])
     return picture
 
 
