@@ -211,7 +211,7 @@ def measure(env: Environment, dataset: xr.Dataset, points: int, seed: int, watch
     from ..landscapes.adapters import within_box
     from ..landscapes.measures.profile import PRECISION, effort, measure_profile
 
-    total = sum(effort(dataset["loss"].ndim, points))
+    total = sum(effort(dataset["loss"].ndim, points, dataset["loss"].shape))
     _announce(env, dataset, points, watch)
     objective = within_box(env) if stored_identity(dataset).get("boxed") else env
     with watch.progress(total) as advance:
@@ -261,7 +261,7 @@ def _announce(env: Environment, dataset: xr.Dataset, points: int, watch: Watch) 
     from .slice import peak_memory
 
     rank = dataset["loss"].ndim
-    losses, gradients = effort(rank, points)
+    losses, gradients = effort(rank, points, dataset["loss"].shape)
     own_seconds, own_bytes = own_cost(dataset["loss"].size)
     with watch.busy(f"{env.name}: {PREPARING}"):
         seconds = estimate_seconds(env, losses, gradients)

@@ -23,8 +23,8 @@ from ..landscapes.adapters import within_box
 from ..landscapes.capacity import size
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.identity import plane_of
+from ..landscapes.measures.records import UnresolvedRecord
 from ..landscapes.measures.unresolved import (
-    UnresolvedRecord,
     attribute_of,
     find_unresolved,
     probes,

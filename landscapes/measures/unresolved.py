@@ -22,7 +22,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypedDict, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -33,7 +33,8 @@ from ..identity import plane_of
 from ..objective import Objective, evaluate
 from ..plain import finite
 from ..plane import Plane
-from ..statistics import Estimate, EstimateRecord, Values, share
+from ..statistics import Estimate, Values, share
+from .records import UnresolvedRecord
 from .ruggedness import box_slopes, span
 
 UNRESOLVED = "unresolved"  # the attribute of a slice that holds its record
@@ -45,18 +46,6 @@ SUSPECTED = 1 / 2  # of the evaluations, at most, goes to where samples contradi
 
 CONTRADICTED, STEEP, QUIET = "contradicted", "steep", "quiet"
 Cells = NDArray[np.intp]  # lower corners of cells, shape (count, rank), in array order
-
-
-class UnresolvedRecord(TypedDict):
-    """What `Unresolved` holds, as plain JSON."""
-
-    share: EstimateRecord
-    least: float | None
-    cells: int
-    probed: int
-    found: int
-    undecided: int
-    episodes: int
 
 
 @dataclass(frozen=True)
@@ -149,12 +138,18 @@ def stored_unresolved(dataset: xr.Dataset) -> UnresolvedRecord | None:
 
 
 def say_unresolved(record: UnresolvedRecord | None) -> str:
-    """Say how much of a slice is finer than its samples; nothing where that is not known."""
+    """Say in a line how much of a slice is finer than its samples; nothing where that is not known."""
+    said = say_share(record)
+    return f"finer than the samples: {said.replace(' %', ' % of cells', 1)}" if said else ""
+
+
+def say_share(record: UnresolvedRecord | None) -> str:
+    """Return the share with its interval, nothing where it is not known."""
     if record is None or record["share"]["value"] is None:
         return ""
     value, low, high = (100 * (part or 0.0) for part in cast("dict[str, float]", record["share"]).values())
     interval = f" ({_round(low)} to {_round(high)} %)" if low else f" (at most {_round(high)} %)"
-    return f"finer than the samples: {_round(value)} % of cells{interval if high > low else ''}"
+    return f"{_round(value)} %{interval if high > low else ''}"
 
 
 def _round(percent: float) -> str:
