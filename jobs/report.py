@@ -277,6 +277,7 @@ def _announce(env: Environment, dataset: xr.Dataset, points: int, watch: Watch) 
 
 def _open(subject: ReportedSlice) -> xr.Dataset:
     """Read a slice that can be reported on; raise ValueError for one that cannot."""
+    from ..landscapes.lattice import sampled_lattice
     from ..landscapes.storage.store import open_slice
 
     dataset = open_slice(subject.store)
@@ -287,7 +288,7 @@ def _open(subject: ReportedSlice) -> xr.Dataset:
             f"{subject.store}: {missing} of {dataset['status'].size} samples are missing or damaged; let the command "
             "that samples the slice go on first"
         )
-    return dataset
+    return sampled_lattice(dataset)
 
 
 def _warn(subject: ReportedSlice, dataset: xr.Dataset, env: Environment, watch: Watch) -> None:

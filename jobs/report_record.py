@@ -148,6 +148,7 @@ class Report:
         import numpy as np
 
         from ..landscapes.draw.figures.quality import quality_figure
+        from ..landscapes.lattice import sampled_lattice
         from ..landscapes.measures.gradient_quality import compare_samples
         from ..landscapes.storage.bundle import open_bundle
         from ..landscapes.storage.store import open_slice
@@ -156,7 +157,7 @@ class Report:
             raise ValueError(
                 f"{self.folder} is a report from before {ARRAYS} was kept to draw from; delete it to measure it anew"
             )
-        dataset, kept = open_slice(self.store), open_bundle(self.folder / ARRAYS)
+        dataset, kept = sampled_lattice(open_slice(self.store)), open_bundle(self.folder / ARRAYS)
         samples = compare_samples(dataset, deviation=float(np.nan_to_num(kept["noise"]["deviation"])))
         return partial(quality_figure, dataset, kept["steps"], samples, kept["smooth"])
 

@@ -36,7 +36,9 @@ from ..landscapes.plane import Plane
 from ..landscapes.sampling.distribution import RemoteSite, Site, evaluator, run_tasks, workers_of
 from ..landscapes.sampling.fill import Progress, sample
 from ..landscapes.sampling.memory import MemoryBound
+from ..landscapes.sampling.refine import Refined, Refinement, partly_refined, refine
 from ..landscapes.storage.arrays import need_of
+from ..landscapes.storage.checkpoint import Checkpoint
 from ..landscapes.storage.files import clear, tidy, write_json
 from ..landscapes.storage.paths import slice_exists
 from ..landscapes.storage.store import SliceStore
@@ -49,7 +51,7 @@ from .workers import recipe
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-STORE, PICTURE = SLICE.store, SLICE.picture
+STORE, PICTURE, REFINING = SLICE.store, SLICE.picture, "slice.refining"
 PAUSE, DRAWING = 10.0, 0.1  # between pictures of an unfinished slice: least seconds, and most of the time for them
 Draw = Callable[..., "Figure"]  # draw(dataset, width=None): a slice for a screen, or for a page so wide [mm]
 
@@ -85,6 +87,7 @@ class SliceSummary:
     loss: dict[str, float | None]
     flat: int | None
     unresolved: UnresolvedRecord | None
+    refinement: Refined | None
     command: str
     files: list[str]
 
@@ -92,19 +95,22 @@ class SliceSummary:
         """Say in a line what the slice cost and what came out."""
         counts = {kind: count for kind, count in self.status.items() if count}
         ends = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+        refined = f"; {self.refinement.say()}" if self.refinement else ""
         low, high = self.loss["lowest"], self.loss["highest"]
         losses = "no finite loss" if low is None else f"losses from {low:.4g} to {high:.4g}"
-        share = (self.flat or 0) / sum(counts.values())
+        sampled = sum(counts.values()) - counts.get("interpolated", 0)
+        share = (self.flat or 0) / sampled if sampled else 0.0
         flat = f"; gradient exactly zero at {share:.1%} of points" if share else ""
         hidden = f"; {said}" if (said := say_unresolved(self.unresolved)) else ""
-        return f"{self.episodes} episodes in {duration(self.seconds)}; {ends}; {losses}{flat}{hidden}"
+        return f"{self.episodes} episodes in {duration(self.seconds)}; {ends}; {losses}{flat}{refined}{hidden}"
 
 
 @dataclass(frozen=True)
 class SliceJob:
     """A slice to sample into `folder`, and how to draw it; `executor` and `remake` are those of `sample`.
 
-    `prints` are widths of pages [mm] that it is also drawn for; `command` is how it is made again.
+    `prints` are widths of pages [mm] that it is also drawn for; `command` is how it is made again. With a `refinement`
+    it is sampled only where it has to be.
     """
 
     objective: Objective
@@ -116,6 +122,7 @@ class SliceJob:
     executor: Executor | None = None
     remake: Callable[[], Objective] | None = None
     prints: Sequence[float] = ()
+    refinement: Refinement | None = None
 
     @classmethod
     def open(
@@ -133,6 +140,7 @@ class SliceJob:
         executor: Executor | None = None,
         remake: Callable[[], Objective] | None = None,
         prints: Sequence[float] = (),
+        refinement: Refinement | None = None,
     ) -> SliceJob:
         """Go on with the slice in `folder`, or begin it there; `force` begins anew where another slice is.
 
@@ -140,13 +148,17 @@ class SliceJob:
         """
         SLICE.check(folder)
         path = folder / STORE
+        if refinement is not None:
+            refinement.check(plane)
+            identity = {**identity, "refinement": asdict(refinement)}
         settings: dict[str, Any] = {"identity": identity, "provenance": provenance, "grad": grad}
         if force and slice_exists(path):
             store = SliceStore.create(path, plane, objective.space, overwrite=True, **settings)
             clear(folder, (PICTURE, SUMMARY), PICTURE)
+            pieces_in(folder).remove()
         else:
             store = SliceStore.open_or_create(path, plane, objective.space, **settings)
-        return cls(objective, plane, folder, store, draw, command, executor, remake, prints)
+        return cls(objective, plane, folder, store, draw, command, executor, remake, prints, refinement)
 
     @classmethod
     def of(
@@ -162,6 +174,7 @@ class SliceJob:
         boxed: bool = False,
         executor: Executor | None = None,
         prints: Sequence[float] = (),
+        refinement: Refinement | None = None,
     ) -> SliceJob:
         """Open the slice of an environment, or of any objective, in `out`, by default a folder named after it.
 
@@ -174,7 +187,7 @@ class SliceJob:
         return cls.open(
             within_box(objective) if boxed else objective,
             plane,
-            out or _default_folder(identity, plane, grad, root),
+            out or _default_folder(identity, plane, grad, root, refinement),
             picture_of(objective, plane),
             identity=identity,
             provenance=provenance(objective, command),
@@ -184,6 +197,7 @@ class SliceJob:
             executor=executor,
             remake=None if boxed else recipe(objective),
             prints=prints,
+            refinement=refinement,
         )
 
     def cost(self) -> SliceCost:
@@ -209,13 +223,18 @@ class SliceJob:
 
     def say_kept(self) -> str:
         """Say how much of it is on disk."""
-        status = self.store.status()
+        status = self._so_far()["status"] if self.refinement else self.store.status()
         return f"{int((status > 0).sum())} of {status.size} points are kept in {self.folder}"
 
     def picture(self) -> None:
         """Draw the finest complete picture of the whole so far, if there is one."""
-        if (coarse := self.store.coarse()) is not None:
+        coarse = self._so_far() if self.refinement else self.store.coarse()
+        if coarse is not None and bool((coarse["status"] != Status.MISSING).any()):
             self._save(coarse)
+
+    def _so_far(self) -> xr.Dataset:
+        """Return what is sampled of a slice that is refined."""
+        return partly_refined(self.store, pieces_in(self.folder))
 
     def _announce(self, watch: Watch) -> None:
         """Say what is left to compute and what that costs."""
@@ -230,8 +249,9 @@ class SliceJob:
             watch.note(f"all {total} {kind} are there already")
             return
         kept = f", {total - cost.episodes} are there already" if cost.episodes < total else ""
+        most = "up to " if self.refinement else ""
         watch.note(
-            f"{cost.episodes} {kind} to compute{kept}: about {duration(cost.seconds)}, "
+            f"{most}{cost.episodes} {kind} to compute{kept}: about {duration(cost.seconds)}, "
             f"{size(cost.memory)} of memory{_gpu_memory(self.objective)}; then up to "
             f"{probes(total, grad=self.store.grad)} losses between them"
         )
@@ -257,7 +277,11 @@ class SliceJob:
 
             how: dict[str, Any] = {"grad": self.store.grad, "executor": self.executor, "made": self.remake}
             how |= {"progress": follow, "conclude": conclude}
-            return sample(self.objective, self.plane, self.store, **how), computed
+            if self.refinement is None:
+                return sample(self.objective, self.plane, self.store, **how), computed
+            del how["grad"]  # as the store has it
+            how |= {"refinement": self.refinement, "pieces": pieces_in(self.folder)}
+            return refine(self.objective, self.plane, self.store, **how), computed
 
     def _save(self, dataset: xr.Dataset) -> None:
         from ..landscapes.draw.figures.page import save
@@ -280,12 +304,13 @@ class SliceJob:
             resolution=list(self.plane.resolution),
             gradients=self.store.grad,
             episodes=computed,
-            resumed=int(status.size) - computed,
+            resumed=int((status != Status.INTERPOLATED).sum()) - computed,
             seconds=round(seconds, 3),
             status=count_statuses(dataset),
             loss=range_of(dataset),
             flat=flat_points(dataset),
             unresolved=stored_unresolved(dataset),
+            refinement=Refined.of(dataset),
             command=self.command,
             files=files,
         )
@@ -325,14 +350,22 @@ def picture_of(objective: Objective, plane: Plane) -> Draw:
     return surface if plane.rank == 2 else profile
 
 
-def _default_folder(identity: dict[str, Any], plane: Plane, grad: bool, root: Path) -> Path:
+def pieces_in(folder: Path) -> Checkpoint:
+    """Return what is kept of a slice in a folder while it is refined."""
+    return Checkpoint(folder / REFINING)
+
+
+def _default_folder(
+    identity: dict[str, Any], plane: Plane, grad: bool, root: Path, refinement: Refinement | None
+) -> Path:
     """Return a folder of its own for every different slice, the same for the same one."""
     aligned = all(len(row.nonzero()) == 1 for row in plane.basis)
     axes = [str(int(row.nonzero()[0])) for row in plane.basis] if aligned else ["plane"]
     points = "x".join(map(str, plane.resolution))
     fidelity = [identity["fidelity"]] if "fidelity" in identity else []
     parts = [identity["objective"], *axes, *fidelity, points]
-    return folder_named(parts, [identity, plane.record(), grad], root)
+    refined = [asdict(refinement)] if refinement else []
+    return folder_named([*parts, *["refined" for _ in refined]], [identity, plane.record(), grad, *refined], root)
 
 
 def identity_of(objective: Objective) -> dict[str, Any]:

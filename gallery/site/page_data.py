@@ -14,7 +14,7 @@ import xarray as xr
 from ...jobs.slice import count_statuses, flat_points
 from ...landscapes.identity import plane_of
 from ...landscapes.measures.unresolved import stored_unresolved
-from ...landscapes.objective import Status
+from ...landscapes.objective import NOT_EVALUATED, Status
 from ...landscapes.plain import number
 from ...landscapes.plane import Plane
 from ...landscapes.storage.records import read_json, reading
@@ -27,7 +27,7 @@ def count_numbers(dataset: xr.Dataset) -> Numbers:
     """Count how the points of a slice ended, and find the range of their losses."""
     loss, status, flat = dataset["loss"].to_numpy(), dataset["status"].to_numpy(), flat_points(dataset)
     between = stored_unresolved(dataset)
-    finite, evaluated = loss[np.isfinite(loss)], int((status != Status.MISSING).sum())
+    finite, evaluated = loss[np.isfinite(loss)], int(np.isin(status, NOT_EVALUATED, invert=True).sum())
     return Numbers(
         points=int(status.size),
         status=count_statuses(dataset),

@@ -13,7 +13,8 @@ Cells are drawn at random from three strata, with new evaluations of their losse
 - steep: along an edge the loss changes by more than half a step, as its gradients say. The edge is bisected, too.
 - quiet: all others. The loss is asked for in the middle, since what left no trace can only be met.
 
-Of a slice without gradients their place is taken by differences of neighbouring losses.
+Of a slice without gradients their place is taken by differences of neighbouring losses. Of a refined slice the cells
+that it interpolates count as resolved; how exact they are is said beside.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..identity import plane_of
-from ..objective import Objective, evaluate
+from ..objective import Objective, Status, evaluate
 from ..plain import finite
 from ..plane import Plane
 from ..statistics import Estimate, Values, share
@@ -83,7 +84,7 @@ def find_unresolved(
     least = max(floor, np.nan_to_num(whole) / (max(loss.shape) - 1) / 2)
     least = float(max(least, ROUNDING * np.abs(loss[known]).max())) if known.any() else least
     strata = _strata(loss, slope, least)
-    budget = probes(loss.size, grad="grad" in dataset)
+    budget = probes(_evaluated(dataset), grad="grad" in dataset)
     cells = sum(map(len, strata.values()))
     if not cells:
         return None
@@ -97,7 +98,10 @@ def find_unresolved(
         parts.append((len(stratum), len(drawn), look.middles(drawn) if name == QUIET else look.edges(drawn, name)))
     decided = [result[np.isfinite(result)] for _, _, result in parts]
     return Unresolved(
-        share=_combine([(count, int(one.sum()), len(one)) for (count, _, _), one in zip(parts, decided, strict=True)]),
+        share=_combine(
+            [(count, int(one.sum()), len(one)) for (count, _, _), one in zip(parts, decided, strict=True)],
+            of=math.prod(points - 1 for points in loss.shape) if _evaluated(dataset) < loss.size else cells,
+        ),
         least=least,
         cells=cells,
         probed=sum(drawn for _, drawn, _ in parts),
@@ -283,18 +287,25 @@ class _Look:
         return np.where(np.isfinite(found), (off > self.least).astype(float), np.nan)
 
 
-def _combine(strata: Sequence[tuple[int, int, int]]) -> Estimate:
+def _evaluated(dataset: xr.Dataset) -> int:
+    """Return how many samples of a slice were evaluated: a refined one interpolates others."""
+    return int((dataset["status"] != Status.INTERPOLATED).sum())
+
+
+def _combine(strata: Sequence[tuple[int, int, int]], *, of: int) -> Estimate:
     """Return the share over strata, each a count of cells, of hits and of tries, and its interval.
+
+    It is a share `of` so many cells.
 
     Each stratum has its exact binomial interval, none where all of it was tried; they are combined by the variances
     that they stand for (Zou & Donner 2008, Stat. Med. 27, eqs. 3 and 4).
     """
-    total, value, below, above = sum(count for count, _, _ in strata), 0.0, 0.0, 0.0
+    value, below, above = 0.0, 0.0, 0.0
     for count, hits, tries in strata:
         if not count:
             continue
         one = share(hits, tries) if tries < count else Estimate(*[hits / tries] * 3)
-        weight = count / total
+        weight = count / of
         value += weight * one.value
         below += (weight * (one.value - one.low)) ** 2
         above += (weight * (one.high - one.value)) ** 2

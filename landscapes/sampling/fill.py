@@ -72,7 +72,7 @@ def sample(
     where a single point is too much for the device.
     """
     if store is None:
-        store = SliceStore.in_memory(plane, objective.space, **_describe(objective), grad=grad)
+        store = SliceStore.in_memory(plane, objective.space, **describe(objective), grad=grad)
     _check_store(store, objective, plane, grad=grad)
     batch = as_whole(getattr(objective, "preferred_batch", 1) if batch is None else batch, "sample's batch", least=1)
     status = store.status()
@@ -92,7 +92,7 @@ def sample(
     report()
     back = ReadBack(store)
     site = Site(MemoryBound(objective), store, made)
-    with _resumable(store, counts), closing(_fill(site, pending, batch, executor)) as tiles:
+    with resumable(store, counts), closing(_fill(site, pending, batch, executor)) as tiles:
         for filled in tiles:
             for note in filled.notes:
                 warnings.warn(note, RuntimeWarning, stacklevel=2)
@@ -109,7 +109,7 @@ def sample(
     return dataset
 
 
-def _describe(objective: Objective) -> dict[str, dict[str, Any]]:
+def describe(objective: Objective) -> dict[str, dict[str, Any]]:
     """Return what an objective says of itself: an environment its fidelity and options, any its name and unit."""
     about: Callable[[], dict[str, Any]] = getattr(objective, "identity", lambda: {"objective": name_of(objective)})
     return {"identity": about(), "provenance": {"loss_unit": getattr(objective, "loss_unit", "")}}
@@ -131,7 +131,7 @@ def _warn_of_damage(store: SliceStore, pending: Sequence[Tile]) -> None:
 
 
 @contextmanager
-def _resumable(store: SliceStore, counts: Counter[Status]) -> Iterator[None]:
+def resumable(store: SliceStore, counts: Counter[Status]) -> Iterator[None]:
     """Say what is kept where the disk is full or the workers are lost."""
     try:
         yield
