@@ -97,7 +97,7 @@ def _open(path: Path, remake: Callable[[], Objective] | None) -> Slice:
 def _sample_in_memory(
     objective: Objective, plane: Plane, grad: bool, refinement: Refinement | None, watch: Watch
 ) -> Slice:
-    from ..jobs.slice import look_between
+    from ..jobs.slice_summary import look_between
     from ..landscapes.sampling.fill import describe, sample
     from ..landscapes.sampling.refine import refine
     from ..landscapes.slice import Slice

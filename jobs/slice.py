@@ -6,14 +6,12 @@ import math
 import resource
 import sys
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-import numpy as np
 import torch
 import xarray as xr
 from jaxtyping import Float
@@ -22,15 +20,7 @@ from torch import Tensor
 from ..landscapes.adapters import within_box
 from ..landscapes.capacity import size
 from ..landscapes.cost import duration, seconds_per_episode
-from ..landscapes.identity import plane_of
-from ..landscapes.measures.records import UnresolvedRecord
-from ..landscapes.measures.unresolved import (
-    attribute_of,
-    find_unresolved,
-    probes,
-    say_unresolved,
-    stored_unresolved,
-)
+from ..landscapes.measures.unresolved import probes, stored_unresolved
 from ..landscapes.objective import Objective, Status, name_of
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.distribution import RemoteSite, Site, evaluator, run_tasks, workers_of
@@ -45,6 +35,7 @@ from ..landscapes.storage.store import SliceStore
 from ..landscapes.storage.tiles import Tile
 from .folder import ROOT, SLICE, SUMMARY, folder_named
 from .scene import provenance
+from .slice_summary import SliceSummary, count_statuses, flat_points, look_between, range_of
 from .watch import PREPARING, Watch, resumable
 from .workers import recipe
 
@@ -63,46 +54,6 @@ class SliceCost:
     episodes: int
     seconds: float
     memory: int
-
-
-@dataclass(frozen=True)
-class SliceSummary:
-    """Say what a slice cost, as `summary.json` beside it has it; `status` counts points, `flat` those without slope.
-
-    `episodes` are those of the samples; `unresolved` has those that looked between them, and what they found, None
-    where nothing is known of it.
-    """
-
-    env: str | None
-    dims: list[str]
-    fidelity: str | None
-    device: str | None
-    options: dict[str, Any] | None
-    resolution: list[int]
-    gradients: bool
-    episodes: int
-    resumed: int
-    seconds: float
-    status: dict[str, int]
-    loss: dict[str, float | None]
-    flat: int | None
-    unresolved: UnresolvedRecord | None
-    refinement: Refined | None
-    command: str
-    files: list[str]
-
-    def outcome(self) -> str:
-        """Say in a line what the slice cost and what came out."""
-        counts = {kind: count for kind, count in self.status.items() if count}
-        ends = ", ".join(f"{count} {kind}" for kind, count in counts.items())
-        refined = f"; {self.refinement.say()}" if self.refinement else ""
-        low, high = self.loss["lowest"], self.loss["highest"]
-        losses = "no finite loss" if low is None else f"losses from {low:.4g} to {high:.4g}"
-        sampled = sum(counts.values()) - counts.get("interpolated", 0)
-        share = (self.flat or 0) / sampled if sampled else 0.0
-        flat = f"; gradient exactly zero at {share:.1%} of points" if share else ""
-        hidden = f"; {said}" if (said := say_unresolved(self.unresolved)) else ""
-        return f"{self.episodes} episodes in {duration(self.seconds)}; {ends}; {losses}{flat}{refined}{hidden}"
 
 
 @dataclass(frozen=True)
@@ -316,21 +267,6 @@ class SliceJob:
         )
 
 
-def look_between(objective: Objective, dataset: xr.Dataset) -> dict[str, Any]:
-    """Return the attribute of a slice that says how much of it is finer than its samples.
-
-    An objective that raises between them has been sampled all the same: that is warned of, and nothing is said.
-    """
-    try:
-        return attribute_of(find_unresolved(objective, dataset))
-    except (OSError, MemoryError):  # lost workers, a full disk: the slice is finished once they are there again
-        raise
-    except Exception as error:
-        said = f"{name_of(objective)} raised between the samples, so what they hide is not known: {error}"
-        warnings.warn(said, RuntimeWarning, stacklevel=2)
-        return {}
-
-
 def picture_of(objective: Objective, plane: Plane) -> Draw:
     """Return how a slice is drawn: a map, or a profile over a line with the events of an environment's episodes."""
 
@@ -381,20 +317,6 @@ def _gpu_memory(objective: Objective) -> str:
     return f", {size(env.memory() * env.preferred_batch)} of it on the GPU at a time"
 
 
-def count_statuses(dataset: xr.Dataset) -> dict[str, int]:
-    """Count the points of a slice by how they ended."""
-    status = dataset["status"].to_numpy()
-    return {kind.name.lower(): int((status == kind).sum()) for kind in Status}
-
-
-def range_of(dataset: xr.Dataset) -> dict[str, float | None]:
-    """Return the lowest and the highest finite loss of a slice, None where there is none."""
-    loss = dataset["loss"].to_numpy()
-    if not np.isfinite(loss).any():
-        return {"lowest": None, "highest": None}
-    return {"lowest": float(np.nanmin(loss)), "highest": float(np.nanmax(loss))}
-
-
 def pause_after(seconds: float) -> float:
     """Return how long no picture of an unfinished slice follows one that took so many seconds."""
     return max(PAUSE, seconds / DRAWING)
@@ -441,14 +363,6 @@ def first_points(store: SliceStore, tiles: Sequence[Tile], count: int) -> Float[
             parts.append(store.points(tile))
             size += len(parts[-1])
     return torch.cat(parts)[:count]
-
-
-def flat_points(dataset: xr.Dataset) -> int | None:
-    """Count the points whose gradient along the plane is exactly zero, none if gradients are not there."""
-    if "grad" not in dataset:
-        return None
-    slope = plane_of(dataset).slope(torch.from_numpy(dataset["grad"].to_numpy()))
-    return int((slope == 0).all(dim=-1).sum())
 
 
 def peak_memory() -> int:

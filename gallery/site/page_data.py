@@ -11,7 +11,7 @@ import numpy as np
 import torch
 import xarray as xr
 
-from ...jobs.slice import count_statuses, flat_points
+from ...jobs.slice_summary import count_statuses, flat_points
 from ...landscapes.identity import plane_of
 from ...landscapes.measures.unresolved import stored_unresolved
 from ...landscapes.objective import NOT_EVALUATED, Status

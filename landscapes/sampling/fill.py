@@ -132,7 +132,10 @@ def _warn_of_damage(store: SliceStore, pending: Sequence[Tile]) -> None:
 
 @contextmanager
 def resumable(store: SliceStore, counts: Counter[Status]) -> Iterator[None]:
-    """Say what is kept where the disk is full or the workers are lost."""
+    """Say what is kept where the disk is full or the workers are lost.
+
+    Raises DiskFullError and WorkersLostError there, and what is raised otherwise.
+    """
     try:
         yield
     except OSError as error:

@@ -25,6 +25,7 @@ UNTESTED = 1 / 4  # of the error of a cell that its halves are taken to have, wh
 SMOOTHEST = 1 / 16  # and at best: that of a cubic falls by the fourth power of its length
 SURPRISE = 1 / 2  # of the difference of an edge from what its gradients say, which counts as an error
 INSIDE = 1e-9  # steps of the grid below its upper border
+CALMEST = 1 / 8  # of it is taken, at least, where less has come of it so far
 BULGE = 1 / 4  # and of how far its cubic is from its chord, which is not an error yet where it is a bowl's
 
 
@@ -34,7 +35,7 @@ class Cells:
 
     A cell of level k is 2^k points wide, or what is left at the upper border. `error` are those of its parent's cubic
     and of its linear interpolation, shape (cell, 2), and `before` is the better of its grandparent's: NaN where there
-    was none.
+    was none. `weight` is what came of the surprise that its parent held.
     """
 
     low: Places
@@ -42,6 +43,7 @@ class Cells:
     level: NDArray[np.intp]
     error: Values
     before: Values
+    weight: Values
 
     def __len__(self) -> int:
         return len(self.low)
@@ -52,9 +54,7 @@ class Cells:
 
     def pick(self, numbers: NDArray[np.intp]) -> Cells:
         """Return cells by their numbers, any as often as it is named."""
-        return Cells(
-            self.low[numbers], self.high[numbers], self.level[numbers], self.error[numbers], self.before[numbers]
-        )
+        return Cells(*(getattr(self, name)[numbers] for name in self.__dataclass_fields__))
 
     def join(self, others: Cells) -> Cells:
         """Return these cells and others."""
@@ -147,12 +147,14 @@ class Quadtree:
     def split(self, which: NDArray[np.bool_]) -> None:
         """Split some cells, whose points are sampled."""
         parents, error = self.cells.take(which), self._tested()[which]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            weight = np.fmin(np.fmax(parents.weight * _better(error) / self._surprise()[which], CALMEST), 1.0)
         middle = parents.low + 2 ** (parents.level - 1)[:, None]
         parts = [self.cells.take(np.logical_not(which))]
         for corner in self.corners:
             low = np.where(corner, middle, parents.low)
             high = np.where(corner, parents.high, np.minimum(middle, parents.high))
-            whole = Cells(low, high, parents.level - 1, error, _better(parents.error))
+            whole = Cells(low, high, parents.level - 1, error, _better(parents.error), weight)
             parts.append(whole.take((low < high).all(axis=1)))
         self.cells = reduce(Cells.join, parts)
         self._known = None
@@ -185,7 +187,9 @@ class Quadtree:
         low = np.array(list(product(*(axis[:-1] for axis in axes))), dtype=np.intp)
         high = np.array(list(product(*(axis[1:] for axis in axes))), dtype=np.intp)
         count = len(low)
-        return Cells(low, high, np.full(count, level), np.full((count, 2), np.nan), np.full(count, np.nan))
+        return Cells(
+            low, high, np.full(count, level), np.full((count, 2), np.nan), np.full(count, np.nan), np.ones(count)
+        )
 
     def _find(self, places: Values) -> NDArray[np.intp]:
         """Return the number of the cell that each place is in."""
@@ -258,7 +262,7 @@ class Quadtree:
                 contradiction = np.abs(loss[:, end] - loss[:, start] - rise.mean(axis=1))
                 bulge = np.abs(rise[:, 0] - rise[:, 1]) / 8
                 found = np.fmax(found, np.fmax(SURPRISE * contradiction, BULGE * bulge))
-        return found
+        return cells.weight * found
 
     def _interpolate(self, cells: Cells, at: Values) -> Values:
         """Return the cubic and the linear interpolation at places `at` from 0 to 1 along each side of each cell.

@@ -34,7 +34,7 @@ from .quadtree import Places, Quadtree, Values
 
 REFINED = "refinement"  # the attribute of a slice that says how it was refined
 FIRST, FINEST = 0.16, 1e-6  # shares of the range that a budget alone begins with, and ends at
-PROBED, PROBES = 1 / 50, 32  # of the points not sampled, drawn in a round of tests, and the least
+PROBES = 32  # points not sampled that are drawn in a round of tests
 OFF = 1 / 20  # of them that may be off by more than was asked for
 LEAST_BATCH = 16
 GRAIN = 1 << 16  # of the random numbers that tell rounds apart
@@ -144,7 +144,9 @@ def refine(
     else:
         batch = max(LEAST_BATCH, getattr(objective, "preferred_batch", 1))
         batch *= workers_of(executor) if executor else 1
-        run = _Run(evaluator(objective, store, executor, made), batch, plane, store, refinement, pieces, progress, seed)
+        run = Refining(
+            evaluator(objective, store, executor, made), batch, plane, store, refinement, pieces, progress, seed
+        )
         with resumable(store, run.counts):
             run.go()
         dataset = run.dataset()
@@ -197,8 +199,8 @@ class _Samples:
         return empty.assign({name: empty[name].copy(data=values[str(name)]) for name in empty.data_vars})
 
 
-class _Run:
-    """A refinement under way."""
+class Refining:
+    """A refinement under way: `tree` holds what is sampled, and interpolates the rest."""
 
     def __init__(
         self,
@@ -229,6 +231,10 @@ class _Run:
         for share in self.refinement.shares():
             if not self._refine_to(share):
                 return
+
+    def take_all(self) -> None:
+        """Sample the whole grid."""
+        self._evaluate(np.argwhere(np.ones(self.tree.shape, bool)))
 
     def dataset(self) -> xr.Dataset:
         """Return the slice."""
@@ -299,7 +305,7 @@ class _Run:
     def _test(self) -> Values | None:
         """Sample some points at random, and return how far off the interpolation was; None without budget."""
         unknown = np.argwhere(np.logical_not(self.tree.sampled))
-        count = min(len(unknown), max(PROBES, math.ceil(PROBED * len(unknown))))
+        count = min(len(unknown), PROBES)
         if count > self._left():
             return None
         generator = np.random.default_rng(self.seed * GRAIN + self.tests)

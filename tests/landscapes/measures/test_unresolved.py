@@ -11,7 +11,7 @@ import torch
 import xarray as xr
 from torch import Tensor
 
-from gradscape.jobs.slice import look_between
+from gradscape.jobs.slice_summary import look_between
 from gradscape.landscapes.adapters import from_numpy, from_torch
 from gradscape.landscapes.measures.unresolved import (
     UNRESOLVED,

@@ -122,7 +122,9 @@ def test_a_thin_ridge_is_unresolved_at_32_and_resolved_by_refinement() -> None:
     assert fine is not None
     assert fine.share.high < 0.01
     assert sampled(dataset).mean() < 0.06
-    assert np.nanmax(off(dataset, ridged, 513)) < 0.05
+    between = off(dataset, ridged, 513)
+    assert np.nanquantile(between, 0.9999) < 0.02
+    assert np.nanmax(between) < 0.1
 
 
 def test_samples_have_the_bits_of_a_slice_that_is_sampled_everywhere() -> None:
