@@ -40,12 +40,8 @@ def sizes() -> list[list[str]]:
         needed = [word for one in command.params for word in _said(one, path)]
         for one in command.params:
             kind = one.type_descriptor.annotation
-            if (
-                int in (kind, *get_args(kind))
-                and one.max is None
-                and one.name not in COUNTS
-                and (path, one.name) not in OF_A_GRID
-            ):
+            held = one.max is not None or one.name in COUNTS or (path, one.name) in OF_A_GRID
+            if int in (kind, *get_args(kind)) and not held:
                 found.append([*path, *needed, one.opts[0], str(HUGE)])
     return found
 

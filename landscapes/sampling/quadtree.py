@@ -180,10 +180,7 @@ class Quadtree:
         return np.where(self.sampled, np.nan, found)
 
     def _coarsest(self) -> Cells:
-        level = 0
-        while (max(self.shape) - 1) / 2 ** (level + 1) >= CELLS:
-            level += 1
-        axes = [np.append(np.arange(0, points - 1, 2**level), points - 1) for points in self.shape]
+        level, axes = coarsest_lattice(self.shape)
         low = np.array(list(product(*(axis[:-1] for axis in axes))), dtype=np.intp)
         high = np.array(list(product(*(axis[1:] for axis in axes))), dtype=np.intp)
         count = len(low)
@@ -289,6 +286,14 @@ class Quadtree:
     def _unique(self, places: Places) -> Places:
         flat = np.unique(np.ravel_multi_index(tuple(places.reshape(-1, self.rank).T), self.shape))
         return np.stack(np.unravel_index(flat, self.shape), axis=-1)
+
+
+def coarsest_lattice(shape: Sequence[int]) -> tuple[int, list[NDArray[np.intp]]]:
+    """Return the level of the coarsest lattice of a grid, and its points along each axis."""
+    level = 0
+    while (max(shape) - 1) / 2 ** (level + 1) >= CELLS:
+        level += 1
+    return level, [np.append(np.arange(0, points - 1, 2**level), points - 1) for points in shape]
 
 
 def _better(errors: Values) -> Values:

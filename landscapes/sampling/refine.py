@@ -30,7 +30,7 @@ from ..storage.checkpoint import Checkpoint
 from ..storage.store import SliceStore
 from .distribution import evaluator, workers_of
 from .fill import Progress, resumable
-from .quadtree import Places, Quadtree, Values
+from .quadtree import Places, Quadtree, Values, coarsest_lattice
 
 REFINED = "refinement"  # the attribute of a slice that says how it was refined
 FIRST, FINEST = 0.16, 1e-6  # shares of the range that a budget alone begins with, and ends at
@@ -65,7 +65,8 @@ class Refinement:
 
     def check(self, plane: Plane) -> None:
         """Raise ValueError where the budget does not cover the coarsest lattice of a slice."""
-        least = len(Quadtree(plane.resolution[::-1]).lattice())
+        _, axes = coarsest_lattice(plane.resolution)
+        least = math.prod(map(len, axes))
         if self.budget is not None and self.budget < least:
             raise ValueError(f"a slice of this resolution begins with {least} points; got a budget of {self.budget}")
 
