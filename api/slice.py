@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 from ..jobs.scene import SceneSpec, environment_of, plane_through
 from ..jobs.watch import Watch
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from ..envs.base import Environment
     from ..landscapes.objective import Objective
     from ..landscapes.plane import Plane
+    from ..landscapes.sampling.refine import Refinement
     from ..landscapes.slice import Slice
 
 
@@ -29,6 +30,8 @@ def slice(
     resolution: int | Sequence[int] = 16,
     through: str | Float[Tensor, " dim"] = "center",
     extent: float | tuple[float, float] | None = None,
+    refine: float | None = None,
+    budget: int | None = None,
     gradients: bool = True,
     out: str | Path | None = None,
     force: bool = False,
@@ -42,21 +45,34 @@ def slice(
     the whole box by default. The samples lie in the folder `out`, by default one under out/ named after the slice: the
     same call goes on there where it stopped. An objective that is no environment is sampled in memory without `out`.
 
+    With `refine`, a share of the range of the losses, it is sampled only where neighbours do not explain to that share
+    what is between them, and with a `budget` at no more points than that. The others are interpolated: status says
+    which, their loss is NaN, and no measure uses them.
+
     Raises ValueError for what the scene does not have, and where the folder holds something else or another slice,
     which `force` replaces; Stopped where it is interrupted.
     """
     watch = default_watch()
     objective = objective_of(scene, keywords, watch)
     plane = plane_through(objective, dims, through=through, extent=extent, resolution=resolution)
+    from ..landscapes.sampling.refine import Refinement
+
     if out is None and not is_environment(objective):
-        return _sample_in_memory(objective, plane, gradients, watch)
+        return _sample_in_memory(objective, plane, gradients, Refinement.of(refine, budget), watch)
     from ..jobs.slice import SliceJob
 
     point = through if isinstance(through, str) else through.tolist()
-    cut = {"through": None if point == "center" else point, "extent": extent, "gradients": None if gradients else False}
+    cut = {
+        "refine": refine,
+        "budget": budget,
+        "through": None if point == "center" else point,
+        "extent": extent,
+        "gradients": None if gradients else False,
+    }
     command = say_call("slice", scene, tuple(dims), resolution=resolution, **cut, **keywords)
     folder = Path(out) if out is not None else None
-    job = SliceJob.of(objective, plane, command=command, out=folder, grad=gradients, force=force)
+    how = Refinement.of(refine, budget)
+    job = SliceJob.of(objective, plane, command=command, out=folder, grad=gradients, force=force, refinement=how)
     job.run(watch)
     return _open(job.folder, lambda: objective)
 
@@ -78,10 +94,23 @@ def _open(path: Path, remake: Callable[[], Objective] | None) -> Slice:
     return Slice(dataset, path if path.suffix != ".zarr" else None, remake or (lambda: environment_of(dataset, "auto")))
 
 
-def _sample_in_memory(objective: Objective, plane: Plane, grad: bool, watch: Watch) -> Slice:
-    from ..landscapes.sampling.fill import sample
+def _sample_in_memory(
+    objective: Objective, plane: Plane, grad: bool, refinement: Refinement | None, watch: Watch
+) -> Slice:
+    from ..jobs.slice_summary import look_between
+    from ..landscapes.sampling.fill import describe, sample
+    from ..landscapes.sampling.refine import refine
     from ..landscapes.slice import Slice
+    from ..landscapes.storage.store import SliceStore
 
     with watch.progress(math.prod(plane.resolution), "evaluations") as advance:
-        dataset = sample(objective, plane, grad=grad, progress=lambda now: advance(now.done))
+        how: dict[str, Any] = {
+            "progress": lambda now: advance(now.done),
+            "conclude": lambda whole: look_between(objective, whole),
+        }
+        if refinement is None:
+            dataset = sample(objective, plane, grad=grad, **how)
+        else:
+            store = SliceStore.in_memory(plane, objective.space, **describe(objective), grad=grad)
+            dataset = refine(objective, plane, store, refinement, **how)
     return Slice(dataset, None, lambda: objective)

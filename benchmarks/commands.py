@@ -38,6 +38,7 @@ envs branin
 info
 slice branin --dims 0 1 --resolution 3 --through center --extent 0.5 --out made
 slice ackley --dims x0 x1 --set dim=3 --no-gradients --json --resolution 3
+slice branin --dims 0 1 --resolution 17 --refine 10% --budget 100
 slice bounce --dims 0 1 --resolution 3 --fidelity draft --tolerance 20%
 slice own.py:Bowl --dims 0 1 --resolution 3
 sweep ackley --dims 0 1 --over 2 --set dim=3 --frames 2 --resolution 3

@@ -26,7 +26,7 @@ JOBS = {
     "slice of cartpole": "slice cartpole --dims 0 1 --resolution 128",  # a third of its memory is gradients
     "sweep of bounce": "sweep bounce --dims 0 1 --over 2 --frames 6 --resolution 16",
 }
-WORK = ("simulating", "writing", "drawing")
+WORK = ("simulating", "writing", "drawing", "between")
 
 
 @dataclass(frozen=True)

@@ -80,6 +80,18 @@ Scheduler = Annotated[
     ),
 ]
 NoGradients = Annotated[bool, typer.Option("--no-gradients", help="Sample losses only.")]
+Refine = Annotated[
+    str | None,
+    typer.Option(
+        metavar="SHARE",
+        help="Sample only where neighbours and their gradients do not explain what is between them, until 95 % of the "
+        "other points are exact to this share of the range of the losses: 1%.",
+    ),
+]
+RefineBudget = Annotated[
+    int | None,
+    typer.Option("--budget", min=1, help="The same with this many points at most, alone or with --refine."),
+]
 Print = Annotated[
     list[float] | None,
     typer.Option(
@@ -157,6 +169,16 @@ def read_settings(settings: Sequence[str], flag: str = "--set") -> dict[str, Any
         if flag == "--set" and name in OWN:
             raise ValueError(f"{flag} takes a scene's own options; {name} is none, and chosen by --{name} if at all")
     return {name: value for name, _, value in pairs}
+
+
+def read_share(text: str | None, flag: str) -> float | None:
+    """Return a share given as 1% or 0.01. Raises ValueError where it is neither."""
+    if text is None:
+        return None
+    try:
+        return float(text.strip().removesuffix("%")) / (100 if text.strip().endswith("%") else 1)
+    except ValueError:
+        raise ValueError(f"{flag} takes a share such as 1% or 0.01; got {text!r}") from None
 
 
 def read_extent(text: str | None) -> float | tuple[float, float] | None:

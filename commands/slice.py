@@ -18,10 +18,13 @@ from .arguments import (
     NoGradients,
     Out,
     Print,
+    Refine,
+    RefineBudget,
     Resolution,
     Scheduler,
     Through,
     read_extent,
+    read_share,
     takes_scene,
 )
 
@@ -33,6 +36,8 @@ def slice_(
     resolution: Resolution = 16,
     through: Through = "center",
     extent: Extent = None,
+    refine: Refine = None,
+    budget: RefineBudget = None,
     no_gradients: NoGradients = False,
     scheduler: Scheduler = None,
     out: Out = None,
@@ -43,11 +48,13 @@ def slice_(
     """Sample losses and gradients over a plane through parameter space, and draw them.
 
     The folder then holds slice.zarr (the samples), landscape.png and summary.json. Stop it at any moment: the same
-    command goes on where it stopped.
+    command goes on where it stopped. With --refine or --budget it is the finest grid that --resolution says: what is
+    smooth is sampled coarser, status tells what is interpolated, and no measure uses that.
 
     Example: landscape slice fluid --dims 6 8 --resolution 24
     """
     how: dict[str, Any] = {"resolution": resolution, "through": through, "grad": not no_gradients}
+    how |= {"refine": refine, "budget": budget}
     _sample(scene, dims, extent, print_, out, **how, as_json=json_, force=force, scheduler=scheduler)
 
 
@@ -88,6 +95,8 @@ def _sample(
     as_json: bool,
     force: bool,
     scheduler: str | None = None,
+    refine: str | None = None,
+    budget: int | None = None,
 ) -> None:
     """Sample a slice, and say what came out."""
     from .terminal import Bars, command_line, print_json
@@ -97,6 +106,7 @@ def _sample(
     from ..jobs.scene import plane_through
     from ..jobs.slice import SliceJob
     from ..jobs.workers import workers
+    from ..landscapes.sampling.refine import Refinement
 
     plane = plane_through(env, dims, through=through, extent=read_extent(extent), resolution=resolution)
     folder, widths = Path(out) if out else None, prints or []
@@ -110,6 +120,7 @@ def _sample(
             force=force,
             executor=executor,
             prints=widths,
+            refinement=Refinement.of(read_share(refine, "--refine"), budget),
         )
         summary = job.run(bars)
     bars.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")

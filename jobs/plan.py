@@ -35,7 +35,8 @@ SUMMARY = 1000  # bytes of a slice's summary, about
 class Plan:
     """Say what a job takes, in seconds, bytes, files and folders.
 
-    `start` is what passes until the first episode that counts. `memory` is of the host, `gpu` of the device. `disk` is
+    `start` is what passes until the first episode that counts. So many `losses`, at most, are evaluated between the
+    samples of a slice, each taken to cost an episode. `memory` is of the host, `gpu` of the device. `disk` is
     what results take, `filling` what the tiles of a slice take until it is finished. `rate` says where the seconds of
     an episode are from.
     """
@@ -51,11 +52,17 @@ class Plan:
     disk: Room
     filling: Room
     rate: str = HERE
+    losses: int = 0
+
+    @property
+    def between(self) -> float:
+        """What looking between the samples takes, at most [s]."""
+        return self.losses * self.simulating / self.episodes
 
     def wall(self, workers: int) -> float:
         """Return seconds from start to end where each of `workers` has a device such as this; one of them draws."""
         share = math.ceil(self.batches / workers) / self.batches
-        return self.start + share * (self.simulating + self.writing) + self.drawing
+        return self.start + share * (self.simulating + self.writing + self.between) + self.drawing
 
     @property
     def device_hours(self) -> float:
@@ -64,7 +71,7 @@ class Plan:
 
     def seconds(self) -> dict[str, float]:
         """Return what each part takes [s], by its name."""
-        return {name: getattr(self, name) for name in ("start", "simulating", "writing", "drawing")}
+        return {name: getattr(self, name) for name in ("start", "simulating", "writing", "drawing", "between")}
 
     def record(self, workers: int) -> dict[str, Any]:
         """Return all of it as plain JSON."""
@@ -207,6 +214,7 @@ def plan_slice(env: Environment, plane: Plane, folder: Path, *, grad: bool, bega
 
     Of a large one a smaller one is rehearsed.
     """
+    from ..landscapes.measures.unresolved import probes
     from .rehearsal import Replica, Room, count_pictures, store_replica, time_drawing
     from .slice import SliceJob, peak_memory
 
@@ -232,6 +240,7 @@ def plan_slice(env: Environment, plane: Plane, folder: Path, *, grad: bool, bega
     return Plan(
         episodes, batches, start, simulating, writing, loading + count * once, memory + peak_memory(), _gpu(env),
         grown.finished_room(kept, 1, extra), grown.filling_room(kept), _rate(little, plane),
+        probes(episodes, grad=grad),
     )  # fmt: skip
 
 

@@ -211,7 +211,7 @@ def measure(env: Environment, dataset: xr.Dataset, points: int, seed: int, watch
     from ..landscapes.adapters import within_box
     from ..landscapes.measures.profile import PRECISION, effort, measure_profile
 
-    total = sum(effort(dataset["loss"].ndim, points))
+    total = sum(effort(dataset["loss"].ndim, points, dataset["loss"].shape))
     _announce(env, dataset, points, watch)
     objective = within_box(env) if stored_identity(dataset).get("boxed") else env
     with watch.progress(total) as advance:
@@ -261,7 +261,7 @@ def _announce(env: Environment, dataset: xr.Dataset, points: int, watch: Watch) 
     from .slice import peak_memory
 
     rank = dataset["loss"].ndim
-    losses, gradients = effort(rank, points)
+    losses, gradients = effort(rank, points, dataset["loss"].shape)
     own_seconds, own_bytes = own_cost(dataset["loss"].size)
     with watch.busy(f"{env.name}: {PREPARING}"):
         seconds = estimate_seconds(env, losses, gradients)
@@ -277,6 +277,7 @@ def _announce(env: Environment, dataset: xr.Dataset, points: int, watch: Watch) 
 
 def _open(subject: ReportedSlice) -> xr.Dataset:
     """Read a slice that can be reported on; raise ValueError for one that cannot."""
+    from ..landscapes.lattice import sampled_lattice
     from ..landscapes.storage.store import open_slice
 
     dataset = open_slice(subject.store)
@@ -287,7 +288,7 @@ def _open(subject: ReportedSlice) -> xr.Dataset:
             f"{subject.store}: {missing} of {dataset['status'].size} samples are missing or damaged; let the command "
             "that samples the slice go on first"
         )
-    return dataset
+    return sampled_lattice(dataset)
 
 
 def _warn(subject: ReportedSlice, dataset: xr.Dataset, env: Environment, watch: Watch) -> None:

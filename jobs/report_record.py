@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -123,6 +123,8 @@ class Report:
         """Return the words, each with its reason, and whether the paper has them, a line each."""
         verdict = self.profile["verdict"]
         lines = [f"{word}: {verdict['reasons'][word]}" for word in verdict["words"]]
+        if finer := self.profile.get("at_twice"):
+            lines.append(_say_changes(finer["appear"], finer["go"]))
         if self.paper:
             said = "; ".join(f"{one['word']}: {'yes' if one['measured'] else 'no'}" for one in self.paper["words"])
             lines.append(f"the paper's words ({self.paper['where']}), measured too? {said}")
@@ -146,6 +148,7 @@ class Report:
         import numpy as np
 
         from ..landscapes.draw.figures.quality import quality_figure
+        from ..landscapes.lattice import sampled_lattice
         from ..landscapes.measures.gradient_quality import compare_samples
         from ..landscapes.storage.bundle import open_bundle
         from ..landscapes.storage.store import open_slice
@@ -154,7 +157,7 @@ class Report:
             raise ValueError(
                 f"{self.folder} is a report from before {ARRAYS} was kept to draw from; delete it to measure it anew"
             )
-        dataset, kept = open_slice(self.store), open_bundle(self.folder / ARRAYS)
+        dataset, kept = sampled_lattice(open_slice(self.store)), open_bundle(self.folder / ARRAYS)
         samples = compare_samples(dataset, deviation=float(np.nan_to_num(kept["noise"]["deviation"])))
         return partial(quality_figure, dataset, kept["steps"], samples, kept["smooth"])
 
@@ -164,6 +167,12 @@ class Report:
 
         lines = "".join(f"<li>{escape(line)}</li>" for line in self.verdict_lines())
         return f"<p>{escape(self.name)} ({escape(self.env)})</p><ul>{lines}</ul>{self.table().to_html()}"
+
+
+def _say_changes(appear: Sequence[str], go: Sequence[str]) -> str:
+    """Say which words would change at twice the resolution."""
+    said = [f"{word} would appear" for word in appear] + [f"{word} would go" for word in go]
+    return f"at twice the resolution: {', '.join(said) or 'no word is seen to change'}"
 
 
 @dataclass(frozen=True)

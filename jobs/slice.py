@@ -12,7 +12,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-import numpy as np
 import torch
 import xarray as xr
 from jaxtyping import Float
@@ -21,26 +20,29 @@ from torch import Tensor
 from ..landscapes.adapters import within_box
 from ..landscapes.capacity import size
 from ..landscapes.cost import duration, seconds_per_episode
-from ..landscapes.identity import plane_of
+from ..landscapes.measures.unresolved import probes, stored_unresolved
 from ..landscapes.objective import Objective, Status, name_of
 from ..landscapes.plane import Plane
-from ..landscapes.sampling.distribution import RemoteSite, Site, run_tasks, workers_of
+from ..landscapes.sampling.distribution import RemoteSite, Site, evaluator, run_tasks, workers_of
 from ..landscapes.sampling.fill import Progress, sample
 from ..landscapes.sampling.memory import MemoryBound
+from ..landscapes.sampling.refine import Refined, Refinement, partly_refined, refine
 from ..landscapes.storage.arrays import need_of
+from ..landscapes.storage.checkpoint import Checkpoint
 from ..landscapes.storage.files import clear, tidy, write_json
 from ..landscapes.storage.paths import slice_exists
 from ..landscapes.storage.store import SliceStore
 from ..landscapes.storage.tiles import Tile
 from .folder import ROOT, SLICE, SUMMARY, folder_named
 from .scene import provenance
+from .slice_summary import SliceSummary, count_statuses, flat_points, look_between, range_of
 from .watch import PREPARING, Watch, resumable
 from .workers import recipe
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-STORE, PICTURE = SLICE.store, SLICE.picture
+STORE, PICTURE, REFINING = SLICE.store, SLICE.picture, "slice.refining"
 PAUSE, DRAWING = 10.0, 0.1  # between pictures of an unfinished slice: least seconds, and most of the time for them
 Draw = Callable[..., "Figure"]  # draw(dataset, width=None): a slice for a screen, or for a page so wide [mm]
 
@@ -55,41 +57,11 @@ class SliceCost:
 
 
 @dataclass(frozen=True)
-class SliceSummary:
-    """Say what a slice cost, as `summary.json` beside it has it; `status` counts points, `flat` those without slope."""
-
-    env: str | None
-    dims: list[str]
-    fidelity: str | None
-    device: str | None
-    options: dict[str, Any] | None
-    resolution: list[int]
-    gradients: bool
-    episodes: int
-    resumed: int
-    seconds: float
-    status: dict[str, int]
-    loss: dict[str, float | None]
-    flat: int | None
-    command: str
-    files: list[str]
-
-    def outcome(self) -> str:
-        """Say in a line what the slice cost and what came out."""
-        counts = {kind: count for kind, count in self.status.items() if count}
-        ends = ", ".join(f"{count} {kind}" for kind, count in counts.items())
-        low, high = self.loss["lowest"], self.loss["highest"]
-        losses = "no finite loss" if low is None else f"losses from {low:.4g} to {high:.4g}"
-        share = (self.flat or 0) / sum(counts.values())
-        flat = f"; gradient exactly zero at {share:.1%} of points" if share else ""
-        return f"{self.episodes} episodes in {duration(self.seconds)}; {ends}; {losses}{flat}"
-
-
-@dataclass(frozen=True)
 class SliceJob:
     """A slice to sample into `folder`, and how to draw it; `executor` and `remake` are those of `sample`.
 
-    `prints` are widths of pages [mm] that it is also drawn for; `command` is how it is made again.
+    `prints` are widths of pages [mm] that it is also drawn for; `command` is how it is made again. With a `refinement`
+    it is sampled only where it has to be.
     """
 
     objective: Objective
@@ -101,6 +73,7 @@ class SliceJob:
     executor: Executor | None = None
     remake: Callable[[], Objective] | None = None
     prints: Sequence[float] = ()
+    refinement: Refinement | None = None
 
     @classmethod
     def open(
@@ -118,6 +91,7 @@ class SliceJob:
         executor: Executor | None = None,
         remake: Callable[[], Objective] | None = None,
         prints: Sequence[float] = (),
+        refinement: Refinement | None = None,
     ) -> SliceJob:
         """Go on with the slice in `folder`, or begin it there; `force` begins anew where another slice is.
 
@@ -125,13 +99,17 @@ class SliceJob:
         """
         SLICE.check(folder)
         path = folder / STORE
+        if refinement is not None:
+            refinement.check(plane)
+            identity = {**identity, "refinement": asdict(refinement)}
         settings: dict[str, Any] = {"identity": identity, "provenance": provenance, "grad": grad}
         if force and slice_exists(path):
             store = SliceStore.create(path, plane, objective.space, overwrite=True, **settings)
             clear(folder, (PICTURE, SUMMARY), PICTURE)
+            pieces_in(folder).remove()
         else:
             store = SliceStore.open_or_create(path, plane, objective.space, **settings)
-        return cls(objective, plane, folder, store, draw, command, executor, remake, prints)
+        return cls(objective, plane, folder, store, draw, command, executor, remake, prints, refinement)
 
     @classmethod
     def of(
@@ -147,6 +125,7 @@ class SliceJob:
         boxed: bool = False,
         executor: Executor | None = None,
         prints: Sequence[float] = (),
+        refinement: Refinement | None = None,
     ) -> SliceJob:
         """Open the slice of an environment, or of any objective, in `out`, by default a folder named after it.
 
@@ -159,7 +138,7 @@ class SliceJob:
         return cls.open(
             within_box(objective) if boxed else objective,
             plane,
-            out or _default_folder(identity, plane, grad, root),
+            out or _default_folder(identity, plane, grad, root, refinement),
             picture_of(objective, plane),
             identity=identity,
             provenance=provenance(objective, command),
@@ -169,6 +148,7 @@ class SliceJob:
             executor=executor,
             remake=None if boxed else recipe(objective),
             prints=prints,
+            refinement=refinement,
         )
 
     def cost(self) -> SliceCost:
@@ -194,13 +174,18 @@ class SliceJob:
 
     def say_kept(self) -> str:
         """Say how much of it is on disk."""
-        status = self.store.status()
+        status = self._so_far()["status"] if self.refinement else self.store.status()
         return f"{int((status > 0).sum())} of {status.size} points are kept in {self.folder}"
 
     def picture(self) -> None:
         """Draw the finest complete picture of the whole so far, if there is one."""
-        if (coarse := self.store.coarse()) is not None:
+        coarse = self._so_far() if self.refinement else self.store.coarse()
+        if coarse is not None and bool((coarse["status"] != Status.MISSING).any()):
             self._save(coarse)
+
+    def _so_far(self) -> xr.Dataset:
+        """Return what is sampled of a slice that is refined."""
+        return partly_refined(self.store, pieces_in(self.folder))
 
     def _announce(self, watch: Watch) -> None:
         """Say what is left to compute and what that costs."""
@@ -215,9 +200,11 @@ class SliceJob:
             watch.note(f"all {total} {kind} are there already")
             return
         kept = f", {total - cost.episodes} are there already" if cost.episodes < total else ""
+        most = "up to " if self.refinement else ""
         watch.note(
-            f"{cost.episodes} {kind} to compute{kept}: about {duration(cost.seconds)}, "
-            f"{size(cost.memory)} of memory{_gpu_memory(self.objective)}"
+            f"{most}{cost.episodes} {kind} to compute{kept}: about {duration(cost.seconds)}, "
+            f"{size(cost.memory)} of memory{_gpu_memory(self.objective)}; then up to "
+            f"{probes(total, grad=self.store.grad)} losses between them"
         )
 
     def _sample(self, watch: Watch) -> tuple[xr.Dataset, int]:
@@ -235,8 +222,17 @@ class SliceJob:
                     drawn = time.monotonic()
                     pause = pause_after(drawn - began)
 
+            def conclude(dataset: xr.Dataset) -> dict[str, Any]:
+                advance(dataset["status"].size, "looking between them")
+                return look_between(evaluator(self.objective, self.store, self.executor, self.remake), dataset)
+
             how: dict[str, Any] = {"grad": self.store.grad, "executor": self.executor, "made": self.remake}
-            return sample(self.objective, self.plane, self.store, progress=follow, **how), computed
+            how |= {"progress": follow, "conclude": conclude}
+            if self.refinement is None:
+                return sample(self.objective, self.plane, self.store, **how), computed
+            del how["grad"]  # as the store has it
+            how |= {"refinement": self.refinement, "pieces": pieces_in(self.folder)}
+            return refine(self.objective, self.plane, self.store, **how), computed
 
     def _save(self, dataset: xr.Dataset) -> None:
         from ..landscapes.draw.figures.page import save
@@ -259,11 +255,13 @@ class SliceJob:
             resolution=list(self.plane.resolution),
             gradients=self.store.grad,
             episodes=computed,
-            resumed=int(status.size) - computed,
+            resumed=int((status != Status.INTERPOLATED).sum()) - computed,
             seconds=round(seconds, 3),
             status=count_statuses(dataset),
             loss=range_of(dataset),
             flat=flat_points(dataset),
+            unresolved=stored_unresolved(dataset),
+            refinement=Refined.of(dataset),
             command=self.command,
             files=files,
         )
@@ -288,14 +286,22 @@ def picture_of(objective: Objective, plane: Plane) -> Draw:
     return surface if plane.rank == 2 else profile
 
 
-def _default_folder(identity: dict[str, Any], plane: Plane, grad: bool, root: Path) -> Path:
+def pieces_in(folder: Path) -> Checkpoint:
+    """Return what is kept of a slice in a folder while it is refined."""
+    return Checkpoint(folder / REFINING)
+
+
+def _default_folder(
+    identity: dict[str, Any], plane: Plane, grad: bool, root: Path, refinement: Refinement | None
+) -> Path:
     """Return a folder of its own for every different slice, the same for the same one."""
     aligned = all(len(row.nonzero()) == 1 for row in plane.basis)
     axes = [str(int(row.nonzero()[0])) for row in plane.basis] if aligned else ["plane"]
     points = "x".join(map(str, plane.resolution))
     fidelity = [identity["fidelity"]] if "fidelity" in identity else []
     parts = [identity["objective"], *axes, *fidelity, points]
-    return folder_named(parts, [identity, plane.record(), grad], root)
+    refined = [asdict(refinement)] if refinement else []
+    return folder_named([*parts, *["refined" for _ in refined]], [identity, plane.record(), grad, *refined], root)
 
 
 def identity_of(objective: Objective) -> dict[str, Any]:
@@ -309,20 +315,6 @@ def _gpu_memory(objective: Objective) -> str:
         return ""
     env: Any = objective
     return f", {size(env.memory() * env.preferred_batch)} of it on the GPU at a time"
-
-
-def count_statuses(dataset: xr.Dataset) -> dict[str, int]:
-    """Count the points of a slice by how they ended."""
-    status = dataset["status"].to_numpy()
-    return {kind.name.lower(): int((status == kind).sum()) for kind in Status}
-
-
-def range_of(dataset: xr.Dataset) -> dict[str, float | None]:
-    """Return the lowest and the highest finite loss of a slice, None where there is none."""
-    loss = dataset["loss"].to_numpy()
-    if not np.isfinite(loss).any():
-        return {"lowest": None, "highest": None}
-    return {"lowest": float(np.nanmin(loss)), "highest": float(np.nanmax(loss))}
 
 
 def pause_after(seconds: float) -> float:
@@ -371,14 +363,6 @@ def first_points(store: SliceStore, tiles: Sequence[Tile], count: int) -> Float[
             parts.append(store.points(tile))
             size += len(parts[-1])
     return torch.cat(parts)[:count]
-
-
-def flat_points(dataset: xr.Dataset) -> int | None:
-    """Count the points whose gradient along the plane is exactly zero, none if gradients are not there."""
-    if "grad" not in dataset:
-        return None
-    slope = plane_of(dataset).slope(torch.from_numpy(dataset["grad"].to_numpy()))
-    return int((slope == 0).all(dim=-1).sum())
 
 
 def peak_memory() -> int:

@@ -24,7 +24,8 @@ from ..landscapes.storage.store import SliceStore
 from .folder import ROOT, SWEEP, folder_named
 from .motion import HORIZON, SMOOTHING, Motion, refuse_too_large
 from .scene import provenance
-from .slice import SliceCost, count_statuses, estimate_cost, flat_points, range_of
+from .slice import SliceCost, estimate_cost
+from .slice_summary import count_statuses, flat_points, range_of
 from .watch import PREPARING, Advance, Watch, resumable
 from .workers import recipe
 

@@ -17,13 +17,20 @@ ROUNDING = 1e-9  # of the box; points that are no farther beyond it are moved ba
 
 
 class Status(IntEnum):
-    """Say how the evaluation of one point ended; a NaN result is not a missing one."""
+    """Say how the evaluation of one point ended; a NaN result is not a missing one.
+
+    INTERPOLATED is a point of a refined slice that was not evaluated, as those around it explain it: its loss is NaN.
+    """
 
     MISSING = 0
     OK = 1
     NONFINITE = 2
     ESCAPED = 3
     ERROR = 4
+    INTERPOLATED = 5
+
+
+NOT_EVALUATED = (Status.MISSING, Status.INTERPOLATED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,8 +171,9 @@ def _ask(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> 
             raise ValueError(
                 f"{who} must return {field} of shape {shape} for x of shape {tuple(x.shape)}; got {tuple(tensor.shape)}"
             )
-    if bool((found.status == Status.MISSING).any()):
-        raise ValueError(f"{who} must say how every point ended; got status MISSING")
+    for status in NOT_EVALUATED:
+        if bool((found.status == status).any()):
+            raise ValueError(f"{who} must say how every point ended; got status {status.name}")
     return found
 
 

@@ -13,7 +13,7 @@ import torch
 import xarray as xr
 from numpy.typing import NDArray
 
-from .identity import stored_identity, stored_provenance
+from .identity import plane_of, stored_identity, stored_provenance
 from .objective import Objective, Status
 from .plane import Plane
 
@@ -75,17 +75,20 @@ class Slice:
         """Return the local minima deeper than a share of the range of the losses, deepest first, a row each.
 
         The columns are the plane's coordinates, the loss there, and the depth: how far one must climb to get to a lower
-        minimum (persistence). The depth of the lowest is the range of the losses.
+        minimum (persistence). The depth of the lowest is the range of the losses. Of a refined slice its finest lattice
+        that is sampled everywhere counts.
         """
         import pandas as pd
 
+        from .lattice import sampled_lattice
         from .measures.ruggedness import minima, span
 
-        loss = self.data["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+        data = sampled_lattice(self.data)
+        loss = data["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
         found = minima(loss)
         deep = found.depth > depth * span(loss)
         places = np.unravel_index(found.sample[deep], loss.shape)[::-1]  # u first
-        axes = (axis.numpy()[at] for axis, at in zip(self.plane.axes(), places, strict=True))
+        axes = (axis.numpy()[at] for axis, at in zip(plane_of(data).axes(), places, strict=True))
         columns = dict(zip(self.plane.labels, axes, strict=True))
         return pd.DataFrame({**columns, "loss": loss.ravel()[found.sample[deep]], "depth": found.depth[deep]})
 
@@ -115,6 +118,7 @@ class Slice:
         without gradients, for one that is not finished, and for one whose objective cannot be made again.
         """
         from .adapters import within_box
+        from .lattice import sampled_lattice
         from .measures.profile import PRECISION, measure_profile
 
         if missing := int((self.data["status"] == Status.MISSING).sum()):
@@ -125,8 +129,8 @@ class Slice:
         objective = self.remake()
         rounding = PRECISION[self.identity.get("settings", {}).get("precision", "float64")]
         return measure_profile(
-            within_box(objective) if self.identity.get("boxed") else objective,
-            self.data, rounding=rounding, points=points, seed=seed, events=getattr(objective, "events", None),
+            within_box(objective) if self.identity.get("boxed") else objective, sampled_lattice(self.data),
+            rounding=rounding, points=points, seed=seed, events=getattr(objective, "events", None),
         )  # fmt: skip
 
     def __repr__(self) -> str:

@@ -22,6 +22,7 @@ from .processes import Ended, alone, landscape
 HUGE = 10**15
 ROOM = 2 << 30  # bytes that a command may take beyond what it is loaded with
 COUNTS = {"seed", "top", "workers"}  # whole numbers that allocate nothing
+OF_A_GRID = [(("slice",), "budget")]  # nor does one that is held to the points of a grid
 SUBJECTS = {"ENV": "ackley", "SLICE": "cut", "RUN": "run", "[SLICE|ENV]": "cut", "ENV|FIGURES.toml": "branin"}
 NEEDED = {"--dims": "0 1", "--over": "smoothing", "--method": "random", "--axis": "x", "--plane": "pca"}
 
@@ -39,7 +40,8 @@ def sizes() -> list[list[str]]:
         needed = [word for one in command.params for word in _said(one, path)]
         for one in command.params:
             kind = one.type_descriptor.annotation
-            if int in (kind, *get_args(kind)) and one.max is None and one.name not in COUNTS:
+            held = one.max is not None or one.name in COUNTS or (path, one.name) in OF_A_GRID
+            if int in (kind, *get_args(kind)) and not held:
                 found.append([*path, *needed, one.opts[0], str(HUGE)])
     return found
 

@@ -28,13 +28,17 @@ def as_json(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Numbers:
-    """Say how a slice's points ended, the ends of their losses, and at what share of them the gradient is zero."""
+    """Say how a slice's points ended, the ends of their losses, and at what share of them the gradient is zero.
+
+    `unresolved` is the share of its cells that is finer than its samples, with its interval, where that is known.
+    """
 
     points: int
     status: Mapping[str, int]
     lowest: float | None
     highest: float | None
     flat: float | None
+    unresolved: Mapping[str, float | None] | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True)

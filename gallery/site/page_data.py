@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 import xarray as xr
 
-from ...jobs.slice import count_statuses, flat_points
+from ...jobs.slice_summary import count_statuses, flat_points
 from ...landscapes.identity import plane_of
-from ...landscapes.objective import Status
+from ...landscapes.measures.unresolved import stored_unresolved
+from ...landscapes.objective import NOT_EVALUATED, Status
 from ...landscapes.plain import number
 from ...landscapes.plane import Plane
 from ...landscapes.storage.records import read_json, reading
@@ -25,13 +26,15 @@ from .manifest import Axis, ColourScale, EpisodeEntry, Nodes, Numbers, Trajector
 def count_numbers(dataset: xr.Dataset) -> Numbers:
     """Count how the points of a slice ended, and find the range of their losses."""
     loss, status, flat = dataset["loss"].to_numpy(), dataset["status"].to_numpy(), flat_points(dataset)
-    finite, evaluated = loss[np.isfinite(loss)], int((status != Status.MISSING).sum())
+    between = stored_unresolved(dataset)
+    finite, evaluated = loss[np.isfinite(loss)], int(np.isin(status, NOT_EVALUATED, invert=True).sum())
     return Numbers(
         points=int(status.size),
         status=count_statuses(dataset),
         lowest=float(finite.min()) if finite.size else None,
         highest=float(finite.max()) if finite.size else None,
         flat=None if flat is None or not evaluated else flat / evaluated,
+        unresolved=dict(cast("Mapping[str, float | None]", between["share"])) if between else None,
     )
 
 

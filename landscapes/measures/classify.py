@@ -7,6 +7,7 @@ ripples, at 48 x 48 samples.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -53,6 +54,17 @@ def classify(found: Ruggedness, jumps: Jumps | None, cosine: Values) -> Verdict:
     `cosine` is that of its gradients with differences over two samples, NaN where neither shows a slope. A gradient
     of zero is no direction, so it counts for the word zero only. What jumps is not called very smooth.
     """
+    return judge(found, jumps, *likeness(cosine))
+
+
+def likeness(cosine: Values) -> tuple[float, float]:
+    """Return the mean of cosines that are of two directions, and the share that is below zero; NaN of none."""
+    known = cosine[np.isfinite(cosine) & (cosine != 0)]
+    return (float(known.mean()), float((known < 0).mean())) if len(known) else (math.nan, math.nan)
+
+
+def judge(found: Ruggedness, jumps: Jumps | None, average: float, uphill: float) -> Verdict:
+    """Put a landscape into words, of whose gradients the mean cosine and the share uphill are known."""
     reasons = dict([_surface(found)])
     if found.level.value >= MUCH:
         reasons[LARGE_FLAT] = f"{found.level.value:.0%} of the samples are level with their neighbours"
@@ -60,7 +72,7 @@ def classify(found: Ruggedness, jumps: Jumps | None, cosine: Values) -> Verdict:
         share = jumps.share
         reasons.pop(VERY_SMOOTH, None)
         reasons[DISCONTINUOUS] = f"{len(jumps.height)} jumps found, between {share.value:.1%} of neighbouring samples"
-    return Verdict(reasons | _gradients(found, cosine))
+    return Verdict(reasons | _gradients(found, average, uphill))
 
 
 def _surface(found: Ruggedness) -> tuple[str, str]:
@@ -73,14 +85,12 @@ def _surface(found: Ruggedness) -> tuple[str, str]:
     return (SMOOTH if count > 1 else VERY_SMOOTH), said
 
 
-def _gradients(found: Ruggedness, cosine: Values) -> dict[str, str]:
+def _gradients(found: Ruggedness, average: float, uphill: float) -> dict[str, str]:
     reasons = {}
     if found.flat is not None and found.flat.value >= MUCH:
         reasons[ZERO] = f"effectively zero at {found.flat.value:.0%} of the samples"
-    known = cosine[np.isfinite(cosine) & (cosine != 0)]
-    if not len(known):
+    if math.isnan(average):
         return reasons
-    average, uphill = float(known.mean()), float((known < 0).mean())
     said = f"mean cosine {average:z.2f} with the slope over two samples"
     reasons[GOOD if average >= AGREE else NOISY] = said
     if uphill >= OFTEN:

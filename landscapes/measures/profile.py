@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,8 +20,10 @@ from . import gradient_quality as gradients
 from .classify import Verdict, classify, thresholds
 from .discontinuities import Count, Jumps, find_jumps
 from .noise import Noise, noise
-from .records import ProfileRecord
+from .records import ProfileRecord, UnresolvedRecord
 from .ruggedness import Ruggedness, ruggedness
+from .twice import Twice, at_twice, episodes_at_twice
+from .unresolved import find_unresolved, probes, say_share, stored_unresolved
 
 PRECISION = {"float32": 2.0**-23, "float64": 2.0**-52}  # relative, of an engine that computes in it
 NOISE_POINTS, REPEATS, PAIRS = 16, 4, 12
@@ -34,6 +37,7 @@ class Profile:
 
     `steps`, `samples` and `smooth` are what `gradients.ladder`, `of_samples` and `smoothed_slopes` return. `cut` of
     `asked` evaluations would have been beyond the box of an objective that does not invite that, and were left out.
+    `unresolved` and `at_twice` say what its samples hide, None where that is not known.
     """
 
     losses: Ruggedness
@@ -45,6 +49,8 @@ class Profile:
     verdict: Verdict
     asked: int
     cut: int
+    unresolved: UnresolvedRecord | None = None
+    at_twice: Twice | None = None
 
     @property
     def words(self) -> tuple[str, ...]:
@@ -63,15 +69,21 @@ class Profile:
             "verdict": {"words": list(self.verdict.words), "reasons": self.verdict.reasons},
             "thresholds": thresholds(),
             "beyond_the_box": {"asked": self.asked, "cut": self.cut},
+            "unresolved": self.unresolved,
+            "at_twice": self.at_twice.record() if self.at_twice else None,
         }
 
 
-def effort(rank: int, points: int) -> tuple[int, int]:
-    """Return how many losses, at most, and how many gradients `measure_profile` evaluates."""
+def effort(rank: int, points: int, shape: Sequence[int] = ()) -> tuple[int, int]:
+    """Return how many losses, at most, and how many gradients `measure_profile` evaluates.
+
+    Without the `shape` of the slice those are left out that look between its samples.
+    """
     places = points**2
     losses = NOISE_POINTS * (2 + 2 * REPEATS) + PAIRS_PER_POINT * points * 14
     losses += places * rank * 2 * len(gradients.SCALES)
-    return losses, places * (1 + 2 * PAIRS * len(gradients.WIDTHS))
+    between = (probes(math.prod(shape), grad=True), episodes_at_twice(shape)) if shape else (0, 0)
+    return losses + between[0], places * (1 + 2 * PAIRS * len(gradients.WIDTHS)) + between[1]
 
 
 def need_of(rank: int, dim: int, points: int) -> Need:
@@ -115,7 +127,12 @@ def measure_profile(
     samples = gradients.compare_samples(dataset, deviation=deviation)
     cosine = samples["cosine"].isel(scale=0).to_numpy()
     words = classify(found, jumps, cosine)
-    return Profile(found, fuzz, jumps, steps, samples, smooth, words, objective.asked, objective.cut)
+    between = stored_unresolved(dataset)
+    if between is None and (looked := find_unresolved(objective, dataset, floor=floor, seed=seed)):
+        between = looked.record()
+    twice = at_twice(objective, dataset, found, jumps, cosine, deviation=deviation, seed=seed)
+    asked = objective.asked, objective.cut
+    return Profile(found, fuzz, jumps, steps, samples, smooth, words, *asked, between, twice)
 
 
 class _Within:
@@ -157,6 +174,8 @@ def named_measures(record: ProfileRecord) -> dict[str, str]:
         f"Cosine of gradient and difference over {near['scale']:.1%} of the box": _number(near["cosine"]),
         f"Gradients uphill over {near['scale']:.1%} of the box": _shares(near["uphill"]),
     }
+    if between := say_share(record.get("unresolved")):
+        named["Cells finer than the samples"] = between
     if cut := record.get("beyond_the_box", {}).get("cut"):
         named["Probes beyond the bounds, left out"] = f"{cut} of {record['beyond_the_box']['asked']}"
     for row in smooth:

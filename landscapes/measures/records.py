@@ -107,8 +107,30 @@ class BeyondRecord(TypedDict):
     cut: int
 
 
+class UnresolvedRecord(TypedDict):
+    """What `unresolved.Unresolved` holds; the least difference is in the loss's unit."""
+
+    share: EstimateRecord
+    least: float | None
+    cells: int
+    probed: int
+    found: int
+    undecided: int
+    episodes: int
+
+
+class TwiceRecord(TypedDict):
+    """What `twice.Twice` holds: measures at twice the resolution, and the words that would appear and go."""
+
+    blocks: int
+    episodes: int
+    measures: dict[str, EstimateRecord]
+    appear: list[str]
+    go: list[str]
+
+
 class ProfileRecord(TypedDict):
-    """All that is measured of a slice; reports of early versions do not have the last key."""
+    """All that is measured of a slice; reports of early versions do not have the last keys."""
 
     losses: LossesRecord
     noise: NoiseRecord
@@ -119,3 +141,5 @@ class ProfileRecord(TypedDict):
     verdict: VerdictRecord
     thresholds: dict[str, float | None]
     beyond_the_box: NotRequired[BeyondRecord]
+    unresolved: NotRequired[UnresolvedRecord | None]
+    at_twice: NotRequired[TwiceRecord | None]

@@ -21,10 +21,12 @@ from typing import Any, TypeVar
 
 import cloudpickle
 import torch
+from jaxtyping import Float
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ..identity import StoreError, check_identity
-from ..objective import Objective, Status, name_of
+from ..objective import Evaluation, Objective, Status, name_of
 from ..storage.paths import place_of
 from ..storage.store import SliceStore
 from ..storage.tiles import Tile
@@ -203,6 +205,33 @@ class ReadBack:
         return self._values
 
 
+class Distributed:
+    """An objective whose points an executor's workers evaluate, each an equal part of a batch."""
+
+    def __init__(self, site: Site, executor: Executor) -> None:
+        self.objective, self.space, self.name = site.objective, site.objective.space, site.objective.name
+        self.beyond_box = getattr(site.objective.objective, "beyond_box", False)
+        self._site, self._executor = site, executor
+
+    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
+        """Return losses, and gradients if asked, at points `x` in the parameters' own units.
+
+        Raises WorkersLostError where nobody is left to evaluate them, and what the objective raises.
+        """
+        parts = torch.tensor_split(x, max(1, min(len(x), workers_of(self._executor))))
+        tasks = [(self._site, number, part, grad) for number, part in enumerate(parts)]
+        found = dict(run_tasks(self._executor, _evaluate, tasks))
+        return Evaluation.join([found[number] for number in range(len(parts))], dim=x.shape[1], grad=grad)
+
+
+def evaluator(
+    objective: Objective, store: SliceStore, executor: Executor | None, made: Callable[[], Objective] | None
+) -> Objective:
+    """Return the objective of a slice as it is to be evaluated: here, or by an executor's workers."""
+    site = Site(MemoryBound(objective), store, made)
+    return site.objective if executor is None else Distributed(site, executor)
+
+
 def workers_of(executor: Executor) -> int:
     """Return how many batches an executor works on at a time, 1 if it does not say: no interface of theirs has it."""
     client = getattr(executor, "_client", None)  # Dask's
@@ -252,6 +281,12 @@ def _has_workers(executor: Executor) -> bool:
         return client is None or bool(client.nthreads())
     except OSError:  # nobody is there to answer
         return False
+
+
+def _evaluate(
+    site: Site | RemoteSite, number: int, x: Float[Tensor, "batch dim"], grad: bool
+) -> tuple[int, Evaluation]:
+    return number, site.here().objective.evaluate(x, grad=grad)
 
 
 def _fill(site: Site | RemoteSite, tiles: Sequence[Tile]) -> list[FilledTile]:

@@ -51,6 +51,7 @@ def sample(
     progress: Callable[[Progress], None] | None = None,
     executor: Executor | None = None,
     made: Callable[[], Objective] | None = None,
+    conclude: Callable[[xr.Dataset], Mapping[str, Any]] | None = None,
 ) -> xr.Dataset:
     """Evaluate an objective on a plane and return the slice; what `store` holds already is not evaluated again.
 
@@ -63,12 +64,15 @@ def sample(
     path. Threads share the objective; in a process `made`, a function that can be pickled, makes it once, or else it is
     pickled itself. Batches are equal then, and of at most `batch` points. Where workers are lost, `WorkersLostError`.
 
+    `conclude` is called with the slice when it is complete, and returns attributes of it that are kept, too. Of one
+    that was finished before it is not called.
+
     Raises StoreMismatchError where the store was made by other settings, TooLargeError where the slice does not fit
     into memory, DiskFullError and WorkersLostError where filling ended early, which say what is kept, and MemoryError
     where a single point is too much for the device.
     """
     if store is None:
-        store = SliceStore.in_memory(plane, objective.space, **_describe(objective), grad=grad)
+        store = SliceStore.in_memory(plane, objective.space, **describe(objective), grad=grad)
     _check_store(store, objective, plane, grad=grad)
     batch = as_whole(getattr(objective, "preferred_batch", 1) if batch is None else batch, "sample's batch", least=1)
     status = store.status()
@@ -88,7 +92,7 @@ def sample(
     report()
     back = ReadBack(store)
     site = Site(MemoryBound(objective), store, made)
-    with _resumable(store, counts), closing(_fill(site, pending, batch, executor)) as tiles:
+    with resumable(store, counts), closing(_fill(site, pending, batch, executor)) as tiles:
         for filled in tiles:
             for note in filled.notes:
                 warnings.warn(note, RuntimeWarning, stacklevel=2)
@@ -99,11 +103,13 @@ def sample(
                 back.look(filled.tile)
         dataset = store.dataset(back.values())
         if not bool((dataset["status"] == Status.MISSING).any()):
+            if conclude is not None and not store.ascending:
+                dataset = dataset.assign_attrs(conclude(dataset))
             store.finish(dataset)
     return dataset
 
 
-def _describe(objective: Objective) -> dict[str, dict[str, Any]]:
+def describe(objective: Objective) -> dict[str, dict[str, Any]]:
     """Return what an objective says of itself: an environment its fidelity and options, any its name and unit."""
     about: Callable[[], dict[str, Any]] = getattr(objective, "identity", lambda: {"objective": name_of(objective)})
     return {"identity": about(), "provenance": {"loss_unit": getattr(objective, "loss_unit", "")}}
@@ -125,8 +131,11 @@ def _warn_of_damage(store: SliceStore, pending: Sequence[Tile]) -> None:
 
 
 @contextmanager
-def _resumable(store: SliceStore, counts: Counter[Status]) -> Iterator[None]:
-    """Say what is kept where the disk is full or the workers are lost."""
+def resumable(store: SliceStore, counts: Counter[Status]) -> Iterator[None]:
+    """Say what is kept where the disk is full or the workers are lost.
+
+    Raises DiskFullError and WorkersLostError there, and what is raised otherwise.
+    """
     try:
         yield
     except OSError as error:

@@ -29,6 +29,7 @@ class MemoryBound:
         self.objective = objective
         self.space = objective.space
         self.name = name_of(objective)
+        self.beyond_box = getattr(objective, "beyond_box", False)
         self._notes: list[str] = []
         self._most: int | None = None
 

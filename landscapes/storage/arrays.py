@@ -25,7 +25,8 @@ from .tiles import coarse_to_fine, tile_side
 FORMAT = 2
 AXES = ("u", "v")
 CF = "CF-1.11"
-FILES = store_files(("loss", "grad", "status", SUMS, *AXES, "dim", "unit"))  # of a slice on disk
+INTERPOLATED = "interpolated"  # the array of a refined slice that has what was not sampled
+FILES = store_files(("loss", "grad", "status", INTERPOLATED, SUMS, *AXES, "dim", "unit"))  # of a slice on disk
 DRAWN = 150  # bytes that a picture takes for each sample
 COORDINATES = {"coordinates": "unit"}  # tells xarray that it is no variable
 
@@ -110,7 +111,7 @@ def write_finished(path: Path, dataset: xr.Dataset) -> None:
             array[...] = values.to_numpy()
         else:
             _keep(group, str(name), values.to_numpy(), dims, values.attrs)
-    write_sums(group, dataset)
+    write_sums(group, dataset.drop_vars(INTERPOLATED, errors="ignore"))
     consolidate(path)
 
 

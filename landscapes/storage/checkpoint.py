@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..identity import DamagedError, check_identity
 from ..plain import plain_json, text
 from .files import discard, replacing, visible_files, write_json
-from .ownership import check_ours, refuse_others
+from .ownership import check_ours, refuse_others, remove
 from .records import read_json, reading
 
 SETTINGS, PARTS = "settings.json", "pieces"
@@ -69,6 +69,14 @@ class Checkpoint:
         """Write the arrays of a part, whole or not at all."""
         with replacing(self._path(name)) as partial, partial.open("wb") as file:
             np.savez(file, **{NAME_KEY: np.array(name), **arrays})
+
+    def names(self) -> list[str]:
+        """Return the names of the parts, in order."""
+        return sorted(path.stem for path in (self.folder / PARTS).glob("[!.]*.npz"))
+
+    def remove(self) -> None:
+        """Remove the parts, and the folder where nothing else is in it."""
+        remove(self.folder, re.compile(rf"{PARTS}/{PART.pattern}").fullmatch)
 
     def count(self) -> int:
         """Count the parts."""

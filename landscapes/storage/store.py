@@ -37,7 +37,7 @@ from ..objective import Evaluation, Status
 from ..plain import plain_json
 from ..plane import Plane
 from ..space import ParameterSpace
-from .arrays import AXES, FILES, FORMAT, attributes_of, axes_of, lay_out, refuse_too_large, write_finished
+from .arrays import AXES, FILES, FORMAT, INTERPOLATED, attributes_of, axes_of, lay_out, refuse_too_large, write_finished
 from .checksums import text_sum
 from .files import placing, resolve
 from .integrity import check_integrity, check_layouts, damage
@@ -73,6 +73,7 @@ class SliceStore:
         self._coordinates = {name: np.asarray(arrays[name][:]) for name in self.dims}
         self._parameters, self._units = ([str(one) for one in np.asarray(arrays[name][:])] for name in ("dim", "unit"))
         self._attributes = {name: attributes_of(array) for name, array in arrays.items()}
+        self._interpolated = arrays.get(INTERPOLATED)
         shape = tuple(len(self._coordinates[name]) for name in self.dims)
         self._samples = Samples(group, shape, place, ascending=self.ascending)
 
@@ -332,6 +333,9 @@ class SliceStore:
             {name: (name, values, self._attributes[name]) for name, values in coordinates.items()},
             self._about,
         )
+        if self._interpolated is not None:
+            inside = np.asarray(self._interpolated[box])
+            dataset[INTERPOLATED] = (self.dims, inside, self._attributes[INTERPOLATED])
         words = {"dim": self._parameters, "unit": self._units}
         named = {name: ("dim", np.array(said, object), self._attributes[name]) for name, said in words.items()}
         return dataset.assign_coords(named).sortby(list(self.dims))

@@ -81,8 +81,10 @@ def test_the_parts_of_a_plan_add_up_to_what_the_job_takes(
     assert planned["episodes"] == done["episodes"]
     assert seconds["simulating"] == pytest.approx(EPISODE * done["episodes"])
     assert seconds["writing"] == pytest.approx(TILE * (clock.slept.count(TILE) - before))
+    between = EPISODE * done["unresolved"]["episodes"] if verb == "slice" else 0.0
     parts = seconds["simulating"] + seconds["writing"] + seconds["drawing"]
-    assert parts == pytest.approx(done["seconds"], abs=guess)
+    assert parts + between == pytest.approx(done["seconds"], abs=guess)
+    assert between <= seconds["between"] <= seconds["simulating"] / 5
     assert planned["disk"]["bytes"] == pytest.approx(room.bytes, rel=0.25)
     assert planned["disk"]["files"] == room.files - 1  # all that is in the folder
     filling = planned["disk"]["filling"]
@@ -142,7 +144,7 @@ def test_a_plan_leaves_nothing_behind_and_workers_share_what_can_be_shared(
     assert one["device_hours"] == one["seconds"]["simulating"] / 3600
     for planned, share in ((one, 1.0), (four, 2 / 5)):  # 2304 points in 5 batches
         seconds = planned["seconds"]
-        shared = share * (seconds["simulating"] + seconds["writing"])
+        shared = share * (seconds["simulating"] + seconds["writing"] + seconds["between"])
         assert planned["wall"] == pytest.approx(seconds["start"] + shared + seconds["drawing"])
 
 

@@ -15,6 +15,8 @@ from matplotlib.path import Path
 from numpy.typing import NDArray
 
 from ...identity import plane_of
+from ...lattice import own_cells
+from ...objective import Status
 from ...plane import Plane
 from .. import style
 from . import page, panel
@@ -27,7 +29,8 @@ PITCH = 6.0  # room of a map with its colour bar on a screen [inch]
 def landscape_figure(dataset: xr.Dataset, *, width: float | None = None) -> page.Picture:
     """Draw a slice of rank 2: the loss as colours above, its negated gradients as arrows below, or beside it.
 
-    Each cell is one sample, or for a coarse slice the part of the box nearest to it; nothing is interpolated. All
+    Each cell is one sample, or for a coarse or a refined slice the part of the box nearest to it; nothing is
+    interpolated. All
     arrows are equally long and point down the steepest slope of the picture as it is seen, its axes scaled to the same
     length; their colour is the magnitude of the gradient along the plane. Failures are hatched and counted. `width` is
     that of a page for print [mm]; as for every picture, without it the picture is as large as suits a screen.
@@ -47,7 +50,7 @@ def landscape_figure(dataset: xr.Dataset, *, width: float | None = None) -> page
         frame(ax, dataset, plane)
         panel.name_outer(ax, *plane.labels)
     page.head(picture, axes[0], dataset)
-    page.finish(picture, [*entries, *page.failure_key(dataset)])
+    page.finish(picture, [*entries, *page.failure_key(dataset), *page.unresolved_key(dataset)])
     return picture
 
 
@@ -58,7 +61,7 @@ def frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
     ax.set_xlim(*_limits(plane, 0))
     ax.set_ylim(*_limits(plane, 1))
     panel.name_axes(ax, y=plane.labels[1])
-    status = dataset["status"].to_numpy()
+    status = own_cells(dataset)["status"].to_numpy()
     edges = cell_edges(dataset)
     for kind, look in style.STATUS_LOOKS.items():
         if (where := status == kind).any():
@@ -91,8 +94,8 @@ def loss_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) 
 
 
 def loss_map(ax: Axes, dataset: xr.Dataset, scale: style.Scale) -> None:
-    """Draw every sample's loss as the colour of its cell, with the colour bar."""
-    loss = dataset["loss"].to_numpy()
+    """Draw every sample's loss as the colour of its cell, with the colour bar; of a refined slice cells differ."""
+    loss = own_cells(dataset)["loss"].to_numpy()
     mesh = ax.pcolormesh(
         *cell_edges(dataset), np.ma.masked_invalid(loss), cmap=style.LOSS_MAP, norm=scale.norm, rasterized=True
     )
@@ -102,7 +105,8 @@ def loss_map(ax: Axes, dataset: xr.Dataset, scale: style.Scale) -> None:
 def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> list[Artist]:
     """Draw the negated gradients as arrows, on the slice's own scale unless given; return the legend's entries."""
     plane = plane_of(dataset)
-    rows, columns = (pick_arrows(dataset.sizes[name]) for name in ("v", "u"))
+    refined = bool((dataset["status"] == Status.INTERPOLATED).any()) if "status" in dataset else False
+    rows, columns = (pick_arrows(dataset.sizes[name], refined=refined) for name in ("v", "u"))
     slope = plane.slope(torch.from_numpy(dataset["grad"].to_numpy())).numpy()
     size, label = magnitude(slope, plane, dataset["loss"].attrs.get("units", ""))
     flat = size == 0
@@ -125,7 +129,7 @@ def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None)
         return []
     look = page.sheet_of(ax).look(style.FLAT_MARK)
     ax.plot(u[flat[at]], v[flat[at]], **look, zorder=2.5)
-    return [Line2D([], [], **look, label=f"gradient exactly zero: {int(flat.sum())} of {flat.size}")]
+    return [Line2D([], [], **look, label=f"gradient exactly zero: {int(flat.sum())} of {page.evaluated(dataset)}")]
 
 
 def log_magnitude(dataset: xr.Dataset) -> Grid:
@@ -189,7 +193,9 @@ def _edges(centers: Grid, low: float, high: float) -> Grid:
     return np.concatenate([[low], (centers[1:] + centers[:-1]) / 2, [high]])
 
 
-def pick_arrows(points: int) -> NDArray[np.intp]:
-    """Return which of so many points along an axis keep their arrow."""
+def pick_arrows(points: int, *, refined: bool = False) -> NDArray[np.intp]:
+    """Return which of so many points along an axis keep their arrow: of a refined slice, those of its lattices."""
     step = -(-points // style.ARROWS)
+    if refined:
+        return cast("NDArray[np.intp]", np.arange(0, points, 1 << (step - 1).bit_length()))
     return cast("NDArray[np.intp]", np.arange((points - 1) % step // 2, points, step))

@@ -20,7 +20,9 @@ from matplotlib.patches import Patch
 from matplotlib.text import Text
 
 from ...identity import stored_identity, stored_provenance
+from ...measures.unresolved import say_unresolved, stored_unresolved
 from ...objective import Status
+from ...sampling.refine import Refined
 from ...storage.files import print_width, replacing, visible_files
 from .. import style
 from .typesetting import MARGIN, settle, title_room, wrap_text
@@ -92,6 +94,11 @@ def sheet_of(ax: Axes) -> style.Sheet:
     return picture_of(ax).sheet
 
 
+def evaluated(dataset: xr.Dataset) -> int:
+    """Return how many points of a slice are not interpolated."""
+    return int((dataset["status"] != Status.INTERPOLATED).sum()) if "status" in dataset else dataset["loss"].size
+
+
 def title(dataset: xr.Dataset) -> str:
     """Return objective, fidelity and resolution, and how much of it is sampled if not all."""
     identity = stored_identity(dataset)
@@ -99,7 +106,9 @@ def title(dataset: xr.Dataset) -> str:
     said = [str(identity[key]) for key in ("objective", "fidelity") if identity.get(key)]
     whole = int(np.prod(identity["plane"]["resolution"]))
     done = int((dataset["status"] != Status.MISSING).sum())
-    said.append(f"{points} points" if done == whole else f"{done} of {whole} points so far")
+    sampled = evaluated(dataset)
+    refined = f", {sampled} sampled" if sampled < dataset["loss"].size else ""
+    said.append(f"{points} points{refined}" if done == whole else f"{done} of {whole} points so far")
     return " · ".join(said)
 
 
@@ -122,10 +131,22 @@ def failure_key(dataset: xr.Dataset) -> list[Patch]:
     status = dataset["status"].to_numpy()
     names = style.FAILURES | {Status.MISSING: "not sampled yet"}
     return [
-        Patch(**style.STATUS_LOOKS[kind], label=f"{name}: {count} of {status.size}")
+        Patch(**style.STATUS_LOOKS[kind], label=f"{name}: {count} of {evaluated(dataset)}")
         for kind, name in names.items()
         if (count := int((status == kind).sum()))
     ]
+
+
+def unresolved_key(dataset: xr.Dataset) -> list[Patch]:
+    """Return legend entries of how exact a refined slice is, and how much is finer than the samples, where known."""
+    refined = Refined.of(dataset)
+    exact = (
+        f"interpolated points: 95 % within {100 * refined.error:.2g} % of the range"
+        if refined and refined.error
+        else ""
+    )
+    lines = [exact, say_unresolved(stored_unresolved(dataset))]
+    return [Patch(facecolor="none", edgecolor="none", label=said) for said in lines if said]
 
 
 def finish(picture: Picture, entries: Sequence[Artist], *, columns: int = 2, heading: str = "") -> None:

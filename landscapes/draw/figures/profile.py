@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
 
 from ...identity import plane_of
+from ...lattice import sampled_line
 from ...plane import Plane
 from .. import style
 from . import page, panel, typesetting
@@ -36,6 +37,7 @@ def profile_figure(
     if plane.rank != 1:
         raise ValueError(f"profile_figure draws lines; got a slice of rank {plane.rank}, so use landscape_figure")
     counted = {name: _counts(name, values, dataset.sizes["u"]) for name, values in (events or {}).items()}
+    places, whole, dataset = dataset["u"].to_numpy(), dataset, sampled_line(dataset)
     sheet = style.Sheet.of(width, pitch=WIDTH)
     heights = [STRIP * sheet.small / 72] * len(counted)
     heights += [max(FLATTEST, sheet.zoom) * height for height in (LOSS, SLOPE)[: 1 + ("grad" in dataset)]]
@@ -49,11 +51,11 @@ def profile_figure(
     for ax in panels:
         _frame(ax, dataset, plane)
     for strip, (name, counts) in zip(strips, counted.items(), strict=True):
-        _draw_strip(strip, panels, dataset["u"].to_numpy(), name, counts)
+        _draw_strip(strip, panels, places, name, counts)
     panel.name_axes(panels[-1], plane.labels[0])
     picture.align_ylabels(panels)
-    page.head(picture, [*strips, *panels][0], dataset)
-    page.finish(picture, [*entries, *page.failure_key(dataset)])
+    page.head(picture, [*strips, *panels][0], whole)
+    page.finish(picture, [*entries, *page.failure_key(whole), *page.unresolved_key(whole)])
     return picture
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import xarray as xr
 
 from ...identity import plane_of
+from ...lattice import own_cells, sampled_line
 from .. import style
 from .page import Picture
 
@@ -20,6 +21,7 @@ def thumbnail_figure(dataset: xr.Dataset, *, width: float | None = None) -> Pict
     ax = picture.add_axes((0, 0, 1, 1))
     ax.set_axis_off()
     picture.set_facecolor(style.UNSAMPLED)
+    dataset = sampled_line(dataset) if plane_of(dataset).rank == 1 else own_cells(dataset)
     loss = dataset["loss"].to_numpy()
     if plane_of(dataset).rank == 1:
         ax.plot(dataset["u"], loss, color=style.LOSS_LINE, linewidth=1.2)

@@ -9,6 +9,7 @@ import xarray as xr
 from matplotlib.ticker import LogLocator, MaxNLocator
 from numpy.typing import NDArray
 
+from ...lattice import own_cells
 from ...plane import Plane
 from .. import style
 from ..figures import contour
@@ -90,7 +91,7 @@ def cells(relief: Relief, dataset: xr.Dataset) -> Cells:
     Nothing is drawn between samples that was not sampled: a wall has the colour of the sample it belongs to, the higher
     one. A sample that failed has no top, and like the border of the slice is walled down to the ground.
     """
-    height = relief.height(dataset["loss"].transpose("v", "u").to_numpy())
+    height = relief.height(own_cells(dataset)["loss"].transpose("v", "u").to_numpy())
     rows, columns = np.nonzero(np.isfinite(height))
     high = height[rows, columns]
     u, v = (SIDE * ((at - at[0]) / (at[-1] - at[0]) - 0.5) for at in contour.cell_edges(dataset))
@@ -155,7 +156,7 @@ def stand(relief: Relief, dataset: xr.Dataset) -> Stand:
 
 def azimuth(relief: Relief, dataset: xr.Dataset) -> float:
     """Return from which of the azimuths [degrees] most of the valley is seen, over what stands in front of it."""
-    height = relief.height(dataset["loss"].transpose("v", "u").to_numpy())
+    height = relief.height(own_cells(dataset)["loss"].transpose("v", "u").to_numpy())
     if not np.isfinite(height).any():
         return AZIMUTHS[0]
     rows, columns = np.nonzero(height <= np.nanquantile(height, VALLEY_SHARE))

@@ -18,6 +18,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from ...identity import plane_of
+from ...lattice import own_cells
 from ...objective import Status
 from ...storage.files import replacing
 from .. import style
@@ -143,7 +144,8 @@ def _add_surface(plotter: pv.Plotter, body: Relief, dataset: xr.Dataset) -> None
     if not len(made.corners):
         return
     surface = pv.PolyData.from_regular_faces(made.corners.reshape(-1, 3), made.triangles)
-    colours = style.LOSS_MAP(body.shade(dataset["loss"].transpose("v", "u").to_numpy()).ravel(), bytes=True)[:, :3]
+    loss = own_cells(dataset)["loss"].transpose("v", "u").to_numpy()
+    colours = style.LOSS_MAP(body.shade(loss).ravel(), bytes=True)[:, :3]
     surface["color"] = np.repeat(colours[made.sample], 4, axis=0)
     surface.point_data.active_normals = np.repeat(made.normals, 4, axis=0)
     look = {"color": "white", "scalars": "color", "rgb": True, "smooth_shading": True, **MATTER}

@@ -1,0 +1,95 @@
+"""What a slice came to: how its points ended, the range of its losses, and what its samples hide."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import xarray as xr
+
+from ..landscapes.cost import duration
+from ..landscapes.identity import plane_of
+from ..landscapes.measures.records import UnresolvedRecord
+from ..landscapes.measures.unresolved import attribute_of, find_unresolved, say_unresolved
+from ..landscapes.objective import Objective, Status, name_of
+from ..landscapes.sampling.refine import Refined
+
+
+@dataclass(frozen=True)
+class SliceSummary:
+    """Say what a slice cost, as `summary.json` beside it has it; `status` counts points, `flat` those without slope.
+
+    `episodes` are those of the samples; `unresolved` has those that looked between them, and what they found, None
+    where nothing is known of it.
+    """
+
+    env: str | None
+    dims: list[str]
+    fidelity: str | None
+    device: str | None
+    options: dict[str, Any] | None
+    resolution: list[int]
+    gradients: bool
+    episodes: int
+    resumed: int
+    seconds: float
+    status: dict[str, int]
+    loss: dict[str, float | None]
+    flat: int | None
+    unresolved: UnresolvedRecord | None
+    refinement: Refined | None
+    command: str
+    files: list[str]
+
+    def outcome(self) -> str:
+        """Say in a line what the slice cost and what came out."""
+        counts = {kind: count for kind, count in self.status.items() if count}
+        ends = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+        refined = f"; {self.refinement.say()}" if self.refinement else ""
+        low, high = self.loss["lowest"], self.loss["highest"]
+        losses = "no finite loss" if low is None else f"losses from {low:.4g} to {high:.4g}"
+        sampled = sum(counts.values()) - counts.get("interpolated", 0)
+        share = (self.flat or 0) / sampled if sampled else 0.0
+        flat = f"; gradient exactly zero at {share:.1%} of points" if share else ""
+        hidden = f"; {said}" if (said := say_unresolved(self.unresolved)) else ""
+        return f"{self.episodes} episodes in {duration(self.seconds)}; {ends}; {losses}{flat}{refined}{hidden}"
+
+
+def look_between(objective: Objective, dataset: xr.Dataset) -> dict[str, Any]:
+    """Return the attribute of a slice that says how much of it is finer than its samples.
+
+    An objective that raises between them has been sampled all the same: that is warned of, and nothing is said.
+    """
+    try:
+        return attribute_of(find_unresolved(objective, dataset))
+    except (OSError, MemoryError):  # lost workers, a full disk: the slice is finished once they are there again
+        raise
+    except Exception as error:
+        said = f"{name_of(objective)} raised between the samples, so what they hide is not known: {error}"
+        warnings.warn(said, RuntimeWarning, stacklevel=2)
+        return {}
+
+
+def count_statuses(dataset: xr.Dataset) -> dict[str, int]:
+    """Count the points of a slice by how they ended."""
+    status = dataset["status"].to_numpy()
+    return {kind.name.lower(): int((status == kind).sum()) for kind in Status}
+
+
+def range_of(dataset: xr.Dataset) -> dict[str, float | None]:
+    """Return the lowest and the highest finite loss of a slice, None where there is none."""
+    loss = dataset["loss"].to_numpy()
+    if not np.isfinite(loss).any():
+        return {"lowest": None, "highest": None}
+    return {"lowest": float(np.nanmin(loss)), "highest": float(np.nanmax(loss))}
+
+
+def flat_points(dataset: xr.Dataset) -> int | None:
+    """Count the points whose gradient along the plane is exactly zero, none if gradients are not there."""
+    if "grad" not in dataset:
+        return None
+    slope = plane_of(dataset).slope(torch.from_numpy(dataset["grad"].to_numpy()))
+    return int((slope == 0).all(dim=-1).sum())

@@ -1,0 +1,317 @@
+"""What the samples of a slice do not show: jumps, ridges and ripples finer than they are, as a share of its cells.
+
+A cell lies between neighbouring samples: two along a line, four of a plane. It is unresolved if the loss between them
+is not what they tell, in one of two ways. At a point halfway it differs from both the mean of the samples around it and
+what their gradients say (exact for a quadratic) by more than half a step of a ramp through the range of the losses. Or
+a difference of as much keeps more than a quarter of itself while the interval it lies in is halved three times, as a
+jump does; of a slope, steep as it may be, an eighth is left.
+
+Cells are drawn at random from three strata, with new evaluations of their losses alone:
+
+- contradicted: along an edge, the gradients at both ends do not explain the difference between them, or send the cubic
+  through both (Hermite) beyond the ends. That is the trace of what lies between. The edge is bisected.
+- steep: along an edge the loss changes by more than half a step, as its gradients say. The edge is bisected, too.
+- quiet: all others. The loss is asked for in the middle, since what left no trace can only be met.
+
+Of a slice without gradients their place is taken by differences of neighbouring losses. Of a refined slice the cells
+that it interpolates count as resolved; how exact they are is said beside.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+import torch
+import xarray as xr
+from numpy.typing import NDArray
+
+from ..identity import plane_of
+from ..objective import Objective, Status, evaluate
+from ..plain import finite
+from ..plane import Plane
+from ..statistics import Estimate, Values, share
+from .records import UnresolvedRecord
+from .ruggedness import box_slopes, span
+
+UNRESOLVED = "unresolved"  # the attribute of a slice that holds its record
+COST = {True: 5, False: 10}  # samples of a slice, with or without gradients, that cost ten times as much as a loss
+HALVINGS, KEPT = 3, 1 / 4  # of an edge, and what a jump keeps more than of its height; a slope keeps an eighth
+PLACES = np.arange(1, 16) / 16  # of an edge, where its cubic is looked at
+ROUNDING = 2.0**-20  # of the largest loss: what float32 may add up to is no difference
+SUSPECTED = 1 / 2  # of the evaluations, at most, goes to where samples contradict each other
+
+CONTRADICTED, STEEP, QUIET = "contradicted", "steep", "quiet"
+Cells = NDArray[np.intp]  # lower corners of cells, shape (count, rank), in array order
+
+
+@dataclass(frozen=True)
+class Unresolved:
+    """Hold the `share` of a slice's cells that are finer than its samples.
+
+    Of `cells` between samples that did not fail `probed` were looked into, `found` unresolved, and `undecided` as an
+    evaluation failed there, with so many `episodes`. A difference counts from `least` on [loss unit].
+    """
+
+    share: Estimate
+    least: float
+    cells: int
+    probed: int
+    found: int
+    undecided: int
+    episodes: int
+
+    def record(self) -> UnresolvedRecord:
+        """Return it as plain JSON."""
+        return cast("UnresolvedRecord", {**vars(self), "share": self.share.record(), "least": finite(self.least)})
+
+
+def find_unresolved(
+    objective: Objective, dataset: xr.Dataset, *, floor: float = 0.0, seed: int = 0
+) -> Unresolved | None:
+    """Look between the samples of a slice, at no more than a tenth of its own cost; None where that is too little.
+
+    `floor` [loss unit] is the least difference that is more than noise. A slice whose range is zero has steps of zero,
+    so that any difference beyond rounding counts.
+    """
+    loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+    slope = _step_slopes(dataset, loss)
+    known, whole = np.isfinite(loss), span(loss)
+    least = max(floor, np.nan_to_num(whole) / (max(loss.shape) - 1) / 2)
+    least = float(max(least, ROUNDING * np.abs(loss[known]).max())) if known.any() else least
+    strata = _strata(loss, slope, least)
+    budget = probes(_evaluated(dataset), grad="grad" in dataset)
+    cells = sum(map(len, strata.values()))
+    if not cells:
+        return None
+    look = _Look(objective, plane_of(dataset), loss, slope, least)
+    generator, parts = np.random.default_rng(seed), list[tuple[int, int, Values]]()
+    for name, stratum in strata.items():
+        most = _most(name, strata, budget, budget - look.episodes)
+        if len(stratum) and not most:
+            return None
+        drawn = stratum[np.sort(generator.permutation(len(stratum))[:most])]
+        parts.append((len(stratum), len(drawn), look.middles(drawn) if name == QUIET else look.edges(drawn, name)))
+    decided = [result[np.isfinite(result)] for _, _, result in parts]
+    return Unresolved(
+        share=_combine(
+            [(count, int(one.sum()), len(one)) for (count, _, _), one in zip(parts, decided, strict=True)],
+            of=math.prod(points - 1 for points in loss.shape) if _evaluated(dataset) < loss.size else cells,
+        ),
+        least=least,
+        cells=cells,
+        probed=sum(drawn for _, drawn, _ in parts),
+        found=int(sum(one.sum() for one in decided)),
+        undecided=sum(drawn - len(one) for (_, drawn, _), one in zip(parts, decided, strict=True)),
+        episodes=look.episodes,
+    )
+
+
+def probes(samples: int, *, grad: bool) -> int:
+    """Return how many losses, at most, are evaluated between so many samples.
+
+    That is a tenth of what the samples cost, if a gradient costs as much as the loss itself; it costs more.
+    """
+    return samples // COST[grad]
+
+
+def _most(name: str, strata: dict[str, Cells], budget: int, left: int) -> int:
+    """Return how many cells of a stratum may be looked into, so that no more evaluations than are left are used.
+
+    Those that are suspected get half of the budget, or what they need of it; the others get the rest by their numbers.
+    """
+    if name == QUIET:
+        return left
+    steep, quiet = len(strata[STEEP]), len(strata[QUIET])
+    part = SUSPECTED * budget if name == CONTRADICTED else left * steep / max(steep + quiet, 1)
+    return min(max(1, int(part) // HALVINGS), left // HALVINGS)
+
+
+def stored_unresolved(dataset: xr.Dataset) -> UnresolvedRecord | None:
+    """Return the record that a slice holds, None where it has none or what it has is none."""
+    try:
+        found = json.loads(dataset.attrs[UNRESOLVED])
+        float(found["share"]["value"])
+        return cast("UnresolvedRecord", found)
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def say_unresolved(record: UnresolvedRecord | None) -> str:
+    """Say in a line how much of a slice is finer than its samples; nothing where that is not known."""
+    said = say_share(record)
+    return f"finer than the samples: {said.replace(' %', ' % of cells', 1)}" if said else ""
+
+
+def say_share(record: UnresolvedRecord | None) -> str:
+    """Return the share with its interval, nothing where it is not known."""
+    if record is None or record["share"]["value"] is None:
+        return ""
+    value, low, high = (100 * (part or 0.0) for part in cast("dict[str, float]", record["share"]).values())
+    interval = f" ({_round(low)} to {_round(high)} %)" if low else f" (at most {_round(high)} %)"
+    return f"{_round(value)} %{interval if high > low else ''}"
+
+
+def _round(percent: float) -> str:
+    return f"{percent:.1f}" if 0 < percent < 1 else f"{percent:.0f}"
+
+
+def _step_slopes(dataset: xr.Dataset, loss: Values) -> Values:
+    """Return the derivatives by a step from sample to sample along each axis of the array, axis last."""
+    if "grad" not in dataset:
+        return np.stack([np.gradient(loss, axis=axis) for axis in range(loss.ndim)], axis=-1)
+    slopes: Values = (box_slopes(dataset) / (np.array(plane_of(dataset).resolution) - 1))[..., ::-1]
+    return slopes
+
+
+def _strata(loss: Values, slope: Values, least: float) -> dict[str, Cells]:
+    """Return the lower corners of the cells of each stratum; a cell with a corner that failed is in none."""
+    gap, surprise = (_of_cells(edges) for edges in _edges(loss, slope))
+    whole = np.isfinite(gap)
+    contradicted = whole & (surprise > least)
+    steep = whole & ~contradicted & (gap > least)
+    kinds = {CONTRADICTED: contradicted, STEEP: steep, QUIET: whole & ~contradicted & ~steep}
+    return {name: np.argwhere(where) for name, where in kinds.items()}
+
+
+def _edges(loss: Values, slope: Values) -> tuple[list[Values], list[Values]]:
+    """Return for the edges along each axis how far their ends differ, and how far that is not what gradients say."""
+    gaps, surprises = list[Values](), list[Values]()
+    for axis in range(loss.ndim):
+        low, high = _pairs(loss, axis)
+        gaps.append(np.abs(high - low))
+        surprises.append(np.nan_to_num(_surprise(low, high, *_pairs(slope[..., axis], axis))))
+    return gaps, surprises
+
+
+def _surprise(low: Values, high: Values, start: Values, end: Values) -> Values:
+    """Return how far the gradients at the ends of edges contradict their losses.
+
+    That is by the rule of the trapezoid, or as far as the cubic through both goes beyond the ends.
+    """
+    found: Values = np.abs(high - low - (start + end) / 2)
+    top, bottom = np.maximum(low, high), np.minimum(low, high)
+    for at in PLACES:
+        between = low + (high - low) * at**2 * (3 - 2 * at) + at * (1 - at) * (start * (1 - at) - end * at)
+        found = np.maximum(found, np.maximum(between - top, bottom - between))
+    return found
+
+
+def _pairs(values: Values, axis: int) -> tuple[Values, Values]:
+    count = values.shape[axis]
+    return np.take(values, range(count - 1), axis), np.take(values, range(1, count), axis)
+
+
+def _of_cells(edges: Sequence[Values]) -> Values:
+    """Return the largest value of the edges of each cell, NaN where one is."""
+    found: Values | None = None
+    for axis, values in enumerate(edges):
+        most = values
+        for other in range(values.ndim):
+            most = most if other == axis else np.maximum(*_pairs(most, other))
+        found = most if found is None else np.maximum(found, most)
+    return cast("Values", found)
+
+
+class _Look:
+    """Look into cells of a slice by new evaluations, and count them.
+
+    An answer is 1 for a cell that is unresolved, 0 for one that is not, NaN where an evaluation failed.
+    """
+
+    def __init__(self, objective: Objective, plane: Plane, loss: Values, slope: Values, least: float) -> None:
+        self.objective, self.plane, self.loss, self.slope, self.least = objective, plane, loss, slope, least
+        self.axes = [axis.numpy() for axis in plane.axes()[::-1]]  # in array order
+        self.episodes = 0
+
+    def ask(self, at: Values) -> Values:
+        """Return the losses at places between samples, shape (count, rank), in steps along each axis of the array."""
+        if not len(at):
+            return np.zeros(0)
+        self.episodes += len(at)
+        places = [np.interp(at[:, axis], np.arange(len(one)), one) for axis, one in enumerate(self.axes)][::-1]
+        u = torch.from_numpy(np.stack(places, axis=-1))
+        return cast("Values", evaluate(self.objective, self.plane.lift(u), grad=False).loss.numpy())
+
+    def middles(self, cells: Cells) -> Values:
+        """Look at the middles of cells, against all their corners."""
+        corners = [np.array(corner) for corner in np.ndindex((2,) * self.loss.ndim)]
+        middle = cells.astype(np.float64) + 0.5
+        return self._off(self.ask(middle), [cells + corner for corner in corners], middle)
+
+    def edges(self, cells: Cells, kind: str) -> Values:
+        """Bisect of each cell the edge that is the steepest, or contradicted most, towards the larger difference."""
+        low, high = self._worst(cells, kind)
+        below, above = self.loss[tuple(low.T)], self.loss[tuple(high.T)]
+        low, high, first = low.astype(float), high.astype(float), np.abs(above - below)
+        ends = [low.astype(int), high.astype(int)]
+        found, open_ = np.zeros(len(cells)), np.ones(len(cells), bool)
+        for halving in range(HALVINGS):
+            middle = (low + high) / 2
+            between = np.full(len(cells), np.nan)
+            between[open_] = self.ask(middle[open_])
+            found[open_ & ~np.isfinite(between)] = np.nan
+            if not halving:
+                found = np.maximum(found, self._off(between, ends, middle))
+            left = np.abs(between - below) >= np.abs(above - between)
+            high, above = np.where(left[:, None], middle, high), np.where(left, between, above)
+            low, below = np.where(left[:, None], low, middle), np.where(left, below, between)
+            open_ &= (found == 0) & (np.abs(above - below) > self.least)
+        return np.where(open_ & (np.abs(above - below) > KEPT * first), 1.0, found)
+
+    def _worst(self, cells: Cells, kind: str) -> tuple[Cells, Cells]:
+        """Return the ends of the edge of each cell that is to be bisected."""
+        measure = _edges(self.loss, self.slope)[kind == CONTRADICTED]
+        rank = self.loss.ndim
+        edges = [
+            (axis, np.array(corner)) for axis in range(rank) for corner in np.ndindex((2,) * rank) if not corner[axis]
+        ]
+        values = np.stack([measure[axis][tuple((cells + corner).T)] for axis, corner in edges], axis=-1)
+        chosen = values.argmax(axis=-1) if len(cells) else np.zeros(0, int)
+        low = cells + np.array([corner for _, corner in edges])[chosen]
+        return low, low + np.eye(rank, dtype=int)[np.array([axis for axis, _ in edges])[chosen]]
+
+    def _off(self, found: Values, around: Sequence[Cells], at: Values) -> Values:
+        """Say where losses are neither the mean of the samples `around` nor what their gradients say, NaN if failed.
+
+        The mean of f + g d / 2 over samples on opposite sides is the loss between them where it is quadratic.
+        """
+        losses = [self.loss[tuple(one.T)] for one in around]
+        off = np.abs(found - np.mean(losses, axis=0))
+        rises = [(self.slope[tuple(one.T)] * (at - one)).sum(axis=-1) for one in around]
+        off = np.fmin(off, np.abs(found - np.mean(losses, axis=0) - np.mean(rises, axis=0) / 2))
+        return np.where(np.isfinite(found), (off > self.least).astype(float), np.nan)
+
+
+def _evaluated(dataset: xr.Dataset) -> int:
+    """Return how many samples of a slice were evaluated: a refined one interpolates others."""
+    return int((dataset["status"] != Status.INTERPOLATED).sum())
+
+
+def _combine(strata: Sequence[tuple[int, int, int]], *, of: int) -> Estimate:
+    """Return the share over strata, each a count of cells, of hits and of tries, and its interval.
+
+    It is a share `of` so many cells.
+
+    Each stratum has its exact binomial interval, none where all of it was tried; they are combined by the variances
+    that they stand for (Zou & Donner 2008, Stat. Med. 27, eqs. 3 and 4).
+    """
+    value, below, above = 0.0, 0.0, 0.0
+    for count, hits, tries in strata:
+        if not count:
+            continue
+        one = share(hits, tries) if tries < count else Estimate(*[hits / tries] * 3)
+        weight = count / of
+        value += weight * one.value
+        below += (weight * (one.value - one.low)) ** 2
+        above += (weight * (one.high - one.value)) ** 2
+    return Estimate(value, max(0.0, value - math.sqrt(below)), min(1.0, value + math.sqrt(above)))
+
+
+def attribute_of(found: Unresolved | None) -> dict[str, Any]:
+    """Return the attribute that a slice holds it in, as text: none where nothing was found out."""
+    return {} if found is None else {UNRESOLVED: json.dumps(found.record())}

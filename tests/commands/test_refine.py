@@ -1,0 +1,149 @@
+"""`landscape slice --refine` and `--budget`, and what a slice says of what its samples hide."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gradscape as gs
+from gradscape.gallery.site.page_data import count_numbers
+from gradscape.jobs.slice import SliceJob
+from gradscape.jobs.watch import Stopped, Watch
+from gradscape.landscapes.draw.figures.contour import landscape_figure
+from gradscape.landscapes.draw.figures.profile import profile_figure
+from gradscape.landscapes.draw.figures.thumbnail import thumbnail_figure
+from gradscape.landscapes.objective import Status
+from gradscape.landscapes.storage.store import open_slice
+
+from ..command import Said
+
+Run = Callable[..., Said]
+REFINED = "slice pinball-2 --dims 0 1 --resolution 33 --refine 5% --json --device cpu --fidelity draft --out"
+
+
+def foot(figure: object) -> str:
+    legends = figure.legends  # type: ignore[attr-defined]
+    return "\n".join(text.get_text() for legend in legends for text in legend.get_texts())
+
+
+def test_a_refined_slice_says_what_was_sampled_and_is_there_the_second_time(run: Run, tmp_path: Path) -> None:
+    first = run(*REFINED.split(), "made", cwd=tmp_path)
+    assert first.returncode == 0, first.stderr
+    said = json.loads(first.stdout)
+    assert said["status"]["ok"] + said["status"]["interpolated"] == 33 * 33
+    assert said["refinement"]["sampled"] == said["status"]["ok"] == said["episodes"]
+    assert "up to 1089 episodes with gradients to compute" in first.stderr
+    assert f"{said['episodes']} of 1089 points sampled" in first.stderr
+    again = json.loads(run(*REFINED.split(), "made", cwd=tmp_path).stdout)
+    assert (again["episodes"], again["resumed"]) == (0, said["episodes"])
+    assert {name: again[name] for name in ("status", "loss", "unresolved")} == {
+        name: said[name] for name in ("status", "loss", "unresolved")
+    }
+    other = run(*REFINED.replace("5%", "4%").split(), "made", cwd=tmp_path)
+    assert other.returncode == 2
+    assert "refinement.share: wanted 0.04, found 0.05" in other.stderr
+    plain = run(*REFINED.replace("--refine 5%", "--force").split(), "made", cwd=tmp_path)
+    assert json.loads(plain.stdout)["refinement"] is None
+    assert sorted(path.name for path in (tmp_path / "made").iterdir()) == [
+        "landscape.png", "slice.zarr", "summary.json",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--refine much", "--refine takes a share such as 1% or 0.01; got 'much'"),
+        ("--refine 0", "a share of the range between 0 and 1; got 0"),
+        ("--refine nan", "a share of the range between 0 and 1; got nan"),
+        ("--refine 120%", "a share of the range between 0 and 1; got 1.2"),
+        ("--budget 9", "begins with 81 points; got a budget of 9"),
+    ],
+)
+def test_what_is_no_share_or_too_small_is_refused_in_a_line(run: Run, tmp_path: Path, words: str, said: str) -> None:
+    done = run(*["slice", "branin", "--dims", "0", "1", "--resolution", "33"], *words.split(), cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not any(tmp_path.iterdir())
+
+
+class Impatient(Watch):
+    """Stop a job at every so many steps, as Ctrl-C does."""
+
+    def progress(self, total: int, what: str = "episodes"):  # type: ignore[no-untyped-def]
+        from contextlib import contextmanager
+
+        @contextmanager
+        def counting():  # type: ignore[no-untyped-def]
+            calls = 0
+
+            def advance(done: int, text: str = "") -> None:
+                nonlocal calls
+                calls += 1
+                if calls == 4:
+                    raise KeyboardInterrupt
+
+            yield advance
+
+        return counting()
+
+
+def test_a_job_that_is_stopped_keeps_what_it_has_and_draws_it(tmp_path: Path) -> None:
+    from gradscape.envs.registry import make
+    from gradscape.jobs.scene import plane_through
+    from gradscape.landscapes.sampling.refine import Refinement
+
+    env = make("pinball-2", fidelity="draft", device="cpu")
+    plane = plane_through(env, (0, 1), through="center", extent=None, resolution=33)
+
+    def job(name: str) -> SliceJob:
+        return SliceJob.of(env, plane, command="", out=tmp_path / name, refinement=Refinement(0.05))
+
+    whole = job("one").run()
+    with pytest.raises(Stopped, match="of 1089 points are kept"):
+        job("two").run(Impatient())
+    assert (tmp_path / "two" / "landscape.png").exists()
+    rest = job("two").run()
+    assert rest.resumed > 0
+    assert rest.episodes + rest.resumed == whole.episodes
+    one, two = (open_slice(tmp_path / name) for name in ("one", "two"))
+    for name in ("loss", "grad", "status", "interpolated"):
+        assert one[name].to_numpy().tobytes() == two[name].to_numpy().tobytes()
+    assert one.attrs["unresolved"] == two.attrs["unresolved"]
+
+
+def test_pictures_draw_each_sample_as_large_as_what_it_stands_for(tmp_path: Path) -> None:
+    cut = gs.slice("branin", (0, 1), resolution=65, refine=0.02, out=tmp_path / "map")
+    picture = landscape_figure(cut.data)
+    (mesh,) = (one for one in picture.axes[0].collections if one.get_gid() is None)
+    colours = np.ma.filled(mesh.get_array(), np.nan).reshape(65, 65)
+    assert np.isfinite(colours).all()
+    assert set(np.unique(colours)) == set(np.unique(cut.data["loss"].to_numpy()[cut.data["status"] == Status.OK]))
+    assert f"65 \N{MULTIPLICATION SIGN} 65 points, {int((cut.data['status'] == 1).sum())} sampled" in str(
+        picture.get_suptitle()
+    )
+    assert "interpolated points: 95 % within" in foot(picture)
+    thumbnail_figure(cut.data)
+    line = gs.slice("branin", (0,), resolution=257, refine=0.02, out=tmp_path / "line")
+    (drawn, *_) = profile_figure(line.data).axes[0].get_lines()
+    assert len(drawn.get_xdata()) == int((line.data["status"] == Status.OK).sum()) < 257
+
+
+def test_a_slice_says_at_its_foot_and_on_its_page_what_it_hides(tmp_path: Path) -> None:
+    cut = gs.slice("pinball-2", (0, 1), resolution=12, fidelity="draft", device="cpu", out=tmp_path / "cut")
+    numbers = count_numbers(cut.data)
+    assert numbers.unresolved is not None
+    assert (numbers.unresolved["value"] or 0) > 0.1
+    said = f"finer than the samples: {100 * (numbers.unresolved['value'] or 0):.0f} % of cells ("
+    assert said in foot(landscape_figure(cut.data))
+    older = cut.data.drop_attrs(deep=False).assign_attrs(
+        {name: value for name, value in cut.data.attrs.items() if name != "unresolved"}
+    )
+    assert "finer" not in foot(landscape_figure(older))
+    assert count_numbers(older).unresolved is None
+    assert cut.report(points=2).record()["unresolved"] == json.loads(cut.data.attrs["unresolved"])
+    looked = gs.Slice(older, None, cut.remake).report(points=2).record()["unresolved"]
+    assert looked is not None
+    assert (looked["share"]["value"] or 0) > 0.1

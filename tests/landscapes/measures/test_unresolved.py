@@ -1,0 +1,176 @@
+"""What the samples of a slice hide: functions whose jumps, ridges and slopes have a known width."""
+
+import json
+import math
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+from torch import Tensor
+
+from gradscape.jobs.slice_summary import look_between
+from gradscape.landscapes.adapters import from_numpy, from_torch
+from gradscape.landscapes.measures.unresolved import (
+    UNRESOLVED,
+    Unresolved,
+    find_unresolved,
+    probes,
+    say_unresolved,
+    stored_unresolved,
+)
+from gradscape.landscapes.objective import Objective
+from gradscape.landscapes.plane import Plane
+from gradscape.landscapes.sampling.fill import sample
+from gradscape.landscapes.space import ParameterSpace
+
+SPACE = ParameterSpace(["a", "b"], [-1.0, -1.0], [1.0, 1.0])
+RIDGE = 0.006  # standard deviation of a ridge; samples of 32 are 0.065 apart
+ACROSS = math.hypot(1.0, 0.37)
+
+
+def bowl(x: Tensor) -> Tensor:
+    return x.square().sum(dim=1) + x[:, 0] * x[:, 1]
+
+
+def ridged(x: Tensor) -> Tensor:
+    return bowl(x) + 2 * torch.exp(-(((x[:, 0] + 0.37 * x[:, 1] - 0.1) / ACROSS / RIDGE) ** 2) / 2)
+
+
+def jumping(x: Tensor) -> Tensor:
+    return bowl(x) + (x[:, 0] + 0.3 * x[:, 1] > 0.11).double()
+
+
+def steep(x: Tensor) -> Tensor:
+    return torch.tanh(8 * x[:, 0])
+
+
+def cut(
+    function: Callable[[Tensor], Tensor], points: int = 32, dims: tuple[int, ...] = (0, 1), grad: bool = True
+) -> tuple[Objective, xr.Dataset]:
+    objective = from_torch(function, SPACE)
+    plane = Plane.through(SPACE, torch.zeros(2), dims, resolution=points)
+    return objective, sample(objective, plane, grad=grad)
+
+
+def look(
+    function: Callable[[Tensor], Tensor], points: int = 32, dims: tuple[int, ...] = (0, 1), **how: bool
+) -> Unresolved:
+    found = find_unresolved(*cut(function, points, dims, **how))
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("grad", [True, False])
+@pytest.mark.parametrize("function", [bowl, steep, lambda x: x[:, 0], lambda x: 0 * x[:, 0] + 1.0])
+def test_what_is_smooth_is_resolved_however_steep(function: Callable[[Tensor], Tensor], grad: bool) -> None:
+    found = look(function, grad=grad)
+    assert (found.share.value, found.found, found.undecided) == (0.0, 0, 0)
+
+
+def test_a_ridge_thinner_than_a_sample_is_flagged_and_one_of_many_samples_is_not() -> None:
+    share = look(ridged).share
+    crossed = 31 * (2 / 31) / 2 * (1 + 0.37) * 31 / 31**2  # cells that a line across the box of this slope meets
+    assert 0.5 * crossed < share.value < 2 * crossed
+    assert share.low > 0
+    wide = look(lambda x: bowl(x) + 2 * torch.exp(-(((x[:, 0] + 0.37 * x[:, 1]) / 0.3) ** 2)))
+    assert wide.found == 0
+
+
+@pytest.mark.parametrize("grad", [True, False])
+def test_the_cells_of_a_jump_are_the_share_that_is_found(grad: bool) -> None:
+    _, dataset = cut(jumping)
+    sides = dataset["u"].to_numpy()[None, :] + 0.3 * dataset["v"].to_numpy()[:, None] > 0.11
+    corners = np.stack([sides[:-1, :-1], sides[1:, :-1], sides[:-1, 1:], sides[1:, 1:]])
+    crossed = float((corners.any(axis=0) & ~corners.all(axis=0)).mean())
+    share = look(jumping, grad=grad).share
+    assert share.low <= crossed <= share.high
+    assert share.value == pytest.approx(crossed, rel=0.6)
+
+
+def test_a_jump_in_the_middle_of_an_interval_is_one() -> None:
+    """There the loss is the mean of both sides, and half of the height is left after the first halving."""
+    found = look(lambda x: torch.sign(x[:, 0]) + 0 * x[:, 0])
+    assert found.share.value == pytest.approx(1 / 31)
+
+
+def test_a_line_has_cells_too() -> None:
+    assert look(jumping, 200, (0,)).share.value == pytest.approx(1 / 199)
+    assert look(bowl, 200, (0,)).found == 0
+
+
+def test_what_left_no_trace_is_met_by_chance() -> None:
+    comb = 31 / 2 * math.pi  # a ripple that is zero, with its slope, at every sample
+    found = look(lambda x: 0.01 * x[:, 0] + torch.sin(comb * (x[:, 0] + 1)).square())
+    assert found.share.value == 1.0
+    assert found.share.low > 0.9
+
+
+@pytest.mark.parametrize(("points", "grad"), [(8, True), (24, True), (24, False), (50, True)])
+def test_it_takes_a_tenth_of_the_slice_at_most(points: int, grad: bool) -> None:
+    asked = 0
+
+    def counted(x: Tensor) -> Tensor:
+        nonlocal asked
+        asked += len(x)
+        return jumping(x)
+
+    objective, dataset = cut(counted, points, grad=grad)
+    asked = 0
+    found = find_unresolved(objective, dataset)
+    assert found is not None
+    assert asked == found.episodes <= probes(points**2, grad=grad) <= points**2 / (5 if grad else 10)
+
+
+@pytest.mark.parametrize("points", [2, 3, 4])
+def test_of_few_samples_nothing_is_said(points: int) -> None:
+    assert find_unresolved(*cut(jumping, points)) is None
+
+
+def test_failures_are_left_out() -> None:
+    def failing(x: Tensor) -> Tensor:
+        return torch.where(x[:, 0] > 0.3, torch.nan, jumping(x))
+
+    found = look(failing)
+    assert found.cells == 20 * 31  # between the samples that did not fail
+    assert found.share.value > 0
+    assert find_unresolved(*cut(lambda x: torch.nan * x[:, 0])) is None
+
+    def failing_between(x: Tensor) -> Tensor:
+        steps = (x + 1) / 2 * 31
+        return torch.where(((steps - steps.round()).abs() > 1e-6).any(dim=1), torch.nan, bowl(x))
+
+    found = look(failing_between)
+    assert found.undecided == found.probed > 0
+    assert math.isnan(found.share.value)
+    assert say_unresolved(found.record()) == ""
+
+
+def test_it_is_the_same_every_time_and_travels_as_text() -> None:
+    objective, dataset = cut(jumping)
+    said = look_between(objective, dataset)
+    assert said == look_between(objective, dataset)
+    assert isinstance(said[UNRESOLVED], str)
+    record = stored_unresolved(dataset.assign_attrs(said))
+    assert record == json.loads(said[UNRESOLVED])
+    assert "finer than the samples: 4 % of cells" in say_unresolved(record)
+    assert stored_unresolved(dataset) is None
+    assert stored_unresolved(dataset.assign_attrs({UNRESOLVED: "["})) is None
+
+
+def test_what_raises_between_the_samples_is_warned_of() -> None:
+    _, dataset = cut(jumping)
+
+    def raising(x: object) -> object:
+        raise RuntimeError("no more")
+
+    with pytest.warns(RuntimeWarning, match="raising raised between the samples.*no more"):
+        assert look_between(from_numpy(raising, SPACE), dataset) == {}
+    with warnings.catch_warnings(), pytest.raises(OSError, match="gone"):
+        look_between(from_numpy(_gone, SPACE), dataset)
+
+
+def _gone(x: object) -> object:
+    raise OSError("gone")
