@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -22,6 +23,7 @@ from ..landscapes.objective import Evaluation
 from ..landscapes.storage.disk import is_full
 from ..landscapes.storage.files import make_folder, other_files, replacing, tidy, write_json
 from ..landscapes.storage.records import read_json, write_record
+from . import growth
 from .folder import REPORT, REPORTS, ROOT, SLICE_STORE, folder_named, store_in
 from .report_record import ARRAYS, MEASURES, PICTURE, RECORD, PaperRecord, Quoted, Report, ReportKey, Reports
 from .report_tables import slices_markdown
@@ -180,13 +182,14 @@ class ReportJob:
         require("number of samples", dataset["loss"].size, lambda count: Need(own_cost(count)[1]))
         start = time.monotonic()
         profile = measure(env, dataset, self.points, self.seed, watch)
+        grown = measure_growth(env, dataset, watch)
         report = Report(
             name=subject.name,
             env=env.name,
             options=stored_identity(dataset)["options"],
             fidelity=env.fidelity.name,
             device=env.device,
-            profile=cast("ProfileRecord", json.loads(json.dumps(profile.record()))),
+            profile=cast("ProfileRecord", json.loads(json.dumps({**profile.record(), "growth": grown}))),
             paper=_beside(profile, self.paper.get(env.name)),
             seconds=round(time.monotonic() - start, 3),
             command=self.command,
@@ -220,6 +223,21 @@ def measure(env: Environment, dataset: xr.Dataset, points: int, seed: int, watch
         found = measure_profile(counted, dataset, rounding=rounding, points=points, seed=seed, events=env.events)
         advance(total)
     return found
+
+
+def measure_growth(env: Environment, dataset: xr.Dataset, watch: Watch) -> dict[str, Any] | None:
+    """Measure how gradients grow with the length of episodes; None where that cannot be said of the scene."""
+    from ..landscapes.identity import plane_of
+    from ..landscapes.measures.gradient_quality import subgrid
+
+    if not growth.effort(env):
+        return None
+    plane = plane_of(dataset)
+    places = plane.lift(subgrid(plane, math.isqrt(growth.POINTS) if plane.rank == 2 else growth.POINTS))
+    boxed = bool(stored_identity(dataset).get("boxed"))
+    with watch.progress(growth.effort(env), "gradients of shorter episodes") as advance:
+        found = growth.measure_growth_of(env, places, advance, boxed=boxed)
+    return None if found is None else found.record()
 
 
 class _Counted:
@@ -262,6 +280,7 @@ def _announce(env: Environment, dataset: xr.Dataset, points: int, watch: Watch) 
 
     rank = dataset["loss"].ndim
     losses, gradients = effort(rank, points, dataset["loss"].shape)
+    gradients += growth.effort(env)  # of shorter episodes most
     own_seconds, own_bytes = own_cost(dataset["loss"].size)
     with watch.busy(f"{env.name}: {PREPARING}"):
         seconds = estimate_seconds(env, losses, gradients)

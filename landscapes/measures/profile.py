@@ -19,6 +19,7 @@ from ..statistics import EstimateRecord
 from . import gradient_quality as gradients
 from .classify import Verdict, classify, thresholds
 from .discontinuities import Count, Jumps, find_jumps
+from .lyapunov import GradientGrowth
 from .noise import Noise, noise
 from .records import ProfileRecord, UnresolvedRecord
 from .ruggedness import Ruggedness, ruggedness
@@ -178,6 +179,8 @@ def named_measures(record: ProfileRecord) -> dict[str, str]:
         named["Cells finer than the samples"] = between
     if cut := record.get("beyond_the_box", {}).get("cut"):
         named["Probes beyond the bounds, left out"] = f"{cut} of {record['beyond_the_box']['asked']}"
+    if grown := record.get("growth"):
+        named["Growth with the length of episodes"] = GradientGrowth.of_record(grown).say()
     for row in smooth:
         named[f"First order biased, smoothed over {row['width']:.0%} of the box"] = _shares(row["biased"])
     return {name: text for name, text in named.items() if text}

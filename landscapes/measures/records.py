@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NotRequired, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 from ..statistics import EstimateRecord
 
@@ -143,3 +143,4 @@ class ProfileRecord(TypedDict):
     beyond_the_box: NotRequired[BeyondRecord]
     unresolved: NotRequired[UnresolvedRecord | None]
     at_twice: NotRequired[TwiceRecord | None]
+    growth: NotRequired[dict[str, Any] | None]  # what `lyapunov.GradientGrowth` holds
