@@ -46,7 +46,9 @@ class ReportPart(FigurePart):
         from ..jobs.report import estimate_seconds
         from ..landscapes.measures.profile import effort
 
-        return estimate_seconds(self._scene().make(), *effort(len(self.figure.dims), REPORT_POINTS))
+        rank = len(self.figure.dims)
+        shape = (self.figure.resolution,) * rank
+        return estimate_seconds(self._scene().make(), *effort(rank, REPORT_POINTS, shape))
 
     def make(self, watch: Watch) -> str:
         """Measure the slice, in the place of a report of another one."""

@@ -200,11 +200,11 @@ class SliceJob:
             watch.note(f"all {total} {kind} are there already")
             return
         kept = f", {total - cost.episodes} are there already" if cost.episodes < total else ""
-        most = "up to " if self.refinement else ""
+        most, losses = "up to " if self.refinement else "", probes(total, grad=self.store.grad)
+        between = f"; then up to {losses} losses between them" if losses else ""
         watch.note(
             f"{most}{cost.episodes} {kind} to compute{kept}: about {duration(cost.seconds)}, "
-            f"{size(cost.memory)} of memory{_gpu_memory(self.objective)}; then up to "
-            f"{probes(total, grad=self.store.grad)} losses between them"
+            f"{size(cost.memory)} of memory{_gpu_memory(self.objective)}{between}"
         )
 
     def _sample(self, watch: Watch) -> tuple[xr.Dataset, int]:

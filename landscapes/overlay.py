@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .identity import plane_of
+from .lattice import own_cells
 from .plane import Plane
 
 RECENT = 64  # how many evaluations ago an iterate's predecessor is looked for
@@ -114,7 +115,7 @@ def _nearest(dataset: xr.Dataset, axes: dict[str, NDArray[np.float64]]) -> NDArr
     """Return the loss of the samples whose cells hold these places: what a picture shows there."""
     samples = {name: dataset[name].to_numpy() for name in reversed(axes)}
     cells = tuple(np.searchsorted((at[1:] + at[:-1]) / 2, axes[name]) for name, at in samples.items())
-    found: NDArray[np.float64] = dataset["loss"].transpose(*samples).to_numpy()[cells]
+    found: NDArray[np.float64] = own_cells(dataset)["loss"].transpose(*samples).to_numpy()[cells]
     return found
 
 

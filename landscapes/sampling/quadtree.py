@@ -23,10 +23,10 @@ Places = NDArray[np.intp]  # of points of the grid, shape (count, rank), in arra
 CELLS = 6  # along the longer axis, of the coarsest lattice, at least
 UNTESTED = 1 / 4  # of the error of a cell that its halves are taken to have, where nothing is known yet,
 SMOOTHEST = 1 / 16  # and at best: that of a cubic falls by the fourth power of its length
-SURPRISE = 1 / 2  # of the difference of an edge from what its gradients say, which counts as an error
-INSIDE = 1e-9  # steps of the grid below its upper border
-CALMEST = 1 / 8  # of it is taken, at least, where less has come of it so far
+SURPRISE = 1 / 2  # of the difference of an edge from what its gradients say, which counts as an error,
 BULGE = 1 / 4  # and of how far its cubic is from its chord, which is not an error yet where it is a bowl's
+CALMEST = 1 / 8  # of that surprise is taken, at least, where less has come of it so far
+INSIDE = 1e-9  # steps of the grid below its upper border
 
 
 @dataclass

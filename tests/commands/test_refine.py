@@ -147,3 +147,10 @@ def test_a_slice_says_at_its_foot_and_on_its_page_what_it_hides(tmp_path: Path) 
     looked = gs.Slice(older, None, cut.remake).report(points=2).record()["unresolved"]
     assert looked is not None
     assert (looked["share"]["value"] or 0) > 0.1
+
+
+def test_runs_lie_over_what_the_picture_of_a_refined_slice_shows(tmp_path: Path) -> None:
+    cut = gs.slice("branin", (0, 1), resolution=65, refine=0.02, out=tmp_path / "map")
+    run = gs.optimize("branin", "random", budget=30, seed=0, out=tmp_path / "run")
+    beneath = gs.overlay(cut, run).runs[0]["beneath"].to_numpy()
+    assert np.isin(beneath, cut.data["loss"].to_numpy()).all()

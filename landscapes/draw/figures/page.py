@@ -142,7 +142,7 @@ def unresolved_key(dataset: xr.Dataset) -> list[Patch]:
     refined = Refined.of(dataset)
     exact = (
         f"interpolated points: 95 % within {100 * refined.error:.2g} % of the range"
-        if refined and refined.error
+        if refined and refined.error is not None
         else ""
     )
     lines = [exact, say_unresolved(stored_unresolved(dataset))]

@@ -86,8 +86,7 @@ def _draw_loss(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
 def _draw_slope(ax: Axes, dataset: xr.Dataset, plane: Plane) -> list[Artist]:
     u, loss = dataset["u"].to_numpy(), dataset["loss"].to_numpy()
     slope = plane.slope(torch.from_numpy(dataset["grad"].to_numpy())).numpy()[:, 0]
-    differences = np.full_like(u, np.nan)
-    differences[1:-1] = (loss[2:] - loss[:-2]) / (u[2:] - u[:-2])
+    differences = _differences(u, loss)
     ax.axhline(0, color=style.FAINT, linewidth=0.8, zorder=0.5)
     sheet, thin = page.sheet_of(ax), {"color": style.QUIET, "linewidth": 0.7}
     (behind,) = ax.plot(u, differences, **sheet.look(thin), label="central difference of the loss")
@@ -99,6 +98,15 @@ def _draw_slope(ax: Axes, dataset: xr.Dataset, plane: Plane) -> list[Artist]:
         if off := int(((values < low) | (values > high)).sum()):
             drawn.set_label(f"{drawn.get_label()} ({off} off scale)")
     return [line, behind]
+
+
+def _differences(u: NDArray[np.float64], loss: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the slope of the parabola through every three samples, which may be unevenly apart; NaN at the ends."""
+    found = np.full_like(u, np.nan)
+    before, after = np.diff(u)[:-1], np.diff(u)[1:]
+    rises = np.diff(loss) / np.diff(u)
+    found[1:-1] = (rises[:-1] * after + rises[1:] * before) / (before + after)
+    return found
 
 
 def _slope_label(plane: Plane, loss_unit: str) -> str:
