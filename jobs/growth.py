@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ..landscapes.adapters import within_box
-from ..landscapes.objective import Evaluation, evaluate
+from ..landscapes.identity import plane_of, stored_identity
+from ..landscapes.objective import evaluate
 from .scene import SceneSpec
+from .watch import Watch
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from jaxtyping import Float
-    from torch import Tensor
+    import xarray as xr
 
     from ..envs.base import Environment
-    from ..landscapes.measures.lyapunov import GradientGrowth
 
 SHARES = (0.2, 0.4, 0.6, 0.8, 1.0)  # of the episode
 POINTS = 16
@@ -30,30 +30,29 @@ def effort(env: Environment) -> int:
     return len(SHARES) * POINTS if hasattr(env.options, HORIZON) else 0
 
 
-def measure_growth_of(
-    env: Environment, x: Float[Tensor, "place dim"], advance: Callable[[int], None], *, boxed: bool = False
-) -> GradientGrowth | None:
-    """Measure how gradients grow with the length of episodes, at some of the points `x`, spread over their order.
+def measure_growth_of(env: Environment, dataset: xr.Dataset, watch: Watch) -> dict[str, Any] | None:
+    """Measure how gradients grow with the length of episodes at points of a slice; return the record of it.
 
-    None where a scene's episodes have no option `horizon`, or nothing to draw that says how long they last. With
-    `boxed` points beyond the bounds are left out.
+    None where a scene's episodes have no option `horizon`, or nothing to draw that says how long they last.
     """
+    from ..landscapes.measures.gradient_quality import subgrid
     from ..landscapes.measures.lyapunov import measure_growth
 
-    if not hasattr(env.options, HORIZON):
+    if not effort(env):
         return None
-    x = x[torch.linspace(0, len(x) - 1, min(POINTS, len(x))).round().long()]
     try:
         time = float(env.episode(env.space.center).time[-1])
     except ValueError:  # nothing to draw
         return None
-    width, spec = env.space.upper - env.space.lower, SceneSpec.of(env)
-    lengths, norms = list[float](), list[np.ndarray]()
-    for number, share in enumerate(SHARES):
-        other = spec.make(horizon=share * env.options.horizon)
-        found: Evaluation = evaluate(within_box(other) if boxed else other, x, grad=True)
-        assert found.grad is not None
-        lengths.append(share * time)
-        norms.append((found.grad * width).norm(dim=1).numpy())
-        advance((number + 1) * len(x))
-    return measure_growth(np.array(lengths), np.array(norms))
+    plane = plane_of(dataset)
+    x = plane.lift(subgrid(plane, math.isqrt(POINTS) if plane.rank == 2 else POINTS))
+    boxed = bool(stored_identity(dataset).get("boxed"))
+    width, spec, norms = env.space.upper - env.space.lower, SceneSpec.of(env), list[Tensor]()
+    with watch.progress(effort(env), "gradients of shorter episodes") as advance:
+        for share in SHARES:
+            other = spec.make(horizon=share * env.options.horizon)
+            found = evaluate(within_box(other) if boxed else other, x, grad=True)
+            assert found.grad is not None
+            norms.append((found.grad * width).norm(dim=1))
+            advance(len(norms) * len(x))
+    return measure_growth(time * np.array(SHARES), torch.stack(norms).numpy()).record()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import math
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -182,7 +181,7 @@ class ReportJob:
         require("number of samples", dataset["loss"].size, lambda count: Need(own_cost(count)[1]))
         start = time.monotonic()
         profile = measure(env, dataset, self.points, self.seed, watch)
-        grown = measure_growth(env, dataset, watch)
+        grown = growth.measure_growth_of(env, dataset, watch)
         report = Report(
             name=subject.name,
             env=env.name,
@@ -223,21 +222,6 @@ def measure(env: Environment, dataset: xr.Dataset, points: int, seed: int, watch
         found = measure_profile(counted, dataset, rounding=rounding, points=points, seed=seed, events=env.events)
         advance(total)
     return found
-
-
-def measure_growth(env: Environment, dataset: xr.Dataset, watch: Watch) -> dict[str, Any] | None:
-    """Measure how gradients grow with the length of episodes; None where that cannot be said of the scene."""
-    from ..landscapes.identity import plane_of
-    from ..landscapes.measures.gradient_quality import subgrid
-
-    if not growth.effort(env):
-        return None
-    plane = plane_of(dataset)
-    places = plane.lift(subgrid(plane, math.isqrt(growth.POINTS) if plane.rank == 2 else growth.POINTS))
-    boxed = bool(stored_identity(dataset).get("boxed"))
-    with watch.progress(growth.effort(env), "gradients of shorter episodes") as advance:
-        found = growth.measure_growth_of(env, places, advance, boxed=boxed)
-    return None if found is None else found.record()
 
 
 class _Counted:
