@@ -7,8 +7,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Unpack
 
-from ..jobs.scene import SceneSpec, environment_of, plane_through
+from ..jobs.scene import SceneSpec, cut, environment_of
 from ..jobs.watch import Watch
+from ..landscapes.adapters import within_box
 from .progress import default_watch
 from .scene import SceneKeywords, is_environment, objective_of, say_call
 
@@ -24,8 +25,9 @@ if TYPE_CHECKING:
 
 def slice(
     scene: str | type[Environment] | Objective | SceneSpec,
-    dims: Sequence[int | str],
+    dims: Sequence[int | str] | None = None,
     *,
+    along: str | None = None,
     resolution: int | Sequence[int] = 16,
     through: str | Float[Tensor, " dim"] = "center",
     extent: float | tuple[float, float] | None = None,
@@ -39,7 +41,8 @@ def slice(
     `scene` is an environment's name, FILE.py:Class, its class, itself, or anyone's objective (`from_torch`,
     `from_numpy`). `dims` are one or two parameters, by number or by name; `through` is the point that the plane goes
     through, and `extent` what it covers: a fraction of the box around that point, or two ends [the parameters' unit];
-    the whole box by default. The samples lie in the folder `out`, by default one under out/ named after the slice: the
+    the whole box by default. `along` names directions instead of `dims`: random:SEED, gradient, hessian, pca:RUN, a
+    line A:B or a plane A:B:C between points; what lies off the box is left out. The samples lie in the folder `out`, by default one under out/ named after the slice: the
     same call goes on there where it stopped. An objective that is no environment is sampled in memory without `out`.
 
     Raises ValueError for what the scene does not have, and where the folder holds something else or another slice,
@@ -47,16 +50,23 @@ def slice(
     """
     watch = default_watch()
     objective = objective_of(scene, keywords, watch)
-    plane = plane_through(objective, dims, through=through, extent=extent, resolution=resolution)
+    plane = cut(objective, dims, along, through=through, extent=extent, resolution=resolution)
     if out is None and not is_environment(objective):
-        return _sample_in_memory(objective, plane, gradients, watch)
+        return _sample_in_memory(within_box(objective) if along else objective, plane, gradients, watch)
     from ..jobs.slice import SliceJob
 
     point = through if isinstance(through, str) else through.tolist()
-    cut = {"through": None if point == "center" else point, "extent": extent, "gradients": None if gradients else False}
-    command = say_call("slice", scene, tuple(dims), resolution=resolution, **cut, **keywords)
+    how = {
+        "along": along,
+        "through": None if point == "center" else point,
+        "extent": extent,
+        "gradients": None if gradients else False,
+    }
+    command = say_call("slice", scene, *([tuple(dims)] if dims else []), resolution=resolution, **how, **keywords)
     folder = Path(out) if out is not None else None
-    job = SliceJob.of(objective, plane, command=command, out=folder, grad=gradients, force=force)
+    job = SliceJob.of(
+        objective, plane, command=command, out=folder, grad=gradients, force=force, boxed=along is not None
+    )
     job.run(watch)
     return _open(job.folder, lambda: objective)
 

@@ -11,7 +11,7 @@ import typer
 
 from ..jobs.scene import SceneSpec
 from .arguments import (
-    Dims,
+    Along,
     Extent,
     Force,
     Json,
@@ -20,6 +20,7 @@ from .arguments import (
     Print,
     Resolution,
     Scheduler,
+    SomeDims,
     Through,
     read_extent,
     takes_scene,
@@ -29,7 +30,8 @@ from .arguments import (
 @takes_scene()
 def slice_(
     scene: SceneSpec,
-    dims: Dims,
+    dims: SomeDims = None,
+    along: Along = None,
     resolution: Resolution = 16,
     through: Through = "center",
     extent: Extent = None,
@@ -48,7 +50,7 @@ def slice_(
     Example: landscape slice fluid --dims 6 8 --resolution 24
     """
     how: dict[str, Any] = {"resolution": resolution, "through": through, "grad": not no_gradients}
-    _sample(scene, dims, extent, print_, out, **how, as_json=json_, force=force, scheduler=scheduler)
+    _sample(scene, dims, extent, print_, out, **how, along=along, as_json=json_, force=force, scheduler=scheduler)
 
 
 @takes_scene("env", "tolerance", "engine", "deterministic", env="bounce", fidelity="standard")
@@ -77,7 +79,7 @@ def bounce(
 
 def _sample(
     scene: SceneSpec,
-    dims: Sequence[str],
+    dims: Sequence[str] | None,
     extent: str | None,
     prints: Sequence[float] | None,
     out: str | None,
@@ -88,17 +90,18 @@ def _sample(
     as_json: bool,
     force: bool,
     scheduler: str | None = None,
+    along: str | None = None,
 ) -> None:
     """Sample a slice, and say what came out."""
     from .terminal import Bars, command_line, print_json
 
     bars = Bars()
     env = scene.make(bars)
-    from ..jobs.scene import plane_through
+    from ..jobs.scene import cut
     from ..jobs.slice import SliceJob
     from ..jobs.workers import workers
 
-    plane = plane_through(env, dims, through=through, extent=read_extent(extent), resolution=resolution)
+    plane = cut(env, dims, along, through=through, extent=read_extent(extent), resolution=resolution)
     folder, widths = Path(out) if out else None, prints or []
     with workers(scheduler, env.device) as executor:
         job = SliceJob.of(
@@ -108,6 +111,7 @@ def _sample(
             out=folder,
             grad=grad,
             force=force,
+            boxed=along is not None,
             executor=executor,
             prints=widths,
         )

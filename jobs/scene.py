@@ -119,15 +119,24 @@ def point_of(env: Environment, text: str) -> Tensor:
         from ..envs.points import point
 
         return point(env, text)
-    from ..landscapes.identity import stored_identity
     from ..landscapes.overlay import best_point
-    from .folder import run_tables
 
-    tables = run_tables([run])
-    searched = {str(stored_identity(table).get("objective")) for table in tables}
-    if searched != {env.name}:
-        raise ValueError(f"{run} holds no runs of {env.name} alone; it holds those of {', '.join(sorted(searched))}")
-    return best_point(tables)[0]
+    return best_point(_tables(env, run) if run else _known_runs(env))[0]
+
+
+def _known_runs(env: Environment) -> list[xr.Dataset]:
+    """Return all runs of an environment under the default folder. Raises ValueError where there is none."""
+    from .folder import ROOT
+
+    found = list[Any]()
+    for folder in sorted(path for path in ROOT.glob("*") if path.is_dir()):
+        try:
+            found += _tables(env, str(folder))
+        except ValueError:
+            continue  # no run, or one of another environment
+    if not found:
+        raise ValueError(f"no run of {env.name} is known under {ROOT}/; `landscape optimize {env.name}` makes one")
+    return found
 
 
 def plane_through(
@@ -146,6 +155,94 @@ def plane_through(
 
     point = _named_point(objective, through) if isinstance(through, str) else through
     return Plane.through(objective.space, point, dims, resolution=resolution, extent=extent)
+
+
+def cut(
+    objective: Objective,
+    dims: Sequence[int | str] | None,
+    along: str | None,
+    *,
+    through: str | Tensor,
+    extent: float | tuple[float, float] | None,
+    resolution: int | Sequence[int],
+) -> Plane:
+    """Return the line or plane along parameters, or along directions that are named.
+
+    Raises ValueError where both or neither are given, and as `plane_through` and `plane_along` do.
+    """
+    if (dims is None or len(dims) == 0) == (along is None):
+        raise ValueError("a slice takes --dims, one or two parameters, or --along, directions; give one of them")
+    if along is None:
+        assert dims is not None  # as one of the two is given
+        return plane_through(objective, dims, through=through, extent=extent, resolution=resolution)
+    if not isinstance(resolution, int):
+        raise ValueError(f"a slice along {along} takes one resolution for its axes; got {list(resolution)}")
+    return plane_along(objective, along, through=through, extent=extent, resolution=resolution)
+
+
+def plane_along(
+    objective: Objective,
+    along: str,
+    *,
+    through: str | Tensor,
+    extent: float | tuple[float, float] | None,
+    resolution: int,
+) -> Plane:
+    """Return the line or plane along directions that are named: random:SEED, gradient, hessian, pca:RUN, A:B, A:B:C.
+
+    Directions are in widths of the box, half a width to each side of the point by default. Points of a line or a plane
+    are named as those it goes through. Raises ValueError for what is none of these.
+    """
+    from ..landscapes.directions import gradient_directions, hessian_directions, joining, random_directions
+    from ..landscapes.plane import Plane
+
+    kind, _, value = along.partition(":")
+    names = points_in(along)
+    joins = along not in ("gradient", "hessian") and kind != "pca" and len(names) in (2, 3)
+    if joins or kind == "pca":
+        if extent is not None or not isinstance(through, str) or through != "center":
+            raise ValueError(f"--along {along} says where it goes; leave out --through and --extent")
+    if joins:
+        return joining(objective.space, [_named_point(objective, name) for name in names], names, resolution)
+    if kind == "pca":
+        from ..landscapes.overlay import principal_plane
+
+        return principal_plane(_tables(objective, value), resolution=(resolution, resolution))
+    point = _named_point(objective, through) if isinstance(through, str) else through
+    if kind == "random" and value.isdecimal():
+        directions, labels = random_directions(objective.space, int(value))
+    elif along == "gradient":
+        directions, labels = gradient_directions(objective, point)
+    elif along == "hessian":
+        directions, labels = hessian_directions(objective, point)
+    else:
+        raise ValueError(f"--along takes random:SEED, gradient, hessian, pca:RUN, A:B or A:B:C; got {along!r}")
+    width = (objective.space.upper - objective.space.lower).numpy()
+    size = 1.0 if extent is None else extent
+    ends = size if isinstance(size, tuple) else (-size / 2, size / 2)
+    return Plane.span(point, directions * width, resolution=resolution, extent=ends, labels=labels)
+
+
+def points_in(text: str) -> list[str]:
+    """Return the names of points in A:B or A:B:C, of which example:, random: and best: take what follows them."""
+    parts, names = text.split(":"), list[str]()
+    while parts:
+        name = parts.pop(0)
+        names.append(f"{name}:{parts.pop(0)}" if name in ("example", "random", "best") and parts else name)
+    return names
+
+
+def _tables(objective: Objective, run: str) -> list[xr.Dataset]:
+    """Return the runs in a folder. Raises ValueError where they searched another environment."""
+    from ..landscapes.identity import stored_identity
+    from ..landscapes.objective import name_of
+    from .folder import run_tables
+
+    tables, name = run_tables([run]), name_of(objective)
+    searched = {str(stored_identity(table).get("objective")) for table in tables}
+    if searched != {name}:
+        raise ValueError(f"{run} holds no runs of {name} alone; it holds those of {', '.join(sorted(searched))}")
+    return tables
 
 
 def _named_point(objective: Objective, text: str) -> Tensor:

@@ -21,6 +21,7 @@ from torch import Tensor
 from ..landscapes.adapters import within_box
 from ..landscapes.capacity import size
 from ..landscapes.cost import duration, seconds_per_episode
+from ..landscapes.directions import barrier
 from ..landscapes.identity import plane_of
 from ..landscapes.objective import Objective, Status, name_of
 from ..landscapes.plane import Plane
@@ -73,6 +74,7 @@ class SliceSummary:
     flat: int | None
     command: str
     files: list[str]
+    barrier: float | None = None
 
     def outcome(self) -> str:
         """Say in a line what the slice cost and what came out."""
@@ -82,7 +84,8 @@ class SliceSummary:
         losses = "no finite loss" if low is None else f"losses from {low:.4g} to {high:.4g}"
         share = (self.flat or 0) / sum(counts.values())
         flat = f"; gradient exactly zero at {share:.1%} of points" if share else ""
-        return f"{self.episodes} episodes in {duration(self.seconds)}; {ends}; {losses}{flat}"
+        barred = "" if self.barrier is None else f"; barrier of {self.barrier:.4g} above the line between its ends"
+        return f"{self.episodes} episodes in {duration(self.seconds)}; {ends}; {losses}{flat}{barred}"
 
 
 @dataclass(frozen=True)
@@ -266,6 +269,7 @@ class SliceJob:
             flat=flat_points(dataset),
             command=self.command,
             files=files,
+            barrier=barrier_of(dataset, self.plane),
         )
 
 
@@ -309,6 +313,14 @@ def _gpu_memory(objective: Objective) -> str:
         return ""
     env: Any = objective
     return f", {size(env.memory() * env.preferred_batch)} of it on the GPU at a time"
+
+
+def barrier_of(dataset: xr.Dataset, plane: Plane) -> float | None:
+    """Return the height of the barrier on a line between two points, None for other slices and where samples failed."""
+    if plane.rank != 1 or not plane.labels[0].startswith("from "):
+        return None
+    height = barrier(dataset["u"].to_numpy(), dataset["loss"].to_numpy())
+    return height if math.isfinite(height) else None
 
 
 def count_statuses(dataset: xr.Dataset) -> dict[str, int]:
