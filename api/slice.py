@@ -42,8 +42,9 @@ def slice(
     `from_numpy`). `dims` are one or two parameters, by number or by name; `through` is the point that the plane goes
     through, and `extent` what it covers: a fraction of the box around that point, or two ends [the parameters' unit];
     the whole box by default. `along` names directions instead of `dims`: random:SEED, gradient, hessian, pca:RUN, a
-    line A:B or a plane A:B:C between points; what lies off the box is left out. The samples lie in the folder `out`, by default one under out/ named after the slice: the
-    same call goes on there where it stopped. An objective that is no environment is sampled in memory without `out`.
+    line A:B or a plane A:B:C between points; what lies off the box is left out. The samples lie in the folder `out`,
+    by default one under out/ named after the slice: the same call goes on there where it stopped. An objective that is
+    no environment is sampled in memory without `out`.
 
     Raises ValueError for what the scene does not have, and where the folder holds something else or another slice,
     which `force` replaces; Stopped where it is interrupted.

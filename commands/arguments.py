@@ -76,7 +76,7 @@ Extent = Annotated[
 Through = Annotated[
     str,
     typer.Option(
-        help="The point it goes through: center, random:SEED, example:NAME, best (known), best:RUN or a file of numbers."
+        help="The point it goes through: center, random:SEED, example:NAME, best, best:RUN or a file of numbers."
     ),
 ]
 Scheduler = Annotated[

@@ -199,9 +199,9 @@ def plane_along(
     kind, _, value = along.partition(":")
     names = points_in(along)
     joins = along not in ("gradient", "hessian") and kind != "pca" and len(names) in (2, 3)
-    if joins or kind == "pca":
-        if extent is not None or not isinstance(through, str) or through != "center":
-            raise ValueError(f"--along {along} says where it goes; leave out --through and --extent")
+    elsewhere = extent is not None or not isinstance(through, str) or through != "center"
+    if (joins or kind == "pca") and elsewhere:
+        raise ValueError(f"--along {along} says where it goes; leave out --through and --extent")
     if joins:
         return joining(objective.space, [_named_point(objective, name) for name in names], names, resolution)
     if kind == "pca":
