@@ -7,8 +7,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
-from ..jobs.scene import SceneSpec, environment_of, plane_through
+from ..jobs.cut import cut, describe_cut
+from ..jobs.scene import SceneSpec, environment_of
 from ..jobs.watch import Watch
+from ..landscapes.adapters import within_box
 from .progress import default_watch
 from .scene import SceneKeywords, is_environment, objective_of, say_call
 
@@ -25,8 +27,9 @@ if TYPE_CHECKING:
 
 def slice(
     scene: str | type[Environment] | Objective | SceneSpec,
-    dims: Sequence[int | str],
+    dims: Sequence[int | str] | None = None,
     *,
+    along: str | None = None,
     resolution: int | Sequence[int] = 16,
     through: str | Float[Tensor, " dim"] = "center",
     extent: float | tuple[float, float] | None = None,
@@ -42,8 +45,10 @@ def slice(
     `scene` is an environment's name, FILE.py:Class, its class, itself, or anyone's objective (`from_torch`,
     `from_numpy`). `dims` are one or two parameters, by number or by name; `through` is the point that the plane goes
     through, and `extent` what it covers: a fraction of the box around that point, or two ends [the parameters' unit];
-    the whole box by default. The samples lie in the folder `out`, by default one under out/ named after the slice: the
-    same call goes on there where it stopped. An objective that is no environment is sampled in memory without `out`.
+    the whole box by default. `along` names directions instead of `dims`: random:SEED, gradient, hessian, pca:RUN, a
+    line A:B or a plane A:B:C between points; what lies off the box is left out. The samples lie in the folder `out`,
+    by default one under out/ named after the slice: the same call goes on there where it stopped. An objective that is
+    no environment is sampled in memory without `out`.
 
     With `refine`, a share of the range of the losses, it is sampled only where neighbours do not explain to that share
     what is between them, and with a `budget` at no more points than that. The others are interpolated: status says
@@ -54,25 +59,27 @@ def slice(
     """
     watch = default_watch()
     objective = objective_of(scene, keywords, watch)
-    plane = plane_through(objective, dims, through=through, extent=extent, resolution=resolution)
+    plane = cut(objective, dims, along, through=through, extent=extent, resolution=resolution)
     from ..landscapes.sampling.refine import Refinement
 
+    fine = Refinement.of(refine, budget)
     if out is None and not is_environment(objective):
-        return _sample_in_memory(objective, plane, gradients, Refinement.of(refine, budget), watch)
+        return _sample_in_memory(within_box(objective) if along else objective, plane, gradients, fine, watch)
     from ..jobs.slice import SliceJob
 
     point = through if isinstance(through, str) else through.tolist()
-    cut = {
+    where = {"along": along, "through": None if point == "center" else point, "extent": extent}
+    how = {
         "refine": refine,
         "budget": budget,
-        "through": None if point == "center" else point,
-        "extent": extent,
+        **where,
         "gradients": None if gradients else False,
     }
-    command = say_call("slice", scene, tuple(dims), resolution=resolution, **cut, **keywords)
-    folder = Path(out) if out is not None else None
-    how = Refinement.of(refine, budget)
-    job = SliceJob.of(objective, plane, command=command, out=folder, grad=gradients, force=force, refinement=how)
+    command = say_call("slice", scene, *([tuple(dims)] if dims else []), resolution=resolution, **how, **keywords)
+    settings: dict[str, Any] = {"out": Path(out) if out is not None else None, "grad": gradients, "force": force}
+    job = SliceJob.of(
+        objective, plane, command=command, refinement=fine, cut=describe_cut(along, through, extent), **settings
+    )
     job.run(watch)
     return _open(job.folder, lambda: objective)
 

@@ -28,6 +28,17 @@ Dims = Annotated[
     list[str],
     typer.Option("--dims", metavar="DIM [DIM]", help="The one or two parameters to vary, by number or by name."),
 ]
+SomeDims = Annotated[
+    list[str] | None,
+    typer.Option("--dims", metavar="DIM [DIM]", help="The one or two parameters to vary, by number or by name."),
+]
+Along = Annotated[
+    str | None,
+    typer.Option(
+        help="Instead of --dims: random:SEED, gradient, hessian, pca:RUN, a line between two points A:B, or the plane "
+        "through three, A:B:C."
+    ),
+]
 Resolution = Annotated[int, typer.Option(min=2, help="Points along each axis.")]
 Fidelity = Annotated[str | None, typer.Option(help="How accurately to simulate: draft, standard or reference.")]
 Tolerance = Annotated[
@@ -70,7 +81,9 @@ Extent = Annotated[
 ]
 Through = Annotated[
     str,
-    typer.Option(help="The point it goes through: center, random:SEED, example:NAME, best:RUN or a file of numbers."),
+    typer.Option(
+        help="The point it goes through: center, random:SEED, example:NAME, best, best:RUN or a file of numbers."
+    ),
 ]
 Scheduler = Annotated[
     str | None,

@@ -11,7 +11,7 @@ import typer
 
 from ..jobs.scene import SceneSpec
 from .arguments import (
-    Dims,
+    Along,
     Extent,
     Force,
     Json,
@@ -22,6 +22,7 @@ from .arguments import (
     RefineBudget,
     Resolution,
     Scheduler,
+    SomeDims,
     Through,
     read_extent,
     read_share,
@@ -32,7 +33,8 @@ from .arguments import (
 @takes_scene()
 def slice_(
     scene: SceneSpec,
-    dims: Dims,
+    dims: SomeDims = None,
+    along: Along = None,
     resolution: Resolution = 16,
     through: Through = "center",
     extent: Extent = None,
@@ -54,7 +56,7 @@ def slice_(
     Example: landscape slice fluid --dims 6 8 --resolution 24
     """
     how: dict[str, Any] = {"resolution": resolution, "through": through, "grad": not no_gradients}
-    how |= {"refine": refine, "budget": budget}
+    how |= {"refine": refine, "budget": budget, "along": along}
     _sample(scene, dims, extent, print_, out, **how, as_json=json_, force=force, scheduler=scheduler)
 
 
@@ -84,7 +86,7 @@ def bounce(
 
 def _sample(
     scene: SceneSpec,
-    dims: Sequence[str],
+    dims: Sequence[str] | None,
     extent: str | None,
     prints: Sequence[float] | None,
     out: str | None,
@@ -97,18 +99,19 @@ def _sample(
     scheduler: str | None = None,
     refine: str | None = None,
     budget: int | None = None,
+    along: str | None = None,
 ) -> None:
     """Sample a slice, and say what came out."""
     from .terminal import Bars, command_line, print_json
 
     bars = Bars()
     env = scene.make(bars)
-    from ..jobs.scene import plane_through
+    from ..jobs.cut import cut, describe_cut
     from ..jobs.slice import SliceJob
     from ..jobs.workers import workers
     from ..landscapes.sampling.refine import Refinement
 
-    plane = plane_through(env, dims, through=through, extent=read_extent(extent), resolution=resolution)
+    plane = cut(env, dims, along, through=through, extent=read_extent(extent), resolution=resolution)
     folder, widths = Path(out) if out else None, prints or []
     with workers(scheduler, env.device) as executor:
         job = SliceJob.of(
@@ -118,6 +121,7 @@ def _sample(
             out=folder,
             grad=grad,
             force=force,
+            cut=describe_cut(along, through, extent),
             executor=executor,
             prints=widths,
             refinement=Refinement.of(read_share(refine, "--refine"), budget),

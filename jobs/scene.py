@@ -125,15 +125,24 @@ def point_of(env: Environment, text: str) -> Tensor:
         from ..envs.points import point
 
         return point(env, text)
-    from ..landscapes.identity import stored_identity
     from ..landscapes.overlay import best_point
-    from .folder import run_tables
 
-    tables = run_tables([run])
-    searched = {str(stored_identity(table).get("objective")) for table in tables}
-    if searched != {env.name}:
-        raise ValueError(f"{run} holds no runs of {env.name} alone; it holds those of {', '.join(sorted(searched))}")
-    return best_point(tables)[0]
+    return best_point(runs_in(env, run) if run else _known_runs(env))[0]
+
+
+def _known_runs(env: Environment) -> list[xr.Dataset]:
+    """Return all runs of an environment under the default folder. Raises ValueError where there is none."""
+    from .folder import ROOT
+
+    found = list[Any]()
+    for folder in sorted(path for path in ROOT.glob("*") if path.is_dir()):
+        try:
+            found += runs_in(env, str(folder))
+        except ValueError:
+            continue  # no run, or one of another environment
+    if not found:
+        raise ValueError(f"no run of {env.name} is known under {ROOT}/; `landscape optimize {env.name}` makes one")
+    return found
 
 
 def plane_through(
@@ -150,11 +159,25 @@ def plane_through(
     """
     from ..landscapes.plane import Plane
 
-    point = _named_point(objective, through) if isinstance(through, str) else through
+    point = named_point(objective, through) if isinstance(through, str) else through
     return Plane.through(objective.space, point, dims, resolution=resolution, extent=extent)
 
 
-def _named_point(objective: Objective, text: str) -> Tensor:
+def runs_in(objective: Objective, run: str) -> list[xr.Dataset]:
+    """Return the runs in a folder. Raises ValueError where they searched another environment."""
+    from ..landscapes.identity import stored_identity
+    from ..landscapes.objective import name_of
+    from .folder import run_tables
+
+    tables, name = run_tables([run]), name_of(objective)
+    searched = {str(stored_identity(table).get("objective")) for table in tables}
+    if searched != {name}:
+        raise ValueError(f"{run} holds no runs of {name} alone; it holds those of {', '.join(sorted(searched))}")
+    return tables
+
+
+def named_point(objective: Objective, text: str) -> Tensor:
+    """Return the point that `text` names, of any objective. Raises ValueError where there is no such point."""
     from ..envs.base import Environment
     from ..landscapes.objective import name_of
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass
 from typing import Any
@@ -11,11 +12,14 @@ import torch
 import xarray as xr
 
 from ..landscapes.cost import duration
-from ..landscapes.identity import plane_of
+from ..landscapes.directions import barrier
+from ..landscapes.identity import plane_of, stored_identity
 from ..landscapes.measures.records import UnresolvedRecord
 from ..landscapes.measures.unresolved import attribute_of, find_unresolved, say_unresolved
 from ..landscapes.objective import Objective, Status, name_of
 from ..landscapes.sampling.refine import Refined
+
+JOINED = "joined"  # in the identity of a slice that was cut between points: their names
 
 
 @dataclass(frozen=True)
@@ -23,7 +27,7 @@ class SliceSummary:
     """Say what a slice cost, as `summary.json` beside it has it; `status` counts points, `flat` those without slope.
 
     `episodes` are those of the samples; `unresolved` has those that looked between them, and what they found, None
-    where nothing is known of it.
+    where nothing is known of it. `barrier` [loss unit] is that between the ends of a line.
     """
 
     env: str | None
@@ -43,6 +47,7 @@ class SliceSummary:
     refinement: Refined | None
     command: str
     files: list[str]
+    barrier: float | None = None
 
     def outcome(self) -> str:
         """Say in a line what the slice cost and what came out."""
@@ -54,8 +59,9 @@ class SliceSummary:
         sampled = sum(counts.values()) - counts.get("interpolated", 0)
         share = (self.flat or 0) / sampled if sampled else 0.0
         flat = f"; gradient exactly zero at {share:.1%} of points" if share else ""
+        barred = "" if self.barrier is None else f"; barrier of {self.barrier:.4g} above the line between its ends"
         hidden = f"; {said}" if (said := say_unresolved(self.unresolved)) else ""
-        return f"{self.episodes} episodes in {duration(self.seconds)}; {ends}; {losses}{flat}{refined}{hidden}"
+        return f"{self.episodes} episodes in {duration(self.seconds)}; {ends}; {losses}{flat}{barred}{refined}{hidden}"
 
 
 def look_between(objective: Objective, dataset: xr.Dataset) -> dict[str, Any]:
@@ -71,6 +77,14 @@ def look_between(objective: Objective, dataset: xr.Dataset) -> dict[str, Any]:
         said = f"{name_of(objective)} raised between the samples, so what they hide is not known: {error}"
         warnings.warn(said, RuntimeWarning, stacklevel=2)
         return {}
+
+
+def barrier_of(dataset: xr.Dataset) -> float | None:
+    """Return the height of the barrier on a line between two points, None for other slices and where samples failed."""
+    if dataset["loss"].ndim != 1 or JOINED not in stored_identity(dataset).get("cut", {}):
+        return None
+    height = barrier(dataset["u"].to_numpy(), dataset["loss"].to_numpy())
+    return height if math.isfinite(height) else None
 
 
 def count_statuses(dataset: xr.Dataset) -> dict[str, int]:

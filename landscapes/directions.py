@@ -1,153 +1,158 @@
-"""Directions to cut a landscape along: random ones, the gradient, the Hessian's.
-
-Directions are found in the unit cube, where each parameter's bounds are one apart, so that units do not decide; each
-function returns them in parameters' own units: one step along a row is as long as a side of the cube.
-"""
+"""Directions to cut a landscape along: random, along the gradient, along the curvature; lines between points."""
 
 from __future__ import annotations
 
-from typing import cast
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 from torch import Tensor
 
 from .objective import Objective, evaluate, name_of
+from .plane import Plane
 from .space import ParameterSpace
 
 Array = NDArray[np.float64]
-STEP = 1e-3  # of differences of gradients, in sides of the cube: rounding is 1e-16 / 1e-3, the third derivative's 1e-6
-SMALL = 1e-9  # of the gradient's length: curvature below it is rounding
+STEP = 1e-4  # of the box: differences of float64 gradients lose eps / STEP = 2e-12 to rounding, STEP**2 to truncation
+BEYOND = 0.1  # of a line's samples, past each of its ends
+SHARES = "shares of the box"
 
 
-def orthonormal(generator: np.random.Generator, dim: int, rank: int = 2) -> Array:
-    """Draw so many orthonormal directions of the cube, shape (rank, dim), evenly over all of them."""
-    frame, scale = np.linalg.qr(generator.standard_normal((dim, rank)))
-    return cast(Array, (frame * np.sign(np.diag(scale))).T)
+def orthonormal(generator: np.random.Generator, dim: int) -> Array:
+    """Draw two orthonormal directions, evenly over all of them; shape (2, dim)."""
+    frame, scale = np.linalg.qr(generator.standard_normal((dim, 2)))
+    directions: Array = (frame * np.sign(np.diag(scale))).T
+    return directions
 
 
-def random_directions(space: ParameterSpace, seed: int) -> Float[Tensor, "2 dim"]:
-    """Return two random directions, orthonormal in the cube; the same seed gives the same.
+def random_directions(space: ParameterSpace, seed: int) -> tuple[Array, list[str]]:
+    """Return two random directions, orthonormal in widths of the box, and what they are called."""
+    _two(space)
+    labels = [f"random direction {axis} [{SHARES}]" for axis in (1, 2)]
+    return orthonormal(np.random.default_rng(seed), space.dim), labels
 
-    Raises ValueError where the space has one parameter.
+
+def gradient_directions(objective: Objective, x: Float[Tensor, " dim"]) -> tuple[Array, list[str]]:
+    """Return the gradient's direction, and the one orthogonal to it that changes it most: of H g without g.
+
+    Both are orthonormal in widths of the box. Raises ValueError where the gradient is zero or not known, and where its
+    change has no part orthogonal to it.
     """
-    _require_two(space, "random directions")
-    return scale_to(space, orthonormal(np.random.default_rng(seed), space.dim))
+    _two(objective.space)
+    curvature = _Curvature(objective, x)
+    g = curvature.gradient(np.zeros(objective.space.dim))
+    if not (size := float(np.linalg.norm(g))):
+        raise ValueError(f"{name_of(objective)} has a gradient of zero at this point; cut it through another")
+    first = g / size
+    change = curvature(first)
+    second = change - (change @ first) * first
+    if not np.linalg.norm(second) > 1e-6 * np.linalg.norm(change):  # what differences of gradients can tell from none
+        raise ValueError(
+            f"{name_of(objective)}'s gradient changes along itself only at this point; cut along random:SEED instead"
+        )
+    labels = [f"gradient [{SHARES}]", f"where the gradient turns most [{SHARES}]"]
+    return np.stack([first, second / np.linalg.norm(second)]), labels
 
 
-def gradient_directions(objective: Objective, point: Float[Tensor, " dim"]) -> Float[Tensor, "2 dim"]:
-    """Return the gradient at a point, and the direction orthogonal to it that changes it most.
+def hessian_directions(objective: Objective, x: Float[Tensor, " dim"]) -> tuple[Array, list[str]]:
+    """Return the two eigenvectors of the Hessian with the largest curvatures, by magnitude, in widths of the box.
 
-    Along a direction d the gradient g changes by H d, so that d H^2 d is largest for the second: the leading singular
-    vector of the Hessian on what is orthogonal to the gradient, by power iteration of differences of gradients.
-
-    Raises ValueError where there is no gradient to follow, and where the space has one parameter.
+    Products with the Hessian are central differences of gradients; the largest component of each direction is
+    positive. Raises ValueError where gradients are not known or all zero, and where Lanczos' method does not converge.
     """
-    space = objective.space
-    _require_two(space, "the gradient and what changes it")
-    slope = _Slope(objective, point)
-    here = slope.at(np.zeros((1, space.dim)))[0]
-    length = float(np.linalg.norm(here))
-    if not length > 0:
-        raise ValueError(f"{name_of(objective)} has a gradient of zero there; cut along something else than gradient")
-    first = here / length
-
-    def onto(vector: Array) -> Array:
-        return cast(Array, vector - first * (first @ vector))
-
-    def product(vector: Array) -> Array:  # H^2 on what is orthogonal to the gradient
-        return onto(slope.hessian(slope.hessian(onto(vector.ravel()))))
-
-    if not float(np.linalg.norm(product(_start(space.dim)))) > (SMALL * length) ** 2:
-        raise ValueError(f"{name_of(objective)} has no curvature beside its gradient there; cut along random:0 instead")
-    second = onto(_leading(product, space.dim, 1, name_of(objective))[1][0])
-    return scale_to(space, np.stack([first, _with_sign(second / np.linalg.norm(second))]))
+    dim = objective.space.dim
+    _two(objective.space)
+    curvature = _Curvature(objective, x)
+    values, vectors = _eigen(curvature, dim, name_of(objective))
+    if not np.abs(values).max():
+        raise ValueError(f"{name_of(objective)} has no curvature at this point; cut it through another")
+    order = np.argsort(-np.abs(values), kind="stable")[:2]
+    frame = vectors[:, order].T
+    frame = frame * np.sign(np.take_along_axis(frame, np.abs(frame).argmax(axis=1)[:, None], axis=1))
+    labels = [f"Hessian's direction {axis + 1}, curvature {values[at]:.3g} [{SHARES}]" for axis, at in enumerate(order)]
+    return frame, labels
 
 
-def hessian_directions(
-    objective: Objective, point: Float[Tensor, " dim"]
-) -> tuple[Float[Tensor, "2 dim"], tuple[float, float]]:
-    """Return the two eigenvectors of the Hessian at a point with the largest eigenvalues in magnitude, and these.
+def _eigen(curvature: Callable[[Array], Array], dim: int, name: str) -> tuple[Array, Array]:
+    """Return leading eigenvalues and eigenvectors; of up to three parameters all, which Lanczos' method cannot."""
+    from scipy.sparse.linalg import ArpackError, LinearOperator, eigsh
 
-    Eigenvalues are second derivatives in the cube [loss unit]. By Lanczos iteration (ARPACK, Lehoucq et al. 1998) of
-    products with the Hessian, each a central difference of two gradients.
-
-    Raises ValueError where a gradient is not finite, where the iteration does not converge, and for one parameter.
-    """
-    space = objective.space
-    _require_two(space, "the Hessian's directions")
-    slope = _Slope(objective, point)
-    if not slope.hessian(_start(space.dim)).any():
-        raise ValueError(f"{name_of(objective)} has no curvature there; cut along random:0 instead")
-    values, vectors = _leading(slope.hessian, space.dim, 2, name_of(objective))
-    return scale_to(space, np.stack([_with_sign(one) for one in vectors])), (float(values[0]), float(values[1]))
-
-
-def scale_to(space: ParameterSpace, directions: Array) -> Float[Tensor, "rank dim"]:
-    """Return directions of the cube in the parameters' own units."""
-    return torch.from_numpy(directions.copy()) * (space.upper - space.lower)
-
-
-class _Slope:
-    """Gradients of an objective near a point, in the cube [loss unit]."""
-
-    def __init__(self, objective: Objective, point: Float[Tensor, " dim"]) -> None:
-        space = objective.space
-        self.objective, self.width = objective, (space.upper - space.lower)
-        middle = space.to_unit(point)
-        if not getattr(objective, "beyond_box", False):  # differences stay inside
-            middle = middle.clamp(STEP, 1 - STEP)
-        self.point = space.from_unit(middle)
-
-    def at(self, offsets: Array) -> Array:
-        """Return the gradients at offsets from the point, shape (count, dim) both."""
-        x = self.point + torch.from_numpy(offsets) * self.width
-        found = evaluate(self.objective, x, grad=True)
-        if found.grad is None or not bool(found.grad.isfinite().all()):
-            raise ValueError(f"{name_of(self.objective)} has no finite gradient there; cut through another point")
-        return cast(Array, (found.grad * self.width).numpy())
-
-    def hessian(self, vector: Array) -> Array:
-        """Return the Hessian's product with a vector."""
-        length = float(np.linalg.norm(vector))
-        if not length > 0:
-            return np.zeros(vector.size)
-        step = STEP * vector.ravel() / length
-        ahead, behind = self.at(np.stack([step, -step]))
-        return cast(Array, (ahead - behind) * (length / (2 * STEP)))
-
-
-def _leading(product: object, dim: int, count: int, name: str) -> tuple[Array, Array]:
-    """Return the leading eigenvalues of a symmetric operator, the largest in magnitude first, and their vectors."""
-    if dim <= count + 1:  # too few for Lanczos
-        whole = np.stack([np.asarray(product(row)) for row in np.eye(dim)])  # type: ignore[operator]
+    if dim <= 3:
+        whole = np.stack([curvature(row) for row in np.eye(dim)])
         values, vectors = np.linalg.eigh((whole + whole.T) / 2)
-    else:
-        try:
-            values, vectors = eigsh(
-                LinearOperator((dim, dim), matvec=product, dtype=float), k=count, v0=_start(dim), tol=1e-6
-            )
-        except ArpackNoConvergence as error:
-            raise ValueError(
-                f"the Hessian of {name} has no leading directions that can be told apart: {error}"
-            ) from error
-    order = np.argsort(-np.abs(values), kind="stable")[:count]
-    return values[order], vectors.T[order]
+        return values, vectors
+    start = np.random.default_rng(0).standard_normal(dim)
+    try:
+        operator = LinearOperator((dim, dim), matvec=lambda v: curvature(np.ravel(v)), dtype=np.float64)
+        values, vectors = eigsh(operator, k=2, which="LM", v0=start, tol=1e-6)
+    except ArpackError as error:
+        raise ValueError(
+            f"the Hessian of {name} has no clear leading directions at this point ({error}); cut through another"
+        ) from None
+    return values, vectors
 
 
-def _start(dim: int) -> Array:
-    """Return the direction that iterations begin with, the same each time."""
-    return np.random.default_rng(0).standard_normal(dim)
+class _Curvature:
+    """Multiply by the Hessian at a point, in widths of the box."""
+
+    def __init__(self, objective: Objective, x: Float[Tensor, " dim"]) -> None:
+        space = objective.space
+        self.objective, self.width = objective, (space.upper - space.lower).numpy()
+        step = STEP * torch.from_numpy(self.width)
+        self.x = torch.maximum(torch.minimum(x, space.upper - step), space.lower + step).numpy()  # room to every side
+
+    def gradient(self, *offsets: Array) -> Array:
+        """Return gradients [loss unit] at offsets from the point, one of shape (dim,) for one."""
+        points = torch.from_numpy(self.x + np.stack(offsets) * self.width)
+        found = evaluate(self.objective, points, grad=True).grad
+        if found is None or not bool(found.isfinite().all()):
+            raise ValueError(f"{name_of(self.objective)} has no finite gradient at this point; cut it through another")
+        grad: Array = found.numpy() * self.width
+        return grad[0] if len(offsets) == 1 else grad
+
+    def __call__(self, direction: Array) -> Array:
+        offset = STEP * direction / max(float(np.linalg.norm(direction)), np.finfo(float).tiny)
+        ahead, behind = self.gradient(offset, -offset)
+        product: Array = (ahead - behind) / (2 * STEP) * np.linalg.norm(direction)
+        return product
 
 
-def _with_sign(vector: Array) -> Array:
-    """Return a direction whose largest component is positive."""
-    return cast(Array, vector * np.sign(vector[np.abs(vector).argmax()]))
-
-
-def _require_two(space: ParameterSpace, what: str) -> None:
+def _two(space: ParameterSpace) -> None:
     if space.dim < 2:
-        raise ValueError(f"{what} need two parameters and more; there is one: give --dims 0")
+        raise ValueError("two directions take two parameters and more; got one")
+
+
+def joining(
+    space: ParameterSpace, points: Sequence[Float[Tensor, " dim"]], names: Sequence[str], resolution: int
+) -> Plane:
+    """Return the line from one point to another, or the plane through three: the first at 0, the others at 1.
+
+    A line's ends are samples, and it goes on a little beyond them where the box does. Raises ValueError where points
+    are the same or lie on a line.
+    """
+    along = torch.stack([point - points[0] for point in points[1:]])
+    labels = [f"from {names[0]} to {name}" for name in names[1:]]
+    if len(along) == 2:
+        return Plane.span(points[0], along, resolution=resolution, extent=(-0.25, 1.25), labels=labels)
+    past = int(BEYOND * resolution)
+    step = 1 / max(resolution - 1 - 2 * past, 1)
+    ends = [(points[0] - past * step * along[0]), (points[1] + past * step * along[0])]
+    before, after = (past if bool(((end >= space.lower) & (end <= space.upper)).all()) else 0 for end in ends)
+    step = 1 / (resolution - 1 - before - after)
+    extent = (-before * step, 1 + after * step)
+    return Plane.span(points[0], along, resolution=resolution, extent=extent, labels=labels)
+
+
+def barrier(u: Array, loss: Array) -> float:
+    """Return the height of the barrier between 0 and 1 [loss unit]: the most that losses lie above the straight line.
+
+    That line joins the losses of both ends (Frankle et al. 2020, Garipov et al. 2018). It is of the samples: a lower
+    bound where the landscape is finer. NaN where an end or any sample between failed.
+    """
+    between = (u > -1e-9) & (u < 1 + 1e-9)
+    at, height = u[between], loss[between]
+    if len(at) < 2 or abs(at[0]) > 1e-9 or abs(at[-1] - 1) > 1e-9 or not np.isfinite(height).all():
+        return float("nan")
+    return float((height - (1 - at) * height[0] - at * height[-1]).max())

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..directions import orthonormal
 from ..identity import plane_of
 from ..objective import Objective, evaluate
 from ..plane import Plane
@@ -95,7 +96,7 @@ class CensusDesign:
         generator = np.random.default_rng(seed)
         count = math.isqrt(slices)
         if along == RANDOM:
-            cuts = [Cut(None, _orthonormal(generator, space.dim)) for _ in range(count)]
+            cuts = [Cut(None, tuple(map(tuple, orthonormal(generator, space.dim).tolist()))) for _ in range(count)]
         else:
             every = list(combinations(range(space.dim), 2))
             cuts = [Cut(every[at]) for at in sorted(generator.permutation(len(every))[:count])]
@@ -111,12 +112,6 @@ class CensusDesign:
     def plane(self, base: int, cut: int) -> Plane:
         """Return a slice."""
         return self.cuts[cut].through(self.space, self.bases[base], self.resolution)
-
-
-def _orthonormal(generator: np.random.Generator, dim: int) -> tuple[tuple[float, ...], ...]:
-    """Draw two orthonormal directions, evenly over all of them."""
-    frame, scale = np.linalg.qr(generator.standard_normal((dim, 2)))
-    return tuple(map(tuple, (frame * np.sign(np.diag(scale))).T.tolist()))
 
 
 @dataclass(frozen=True, eq=False)

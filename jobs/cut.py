@@ -1,0 +1,127 @@
+"""Where a landscape is cut: along parameters, or along directions that are named."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from .scene import named_point, plane_through, runs_in
+from .slice_summary import JOINED
+
+if TYPE_CHECKING:
+    from ..landscapes.objective import Objective
+    from ..landscapes.plane import Plane
+    from ..landscapes.space import ParameterSpace
+
+HALF, LEAST = 0.5, 1e-3  # of a width of the box: how far a slice reaches at most, and what is no width for one
+
+
+def cut(
+    objective: Objective,
+    dims: Sequence[int | str] | None,
+    along: str | None,
+    *,
+    through: str | Tensor,
+    extent: float | tuple[float, float] | None,
+    resolution: int | Sequence[int],
+) -> Plane:
+    """Return the line or plane along parameters, or along directions that are named.
+
+    Raises ValueError where both or neither are given, and as `plane_through` and `plane_along` do.
+    """
+    if (dims is None or len(dims) == 0) == (along is None):
+        raise ValueError("a slice takes --dims, one or two parameters, or --along, directions; give one of them")
+    if along is None:
+        assert dims is not None  # as one of the two is given
+        return plane_through(objective, dims, through=through, extent=extent, resolution=resolution)
+    if not isinstance(resolution, int):
+        raise ValueError(f"a slice along {along} takes one resolution for its axes; got {list(resolution)}")
+    return plane_along(objective, along, through=through, extent=extent, resolution=resolution)
+
+
+def plane_along(
+    objective: Objective,
+    along: str,
+    *,
+    through: str | Tensor,
+    extent: float | tuple[float, float] | None,
+    resolution: int,
+) -> Plane:
+    """Return the line or plane along directions that are named: random:SEED, gradient, hessian, pca:RUN, A:B, A:B:C.
+
+    Directions are in widths of the box, half a width to each side of the point by default. Points of a line or a plane
+    are named as those it goes through. Raises ValueError for what is none of these.
+    """
+    from ..landscapes.directions import gradient_directions, hessian_directions, joining, random_directions
+    from ..landscapes.plane import Plane
+
+    kind, _, value = along.partition(":")
+    names = joined_points(along)
+    joins = len(names) in (2, 3)
+    elsewhere = extent is not None or not isinstance(through, str) or through != "center"
+    if (joins or kind == "pca") and elsewhere:
+        raise ValueError(f"--along {along} says where it goes; leave out --through and --extent")
+    if joins:
+        return joining(objective.space, [named_point(objective, name) for name in names], names, resolution)
+    if kind == "pca":
+        from ..landscapes.overlay import principal_plane
+
+        return principal_plane(runs_in(objective, value), resolution=(resolution, resolution))
+    point = named_point(objective, through) if isinstance(through, str) else through
+    if kind == "random" and value.isdecimal():
+        directions, labels = random_directions(objective.space, int(value))
+    elif along == "gradient":
+        directions, labels = gradient_directions(objective, point)
+    elif along == "hessian":
+        directions, labels = hessian_directions(objective, point)
+    else:
+        raise ValueError(f"--along takes random:SEED, gradient, hessian, pca:RUN, A:B or A:B:C; got {along!r}")
+    spans = torch.from_numpy(directions) * (objective.space.upper - objective.space.lower)
+    lower, upper = _reach(objective.space, point, spans) if extent is None else _ends(extent)
+    return Plane.span(point, spans, resolution=resolution, extent=(lower, upper), labels=labels)
+
+
+def _reach(space: ParameterSpace, point: Tensor, spans: Tensor) -> tuple[list[float], list[float]]:
+    """Return how far the box reaches along each direction from a point, at most half a width of it to either side."""
+    ends = [[(bound - point) / span for bound in (space.lower, space.upper)] for span in spans]
+    lower = [max(-HALF, float(torch.minimum(*pair).nan_to_num(-HALF).max())) for pair in ends]
+    upper = [min(HALF, float(torch.maximum(*pair).nan_to_num(HALF).min())) for pair in ends]
+    narrow = [high - low < LEAST for low, high in zip(lower, upper, strict=True)]  # in a corner that it points out of
+    return [-HALF if n else v for n, v in zip(narrow, lower, strict=True)], [
+        HALF if n else v for n, v in zip(narrow, upper, strict=True)
+    ]
+
+
+def _ends(extent: float | tuple[float, float]) -> tuple[float, float]:
+    return extent if isinstance(extent, tuple) else (-extent / 2, extent / 2)
+
+
+def describe_cut(
+    along: str | None, through: str | Tensor, extent: float | tuple[float, float] | str | None
+) -> dict[str, Any] | None:
+    """Return what a slice along directions is known by; None for one along parameters."""
+    if along is None:
+        return None
+    names = joined_points(along)
+    point = through if isinstance(through, str) else through.tolist()
+    return {"along": along, "through": point, "extent": extent, **({JOINED: names} if names else {})}
+
+
+def joined_points(along: str) -> list[str]:
+    """Return the names of the two or three points that a line or a plane joins, none where `along` is another word."""
+    if along in ("gradient", "hessian") or along.partition(":")[0] == "pca":
+        return []
+    names = points_in(along)
+    return names if len(names) in (2, 3) else []
+
+
+def points_in(text: str) -> list[str]:
+    """Return the names of points in A:B or A:B:C, of which example:, random: and best: take what follows them."""
+    parts, names = text.split(":"), list[str]()
+    while parts:
+        name = parts.pop(0)
+        names.append(f"{name}:{parts.pop(0)}" if name in ("example", "random", "best") and parts else name)
+    return names

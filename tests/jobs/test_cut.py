@@ -1,0 +1,154 @@
+"""Slices along directions that are named: what they cover, that they go on, what is said of others."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+import gradscape as gs
+from gradscape.jobs.cut import joined_points, plane_along
+from gradscape.landscapes.objective import Status
+from gradscape.landscapes.plane import Plane
+
+SPACE = gs.ParameterSpace({"a": (-2, 2, "m"), "b": (0, 1, "s"), "c": (-1, 1, ""), "d": (5, 9, "")})
+WIDTH = SPACE.upper - SPACE.lower
+
+
+def wells(x):
+    """Two wells along the first parameter, at -1 and 1, a bowl in the others."""
+    u = (x - SPACE.center) / WIDTH
+    return (x[:, 0] ** 2 - 1) ** 2 + (u[:, 1:] ** 2 * torch.tensor([3.0, 2.0, 1.0]).double()).sum(dim=1)
+
+
+WELLS = gs.from_torch(wells, SPACE)
+HOW = {"through": "center", "extent": None, "resolution": 9}
+
+
+class Wells(gs.Environment):
+    """The wells, as a scene, which takes points from files."""
+
+    space = SPACE
+
+    def _evaluate(self, x, *, grad):
+        return WELLS.evaluate(x, grad=grad)
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("center:example:aim", ["center", "example:aim"]),
+        ("random:1:random:2:center", ["random:1", "random:2", "center"]),
+        ("best:run:p.json", ["best:run", "p.json"]),
+        ("random:3", []),
+        ("hessian", []),
+        ("gradient", []),
+        ("pca:run", []),
+        ("center", []),
+    ],
+)
+def test_points_of_lines_and_planes_are_told_from_directions(text, names):
+    assert joined_points(text) == names
+
+
+@pytest.mark.parametrize("along", ["random:4", "gradient", "hessian"])
+def test_a_slice_along_directions_reaches_as_far_as_the_box_does_along_each(along):
+    for seed in range(4):
+        plane = plane_along(WELLS, along, **{**HOW, "through": f"random:{seed}"})
+        for axis in range(2):
+            for end in (plane.lower[axis], plane.upper[axis]):
+                u = torch.zeros(2, dtype=torch.float64)
+                u[axis] = end
+                unit = SPACE.to_unit(plane.lift(u))
+                assert (unit > -1e-9).all()
+                assert (unit < 1 + 1e-9).all()
+                assert abs(float(end)) == pytest.approx(0.5) or float(torch.minimum(unit, 1 - unit).min()) < 1e-9
+        assert float(plane.lower.max()) <= 0 <= float(plane.upper.min())
+
+
+def test_from_a_corner_that_a_direction_points_out_of_it_covers_half_a_width():
+    corner = torch.stack([SPACE.lower[0], SPACE.upper[1], SPACE.upper[2], SPACE.lower[3]])
+    plane = plane_along(WELLS, "random:0", **{**HOW, "through": corner})
+    assert (plane.upper > plane.lower).all()
+
+
+def test_what_is_off_the_box_is_left_out(tmp_path):
+    cut = gs.slice(WELLS, along="random:1", through="random:2", resolution=12, extent=1.5, out=tmp_path / "cut")
+    status, plane = cut.data.status.to_numpy(), Plane.from_record(json.loads(cut.data.attrs["identity"])["plane"])
+    u, v = plane.axes()
+    unit = SPACE.to_unit(plane.lift(torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1))).numpy()
+    outside = ((unit < -1e-9) | (unit > 1 + 1e-9)).any(axis=-1)
+    assert outside.any()
+    np.testing.assert_array_equal(status == Status.ESCAPED, outside)
+
+
+def test_a_barrier_is_the_height_between_two_wells(tmp_path):
+    for name, at in (("left", -1.0), ("right", 1.0)):
+        (tmp_path / f"{name}.txt").write_text(f"{at} 0.5 0 7")
+    line = gs.slice(Wells, along=f"{tmp_path}/left.txt:{tmp_path}/right.txt", resolution=23, out=tmp_path / "line")
+    summary = json.loads((tmp_path / "line/summary.json").read_text())
+    assert summary["barrier"] == pytest.approx(1.0)
+    assert line.data.sizes["u"] == 23
+    assert float(line.data.u.min()) < 0 < 1 < float(line.data.u.max())
+
+
+def test_a_slice_that_was_begun_goes_on_along_its_own_directions(tmp_path, monkeypatch):
+    """On a GPU gradients, and so directions, come out a little different each time."""
+    first = gs.slice("bounce", along="gradient", resolution=5, out=tmp_path / "cut", device="cpu")
+    from gradscape.jobs import cut as module
+
+    exact = module.plane_along
+
+    def shaken(*how, **more):
+        plane = exact(*how, **more)
+        return Plane(plane.origin, plane.basis * (1 + 1e-12), plane.lower, plane.upper, plane.resolution, plane.labels)
+
+    monkeypatch.setattr(module, "plane_along", shaken)
+    again = gs.slice("bounce", along="gradient", resolution=5, out=tmp_path / "cut", device="cpu")
+    assert again.data.loss.to_numpy().tobytes() == first.data.loss.to_numpy().tobytes()
+    assert json.loads((tmp_path / "cut/summary.json").read_text())["episodes"] == 0
+    with pytest.raises(ValueError, match=r"another slice|differ|other"):
+        gs.slice("bounce", along="hessian", resolution=5, out=tmp_path / "cut", device="cpu")
+
+
+def test_verbs_take_such_slices(run, tmp_path):
+    for command in (
+        ["slice", "bounce", "--along", "random:3", "--through", "random:1", "--resolution", "8", "--out", "cut"],
+        ["optimize", "bounce", "--method", "random", "--budget", "6", "--fidelity", "draft", "--out", "run"],
+        ["slice", "bounce", "--along", "pca:run", "--resolution", "3", "--out", "principal"],
+        ["slice", "bounce", "--along", "hessian", "--through", "best:run", "--resolution", "3", "--out", "hessian"],
+        ["slice", "bounce", "--along", "center:best:run:random:1", "--resolution", "3", "--out", "plane"],
+        ["overlay", "cut", "run", "--out", "over"],
+        ["report", "cut", "--out", "report"],
+        ["surface", "cut"],
+        ["export", "cut", "--to", "csv", "--out", "cut.csv"],
+    ):
+        done = run(*command, cwd=tmp_path)
+        assert done.returncode == 0, (command, done.stderr)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "--dims, one or two parameters, or --along, directions; give one of them"),
+        (["--dims", "0", "--along", "hessian"], "give one of them"),
+        (
+            ["--along", "downhill"],
+            "--along takes random:SEED, gradient, hessian, pca:RUN, A:B or A:B:C; got",
+        ),
+        (["--along", "center:random:1", "--through", "random:2"], "says where it goes; leave out --through"),
+        (["--along", "center:center"], "not zero and not parallel"),
+        (["--along", "pca:nothing"], "nothing"),
+        (
+            ["--along", "hessian", "--through", "best"],
+            "no run of bounce is known under out/; `landscape optimize",
+        ),
+    ],
+)
+def test_what_cannot_be_cut_is_one_line_and_nothing_is_written(run, tmp_path, monkeypatch, words, said):
+    monkeypatch.chdir(tmp_path)
+    done = run("slice", "bounce", *words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
