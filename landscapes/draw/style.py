@@ -33,7 +33,7 @@ LOSS_MAP: Colormap = colormaps["viridis"]
 SLOPE_MAP: Colormap = ListedColormap(colormaps["magma"](np.linspace(0.08, 0.77, 256)), "magma, legible on white")
 SLOPE_MAP_DARK: Colormap = ListedColormap(colormaps["magma"](np.linspace(0.42, 1.0, 256)), "magma, legible on black")
 
-FAILURES = {Status.NONFINITE: "not finite", Status.ESCAPED: "left the domain", Status.ERROR: "error"}
+FAILURES = {Status.NONFINITE: "not finite", Status.ESCAPED: "outside the domain", Status.ERROR: "error"}
 _FAILED: dict[str, Any] = {"facecolor": "white", "edgecolor": QUIET, "linewidth": 0.0}
 STATUS_LOOKS: dict[Status, dict[str, Any]] = {  # of every sample that is not OK
     Status.MISSING: {"facecolor": UNSAMPLED, "linewidth": 0.0},

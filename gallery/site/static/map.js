@@ -205,7 +205,7 @@ const redraw = fit(canvas, (brush, width, height) => {
   ring(node, 9, "#b5367a", "#ffffff");
 });
 
-const SAID = { MISSING: "not sampled yet", NONFINITE: "not finite", ESCAPED: "left the domain", ERROR: "error" };
+const SAID = { MISSING: "not sampled yet", NONFINITE: "not finite", ESCAPED: "outside the domain", ERROR: "error", INTERPOLATED: "interpolated" };
 const lossSaid = (loss, status) => (loss === null ? SAID[status] : number(loss) + (SLICE.unit ? " " + SLICE.unit : ""));
 
 function episodeAt(index) {

@@ -137,7 +137,7 @@ def test_failures_are_masked_hatched_and_counted_and_not_interpolated():
         assert patches["ESCAPED"].get_path().contains_point((-1.0, 50.0))
         assert not patches["ESCAPED"].get_path().contains_point((0.0, 25.0))
     said = legend_of(FIGURE)
-    for kind, name in ((Status.NONFINITE, "not finite"), (Status.ESCAPED, "left the domain")):
+    for kind, name in ((Status.NONFINITE, "not finite"), (Status.ESCAPED, "outside the domain")):
         assert f"{name}: {(status == kind).sum()} of 192" in said
 
 
