@@ -16,6 +16,8 @@ from . import extremes
 from . import gradients as gradient_checks
 from .extremes import ExtremeCase
 from .finding import FAIL, SKIP, UNEXPECTED, Finding, verdict
+from .special import check_special_places
+from .special import episodes as special_episodes
 from .subject import Subject, difference
 
 REPEATS = 3
@@ -69,6 +71,7 @@ def check(
 def episodes(dim: int, points: int) -> tuple[int, int]:
     """Return about how many episodes `check` takes without variants: losses alone, and with gradients."""
     plain = 2 * points * gradient_checks.SLOPES * len(gradient_checks.DIFFERENCE_STEPS) + points
+    plain += special_episodes(dim)
     return plain, points * (REPEATS + 6) + 3 * len(extremes.corners(dim)) + 10
 
 
@@ -88,6 +91,8 @@ def _checks(
     exact = other if subject.precision == "float32" else lambda: subject
     name = "finite differences"
     yield name, lambda: gradient_checks.check_slopes(exact() if exact else subject, name)
+    special = "special places"
+    yield special, lambda: check_special_places(exact() if exact else subject, special)
     yield "gradcheck", lambda: _gradcheck(subject, exact)
     yield "second backward", lambda: gradient_checks.second_backward(subject, "second backward")
     yield from extremes.checks(subject, other, variants)

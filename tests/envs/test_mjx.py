@@ -11,6 +11,8 @@ import gradscape as gs
 from gradscape.envs.mjx.scene import MjxScene, Parameter
 from gradscape.envs.mjx.scenes import Drop, Push
 from gradscape.envs.registry import entries
+from gradscape.landscapes.conformance.special import check_special_places
+from gradscape.landscapes.conformance.subject import Subject
 
 POINT = """
 <mujoco>
@@ -105,6 +107,10 @@ def test_a_drop_that_does_not_slide_has_a_gradient_that_the_slope_beside_it_does
     slope = (drop.evaluate(beside, grad=False).loss - drop.evaluate(-beside, grad=False).loss) / 2e-6
     assert abs(float(drop.evaluate(beside).grad[0, 0]) / float(slope) - 1) < 0.2
     assert abs(float(drop.evaluate(at).grad[0, 0]) / float(slope)) > 5
+    subject = Subject.observe(drop, drop.space.uniform(2, seed=0), precision="float64", seed=0, repeats=2)
+    found = check_special_places(subject, "special places")
+    assert found.outcome == "fail"
+    assert "at the centre, by velocity x, the gradient is" in found.figure
 
 
 def test_a_shorter_horizon_ends_earlier_and_a_longer_one_goes_on(dart):

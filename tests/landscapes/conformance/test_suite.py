@@ -63,6 +63,25 @@ class TwiceTheGradient(Sound):
         return 2 * slope
 
 
+class WrongWhereOneIsZero(Sound):
+    """As of a contact that does not slide: right everywhere else."""
+
+    def evaluate(self, x, *, grad=True):
+        found = super().evaluate(x, grad=grad)
+        if found.grad is None:
+            return found
+        return Evaluation(found.loss, torch.where(x == 0, 40 * found.grad + 1, found.grad), found.status)
+
+
+class WrongAtTheCentre(Sound):
+    def evaluate(self, x, *, grad=True):
+        found = super().evaluate(x, grad=grad)
+        if found.grad is None:
+            return found
+        still = (x == self.space.center).all(dim=1, keepdim=True)
+        return Evaluation(found.loss, torch.where(still, torch.zeros_like(found.grad), found.grad), found.status)
+
+
 class OneWrongSign(Sound):
     def slope(self, slope):
         return slope * torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
@@ -169,7 +188,7 @@ class SpentTape(Sound):
         return Tape.apply(x, self)
 
 
-GRADIENT = {"finite differences", "gradcheck"}
+GRADIENT = {"finite differences", "special places", "gradcheck"}
 
 
 @pytest.mark.parametrize("objective", [Sound(), from_torch(loss_of, SPACE)])
@@ -188,6 +207,8 @@ def test_a_sound_objective_passes(objective):
     ("defect", "checks"),
     [
         (TwiceTheGradient, GRADIENT),
+        (WrongWhereOneIsZero, {"special places"}),
+        (WrongAtTheCentre, {"special places"}),
         (OneWrongSign, GRADIENT),
         (NoGradient, GRADIENT),
         (LeakingRows, {"rows alone"}),
@@ -237,7 +258,29 @@ def test_a_single_wrong_sign_among_ninety_is_seen():
         def slope(self, slope):
             return slope * torch.cat([torch.ones(89), -torch.ones(1)])
 
-    assert failures(Wide()) == GRADIENT
+    assert failures(Wide()) >= {"finite differences", "gradcheck"}
+
+
+def test_a_wrong_gradient_at_a_special_place_is_said_with_what_it_should_be():
+    found = outcomes(WrongWhereOneIsZero())["special places"]
+    assert "at a zero, by a, the gradient is" in found.figure or "at zero, by a, the gradient is" in found.figure
+    assert "the loss rises by" in found.figure
+
+
+@pytest.mark.parametrize("side", [0.0, 0.4, 1.0])
+def test_at_a_kink_either_slope_will_do_and_nothing_beyond(side):
+    def kinked(slope):
+        class Kinked(Sound):
+            def evaluate(self, x, *, grad=True):
+                found = super().evaluate(x, grad=grad)
+                kink = x.abs().sum(dim=1)
+                push = torch.where(x == 0, slope, x.sign()) if grad else None
+                return Evaluation(found.loss + kink, None if push is None else found.grad + push, found.status)
+
+        return Kinked()
+
+    assert outcomes(kinked(2 * side - 1))["special places"].outcome == "pass"
+    assert outcomes(kinked(3 + side))["special places"].outcome == "fail"
 
 
 def test_in_float32_thresholds_follow_from_the_precision():
@@ -303,7 +346,7 @@ def test_a_variant_answers_with_a_number_a_status_or_a_refusal(make, outcome, fi
 
 
 def test_an_expected_failure_is_excused_until_it_passes():
-    reason = {"finite differences": "its gradient is a surrogate", "gradcheck": "the same"}
+    reason = dict.fromkeys(GRADIENT, "the same")
     excused = outcomes(TwiceTheGradient(), expected=reason)
     assert not any(finding.bad for finding in excused.values())
     assert excused["gradcheck"].outcome == "known"
