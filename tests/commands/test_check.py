@@ -72,7 +72,7 @@ def test_bounce_passes_at_draft(run: Callable[..., Said], tmp_path: Path) -> Non
     assert checks["corners"]["numbers"]["finite"] == 8
     for name in ("dt 8x", "horizon 8x", "ke 100000", "10% outside the box"):
         assert sum(checks[name]["numbers"][kind] for kind in ("finite", "non-finite", "escaped", "error")) >= 2
-    assert "bounce · draft · cpu · warp · 4 points: some 148 episodes and" in done.stderr
+    assert "bounce · draft · cpu · warp · 4 points: some 244 episodes and" in done.stderr
     assert not list(tmp_path.iterdir())
 
 
@@ -104,9 +104,13 @@ def test_a_time_step_is_checked_once_however_it_is_called(run: Callable[..., Sai
 
 
 def test_the_whole_check_of_every_environment_is_on_record() -> None:
-    """It takes minutes for the soft bodies: its results stand in BENCHMARKS.md, with the command."""
+    """It takes minutes for the soft bodies: its results stand in BENCHMARKS.md, with the command.
+
+    Engines of others, which come with an extra, are not ours to vouch for.
+    """
+    ours = {name for name, entry in entries().items() if not entry.extra}
     rows = re.findall(r"^\| `([\w-]+)` \| (passes|fails) \|", BENCHMARKS.read_text(), re.MULTILINE)
-    assert dict(rows) == dict.fromkeys(set(entries()) - set(FUNCTIONS), "passes")
+    assert dict(rows) == dict.fromkeys(ours - set(FUNCTIONS), "passes")
 
 
 def test_anyone_s_environment_is_checked_and_each_check_has_a_line(
@@ -129,7 +133,7 @@ def test_a_failure_is_exit_code_1_and_names_itself(run: Callable[..., Said], tmp
     done = run("check", "bowl", "--set", "wrong=true", cwd=tmp_path)
     assert done.returncode == 1
     failed = [line.split("  ")[0] for line in done.stdout.splitlines() if line.startswith("fail ")]
-    assert len(failed) == 2
+    assert len(failed) == 3
     assert "sign right 0%" in done.stdout
     assert done.stdout.splitlines()[-1].startswith("fails: ")
     report = json.loads(run("check", "bowl", "--set", "wrong=true", "--json", cwd=tmp_path).stdout)
@@ -148,11 +152,11 @@ def test_json_knows_no_infinity(run: Callable[..., Said], tmp_path: Path, bowl: 
 def test_a_known_exception_is_printed_with_its_reason_until_it_is_none(
     run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bowl: None
 ) -> None:
-    reasons = dict.fromkeys(("finite differences", "gradcheck"), "its gradient points downhill")
+    reasons = dict.fromkeys(("finite differences", "special places", "gradcheck"), "its gradient points downhill")
     monkeypatch.setattr(environment_class("bowl"), "known_failures", {"only": reasons})
     excused = run("check", "bowl", "--set", "wrong=true", cwd=tmp_path)
     assert excused.returncode == 0
-    assert excused.stdout.count("known: its gradient points downhill") == 2
+    assert excused.stdout.count("known: its gradient points downhill") == 3
     no_longer = run("check", "bowl", cwd=tmp_path)
     assert no_longer.returncode == 1
     assert "it passes, so this is no longer true: its gradient points downhill" in no_longer.stdout
