@@ -82,7 +82,8 @@ Extent = Annotated[
 Through = Annotated[
     str,
     typer.Option(
-        help="The point it goes through: center, random:SEED, example:NAME, best, best:RUN or a file of numbers."
+        help="The point it goes through: center, random:SEED, example:NAME, best, best:RUN or a file of numbers; slice "
+        "takes several, A,B."
     ),
 ]
 Scheduler = Annotated[

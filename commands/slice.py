@@ -51,7 +51,8 @@ def slice_(
 
     The folder then holds slice.zarr (the samples), landscape.png and summary.json. Stop it at any moment: the same
     command goes on where it stopped. With --refine or --budget it is the finest grid that --resolution says: what is
-    smooth is sampled coarser, status tells what is interpolated, and no measure uses that.
+    smooth is sampled coarser, status tells what is interpolated, and no measure uses that. Through several points,
+    A,B, there is a slice for each, in a folder of its own.
 
     Example: landscape slice fluid --dims 6 8 --resolution 24
     """
@@ -106,27 +107,24 @@ def _sample(
 
     bars = Bars()
     env = scene.make(bars)
-    from ..jobs.cut import cut, describe_cut
+    from ..jobs.cut import cut, describe_cut, folder_for, split_points
     from ..jobs.slice import SliceJob
     from ..jobs.workers import workers
     from ..landscapes.sampling.refine import Refinement
 
-    plane = cut(env, dims, along, through=through, extent=read_extent(extent), resolution=resolution)
-    folder, widths = Path(out) if out else None, prints or []
+    points = split_points(through)
+    where: dict[str, Any] = {"extent": read_extent(extent), "resolution": resolution}
+    planes = {point: cut(env, dims, along, through=point, **where) for point in points}  # or none is sampled
+    how: dict[str, Any] = {"command": command_line(), "grad": grad, "force": force, "prints": prints or []}
+    how["refinement"] = Refinement.of(read_share(refine, "--refine"), budget)
+    said = list[dict[str, Any]]()
     with workers(scheduler, env.device) as executor:
-        job = SliceJob.of(
-            env,
-            plane,
-            command=command_line(),
-            out=folder,
-            grad=grad,
-            force=force,
-            cut=describe_cut(along, through, extent),
-            executor=executor,
-            prints=widths,
-            refinement=Refinement.of(read_share(refine, "--refine"), budget),
-        )
-        summary = job.run(bars)
-    bars.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
+        for point, plane in planes.items():
+            folder = folder_for(Path(out), point, points) if out else None
+            named = describe_cut(along, point, extent)
+            job = SliceJob.of(env, plane, out=folder, cut=named, executor=executor, **how)
+            summary = job.run(bars)
+            bars.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
+            said.append({**asdict(summary), "folder": str(job.folder)})
     if as_json:
-        print_json(asdict(summary), folder=str(job.folder))
+        print_json(said[0] if len(said) == 1 else {"slices": said})

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -108,6 +110,16 @@ def describe_cut(
     names = joined_points(along)
     point = through if isinstance(through, str) else through.tolist()
     return {"along": along, "through": point, "extent": extent, **({JOINED: names} if names else {})}
+
+
+def split_points(through: str) -> list[str]:
+    """Return the points in A,B,..., each once; a file is one, whatever its name."""
+    return [through] if Path(through).is_file() else list(dict.fromkeys(through.split(",")))
+
+
+def folder_for(out: Path, point: str, points: Sequence[str]) -> Path:
+    """Return where the slice through a point belongs: `out` itself where there is one, else a folder there."""
+    return out if len(points) == 1 else out / re.sub(r"[^\w.]+", "-", point)
 
 
 def joined_points(along: str) -> list[str]:

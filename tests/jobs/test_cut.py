@@ -127,6 +127,21 @@ def test_verbs_take_such_slices(run, tmp_path):
         assert done.returncode == 0, (command, done.stderr)
 
 
+def test_through_several_points_there_is_a_slice_for_each(run, tmp_path):
+    words = ["slice", "bounce", "--dims", "0", "1", "--through", "center,random:1,center", "--resolution", "2"]
+    done = run(*words, "--json", cwd=tmp_path)
+    folders = [one["folder"] for one in json.loads(done.stdout)["slices"]]
+    assert len(set(folders)) == 2
+    named = run(*words, "--out", "both", cwd=tmp_path)
+    assert named.returncode == 0
+    assert sorted(path.name for path in (tmp_path / "both").iterdir()) == ["center", "random-1"]
+    ours, theirs = (gs.open_slice(tmp_path / path).data.loss for path in ("both/random-1", folders[1]))
+    assert ours.equals(theirs)
+    none = run("slice", "bounce", "--dims", "0", "1", "--through", "center,nowhere", "--out", "none", cwd=tmp_path)
+    assert none.returncode == 2
+    assert not (tmp_path / "none").exists()
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
