@@ -67,7 +67,8 @@ class Row:
 def scenes() -> list[str]:
     """Return the registered scenes that have draft and standard, by name."""
     wanted = {claim.name for claim in CLAIMS}
-    return [name for name in sorted(entries()) if wanted <= set(environment_class(name).fidelities)]
+    ours = sorted(name for name, entry in entries().items() if not entry.extra)  # others' engines promise nothing
+    return [name for name in ours if wanted <= set(environment_class(name).fidelities)]
 
 
 def kept(data: Path = DATA) -> list[Row]:

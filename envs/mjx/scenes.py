@@ -126,7 +126,6 @@ class MjxCartpole(MjxScene):
     mjcf: ClassVar[str] = _chain()
     duration: ClassVar[float] = 2.0
     segments: ClassVar[int] = 100
-    decisions: ClassVar[int] = 100
     control_step: ClassVar[float] = 0.02
     loss_unit: ClassVar[str] = "m"
     Options: ClassVar[type[Any]] = ChainOptions
@@ -192,7 +191,6 @@ class Push(MjxScene):
     )
     duration: ClassVar[float] = 1.0
     segments: ClassVar[int] = 5
-    decisions: ClassVar[int] = 5
     control_step: ClassVar[float] = 0.2
     loss_unit: ClassVar[str] = "m²"
     examples: ClassVar[dict[str, tuple[float, ...]]] = {"straight": (0.8, 0.0) * 5}

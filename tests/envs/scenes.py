@@ -31,7 +31,8 @@ def cheap(kind: type[Environment]) -> Fidelity:
     return replace(next(iter(kind.fidelities.values())), precision="float64")
 
 
-SIMULATED = [name for name in entries() if not issubclass(environment_class(name), Function)]
+REGISTERED = tuple(entries())  # before other tests register classes from files
+SIMULATED = [name for name in REGISTERED if not issubclass(environment_class(name), Function)]
 SETTINGS = {name: {"fidelity": cheap(environment_class(name))} for name in SIMULATED}
 SOFT = of_family(Plasticine)
 # Of these two fifths of an episode, in which every tool works: `test_plasticine` holds whole ones against slopes.

@@ -57,7 +57,7 @@ def test_scenes_that_only_warp_has_refuse_taichi():
     for name in entries():
         kind = environment_class(name)
         if "taichi" not in kind.engines:
-            with pytest.raises(ValueError, match=f"{name} has engine warp; got engine 'taichi'"):
+            with pytest.raises(ValueError, match=f"{name} has engine {kind.engines[0]}; got engine 'taichi'"):
                 make(name, device="cpu", engine="taichi")
 
 

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from gradscape.envs.mpm.fluid import EASING
-from gradscape.envs.registry import entries, environment_class, make
+from gradscape.envs.registry import environment_class, make
 
-from .scenes import SETTINGS, SMALL_STEPS, SOFT
+from .scenes import REGISTERED, SETTINGS, SMALL_STEPS, SOFT
 from .test_contract import refusal
 
 ENGINES = ("bounce", "cartpole", "flip", "fluid", "pinball-2", "pinch")  # a scene each
@@ -32,7 +32,7 @@ def name(request):
 
 
 def test_every_simulated_scene_has_the_option_and_no_function_has():
-    timed = {name for name in entries() if hasattr(environment_class(name).Options(), "horizon")}
+    timed = {name for name in REGISTERED if hasattr(environment_class(name).Options(), "horizon")}
     assert timed == set(SETTINGS)
 
 
