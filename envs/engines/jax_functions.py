@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -11,14 +12,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ...landscapes.adapters import check_points, function_name
+from ...landscapes.adapters import function_name
 from ...landscapes.objective import Evaluation, Objective
 from ...landscapes.space import ParameterSpace, as_whole
+from .functions import ROWS, FunctionObjective
 
 Mode = Literal["reverse", "forward"]
 Batch = Literal["vmap", "map"]
 Precision = Literal["float64", "float32"]
-ROWS, GROWTH = 256, 4
+GROWTH = 4
 
 
 def from_jax(
@@ -48,37 +50,23 @@ def from_jax(
         if value not in get_args(known):
             raise ValueError(f"from_jax takes {option} {' or '.join(get_args(known))}; got {value!r}")
     most = as_whole(rows, "from_jax's rows", least=1)
-    return JaxObjective(fn, space, name or function_name(fn), loss_unit, mode, batch, precision, most)
+    return JaxObjective(fn, space, name or function_name(fn), loss_unit, precision, most, mode, batch)
 
 
-class JaxObjective:
+@dataclass(eq=False)
+class JaxObjective(FunctionObjective):
     """What `from_jax` makes."""
 
-    def __init__(
-        self,
-        fn: Callable[[Any], Any],
-        space: ParameterSpace,
-        name: str,
-        loss_unit: str,
-        mode: Mode,
-        batch: Batch,
-        precision: Precision,
-        rows: int,
-    ) -> None:
+    mode: Mode
+    batch: Batch
+
+    def __post_init__(self) -> None:
         _import_jax()
-        self.fn, self.space, self.name, self.loss_unit = fn, space, name, loss_unit
-        self.mode, self.batch, self.precision, self.preferred_batch = mode, batch, precision, rows
         self._compiled: dict[bool, Callable[[Any], Any]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what was compiled: another process compiles it anew."""
         return vars(self) | {"_compiled": {}}
-
-    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
-        """Return losses, and gradients if asked, at points `x` in the parameters' own units."""
-        x = check_points(x, self.space, self.name)
-        parts = [self._evaluate(part, grad=grad) for part in torch.split(x, self.preferred_batch) if len(part)]
-        return Evaluation.join(parts, dim=self.space.dim, grad=grad)
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         import jax.numpy as jnp

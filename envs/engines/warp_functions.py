@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,12 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from ...landscapes.adapters import check_points, check_shape, function_name
+from ...landscapes.adapters import check_shape, function_name
 from ...landscapes.objective import Evaluation, Objective
 from ...landscapes.space import ParameterSpace, as_whole
+from .functions import ROWS, FunctionObjective
 from .runtime import cuda_available, precision
 
-ROWS = 256
 CORRUPTS = "This may corrupt gradient computation"  # how Warp ends what it says of an array that is overwritten
 
 
@@ -50,49 +51,35 @@ def from_warp(
     if at not in ("cpu", "cuda") or (at == "cuda" and not cuda_available()):
         raise ValueError(f"from_warp runs on auto, cpu, or cuda where there is a CUDA device; got device {device!r}")
     most = as_whole(rows, "from_warp's rows", least=1)
-    return WarpObjective(fn, space, name or function_name(fn), loss_unit, precision, at, most, check_overwrites)
+    return WarpObjective(fn, space, name or function_name(fn), loss_unit, precision, most, at, check_overwrites)
 
 
-class WarpObjective:
-    """What `from_warp` makes."""
+@dataclass(eq=False)
+class WarpObjective(FunctionObjective):
+    """What `from_warp` makes; `unchecked` until it has looked for what is overwritten."""
 
-    def __init__(
-        self,
-        fn: Callable[[Any], Any],
-        space: ParameterSpace,
-        name: str,
-        loss_unit: str,
-        real: str,
-        device: str,
-        rows: int,
-        check_overwrites: bool,
-    ) -> None:
-        self.fn, self.space, self.name, self.loss_unit = fn, space, name, loss_unit
-        self.real, self.device, self.preferred_batch = precision(real).real, device, rows
-        self._unchecked = check_overwrites
+    device: str
+    unchecked: bool
 
-    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
-        """Return losses, and gradients if asked, at points `x` in the parameters' own units."""
-        x = check_points(x, self.space, self.name)
-        with wp.ScopedDevice(self.device):
-            if grad and self._unchecked and len(x):
-                self._refuse_overwrites(x[:1])
-                self._unchecked = False
-            parts = [self._evaluate(part, grad=grad) for part in torch.split(x, self.preferred_batch) if len(part)]
-        return Evaluation.join(parts, dim=self.space.dim, grad=grad)
+    def __post_init__(self) -> None:
+        self.real = precision(self.precision).real
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
-        points: Any = wp.array(x.numpy(), dtype=self.real, requires_grad=grad)
-        if not grad:
-            return Evaluation.from_results(_tensor(self._losses(points)), None)
-        tape = wp.Tape()
-        with tape:
-            losses = self._losses(points)
-        try:
-            slope = self._gradient(tape, losses, points)
-        finally:
-            tape.zero()  # of arrays that the function keeps
-        return Evaluation.from_results(_tensor(losses), slope)
+        with wp.ScopedDevice(self.device):
+            if grad and self.unchecked:
+                self._refuse_overwrites(x[:1])
+                self.unchecked = False
+            points: Any = wp.array(x.numpy(), dtype=self.real, requires_grad=grad)
+            if not grad:
+                return Evaluation.from_results(_tensor(self._losses(points)), None)
+            tape = wp.Tape()
+            with tape:
+                losses = self._losses(points)
+            try:
+                slope = self._gradient(tape, losses, points)
+            finally:
+                tape.zero()  # of arrays that the function keeps
+            return Evaluation.from_results(_tensor(losses), slope)
 
     def _losses(self, points: Any) -> Any:
         """Return what the function makes of points, held against what it must be."""

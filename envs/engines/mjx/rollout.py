@@ -60,10 +60,7 @@ class Settings:
 
 
 class Rollout:
-    """Hold a model that is ready to be simulated.
-
-    `places` are what the parameters set, the controls last; controls are held for the same number of steps each.
-    """
+    """Hold a model that is ready to be simulated."""
 
     def __init__(self, mjcf: str, settings: Settings, precision: str, *, name: str) -> None:
         """Load a model from a file, or from the text of one.
@@ -118,13 +115,7 @@ class Rollout:
 
     def end(self, x: Any, course: Course) -> Any:
         """Return the last state of one parameter vector's episode, with bodies and geoms where they are then."""
-        model, state = self._begin(x, course.places)
-
-        def hold(state: Any, control: Any) -> Any:
-            state = course.act(model, state, control)
-            return jax.lax.scan(lambda now, _: (mjx.step(model, now), None), state, length=course.steps)[0], None
-
-        state, _ = jax.lax.scan(hold, state, self._controls(x, course))
+        model, state, _ = self._walk(x, course, lambda model, state: None)
         return mjx.kinematics(model, state)
 
     def frames(self, x: NDArray[np.float64], course: Course) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -137,21 +128,26 @@ class Rollout:
         return np.asarray(at, dtype=np.float64), np.asarray(turn, dtype=np.float64)
 
     def _frames(self, x: Any, course: Course) -> Any:
-        model, state = self._begin(x, course.places)
-
-        def look(state: Any) -> Any:
+        def look(model: Any, state: Any) -> Any:
             seen = mjx.kinematics(model, state)
             return seen.geom_xpos, seen.geom_xmat
 
-        def hold(state: Any, control: Any) -> Any:
-            state = course.act(model, state, control)
-            return jax.lax.scan(lambda now, _: (mjx.step(model, now), look(now)), state, length=course.steps)
-
-        state, seen = jax.lax.scan(hold, state, self._controls(x, course))
-        last = look(state)
+        model, state, seen = self._walk(x, course, look)
+        last = look(model, state)
         return tuple(
             jnp.concatenate([of.reshape(-1, *of.shape[2:]), one[None]]) for of, one in zip(seen, last, strict=True)
         )
+
+    def _walk(self, x: Any, course: Course, look: Callable[[Any, Any], Any]) -> tuple[Any, Any, Any]:
+        """Return the model, its last state, and what `look` sees before each step, shape (segment, step, ...)."""
+        model, start = self._begin(x, course.places)
+
+        def hold(state: Any, control: Any) -> Any:
+            state = course.act(model, state, control)
+            return jax.lax.scan(lambda now, _: (mjx.step(model, now), look(model, now)), state, length=course.steps)
+
+        state, seen = jax.lax.scan(hold, start, self._controls(x, course))
+        return model, state, seen
 
     def _begin(self, x: Any, places: Sequence[Place]) -> tuple[Any, Any]:
         """Return the model and the state that parameters ask for, before the first step."""
@@ -173,12 +169,9 @@ class Rollout:
         return whole.at[: len(given), jnp.array(own)].set(given)
 
     def geoms(self) -> list[Mapping[str, Any]]:
-        """Return shape, size [m] and name of every geom."""
+        """Return shape and size [m] of every geom."""
         kinds = [mujoco.mjtGeom(kind).name[7:].lower() for kind in self.host.geom_type]
-        return [
-            {"shape": kind, "size": tuple(self.host.geom_size[n]), "body": int(self.host.geom_bodyid[n])}
-            for n, kind in enumerate(kinds)
-        ]
+        return [{"shape": kind, "size": tuple(size)} for kind, size in zip(kinds, self.host.geom_size, strict=True)]
 
 
 def load(mjcf: str, name: str) -> Any:
