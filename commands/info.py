@@ -14,13 +14,14 @@ def info() -> None:
 
     from .. import __version__
     from ..envs.engines.runtime import cores, device_names
-    from ..jobs.scene import PACKAGES, installed_version
+    from ..envs.installed import installed_version
+    from ..jobs.scene import ABSENT, PACKAGES
     from .terminal import Console, table
 
     found = table("what", "version or name", title=f"gradscape {__version__}")
     found.add_row("python", sys.version.split()[0])
     for package in PACKAGES:
-        found.add_row(package, installed_version(package))
+        found.add_row(package, installed_version(package) or ABSENT)
     found.add_row("cpu", f"{cores()} cores for this process")
     for name in device_names() or ["none found"]:
         found.add_row("cuda", name)

@@ -121,7 +121,7 @@ def _sample(
     with workers(scheduler, env.device) as executor:
         for point, plane in planes.items():
             folder = folder_for(Path(out), point, points) if out else None
-            named = describe_cut(along, point, extent)
+            named = describe_cut(along, point, where["extent"])
             job = SliceJob.of(env, plane, out=folder, cut=named, executor=executor, **how)
             summary = job.run(bars)
             bars.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")

@@ -7,13 +7,17 @@ from importlib.metadata import PackageNotFoundError, version
 COMPUTES_LOSSES = False  # for `code`
 
 
+def installed_version(package: str) -> str | None:
+    """Return the version of a package, without importing it; None where it is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
 def is_installed(package: str) -> bool:
     """Say whether a package is installed, without importing it."""
-    try:
-        version(package)
-    except PackageNotFoundError:
-        return False
-    return True
+    return installed_version(package) is not None
 
 
 def install_line(extra: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from ..landscapes.plain import plain_name
 from .scene import named_point, plane_through, runs_in
 from .slice_summary import JOINED
 
@@ -62,11 +62,10 @@ def plane_along(
 
     kind, _, value = along.partition(":")
     names = joined_points(along)
-    joins = len(names) in (2, 3)
     elsewhere = extent is not None or not isinstance(through, str) or through != "center"
-    if (joins or kind == "pca") and elsewhere:
+    if (names or kind == "pca") and elsewhere:
         raise ValueError(f"--along {along} says where it goes; leave out --through and --extent")
-    if joins:
+    if names:
         return joining(objective.space, [named_point(objective, name) for name in names], names, resolution)
     if kind == "pca":
         from ..landscapes.overlay import principal_plane
@@ -102,7 +101,7 @@ def _ends(extent: float | tuple[float, float]) -> tuple[float, float]:
 
 
 def describe_cut(
-    along: str | None, through: str | Tensor, extent: float | tuple[float, float] | str | None
+    along: str | None, through: str | Tensor, extent: float | tuple[float, float] | None
 ) -> dict[str, Any] | None:
     """Return what a slice along directions is known by; None for one along parameters."""
     if along is None:
@@ -119,7 +118,7 @@ def split_points(through: str) -> list[str]:
 
 def folder_for(out: Path, point: str, points: Sequence[str]) -> Path:
     """Return where the slice through a point belongs: `out` itself where there is one, else a folder there."""
-    return out if len(points) == 1 else out / re.sub(r"[^\w.]+", "-", point)
+    return out if len(points) == 1 else out / plain_name(point)
 
 
 def joined_points(along: str) -> list[str]:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
-from ..landscapes.foreign import SUFFIXES, plain_name, points_table, read_points, study_frame
+from ..landscapes.foreign import SUFFIXES, points_table, read_points, study_frame
+from ..landscapes.plain import plain_name
 from .folder import run_tables
 from .scene import environment_of
 

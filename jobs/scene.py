@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
+from ..envs.installed import installed_version
 from ..envs.registry import environment_class, make
 from .watch import Watch
 
@@ -23,6 +23,7 @@ PACKAGES = (
     *("numpy", "torch", "warp-lang", "taichi", "xarray", "zarr", "matplotlib"),
     *("pyvista", "rerun-sdk", "botorch", "gpytorch", "cma", "typer", "rich"),
 )
+ABSENT = "not installed"  # in the place of a version
 
 
 @dataclass(frozen=True)
@@ -80,17 +81,9 @@ def provenance(objective: Objective, command: str) -> dict[str, Any]:
     return {
         "command": command,
         "created": datetime.now(UTC).strftime("%Y-%m-%d"),
-        "versions": {package: installed_version(package) for package in PACKAGES},
+        "versions": {package: installed_version(package) or ABSENT for package in PACKAGES},
         "loss_unit": getattr(objective, "loss_unit", ""),
     }
-
-
-def installed_version(package: str) -> str:
-    """Return the version of a package, or that it is not installed."""
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed"
 
 
 def environment_of(dataset: xr.Dataset, device: str) -> Environment:

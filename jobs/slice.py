@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import resource
 import sys
 import time
@@ -24,6 +23,7 @@ from ..landscapes.capacity import size
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.measures.unresolved import probes, stored_unresolved
 from ..landscapes.objective import Objective, Status, name_of
+from ..landscapes.plain import plain_name
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.distribution import RemoteSite, Site, evaluator, run_tasks, workers_of
 from ..landscapes.sampling.fill import Progress, sample
@@ -307,7 +307,7 @@ def _default_folder(
     """Return a folder of its own for every different slice, the same for the same one."""
     aligned = all(len(row.nonzero()) == 1 for row in plane.basis)
     axes = [str(int(row.nonzero()[0])) for row in plane.basis] if aligned else ["plane"]
-    axes = [re.sub(r"[^\w.]+", "-", str(identity["cut"]["along"]))[:MOST]] if "cut" in identity else axes
+    axes = [plain_name(identity["cut"]["along"])[:MOST]] if "cut" in identity else axes
     points = "x".join(map(str, plane.resolution))
     fidelity = [identity["fidelity"]] if "fidelity" in identity else []
     parts = [identity["objective"], *axes, *fidelity, points]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,8 +55,7 @@ class SliceSummary:
         counts = {kind: count for kind, count in self.status.items() if count}
         ends = ", ".join(f"{count} {kind}" for kind, count in counts.items())
         refined = f"; {self.refinement.say()}" if self.refinement else ""
-        low, high = self.loss["lowest"], self.loss["highest"]
-        losses = "no finite loss" if low is None else f"losses from {low:.4g} to {high:.4g}"
+        losses = say_range(self.loss)
         sampled = sum(counts.values()) - counts.get("interpolated", 0)
         share = (self.flat or 0) / sampled if sampled else 0.0
         flat = f"; gradient exactly zero at {share:.1%} of points" if share else ""
@@ -99,6 +99,12 @@ def range_of(dataset: xr.Dataset) -> dict[str, float | None]:
     if not np.isfinite(loss).any():
         return {"lowest": None, "highest": None}
     return {"lowest": float(np.nanmin(loss)), "highest": float(np.nanmax(loss))}
+
+
+def say_range(loss: Mapping[str, float | None]) -> str:
+    """Say in words what `range_of` returns."""
+    low, high = loss["lowest"], loss["highest"]
+    return "no finite loss" if low is None else f"losses from {low:.4g} to {high:.4g}"
 
 
 def flat_points(dataset: xr.Dataset) -> int | None:

@@ -25,7 +25,7 @@ from .folder import ROOT, SWEEP, folder_named
 from .motion import HORIZON, SMOOTHING, Motion, refuse_too_large
 from .scene import provenance
 from .slice import SliceCost, estimate_cost
-from .slice_summary import count_statuses, flat_points, range_of
+from .slice_summary import count_statuses, flat_points, range_of, say_range
 from .watch import PREPARING, Advance, Watch, resumable
 from .workers import recipe
 
@@ -76,8 +76,7 @@ class SweepSummary:
     def outcome(self) -> str:
         """Say in a line what the sweep cost and what came out."""
         failed = sum(count for frame in self.frames for kind, count in frame.status.items() if kind != "ok")
-        low, high = self.loss["lowest"], self.loss["highest"]
-        losses = "no finite loss" if low is None else f"losses from {low:.4g} to {high:.4g}"
+        losses = say_range(self.loss)
         failures = f"; {failed} failed" if failed else ""
         done = f"{self.episodes} episodes in {duration(self.seconds)}"
         return f"{done}; {len(self.frames)} frames; {losses}{failures}"

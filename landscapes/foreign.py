@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -100,11 +99,6 @@ def points_table(frame: pd.DataFrame, dataset: xr.Dataset, space: ParameterSpace
         "identity": json.dumps(plain_json(identity, "a table's identity")),
     }
     return xr.Dataset(data, {"dim": dataset["dim"].to_numpy()}, about)
-
-
-def plain_name(text: str) -> str:
-    """Return a name of letters, digits, dots, dashes and underscores, as recordings have them."""
-    return re.sub(r"[^A-Za-z0-9_.-]+", "-", text).strip("-.") or "points"
 
 
 def _column(frame: pd.DataFrame, *names: str, name: str, gaps: bool = False) -> NDArray[np.float64]:

@@ -8,9 +8,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 import xarray as xr
+from numpy.typing import NDArray
 
 from .identity import plane_of, stored_identity
 from .objective import Status
+from .plane import Plane
 
 DRAWN = ("loss", "status")
 
@@ -34,6 +36,13 @@ def sampled_lattice(dataset: xr.Dataset) -> xr.Dataset:
 
 def _every(dataset: xr.Dataset, stride: int) -> dict[str, slice]:
     return {str(name): slice(None, None, stride) for name in dataset["loss"].dims}
+
+
+def lift_between(plane: Plane, places: NDArray[np.float64]) -> torch.Tensor:
+    """Return the parameters at places between samples, shape (count, rank), in steps along each axis of the array."""
+    axes = [axis.numpy() for axis in plane.axes()[::-1]]
+    u = [np.interp(places[:, axis], np.arange(len(one)), one) for axis, one in enumerate(axes)][::-1]
+    return plane.lift(torch.from_numpy(np.stack(u, axis=-1)))
 
 
 def own_cells(dataset: xr.Dataset) -> xr.Dataset:

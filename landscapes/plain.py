@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -11,6 +12,11 @@ from typing import Any
 def finite(value: float) -> float | None:
     """Return a number as JSON has it: None where it is NaN or infinite."""
     return float(value) if math.isfinite(value) else None
+
+
+def or_nan(value: Any) -> float:
+    """Return a number that JSON had, NaN for None. Raises TypeError for anything else."""
+    return math.nan if value is None else number(value)
 
 
 def plain(value: Any) -> Any:
@@ -69,3 +75,8 @@ def number(value: Any) -> float:
 def optional(kind: Callable[[Any], Any], value: Any) -> Any:
     """Return what has to be of a kind, or None."""
     return None if value is None else kind(value)
+
+
+def plain_name(text: str) -> str:
+    """Return a name of letters, digits, dots, dashes and underscores, as recordings and folders have them."""
+    return re.sub(r"[^A-Za-z0-9_.-]+", "-", text).strip("-.") or "points"

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from .plain import finite
+from .plain import finite, or_nan
 
 Values = NDArray[np.float64]
 CONFIDENCE = 0.95
@@ -37,6 +37,11 @@ class Estimate:
     def record(self) -> EstimateRecord:
         """Return it as plain JSON."""
         return {"value": finite(self.value), "low": finite(self.low), "high": finite(self.high)}
+
+    @classmethod
+    def of_record(cls, record: EstimateRecord) -> Estimate:
+        """Read it from plain JSON; raises TypeError and KeyError for what is none."""
+        return cls(or_nan(record["value"]), or_nan(record["low"]), or_nan(record["high"]))
 
 
 def jackknife(

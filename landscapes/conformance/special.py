@@ -15,12 +15,12 @@ from torch import Tensor
 from ..objective import evaluate
 from ..space import ParameterSpace
 from .finding import SKIP, Finding, verdict
+from .gradients import CLEAR
 from .subject import Subject
 
 STEPS = (1e-6, 1e-5, 1e-4, 1e-3)  # as shares of the box
 AXES = 4  # at each place, drawn from all
 INSIDE = 2e-3  # how far from the corner of the box, so that the longest step stays within it
-CLEAR = 10  # times the noise is what a slope has to be, to be compared
 APART = 0.05  # of the larger of gradient and slopes: how far outside the slopes a gradient is wrong
 
 

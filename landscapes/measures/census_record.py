@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..plain import number, optional, plain, text
-from ..statistics import Estimate, EstimateRecord
+from ..plain import number, optional, or_nan, plain, text
+from ..statistics import Estimate
 from .census import MEASURES, CensusDesign, SurveyedSlice, ordered
 from .census_statistics import QUANTILES, Parts, Spread, bootstrap, divide, spread, word_shares
 
@@ -77,9 +77,9 @@ class Census:
             episodes=int(number(record["episodes"])),
             command=text(record["command"]),
             slices=tuple(map(_slice, record["slices"])),
-            words={word: _estimate(one) for word, one in record["words"].items()},
+            words={word: Estimate.of_record(one) for word, one in record["words"].items()},
             spreads={name: _spread(one) for name, one in record["spreads"].items()},
-            parts={name: Parts(**{key: _known(one[key]) for key in _PARTS}) for name, one in record["parts"].items()},
+            parts={name: Parts(**{key: or_nan(one[key]) for key in _PARTS}) for name, one in record["parts"].items()},
             identity=dict(record["identity"]),
             provenance=dict(record["provenance"]),
             losses=losses,
@@ -181,13 +181,5 @@ def _slice(record: Mapping[str, Any]) -> CensusedSlice:
     )
 
 
-def _known(value: Any) -> float:
-    return np.nan if value is None else number(value)
-
-
-def _estimate(record: EstimateRecord) -> Estimate:
-    return Estimate(*(_known(record[end]) for end in ("value", "low", "high")))
-
-
 def _spread(record: Mapping[str, Any]) -> Spread:
-    return Spread(tuple(map(_known, record["quantiles"])), _estimate(record["median"]))
+    return Spread(tuple(map(or_nan, record["quantiles"])), Estimate.of_record(record["median"]))

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import linregress
 
-from ..plain import number, plain
-from ..statistics import Estimate, EstimateRecord, Values, mean
+from ..plain import number, or_nan, plain
+from ..statistics import Estimate, Values, mean
 
 FEWEST = 4  # horizons that a rate is fitted to
 MUCH = 0.5  # share of the points whose gradients must be known at all horizons
@@ -60,13 +60,13 @@ class GradientGrowth:
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> GradientGrowth:
         """Read it from plain JSON; raises TypeError and KeyError for what is none."""
-        first, second = (_known(one) for one in record["misfit"])
+        first, second = (or_nan(one) for one in record["misfit"])
         return cls(
-            _estimate(record["rate"]),
-            _estimate(record["power"]),
+            Estimate.of_record(record["rate"]),
+            Estimate.of_record(record["power"]),
             (first, second),
             tuple(map(number, record["time"])),
-            tuple(map(_known, record["norm"])),
+            tuple(map(or_nan, record["norm"])),
             int(record["known"]),
             int(record["points"]),
         )
@@ -101,11 +101,3 @@ def _fit(axis: Values, values: Values) -> tuple[float, float]:
     """Return the slope of a line through values, and the standard deviation of what it leaves."""
     found = linregress(axis, values)
     return float(found.slope), float(np.std(values - found.intercept - found.slope * axis))
-
-
-def _estimate(record: EstimateRecord) -> Estimate:
-    return Estimate(_known(record["value"]), _known(record["low"]), _known(record["high"]))
-
-
-def _known(value: Any) -> float:
-    return math.nan if value is None else number(value)

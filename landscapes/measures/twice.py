@@ -14,13 +14,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-import torch
 import xarray as xr
 from numpy.typing import NDArray
 
 from ..identity import plane_of
+from ..lattice import lift_between
 from ..objective import Objective, evaluate
-from ..plane import Plane
 from ..statistics import Estimate, Values, mean
 from .classify import judge, likeness
 from .discontinuities import Jumps
@@ -131,20 +130,13 @@ def _sample(
         losses[number][own], slopes[number][own] = loss[_part(block, 3)], slope[_part(block, 3)]
     new = np.argwhere((np.indices([SIDE] * rank) % 2).any(axis=0))
     places = (drawn[:, None, :] + new / 2).reshape(-1, rank)
-    answer = evaluate(objective, _lift(plane, places), grad=True)
+    answer = evaluate(objective, lift_between(plane, places), grad=True)
     at = tuple([slice(None), *new.T])
     losses[at] = answer.loss.numpy().reshape(len(drawn), -1)
     assert answer.grad is not None  # as it was asked for
     sides = (plane.upper - plane.lower).numpy()
     slopes[at] = (plane.slope(answer.grad).numpy() * sides)[:, ::-1].reshape(len(drawn), -1, rank)
     return losses, slopes, len(places)
-
-
-def _lift(plane: Plane, places: Values) -> torch.Tensor:
-    """Return the parameters at places in steps along each axis of the array."""
-    axes = [axis.numpy() for axis in plane.axes()[::-1]]
-    u = [np.interp(places[:, axis], np.arange(len(one)), one) for axis, one in enumerate(axes)][::-1]
-    return plane.lift(torch.from_numpy(np.stack(u, axis=-1)))
 
 
 def _measure(

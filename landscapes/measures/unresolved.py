@@ -26,11 +26,11 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
-import torch
 import xarray as xr
 from numpy.typing import NDArray
 
 from ..identity import plane_of
+from ..lattice import lift_between
 from ..objective import Objective, Status, evaluate
 from ..plain import finite
 from ..plane import Plane
@@ -225,7 +225,6 @@ class _Look:
 
     def __init__(self, objective: Objective, plane: Plane, loss: Values, slope: Values, least: float) -> None:
         self.objective, self.plane, self.loss, self.slope, self.least = objective, plane, loss, slope, least
-        self.axes = [axis.numpy() for axis in plane.axes()[::-1]]  # in array order
         self.episodes = 0
 
     def ask(self, at: Values) -> Values:
@@ -233,9 +232,7 @@ class _Look:
         if not len(at):
             return np.zeros(0)
         self.episodes += len(at)
-        places = [np.interp(at[:, axis], np.arange(len(one)), one) for axis, one in enumerate(self.axes)][::-1]
-        u = torch.from_numpy(np.stack(places, axis=-1))
-        return cast("Values", evaluate(self.objective, self.plane.lift(u), grad=False).loss.numpy())
+        return cast("Values", evaluate(self.objective, lift_between(self.plane, at), grad=False).loss.numpy())
 
     def middles(self, cells: Cells) -> Values:
         """Look at the middles of cells, against all their corners."""
