@@ -5,7 +5,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from benchmarks.results import leave_blank
 from hypothesis import HealthCheck, settings
 
 from gradscape.cli import main
+from gradscape.envs import registry
 
 from .command import NO_BROWSER, Said
 
@@ -37,6 +38,16 @@ def freeze() -> None:
     """Spare what was loaded before a module to every collection of garbage in it: studies ask for one at each step."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(autouse=True)
+def forgotten() -> Iterator[None]:
+    """Forget the environments that a test registers, or a command that it runs in this process."""
+    known, path = dict(registry.entries()), list(sys.path)
+    yield
+    registry.entries().clear()
+    registry.entries().update(known)
+    sys.path[:] = path
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)

@@ -50,13 +50,9 @@ NOTHING = 3
 
 
 @pytest.fixture(autouse=True)
-def forgotten() -> Iterator[None]:
-    """Forget what a test registers and imports."""
-    known, path = dict(registry.entries()), list(sys.path)
+def unimported() -> Iterator[None]:
+    """Forget the module that lies beside a class's file."""
     yield
-    registry.entries().clear()
-    registry.entries().update(known)
-    sys.path[:] = path
     sys.modules.pop("joints_of_the_arm", None)
 
 
