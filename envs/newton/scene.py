@@ -46,6 +46,7 @@ class NewtonScene(Environment):
     engines: ClassVar[tuple[str, ...]] = ("newton",)
     loss_unit: ClassVar[str] = "m²"
     Options: ClassVar[type[Any]] = NewtonOptions
+    _solvers: Pool[Any]
 
     @property
     def steps(self) -> int:

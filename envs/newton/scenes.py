@@ -89,7 +89,7 @@ class Ball(NewtonScene):
 class ClothOptions(NewtonOptions):
     """`solver`: which of Newton's solvers makes the steps; featherstone has none of its own for cloth."""
 
-    solver: Literal["semi-implicit", "xpbd"] = "semi-implicit"  # type: ignore[assignment]
+    solver: Literal["semi-implicit", "xpbd"] = "semi-implicit"
 
 
 class ClothThrow(NewtonScene):

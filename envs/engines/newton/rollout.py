@@ -20,7 +20,6 @@ from torch import Tensor
 from ..runtime import to_torch
 
 TAPE = threading.Lock()  # Warp records on one tape at a time
-UP = (0.0, 1.0, 0.0)
 ROOM = 1e3  # how far from the ground contact is looked for, once [m]: wherever a thing starts
 SOLVERS: dict[str, Callable[[Any], Any]] = {
     "semi-implicit": lambda model: newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False),
@@ -136,8 +135,8 @@ class Rollout:
 
     def __init__(self, thing: Sphere | Particle | Cloth, ground: Ground | None, settings: Settings) -> None:
         self.settings = settings
-        one, whole = (newton.ModelBuilder(up_axis=newton.Axis.Y) for _ in range(2))
-        whole.gravity = wp.vec3(UP) * -settings.gravity
+        down = wp.vec3(0.0, -settings.gravity, 0.0)
+        one, whole = (newton.ModelBuilder(up_axis=newton.Axis.Y, gravity=down) for _ in range(2))
         thing.add(one)
         if ground is not None:
             ground.add(whole)
@@ -151,7 +150,8 @@ class Rollout:
         self.control = self.model.control()
         self.contacts = None if ground is None else self._contacts()
         self._step(0)  # compiles the kernels, or fetches them from Warp's cache
-        self.faces = to_torch(self.model.tri_indices)[: len(one.tri_indices)] if one.tri_count else None
+        faces: Any = self.model.tri_indices
+        self.faces = to_torch(faces)[: one.tri_count] if one.tri_count else None
 
     def ends(self, velocity: Float[Tensor, "row 3"]) -> Float[Tensor, "row point 3"]:
         """Return where points are at the end [m] of episodes that begin with one velocity [m/s] each."""
