@@ -13,6 +13,8 @@ from ...landscapes.episode import Part
 from ..base import Fidelity
 from .scene import NewtonOptions, NewtonScene, speeds
 
+MASS = 1.0  # of the ball [kg]
+
 
 class Flight(NewtonScene):
     """Throw a sphere so that it is at the target after 0.5 s; it touches nothing.
@@ -78,11 +80,12 @@ class Ball(NewtonScene):
     space = speeds(10.0)
 
     def _thing(self) -> Any:
-        return self._engine("rollout").Particle((-0.5, 1.0, 0.0), 0.1, 1.0)
+        return self._engine("rollout").Particle((-0.5, 1.0, 0.0), 0.1, MASS)
 
     def _ground(self) -> Any:
         o = self.options
-        return self._engine("rollout").Ground(o.ke, o.kd, o.kf, o.mu, o.restitution)
+        stopping = MASS / self.fidelity.dt  # more would turn sliding round within a step, and shake it
+        return self._engine("rollout").Ground(o.ke, o.kd, min(o.kf, stopping), o.mu, o.restitution)
 
 
 @dataclass(frozen=True)
@@ -120,7 +123,7 @@ class ClothThrow(NewtonScene):
         )
 
     def _ground(self) -> Any:
-        return self._engine("rollout").Ground(ke=100.0, kd=0.1, kf=1.0, mu=0.3, restitution=0.0)
+        return self._engine("rollout").Ground(ke=100.0, kd=0.0, kf=1.0, mu=0.3, restitution=0.0)
 
     def _parts(self, at: Float[Tensor, "frame point 3"]) -> tuple[Part, ...]:
         with self._solvers.lend() as rollout:
