@@ -20,6 +20,7 @@ from ..options import EpisodeOptions
 
 GRAVITY = 9.8  # [m/s^2]
 FRAMES = 240  # of an episode that is drawn, at most
+MARK = 0.1  # radius of the target that is drawn [m]
 BUDGET = 1 << 28  # bytes of the states that are kept for the tape
 SPEED = ("velocity x", "velocity y", "velocity z")
 
@@ -69,9 +70,10 @@ class NewtonScene(Environment):
         shown = torch.linspace(0, len(frames) - 1, min(FRAMES, len(frames))).round().long()
         at = frames[shown]
         target = torch.tensor(self.target, dtype=torch.float64).expand(len(at), 3)
-        parts = (*self._parts(at), Part("sphere", "target", target[:, None], (self._thing().radius,)))
+        parts = (*self._parts(at), Part("sphere", "target", target[:, None], (MARK,)))
         everything = torch.cat([at, target[:, None]], dim=1)
-        lower, upper = everything.amin(dim=(0, 1)) - 0.3, everything.amax(dim=(0, 1)) + 0.3
+        room = self._thing().radius + 2 * MARK
+        lower, upper = everything.amin(dim=(0, 1)) - room, everything.amax(dim=(0, 1)) + room
         view = View(tuple(lower.tolist()), tuple(upper.tolist()), ground=None if self._ground() is None else 0.0)
         return Episode(self.fidelity.dt * shown, {"thing": at}, {"target": target}, parts, view)
 

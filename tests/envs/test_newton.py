@@ -118,14 +118,14 @@ def test_a_cloth_meets_the_floor_and_holds_together(solver, bounces):
 
 @pytest.mark.parametrize(("name", "solver"), SOLVED)
 def test_rows_do_not_depend_on_each_other(name, solver):
-    env = scene(name, solver, horizon=0.6 if name == "newton-cloth" else 0.4)
-    x = env.space.uniform(4, seed=1)
-    whole, back = env.evaluate(x), env.evaluate(x.flip(0))
-    alone = [env.evaluate(row[None]) for row in x]
+    """To the bit: each has a world of its own, and sums over its springs come in one order."""
+    env = scene(name, solver, fidelity="draft", horizon=0.65 if name == "newton-cloth" else 0.4)
+    x = env.space.uniform(3, seed=1)
+    whole, back, alone = env.evaluate(x), env.evaluate(x.flip(0)), env.evaluate(x[1:2])
     for field in ("loss", "grad"):
         together = getattr(whole, field)
         assert torch.equal(getattr(back, field).flip(0), together)
-        assert torch.equal(torch.cat([getattr(one, field) for one in alone]), together)
+        assert torch.equal(getattr(alone, field), together[1:2])
 
 
 @pytest.mark.parametrize(("name", "solver"), SOLVED)
