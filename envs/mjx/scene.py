@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -125,6 +125,11 @@ class MjxScene(Environment):
 
     def _loss(self, x: Any) -> Any:
         return self.loss_of(self._rollout.end(x, self._course))
+
+    def engine_call(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Callable[[], object]:
+        """Return what calls MJX's compiled program alone, on points that JAX holds already."""
+        call: Callable[[], object] = self._objective.engine_call(x, grad=grad)
+        return call
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         """Evaluate batches of one size only: programs for other sizes round in another order."""
