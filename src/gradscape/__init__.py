@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from .api.compare import compare
     from .api.environments import list_envs
     from .api.measure import census, check, extremes, pairs, report
     from .api.overlay import overlay
@@ -43,6 +44,7 @@ _HOMES = {
     "Slice": "landscapes.slice",
     "Status": "landscapes.objective",
     "check": "api.measure",
+    "compare": "api.compare",
     "extremes": "api.measure",
     "from_jax": "envs.engines.jax_functions",
     "from_numpy": "landscapes.adapters",
@@ -81,6 +83,7 @@ __all__ = [
     "__version__",
     "census",
     "check",
+    "compare",
     "extremes",
     "from_jax",
     "from_numpy",

@@ -1,0 +1,176 @@
+"""Two slices of one plane: both losses on one scale, their difference, and how their gradients agree (matplotlib)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.patches import Patch
+
+from ...identity import plane_of
+from ...measures.ruggedness import box_slopes
+from ...objective import Status
+from .. import style
+from . import contour, page, panel
+
+if TYPE_CHECKING:
+    from ...measures.slice_comparison import SliceComparison
+    from ...statistics import Estimate
+
+PITCH, LEAST = 4.8, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
+WIDTH, HEIGHT = 8.0, 2.2  # of the picture of a line, and of each of its panels [inch]
+LISTED = 4  # settings that differ, in the legend
+
+
+def comparison_figure(found: SliceComparison, *, width: float | None = None) -> page.Picture:
+    """Draw the losses of both slices on one scale, their difference, and the cosine of their gradients.
+
+    Each cell, or point of a line, is a sample of both; nothing is interpolated. The scale of differences is the same
+    to both sides of zero. Where a sample failed in one of the slices it is hatched in what is drawn of both. Of a line
+    the gradients themselves are drawn, as their cosine is but a sign.
+
+    Raises ValueError where the page is too narrow or too wide.
+    """
+    draw = _draw_maps if plane_of(found.data[0]).rank == 2 else _draw_lines
+    picture, entries = draw(found, width)
+    points = " \N{MULTIPLICATION SIGN} ".join(str(count) for count in reversed(found.data[0]["loss"].shape))
+    page.entitle(picture, f"A: {found.a} against B: {found.b} · {points} points")
+    page.finish(picture, [*entries, *_say(found)], heading=_made(found))
+    return picture
+
+
+def _draw_maps(found: SliceComparison, width: float | None) -> tuple[page.Picture, list[Artist]]:
+    panels = 4 if found.slopes else 3
+    sheet = style.Sheet.of(width, pitch=PITCH, columns=2, least=LEAST)
+    picture = page.Picture(sheet, -(-panels // sheet.columns) * sheet.pitch)
+    axes, both = panel.grid(picture, panels, share=True), _where_either_failed(found)
+    entries = _loss_maps(axes, found)
+    _difference_map(axes[2], found)
+    entries += _farthest(axes[2], found)
+    if found.slopes:
+        _cosine_map(axes[3], found)
+    for ax, dataset in zip(axes, (*found.data, both, both), strict=False):
+        contour.frame(ax, dataset, plane_of(dataset))
+        panel.name_outer(ax, *plane_of(dataset).labels)
+    return picture, [*entries, *_failures(both)]
+
+
+def _loss_maps(axes: list[Axes], found: SliceComparison) -> list[Artist]:
+    """Draw the losses of A and B with one colour bar; return the legend's entries."""
+    scale, entries = _loss_scale(found), list[Artist]()
+    for ax, letter, name, dataset in zip(axes, "AB", (found.a, found.b), found.data, strict=False):
+        drawn = contour.cell_map(ax, dataset, dataset["loss"].to_numpy(), scale, style.LOSS_MAP)
+        entries += contour.lowest_sample(ax, dataset, f"lowest sample of {letter}")
+        panel.caption(ax, f"{letter}: {name}")
+        panel.colour_bar(ax, drawn, page.loss_name(dataset), scale)
+    return entries
+
+
+def _loss_scale(found: SliceComparison) -> style.Scale:
+    return style.Scale.of_loss(np.concatenate([one["loss"].to_numpy().ravel() for one in found.data]))
+
+
+def _difference_map(ax: Axes, found: SliceComparison) -> None:
+    values = found.difference.to_numpy()
+    scale = style.Scale.symmetric(values)
+    drawn = contour.cell_map(ax, found.data[0], values, scale, style.DIFFERENCE_MAP)
+    panel.caption(ax, "difference of losses, B \N{MINUS SIGN} A")
+    panel.colour_bar(ax, drawn, _difference_name(found), scale)
+
+
+def _cosine_map(ax: Axes, found: SliceComparison) -> None:
+    scale, colours = style.Scale.linear(-1.0, 1.0), style.COSINE["cmap"]
+    drawn = contour.cell_map(ax, found.data[0], found.cosine.to_numpy(), scale, colours)
+    panel.caption(ax, "gradients of A and B")
+    panel.colour_bar(ax, drawn, "cosine of the angle between them", scale)
+
+
+def _difference_name(found: SliceComparison) -> str:
+    return f"difference [{found.loss_unit}]" if found.loss_unit else "difference"
+
+
+def _farthest(ax: Axes, found: SliceComparison) -> list[Artist]:
+    """Mark where the losses are farthest apart; return the legend's entry."""
+    if not found.parting or found.parting.a == found.parting.b:
+        return []
+    look, place = page.sheet_of(ax).look(style.FARTHEST), list(found.parting.place.values())
+    apart = found.parting.b - found.parting.a
+    at = place if len(place) == 2 else [*place, apart]
+    (mark,) = ax.plot(*([one] for one in at), **look, zorder=4, label=f"farthest apart: {style.number(apart)}")
+    return [mark]
+
+
+def _draw_lines(found: SliceComparison, width: float | None) -> tuple[page.Picture, list[Artist]]:
+    panels, plane = 3 if found.slopes else 2, plane_of(found.data[0])
+    sheet = style.Sheet.of(width, pitch=WIDTH)
+    picture = page.Picture(sheet, panels * HEIGHT * sheet.zoom)
+    axes = list(picture.subplots(panels, 1, sharex=True, squeeze=False)[:, 0])
+    entries = _curves(axes[0], found, [one["loss"].to_numpy() for one in found.data])
+    panel.name_axes(axes[0], y=page.loss_name(found.data[0]))
+    look = sheet.look(style.stroke(found.points))
+    axes[1].plot(found.difference["u"], found.difference, color=style.INK, **look)
+    entries += _farthest(axes[1], found)
+    panel.name_axes(axes[1], y="B \N{MINUS SIGN} A" + (f" [{found.loss_unit}]" if found.loss_unit else ""))
+    if found.slopes:
+        _curves(axes[2], found, [box_slopes(one)[:, 0] for one in found.data])
+        panel.name_axes(axes[2], y=f"slope [{found.loss_unit or 'loss'} per side]")
+    for ax in axes:
+        panel.dress(ax)
+        ax.set_box_aspect(HEIGHT / WIDTH)
+        ax.set_xlim(float(plane.lower[0]), float(plane.upper[0]))
+    for ax in axes[1:]:
+        ax.axhline(0, color=style.FAINT, linewidth=0.8 * sheet.weight, zorder=0.5)
+    panel.name_axes(axes[-1], plane.labels[0])
+    return picture, [*entries, *_failures(_where_either_failed(found))]
+
+
+def _curves(ax: Axes, found: SliceComparison, values: list[Any]) -> list[Artist]:
+    """Draw a curve for each slice; return the legend's entries."""
+    sheet, entries, u = page.sheet_of(ax), list[Artist](), found.data[0]["u"].to_numpy()
+    for letter, name, curve, look in zip("AB", (found.a, found.b), values, style.PAIR, strict=True):
+        entries += ax.plot(u, curve, **sheet.look(style.stroke(len(u)) | look), label=f"{letter}: {name}")
+    return entries
+
+
+def _where_either_failed(found: SliceComparison) -> xr.Dataset:
+    """Return slice A with the status of B where A is well: what is hatched in a map of both."""
+    ours, theirs = (one["status"] for one in found.data)
+    return found.data[0].assign(status=ours.copy(data=np.where(ours == Status.OK, theirs, ours)))
+
+
+def _failures(both: xr.Dataset) -> list[Patch]:
+    """Return the legend's entries of the failures in either slice."""
+    entries = page.failure_key(both)
+    for one in entries:
+        one.set_label(f"in A or B {one.get_label()}")
+    return entries
+
+
+def _say(found: SliceComparison) -> list[Patch]:
+    """Return legend entries without a sign: the chief numbers, and the settings that differ."""
+    percent = style.number(100 * found.loss.shares()["median"].value, ".2g")
+    unit = f" {found.loss_unit}" if found.loss_unit else ""
+    said = [f"median difference: {style.number(found.loss.median.value)}{unit}, {percent} % of A's range"]
+    said.append(f"rank correlation: {_interval(found.spearman)}")
+    if found.slopes:
+        said.append(f"cosine of gradients, median: {_interval(found.slopes.cosine)}")
+        said.append(f"opposing gradients: {style.number(100 * found.slopes.opposing.value, '.2g')} %")
+        said.append(f"length of gradients, B to A, median: {_interval(found.slopes.ratio)}")
+    if found.statuses:
+        said.append(f"ended differently: {sum(one.points for one in found.statuses)} of {found.points}")
+    settings = [f"{name}: {a} in A, {b} in B" for name, (a, b) in found.differing.items()]
+    more = [f"and {len(settings) - LISTED} more settings differ"] if len(settings) > LISTED else []
+    return [Patch(visible=False, label=text) for text in (*said, *settings[:LISTED], *more)]
+
+
+def _interval(one: Estimate) -> str:
+    ends = f" ({style.number(one.low, '.3g')} to {style.number(one.high, '.3g')})" if one.low == one.low else ""
+    return f"{style.number(one.value, '.3g')}{ends}"
+
+
+def _made(found: SliceComparison) -> str:
+    a, b = (page.provenance(one).split(" · ")[0] for one in found.data)
+    return " · ".join(one for one in (a if a == b else f"{a} and {b}", found.command) if one)

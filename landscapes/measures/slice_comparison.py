@@ -1,0 +1,382 @@
+"""Two slices of one plane held against each other: losses, their order, gradients, and where they part."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+import xarray as xr
+from numpy.typing import NDArray
+
+from ..identity import differing_settings, plane_of, stored_identity, stored_provenance
+from ..lattice import sampled_lattice
+from ..objective import Status
+from ..plain import plain
+from ..statistics import Estimate, jackknife
+from .fidelity import gradient_error, spearman
+from .ruggedness import box_slopes, span
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from ..draw.figures.page import Picture
+    from ..plane import Plane
+
+Values = NDArray[np.float64]
+PLACING = ("plane", "cut", "boxed", "parameters")  # in a slice's identity: where it lies, not what it is of
+TWICE = "settings.name"  # what an identity has by another name, too
+ROUNDING = 1e-9  # planes that are no farther apart, relatively, are the same
+ANYTHING = "give the name of an environment as B, which is then sampled on A's plane"
+
+
+@dataclass(frozen=True)
+class LossDifference:
+    """Hold how far losses are apart [loss unit]: `median`, 95th percentile, `largest`; and the `range` of A's losses.
+
+    Nothing is estimated by the largest, which has no interval.
+    """
+
+    median: Estimate
+    p95: Estimate
+    largest: Estimate
+    range: float
+
+    def shares(self) -> dict[str, Estimate]:
+        """Return the three as shares of the range, NaN where A's losses are all the same."""
+        whole = self.range or math.nan
+        return {name: _share(getattr(self, name), whole) for name in ("median", "p95", "largest")}
+
+
+@dataclass(frozen=True)
+class SlopeDifference:
+    """Hold how gradients differ along the plane, whose sides count as 1: two that are exactly zero agree.
+
+    Medians of `cosine` and of `ratio`, B's length to A's; `opposing` is the share of points with a cosine below 0.
+    """
+
+    cosine: Estimate
+    opposing: Estimate
+    ratio: Estimate
+
+
+@dataclass(frozen=True)
+class Parting:
+    """Say where losses are farthest apart: coordinates by the labels of the plane's axes, and both losses there."""
+
+    place: dict[str, float]
+    a: float
+    b: float
+
+
+@dataclass(frozen=True)
+class StatusPair:
+    """Count the points that ended in one way in A and in another in B."""
+
+    a: str
+    b: str
+    points: int
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SliceComparison:
+    """Hold B against A, two slices of one plane; `a` and `b` name what they are of.
+
+    Of `points`, `compared` have a loss in both; `statuses` counts those that ended differently. `slopes` is None where
+    either has no gradients, `parting` where no point is compared. `differing` has both values of every setting that is
+    not the same, by its name. `data` are the samples: of refined slices the finest lattice that both sampled.
+    """
+
+    a: str
+    b: str
+    loss_unit: str
+    points: int
+    compared: int
+    statuses: tuple[StatusPair, ...]
+    loss: LossDifference
+    spearman: Estimate
+    slopes: SlopeDifference | None
+    parting: Parting | None
+    differing: dict[str, tuple[str, str]]
+    data: tuple[xr.Dataset, xr.Dataset]
+    command: str
+
+    @property
+    def difference(self) -> xr.DataArray:
+        """B's losses less A's [loss unit], NaN where either has none."""
+        a, b = (one["loss"] for one in self.data)
+        return b.copy(data=b.to_numpy() - a.to_numpy()).rename("difference")
+
+    @property
+    def cosine(self) -> xr.DataArray:
+        """The cosine between gradients along the plane, NaN where either has none.
+
+        Raises ValueError where one of the slices has no gradients at all.
+        """
+        if self.slopes is None:
+            raise ValueError("one of the slices was sampled without gradients; sample it again with gradients=True")
+        slopes = (box_slopes(one) for one in self.data)
+        like = self.data[0]["loss"].transpose("v", "u", missing_dims="ignore")
+        return like.copy(data=_cosine(*slopes)).rename("cosine").drop_attrs()
+
+    def record(self) -> dict[str, Any]:
+        """Return it as plain JSON, by the names of its fields; what is infinite or not known is None."""
+        loss, slopes, parting = self.loss, self.slopes, self.parting
+        found: dict[str, Any] = plain(
+            {
+                **{name: getattr(self, name) for name in ("a", "b", "loss_unit", "points", "compared")},
+                "statuses": [asdict(one) for one in self.statuses],
+                "loss": {**vars(loss), "shares": loss.shares()},
+                "spearman": self.spearman,
+                "slopes": vars(slopes) if slopes else None,
+                "parting": asdict(parting) if parting else None,
+                "differing": {name: {"a": a, "b": b} for name, (a, b) in self.differing.items()},
+                "command": self.command,
+            }
+        )
+        return found
+
+    def table(self) -> pd.DataFrame:
+        """Return a row for each number, indexed by `measure`: its `value`, its interval `low` to `high`, its `unit`."""
+        import pandas as pd
+
+        rows = [(name, one.value, one.low, one.high, unit) for name, one, unit in self._numbers()]
+        return pd.DataFrame(rows, columns=["measure", "value", "low", "high", "unit"]).set_index("measure")
+
+    def _numbers(self) -> list[tuple[str, Estimate, str]]:
+        """Return each number with its name and unit."""
+        shares, unit, points = self.loss.shares(), self.loss_unit, "share of the points"
+        names = {
+            "median": "median difference",
+            "p95": "difference, 95 % of the points",
+            "largest": "largest difference",
+        }
+        rows = [("loss in both", _exactly(self.compared / self.points), points)]
+        rows += [(name, getattr(self.loss, field), unit) for field, name in names.items()]
+        rows += [(name, shares[field], "share of A's range") for field, name in names.items()]
+        rows += [("rank correlation", self.spearman, "")]
+        if self.slopes:
+            rows += [("cosine of gradients, median", self.slopes.cosine, "")]
+            rows += [("opposing gradients", self.slopes.opposing, points)]
+            rows += [("length of gradients, B to A, median", self.slopes.ratio, "")]
+        return rows
+
+    def plot(self, width: float | None = None) -> Picture:
+        """Draw both losses on one scale, their difference, and the cosine of gradients.
+
+        The picture is matplotlib's figure; `width` is that of a page [mm], and none that of a screen.
+        """
+        from ..draw.figures.comparison import comparison_figure
+
+        return comparison_figure(self, width=width)
+
+    def __repr__(self) -> str:
+        """Return in a line what is compared and what came out."""
+        return f"<SliceComparison of {self.a} and {self.b}: rank correlation {self.spearman.value:.3g}>"
+
+    def _repr_html_(self) -> str:
+        """Show the table in a notebook."""
+        return str(self.table().to_html())
+
+
+def compare_slices(a: xr.Dataset, b: xr.Dataset, *, command: str = "") -> SliceComparison:
+    """Hold the slice B against the slice A of the same plane.
+
+    Intervals leave out blocks of the plane in turn (`statistics.jackknife`), as neighbours depend on each other: they
+    say what another part of the plane might have given. The 95th percentile is the next larger difference.
+
+    Raises ValueError where the two are not on one plane, of other parameters, in other units, or not finished.
+    """
+    check_landscapes(parameters(a), parameters(b), loss_unit(a), loss_unit(b))
+    check_planes(plane_of(a), plane_of(b))
+    check_finished(a, b)
+    a, b = _on_one_lattice(a, b)
+    differing = differing_settings(*(_settings(one) for one in (a, b)))
+    losses = [one["loss"].transpose("v", "u", missing_dims="ignore").to_numpy() for one in (a, b)]
+    apart, names = np.abs(losses[1] - losses[0]), _names(a, b, differing)
+    known = np.isfinite(apart)
+    return SliceComparison(
+        a=names[0],
+        b=names[1],
+        loss_unit=loss_unit(a),
+        points=apart.size,
+        compared=int(known.sum()),
+        statuses=_statuses(a, b),
+        loss=LossDifference(
+            _over_blocks(_median, apart, least=0),
+            _over_blocks(_p95, apart, least=0),
+            _exactly(float(apart[known].max()) if known.any() else math.nan),
+            span(np.where(known, losses[0], np.nan)) if known.any() else math.nan,
+        ),
+        spearman=_over_blocks(lambda *sides: float(spearman(*sides)), *losses, least=-1, most=1),
+        slopes=_compare_slopes(a, b),
+        parting=_part(a, losses, apart) if known.any() else None,
+        differing=differing,
+        data=(a, b),
+        command=command,
+    )
+
+
+def check_landscapes(ours: Sequence[str], theirs: Sequence[str], unit: str, other: str) -> None:
+    """Raise ValueError where B has other parameters than A, or losses in another unit."""
+    if list(ours) != list(theirs):
+        pairs = zip(ours, theirs, strict=False)
+        first = next(((x, y) for x, y in pairs if x != y), (f"{len(ours)} of them", f"{len(theirs)}"))
+        raise ValueError(
+            f"slices to compare have the same parameters; A has {first[0]} where B has {first[1]}, so compare "
+            "landscapes of one space"
+        )
+    if unit != other:
+        raise ValueError(
+            f"losses to compare have one unit; A's is {unit or 'none'} and B's {other or 'none'}, so compare "
+            "landscapes that count the same"
+        )
+
+
+def check_planes(ours: Plane, theirs: Plane) -> None:
+    """Raise ValueError where two planes, or their samples, are not the same, and say what of them is not."""
+    if ours.resolution != theirs.resolution:
+        sizes = (" x ".join(map(str, one.resolution)) for one in (ours, theirs))
+        raise ValueError("slices to compare have the same points; A has {} and B {}; ".format(*sizes) + ANYTHING)
+    for field, said in (("basis", "directions"), ("lower", "lower ends"), ("upper", "upper ends"), ("origin", "point")):
+        one, other = getattr(ours, field), getattr(theirs, field)
+        if not torch.allclose(one, other, rtol=ROUNDING, atol=ROUNDING * float(one.abs().max())):
+            values = _name_axes(ours, theirs) if field == "basis" else _where_apart(one, other)
+            raise ValueError(f"slices to compare lie on one plane; the {said} differ: {values}; {ANYTHING}")
+
+
+def check_finished(*slices: xr.Dataset) -> None:
+    """Raise ValueError where samples are missing."""
+    for name, dataset in zip("AB", slices, strict=False):
+        if missing := int((dataset["status"] == Status.MISSING).sum()):
+            raise ValueError(f"{missing} samples of {name} are missing; let what samples it go on first")
+
+
+def _name_axes(ours: Plane, theirs: Plane) -> str:
+    return " and ".join(f"{name} is along {', '.join(one.names)}" for name, one in (("A", ours), ("B", theirs)))
+
+
+def _where_apart(one: torch.Tensor, other: torch.Tensor) -> str:
+    at = int((one - other).abs().argmax())
+    return f"number {at} is {float(one[at]):.6g} in A and {float(other[at]):.6g} in B"
+
+
+def parameters(dataset: xr.Dataset) -> list[str]:
+    """Return the names of a slice's parameters."""
+    return [str(name) for name in dataset["dim"].to_numpy()]
+
+
+def loss_unit(dataset: xr.Dataset) -> str:
+    """Return the unit of a slice's losses, empty where they have none."""
+    return str(dataset["loss"].attrs.get("units", ""))
+
+
+def _on_one_lattice(a: xr.Dataset, b: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
+    """Return two slices as `sampled_lattice` does, the same lattice of both."""
+    lacking = [one["status"].to_numpy() == Status.INTERPOLATED for one in (a, b)]
+    either = lacking[0] | lacking[1]
+    marked = (
+        one.assign(status=one["status"].copy(data=np.where(either, Status.INTERPOLATED, one["status"].to_numpy())))
+        for one in (a, b)
+    )
+    first, second = (sampled_lattice(one) for one in marked)
+    return first, second
+
+
+def _settings(dataset: xr.Dataset) -> dict[str, Any]:
+    """Return what a slice is of, by its identity, and the versions of packages that made it."""
+    identity = {name: value for name, value in stored_identity(dataset).items() if name not in PLACING}
+    settings = {name: value for name, value in identity.get("settings", {}).items() if f"settings.{name}" != TWICE}
+    return {**identity, "settings": settings, "versions": stored_provenance(dataset).get("versions", {})}
+
+
+def _names(a: xr.Dataset, b: xr.Dataset, differing: dict[str, tuple[str, str]]) -> list[str]:
+    """Name objective and fidelity of both, and of the same ones the first setting that differs."""
+    known = [stored_identity(one) for one in (a, b)]
+    names = [" · ".join(str(one[key]) for key in ("objective", "fidelity") if one.get(key)) for one in known]
+    if names[0] == names[1] and differing:
+        setting, values = next(iter(differing.items()))
+        short = setting.rpartition(".")[2]
+        return [f"{name} · {short} {value.strip(chr(39))}" for name, value in zip(names, values, strict=True)]
+    return names
+
+
+def _statuses(a: xr.Dataset, b: xr.Dataset) -> tuple[StatusPair, ...]:
+    """Count the pairs of ways in which points ended differently, the most frequent first."""
+    ours, theirs = (one["status"].transpose("v", "u", missing_dims="ignore").to_numpy().ravel() for one in (a, b))
+    pairs = Counter(zip(ours.tolist(), theirs.tolist(), strict=True))
+    return tuple(
+        StatusPair(Status(one).name.lower(), Status(other).name.lower(), count)
+        for (one, other), count in pairs.most_common()
+        if one != other
+    )
+
+
+def _compare_slopes(a: xr.Dataset, b: xr.Dataset) -> SlopeDifference | None:
+    if "grad" not in a or "grad" not in b:
+        return None
+    slopes = [box_slopes(one) for one in (a, b)]
+    cosine = _cosine(*slopes)
+    return SlopeDifference(
+        _over_blocks(_median, cosine, least=-1, most=1),
+        _over_blocks(lambda found: float((found < 0).mean()), cosine, least=0, most=1),
+        _over_blocks(_median, _ratio(*slopes), least=0),
+    )
+
+
+def _cosine(ours: Values, theirs: Values) -> Values:
+    """Return the cosine of slopes, axis last, NaN where either is not known."""
+    rank, shape = ours.shape[-1], ours.shape[:-1]
+    found, _ = gradient_error(theirs.reshape(-1, rank), ours.reshape(-1, rank))
+    known = np.isfinite(ours).all(axis=-1) & np.isfinite(theirs).all(axis=-1)
+    return np.where(known, found.reshape(shape), np.nan)
+
+
+def _ratio(ours: Values, theirs: Values) -> Values:
+    """Return how long slopes are, theirs to ours: 1 of two that are zero, NaN where either is not known."""
+    lengths = [np.linalg.norm(one, axis=-1) for one in (ours, theirs)]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where((lengths[0] == 0) & (lengths[1] == 0), 1.0, lengths[1] / lengths[0])
+
+
+def _part(dataset: xr.Dataset, losses: Sequence[Values], apart: Values) -> Parting:
+    """Return the point of the largest difference."""
+    at = np.unravel_index(np.nanargmax(apart), apart.shape)
+    plane = plane_of(dataset)
+    u = (float(axis[index]) for axis, index in zip(plane.axes(), at[::-1], strict=True))
+    return Parting(dict(zip(plane.labels, u, strict=True)), *(float(loss[at]) for loss in losses))
+
+
+def _over_blocks(
+    statistic: Callable[..., float], *fields: Values, least: float = -math.inf, most: float = math.inf
+) -> Estimate:
+    """Estimate a statistic of fields over the plane whose entries belong together, where none of them is NaN."""
+    known = ~np.any([np.isnan(one) for one in fields], axis=0)
+    numbers = np.where(known, np.arange(known.size).reshape(known.shape), np.nan)
+
+    def of(some: Values) -> float:
+        rows = some[~np.isnan(some)].astype(np.intp)
+        return statistic(*(one.ravel()[rows] for one in fields)) if len(rows) else math.nan
+
+    return jackknife(of, numbers, least=least, most=most)
+
+
+def _median(values: Values) -> float:
+    return float(np.median(values))
+
+
+def _p95(values: Values) -> float:
+    return float(np.quantile(values, 0.95, method="higher"))
+
+
+def _exactly(value: float) -> Estimate:
+    """Return a number that is of these samples, and estimates nothing."""
+    return Estimate(value, math.nan, math.nan)
+
+
+def _share(estimate: Estimate, whole: float) -> Estimate:
+    return Estimate(estimate.value / whole, estimate.low / whole, estimate.high / whole)
