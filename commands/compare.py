@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ..landscapes.slice import Slice
     from .terminal import Bars, Console
 
-LISTED = 12  # settings that differ, in the terminal
+LISTED, RECORD = 12, "compare.json"  # settings that differ, in the terminal; and where all of them are
 
 
 @takes_scene("env", env="")
@@ -98,22 +98,20 @@ def show(found: SliceComparison, console: Console) -> None:
 
 def _say(row: Any) -> str:
     """Return a number with its interval and its unit, a share in percent."""
-    is_share = row.unit.startswith("share")
+    is_share = row.unit.startswith("of ")
     numbers = [(100 if is_share else 1) * value for value in (row.value, row.low, row.high)]
-    value, low, high = (format(number, ".3g" if row.unit else ".5g") for number in numbers)
+    value, low, high = (format(number, ".3g" if row.unit else ".4g") for number in numbers)
     ends = f" ({low} to {high})" if low != "nan" else ""
-    return f"{value}{ends} {row.unit.replace('share', '%')}".rstrip()
+    return f"{value}{ends} {'% ' if is_share else ''}{row.unit}".rstrip()
 
 
 def lines(found: SliceComparison) -> list[str]:
     """Say where losses part, how points ended differently, and which settings differ."""
-    said, unit = list[str](), f" [{found.loss_unit}]" if found.loss_unit else ""
+    said, unit = list[str](), f" {found.loss_unit}".rstrip()
     if apart := found.parting:
         place = ", ".join(f"{label} {value:.4g}" for label, value in apart.place.items())
-        said.append(f"farthest apart at {place}: {apart.a:.4g} in A, {apart.b:.4g} in B{unit}")
+        said.append(f"farthest apart at {place}: A {apart.a:.4g}{unit}, B - A {apart.b - apart.a:.4g}{unit}")
     said += [f"{one.points} points are {one.a} in A and {one.b} in B" for one in found.statuses]
-    differing = [f"{name}: {a} in A, {b} in B" for name, (a, b) in found.differing.items()]
+    differing = found.settings()
     said += differing[:LISTED] or ["no setting differs"]
-    if len(differing) > LISTED:
-        said.append(f"and {len(differing) - LISTED} more settings, in compare.json")
-    return said
+    return said + ([f"and {len(differing) - LISTED} more, in {RECORD}"] if len(differing) > LISTED else [])

@@ -15,6 +15,7 @@ from .space import ParameterSpace
 if TYPE_CHECKING:
     import xarray as xr
 
+ABSENT = "none"  # in the place of a setting's value
 LISTED_SETTINGS = 6  # settings that differ, in the refusal of a store
 
 
@@ -115,4 +116,4 @@ def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _show(settings: Mapping[str, Any], name: str) -> str:
-    return repr(settings[name]) if name in settings else "none"
+    return repr(settings[name]) if name in settings else ABSENT

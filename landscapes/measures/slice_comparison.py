@@ -13,7 +13,7 @@ import torch
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..identity import differing_settings, plane_of, stored_identity, stored_provenance
+from ..identity import ABSENT, differing_settings, plane_of, stored_identity, stored_provenance
 from ..lattice import sampled_lattice
 from ..objective import Status
 from ..plain import plain
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 Values = NDArray[np.float64]
 PLACING = ("plane", "cut", "boxed", "parameters")  # in a slice's identity: where it lies, not what it is of
 TWICE = "settings.name"  # what an identity has by another name, too
+POINTS, RANGE = "of the points", "of A's range"  # what shares are of
+PARTS = {"basis": "directions", "lower": "lower ends", "upper": "upper ends", "origin": "points they go through"}
 ROUNDING = 1e-9  # planes that are no farther apart, relatively, are the same
 ANYTHING = "give the name of an environment as B, which is then sampled on A's plane"
 
@@ -123,6 +125,14 @@ class SliceComparison:
         like = self.data[0]["loss"].transpose("v", "u", missing_dims="ignore")
         return like.copy(data=_cosine(*slopes)).rename("cosine").drop_attrs()
 
+    def settings(self) -> list[str]:
+        """Return a line for each setting that differs, and one for those that only one of the two has."""
+        both = [f"{name}: {a} in A, {b} in B" for name, (a, b) in self.differing.items() if ABSENT not in (a, b)]
+        for side, letter in enumerate("AB"):
+            if alone := [name for name, values in self.differing.items() if values[1 - side] == ABSENT]:
+                both.append(f"only {letter} has {', '.join(alone)}")
+        return both
+
     def record(self) -> dict[str, Any]:
         """Return it as plain JSON, by the names of its fields; what is infinite or not known is None."""
         loss, slopes, parting = self.loss, self.slopes, self.parting
@@ -141,7 +151,10 @@ class SliceComparison:
         return found
 
     def table(self) -> pd.DataFrame:
-        """Return a row for each number, indexed by `measure`: its `value`, its interval `low` to `high`, its `unit`."""
+        """Return a row for each number, indexed by `measure`: its `value`, its interval `low` to `high`, its `unit`.
+
+        The unit of a share is what it is a share of.
+        """
         import pandas as pd
 
         rows = [(name, one.value, one.low, one.high, unit) for name, one, unit in self._numbers()]
@@ -149,19 +162,19 @@ class SliceComparison:
 
     def _numbers(self) -> list[tuple[str, Estimate, str]]:
         """Return each number with its name and unit."""
-        shares, unit, points = self.loss.shares(), self.loss_unit, "share of the points"
         names = {
             "median": "median difference",
             "p95": "difference, 95 % of the points",
             "largest": "largest difference",
         }
-        rows = [("loss in both", _exactly(self.compared / self.points), points)]
-        rows += [(name, getattr(self.loss, field), unit) for field, name in names.items()]
-        rows += [(name, shares[field], "share of A's range") for field, name in names.items()]
+        rows = [("loss in both", _exactly(self.compared / self.points), POINTS)]
+        rows += [(name, getattr(self.loss, field), self.loss_unit) for field, name in names.items()]
+        shares = self.loss.shares()
+        rows += [(f"{name}, relative", shares[field], RANGE) for field, name in names.items()]
         rows += [("rank correlation", self.spearman, "")]
         if self.slopes:
             rows += [("cosine of gradients, median", self.slopes.cosine, "")]
-            rows += [("opposing gradients", self.slopes.opposing, points)]
+            rows += [("opposing gradients", self.slopes.opposing, POINTS)]
             rows += [("length of gradients, B to A, median", self.slopes.ratio, "")]
         return rows
 
@@ -242,7 +255,7 @@ def check_planes(ours: Plane, theirs: Plane) -> None:
     if ours.resolution != theirs.resolution:
         sizes = (" x ".join(map(str, one.resolution)) for one in (ours, theirs))
         raise ValueError("slices to compare have the same points; A has {} and B {}; ".format(*sizes) + ANYTHING)
-    for field, said in (("basis", "directions"), ("lower", "lower ends"), ("upper", "upper ends"), ("origin", "point")):
+    for field, said in PARTS.items():
         one, other = getattr(ours, field), getattr(theirs, field)
         if not torch.allclose(one, other, rtol=ROUNDING, atol=ROUNDING * float(one.abs().max())):
             values = _name_axes(ours, theirs) if field == "basis" else _where_apart(one, other)

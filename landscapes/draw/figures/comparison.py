@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import xarray as xr
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
+from numpy.typing import NDArray
 
 from ...identity import plane_of
 from ...measures.ruggedness import box_slopes
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 
 PITCH, LEAST = 4.8, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
 WIDTH, HEIGHT = 8.0, 2.2  # of the picture of a line, and of each of its panels [inch]
+PLAIN = 3  # digits before or after the point, up to which differences have no power of ten
 LISTED = 4  # settings that differ, in the legend
 
 
@@ -74,11 +77,26 @@ def _loss_scale(found: SliceComparison) -> style.Scale:
 
 
 def _difference_map(ax: Axes, found: SliceComparison) -> None:
-    values = found.difference.to_numpy()
+    values, power = _in_powers(found)
     scale = style.Scale.symmetric(values)
     drawn = contour.cell_map(ax, found.data[0], values, scale, style.DIFFERENCE_MAP)
     panel.caption(ax, "difference of losses, B \N{MINUS SIGN} A")
-    panel.colour_bar(ax, drawn, _difference_name(found), scale)
+    panel.colour_bar(ax, drawn, _name("difference", power, found.loss_unit), scale)
+
+
+def _in_powers(found: SliceComparison) -> tuple[NDArray[np.float64], str]:
+    """Return the differences of losses, and of which power of ten if they are far from 1."""
+    values = found.difference.to_numpy()
+    most = found.loss.largest.value
+    exponent = math.floor(math.log10(most)) if most > 0 else 0
+    if -PLAIN <= exponent < PLAIN:
+        return values, ""
+    return values / 10.0**exponent, style.power(10.0**exponent)
+
+
+def _name(what: str, power: str, unit: str) -> str:
+    """Return what stands along an axis, with the power of ten and the unit of its numbers."""
+    return f"{what} [{' '.join(one for one in (power, unit) if one)}]" if power or unit else what
 
 
 def _cosine_map(ax: Axes, found: SliceComparison) -> None:
@@ -88,18 +106,13 @@ def _cosine_map(ax: Axes, found: SliceComparison) -> None:
     panel.colour_bar(ax, drawn, "cosine of the angle between them", scale)
 
 
-def _difference_name(found: SliceComparison) -> str:
-    return f"difference [{found.loss_unit}]" if found.loss_unit else "difference"
-
-
 def _farthest(ax: Axes, found: SliceComparison) -> list[Artist]:
     """Mark where the losses are farthest apart; return the legend's entry."""
-    if not found.parting or found.parting.a == found.parting.b:
+    if not found.loss.largest.value > 0 or not found.parting:
         return []
-    look, place = page.sheet_of(ax).look(style.FARTHEST), list(found.parting.place.values())
-    apart = found.parting.b - found.parting.a
-    at = place if len(place) == 2 else [*place, apart]
-    (mark,) = ax.plot(*([one] for one in at), **look, zorder=4, label=f"farthest apart: {style.number(apart)}")
+    look, apart = page.sheet_of(ax).look(style.FARTHEST), found.parting.b - found.parting.a
+    at = ([one] for one in found.parting.place.values())
+    (mark,) = ax.plot(*at, **look, zorder=4, label=f"farthest apart, B \N{MINUS SIGN} A: {style.number(apart)}")
     return [mark]
 
 
@@ -111,9 +124,9 @@ def _draw_lines(found: SliceComparison, width: float | None) -> tuple[page.Pictu
     entries = _curves(axes[0], found, [one["loss"].to_numpy() for one in found.data])
     panel.name_axes(axes[0], y=page.loss_name(found.data[0]))
     look = sheet.look(style.stroke(found.points))
-    axes[1].plot(found.difference["u"], found.difference, color=style.INK, **look)
-    entries += _farthest(axes[1], found)
-    panel.name_axes(axes[1], y="B \N{MINUS SIGN} A" + (f" [{found.loss_unit}]" if found.loss_unit else ""))
+    values, power = _in_powers(found)
+    axes[1].plot(found.difference["u"], values, color=style.INK, **look)
+    panel.name_axes(axes[1], y=_name("B \N{MINUS SIGN} A", power, found.loss_unit))
     if found.slopes:
         _curves(axes[2], found, [box_slopes(one)[:, 0] for one in found.data])
         panel.name_axes(axes[2], y=f"slope [{found.loss_unit or 'loss'} per side]")
@@ -161,14 +174,14 @@ def _say(found: SliceComparison) -> list[Patch]:
         said.append(f"length of gradients, B to A, median: {_interval(found.slopes.ratio)}")
     if found.statuses:
         said.append(f"ended differently: {sum(one.points for one in found.statuses)} of {found.points}")
-    settings = [f"{name}: {a} in A, {b} in B" for name, (a, b) in found.differing.items()]
-    more = [f"and {len(settings) - LISTED} more settings differ"] if len(settings) > LISTED else []
+    settings = found.settings()
+    more = [f"and {len(settings) - LISTED} more, in compare.json"] if len(settings) > LISTED else []
     return [Patch(visible=False, label=text) for text in (*said, *settings[:LISTED], *more)]
 
 
 def _interval(one: Estimate) -> str:
-    ends = f" ({style.number(one.low, '.3g')} to {style.number(one.high, '.3g')})" if one.low == one.low else ""
-    return f"{style.number(one.value, '.3g')}{ends}"
+    ends = f" ({style.number(one.low)} to {style.number(one.high)})" if one.low == one.low else ""
+    return f"{style.number(one.value)}{ends}"
 
 
 def _made(found: SliceComparison) -> str:

@@ -17,6 +17,7 @@ from matplotlib.text import Text
 from gradscape.landscapes import draw
 from gradscape.landscapes.draw.figures import page, typesetting
 from gradscape.landscapes.draw.figures.census import census_figure
+from gradscape.landscapes.draw.figures.comparison import comparison_figure
 from gradscape.landscapes.draw.figures.contact import Caption, episode_figure
 from gradscape.landscapes.draw.figures.contour import landscape_figure
 from gradscape.landscapes.draw.figures.convergence import convergence_figure
@@ -33,6 +34,7 @@ from gradscape.landscapes.draw.figures.tradeoff import tradeoff_figure
 from gradscape.landscapes.draw.render.surface import surface_figure
 from gradscape.landscapes.episode import Episode, Part, View
 from gradscape.landscapes.measures import gradient_quality as gradients
+from gradscape.landscapes.measures.slice_comparison import SliceComparison, compare_slices
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.storage.files import print_width
 from gradscape.optim.registry import methods
@@ -63,6 +65,18 @@ def quality(dataset):
     places = gradients.subgrid(flat, 4 if flat.rank == 2 else 16)
     steps, smooth = gradients.compare_differences(Bowl(), flat, places), gradients.smoothed_slopes(Bowl(), flat, places)
     return dataset, steps, gradients.compare_samples(dataset), smooth
+
+
+SHIFTED = DATASET.assign(
+    loss=DATASET["loss"] + 0.1 * DATASET["v"], status=DATASET["status"].copy(data=np.roll(DATASET["status"], 1))
+)
+
+
+def compared(one, other) -> SliceComparison:
+    """Compare two slices, of which one is of other options, many of them."""
+    options = {f"the friction of wall number {number}": 0.1 * number for number in range(8)}
+    identity = json.loads(other.attrs["identity"]) | {"objective": "bowl of another engine", "options": options}
+    return compare_slices(one, other.assign_attrs(identity=json.dumps(identity)), command=COMMAND)
 
 
 EPISODE = Episode(
@@ -97,6 +111,10 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
         lambda width: overlay_figure(dated(SLICE), LAID[:1] * 12, width=width),
     ],
     "race_figure": [lambda width: race_figure(race(tuple(methods())), width=width)],
+    "comparison_figure": [
+        lambda width: comparison_figure(compared(DATASET, SHIFTED), width=width),
+        lambda width: comparison_figure(compared(LINE, LINE.assign(loss=1.2 * LINE["loss"])), width=width),
+    ],
     "surface_figure": [
         lambda width: surface_figure(dated(SLICE), LAID, width=width),
         lambda width: surface_figure(PLANE, width=width),
