@@ -125,13 +125,18 @@ class SliceComparison:
         like = self.data[0]["loss"].transpose("v", "u", missing_dims="ignore")
         return like.copy(data=_cosine(*slopes)).rename("cosine").drop_attrs()
 
+    @property
+    def shared(self) -> dict[str, tuple[str, str]]:
+        """Those of the settings that differ which both slices have."""
+        return {name: values for name, values in self.differing.items() if ABSENT not in values}
+
     def settings(self) -> list[str]:
         """Return a line for each setting that differs, and one for those that only one of the two has."""
-        both = [f"{name}: {a} in A, {b} in B" for name, (a, b) in self.differing.items() if ABSENT not in (a, b)]
+        said = [f"{name}: {a} in A, {b} in B" for name, (a, b) in self.shared.items()]
         for side, letter in enumerate("AB"):
             if alone := [name for name, values in self.differing.items() if values[1 - side] == ABSENT]:
-                both.append(f"only {letter} has {', '.join(alone)}")
-        return both
+                said.append(f"only {letter} has {', '.join(alone)}")
+        return said
 
     def record(self) -> dict[str, Any]:
         """Return it as plain JSON, by the names of its fields; what is infinite or not known is None."""

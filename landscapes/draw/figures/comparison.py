@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from ...statistics import Estimate
 
 PITCH, LEAST = 4.8, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
-WIDTH, HEIGHT = 8.0, 2.2  # of the picture of a line, and of each of its panels [inch]
+WIDTH, HEIGHT, ROOM = 8.0, 2.2, 1.2  # of the picture of a line, height of its panels, room beside them [inch]
+FLATTEST = 0.55  # of these panels, against those on a screen
 PLAIN = 3  # digits before or after the point, up to which differences have no power of ten
 LISTED = 4  # settings that differ, in the legend
 
@@ -32,8 +33,8 @@ def comparison_figure(found: SliceComparison, *, width: float | None = None) -> 
     """Draw the losses of both slices on one scale, their difference, and the cosine of their gradients.
 
     Each cell, or point of a line, is a sample of both; nothing is interpolated. The scale of differences is the same
-    to both sides of zero. Where a sample failed in one of the slices it is hatched in what is drawn of both. Of a line
-    the gradients themselves are drawn, as their cosine is but a sign.
+    to both sides of zero. Where a sample failed in one of the slices, what is drawn of both is hatched. Over a line
+    curves break there, and the gradients themselves are drawn, as their cosine is but a sign.
 
     Raises ValueError where the page is too narrow or too wide.
     """
@@ -102,8 +103,8 @@ def _name(what: str, power: str, unit: str) -> str:
 def _cosine_map(ax: Axes, found: SliceComparison) -> None:
     scale, colours = style.Scale.linear(-1.0, 1.0), style.COSINE["cmap"]
     drawn = contour.cell_map(ax, found.data[0], found.cosine.to_numpy(), scale, colours)
-    panel.caption(ax, "gradients of A and B")
-    panel.colour_bar(ax, drawn, "cosine of the angle between them", scale)
+    panel.caption(ax, "gradients of A against B")
+    panel.colour_bar(ax, drawn, "cosine of gradients", scale)
 
 
 def _farthest(ax: Axes, found: SliceComparison) -> list[Artist]:
@@ -119,7 +120,8 @@ def _farthest(ax: Axes, found: SliceComparison) -> list[Artist]:
 def _draw_lines(found: SliceComparison, width: float | None) -> tuple[page.Picture, list[Artist]]:
     panels, plane = 3 if found.slopes else 2, plane_of(found.data[0])
     sheet = style.Sheet.of(width, pitch=WIDTH)
-    picture = page.Picture(sheet, panels * HEIGHT * sheet.zoom)
+    height = max(FLATTEST, sheet.zoom) * HEIGHT
+    picture = page.Picture(sheet, panels * height + 1.6)
     axes = list(picture.subplots(panels, 1, sharex=True, squeeze=False)[:, 0])
     entries = _curves(axes[0], found, [one["loss"].to_numpy() for one in found.data])
     panel.name_axes(axes[0], y=page.loss_name(found.data[0]))
@@ -132,11 +134,12 @@ def _draw_lines(found: SliceComparison, width: float | None) -> tuple[page.Pictu
         panel.name_axes(axes[2], y=f"slope [{found.loss_unit or 'loss'} per side]")
     for ax in axes:
         panel.dress(ax)
-        ax.set_box_aspect(HEIGHT / WIDTH)
+        ax.set_box_aspect(height / (sheet.width - ROOM * sheet.type))
         ax.set_xlim(float(plane.lower[0]), float(plane.upper[0]))
     for ax in axes[1:]:
         ax.axhline(0, color=style.FAINT, linewidth=0.8 * sheet.weight, zorder=0.5)
     panel.name_axes(axes[-1], plane.labels[0])
+    picture.align_ylabels(axes)
     return picture, [*entries, *_failures(_where_either_failed(found))]
 
 
@@ -155,10 +158,11 @@ def _where_either_failed(found: SliceComparison) -> xr.Dataset:
 
 
 def _failures(both: xr.Dataset) -> list[Patch]:
-    """Return the legend's entries of the failures in either slice."""
+    """Return the legend's entries of the failures in either slice; over a line, whose curves break, without a sign."""
     entries = page.failure_key(both)
     for one in entries:
-        one.set_label(f"in A or B {one.get_label()}")
+        kind, _, count = str(one.get_label()).rpartition(": ")
+        one.set(label=f"{kind} in A or B: {count}", visible=both["loss"].ndim == 2)
     return entries
 
 
@@ -174,8 +178,9 @@ def _say(found: SliceComparison) -> list[Patch]:
         said.append(f"length of gradients, B to A, median: {_interval(found.slopes.ratio)}")
     if found.statuses:
         said.append(f"ended differently: {sum(one.points for one in found.statuses)} of {found.points}")
-    settings = found.settings()
-    more = [f"and {len(settings) - LISTED} more, in compare.json"] if len(settings) > LISTED else []
+    settings = [f"{name}: {a} in A, {b} in B" for name, (a, b) in found.shared.items()]
+    rest = len(found.differing) - min(len(settings), LISTED)
+    more = [f"and {rest} more settings differ"] if rest else []
     return [Patch(visible=False, label=text) for text in (*said, *settings[:LISTED], *more)]
 
 
