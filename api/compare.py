@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ..envs.base import Environment
     from ..jobs.scene import SceneSpec
     from ..jobs.watch import Watch
-    from ..landscapes.measures.slice_comparison import SliceComparison
+    from ..landscapes.measures.slice_comparison_record import SliceComparison
     from ..landscapes.objective import Objective
     from ..landscapes.slice import Slice
 

@@ -12,12 +12,12 @@ from ..jobs.scene import SceneSpec
 from .arguments import Json, Print, takes_scene
 
 if TYPE_CHECKING:
-    from ..landscapes.measures.slice_comparison import SliceComparison
+    from ..landscapes.measures.slice_comparison_record import SliceComparison
     from ..landscapes.objective import Objective
     from ..landscapes.slice import Slice
     from .terminal import Bars, Console
 
-LISTED, RECORD = 12, "compare.json"  # settings that differ, in the terminal; and where all of them are
+LISTED = 12  # settings that differ, in the terminal
 
 
 @takes_scene("env", env="")
@@ -107,6 +107,8 @@ def _say(row: Any) -> str:
 
 def lines(found: SliceComparison) -> list[str]:
     """Say where losses part, how points ended differently, and which settings differ."""
+    from ..jobs.compare import RECORD
+
     said, unit = list[str](), f" {found.loss_unit}".rstrip()
     if apart := found.parting:
         place = ", ".join(f"{label} {value:.4g}" for label, value in apart.place.items())

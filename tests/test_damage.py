@@ -17,7 +17,7 @@ MADE = {  # by folder: the verb that leaves it, then those that read it
         CUT,
         "report cut --points 2 --out anew",
         "overlay cut run --out over",
-        "compare cut cut --out anew",
+        "compare cut cut --out alike",
         "export cut --out cut.csv --force",
     ],
     "run": ["optimize branin --method random --budget 4 --out run"],

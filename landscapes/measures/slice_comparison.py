@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,192 +12,23 @@ import torch
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..identity import ABSENT, differing_settings, plane_of, stored_identity, stored_provenance
+from ..identity import differing_settings, plane_of, stored_identity, stored_provenance
 from ..lattice import sampled_lattice
 from ..objective import Status
-from ..plain import plain
 from ..statistics import Estimate, jackknife
-from .fidelity import gradient_error, spearman
+from .fidelity import gradient_error, median_of, p95_of, spearman
 from .ruggedness import box_slopes, span
+from .slice_comparison_record import LossDifference, Parting, SliceComparison, SlopeDifference, StatusPair, exactly
 
 if TYPE_CHECKING:
-    import pandas as pd
-
-    from ..draw.figures.page import Picture
     from ..plane import Plane
 
 Values = NDArray[np.float64]
 PLACING = ("plane", "cut", "boxed", "parameters")  # in a slice's identity: where it lies, not what it is of
 TWICE = "settings.name"  # what an identity has by another name, too
-POINTS, RANGE = "of the points", "of A's range"  # what shares are of
 PARTS = {"basis": "directions", "lower": "lower ends", "upper": "upper ends", "origin": "points they go through"}
 ROUNDING = 1e-9  # planes that are no farther apart, relatively, are the same
 ANYTHING = "give the name of an environment as B, which is then sampled on A's plane"
-
-
-@dataclass(frozen=True)
-class LossDifference:
-    """Hold how far losses are apart [loss unit]: `median`, 95th percentile, `largest`; and the `range` of A's losses.
-
-    Nothing is estimated by the largest, which has no interval.
-    """
-
-    median: Estimate
-    p95: Estimate
-    largest: Estimate
-    range: float
-
-    def shares(self) -> dict[str, Estimate]:
-        """Return the three as shares of the range, NaN where A's losses are all the same."""
-        whole = self.range or math.nan
-        return {name: _share(getattr(self, name), whole) for name in ("median", "p95", "largest")}
-
-
-@dataclass(frozen=True)
-class SlopeDifference:
-    """Hold how gradients differ along the plane, whose sides count as 1: two that are exactly zero agree.
-
-    Medians of `cosine` and of `ratio`, B's length to A's; `opposing` is the share of points with a cosine below 0.
-    """
-
-    cosine: Estimate
-    opposing: Estimate
-    ratio: Estimate
-
-
-@dataclass(frozen=True)
-class Parting:
-    """Say where losses are farthest apart: coordinates by the labels of the plane's axes, and both losses there."""
-
-    place: dict[str, float]
-    a: float
-    b: float
-
-
-@dataclass(frozen=True)
-class StatusPair:
-    """Count the points that ended in one way in A and in another in B."""
-
-    a: str
-    b: str
-    points: int
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class SliceComparison:
-    """Hold B against A, two slices of one plane; `a` and `b` name what they are of.
-
-    Of `points`, `compared` have a loss in both; `statuses` counts those that ended differently. `slopes` is None where
-    either has no gradients, `parting` where no point is compared. `differing` has both values of every setting that is
-    not the same, by its name. `data` are the samples: of refined slices the finest lattice that both sampled.
-    """
-
-    a: str
-    b: str
-    loss_unit: str
-    points: int
-    compared: int
-    statuses: tuple[StatusPair, ...]
-    loss: LossDifference
-    spearman: Estimate
-    slopes: SlopeDifference | None
-    parting: Parting | None
-    differing: dict[str, tuple[str, str]]
-    data: tuple[xr.Dataset, xr.Dataset]
-    command: str
-
-    @property
-    def difference(self) -> xr.DataArray:
-        """B's losses less A's [loss unit], NaN where either has none."""
-        a, b = (one["loss"] for one in self.data)
-        return b.copy(data=b.to_numpy() - a.to_numpy()).rename("difference")
-
-    @property
-    def cosine(self) -> xr.DataArray:
-        """The cosine between gradients along the plane, NaN where either has none.
-
-        Raises ValueError where one of the slices has no gradients at all.
-        """
-        if self.slopes is None:
-            raise ValueError("one of the slices was sampled without gradients; sample it again with gradients=True")
-        slopes = (box_slopes(one) for one in self.data)
-        like = self.data[0]["loss"].transpose("v", "u", missing_dims="ignore")
-        return like.copy(data=_cosine(*slopes)).rename("cosine").drop_attrs()
-
-    @property
-    def shared(self) -> dict[str, tuple[str, str]]:
-        """Those of the settings that differ which both slices have."""
-        return {name: values for name, values in self.differing.items() if ABSENT not in values}
-
-    def settings(self) -> list[str]:
-        """Return a line for each setting that differs, and one for those that only one of the two has."""
-        said = [f"{name}: {a} in A, {b} in B" for name, (a, b) in self.shared.items()]
-        for side, letter in enumerate("AB"):
-            if alone := [name for name, values in self.differing.items() if values[1 - side] == ABSENT]:
-                said.append(f"only {letter} has {', '.join(alone)}")
-        return said
-
-    def record(self) -> dict[str, Any]:
-        """Return it as plain JSON, by the names of its fields; what is infinite or not known is None."""
-        loss, slopes, parting = self.loss, self.slopes, self.parting
-        found: dict[str, Any] = plain(
-            {
-                **{name: getattr(self, name) for name in ("a", "b", "loss_unit", "points", "compared")},
-                "statuses": [asdict(one) for one in self.statuses],
-                "loss": {**vars(loss), "shares": loss.shares()},
-                "spearman": self.spearman,
-                "slopes": vars(slopes) if slopes else None,
-                "parting": asdict(parting) if parting else None,
-                "differing": {name: {"a": a, "b": b} for name, (a, b) in self.differing.items()},
-                "command": self.command,
-            }
-        )
-        return found
-
-    def table(self) -> pd.DataFrame:
-        """Return a row for each number, indexed by `measure`: its `value`, its interval `low` to `high`, its `unit`.
-
-        The unit of a share is what it is a share of.
-        """
-        import pandas as pd
-
-        rows = [(name, one.value, one.low, one.high, unit) for name, one, unit in self._numbers()]
-        return pd.DataFrame(rows, columns=["measure", "value", "low", "high", "unit"]).set_index("measure")
-
-    def _numbers(self) -> list[tuple[str, Estimate, str]]:
-        """Return each number with its name and unit."""
-        names = {
-            "median": "median difference",
-            "p95": "difference, 95 % of the points",
-            "largest": "largest difference",
-        }
-        rows = [("loss in both", _exactly(self.compared / self.points), POINTS)]
-        rows += [(name, getattr(self.loss, field), self.loss_unit) for field, name in names.items()]
-        shares = self.loss.shares()
-        rows += [(f"{name}, relative", shares[field], RANGE) for field, name in names.items()]
-        rows += [("rank correlation", self.spearman, "")]
-        if self.slopes:
-            rows += [("cosine of gradients, median", self.slopes.cosine, "")]
-            rows += [("opposing gradients", self.slopes.opposing, POINTS)]
-            rows += [("length of gradients, B to A, median", self.slopes.ratio, "")]
-        return rows
-
-    def plot(self, width: float | None = None) -> Picture:
-        """Draw both losses on one scale, their difference, and the cosine of gradients.
-
-        The picture is matplotlib's figure; `width` is that of a page [mm], and none that of a screen.
-        """
-        from ..draw.figures.comparison import comparison_figure
-
-        return comparison_figure(self, width=width)
-
-    def __repr__(self) -> str:
-        """Return in a line what is compared and what came out."""
-        return f"<SliceComparison of {self.a} and {self.b}: rank correlation {self.spearman.value:.3g}>"
-
-    def _repr_html_(self) -> str:
-        """Show the table in a notebook."""
-        return str(self.table().to_html())
 
 
 def compare_slices(a: xr.Dataset, b: xr.Dataset, *, command: str = "") -> SliceComparison:
@@ -214,7 +44,7 @@ def compare_slices(a: xr.Dataset, b: xr.Dataset, *, command: str = "") -> SliceC
     check_finished(a, b)
     a, b = _on_one_lattice(a, b)
     differing = differing_settings(*(_settings(one) for one in (a, b)))
-    losses = [one["loss"].transpose("v", "u", missing_dims="ignore").to_numpy() for one in (a, b)]
+    losses, cosine = [one["loss"].to_numpy() for one in (a, b)], _cosine(a, b)
     apart, names = np.abs(losses[1] - losses[0]), _names(a, b, differing)
     known = np.isfinite(apart)
     return SliceComparison(
@@ -225,16 +55,18 @@ def compare_slices(a: xr.Dataset, b: xr.Dataset, *, command: str = "") -> SliceC
         compared=int(known.sum()),
         statuses=_statuses(a, b),
         loss=LossDifference(
-            _over_blocks(_median, apart, least=0),
-            _over_blocks(_p95, apart, least=0),
-            _exactly(float(apart[known].max()) if known.any() else math.nan),
+            _over_blocks(median_of, apart, least=0),
+            _over_blocks(p95_of, apart, least=0),
+            exactly(float(apart[known].max()) if known.any() else math.nan),
             span(np.where(known, losses[0], np.nan)) if known.any() else math.nan,
         ),
-        spearman=_over_blocks(lambda *sides: float(spearman(*sides)), *losses, least=-1, most=1),
-        slopes=_compare_slopes(a, b),
+        spearman=_over_blocks(spearman, *losses, least=-1, most=1),
+        slopes=None if cosine is None else _compare_slopes(a, b, cosine.to_numpy()),
         parting=_part(a, losses, apart) if known.any() else None,
         differing=differing,
         data=(a, b),
+        difference=b["loss"].copy(data=losses[1] - losses[0]).rename("difference"),
+        cosine=cosine,
         command=command,
     )
 
@@ -294,7 +126,8 @@ def loss_unit(dataset: xr.Dataset) -> str:
 
 
 def _on_one_lattice(a: xr.Dataset, b: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return two slices as `sampled_lattice` does, the same lattice of both."""
+    """Return two slices as `sampled_lattice` does, the same lattice of both, v before u."""
+    a, b = (one.transpose("v", "u", ..., missing_dims="ignore") for one in (a, b))
     lacking = [one["status"].to_numpy() == Status.INTERPOLATED for one in (a, b)]
     either = lacking[0] | lacking[1]
     marked = (
@@ -325,8 +158,7 @@ def _names(a: xr.Dataset, b: xr.Dataset, differing: dict[str, tuple[str, str]]) 
 
 def _statuses(a: xr.Dataset, b: xr.Dataset) -> tuple[StatusPair, ...]:
     """Count the pairs of ways in which points ended differently, the most frequent first."""
-    ours, theirs = (one["status"].transpose("v", "u", missing_dims="ignore").to_numpy().ravel() for one in (a, b))
-    pairs = Counter(zip(ours.tolist(), theirs.tolist(), strict=True))
+    pairs = Counter(zip(*(one["status"].to_numpy().ravel().tolist() for one in (a, b)), strict=True))
     return tuple(
         StatusPair(Status(one).name.lower(), Status(other).name.lower(), count)
         for (one, other), count in pairs.most_common()
@@ -334,24 +166,26 @@ def _statuses(a: xr.Dataset, b: xr.Dataset) -> tuple[StatusPair, ...]:
     )
 
 
-def _compare_slopes(a: xr.Dataset, b: xr.Dataset) -> SlopeDifference | None:
-    if "grad" not in a or "grad" not in b:
-        return None
-    slopes = [box_slopes(one) for one in (a, b)]
-    cosine = _cosine(*slopes)
+def _compare_slopes(a: xr.Dataset, b: xr.Dataset, cosine: Values) -> SlopeDifference:
     return SlopeDifference(
-        _over_blocks(_median, cosine, least=-1, most=1),
-        _over_blocks(lambda found: float((found < 0).mean()), cosine, least=0, most=1),
-        _over_blocks(_median, _ratio(*slopes), least=0),
+        _over_blocks(median_of, cosine, least=-1, most=1),
+        _over_blocks(_opposing, cosine, least=0, most=1),
+        _over_blocks(median_of, _ratio(box_slopes(a), box_slopes(b)), least=0),
     )
 
 
-def _cosine(ours: Values, theirs: Values) -> Values:
-    """Return the cosine of slopes, axis last, NaN where either is not known."""
-    rank, shape = ours.shape[-1], ours.shape[:-1]
-    found, _ = gradient_error(theirs.reshape(-1, rank), ours.reshape(-1, rank))
+def _opposing(cosine: Values) -> Values:
+    return np.asarray((cosine < 0).mean())
+
+
+def _cosine(a: xr.Dataset, b: xr.Dataset) -> xr.DataArray | None:
+    """Return the cosine between gradients along the plane, NaN where either failed; None without gradients."""
+    if "grad" not in a or "grad" not in b:
+        return None
+    ours, theirs = (box_slopes(one) for one in (a, b))
+    found, _ = gradient_error(*(one.reshape(-1, one.shape[-1]) for one in (theirs, ours)))
     known = np.isfinite(ours).all(axis=-1) & np.isfinite(theirs).all(axis=-1)
-    return np.where(known, found.reshape(shape), np.nan)
+    return a["loss"].copy(data=np.where(known, found.reshape(known.shape), np.nan)).rename("cosine").drop_attrs()
 
 
 def _ratio(ours: Values, theirs: Values) -> Values:
@@ -370,7 +204,7 @@ def _part(dataset: xr.Dataset, losses: Sequence[Values], apart: Values) -> Parti
 
 
 def _over_blocks(
-    statistic: Callable[..., float], *fields: Values, least: float = -math.inf, most: float = math.inf
+    statistic: Callable[..., Values], *fields: Values, least: float = -math.inf, most: float = math.inf
 ) -> Estimate:
     """Estimate a statistic of fields over the plane whose entries belong together, where none of them is NaN."""
     known = ~np.any([np.isnan(one) for one in fields], axis=0)
@@ -378,23 +212,6 @@ def _over_blocks(
 
     def of(some: Values) -> float:
         rows = some[~np.isnan(some)].astype(np.intp)
-        return statistic(*(one.ravel()[rows] for one in fields)) if len(rows) else math.nan
+        return float(statistic(*(one.ravel()[rows] for one in fields))) if len(rows) else math.nan
 
     return jackknife(of, numbers, least=least, most=most)
-
-
-def _median(values: Values) -> float:
-    return float(np.median(values))
-
-
-def _p95(values: Values) -> float:
-    return float(np.quantile(values, 0.95, method="higher"))
-
-
-def _exactly(value: float) -> Estimate:
-    """Return a number that is of these samples, and estimates nothing."""
-    return Estimate(value, math.nan, math.nan)
-
-
-def _share(estimate: Estimate, whole: float) -> Estimate:
-    return Estimate(estimate.value / whole, estimate.low / whole, estimate.high / whole)

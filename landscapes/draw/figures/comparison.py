@@ -19,7 +19,7 @@ from .. import style
 from . import contour, page, panel
 
 if TYPE_CHECKING:
-    from ...measures.slice_comparison import SliceComparison
+    from ...measures.slice_comparison_record import SliceComparison
     from ...statistics import Estimate
 
 PITCH, LEAST = 4.8, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
@@ -54,8 +54,8 @@ def _draw_maps(found: SliceComparison, width: float | None) -> tuple[page.Pictur
     entries = _loss_maps(axes, found)
     _difference_map(axes[2], found)
     entries += _farthest(axes[2], found)
-    if found.slopes:
-        _cosine_map(axes[3], found)
+    if found.cosine is not None:
+        _cosine_map(axes[3], found.data[0], found.cosine)
     for ax, dataset in zip(axes, (*found.data, both, both), strict=False):
         contour.frame(ax, dataset, plane_of(dataset))
         panel.name_outer(ax, *plane_of(dataset).labels)
@@ -100,9 +100,9 @@ def _name(what: str, power: str, unit: str) -> str:
     return f"{what} [{' '.join(one for one in (power, unit) if one)}]" if power or unit else what
 
 
-def _cosine_map(ax: Axes, found: SliceComparison) -> None:
+def _cosine_map(ax: Axes, dataset: xr.Dataset, cosine: xr.DataArray) -> None:
     scale, colours = style.Scale.linear(-1.0, 1.0), style.COSINE["cmap"]
-    drawn = contour.cell_map(ax, found.data[0], found.cosine.to_numpy(), scale, colours)
+    drawn = contour.cell_map(ax, dataset, cosine.to_numpy(), scale, colours)
     panel.caption(ax, "gradients of A against B")
     panel.colour_bar(ax, drawn, "cosine of gradients", scale)
 

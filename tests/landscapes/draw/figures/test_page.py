@@ -34,7 +34,8 @@ from gradscape.landscapes.draw.figures.tradeoff import tradeoff_figure
 from gradscape.landscapes.draw.render.surface import surface_figure
 from gradscape.landscapes.episode import Episode, Part, View
 from gradscape.landscapes.measures import gradient_quality as gradients
-from gradscape.landscapes.measures.slice_comparison import SliceComparison, compare_slices
+from gradscape.landscapes.measures.slice_comparison import compare_slices
+from gradscape.landscapes.measures.slice_comparison_record import SliceComparison
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.storage.files import print_width
 from gradscape.optim.registry import methods
@@ -68,7 +69,8 @@ def quality(dataset):
 
 
 SHIFTED = DATASET.assign(
-    loss=DATASET["loss"] + 0.1 * DATASET["v"], status=DATASET["status"].copy(data=np.roll(DATASET["status"], 1))
+    loss=DATASET["loss"].copy(data=np.roll(DATASET["loss"], 1)),
+    status=DATASET["status"].copy(data=np.roll(DATASET["status"], 1)),
 )
 
 
