@@ -17,7 +17,14 @@ if TYPE_CHECKING:
     from ..landscapes.conformance.finding import Finding
     from .terminal import Console
 
-STYLES = {"pass": "green", "fail": "bold red", "skip": "dim", "known": "yellow", "unexpected": "bold red"}
+STYLES = {
+    "pass": "green",
+    "fail": "bold red",
+    "skip": "dim",
+    "warn": "yellow",
+    "known": "yellow",
+    "unexpected": "bold red",
+}
 
 
 @takes_scene("tolerance", "deterministic")
@@ -29,9 +36,11 @@ def check(
 ) -> None:
     """Check that an environment keeps what every environment promises, and that it answers at the extremes.
 
-    Checked are shapes, refusals, batches, determinism, gradients against differences over several steps, corners of the
-    box and beyond, long time steps, materials, horizons and precision. Each check prints a line; nothing is written.
-    The exit code is 0 where the environment passes and 1 where it fails.
+    Checked are shapes, refusals, batches, determinism, gradients against differences over several steps and at special
+    places, their growth with the length of an episode, forward against reverse differentiation where both exist,
+    corners of the box and beyond, long time steps, materials, horizons and precision. Each check prints a line; nothing
+    is written. A warning is no failure: the gradient is right, and of no use over an optimiser's step. The exit code is
+    0 where the environment passes and 1 where it fails.
 
     Example: landscape check bounce
     """

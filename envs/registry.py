@@ -27,7 +27,7 @@ COMPUTES_LOSSES = False  # for `code`
 
 Kind = TypeVar("Kind", bound="Environment")
 GROUP = "gradscape.environments"
-EXTRAS = {"mjx": ("mujoco", "mujoco-mjx", "jax")}  # of this package, and what each brings
+EXTRAS = {"mjx": ("mujoco", "mujoco-mjx", "jax"), "newton": ("newton",)}  # of this package, and what each brings
 SCENE = ("draft", "standard", "reference")
 
 
@@ -51,6 +51,11 @@ class Entry:
 
 def _mjx_entry(name: str, target: str, dim: str, parameters: str, model: str) -> Entry:
     return Entry(name, f"gradscape.envs.mjx.scenes:{target}", dim, parameters, f"MuJoCo in JAX: {model}", SCENE, "mjx")
+
+
+def _newton_entry(name: str, target: str, model: str) -> Entry:
+    where, parameters = f"gradscape.envs.newton.scenes:{target}", "initial velocity x, y, z [m/s]"
+    return Entry(name, where, "3", parameters, f"Newton: {model}", SCENE[:2], "newton")
 
 
 def _function_entry(name: str, target: str, model: str, dim: str = "2") -> Entry:
@@ -146,6 +151,9 @@ BUILTIN = (
         "cartpole's chain",
     ),
     _mjx_entry("mjx-push", "Push", "10", "5 x (ball velocity x, y) [m/s]", "a box pushed across friction"),
+    _newton_entry("newton-flight", "Flight", "a sphere in free flight"),
+    _newton_entry("newton-ball", "Ball", "bounce's ball and target"),
+    _newton_entry("newton-cloth", "ClothThrow", "a cloth thrown onto a floor"),
     _function_entry("ackley", "Ackley", "many shallow minima around a funnel", "any"),
     _function_entry("beale", "Beale", "flat plain with sharp corner peaks"),
     _function_entry("branin", "Branin", "three equal minima in a smooth valley"),

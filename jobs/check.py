@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from ..landscapes.conformance.extremes import ExtremeCase
 
 FACTORS = (1, 2, 4, 8)  # of the fidelity's time step, and of the scene's horizon
+GROWTH = (1, 2, 4)  # of the horizon: how long gradients are held against the rise of the loss
+MODES = ("forward", "reverse")  # of automatic differentiation
 
 
 def _materials(job: CheckJob) -> list[ExtremeCase]:
@@ -156,6 +158,8 @@ class CheckJob:
             precision=self.env.fidelity.precision,
             twin=_twin(self),
             variants=[*_time_steps(self), *_materials(self), *_horizons(self)],
+            horizons=_lengths(self),
+            other_mode=_other_mode(self),
             expected=self.env.known_failures.get(self.env.fidelity.name),
             follow=follow,
         )
@@ -165,7 +169,7 @@ class CheckJob:
         from ..landscapes.conformance.suite import episodes
 
         env, cost = self.env, episode_cost(self.env)
-        plain, sloped = episodes(env.space.dim, self.points)
+        plain, sloped = episodes(env.space.dim, self.points, tuple(_lengths(self)))
         sloped += 2 * (sum(FACTORS) + 4)  # two points over longer horizons, time steps and materials
         seconds = (plain * cost.forward + sloped * cost.gradient) / env.threads
         subject = f"{env.name} · {env.fidelity.name} · {env.device} · {env.engine} · {self.points} points"
@@ -179,7 +183,7 @@ def _need(dim: int, points: int) -> Need:
     return Need(4.0 * 8 * dim * sum(episodes(dim, points)))
 
 
-def _with_option(scene: SceneSpec, option: str, value: float) -> Callable[[], Environment]:
+def _with_option(scene: SceneSpec, option: str, value: float | str) -> Callable[[], Environment]:
     """Return what makes a scene with one of its options changed."""
     return replace(scene, options={**scene.options, option: value}).make
 
@@ -236,13 +240,38 @@ def _time_step(job: CheckJob, factor: int, dt: float) -> ExtremeCase:
 def _horizons(job: CheckJob) -> list[ExtremeCase]:
     from ..landscapes.conformance.extremes import ExtremeCase
 
-    if "horizon" not in {field.name for field in fields(job.env.options)}:
+    if (own := _horizon(job)) is None:
         return [ExtremeCase("horizon 1x to 8x", why="it has no option `horizon`")]
-    own = job.env.options.horizon
     longer = [
         ExtremeCase(f"horizon {factor}x", _with_option(job.spec, "horizon", factor * own)) for factor in FACTORS[1:]
     ]
     return [ExtremeCase("horizon 1x", lambda: job.env), *longer]
+
+
+def _horizon(job: CheckJob) -> float | None:
+    """Return the environment's option `horizon`; None where it has none."""
+    there = "horizon" in {field.name for field in fields(job.env.options)}
+    return job.env.options.horizon if there else None
+
+
+def _lengths(job: CheckJob) -> dict[float, Callable[[], Environment]]:
+    """Return what makes the environment with longer episodes, in float64 where it computes in that, by factor."""
+    if (own := _horizon(job)) is None:
+        return {}
+    exact = replace(job.spec, fidelity=replace(job.env.fidelity, precision="float64"))
+    with suppress(ValueError):  # refused: it computes in its own precision only
+        exact.make()
+        return {factor: _with_option(exact, "horizon", factor * own) for factor in GROWTH}
+    return {factor: _with_option(job.spec, "horizon", factor * own) for factor in GROWTH}
+
+
+def _other_mode(job: CheckJob) -> Callable[[], Environment] | None:
+    """Return what makes the environment with gradients by the other mode, where its option `mode` offers both."""
+    mode = getattr(job.env.options, "mode", None)
+    if mode not in MODES:
+        return None
+    (other,) = set(MODES) - {mode}
+    return _with_option(job.spec, "mode", other)
 
 
 def _record(finding: Finding) -> dict[str, Any]:

@@ -1,9 +1,9 @@
-"""Simulation engines: the only place that knows Warp, Taichi or MuJoCo."""
+"""Simulation engines: the only place that knows Warp, Taichi, MuJoCo or Newton."""
 
-from . import mjx, taichi, warp
+from . import mjx, newton, taichi, warp
 from .engine import Engine
 
-ENGINES = {engine.name: engine for engine in (warp.ENGINE, taichi.ENGINE, mjx.ENGINE)}
+ENGINES = {engine.name: engine for engine in (warp.ENGINE, taichi.ENGINE, mjx.ENGINE, newton.ENGINE)}
 
 
 def find_engine(name: str) -> Engine:

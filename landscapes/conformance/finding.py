@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-PASS, FAIL, SKIP, KNOWN, UNEXPECTED = "pass", "fail", "skip", "known", "unexpected"
+PASS, FAIL, SKIP, WARN, KNOWN, UNEXPECTED = "pass", "fail", "skip", "warn", "known", "unexpected"
 
 
 @dataclass(frozen=True)
 class Finding:
     """Say how one check ended.
 
-    `outcome` is pass, fail or skip; known is a failure that was expected, unexpected a pass where a failure was.
-    `figure` is what was measured, `why` the reason where it is not plain, `numbers` the same to compute with, and
-    `table` a row of numbers for each step of a ladder.
+    `outcome` is pass, fail or skip; warn, where no promise is broken and a user should know it all the same; known is a
+    failure that was expected, unexpected a pass where a failure was. `figure` is what was measured, `why` the reason
+    where it is not plain, `numbers` the same to compute with, and `table` a row of numbers for each step of a ladder.
     """
 
     check: str

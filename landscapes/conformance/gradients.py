@@ -12,16 +12,18 @@ from torch import Tensor
 from torch.autograd.gradcheck import GradcheckError
 
 from ..objective import Objective, Status, evaluate
-from .finding import SKIP, Finding, verdict
+from .finding import PASS, SKIP, WARN, Finding, verdict
 from .subject import Subject, difference, size
 
 DIFFERENCE_STEPS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)  # steps, as shares of the box
+OPTIMISER_STEP = 1e-2  # of the box: what a step of a search is long
 FINER_STEPS = (1e-8, 1e-7)  # in float64, where no other agrees: a loss that jumps often needs a step between its jumps
 GRADCHECK_STEPS = (1e-6, 1e-7, 1e-8, 1e-9, 1e-10)  # of gradcheck, which has to agree at every point at once
 ALONG_RANDOM, ALONG_AXES = 2, 1  # directions at each point
 SLOPES = ALONG_RANDOM + ALONG_AXES
 SIGNS = 0.75  # share of slopes whose sign has to agree
 CLEAR = 10  # times the noise is what a slope has to be, to be compared
+USEFUL = 0.5  # what the median relative error of slopes may be over an optimiser's step
 LEAST_SHARE = 0.25  # share of slopes to compare for a step to be judged by
 Function = Callable[[Tensor], Tensor]
 Row = dict[str, float | None]
@@ -33,19 +35,14 @@ def check_slopes(subject: Subject, name: str) -> Finding:
     What passes is the agreement at the best step: a median relative error of at most ten times the third root of the
     precision, where central differences are exact to its two thirds. A slope that its loss's noise hides is left out.
     """
-    space = subject.objective.space
-    points = 0.1 + 0.8 * space.to_unit(subject.x)  # so that the longest step stays within the box
-    here = subject.evaluate(space.from_unit(points))
-    if here.grad is None:
+    slopes = _slopes(subject)
+    if slopes is None:
         return Finding(name, SKIP, "no gradient")
-    base, direction = _slopes(points, subject.seed)
-    slopes = here.grad * (space.upper - space.lower)
-    exact = (slopes.repeat_interleave(SLOPES, dim=0) * direction).sum(dim=1)
-    limit = 10 * subject.eps ** (1 / 3)
-    table = [_step(subject, base, direction, exact, step) for step in DIFFERENCE_STEPS]
-    if subject.precision == "float64" and _best(table, limit, len(base))[1] is False:
-        table = [_step(subject, base, direction, exact, step) for step in FINER_STEPS] + table
-    best, agrees = _best(table, limit, len(base))
+    limit, count = 10 * subject.eps ** (1 / 3), len(slopes[0])
+    table = [_step(subject, *slopes, step) for step in DIFFERENCE_STEPS]
+    if subject.precision == "float64" and _best(table, limit, count)[1] is False:
+        table = [_step(subject, *slopes, step) for step in FINER_STEPS] + table
+    best, agrees = _best(table, limit, count)
     if best is None:
         return Finding(name, SKIP, "no slope to compare", "all are flat, lost in noise, or failed", table=tuple(table))
     figure = (
@@ -54,6 +51,25 @@ def check_slopes(subject: Subject, name: str) -> Finding:
     )
     found = verdict(name, agrees, figure, f"wanted: error {limit:.0e}, sign right {SIGNS:.0%}")
     return replace(found, numbers={**best, "limit": limit}, table=tuple(table))
+
+
+def check_usefulness(subject: Subject, name: str) -> Finding:
+    """Compare the same slopes with differences over a hundredth of the box, which is what an optimiser steps.
+
+    A gradient may be right and yet say nothing of the loss so far away, where it is rugged or jumps: that is a warning
+    and no failure, as it is the landscape's and not the gradient's.
+    """
+    slopes = _slopes(subject)
+    if slopes is None:
+        return Finding(name, SKIP, "no gradient")
+    row = _step(subject, *slopes, OPTIMISER_STEP)
+    if (row["compared"] or 0) < LEAST_SHARE * len(slopes[0]):
+        return Finding(name, SKIP, "no slope to compare", "all are flat, lost in noise, or failed")
+    sign, error = _number(row["sign"]), _number(row["error"])
+    useful = sign >= SIGNS and error <= USEFUL
+    figure = f"over {OPTIMISER_STEP:g} of the box: sign right {sign:.0%}, median relative error {error:.2g}"
+    why = f"slopes do not hold that far: wanted are sign right {SIGNS:.0%} and an error of {USEFUL:g} for a search"
+    return Finding(name, PASS if useful else WARN, figure, "" if useful else why, row)
 
 
 def _best(table: Sequence[Row], limit: float, slopes: int) -> tuple[Row | None, bool]:
@@ -68,17 +84,26 @@ def _number(value: float | None) -> float:
     return torch.nan if value is None else value
 
 
-def _slopes(points: Float[Tensor, "batch dim"], seed: int) -> tuple[Tensor, Tensor]:
-    """Return points and directions in the unit cube, a row for each slope; axes are drawn in turn from all of them."""
+def _slopes(subject: Subject) -> tuple[Tensor, Tensor, Tensor] | None:
+    """Return points and directions in the unit cube, and the slope that the gradient gives there, a row for each slope.
+
+    Axes are drawn in turn from all of them. None where there is no gradient.
+    """
+    space = subject.objective.space
+    points = 0.1 + 0.8 * space.to_unit(subject.x)  # so that the longest step stays within the box
+    here = subject.evaluate(space.from_unit(points))
+    if here.grad is None:
+        return None
     count, dim = points.shape
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(subject.seed)
     base = points.repeat_interleave(SLOPES, dim=0)
     direction = torch.randn(base.shape, generator=generator, dtype=torch.float64)
     direction = direction / direction.norm(dim=1, keepdim=True)
     rows = torch.arange(len(base)).view(count, -1)[:, ALONG_RANDOM:].flatten()
     axes = torch.randperm(dim, generator=generator).repeat(-(-len(rows) // dim))[: len(rows)]
     direction[rows] = torch.eye(dim, dtype=torch.float64)[axes]
-    return base, direction
+    slopes = (here.grad * (space.upper - space.lower)).repeat_interleave(SLOPES, dim=0)
+    return base, direction, (slopes * direction).sum(dim=1)
 
 
 def _step(subject: Subject, base: Tensor, direction: Tensor, exact: Tensor, step: float) -> Row:

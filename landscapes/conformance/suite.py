@@ -16,6 +16,8 @@ from . import extremes
 from . import gradients as gradient_checks
 from .extremes import ExtremeCase
 from .finding import FAIL, SKIP, UNEXPECTED, Finding, verdict
+from .horizons import check_growth
+from .horizons import episodes as growth_episodes
 from .special import check_special_places
 from .special import episodes as special_episodes
 from .subject import Subject, difference
@@ -31,6 +33,8 @@ def check(
     precision: str = "float64",
     twin: Callable[[], Objective] | None = None,
     variants: Sequence[ExtremeCase] = (),
+    horizons: Mapping[float, Callable[[], Objective]] | None = None,
+    other_mode: Callable[[], Objective] | None = None,
     expected: Mapping[str, str] | None = None,
     follow: Callable[[str], None] | None = None,
 ) -> Iterator[Finding]:
@@ -38,8 +42,10 @@ def check(
 
     `precision`, float32 or float64, is what it computes in; thresholds follow from it. `twin` makes the same objective
     in the other precision: gradients are judged in float64 where there is one. `variants` are further ways to push it.
-    `expected` holds the checks that are known to fail, with the reason: such a failure is excused, and a pass is not.
-    `follow` is called with the name of each check before it runs.
+    `horizons` make it with episodes so many times as long, in float64 where there is a twin; `other_mode` makes it with
+    gradients by the other mode of automatic differentiation, forward or reverse. `expected` holds the checks that are
+    known to fail, with the reason: such a failure is excused, and a pass is not. `follow` is called with the name of
+    each check before it runs.
 
     Raises ValueError where there are fewer than 2 points; what the objective raises is a finding.
     """
@@ -60,7 +66,7 @@ def check(
         yield _failure("determinism", error).excuse(known)
         return
     left = dict(known)
-    for name, run in _checks(subject, _other(subject, twin), variants):
+    for name, run in _checks(subject, _other(subject, twin), variants, horizons or {}, other_mode):
         announce(name)
         left.pop(name, None)
         yield _try(name, run).excuse(known)
@@ -68,11 +74,15 @@ def check(
         yield Finding(name, UNEXPECTED, "not checked", "a failure is expected of it, but there is no such check")
 
 
-def episodes(dim: int, points: int) -> tuple[int, int]:
-    """Return about how many episodes `check` takes without variants: losses alone, and with gradients."""
-    plain = 2 * points * gradient_checks.SLOPES * len(gradient_checks.DIFFERENCE_STEPS) + points
+def episodes(dim: int, points: int, horizons: Sequence[float] = ()) -> tuple[int, int]:
+    """Return about how many episodes `check` takes without variants: losses alone, and with gradients.
+
+    Those of other `horizons`, factors of the length, count by their lengths.
+    """
+    plain = 2 * points * gradient_checks.SLOPES * (len(gradient_checks.DIFFERENCE_STEPS) + 1) + points
     plain += special_episodes(dim)
-    return plain, points * (REPEATS + 6) + 3 * len(extremes.corners(dim)) + 10
+    longer, sloped = (round(count * sum(horizons)) for count in growth_episodes(1))
+    return plain + longer, sloped + points * (REPEATS + 8) + 3 * len(extremes.corners(dim)) + 10
 
 
 def _other(subject: Subject, twin: Callable[[], Objective] | None) -> Callable[[], Subject] | None:
@@ -84,24 +94,46 @@ def _other(subject: Subject, twin: Callable[[], Objective] | None) -> Callable[[
 
 
 def _checks(
-    subject: Subject, other: Callable[[], Subject] | None, variants: Sequence[ExtremeCase]
+    subject: Subject,
+    other: Callable[[], Subject] | None,
+    variants: Sequence[ExtremeCase],
+    horizons: Mapping[float, Callable[[], Objective]],
+    other_mode: Callable[[], Objective] | None,
 ) -> Iterator[tuple[str, Callable[[], Finding]]]:
     for name, run in PROMISES.items():
         yield name, partial(run, subject, name)
     exact = other if subject.precision == "float32" else lambda: subject
-    name = "finite differences"
-    yield name, lambda: gradient_checks.check_slopes(exact() if exact else subject, name)
-    special = "special places"
-    yield special, lambda: check_special_places(exact() if exact else subject, special)
+    for name, judge in SLOPES.items():
+        yield name, partial(_judge, judge, name, exact or (lambda: subject))
     yield "gradcheck", lambda: _gradcheck(subject, exact)
     yield "second backward", lambda: gradient_checks.second_backward(subject, "second backward")
+    yield "forward against reverse", lambda: _check_modes(subject, "forward against reverse", other_mode)
+    growth = "growth over horizons"
+    yield growth, lambda: check_growth(exact() if exact else subject, growth, horizons)
     yield from extremes.checks(subject, other, variants)
+
+
+def _judge(judge: Callable[[Subject, str], Finding], name: str, subject: Callable[[], Subject]) -> Finding:
+    return judge(subject(), name)
 
 
 def _gradcheck(subject: Subject, exact: Callable[[], Subject] | None) -> Finding:
     if exact is None:
         return Finding("gradcheck", SKIP, "not checked", f"it computes in {subject.precision} only")
     return gradient_checks.gradcheck(exact(), "gradcheck")
+
+
+def _check_modes(subject: Subject, name: str, other_mode: Callable[[], Objective] | None) -> Finding:
+    """Hold gradients of the forward mode of automatic differentiation against those of the reverse mode."""
+    if other_mode is None:
+        return Finding(name, SKIP, "n/a", "it has one mode of differentiation only")
+    try:
+        found = evaluate(other_mode(), subject.x, grad=True)
+    except ValueError as refusal:
+        return Finding(name, SKIP, "not checked", " ".join(str(refusal).split()))
+    apart, limit = subject.differences(found, subject.first), 10 * subject.eps ** (1 / 3)
+    figure = "same bits" if max(apart) == 0 else f"gradients up to {apart[1]:.1e} of the largest component apart"
+    return verdict(name, max(apart) <= limit, figure, f"at most {limit:.0e} is wanted: one of the two is wrong")
 
 
 def _try(name: str, run: Callable[[], Finding]) -> Finding:
@@ -226,6 +258,11 @@ def _check_loss_without_gradient(subject: Subject, name: str) -> Finding:
     return verdict(name, apart <= limit, figure, f"at most {limit:.0e} is wanted: the loss depends on grad=")
 
 
+SLOPES: Mapping[str, Callable[[Subject, str], Finding]] = {
+    "finite differences": gradient_checks.check_slopes,
+    "an optimiser's step": gradient_checks.check_usefulness,
+    "special places": check_special_places,
+}
 PROMISES: Mapping[str, Callable[[Subject, str], Finding]] = {
     "status": _check_status,
     "refusal of a wrong shape": _check_refusal_of_shapes,

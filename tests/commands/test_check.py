@@ -16,6 +16,7 @@ from gradscape.landscapes.conformance import suite as conformance
 
 from ..command import Said
 
+RUGGED = ("ackley", "griewank", "pinball-2", "pinball-16")  # over a hundredth of the box, at two points
 FUNCTIONS = [name for name, entry in entries().items() if set(entry.fidelities) == {"exact"}]
 BENCHMARKS = Path(__file__).parent.parent.parent / "BENCHMARKS.md"
 
@@ -63,7 +64,8 @@ def test_bounce_passes_at_draft(run: Callable[..., Said], tmp_path: Path) -> Non
     report = json.loads(done.stdout)
     assert (report["env"], report["fidelity"], report["passed"]) == ("bounce", "draft", True)
     checks = {found["check"]: found for found in report["checks"]}
-    assert {found["outcome"] for found in checks.values()} == {"pass"}
+    said = {name: found["outcome"] for name, found in checks.items() if found["outcome"] != "pass"}
+    assert said == {"forward against reverse": "skip"}
     assert 0 < checks["energy drift"]["numbers"]["rise"] < 0.1
     ladder = checks["finite differences"]["table"]
     assert [row["step"] for row in ladder] == [1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1]
@@ -79,7 +81,10 @@ def test_bounce_passes_at_draft(run: Callable[..., Said], tmp_path: Path) -> Non
 @pytest.mark.parametrize("name", [*FUNCTIONS, "pinball-2", "pinball-16"])
 def test_quick_environments_pass_at_draft(name: str, run: Callable[..., Said], tmp_path: Path) -> None:
     done = run("check", name, "--points", "2", "--device", "cpu", "--json", cwd=tmp_path)
-    assert [found for found in json.loads(done.stdout)["checks"] if found["outcome"] not in ("pass", "skip")] == []
+    said = {found["check"]: found["outcome"] for found in json.loads(done.stdout)["checks"]}
+    step = said.pop("an optimiser's step")
+    assert set(said.values()) <= {"pass", "skip"}
+    assert step == ("warn" if name in RUGGED else "pass")
     assert done.returncode == 0
 
 

@@ -1,0 +1,1 @@
+"""Scenes that Newton simulates; they need the extra `newton` of this package."""

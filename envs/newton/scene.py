@@ -1,0 +1,120 @@
+"""A thing that Newton throws: the parameters are its velocity, the loss is how far from a target it ends."""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, ClassVar, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...landscapes.episode import Part, View
+from ...landscapes.objective import Evaluation
+from ...landscapes.space import ParameterSpace
+from ..base import Environment, Episode, Work
+from ..batching import Pool
+from ..options import EpisodeOptions
+
+GRAVITY = 9.8  # [m/s^2]
+FRAMES = 240  # of an episode that is drawn, at most
+BUDGET = 1 << 28  # bytes of the states that are kept for the tape
+SPEED = ("velocity x", "velocity y", "velocity z")
+
+
+@dataclass(frozen=True)
+class NewtonOptions(EpisodeOptions):
+    """`solver`: which of Newton's solvers makes the steps."""
+
+    solver: Literal["semi-implicit", "featherstone", "xpbd"] = "semi-implicit"
+
+
+class NewtonScene(Environment):
+    """A thing that Newton throws at a target.
+
+    A scene derives from this class and says: `duration` [s], the `target` [m], `rows`, how many are simulated at once
+    at most, what is thrown (`_thing`), and what ground there is (`_ground`). The engine computes in float32, and its
+    tape supplies the gradients, whatever they are worth. A row whose end or gradient is not finite has failed.
+    """
+
+    duration: ClassVar[float]
+    target: ClassVar[tuple[float, float, float]]
+    rows: ClassVar[int]
+    bytes_per_step: ClassVar[dict[str, int]]  # of a row, by solver: states with their adjoints, and what steps allocate
+    engines: ClassVar[tuple[str, ...]] = ("newton",)
+    loss_unit: ClassVar[str] = "m²"
+    Options: ClassVar[type[Any]] = NewtonOptions
+    _solvers: Pool[Any]
+
+    @property
+    def steps(self) -> int:
+        """Number of time steps of an episode."""
+        count: int = self.options.count_steps(round(self.duration / self.fidelity.dt))
+        return count
+
+    def memory(self) -> int:
+        """Estimate the bytes one episode takes while it runs: the tape needs every state."""
+        return (self.steps + 1) * self.bytes_per_step[self.options.solver]
+
+    def work(self) -> Work:
+        """Count steps of the thing."""
+        return Work(self.steps, "body-step")
+
+    def episode(self, x: Float[Tensor, " dim"]) -> Episode:
+        """Return where the thing is during the episode at one point."""
+        with self._solvers.lend() as rollout:
+            frames = rollout.frames(self._row(x))[:, 0]
+        shown = torch.linspace(0, len(frames) - 1, min(FRAMES, len(frames))).round().long()
+        at = frames[shown]
+        target = torch.tensor(self.target, dtype=torch.float64).expand(len(at), 3)
+        parts = (*self._parts(at), Part("sphere", "target", target[:, None], (self._thing().radius,)))
+        everything = torch.cat([at, target[:, None]], dim=1)
+        lower, upper = everything.amin(dim=(0, 1)) - 0.3, everything.amax(dim=(0, 1)) + 0.3
+        view = View(tuple(lower.tolist()), tuple(upper.tolist()), ground=None if self._ground() is None else 0.0)
+        return Episode(self.fidelity.dt * shown, {"thing": at}, {"target": target}, parts, view)
+
+    @abc.abstractmethod
+    def _thing(self) -> Any:
+        """Return what is thrown: a Sphere, a Particle or a Cloth of the engine's."""
+
+    def _ground(self) -> Any:
+        """Return the engine's Ground, or None where there is none."""
+        return None
+
+    def _parts(self, at: Float[Tensor, "frame point 3"]) -> tuple[Part, ...]:
+        """Return what of the thing is drawn."""
+        radius = self._thing().radius
+        return Part("sphere", "rubber", at, (radius,)), Part("trail", "rubber", at, (radius / 8,))
+
+    def _setup(self) -> None:
+        if self.fidelity.precision != "float32":
+            raise ValueError(
+                f"{self.name} is simulated by Newton, which computes in float32 only; got precision "
+                f"{self.fidelity.precision!r}"
+            )
+        engine = self._engine("rollout")
+        self._capacity = max(1, min(self.rows, self._max_rows, BUDGET // self.memory()))
+        settings = engine.Settings(self.fidelity.dt, self.steps, GRAVITY, self.options.solver, self._capacity)
+        self._solvers = Pool(partial(engine.Rollout, self._thing(), self._ground(), settings), most=1)
+
+    def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+        with self._solvers.lend() as rollout:
+            if not grad:
+                return Evaluation.from_results(self._miss(rollout.ends(x)[: len(x)]).square().sum(dim=1), None)
+            end, slope = rollout.pull_back(x, self._adjoint)
+        return Evaluation.from_results(self._miss(end[: len(x)]).square().sum(dim=1), slope)
+
+    def _miss(self, end: Float[Tensor, "batch point 3"]) -> Float[Tensor, "batch 3"]:
+        """Return how far from the target the middle of the points is [m]."""
+        return end.mean(dim=1) - torch.tensor(self.target, dtype=torch.float64)
+
+    def _adjoint(self, end: Float[Tensor, "batch point 3"]) -> Float[Tensor, "batch point 3"]:
+        """Return the loss's gradient by where the points are."""
+        return (2 / end.shape[1] * self._miss(end))[:, None].expand_as(end)
+
+
+def speeds(bound: float) -> ParameterSpace:
+    """Return the space of velocities along x, y and z up to a bound [m/s]."""
+    return ParameterSpace({name: (-bound, bound, "m/s") for name in SPEED})
