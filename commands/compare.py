@@ -98,6 +98,8 @@ def show(found: SliceComparison, console: Console) -> None:
 
 def _say(row: Any) -> str:
     """Return a number with its interval and its unit, a share in percent."""
+    if row.value != row.value:
+        return ""
     is_share = row.unit.startswith("of ")
     numbers = [(100 if is_share else 1) * value for value in (row.value, row.low, row.high)]
     value, low, high = (format(number, ".3g" if row.unit else ".4g") for number in numbers)

@@ -80,7 +80,7 @@ class CompareJob:
             check_landscapes(parameters(ours), other.space.names, loss_unit(ours), unit)
             check_finished(ours)
             identity = {"a": slice.identity, "b": identity_of(other)}
-        names = [str(one["objective"]) for one in identity.values()]
+        names = [str(one.get("objective", "slice")) for one in identity.values()]
         folder = out or folder_named(["compare", *dict.fromkeys(names)], identity)
         COMPARISON.check(folder, allowed=[file for file in visible_files(folder) if slice_exists(file / SLICE_STORE)])
         if not force:

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 Values = NDArray[np.float64]
 PLACING = ("plane", "cut", "boxed", "parameters")  # in a slice's identity: where it lies, not what it is of
-TWICE = "settings.name"  # what an identity has by another name, too
 PARTS = {"basis": "directions", "lower": "lower ends", "upper": "upper ends", "origin": "points they go through"}
 ROUNDING = 1e-9  # planes that are no farther apart, relatively, are the same
 ANYTHING = "give the name of an environment as B, which is then sampled on A's plane"
@@ -141,7 +140,7 @@ def _on_one_lattice(a: xr.Dataset, b: xr.Dataset) -> tuple[xr.Dataset, xr.Datase
 def _settings(dataset: xr.Dataset) -> dict[str, Any]:
     """Return what a slice is of, by its identity, and the versions of packages that made it."""
     identity = {name: value for name, value in stored_identity(dataset).items() if name not in PLACING}
-    settings = {name: value for name, value in identity.get("settings", {}).items() if f"settings.{name}" != TWICE}
+    settings = {name: value for name, value in identity.get("settings", {}).items() if name != "name"}  # the fidelity's
     return {**identity, "settings": settings, "versions": stored_provenance(dataset).get("versions", {})}
 
 

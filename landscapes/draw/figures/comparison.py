@@ -63,7 +63,7 @@ def _draw_maps(found: SliceComparison, width: float | None) -> tuple[page.Pictur
 
 
 def _loss_maps(axes: list[Axes], found: SliceComparison) -> list[Artist]:
-    """Draw the losses of A and B with one colour bar; return the legend's entries."""
+    """Draw the losses of A and B on one scale; return the legend's entries."""
     scale, entries = _loss_scale(found), list[Artist]()
     for ax, letter, name, dataset in zip(axes, "AB", (found.a, found.b), found.data, strict=False):
         drawn = contour.cell_map(ax, dataset, dataset["loss"].to_numpy(), scale, style.LOSS_MAP)
@@ -168,6 +168,8 @@ def _failures(both: xr.Dataset) -> list[Patch]:
 
 def _say(found: SliceComparison) -> list[Patch]:
     """Return legend entries without a sign: the chief numbers, and the settings that differ."""
+    if not found.compared:
+        return [Patch(visible=False, label="no point has a loss in both")]
     percent = style.number(100 * found.loss.shares()["median"].value, ".2g")
     unit = f" {found.loss_unit}" if found.loss_unit else ""
     said = [f"median difference: {style.number(found.loss.median.value)}{unit}, {percent} % of A's range"]

@@ -36,6 +36,7 @@ from gradscape.landscapes.episode import Episode, Part, View
 from gradscape.landscapes.measures import gradient_quality as gradients
 from gradscape.landscapes.measures.slice_comparison import compare_slices
 from gradscape.landscapes.measures.slice_comparison_record import SliceComparison
+from gradscape.landscapes.objective import Status
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.storage.files import print_width
 from gradscape.optim.registry import methods
@@ -72,6 +73,7 @@ SHIFTED = DATASET.assign(
     loss=DATASET["loss"].copy(data=np.roll(DATASET["loss"], 1)),
     status=DATASET["status"].copy(data=np.roll(DATASET["status"], 1)),
 )
+FAILED = DATASET.assign(loss=DATASET["loss"] * np.nan, status=DATASET["status"] * 0 + Status.NONFINITE)
 
 
 def compared(one, other) -> SliceComparison:
@@ -116,6 +118,7 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
     "comparison_figure": [
         lambda width: comparison_figure(compared(DATASET, SHIFTED), width=width),
         lambda width: comparison_figure(compared(LINE, LINE.assign(loss=1.2 * LINE["loss"])), width=width),
+        lambda width: comparison_figure(compared(DATASET, FAILED), width=width),
     ],
     "surface_figure": [
         lambda width: surface_figure(dated(SLICE), LAID, width=width),
