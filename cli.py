@@ -15,6 +15,7 @@ from typer.core import TyperGroup
 from . import __version__
 from .commands import gallery
 from .commands.bench import bench
+from .commands.card import card
 from .commands.census import census
 from .commands.check import check
 from .commands.compare import compare
@@ -64,7 +65,7 @@ _VERBS = (
     envs, info, slice_, sweep,
     methods, optimize, race, overlay,
     compare, surface, replay, export, view, bounce,
-    plan, bench, check, tradeoff, extremes, pairs, report_, census,
+    plan, bench, check, card, tradeoff, extremes, pairs, report_, census,
 )  # fmt: skip
 
 for _verb in _VERBS:

@@ -99,6 +99,7 @@ KINDS = {
     ),
     "pairs": Kind(f"pairs ackley --set dim=3 --samples 2 --out {MADE} --json"),
     "census": Kind(f"census ackley --set dim=3 --slices 4 --resolution 6 --out {MADE} --json"),
+    "card": Kind(f"card --scene control --resolution 3 --out {MADE} --json"),
     "tradeoff": Kind(f"tradeoff bounce --device cpu --points 2 --variants precision --out {MADE} --json"),
     "kept tradeoff": Kind(
         f"tradeoff bounce --device cpu --set horizon=0.5 --points 2 --variants precision --out {MADE}",

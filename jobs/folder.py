@@ -66,6 +66,7 @@ MODEL = Results("model study", ("model.json", "model.png"), "model.png")
 MIXED = Results("search of mixed variants", ("mixed.json", "mixed.png"), "mixed.png")
 CONVERGENCE = Results("study of convergence", ("convergence.json", "convergence.png"), "convergence.png")
 EXTREMES = Results("study of extremes", ("extremes.json", "extremes.png"), "extremes.png")
+CARD = Results("report card", ("card.json", "card.png"), "card.png")
 PAIRS = Results("study of pairs", ("pairs.json",))
 CENSUS = Results("census", ("census.json", "census.npz", "census.png"), "census.png")
 

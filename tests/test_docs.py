@@ -52,6 +52,7 @@ ADDED = {
     "sweep": ["--resolution", "2"],
     "check": ["--points", "2"],
     "pairs": ["--samples", "2"],
+    "card": ["--scene", "control", "--resolution", "3"],
     "census": ["--slices", "1", "--resolution", "6"],
     "gallery compute": ["--only", "bounce-y", "--part", "slices", "--fidelity", "draft", "--data", "made"],
     "gallery build": ["--data", "few", "--out", "site"],

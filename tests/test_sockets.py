@@ -46,6 +46,7 @@ extremes bounce --points 4 --knobs dt --precisions float64 --fidelity draft --de
 pairs bounce --samples 2 --fidelity draft --device cpu
 report cut --device cpu
 census branin --slices 1 --resolution 6
+card --scene control --resolution 3
 gallery compute --only bounce-y --part slices --resolution 4 --fidelity draft --device cpu --data data
 gallery list --data data
 gallery build --data data --out site

@@ -46,6 +46,7 @@ tradeoff bounce --points 2 --variants dt
 extremes bounce --points 4 --knobs dt
 pairs ackley --samples 2 --top 3
 census ackley --slices 1 --resolution 6
+card --scene control --resolution 3
 report cut --points 2
 gallery compute --only bounce --part reports
 gallery list

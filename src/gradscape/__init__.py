@@ -8,7 +8,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from .api.compare import compare
     from .api.environments import list_envs
-    from .api.measure import census, check, extremes, pairs, report
+    from .api.measure import card, census, check, extremes, pairs, report
     from .api.overlay import overlay
     from .api.search import open_run, optimize, race
     from .api.slice import open_slice, slice
@@ -43,6 +43,7 @@ _HOMES = {
     "SceneSpec": "jobs.scene",
     "Slice": "landscapes.slice",
     "Status": "landscapes.objective",
+    "card": "api.measure",
     "check": "api.measure",
     "compare": "api.compare",
     "extremes": "api.measure",
@@ -81,6 +82,7 @@ __all__ = [
     "Slice",
     "Status",
     "__version__",
+    "card",
     "census",
     "check",
     "compare",

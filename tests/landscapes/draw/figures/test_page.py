@@ -16,6 +16,7 @@ from matplotlib.text import Text
 
 from gradscape.landscapes import draw
 from gradscape.landscapes.draw.figures import page, typesetting
+from gradscape.landscapes.draw.figures.card import card_figure
 from gradscape.landscapes.draw.figures.census import census_figure
 from gradscape.landscapes.draw.figures.comparison import comparison_figure
 from gradscape.landscapes.draw.figures.contact import Caption, episode_figure
@@ -44,7 +45,7 @@ from gradscape.optim.registry import methods
 from ....studies import study
 from ...measures.test_fidelity import REPORT
 from ...test_overlay import LAID, SLICE
-from .records import census, convergence, extremes, mixed
+from .records import card, census, convergence, extremes, mixed
 from .test_contour import BOUNCES, DATASET, LINE, Bowl, plane
 from .test_curve import table
 from .test_race import race
@@ -130,6 +131,7 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
     ],
     "convergence_figure": [lambda width: convergence_figure(convergence(), width=width)],
     "model_figure": [lambda width: model_figure(study(PARTS, failing=True), width=width)],
+    "card_figure": [lambda width: card_figure(card(), width=width)],
     "census_figure": [lambda width: census_figure(census(), width=width)],
     "extremes_figure": [lambda width: extremes_figure(extremes(), width=width)],
     "frame_figure": [lambda width: frame_figure(SWEEP, 1, Scales.of(SWEEP), width=width)],
