@@ -31,8 +31,8 @@ OUTCOMES = {"passes": "#1b7837", "fails": "#b2182b", "not installed": style.QUIE
 def card_figure(card: Card, *, width: float | None = None) -> page.Picture:
     """Draw the losses and the direction of steepest descent by the gradient of every engine, scene by scene.
 
-    Maps of a scene share a colour scale. An arrow is orange where the gradient opposes the slope between the neighbouring
-    samples, and white elsewhere; which share of all samples does stands over the map.
+    Maps of a scene share a colour scale. An arrow is orange where the gradient opposes the slope between the
+    neighbouring samples, and white elsewhere; which share of all samples does stands over the map.
 
     Raises ValueError where the page is too narrow or too wide.
     """
