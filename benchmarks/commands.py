@@ -50,6 +50,8 @@ race branin --methods random,cma-es --budget 5 --seeds 2 --workers 2 --option cm
 overlay cut run --resolution 3 --plane pca
 overlay cut race --through best
 surface cut run
+compare cut branin --device cpu
+compare cut cut --force
 replay bounce --params point.json --no-film
 export run --to csv --out made.csv
 export cut --to netcdf --out made.nc

@@ -117,6 +117,9 @@ KINDS = {
         f"overlay cut run --through best --resolution 4 --out {MADE}",
         needs=(f"{CUT} cut", f"{SEARCH} run"),
     ),
+    "comparison": Kind(
+        f"compare cut ackley --set dim=3 --out {MADE} --json", needs=(f"{CUT} cut",)
+    ),
     "replay": Kind(f"replay {BOUNCE} --no-film --out {MADE}"),
     "gallery": Kind(
         f"{GALLERY} --only pinball-2-0-1 --part slices --part sweeps --part episodes --part searches --part reports",

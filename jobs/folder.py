@@ -50,6 +50,7 @@ SWEEP = Results("sweep", ("frames", SLICE_STORE, "sweep.mp4", "sweep.gif", "swee
 RACE_FIGURES = "race.json"
 RACE = Results("race", ("race.png", RACE_FIGURES), "race.png")
 OVERLAY = Results("overlay", ("overlay.png", "overlay.rrd"), "overlay.png")
+COMPARISON = Results("comparison", ("compare.json", "compare.png"), "compare.png")
 SURFACE = Results("surface", ("surface.png", "surface.gltf"), "surface.png")
 EPISODE = Results(
     "episode", ("episode.png", "episode.mp4", "episode.gif", "episode.rrd", "episode.json"), "episode.png"

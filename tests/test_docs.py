@@ -60,7 +60,13 @@ ADDED = {
 }
 SCENES = {verb: {"fluid": "bounce", "flip": "bounce"} for verb in ("race", "optimize", "tradeoff", "extremes")}
 SCENES["--tolerance"] = {"fluid": "bounce", "6": "0", "8": "1"}
-SHORT = {"slice": {"fluid", "assembly"}, "sweep": {"fluid"}, "replay": {"fluid"}, "plan": {"fluid"}}
+SHORT = {
+    "slice": {"fluid", "assembly"},
+    "compare": {"fluid"},
+    "sweep": {"fluid"},
+    "replay": {"fluid"},
+    "plan": {"fluid"},
+}
 TENTH = ["--set", "horizon=0.1"]  # of an episode
 TAICHI = ["--no-gradients"]  # whose kernels take minutes to compile with gradients
 

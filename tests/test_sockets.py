@@ -32,6 +32,7 @@ optimize bounce --method random --budget 4 --fidelity draft --device cpu --out r
 race bounce --methods random --seeds 1 --budget 2 --fidelity draft --device cpu
 overlay cut run --out over
 surface cut run
+compare cut bounce --fidelity draft --device cpu
 replay bounce --fidelity draft --device cpu --no-film
 export cut
 view over/overlay.rrd

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from .api.compare import compare
     from .api.environments import list_envs
     from .api.measure import card, census, check, extremes, pairs, report
     from .api.overlay import overlay
@@ -44,6 +45,7 @@ _HOMES = {
     "Status": "landscapes.objective",
     "card": "api.measure",
     "check": "api.measure",
+    "compare": "api.compare",
     "extremes": "api.measure",
     "from_jax": "envs.engines.jax_functions",
     "from_numpy": "landscapes.adapters",
@@ -83,6 +85,7 @@ __all__ = [
     "card",
     "census",
     "check",
+    "compare",
     "extremes",
     "from_jax",
     "from_numpy",
