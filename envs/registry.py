@@ -153,7 +153,7 @@ BUILTIN = (
     _mjx_entry("mjx-push", "Push", "10", "5 x (ball velocity x, y) [m/s]", "a box pushed across friction"),
     _newton_entry("newton-flight", "Flight", "a sphere in free flight"),
     _newton_entry("newton-ball", "Ball", "bounce's ball and target"),
-    _newton_entry("newton-cloth", "ClothThrow", "a cloth thrown onto a floor"),
+    _newton_entry("newton-cloth", "ClothThrow", "a cloth that bounces off a floor"),
     _function_entry("ackley", "Ackley", "many shallow minima around a funnel", "any"),
     _function_entry("beale", "Beale", "flat plain with sharp corner peaks"),
     _function_entry("branin", "Branin", "three equal minima in a smooth valley"),

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from ..envs.installed import installed_version
-from ..envs.registry import environment_class, make
+from ..envs.registry import EXTRAS, environment_class, make
 from .watch import Watch
 
 if TYPE_CHECKING:
@@ -81,9 +81,15 @@ def provenance(objective: Objective, command: str) -> dict[str, Any]:
     return {
         "command": command,
         "created": datetime.now(UTC).strftime("%Y-%m-%d"),
-        "versions": {package: installed_version(package) or ABSENT for package in PACKAGES},
+        "versions": {package: installed_version(package) or ABSENT for package in _packages(objective)},
         "loss_unit": getattr(objective, "loss_unit", ""),
     }
+
+
+def _packages(objective: Objective) -> tuple[str, ...]:
+    """Return the packages whose versions are worth keeping: beside those of all results, what its engine needs."""
+    engine = getattr(objective, "capabilities", None)
+    return (*PACKAGES, *EXTRAS.get(engine.extra, ())) if engine else PACKAGES
 
 
 def environment_of(dataset: xr.Dataset, device: str) -> Environment:

@@ -13,9 +13,12 @@ import sysconfig
 import tarfile
 import tomllib
 import zipfile
+from itertools import chain
 from pathlib import Path
 
 import pytest
+
+from gradscape.envs.registry import EXTRAS
 
 ROOT = Path(__file__).parent.parent
 NOT_SENT = {".git", ".venv", "build", "dist", "out", "__pycache__", "node_modules"}
@@ -152,7 +155,8 @@ def test_every_module_imports_where_it_is_installed(built: dict[str, Path], pyth
     modules = {"gradscape." + name.removesuffix(".py").replace("/", ".").removesuffix(".__init__") for name in files}
     assert {*names, "gradscape.__init__"} == modules
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    optional = {re.split("[^a-z0-9-]", one)[0].replace("-", "_") for one in extras["rl"] + extras["distributed"]}
+    wanted = [re.split("[^a-z0-9-]", one)[0] for one in extras["rl"] + extras["distributed"]]
+    optional = {one.replace("-", "_") for one in (*wanted, *chain(*EXTRAS.values()))}
     assert set(missing.values()) <= optional
 
 

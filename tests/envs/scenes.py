@@ -1,4 +1,7 @@
-"""Every registered scene, cheap and in float64, for tests that take many episodes; a new one is found by its family."""
+"""Every registered scene, cheap and in float64 if it has that, for tests that take many episodes.
+
+A new one is found by its family.
+"""
 
 from dataclasses import replace
 
@@ -7,6 +10,7 @@ from gradscape.envs.functions import Function
 from gradscape.envs.mjx.scene import MjxScene
 from gradscape.envs.mpm.fluid import Fluid
 from gradscape.envs.mpm.plasticine import Plasticine
+from gradscape.envs.newton.scene import NewtonScene
 from gradscape.envs.registry import entries, environment_class
 from gradscape.envs.sheets.sheets import SheetScene
 
@@ -15,6 +19,7 @@ COARSE = {  # families whose cheapest fidelity takes too long
     Plasticine: {"dt": Plasticine.control_step / 5, "resolution": 16, "particles": 100},
     SheetScene: {"dt": 1 / 500, "resolution": 4},
     MjxScene: {"dt": 1 / 50},
+    NewtonScene: {"dt": 1 / 400, "precision": "float32"},
 }
 
 
@@ -24,10 +29,10 @@ def of_family(*families: type[Environment]) -> list[str]:
 
 
 def cheap(kind: type[Environment]) -> Fidelity:
-    """Return a fidelity in float64 that takes little time."""
+    """Return a fidelity in float64, or what else a scene computes in, that takes little time."""
     for family, settings in COARSE.items():
         if issubclass(kind, family):
-            return Fidelity("tiny", precision="float64", **settings)
+            return Fidelity("tiny", **{"precision": "float64", **settings})
     return replace(next(iter(kind.fidelities.values())), precision="float64")
 
 

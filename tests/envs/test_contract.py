@@ -59,6 +59,8 @@ def test_the_loss_is_the_same_bits_without_its_gradient(env, points, result):
 
 def test_gradcheck(env):
     """Against central differences in float64, backward twice included; one full Jacobian, then random directions."""
+    if env.fidelity.precision != "float64":
+        pytest.skip(f"{env.name} computes in float32 only; its own tests hold its gradients against closed forms")
     full, x = env.space.uniform(1, seed=2).requires_grad_(), env.space.uniform(3, seed=3).requires_grad_()
     step = SMALL_STEPS.get(env.name, 1e-6)
     assert torch.autograd.gradcheck(env, (full,), eps=step, fast_mode=env.space.dim > 5)

@@ -5,6 +5,7 @@ Nothing of the engine is changed or left out: a gradient is what the tape makes 
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -143,6 +144,7 @@ class Rollout:
         whole.replicate(one, settings.rows)
         self.model: Any = whole.finalize(device="cpu", requires_grad=True)
         self.model.particle_grid, self.model.particle_max_radius = None, 0.0  # particles, of any row, do not touch
+        self.model.particle_max_velocity = math.inf  # what flies apart is to be seen as such, not held back
         if ground is not None:
             ground.tell(self.model)
         self.solver: Any = SOLVERS[settings.solver](self.model)
