@@ -37,6 +37,7 @@ WORDS = {"SLICE": "cut", "RUN": "run", "best:RUN": "best:run", "ADDRESS": "local
 WORDS |= {
     "tls://10.0.0.5:8786": "local:1",
     "throw": "cut",
+    "flight": "control",
     "standard": "draft",
     "gallery/data/flip-0-1": str(DATA / "flip-0-1"),
     "triple-move": "bounce",
