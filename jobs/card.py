@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from ..envs.code import code_digest
 from ..envs.installed import installed_version
-from ..envs.registry import EXTRAS, entries, installs
+from ..envs.registry import EXTRAS, entries, environment_class, installs
 from ..landscapes.capacity import require
 from ..landscapes.conformance.finding import FAIL, UNEXPECTED
 from ..landscapes.measures.card import Card, CardSlice, Grade, Outcome, count_outcomes, first_finding
@@ -104,7 +105,7 @@ class CardJob:
         """Go on with the card in its folder, by default one under `root`, or begin it there.
 
         `scenes` are those of the card, by default all. Raises ValueError for a scene that it does not have,
-        StoreMismatchError where the folder holds a card of other versions of the engines.
+        StoreMismatchError where the folder holds a card of other versions of the engines, or of other scenes.
         """
         known = list(dict.fromkeys(one.scene for one in ENTRANTS))
         if unknown := [one for one in scenes if one not in known]:
@@ -113,7 +114,7 @@ class CardJob:
         chosen = [one for one in ENTRANTS if not scenes or one.scene in scenes]
         packages = dict.fromkeys([*OURS, *(package for extra in EXTRAS.values() for package in extra)])
         versions = {package: installed_version(package) for package in packages}
-        identity = {"resolution": resolution, "device": device, "versions": versions}
+        identity = {"resolution": resolution, "device": device, "versions": versions, "code": _code()}
         pieces = Checkpoint.open(
             out or folder_named(["card"], identity, root), identity, what="report card", force=force
         )
@@ -175,6 +176,12 @@ class CardJob:
             arrays = _measure(one, self.resolution, self.device)
             self.pieces.save(one.name, **arrays)
         return arrays
+
+
+def _code() -> dict[str, str]:
+    """Return digests of the code of the scenes, by their names."""
+    kinds = {one.env: environment_class(one.env) for one in ENTRANTS}
+    return {name: code_digest(kind, kind.engines[0]) for name, kind in kinds.items()}
 
 
 def _measure(one: Entrant, resolution: int, device: str) -> dict[str, NDArray[Any]]:
