@@ -15,8 +15,10 @@ from typer.core import TyperGroup
 from . import __version__
 from .commands import gallery
 from .commands.bench import bench
+from .commands.card import card
 from .commands.census import census
 from .commands.check import check
+from .commands.compare import compare
 from .commands.dims import TakesDims
 from .commands.envs import envs
 from .commands.export import export
@@ -62,8 +64,8 @@ LONG = 200  # characters of a path that an error shows
 _VERBS = (
     envs, info, slice_, sweep,
     methods, optimize, race, overlay,
-    surface, replay, export, view, bounce,
-    plan, bench, check, tradeoff, extremes, pairs, report_, census,
+    compare, surface, replay, export, view, bounce,
+    plan, bench, check, card, tradeoff, extremes, pairs, report_, census,
 )  # fmt: skip
 
 for _verb in _VERBS:

@@ -1,4 +1,4 @@
-"""`gs.report`, `gs.check`, `gs.extremes`, `gs.pairs`: what a scene's landscape is like, and what may be asked of it."""
+"""`gs.report`, `gs.check`, `gs.card`, `gs.extremes`, `gs.pairs`: what a landscape is like, and what a scene allows."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from ..jobs.pairs import PairRanking
     from ..jobs.report import ReportedSlice
     from ..jobs.report_record import Report
+    from ..landscapes.measures.card import Card
     from ..landscapes.measures.census_record import Census
     from ..landscapes.measures.extremes import Extremes
     from ..landscapes.slice import Slice
@@ -68,6 +69,30 @@ def check(scene: Scene, *, points: int = 4, seed: int = 0, **keywords: Unpack[Sc
     spec = spec_of(scene, keywords).resolve(watch)
     command = say_call("check", scene, points=points, seed=seed, **keywords)
     return CheckJob.open(spec, points=points, seed=seed, command=command).run(watch)
+
+
+def card(
+    scenes: Sequence[str] = (),
+    *,
+    resolution: int = 17,
+    device: str = "auto",
+    out: str | Path | None = None,
+    force: bool = False,
+) -> Card:
+    """Check the gradients of several engines in the same scenes, and cut their landscapes along one small plane.
+
+    `scenes` are those of the card ("flight", "drop", "bounce" ...), by default all; an engine that is not
+    installed is said to be that. The card lies in the folder `out`, by default one under out/: the same call goes on
+    there. It has `grades`, a `table()` and `plot()`.
+
+    Raises ValueError for a scene that the card does not have, StoreMismatchError where the folder holds a card of other
+    versions, which `force` replaces; Stopped where it is interrupted.
+    """
+    from ..jobs.card import CardJob
+
+    how = {"resolution": resolution, "device": device}
+    command = say_call("card", list(scenes), **how)
+    return CardJob.open(scenes, **how, out=_path(out), force=force, command=command).run(default_watch())  # type: ignore[arg-type] # each of its kind
 
 
 def extremes(

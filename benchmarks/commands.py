@@ -50,6 +50,8 @@ race branin --methods random,cma-es --budget 5 --seeds 2 --workers 2 --option cm
 overlay cut run --resolution 3 --plane pca
 overlay cut race --through best
 surface cut run
+compare cut branin --device cpu
+compare cut cut --force
 replay bounce --params point.json --no-film
 export run --to csv --out made.csv
 export cut --to netcdf --out made.nc
@@ -61,6 +63,7 @@ tradeoff bounce --points 2 --variants precision
 extremes bounce --points 4 --knobs dt --pairs none --fidelity draft
 pairs ackley --samples 2 --top 3 --set dim=3
 census ackley --slices 4 --resolution 6 --set dim=3 --along random
+card --scene control --resolution 3
 report cut --points 2
 report --all --data data --points 2
 plan bounce --dims 0 1 --resolution 3 --workers 2 --over horizon --frames 2

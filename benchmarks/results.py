@@ -99,6 +99,7 @@ KINDS = {
     ),
     "pairs": Kind(f"pairs ackley --set dim=3 --samples 2 --out {MADE} --json"),
     "census": Kind(f"census ackley --set dim=3 --slices 4 --resolution 6 --out {MADE} --json"),
+    "card": Kind(f"card --scene control --resolution 3 --out {MADE} --json"),
     "tradeoff": Kind(f"tradeoff bounce --device cpu --points 2 --variants precision --out {MADE} --json"),
     "kept tradeoff": Kind(
         f"tradeoff bounce --device cpu --set horizon=0.5 --points 2 --variants precision --out {MADE}",
@@ -115,6 +116,9 @@ KINDS = {
     "overlay": Kind(
         f"overlay cut run --through best --resolution 4 --out {MADE}",
         needs=(f"{CUT} cut", f"{SEARCH} run"),
+    ),
+    "comparison": Kind(
+        f"compare cut ackley --set dim=3 --out {MADE} --json", needs=(f"{CUT} cut",)
     ),
     "replay": Kind(f"replay {BOUNCE} --no-film --out {MADE}"),
     "gallery": Kind(

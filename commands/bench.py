@@ -61,6 +61,12 @@ def show(found: Bench, console: Console) -> None:
             console.print(f"batch {rate.batch}, {rate.engine}: {rate.failed} episodes failed", highlight=False)
     if found.kernels and found.kernels["forward"].kernels:
         console.print(_kernels(*found.kernels.values()))
+    if one := found.adapter:
+        console.print(
+            f"a batch of {one.batch}: {one.forward:.1%} of the time is not the engine's own program, "
+            f"{one.with_gradient:.1%} with gradient",
+            highlight=False,
+        )
     said = f"sampling {found.sampler.points} points: {found.sampler.share:.1%} of the time is the sampler's own"
     console.print(said, highlight=False)
 

@@ -2,7 +2,7 @@
 
 Of the data, a figure's folder holds `slice.zarr` and what else was made of it: `sweep.mp4` with `sweep.json`,
 `episodes.json` with a film and a picture of each episode, and the files of `landscape report`. Searches lie in
-`runs/ENVIRONMENT-OPTIONS/`, trade-offs in `tradeoff/`: figures share them.
+`runs/ENVIRONMENT-OPTIONS/`, trade-offs in `tradeoff/`: figures share them. The report card of gradients is in `card/`.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from ..jobs.folder import CARD as CARD_FILES
 from ..jobs.folder import REPORT as REPORT_FILES
 from ..jobs.folder import SLICE as SLICE_FILES
 from ..jobs.folder import TRADEOFF as TRADEOFF_FILES
@@ -29,6 +30,8 @@ REPORT, MEASURES, QUALITY, QUALITY_ARRAYS = REPORT_FILES.files
 SURFACES = ("surface.png", "surface.html", "surface.gltf", "surface.glb")
 RUNS, RUN_SUFFIX = "runs", ".zarr.zip"
 TRADEOFFS = "tradeoff"
+CARD = "card"  # the folder of the report card of gradients
+CARD_RECORD, CARD_PICTURE = CARD_FILES.files
 TRADEOFF_PICTURE = TRADEOFF_FILES.picture  # in the folder of `landscape tradeoff`
 DEVICES = ("cuda", "cpu")  # that trade-offs are shown of
 REMAKE = "delete it, and `landscape gallery compute --part {}` makes it anew"

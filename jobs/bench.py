@@ -31,6 +31,7 @@ from .watch import Watch
 K = TypeVar("K")
 WAYS = {"forward": False, "with_gradient": True}
 LEAST = 2  # repetitions of everything, whatever they take
+ADAPTED = 256  # episodes that an engine's own program is timed for
 SMALL = 64  # points along each axis of the sampler's slice, at most
 
 
@@ -121,11 +122,24 @@ class SamplerShare:
 
 
 @dataclass(frozen=True)
+class AdapterShare:
+    """Say what share of a batch's time is not the compiled program of the engine, which others wrote.
+
+    The program with gradient gives loss and gradient; that ours also gives the loss alone, so that it does not depend
+    on the gradient to the last bit, is part of the share.
+    """
+
+    batch: int
+    forward: float
+    with_gradient: float
+
+
+@dataclass(frozen=True)
 class Bench:
     """Hold what was measured of an environment; fields are called as `landscape bench --json` has them.
 
     `start` is by engine, `kernels` by way (forward, with_gradient), None of other engines than Warp. Ratios are of the
-    largest batch, None without another engine.
+    largest batch, None without another engine. `adapter` is None of engines whose programs are our own.
     """
 
     env: str
@@ -144,6 +158,7 @@ class Bench:
     rates: tuple[BatchRate, ...]
     kernels: dict[str, KernelTable] | None
     sampler: SamplerShare
+    adapter: AdapterShare | None = None
 
     def record(self) -> dict[str, Any]:
         """Return it as plain JSON."""
@@ -193,6 +208,7 @@ class BenchJob:
                 rates += _time_batch(envs, _points(env, batch), self.seconds)
             say("timing kernels")
             kernels = _time_kernels(env) if find_engine(self.engine).profiled else None
+            adapter = _time_adapter(env, self.seconds)
             say("timing the sampler")
             own = [rate.with_gradient.episodes_per_second for rate in rates if rate.engine == self.engine]
             sampler = _time_sampler(env, max(own) * self.seconds / 2)
@@ -214,6 +230,7 @@ class BenchJob:
             rates=tuple(rates),
             kernels=kernels,
             sampler=sampler,
+            adapter=adapter,
         )
 
 
@@ -297,6 +314,22 @@ def alternate(calls: Mapping[K, Callable[[], object]], seconds: float) -> dict[K
             times[key].append(time.perf_counter() - began)
         rounds += 1
     return times
+
+
+def _time_adapter(env: Environment, seconds: float) -> AdapterShare | None:
+    """Time some 256 episodes against the engine's program alone, in turn; None where the program is our own."""
+    engine_call = getattr(env, "engine_call", None)
+    if engine_call is None:
+        return None
+    points = _points(env, -(-ADAPTED // env.preferred_batch) * env.preferred_batch)
+    shares = {}
+    for way, grad in WAYS.items():
+        calls = {"ours": partial(env.evaluate, points, grad=grad), "engine": engine_call(points, grad=grad)}
+        for call in calls.values():
+            call()
+        times = alternate(calls, seconds)
+        shares[way] = max(0.0, 1 - min(times["engine"]) / min(times["ours"]))
+    return AdapterShare(len(points), **shares)
 
 
 def _time_kernels(env: Environment) -> dict[str, KernelTable]:

@@ -50,6 +50,7 @@ SWEEP = Results("sweep", ("frames", SLICE_STORE, "sweep.mp4", "sweep.gif", "swee
 RACE_FIGURES = "race.json"
 RACE = Results("race", ("race.png", RACE_FIGURES), "race.png")
 OVERLAY = Results("overlay", ("overlay.png", "overlay.rrd"), "overlay.png")
+COMPARISON = Results("comparison", ("compare.json", "compare.png"), "compare.png")
 SURFACE = Results("surface", ("surface.png", "surface.gltf"), "surface.png")
 EPISODE = Results(
     "episode", ("episode.png", "episode.mp4", "episode.gif", "episode.rrd", "episode.json"), "episode.png"
@@ -65,6 +66,7 @@ MODEL = Results("model study", ("model.json", "model.png"), "model.png")
 MIXED = Results("search of mixed variants", ("mixed.json", "mixed.png"), "mixed.png")
 CONVERGENCE = Results("study of convergence", ("convergence.json", "convergence.png"), "convergence.png")
 EXTREMES = Results("study of extremes", ("extremes.json", "extremes.png"), "extremes.png")
+CARD = Results("report card", ("card.json", "card.png"), "card.png")
 PAIRS = Results("study of pairs", ("pairs.json",))
 CENSUS = Results("census", ("census.json", "census.npz", "census.png"), "census.png")
 

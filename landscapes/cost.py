@@ -47,11 +47,12 @@ def seconds_per_episode(objective: Objective, points: Float[Tensor, "batch dim"]
     """Measure what an episode costs where many are computed, at points such as those that will be [s].
 
     As many points as there are threads are timed, again (a first time is longer), then more until they take long. A GPU
-    takes a whole batch at once: of one point most would be launches. Where its memory does not hold the batch, parts of
-    it are timed, as they will be computed; raises MemoryError where it does not hold one point.
+    takes a whole batch at once: of one point most would be launches; so does an engine with `whole_batches`, to which
+    one point costs as much. Where its memory does not hold the batch, parts of it are timed, as they will be computed;
+    raises MemoryError where it does not hold one point.
     """
     bound = MemoryBound(objective)
-    whole = getattr(objective, "device", "cpu") == "cuda"
+    whole = getattr(objective, "device", "cpu") == "cuda" or getattr(objective, "whole_batches", False)
     rows = len(points) if whole else min(len(points), getattr(objective, "threads", 1))
     seconds = measure_seconds(bound, points[:rows], grad=grad)
     if seconds < WARM_UP:

@@ -15,6 +15,7 @@ from .space import ParameterSpace
 if TYPE_CHECKING:
     import xarray as xr
 
+ABSENT = "none"  # in the place of a setting's value
 LISTED_SETTINGS = 6  # settings that differ, in the refusal of a store
 
 
@@ -87,15 +88,20 @@ def check_identity(
     """Raise `StoreMismatchError`, naming each setting that differs, unless the two are equal."""
     if wanted == found:
         return
-    ours, theirs = dict(_leaves(wanted)), dict(_leaves(found))
-    names = [name for name in ours | theirs if ours.get(name) != theirs.get(name)]
-    said = [f"{name}: wanted {_show(ours, name)}, found {_show(theirs, name)}" for name in names[:LISTED_SETTINGS]]
-    if len(names) > LISTED_SETTINGS:
-        said.append(f"and {len(names) - LISTED_SETTINGS} more")
+    differ = differing_settings(wanted, found)
+    said = [f"{name}: wanted {ours}, found {theirs}" for name, (ours, theirs) in differ.items()][:LISTED_SETTINGS]
+    if len(differ) > LISTED_SETTINGS:
+        said.append(f"and {len(differ) - LISTED_SETTINGS} more")
     raise StoreMismatchError(
         f"{path or 'the store'} holds a {what} made by other settings ({'; '.join(said)}); "
         "write elsewhere with --out, or replace it with --force"
     )
+
+
+def differing_settings(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
+    """Return both values, as Python writes them, of each setting that differs, by its name ("options.drag")."""
+    one, other = dict(_leaves(ours)), dict(_leaves(theirs))
+    return {name: (_show(one, name), _show(other, name)) for name in one | other if one.get(name) != other.get(name)}
 
 
 def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
@@ -110,4 +116,4 @@ def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _show(settings: Mapping[str, Any], name: str) -> str:
-    return repr(settings[name]) if name in settings else "none"
+    return repr(settings[name]) if name in settings else ABSENT

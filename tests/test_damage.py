@@ -13,10 +13,17 @@ from .command import Said
 Command = Callable[..., Said]
 CUT = "slice branin --dims 0 1 --resolution 4 --out cut"
 MADE = {  # by folder: the verb that leaves it, then those that read it
-    "cut": [CUT, "report cut --points 2 --out anew", "overlay cut run --out over", "export cut --out cut.csv --force"],
+    "cut": [
+        CUT,
+        "report cut --points 2 --out anew",
+        "overlay cut run --out over",
+        "compare cut cut --out alike",
+        "export cut --out cut.csv --force",
+    ],
     "run": ["optimize branin --method random --budget 4 --out run"],
     "race": ["race branin --methods random --seeds 1 --budget 4 --out race"],
     "told": ["report cut --points 2 --out told"],
+    "both": ["compare cut branin --out both"],
     "pairs": ["pairs branin --samples 2 --out pairs"],
     "trade": ["tradeoff bounce --set horizon=0.05 --points 2 --variants precision --device cpu --out trade"],
     "user": ["slice bounce --set horizon=0.05 --dims 0 1 --resolution 2 --tolerance 50% --device cpu --out chosen"],

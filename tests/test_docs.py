@@ -37,6 +37,7 @@ WORDS = {"SLICE": "cut", "RUN": "run", "best:RUN": "best:run", "ADDRESS": "local
 WORDS |= {
     "tls://10.0.0.5:8786": "local:1",
     "throw": "cut",
+    "flight": "control",
     "standard": "draft",
     "gallery/data/flip-0-1": str(DATA / "flip-0-1"),
     "triple-move": "bounce",
@@ -52,6 +53,7 @@ ADDED = {
     "sweep": ["--resolution", "2"],
     "check": ["--points", "2"],
     "pairs": ["--samples", "2"],
+    "card": ["--scene", "control", "--resolution", "3"],
     "census": ["--slices", "1", "--resolution", "6"],
     "gallery compute": ["--only", "bounce-y", "--part", "slices", "--fidelity", "draft", "--data", "made"],
     "gallery build": ["--data", "few", "--out", "site"],
@@ -59,7 +61,13 @@ ADDED = {
 }
 SCENES = {verb: {"fluid": "bounce", "flip": "bounce"} for verb in ("race", "optimize", "tradeoff", "extremes")}
 SCENES["--tolerance"] = {"fluid": "bounce", "6": "0", "8": "1"}
-SHORT = {"slice": {"fluid", "assembly"}, "sweep": {"fluid"}, "replay": {"fluid"}, "plan": {"fluid"}}
+SHORT = {
+    "slice": {"fluid", "assembly"},
+    "compare": {"fluid"},
+    "sweep": {"fluid"},
+    "replay": {"fluid"},
+    "plan": {"fluid"},
+}
 TENTH = ["--set", "horizon=0.1"]  # of an episode
 TAICHI = ["--no-gradients"]  # whose kernels take minutes to compile with gradients
 

@@ -39,8 +39,12 @@ WRITING = {  # the command, the file for which there is no room any more, what i
     ),
     "pairs": ("pairs branin --samples 2 --out made", "pairs.json", "2 batches are kept in made"),
     "census": ("census branin --slices 1 --resolution 6 --out made", "census.json", "1 of 1 slices are kept in made"),
+    "card": (
+        "card --scene control --resolution 3 --out made", "card.json", "1 of 1 engines in scenes are kept in made"
+    ),
     "report": ("report cut --points 2 --out made", "report.json", "0 of 1 reports are kept in"),
     "overlay": ("overlay cut run --out made", "overlay.png", "each file in made is whole"),
+    "compare": ("compare cut branin --out made", "compare.json", "each file in made is whole"),
     "surface": ("surface cut --out made", "surface.png", ANEW),
     "replay": ("replay bounce --no-film --out made", "episode.json", ANEW),
     "export": ("export cut --out made.csv", "made.csv", ANEW),

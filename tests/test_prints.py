@@ -64,13 +64,14 @@ def test_what_begins_anew_leaves_no_print_of_what_was(run: Run, tmp_path: Path) 
     assert not list((tmp_path / "cut").glob("*.pdf"))
 
 
-def test_overlays_surfaces_and_replays_are_printed_too(run: Run, tmp_path: Path) -> None:
+def test_overlays_comparisons_surfaces_and_replays_are_printed_too(run: Run, tmp_path: Path) -> None:
     cut = ("slice", "bounce", "--dims", "0", "1", "--resolution", "5", "--device", "cpu", "--out", "cut")
     search = ("optimize", "bounce", "--method", "random", "--budget", "6", "--device", "cpu", "--out", "run")
     for command in (cut, search):
         assert run(*command, cwd=tmp_path).returncode == 0
     for name, command in (
         ("overlay", ("overlay", "cut", "run", "--out", "overlay")),
+        ("compare", ("compare", "cut", "cut", "--out", "compare")),
         ("surface", ("surface", "cut", "run", "--out", "surface")),
         ("episode", ("replay", "bounce", "--no-film", "--device", "cpu", "--out", "episode")),
     ):

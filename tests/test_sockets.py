@@ -32,6 +32,7 @@ optimize bounce --method random --budget 4 --fidelity draft --device cpu --out r
 race bounce --methods random --seeds 1 --budget 2 --fidelity draft --device cpu
 overlay cut run --out over
 surface cut run
+compare cut bounce --fidelity draft --device cpu
 replay bounce --fidelity draft --device cpu --no-film
 export cut
 view over/overlay.rrd
@@ -45,6 +46,7 @@ extremes bounce --points 4 --knobs dt --precisions float64 --fidelity draft --de
 pairs bounce --samples 2 --fidelity draft --device cpu
 report cut --device cpu
 census branin --slices 1 --resolution 6
+card --scene control --resolution 3
 gallery compute --only bounce-y --part slices --resolution 4 --fidelity draft --device cpu --data data
 gallery list --data data
 gallery build --data data --out site

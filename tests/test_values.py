@@ -33,6 +33,7 @@ sweep ackley --dims 0 1 --over 2 --set dim=3 --frames 2 --resolution 3
 optimize branin --method random --budget 5
 race branin --methods random --budget 5 --seeds 2
 overlay cut run
+compare cut branin
 surface cut
 replay bounce --no-film
 export cut
@@ -45,6 +46,7 @@ tradeoff bounce --points 2 --variants dt
 extremes bounce --points 4 --knobs dt
 pairs ackley --samples 2 --top 3
 census ackley --slices 1 --resolution 6
+card --scene control --resolution 3
 report cut --points 2
 gallery compute --only bounce --part reports
 gallery list

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -70,6 +70,7 @@ class MjxScene(Environment):
     duration: ClassVar[float]
     segments: ClassVar[int] = 1
     engines: ClassVar[tuple[str, ...]] = ("mjx",)
+    whole_batches: ClassVar[bool] = True
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=1 / 250, precision="float64"),
         "standard": Fidelity("standard", dt=1 / 500, precision="float64"),
@@ -125,6 +126,15 @@ class MjxScene(Environment):
 
     def _loss(self, x: Any) -> Any:
         return self.loss_of(self._rollout.end(x, self._course))
+
+    def _prepare(self) -> None:
+        for grad in (False, True):
+            self._evaluate(self.space.center[None], grad=grad)
+
+    def engine_call(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Callable[[], object]:
+        """Return what calls MJX's compiled program alone, on points that JAX holds already."""
+        call: Callable[[], object] = self._objective.engine_call(x, grad=grad)
+        return call
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         """Evaluate batches of one size only: programs for other sizes round in another order."""

@@ -25,6 +25,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from ... import __version__
 from ...envs.registry import entries
 from ...landscapes.identity import plane_of, stored_identity, stored_provenance
+from ...landscapes.measures.card import Card
 from ...landscapes.storage.arrays import parameters_of
 from ...landscapes.storage.files import placing, resolve
 from ...landscapes.storage.ownership import check_ours
@@ -33,6 +34,7 @@ from ...landscapes.storage.records import reading
 from ...landscapes.storage.store import SliceStore, open_slice
 from ..figures import Figure
 from ..files import MEASURES, PICTURE, QUALITY, REMAKE, REPORT, STORE, SURFACES, SWEEP_FILM
+from .card import place_card
 from .manifest import SCHEMA, FigureEntry, Manifest, ModelEntry, TradeoffEntry, as_json
 from .measured import dark_name, place_tradeoffs, read_report
 from .models import place_models
@@ -41,6 +43,7 @@ from .trajectories import lay_runs, read_runs
 
 HERE = Path(__file__).parent
 MANIFEST, NODES, THUMBNAIL = "manifest.json", "nodes.js", "thumbnail.png"
+CARD_PAGE = "card.html"
 
 
 def build_site(
@@ -64,6 +67,7 @@ def build_site(
         envs = [figure.env for figure in there]
         site = _Site(new, _templates(), tables, place_tradeoffs(data, new, envs), place_models(data, new, envs))
         shown = [site.write_page(figure, data / figure.id) for figure in there]
+        site.write_card(place_card(data, new))
         return site.write_index(shown, [figure.id for figure in figures if figure not in there])
 
 
@@ -144,11 +148,18 @@ class _Site:
         (folder / "index.html").write_text(self.pages.get_template("slice.html").render(**about))
         return entry
 
+    def write_card(self, card: Card | None) -> None:
+        """Write the page of the report card of gradients, where there is one."""
+        if card is not None:
+            (self.folder / CARD_PAGE).write_text(self.pages.get_template(CARD_PAGE).render(card=card))
+
     def write_index(self, shown: Sequence[FigureEntry], missing: Sequence[str]) -> Manifest:
         """Write the page of all pages and the manifest, and return that."""
         manifest = Manifest(SCHEMA, __version__, shown, missing, [])
         groups = [(env, list(group)) for env, group in groupby(shown, key=lambda entry: entry.env)]
-        index = self.pages.get_template("index.html").render(groups=groups, manifest=manifest, scenes=entries())
+        card = CARD_PAGE if (self.folder / CARD_PAGE).exists() else ""
+        about = {"groups": groups, "manifest": manifest, "scenes": entries(), "card": card}
+        index = self.pages.get_template("index.html").render(**about)
         (self.folder / "index.html").write_text(index)
         files = [file.relative_to(self.folder).as_posix() for file in self.folder.rglob("*") if file.is_file()]
         manifest = replace(manifest, files=sorted([*files, MANIFEST]))

@@ -89,11 +89,17 @@ BORDER: dict[str, Any] = {"s": 20.0, "facecolors": "none", "linewidths": 0.8, "z
 
 _MAP: dict[str, Any] = {"origin": "lower", "aspect": "auto", "interpolation": "nearest", "rasterized": True}
 COSINE: dict[str, Any] = _MAP | {"cmap": colormaps["RdBu"], "vmin": -1.0, "vmax": 1.0}  # of a gradient and a slope
+DIFFERENCE_MAP: Colormap = colormaps["PuOr_r"]  # of two losses: orange where the second is higher
 DISAGREEMENT: dict[str, Any] = _MAP | {"cmap": colormaps["cividis"], "vmin": 0.0, "vmax": 1.0}  # of two estimates
 NO_SLOPE: dict[str, Any] = {"facecolor": "#dcdcdc", "linewidth": 0.0}  # no slope above the noise
 BIASED: dict[str, Any] = {
     "marker": "D", "markersize": 5.0, "markerfacecolor": "white", "markeredgecolor": INK, "linestyle": "none"
 }  # fmt: skip
+FARTHEST = BIASED | {"markersize": 6.0}  # where two slices are farthest apart
+PAIR: tuple[dict[str, Any], dict[str, Any]] = (  # of two slices over a line, told apart without colour, too
+    {"color": "#0072b2", "linestyle": "solid"},
+    {"color": "#d55e00", "linestyle": (0, (4, 1.5)), "marker": ""},
+)
 
 VARIANTS: dict[str, dict[str, Any]] = {  # which option was changed to make a variant
     "dt": {"color": "#0072b2", "marker": "o"},
@@ -226,6 +232,12 @@ class Scale:
     def linear(cls, low: float, high: float) -> Scale:
         """Span a range."""
         return cls(Normalize(low, high), "neither")
+
+    @classmethod
+    def symmetric(cls, values: NDArray[np.float64]) -> Scale:
+        """Span finite values to both sides of zero alike, without the largest few where they are far out."""
+        _, most, _ = _span(np.abs(values))
+        return cls(Normalize(-most, most), "neither").over(values)
 
     @classmethod
     def of_magnitude(cls, values: NDArray[np.float64]) -> Scale:

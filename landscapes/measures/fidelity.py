@@ -230,11 +230,11 @@ def compare(variant: Sample, reference: Sample, *, seed: int) -> Comparison:
     error = np.where(variant.status == Status.OK, np.abs(variant.loss - reference.loss), np.inf)[known]
     cosine, off = gradient_error(variant.grad[fine], reference.grad[fine])
     scale = spread(reference)
-    median, p95 = (Bootstrap.of(of, error, seed=seed) for of in (_median, _p95))
+    median, p95 = (Bootstrap.of(of, error, seed=seed) for of in (median_of, p95_of))
     return Comparison(
         LossError(median, p95, median.share(scale), p95.share(scale)),
         Bootstrap.of(spearman, variant.loss[fine], reference.loss[fine], seed=seed),
-        GradientError(Bootstrap.of(_median, cosine, seed=seed), Bootstrap.of(_median, off, seed=seed)),
+        GradientError(Bootstrap.of(median_of, cosine, seed=seed), Bootstrap.of(median_of, off, seed=seed)),
         float(1 - fine.sum() / known.sum()) if known.any() else None,
         int(known.sum()),
         Seconds(variant.forward, variant.with_gradient),
@@ -314,9 +314,11 @@ def p95(row: Mapping[str, Any], *, relative: bool) -> float | None:
     return value
 
 
-def _median(values: Array) -> Array:
+def median_of(values: Array) -> Array:
+    """Return the median along the last axis."""
     return np.asarray(np.median(values, axis=-1))
 
 
-def _p95(values: Array) -> Array:
+def p95_of(values: Array) -> Array:
+    """Return the 95th percentile along the last axis: the next larger of the values, not interpolated."""
     return np.asarray(np.quantile(values, 0.95, axis=-1, method="higher"))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..plain import finite
 from .convergence import UNMOVED, Order, choose_order, extrapolate, find_floor, fit_order, measure_order
 from .convergence_record import ConvergenceRule, KnobConvergence, Level, Move, Remainder
-from .fidelity import Bootstrap, gradient_error
+from .fidelity import Bootstrap, gradient_error, median_of, p95_of
 
 Array = NDArray[np.float64]
 JOINT, PRECISION = "joint", "precision"
@@ -84,7 +84,7 @@ def error(values: Array, reference: Array) -> Array:
 
 def sum_up(errors: Array, spread: float, seed: int) -> tuple[Bootstrap, Bootstrap]:
     """Return the median and the 95th percentile of errors, as shares of the spread."""
-    median, p95 = (Bootstrap.of(of, errors, seed=seed).share(spread) for of in (_median, _p95))
+    median, p95 = (Bootstrap.of(of, errors, seed=seed).share(spread) for of in (median_of, p95_of))
     return median, p95
 
 
@@ -117,7 +117,7 @@ def _move(ladder: Ladder, place: int, scale: Scale) -> Move:
     levels = ladder.levels[place : place + 2]
     both = np.isfinite(coarse.loss) & np.isfinite(fine.loss)
     cosine, off = gradient_error(coarse.grad[both], fine.grad[both])
-    known = [Bootstrap.of(_median, one, seed=scale.seed) for one in (cosine, off)]
+    known = [Bootstrap.of(median_of, one, seed=scale.seed) for one in (cosine, off)]
     either = np.isfinite(coarse.loss) | np.isfinite(fine.loss)
     errors = np.nan_to_num(np.abs(coarse.loss - fine.loss)[either], nan=np.inf)
     median, p95 = sum_up(errors, scale.spread, scale.seed)
@@ -183,7 +183,7 @@ def _left(
         return lambda drawn: np.apply_along_axis(lambda one: statistic(errors(one)), -1, drawn)
 
     places: Any = rows  # of points, drawn as samples are
-    return [Bootstrap.of(of(one), places, seed=scale.seed).share(scale.spread) for one in (_median, _p95)]
+    return [Bootstrap.of(of(one), places, seed=scale.seed).share(scale.spread) for one in (median_of, p95_of)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,11 +218,3 @@ class _Correction:
         first = next(k for k in range(len(losses)) if np.isfinite(losses[k:]).all())
         moves = np.median(np.abs(np.diff(losses[first:], axis=0)), axis=-1)
         return float(fit_order(self.ladder.widths[first:], moves))
-
-
-def _median(values: Array) -> Array:
-    return np.asarray(np.median(values, axis=-1))
-
-
-def _p95(values: Array) -> Array:
-    return np.asarray(np.quantile(values, 0.95, axis=-1, method="higher"))

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..cost import measure_seconds
 from ..objective import Evaluation, Objective, evaluate
-from .fidelity import Array, Bootstrap, Sample
+from .fidelity import Array, Bootstrap, Sample, median_of
 
 ROUNDS, MOST_ROUNDS = 9, 49  # least and most rounds in which two objectives are timed in turn
 LASTING = 8.0  # least seconds that the rounds take together, up to the most
@@ -59,11 +59,7 @@ class Turns:
 
     def ratio(self, *, grad: bool, seed: int) -> Bootstrap:
         """Estimate the ratio of the second's time to the first's: the median of the rounds'."""
-        return Bootstrap.of(_median, self.second[int(grad)] / self.first[int(grad)], seed=seed)
-
-
-def _median(values: Array) -> Array:
-    return np.asarray(np.median(values, axis=-1))
+        return Bootstrap.of(median_of, self.second[int(grad)] / self.first[int(grad)], seed=seed)
 
 
 def ask(

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from .api.compare import compare
     from .api.environments import list_envs
-    from .api.measure import census, check, extremes, pairs, report
+    from .api.measure import card, census, check, extremes, pairs, report
     from .api.overlay import overlay
     from .api.search import open_run, optimize, race
     from .api.slice import open_slice, slice
@@ -42,7 +43,9 @@ _HOMES = {
     "SceneSpec": "jobs.scene",
     "Slice": "landscapes.slice",
     "Status": "landscapes.objective",
+    "card": "api.measure",
     "check": "api.measure",
+    "compare": "api.compare",
     "extremes": "api.measure",
     "from_jax": "envs.engines.jax_functions",
     "from_numpy": "landscapes.adapters",
@@ -79,8 +82,10 @@ __all__ = [
     "Slice",
     "Status",
     "__version__",
+    "card",
     "census",
     "check",
+    "compare",
     "extremes",
     "from_jax",
     "from_numpy",

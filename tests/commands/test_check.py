@@ -74,7 +74,7 @@ def test_bounce_passes_at_draft(run: Callable[..., Said], tmp_path: Path) -> Non
     assert checks["corners"]["numbers"]["finite"] == 8
     for name in ("dt 8x", "horizon 8x", "ke 100000", "10% outside the box"):
         assert sum(checks[name]["numbers"][kind] for kind in ("finite", "non-finite", "escaped", "error")) >= 2
-    assert "bounce · draft · cpu · warp · 4 points: some 244 episodes and" in done.stderr
+    assert "bounce · draft · cpu · warp · 4 points: some 394 episodes and" in done.stderr
     assert not list(tmp_path.iterdir())
 
 

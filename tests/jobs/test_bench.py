@@ -115,6 +115,21 @@ def test_simulating_is_not_the_samplers_own_time(report):
     assert sampler["share"] == pytest.approx(tiles * WRITING / sampler["seconds"])
 
 
+class Adapted(Sleeper):
+    """Sleeps four fifths of the time in an engine's own program."""
+
+    def engine_call(self, x, *, grad):
+        return lambda: CLOCK.sleep(0.8 * NAP[self.engine] * len(x) * (1 + grad))
+
+
+def test_what_is_not_the_engines_own_program_is_the_adapters(report, monkeypatch):
+    assert report["adapter"] is None
+    monkeypatch.setattr("gradscape.jobs.bench.time", CLOCK)
+    found = BenchJob(lambda engine: Adapted(engine=engine), "warp", batches=[1], seconds=0.2).run().adapter
+    assert found.batch == 256
+    assert (found.forward, found.with_gradient) == pytest.approx((0.2, 0.2))
+
+
 def test_calls_take_turns_and_are_repeated_whatever_they_take():
     made = []
     times = alternate({"a": lambda: made.append("a"), "b": lambda: made.append("b")}, seconds=0.0)

@@ -9,6 +9,8 @@ import torch
 import xarray as xr
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
+from matplotlib.colors import Colormap
 from matplotlib.lines import Line2D
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
@@ -80,8 +82,13 @@ def _cells(u: Grid, v: Grid, where: NDArray[np.bool_]) -> Path:
 
 def loss_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> list[Artist]:
     """Draw the loss map and its lowest sample, on the slice's own scale unless given; return the legend's entries."""
+    loss_map(ax, dataset, scale or style.Scale.of_loss(dataset["loss"].to_numpy()))
+    return lowest_sample(ax, dataset)
+
+
+def lowest_sample(ax: Axes, dataset: xr.Dataset, said: str = "lowest sample") -> list[Artist]:
+    """Mark the lowest sample on a map, with what is said of it; return the legend's entry, none without a loss."""
     loss = dataset["loss"].to_numpy()
-    loss_map(ax, dataset, scale or style.Scale.of_loss(loss))
     u, v = dataset["u"].to_numpy(), dataset["v"].to_numpy()
     if not np.isfinite(loss).any():
         return []
@@ -89,17 +96,21 @@ def loss_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) 
         return [Line2D([], [], linestyle="none", label=f"every sample: {style.number(np.nanmin(loss))}")]
     row, column = np.unravel_index(np.nanargmin(loss), loss.shape)
     look = page.sheet_of(ax).look(style.LOWEST_MARK)
-    (lowest,) = ax.plot(u[column], v[row], **look, label=f"lowest sample: {style.number(loss[row, column])}")
+    (lowest,) = ax.plot(u[column], v[row], **look, label=f"{said}: {style.number(loss[row, column])}")
     return [lowest]
 
 
 def loss_map(ax: Axes, dataset: xr.Dataset, scale: style.Scale) -> None:
     """Draw every sample's loss as the colour of its cell, with the colour bar; of a refined slice cells differ."""
-    loss = own_cells(dataset)["loss"].to_numpy()
-    mesh = ax.pcolormesh(
-        *cell_edges(dataset), np.ma.masked_invalid(loss), cmap=style.LOSS_MAP, norm=scale.norm, rasterized=True
-    )
+    mesh = cell_map(ax, dataset, own_cells(dataset)["loss"].to_numpy(), scale, style.LOSS_MAP)
     panel.colour_bar(ax, mesh, page.loss_name(dataset), scale)
+
+
+def cell_map(ax: Axes, dataset: xr.Dataset, values: Grid, scale: style.Scale, colours: Colormap) -> QuadMesh:
+    """Draw a value for each sample of a slice, shape (v, u), as the colour of its cell, none where it is not finite."""
+    return ax.pcolormesh(
+        *cell_edges(dataset), np.ma.masked_invalid(values), cmap=colours, norm=scale.norm, rasterized=True
+    )
 
 
 def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> list[Artist]:

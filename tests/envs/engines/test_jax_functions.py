@@ -42,6 +42,15 @@ def test_losses_and_gradients_are_those_of_the_same_function_in_torch(mode, batc
     assert objective.evaluate(X, grad=False).grad is None
 
 
+@pytest.mark.parametrize("grad", [True, False])
+def test_the_engines_own_program_gives_the_same(grad):
+    objective = gs.from_jax(wave, SPACE, rows=len(X))
+    (found,) = objective.engine_call(X, grad=grad)()
+    wanted = objective.evaluate(X, grad=grad)
+    for got, field in zip(found if grad else [found], ("loss", "grad"), strict=False):
+        torch.testing.assert_close(torch.tensor(got.tolist(), dtype=torch.float64), getattr(wanted, field))
+
+
 @pytest.mark.parametrize("rows", [1, 3, 4, 100])
 def test_a_row_does_not_depend_on_its_batch(rows):
     objective = gs.from_jax(wave, SPACE, rows=rows)

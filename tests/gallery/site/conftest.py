@@ -97,6 +97,18 @@ CONVERGENCE = {
 }  # fmt: skip
 
 
+GRADE = {
+    "scene": "drop", "engine": "an engine", "env": "bowl", "fidelity": "draft", "options": {"solver": "fast"},
+    "dims": ["0", "1"], "versions": {"engine": "1.2.3"}, "counts": {"pass": 20, "fail": 1}, "outcome": "fails",
+    "finding": "special places: 1 of 9 slopes < all are wrong", "check": "landscape check bowl --set solver=fast",
+    "slice": "landscape slice bowl --dims 0 1",
+}  # fmt: skip
+CARD = {
+    "created": "2030-01-01", "device": "cpu", "command": "landscape card",
+    "grades": [GRADE, {**GRADE, "outcome": "not installed", "finding": "", "counts": {}}],
+}  # fmt: skip
+
+
 class Bowl:
     """The squared distance from a point of the scaled box, and a corner that is not finite."""
 
@@ -166,6 +178,9 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     picture(folder / "tradeoff/fluid-cuda.model.png")
     (folder / "tradeoff/fluid-cuda.convergence.json").write_text(json.dumps(CONVERGENCE))
     picture(folder / "tradeoff/fluid-cuda.convergence.png")
+    (folder / "card").mkdir()
+    (folder / "card/card.json").write_text(json.dumps(CARD))
+    picture(folder / "card/card.png")
     for name in ("episode-6-5", "episode-11-11", "sweep"):
         film(full / name)
     (full / "episode-11-11.mp4").unlink()

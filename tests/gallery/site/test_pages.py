@@ -285,7 +285,7 @@ def test_every_table_shows_all_of_its_columns_on_a_phone(filed: str, visit: Visi
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_pages_fit_a_phone_in_light_and_dark(filed: str, visit: Visit, scheme: str) -> None:
-    for path in ("index.html", "full/index.html", "line/index.html"):
+    for path in ("index.html", "card.html", "full/index.html", "line/index.html"):
         page = visit(filed, path, width=360, color_scheme=scheme, device_scale_factor=2)
         assert page.evaluate("document.documentElement.scrollWidth") <= 360
         ground = page.evaluate("getComputedStyle(document.body).backgroundColor")

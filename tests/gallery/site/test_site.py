@@ -42,7 +42,7 @@ class Page(HTMLParser):
 
 def test_every_link_and_picture_is_in_the_site(site: Path) -> None:
     pages = {path: Page(path) for path in site.rglob("*.html")}
-    assert len(pages) == 1 + len(FIGURES)
+    assert len(pages) == 2 + len(FIGURES)  # the index and the report card
     for path, page in pages.items():
         assert len(set(page.ids)) == len(page.ids)
         assert set(page.named) <= set(page.ids)
@@ -97,6 +97,15 @@ def test_a_page_shows_what_each_part_of_the_model_is_for(site: Path) -> None:
     assert study["refused"] == [{"name": "tank", "why": "fluid needs its tank"}]
     page = (site / full["page"]).read_text()
     assert all(said in page for said in ("What each part of the model is for", "wall (missing)", "no drag"))
+
+
+def test_the_report_card_says_what_was_found_of_which_version(site: Path) -> None:
+    page = " ".join((site / "card.html").read_text().split())
+    assert "2 engines in scenes, measured on 2030-01-01 on cpu by the same checks, ours included: 1 fail." in page
+    assert "engine 1.2.3" in page
+    assert "special places: 1 of 9 slopes &lt; all are wrong" in page
+    assert "landscape check bowl --set solver=fast" in page
+    assert 'href="card.html"' in (site / "index.html").read_text()
 
 
 def test_words_are_beside_the_papers_and_a_trade_off_is_ranked(site: Path) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from gradscape.landscapes.draw import style
+from gradscape.landscapes.measures.card import Card, CardSlice, Grade
 from gradscape.landscapes.measures.census import MEASURES, CensusDesign, SurveyedSlice
 from gradscape.landscapes.measures.census_record import Census, conclude
 from gradscape.landscapes.measures.classify import WORDS
@@ -113,6 +114,30 @@ def mixed() -> dict[str, Any]:
     ]
     named = [row for row in REPORT["rungs"] if row["ladder"] == "named"]
     return {**REPORT, "env": "triple-move", "rungs": [*named, *rows]}
+
+
+def card() -> Card:
+    """Return a report card of three scenes, one engine of which is not installed."""
+    u = np.linspace(0, 1, 9)
+    loss = u[:, None] ** 2 + u**2
+    slope = 2 * np.stack(np.broadcast_arrays(u, u[:, None]), axis=-1)
+    where = {
+        "u": u,
+        "v": u,
+        "loss": loss,
+        "status": np.zeros((9, 9), int),
+        "labels": ("speed x [m/s]", "speed y [m/s]"),
+    }
+    slices = {n: CardSlice(**where, slope=(1 - n) * slope, loss_unit="m²") for n in (0, 2, 3)}  # type: ignore[arg-type] # each of its kind
+    names = (("drop", "an engine"), ("drop", "another"), ("flight", "an engine"), ("a slide on a rough floor", "third"))
+    ends = ("passes", "not installed", "fails", "passes")
+    grades = [
+        Grade(
+            scene, engine, "bowl", "draft", {}, ["0", "1"], {"engine": "1.2.3"}, end, "", {}, "landscape", "landscape"
+        )  # type: ignore[arg-type] # each of its kind
+        for (scene, engine), end in zip(names, ends, strict=True)
+    ]
+    return Card(grades, "2030-01-01", "cpu", "landscape card", slices)
 
 
 def census() -> Census:

@@ -16,7 +16,9 @@ from matplotlib.text import Text
 
 from gradscape.landscapes import draw
 from gradscape.landscapes.draw.figures import page, typesetting
+from gradscape.landscapes.draw.figures.card import card_figure
 from gradscape.landscapes.draw.figures.census import census_figure
+from gradscape.landscapes.draw.figures.comparison import comparison_figure
 from gradscape.landscapes.draw.figures.contact import Caption, episode_figure
 from gradscape.landscapes.draw.figures.contour import landscape_figure
 from gradscape.landscapes.draw.figures.convergence import convergence_figure
@@ -33,6 +35,9 @@ from gradscape.landscapes.draw.figures.tradeoff import tradeoff_figure
 from gradscape.landscapes.draw.render.surface import surface_figure
 from gradscape.landscapes.episode import Episode, Part, View
 from gradscape.landscapes.measures import gradient_quality as gradients
+from gradscape.landscapes.measures.slice_comparison import compare_slices
+from gradscape.landscapes.measures.slice_comparison_record import SliceComparison
+from gradscape.landscapes.objective import Status
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.storage.files import print_width
 from gradscape.optim.registry import methods
@@ -40,7 +45,7 @@ from gradscape.optim.registry import methods
 from ....studies import study
 from ...measures.test_fidelity import REPORT
 from ...test_overlay import LAID, SLICE
-from .records import census, convergence, extremes, mixed
+from .records import card, census, convergence, extremes, mixed
 from .test_contour import BOUNCES, DATASET, LINE, Bowl, plane
 from .test_curve import table
 from .test_race import race
@@ -63,6 +68,20 @@ def quality(dataset):
     places = gradients.subgrid(flat, 4 if flat.rank == 2 else 16)
     steps, smooth = gradients.compare_differences(Bowl(), flat, places), gradients.smoothed_slopes(Bowl(), flat, places)
     return dataset, steps, gradients.compare_samples(dataset), smooth
+
+
+SHIFTED = DATASET.assign(
+    loss=DATASET["loss"].copy(data=np.roll(DATASET["loss"], 1)),
+    status=DATASET["status"].copy(data=np.roll(DATASET["status"], 1)),
+)
+FAILED = DATASET.assign(loss=DATASET["loss"] * np.nan, status=DATASET["status"] * 0 + Status.NONFINITE)
+
+
+def compared(one, other) -> SliceComparison:
+    """Compare two slices, of which one is of other options, many of them."""
+    options = {f"the friction of wall number {number}": 0.1 * number for number in range(8)}
+    identity = json.loads(other.attrs["identity"]) | {"objective": "bowl of another engine", "options": options}
+    return compare_slices(one, other.assign_attrs(identity=json.dumps(identity)), command=COMMAND)
 
 
 EPISODE = Episode(
@@ -97,6 +116,11 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
         lambda width: overlay_figure(dated(SLICE), LAID[:1] * 12, width=width),
     ],
     "race_figure": [lambda width: race_figure(race(tuple(methods())), width=width)],
+    "comparison_figure": [
+        lambda width: comparison_figure(compared(DATASET, SHIFTED), width=width),
+        lambda width: comparison_figure(compared(LINE, LINE.assign(loss=1.2 * LINE["loss"])), width=width),
+        lambda width: comparison_figure(compared(DATASET, FAILED), width=width),
+    ],
     "surface_figure": [
         lambda width: surface_figure(dated(SLICE), LAID, width=width),
         lambda width: surface_figure(PLANE, width=width),
@@ -107,6 +131,7 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
     ],
     "convergence_figure": [lambda width: convergence_figure(convergence(), width=width)],
     "model_figure": [lambda width: model_figure(study(PARTS, failing=True), width=width)],
+    "card_figure": [lambda width: card_figure(card(), width=width)],
     "census_figure": [lambda width: census_figure(census(), width=width)],
     "extremes_figure": [lambda width: extremes_figure(extremes(), width=width)],
     "frame_figure": [lambda width: frame_figure(SWEEP, 1, Scales.of(SWEEP), width=width)],

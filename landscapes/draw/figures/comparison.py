@@ -1,0 +1,196 @@
+"""Two slices of one plane: both losses on one scale, their difference, and how their gradients agree (matplotlib)."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from ...identity import plane_of
+from ...measures.ruggedness import box_slopes
+from ...objective import Status
+from .. import style
+from . import contour, page, panel
+
+if TYPE_CHECKING:
+    from ...measures.slice_comparison_record import SliceComparison
+    from ...statistics import Estimate
+
+PITCH, LEAST = 4.8, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
+WIDTH, HEIGHT, ROOM = 8.0, 2.2, 1.2  # of the picture of a line, height of its panels, room beside them [inch]
+FLATTEST = 0.55  # of these panels, against those on a screen
+PLAIN = 3  # digits before or after the point, up to which differences have no power of ten
+LISTED = 4  # settings that differ, in the legend
+
+
+def comparison_figure(found: SliceComparison, *, width: float | None = None) -> page.Picture:
+    """Draw the losses of both slices on one scale, their difference, and the cosine of their gradients.
+
+    Each cell, or point of a line, is a sample of both; nothing is interpolated. The scale of differences is the same
+    to both sides of zero. Where a sample failed in one of the slices, what is drawn of both is hatched. Over a line
+    curves break there, and the gradients themselves are drawn, as their cosine is but a sign.
+
+    Raises ValueError where the page is too narrow or too wide.
+    """
+    draw = _draw_maps if plane_of(found.data[0]).rank == 2 else _draw_lines
+    picture, entries = draw(found, width)
+    points = " \N{MULTIPLICATION SIGN} ".join(str(count) for count in reversed(found.data[0]["loss"].shape))
+    page.entitle(picture, f"A: {found.a} against B: {found.b} · {points} points")
+    page.finish(picture, [*entries, *_say(found)], heading=_made(found))
+    return picture
+
+
+def _draw_maps(found: SliceComparison, width: float | None) -> tuple[page.Picture, list[Artist]]:
+    panels = 4 if found.slopes else 3
+    sheet = style.Sheet.of(width, pitch=PITCH, columns=2, least=LEAST)
+    picture = page.Picture(sheet, -(-panels // sheet.columns) * sheet.pitch)
+    axes, both = panel.grid(picture, panels, share=True), _where_either_failed(found)
+    entries = _loss_maps(axes, found)
+    _difference_map(axes[2], found)
+    entries += _farthest(axes[2], found)
+    if found.cosine is not None:
+        _cosine_map(axes[3], found.data[0], found.cosine)
+    for ax, dataset in zip(axes, (*found.data, both, both), strict=False):
+        contour.frame(ax, dataset, plane_of(dataset))
+        panel.name_outer(ax, *plane_of(dataset).labels)
+    return picture, [*entries, *_failures(both)]
+
+
+def _loss_maps(axes: list[Axes], found: SliceComparison) -> list[Artist]:
+    """Draw the losses of A and B on one scale; return the legend's entries."""
+    scale, entries = _loss_scale(found), list[Artist]()
+    for ax, letter, name, dataset in zip(axes, "AB", (found.a, found.b), found.data, strict=False):
+        drawn = contour.cell_map(ax, dataset, dataset["loss"].to_numpy(), scale, style.LOSS_MAP)
+        entries += contour.lowest_sample(ax, dataset, f"lowest sample of {letter}")
+        panel.caption(ax, f"{letter}: {name}")
+        panel.colour_bar(ax, drawn, page.loss_name(dataset), scale)
+    return entries
+
+
+def _loss_scale(found: SliceComparison) -> style.Scale:
+    return style.Scale.of_loss(np.concatenate([one["loss"].to_numpy().ravel() for one in found.data]))
+
+
+def _difference_map(ax: Axes, found: SliceComparison) -> None:
+    values, power = _in_powers(found)
+    scale = style.Scale.symmetric(values)
+    drawn = contour.cell_map(ax, found.data[0], values, scale, style.DIFFERENCE_MAP)
+    panel.caption(ax, "difference of losses, B \N{MINUS SIGN} A")
+    panel.colour_bar(ax, drawn, _name("difference", power, found.loss_unit), scale)
+
+
+def _in_powers(found: SliceComparison) -> tuple[NDArray[np.float64], str]:
+    """Return the differences of losses, and of which power of ten if they are far from 1."""
+    values = found.difference.to_numpy()
+    most = found.loss.largest.value
+    exponent = math.floor(math.log10(most)) if most > 0 else 0
+    if -PLAIN <= exponent < PLAIN:
+        return values, ""
+    return values / 10.0**exponent, style.power(10.0**exponent)
+
+
+def _name(what: str, power: str, unit: str) -> str:
+    """Return what stands along an axis, with the power of ten and the unit of its numbers."""
+    return f"{what} [{' '.join(one for one in (power, unit) if one)}]" if power or unit else what
+
+
+def _cosine_map(ax: Axes, dataset: xr.Dataset, cosine: xr.DataArray) -> None:
+    scale, colours = style.Scale.linear(-1.0, 1.0), style.COSINE["cmap"]
+    drawn = contour.cell_map(ax, dataset, cosine.to_numpy(), scale, colours)
+    panel.caption(ax, "gradients of A against B")
+    panel.colour_bar(ax, drawn, "cosine of gradients", scale)
+
+
+def _farthest(ax: Axes, found: SliceComparison) -> list[Artist]:
+    """Mark where the losses are farthest apart; return the legend's entry."""
+    if not found.loss.largest.value > 0 or not found.parting:
+        return []
+    look, apart = page.sheet_of(ax).look(style.FARTHEST), found.parting.b - found.parting.a
+    at = ([one] for one in found.parting.place.values())
+    (mark,) = ax.plot(*at, **look, zorder=4, label=f"farthest apart, B \N{MINUS SIGN} A: {style.number(apart)}")
+    return [mark]
+
+
+def _draw_lines(found: SliceComparison, width: float | None) -> tuple[page.Picture, list[Artist]]:
+    panels, plane = 3 if found.slopes else 2, plane_of(found.data[0])
+    sheet = style.Sheet.of(width, pitch=WIDTH)
+    height = max(FLATTEST, sheet.zoom) * HEIGHT
+    picture = page.Picture(sheet, panels * height + 1.6)
+    axes = list(picture.subplots(panels, 1, sharex=True, squeeze=False)[:, 0])
+    entries = _curves(axes[0], found, [one["loss"].to_numpy() for one in found.data])
+    panel.name_axes(axes[0], y=page.loss_name(found.data[0]))
+    look = sheet.look(style.stroke(found.points))
+    values, power = _in_powers(found)
+    axes[1].plot(found.difference["u"], values, color=style.INK, **look)
+    panel.name_axes(axes[1], y=_name("B \N{MINUS SIGN} A", power, found.loss_unit))
+    if found.slopes:
+        _curves(axes[2], found, [box_slopes(one)[:, 0] for one in found.data])
+        panel.name_axes(axes[2], y=f"slope [{found.loss_unit or 'loss'} per side]")
+    for ax in axes:
+        panel.dress(ax)
+        ax.set_box_aspect(height / (sheet.width - ROOM * sheet.type))
+        ax.set_xlim(float(plane.lower[0]), float(plane.upper[0]))
+    for ax in axes[1:]:
+        ax.axhline(0, color=style.FAINT, linewidth=0.8 * sheet.weight, zorder=0.5)
+    panel.name_axes(axes[-1], plane.labels[0])
+    picture.align_ylabels(axes)
+    return picture, [*entries, *_failures(_where_either_failed(found))]
+
+
+def _curves(ax: Axes, found: SliceComparison, values: list[Any]) -> list[Artist]:
+    """Draw a curve for each slice; return the legend's entries."""
+    sheet, entries, u = page.sheet_of(ax), list[Artist](), found.data[0]["u"].to_numpy()
+    for letter, name, curve, look in zip("AB", (found.a, found.b), values, style.PAIR, strict=True):
+        entries += ax.plot(u, curve, **sheet.look(style.stroke(len(u)) | look), label=f"{letter}: {name}")
+    return entries
+
+
+def _where_either_failed(found: SliceComparison) -> xr.Dataset:
+    """Return slice A with the status of B where A is well: what is hatched in a map of both."""
+    ours, theirs = (one["status"] for one in found.data)
+    return found.data[0].assign(status=ours.copy(data=np.where(ours == Status.OK, theirs, ours)))
+
+
+def _failures(both: xr.Dataset) -> list[Patch]:
+    """Return the legend's entries of the failures in either slice; over a line, whose curves break, without a sign."""
+    entries = page.failure_key(both)
+    for one in entries:
+        kind, _, count = str(one.get_label()).rpartition(": ")
+        one.set(label=f"{kind} in A or B: {count}", visible=both["loss"].ndim == 2)
+    return entries
+
+
+def _say(found: SliceComparison) -> list[Patch]:
+    """Return legend entries without a sign: the chief numbers, and the settings that differ."""
+    if not found.compared:
+        return [Patch(visible=False, label="no point has a loss in both")]
+    percent = style.number(100 * found.loss.shares()["median"].value, ".2g")
+    unit = f" {found.loss_unit}" if found.loss_unit else ""
+    said = [f"median difference: {style.number(found.loss.median.value)}{unit}, {percent} % of A's range"]
+    said.append(f"rank correlation: {_interval(found.spearman)}")
+    if found.slopes:
+        said.append(f"cosine of gradients, median: {_interval(found.slopes.cosine)}")
+        said.append(f"opposing gradients: {style.number(100 * found.slopes.opposing.value, '.2g')} %")
+        said.append(f"length of gradients, B to A, median: {_interval(found.slopes.ratio)}")
+    if found.statuses:
+        said.append(f"ended differently: {sum(one.points for one in found.statuses)} of {found.points}")
+    settings = [f"{name}: {a} in A, {b} in B" for name, (a, b) in found.shared.items()]
+    rest = len(found.differing) - min(len(settings), LISTED)
+    more = [f"and {rest} more settings differ"] if rest else []
+    return [Patch(visible=False, label=text) for text in (*said, *settings[:LISTED], *more)]
+
+
+def _interval(one: Estimate) -> str:
+    ends = f" ({style.number(one.low)} to {style.number(one.high)})" if one.low == one.low else ""
+    return f"{style.number(one.value)}{ends}"
+
+
+def _made(found: SliceComparison) -> str:
+    a, b = (page.provenance(one).split(" · ")[0] for one in found.data)
+    return " · ".join(one for one in (a if a == b else f"{a} and {b}", found.command) if one)

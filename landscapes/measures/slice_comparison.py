@@ -1,0 +1,216 @@
+"""Two slices of one plane held against each other: losses, their order, gradients, and where they part."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+import xarray as xr
+from numpy.typing import NDArray
+
+from ..identity import differing_settings, plane_of, stored_identity, stored_provenance
+from ..lattice import sampled_lattice
+from ..objective import Status
+from ..statistics import Estimate, jackknife
+from .fidelity import gradient_error, median_of, p95_of, spearman
+from .ruggedness import box_slopes, span
+from .slice_comparison_record import LossDifference, Parting, SliceComparison, SlopeDifference, StatusPair, exactly
+
+if TYPE_CHECKING:
+    from ..plane import Plane
+
+Values = NDArray[np.float64]
+PLACING = ("plane", "cut", "boxed", "parameters")  # in a slice's identity: where it lies, not what it is of
+PARTS = {"basis": "directions", "lower": "lower ends", "upper": "upper ends", "origin": "points they go through"}
+ROUNDING = 1e-9  # planes that are no farther apart, relatively, are the same
+ANYTHING = "give the name of an environment as B, which is then sampled on A's plane"
+
+
+def compare_slices(a: xr.Dataset, b: xr.Dataset, *, command: str = "") -> SliceComparison:
+    """Hold the slice B against the slice A of the same plane.
+
+    Intervals leave out blocks of the plane in turn (`statistics.jackknife`), as neighbours depend on each other: they
+    say what another part of the plane might have given. The 95th percentile is the next larger difference.
+
+    Raises ValueError where the two are not on one plane, of other parameters, in other units, or not finished.
+    """
+    check_landscapes(parameters(a), parameters(b), loss_unit(a), loss_unit(b))
+    check_planes(plane_of(a), plane_of(b))
+    check_finished(a, b)
+    a, b = _on_one_lattice(a, b)
+    differing = differing_settings(*(_settings(one) for one in (a, b)))
+    losses, cosine = [one["loss"].to_numpy() for one in (a, b)], _cosine(a, b)
+    apart, names = np.abs(losses[1] - losses[0]), _names(a, b, differing)
+    known = np.isfinite(apart)
+    return SliceComparison(
+        a=names[0],
+        b=names[1],
+        loss_unit=loss_unit(a),
+        points=apart.size,
+        compared=int(known.sum()),
+        statuses=_statuses(a, b),
+        loss=LossDifference(
+            _over_blocks(median_of, apart, least=0),
+            _over_blocks(p95_of, apart, least=0),
+            exactly(float(apart[known].max()) if known.any() else math.nan),
+            span(np.where(known, losses[0], np.nan)) if known.any() else math.nan,
+        ),
+        spearman=_over_blocks(spearman, *losses, least=-1, most=1),
+        slopes=None if cosine is None else _compare_slopes(a, b, cosine.to_numpy()),
+        parting=_part(a, losses, apart) if known.any() else None,
+        differing=differing,
+        data=(a, b),
+        difference=b["loss"].copy(data=losses[1] - losses[0]).rename("difference"),
+        cosine=cosine,
+        command=command,
+    )
+
+
+def check_landscapes(ours: Sequence[str], theirs: Sequence[str], unit: str, other: str) -> None:
+    """Raise ValueError where B has other parameters than A, or losses in another unit."""
+    if list(ours) != list(theirs):
+        pairs = zip(ours, theirs, strict=False)
+        first = next(((x, y) for x, y in pairs if x != y), (f"{len(ours)} of them", f"{len(theirs)}"))
+        raise ValueError(
+            f"slices to compare have the same parameters; A has {first[0]} where B has {first[1]}, so compare "
+            "landscapes of one space"
+        )
+    if unit != other:
+        raise ValueError(
+            f"losses to compare have one unit; A's is {unit or 'none'} and B's {other or 'none'}, so compare "
+            "landscapes that count the same"
+        )
+
+
+def check_planes(ours: Plane, theirs: Plane) -> None:
+    """Raise ValueError where two planes, or their samples, are not the same, and say what of them is not."""
+    if ours.resolution != theirs.resolution:
+        sizes = (" x ".join(map(str, one.resolution)) for one in (ours, theirs))
+        raise ValueError("slices to compare have the same points; A has {} and B {}; ".format(*sizes) + ANYTHING)
+    for field, said in PARTS.items():
+        one, other = getattr(ours, field), getattr(theirs, field)
+        if not torch.allclose(one, other, rtol=ROUNDING, atol=ROUNDING * float(one.abs().max())):
+            values = _name_axes(ours, theirs) if field == "basis" else _where_apart(one, other)
+            raise ValueError(f"slices to compare lie on one plane; the {said} differ: {values}; {ANYTHING}")
+
+
+def check_finished(*slices: xr.Dataset) -> None:
+    """Raise ValueError where samples are missing."""
+    for name, dataset in zip("AB", slices, strict=False):
+        if missing := int((dataset["status"] == Status.MISSING).sum()):
+            raise ValueError(f"{missing} samples of {name} are missing; let what samples it go on first")
+
+
+def _name_axes(ours: Plane, theirs: Plane) -> str:
+    return " and ".join(f"{name} is along {', '.join(one.names)}" for name, one in (("A", ours), ("B", theirs)))
+
+
+def _where_apart(one: torch.Tensor, other: torch.Tensor) -> str:
+    at = int((one - other).abs().argmax())
+    return f"number {at} is {float(one[at]):.6g} in A and {float(other[at]):.6g} in B"
+
+
+def parameters(dataset: xr.Dataset) -> list[str]:
+    """Return the names of a slice's parameters."""
+    return [str(name) for name in dataset["dim"].to_numpy()]
+
+
+def loss_unit(dataset: xr.Dataset) -> str:
+    """Return the unit of a slice's losses, empty where they have none."""
+    return str(dataset["loss"].attrs.get("units", ""))
+
+
+def _on_one_lattice(a: xr.Dataset, b: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
+    """Return two slices as `sampled_lattice` does, the same lattice of both, v before u."""
+    a, b = (one.transpose("v", "u", ..., missing_dims="ignore") for one in (a, b))
+    lacking = [one["status"].to_numpy() == Status.INTERPOLATED for one in (a, b)]
+    either = lacking[0] | lacking[1]
+    marked = (
+        one.assign(status=one["status"].copy(data=np.where(either, Status.INTERPOLATED, one["status"].to_numpy())))
+        for one in (a, b)
+    )
+    first, second = (sampled_lattice(one) for one in marked)
+    return first, second
+
+
+def _settings(dataset: xr.Dataset) -> dict[str, Any]:
+    """Return what a slice is of, by its identity, and the versions of packages that made it."""
+    identity = {name: value for name, value in stored_identity(dataset).items() if name not in PLACING}
+    settings = {name: value for name, value in identity.get("settings", {}).items() if name != "name"}  # the fidelity's
+    return {**identity, "settings": settings, "versions": stored_provenance(dataset).get("versions", {})}
+
+
+def _names(a: xr.Dataset, b: xr.Dataset, differing: dict[str, tuple[str, str]]) -> list[str]:
+    """Name objective and fidelity of both, and of the same ones the first setting that differs."""
+    known = [stored_identity(one) for one in (a, b)]
+    names = [" · ".join(str(one[key]) for key in ("objective", "fidelity") if one.get(key)) for one in known]
+    if names[0] == names[1] and differing:
+        setting, values = next(iter(differing.items()))
+        short = setting.rpartition(".")[2]
+        return [f"{name} · {short} {value.strip(chr(39))}" for name, value in zip(names, values, strict=True)]
+    return names
+
+
+def _statuses(a: xr.Dataset, b: xr.Dataset) -> tuple[StatusPair, ...]:
+    """Count the pairs of ways in which points ended differently, the most frequent first."""
+    pairs = Counter(zip(*(one["status"].to_numpy().ravel().tolist() for one in (a, b)), strict=True))
+    return tuple(
+        StatusPair(Status(one).name.lower(), Status(other).name.lower(), count)
+        for (one, other), count in pairs.most_common()
+        if one != other
+    )
+
+
+def _compare_slopes(a: xr.Dataset, b: xr.Dataset, cosine: Values) -> SlopeDifference:
+    return SlopeDifference(
+        _over_blocks(median_of, cosine, least=-1, most=1),
+        _over_blocks(_opposing, cosine, least=0, most=1),
+        _over_blocks(median_of, _ratio(box_slopes(a), box_slopes(b)), least=0),
+    )
+
+
+def _opposing(cosine: Values) -> Values:
+    return np.asarray((cosine < 0).mean())
+
+
+def _cosine(a: xr.Dataset, b: xr.Dataset) -> xr.DataArray | None:
+    """Return the cosine between gradients along the plane, NaN where either failed; None without gradients."""
+    if "grad" not in a or "grad" not in b:
+        return None
+    ours, theirs = (box_slopes(one) for one in (a, b))
+    found, _ = gradient_error(*(one.reshape(-1, one.shape[-1]) for one in (theirs, ours)))
+    known = np.isfinite(ours).all(axis=-1) & np.isfinite(theirs).all(axis=-1)
+    return a["loss"].copy(data=np.where(known, found.reshape(known.shape), np.nan)).rename("cosine").drop_attrs()
+
+
+def _ratio(ours: Values, theirs: Values) -> Values:
+    """Return how long slopes are, theirs to ours: 1 of two that are zero, NaN where either is not known."""
+    lengths = [np.linalg.norm(one, axis=-1) for one in (ours, theirs)]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where((lengths[0] == 0) & (lengths[1] == 0), 1.0, lengths[1] / lengths[0])
+
+
+def _part(dataset: xr.Dataset, losses: Sequence[Values], apart: Values) -> Parting:
+    """Return the point of the largest difference."""
+    at = np.unravel_index(np.nanargmax(apart), apart.shape)
+    plane = plane_of(dataset)
+    u = (float(axis[index]) for axis, index in zip(plane.axes(), at[::-1], strict=True))
+    return Parting(dict(zip(plane.labels, u, strict=True)), *(float(loss[at]) for loss in losses))
+
+
+def _over_blocks(
+    statistic: Callable[..., Values], *fields: Values, least: float = -math.inf, most: float = math.inf
+) -> Estimate:
+    """Estimate a statistic of fields over the plane whose entries belong together, where none of them is NaN."""
+    known = ~np.any([np.isnan(one) for one in fields], axis=0)
+    numbers = np.where(known, np.arange(known.size).reshape(known.shape), np.nan)
+
+    def of(some: Values) -> float:
+        rows = some[~np.isnan(some)].astype(np.intp)
+        return float(statistic(*(one.ravel()[rows] for one in fields))) if len(rows) else math.nan
+
+    return jackknife(of, numbers, least=least, most=most)
