@@ -28,8 +28,10 @@ TEXT = "\n".join(page.read_text() for page in PAGES)
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 BLOCKS = [
-    block for block in re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL) if "dask_jobqueue" not in block
-]  # what a batch system needs is installed by no test
+    block
+    for block in re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL)
+    if "dask_jobqueue" not in block and "from brax" not in block
+]  # what a batch system and Brax need is installed by no test
 PLACEHOLDER = re.compile(r"\.{3}|[\[\]|]|\b(?!CUDA)[A-Z]{1,}\b")  # in what a command may look like
 
 # What makes them small: words in the place of others, the values of options, and options that are added.

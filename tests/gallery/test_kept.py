@@ -7,7 +7,7 @@ import pytest
 from gradscape.landscapes.storage.records import read_json
 
 DATA = Path(__file__).parents[2] / "gallery" / "data"
-RECORDS = [path for folder in ("tradeoff", "extremes") for path in sorted((DATA / folder).glob("*.json"))]
+RECORDS = [path for folder in ("tradeoff", "extremes", "census") for path in sorted((DATA / folder).glob("*.json"))]
 
 
 @pytest.mark.parametrize("path", RECORDS, ids=lambda path: f"{path.parent.name}/{path.name}")
@@ -21,6 +21,8 @@ def test_a_kept_record_is_whole_and_its_command_is_anybodys(path: Path) -> None:
 
 def test_every_picture_has_its_record() -> None:
     pictures = {
-        path.with_suffix(".json") for folder in ("tradeoff", "extremes") for path in (DATA / folder).glob("*.png")
+        path.with_suffix(".json")
+        for folder in ("tradeoff", "extremes", "census")
+        for path in (DATA / folder).glob("*.png")
     }
     assert pictures == set(RECORDS)

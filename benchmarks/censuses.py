@@ -1,0 +1,96 @@
+"""Write the table of what many slices of every scene are like, from the censuses that the gallery keeps.
+
+    python -m benchmarks.censuses [--check]
+
+The table in docs/measures.md has a row for each scene: how many slices were measured, which share of them each word of
+the classification fits, with its interval, and the paper's words with their shares. It is of the records by
+`landscape census ENV --fidelity standard` in gallery/data/census; a scene that has none, or has changed since, is said
+to be so. With --check nothing is written: exit code 1 says that the page differs, or that a scene is not measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gradscape.envs.registry import entries, environment_class
+from gradscape.gallery.files import DEVICES
+from gradscape.gallery.paper import read_paper
+from gradscape.jobs.report_tables import markdown
+from gradscape.landscapes.statistics import Estimate
+from gradscape.landscapes.storage.records import read_json
+
+from .pages import DATA, DOCS, UNMEASURED, is_present, settle
+
+PAGE, NAME = DOCS / "measures.md", "censuses"
+HEAD = ("environment", "slices", "measured: share of the slices (95 % interval)", "the paper's words")
+MISSING = "not measured"
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Say which share of so many slices each word fits."""
+
+    slices: int
+    words: Mapping[str, Estimate]
+
+    @classmethod
+    def of_record(cls, record: Mapping[str, Any]) -> Shares:
+        """Read it from the record of a census."""
+        words = {word: Estimate.of_record(one) for word, one in record["words"].items()}
+        return cls(len(record["slices"]), words)
+
+    def say(self, word: str) -> str:
+        """Say the share of a word."""
+        one = self.words[word]
+        interval = f" ({100 * one.low:.0f} to {100 * one.high:.0f})" if one.low < one.high else ""
+        return f"{word} {100 * one.value:.0f} %{interval}"
+
+
+def censuses(data: Path = DATA) -> dict[str, Shares | str]:
+    """Return the kept census of each scene, or why there is none."""
+    found: dict[str, Shares | str] = {}
+    for name, entry in sorted(entries().items()):
+        if entry.extra or len(environment_class(name).fidelities) == 1:
+            continue  # others' engines, and functions
+        files = (data / "census" / f"{name}-{device}.json" for device in DEVICES)
+        record = next((read_json(file) for file in files if file.exists()), None)
+        if record is None:
+            found[name] = MISSING
+        elif not is_present(name, record["identity"]["code"], record["identity"]["engine"]):
+            found[name] = UNMEASURED
+        else:
+            found[name] = Shares.of_record(record)
+    return found
+
+
+def rows(found: Mapping[str, Shares | str]) -> Iterator[list[str]]:
+    """Return a row for each scene."""
+    paper = read_paper().words
+    for name, one in found.items():
+        said = paper[name].words if name in paper else ()
+        if isinstance(one, str):
+            yield [f"`{name}`", "", one, ", ".join(said)]
+            continue
+        most = sorted(one.words, key=lambda word, one=one: -one.words[word].value)  # type: ignore[misc]
+        measured = ", ".join(one.say(word) for word in most if one.words[word].value > 0)
+        yield [f"`{name}`", str(one.slices), measured, ", ".join(map(one.say, said))]
+
+
+def main() -> int:
+    """Write the page, or say what is not so."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing, say what is not so")
+    asked = parser.parse_args()
+    found = censuses()
+    wrong = [f"{name}: {one}" for name, one in found.items() if isinstance(one, str)]
+    fine = f"all {len(found)} scenes are measured"
+    return settle(markdown(HEAD, list(rows(found))), PAGE, NAME, wrong, check=asked.check, fine=fine)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,33 @@
+"""docs/measures.md has a row for every scene, with what the kept census says of its slices."""
+
+from pathlib import Path
+
+from benchmarks import censuses
+from benchmarks.censuses import HEAD, MISSING, NAME, PAGE, Shares, rows
+from benchmarks.pages import DATA, UNMEASURED, written
+
+from gradscape.envs.registry import entries, environment_class
+from gradscape.jobs.report_tables import markdown
+from gradscape.landscapes.storage.records import read_json, write_record
+
+
+def test_the_page_holds_the_censuses() -> None:
+    wanted = markdown(HEAD, list(rows(censuses.censuses())))
+    assert written(PAGE, NAME) == wanted, "`python -m benchmarks.censuses` writes the page"
+
+
+def test_every_scene_of_ours_has_a_row() -> None:
+    ours = {name for name, entry in entries().items() if not entry.extra}
+    scenes = {name for name in ours if len(environment_class(name).fidelities) > 1}
+    assert {line[0].strip("`") for line in rows(censuses.censuses())} == scenes
+
+
+def test_a_scene_that_changed_or_was_never_measured_is_said_to_be_so(tmp_path: Path) -> None:
+    record = read_json(DATA / "census" / "bounce-cpu.json")
+    assert isinstance(censuses.censuses()["bounce"], Shares)
+    record["identity"]["code"] = "000000000000"
+    (tmp_path / "census").mkdir()
+    write_record(tmp_path / "census" / "bounce-cpu.json", record)
+    found = censuses.censuses(tmp_path)
+    assert (found["bounce"], found["cartpole"]) == (UNMEASURED, MISSING)
+    assert dict((line[0], line[2]) for line in rows(found))["`bounce`"] == UNMEASURED
