@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 from ..jobs.cut import cut, describe_cut
-from ..jobs.scene import SceneSpec, environment_of
+from ..jobs.scene import SceneSpec, environment_of, with_policy
 from ..jobs.watch import Watch
 from ..landscapes.adapters import within_box
+from ..landscapes.objective import name_of
 from .progress import default_watch
 from .scene import SceneKeywords, is_environment, objective_of, say_call
 
@@ -35,6 +36,7 @@ def slice(
     extent: float | tuple[float, float] | None = None,
     refine: float | None = None,
     budget: int | None = None,
+    policy: str | None = None,
     gradients: bool = True,
     out: str | Path | None = None,
     force: bool = False,
@@ -50,6 +52,9 @@ def slice(
     by default one under out/ named after the slice: the same call goes on there where it stopped. An objective that is
     no environment is sampled in memory without `out`.
 
+    With a `policy`, mlp:32x32, it is over the weights of a perceptron that takes the environment's decisions by what it
+    sees, not over the environment's own parameters; it has losses only.
+
     With `refine`, a share of the range of the losses, it is sampled only where neighbours do not explain to that share
     what is between them, and with a `budget` at no more points than that. The others are interpolated: status says
     which, their loss is NaN, and no measure uses them.
@@ -59,11 +64,15 @@ def slice(
     """
     watch = default_watch()
     objective = objective_of(scene, keywords, watch)
+    if policy is not None:
+        if not is_environment(objective):
+            raise ValueError(f"a policy decides in an environment; got the objective {name_of(objective)}")
+        objective, gradients = with_policy(objective, policy), False
     plane = cut(objective, dims, along, through=through, extent=extent, resolution=resolution)
     from ..landscapes.sampling.refine import Refinement
 
     fine = Refinement.of(refine, budget)
-    if out is None and not is_environment(objective):
+    if out is None and policy is None and not is_environment(objective):
         return _sample_in_memory(within_box(objective) if along else objective, plane, gradients, fine, watch)
     from ..jobs.slice import SliceJob
 
@@ -72,8 +81,9 @@ def slice(
     how = {
         "refine": refine,
         "budget": budget,
+        "policy": policy,
         **where,
-        "gradients": None if gradients else False,
+        "gradients": None if gradients or policy else False,
     }
     command = say_call("slice", scene, *([tuple(dims)] if dims else []), resolution=resolution, **how, **keywords)
     settings: dict[str, Any] = {"out": Path(out) if out is not None else None, "grad": gradients, "force": force}

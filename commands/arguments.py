@@ -93,6 +93,13 @@ Scheduler = Annotated[
         "one per GPU, or per core."
     ),
 ]
+Policy = Annotated[
+    str | None,
+    typer.Option(
+        help="Sample over the weights of a policy instead of the environment's own parameters: mlp:32x32, a perceptron "
+        "with two hidden layers of 32 that decides by what it sees. Losses only."
+    ),
+]
 NoGradients = Annotated[bool, typer.Option("--no-gradients", help="Sample losses only.")]
 Refine = Annotated[
     str | None,

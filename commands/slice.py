@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ..jobs.scene import SceneSpec
+from ..jobs.scene import SceneSpec, with_policy
 from .arguments import (
     Along,
     Extent,
@@ -17,6 +17,7 @@ from .arguments import (
     Json,
     NoGradients,
     Out,
+    Policy,
     Print,
     Refine,
     RefineBudget,
@@ -40,6 +41,7 @@ def slice_(
     extent: Extent = None,
     refine: Refine = None,
     budget: RefineBudget = None,
+    policy: Policy = None,
     no_gradients: NoGradients = False,
     scheduler: Scheduler = None,
     out: Out = None,
@@ -57,7 +59,7 @@ def slice_(
     Example: landscape slice fluid --dims 6 8 --resolution 24
     """
     how: dict[str, Any] = {"resolution": resolution, "through": through, "grad": not no_gradients}
-    how |= {"refine": refine, "budget": budget, "along": along}
+    how |= {"refine": refine, "budget": budget, "along": along, "policy": policy}
     _sample(scene, dims, extent, print_, out, **how, as_json=json_, force=force, scheduler=scheduler)
 
 
@@ -101,12 +103,14 @@ def _sample(
     refine: str | None = None,
     budget: int | None = None,
     along: str | None = None,
+    policy: str | None = None,
 ) -> None:
     """Sample a slice, and say what came out."""
     from .terminal import Bars, command_line, print_json
 
     bars = Bars()
     env = scene.make(bars)
+    subject = with_policy(env, policy)
     from ..jobs.cut import cut, describe_cut, folder_for, split_points
     from ..jobs.slice import SliceJob
     from ..jobs.workers import workers
@@ -114,15 +118,20 @@ def _sample(
 
     points = split_points(through)
     where: dict[str, Any] = {"extent": read_extent(extent), "resolution": resolution}
-    planes = {point: cut(env, dims, along, through=point, **where) for point in points}  # or none is sampled
-    how: dict[str, Any] = {"command": command_line(), "grad": grad, "force": force, "prints": prints or []}
+    planes = {point: cut(subject, dims, along, through=point, **where) for point in points}  # or none is sampled
+    how: dict[str, Any] = {
+        "command": command_line(),
+        "grad": grad and policy is None,
+        "force": force,
+        "prints": prints or [],
+    }
     how["refinement"] = Refinement.of(read_share(refine, "--refine"), budget)
     said = list[dict[str, Any]]()
     with workers(scheduler, env.device) as executor:
         for point, plane in planes.items():
             folder = folder_for(Path(out), point, points) if out else None
             named = describe_cut(along, point, where["extent"])
-            job = SliceJob.of(env, plane, out=folder, cut=named, executor=executor, **how)
+            job = SliceJob.of(subject, plane, out=folder, cut=named, executor=executor, **how)
             summary = job.run(bars)
             bars.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
             said.append({**asdict(summary), "folder": str(job.folder)})

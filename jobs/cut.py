@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from ..landscapes.plane import Plane
     from ..landscapes.space import ParameterSpace
 
-HALF, LEAST = 0.5, 1e-3  # of a width of the box: how far a slice reaches at most, and what is no width for one
+HALF, LEAST = 0.5, 1e-3  # of a width of the box: how far a slice reaches at least, and what is no width for one
+SPREAD = 1 / 8  # the same by the root of how many parameters there are: each moves by that share of its width
 
 
 def cut(
@@ -54,8 +55,9 @@ def plane_along(
 ) -> Plane:
     """Return the line or plane along directions that are named: random:SEED, gradient, hessian, pca:RUN, A:B, A:B:C.
 
-    Directions are in widths of the box, half a width to each side of the point by default. Points of a line or a plane
-    are named as those it goes through. Raises ValueError for what is none of these.
+    Directions are in widths of the box. By default they reach half a width to each side of the point, and farther where
+    there are more than sixteen parameters. Points of a line or a plane are named as those it goes through. Raises
+    ValueError for what is none of these.
     """
     from ..landscapes.directions import gradient_directions, hessian_directions, joining, random_directions
     from ..landscapes.plane import Plane
@@ -86,10 +88,14 @@ def plane_along(
 
 
 def _reach(space: ParameterSpace, point: Tensor, spans: Tensor) -> tuple[list[float], list[float]]:
-    """Return how far the box reaches along each direction from a point, at most half a width of it to either side."""
+    """Return how far the box reaches along each direction from a point, at most half a width of it to either side.
+
+    A direction of many parameters has a little of each: there it is an eighth of a width for each of them.
+    """
+    most = max(HALF, SPREAD * space.dim**0.5)
     ends = [[(bound - point) / span for bound in (space.lower, space.upper)] for span in spans]
-    lower = [max(-HALF, float(torch.minimum(*pair).nan_to_num(-HALF).max())) for pair in ends]
-    upper = [min(HALF, float(torch.maximum(*pair).nan_to_num(HALF).min())) for pair in ends]
+    lower = [max(-most, float(torch.minimum(*pair).nan_to_num(-most).max())) for pair in ends]
+    upper = [min(most, float(torch.maximum(*pair).nan_to_num(most).min())) for pair in ends]
     narrow = [high - low < LEAST for low, high in zip(lower, upper, strict=True)]  # in a corner that it points out of
     return [-HALF if n else v for n, v in zip(narrow, lower, strict=True)], [
         HALF if n else v for n, v in zip(narrow, upper, strict=True)

@@ -92,6 +92,18 @@ def _packages(objective: Objective) -> tuple[str, ...]:
     return (*PACKAGES, *EXTRAS.get(engine.extra, ())) if engine else PACKAGES
 
 
+def with_policy(env: Environment, policy: str | None) -> Objective:
+    """Return an environment over the weights of a policy (mlp:32x32), itself where there is none.
+
+    Raises ValueError for what is no policy, and for an environment without decisions to take.
+    """
+    if policy is None:
+        return env
+    from ..landscapes.policies import PolicyObjective
+
+    return PolicyObjective(env, policy)
+
+
 def environment_of(dataset: xr.Dataset, device: str) -> Environment:
     """Return the environment that a slice was sampled from, on a device.
 
@@ -101,6 +113,8 @@ def environment_of(dataset: xr.Dataset, device: str) -> Environment:
     from ..landscapes.identity import stored_identity
 
     identity = stored_identity(dataset)
+    if "policy" in identity:
+        raise ValueError(f"the slice is over the weights of a policy, {identity['objective']}, which is not made again")
     if missing := {"objective", "settings", "engine", "options", "deterministic"} - set(identity):
         raise ValueError(
             f"the slice is not one of an environment, its identity lacks {', '.join(sorted(missing))}; "

@@ -60,6 +60,8 @@ def refusal(data: Path, out: Path) -> str:
 
 def maker(file: Path) -> str:
     """Return the command that makes a file again: a study of a scene is none of the gallery's parts."""
+    if file.name == "card.json":
+        return f"card --out {file.parent}` measures it anew"
     scene, _, study = file.stem.partition("-cuda.")
     return f"tradeoff {scene} --ladder {study}` measures it anew" if study else "gallery compute --part "
 

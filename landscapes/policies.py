@@ -1,0 +1,119 @@
+"""An environment's loss over the weights of a policy that decides by what it sees: the landscape that learning walks.
+
+The policy is a multilayer perceptron, deterministic: tanh layers, and tanh at its end, which is squashed to the box of
+each decision's parameters. What it sees is what the environment shows just before each decision.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .adapters import check_points
+from .capacity import Need, require
+from .objective import Evaluation
+from .space import ParameterSpace
+
+FORM = re.compile(r"mlp:([1-9]\d*(?:x[1-9]\d*)*)")
+REACH = 3.0  # times as far as torch draws weights at first: where learning may take them
+COPIES = 8  # of the weights of all rows, at most
+
+
+class PolicyObjective:
+    """The loss of an episode in which a policy decides, over the policy's weights.
+
+    Weights and biases of a layer with n inputs lie within 3 / sqrt(n), three times as far as torch draws them at first;
+    at the centre they are zero, and every decision is the middle of its box. It has no gradients: what a policy sees is
+    not differentiated, and without that they would be wrong.
+    """
+
+    whole_batches = True  # of every decision most of the time is no row's
+
+    def __init__(self, env: Any, policy: str) -> None:
+        """Give an environment, an objective with decisions and `observe`, a policy: mlp:32x32 has two hidden layers.
+
+        Raises ValueError for another form, and where the environment decides but once or its decisions are not alike;
+        TooLargeError for more weights than there is memory for.
+        """
+        hidden = _hidden_layers(policy)
+        if env.decisions == 1 or env.space.dim % env.decisions:
+            raise ValueError(
+                f"{env.name} decides {'once' if env.decisions == 1 else 'unequally'} in an episode, so that there is "
+                "nothing to see for a policy; slice its own parameters, without --policy"
+            )
+        self._env, self.policy = env, policy
+        self.name, self.loss_unit, self.device = f"{env.name} with policy {policy}", env.loss_unit, env.device
+        self.preferred_batch, self.threads = env.preferred_batch, env.threads
+        features = env.observe(env.space.center[None], 0).shape[1]
+        self._sizes = list(pairwise([features, *hidden, env.space.dim // env.decisions]))
+        dim = sum((n + 1) * m for n, m in self._sizes)
+        require("policy", dim, lambda weights: Need(8.0 * COPIES * weights * self.preferred_batch))
+        bounds = torch.cat([torch.full(((n + 1) * m,), REACH / math.sqrt(n)).double() for n, m in self._sizes])
+        self.space = ParameterSpace(tuple(self._names()), -bounds, bounds)
+
+    def identity(self) -> dict[str, Any]:
+        """Return what decides the numbers: all that does of the environment, and the policy."""
+        return {**self._env.identity(), "objective": self.name, "policy": self.policy}
+
+    def prepare(self) -> None:
+        """Make the first evaluation as quick as the next."""
+        self._env.prepare()
+
+    def memory(self) -> int:
+        """Estimate the bytes one episode takes while it runs."""
+        needed: int = self._env.memory()
+        return needed
+
+    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
+        """Return the losses of episodes that are played with these weights, a row for each policy.
+
+        Raises ValueError where gradients are asked for.
+        """
+        if grad:
+            raise ValueError(
+                f"{self.name} has no gradients, as what a policy sees is not differentiated; sample losses only, with "
+                "--no-gradients, along random:SEED or parameters"
+            )
+        found: Evaluation = self._env.evaluate(self.decide(x), grad=False)
+        return found
+
+    def decide(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch decided"]:
+        """Return the environment's parameters that policies with these weights decide on, one after another."""
+        x = check_points(x, self.space, self.name)
+        space, count = self._env.space, self._env.space.dim // self._env.decisions
+        decided: Tensor = space.center.repeat(len(x), 1)
+        for decision in range(self._env.decisions if len(x) else 0):
+            own = slice(decision * count, (decision + 1) * count)
+            share = (1 + self._act(x, self._env.observe(decided, decision))) / 2
+            decided[:, own] = space.lower[own] + share * (space.upper - space.lower)[own]
+        return decided
+
+    def _act(self, x: Float[Tensor, "batch dim"], seen: Float[Tensor, "batch feature"]) -> Float[Tensor, "batch act"]:
+        """Return what each row's own perceptron answers to what it sees."""
+        first = 0
+        for n, m in self._sizes:
+            weight = x[:, first : first + n * m].view(-1, m, n)
+            bias = x[:, first + n * m : first + (n + 1) * m]
+            seen = torch.tanh(torch.einsum("bmn,bn->bm", weight, seen) + bias)
+            first += (n + 1) * m
+        return seen
+
+    def _names(self) -> Iterator[str]:
+        for layer, (n, m) in enumerate(self._sizes, start=1):
+            yield from (f"layer {layer} weight {row},{column}" for row in range(m) for column in range(n))
+            yield from (f"layer {layer} bias {row}" for row in range(m))
+
+
+def _hidden_layers(policy: str) -> list[int]:
+    """Return the sizes of the hidden layers. Raises ValueError where a policy is not so written."""
+    found = FORM.fullmatch(policy)
+    if found is None:
+        raise ValueError(f"--policy takes mlp and the sizes of its hidden layers, as mlp:32x32; got {policy!r}")
+    return [int(size) for size in found[1].split("x")]
