@@ -53,8 +53,9 @@ def compare(
     from ..jobs.compare import PICTURE, RECORD, CompareJob
     from .terminal import Bars, Console, command_line, print_json
 
-    bars, first = Bars(), open_slice(slice_)
-    second = _second(other, scene, bars)
+    bars = Bars()
+    second = _second(other, scene, bars)  # which may be refused at once
+    first = open_slice(slice_)
     how: dict[str, Any] = {"out": Path(out) if out else None, "force": force, "prints": print_ or []}
     job = CompareJob.of(first, second, command=command_line(), **how)
     found = job.run(bars)

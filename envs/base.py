@@ -57,7 +57,6 @@ class Environment(abc.ABC):
     engines: ClassVar[tuple[str, ...]] = ("warp",)
     loss_unit: ClassVar[str] = ""
     beyond_box: ClassVar[bool] = False  # whether parameters beyond their bounds mean something and may be tried
-    whole_batches: ClassVar[bool] = False  # whether one point costs as much as a batch
     decisions: ClassVar[int] = 1  # how often controls are chosen in an episode: dim / decisions of them, time first
     control_step: ClassVar[float] = 0.0  # how long a control is held [s], in whole time steps; 0 where any step does
     known_failures: ClassVar[Mapping[str, Mapping[str, str]]] = {}  # fidelity -> check of `landscape check` -> reason
