@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 FACTORS = (1, 2, 4, 8)  # of the fidelity's time step, and of the scene's horizon
 GROWTH = (1, 2, 4)  # of the horizon: how long gradients are held against the rise of the loss
+FORWARD = 64  # parameters of which both modes are compared at most
 MODES = ("forward", "reverse")  # of automatic differentiation
 
 
@@ -271,7 +272,13 @@ def _other_mode(job: CheckJob) -> Callable[[], Environment] | None:
     if mode not in MODES:
         return None
     (other,) = set(MODES) - {mode}
+    if job.env.space.dim > FORWARD:
+        return partial(_refuse_forward, job.env.space.dim)
     return _with_option(job.spec, "mode", other)
+
+
+def _refuse_forward(dim: int) -> Environment:
+    raise ValueError(f"forward differentiation takes as many tangents as parameters; {dim} are too many to try")
 
 
 def _record(finding: Finding) -> dict[str, Any]:

@@ -16,11 +16,13 @@ from ...storage.files import replacing
 def recording(name: str, path: Path, blueprint: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
     """Give a stream to log to, and write the recording, with the view it opens in, to `path` at the end.
 
-    `name` is that of the application too, since a viewer keeps one blueprint for each. No clock is recorded, so that
-    equal logs give equal recordings. It is gathered in memory: on a full disk rerun's own files end in the middle
-    without an error, and their closing waits for ever.
+    `name` is that of the application too, since a viewer keeps one blueprint for each. No clock is recorded, and none
+    says what is put together into a chunk, so that equal logs give equal recordings. It is gathered in memory: on a
+    full disk rerun's own files end in the middle without an error, and their closing waits for ever.
     """
-    stream = rr.RecordingStream(f"gradscape-{name}", recording_id=name, send_properties=False)
+    stream = rr.RecordingStream(
+        f"gradscape-{name}", recording_id=name, send_properties=False, batcher_config=rr.ChunkBatcherConfig.NEVER()
+    )
     stream.set_log_time_enabled(False)
     kept = stream.memory_recording()
     stream.send_blueprint(blueprint, make_active=False)
