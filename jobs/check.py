@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
-from functools import partial
+from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 from ..landscapes.capacity import Need, require
@@ -165,6 +165,15 @@ class CheckJob:
             follow=follow,
         )
 
+    @cached_property
+    def longer(self) -> dict[int, Callable[[], Environment]]:
+        """What makes the environment with episodes so many times as long, once each; empty without `horizon`."""
+        if "horizon" not in {field.name for field in fields(self.env.options)}:
+            return {}
+        own = self.env.options.horizon
+        others = {factor: cache(_with_option(self.spec, "horizon", factor * own)) for factor in FACTORS[1:]}
+        return {1: lambda: self.env, **others}
+
     def _cost(self) -> str:
         """Return what is checked and how long it will take."""
         from ..landscapes.conformance.suite import episodes
@@ -241,29 +250,20 @@ def _time_step(job: CheckJob, factor: int, dt: float) -> ExtremeCase:
 def _horizons(job: CheckJob) -> list[ExtremeCase]:
     from ..landscapes.conformance.extremes import ExtremeCase
 
-    if (own := _horizon(job)) is None:
+    if not job.longer:
         return [ExtremeCase("horizon 1x to 8x", why="it has no option `horizon`")]
-    longer = [
-        ExtremeCase(f"horizon {factor}x", _with_option(job.spec, "horizon", factor * own)) for factor in FACTORS[1:]
-    ]
-    return [ExtremeCase("horizon 1x", lambda: job.env), *longer]
-
-
-def _horizon(job: CheckJob) -> float | None:
-    """Return the environment's option `horizon`; None where it has none."""
-    there = "horizon" in {field.name for field in fields(job.env.options)}
-    return job.env.options.horizon if there else None
+    return [ExtremeCase(f"horizon {factor}x", make) for factor, make in job.longer.items()]
 
 
 def _lengths(job: CheckJob) -> dict[float, Callable[[], Environment]]:
     """Return what makes the environment with longer episodes, in float64 where it computes in that, by factor."""
-    if (own := _horizon(job)) is None:
-        return {}
-    exact = replace(job.spec, fidelity=replace(job.env.fidelity, precision="float64"))
-    with suppress(ValueError):  # refused: it computes in its own precision only
-        exact.make()
-        return {factor: _with_option(exact, "horizon", factor * own) for factor in GROWTH}
-    return {factor: _with_option(job.spec, "horizon", factor * own) for factor in GROWTH}
+    if job.longer and job.env.fidelity.precision != "float64":
+        exact = replace(job.spec, fidelity=replace(job.env.fidelity, precision="float64"))
+        with suppress(ValueError):  # refused: it computes in its own precision only
+            exact.make()
+            own = job.env.options.horizon
+            return {factor: _with_option(exact, "horizon", factor * own) for factor in GROWTH}
+    return {factor: make for factor, make in job.longer.items() if factor in GROWTH}
 
 
 def _other_mode(job: CheckJob) -> Callable[[], Environment] | None:
