@@ -161,9 +161,12 @@ def _check_precisions(subject: Subject, name: str, other: Callable[[], Subject] 
     figure = f"{int(both.sum())} of {len(both)} points finite in both, losses up to {loss:.1e} of their range apart"
     if subject.first.grad is None or twin.first.grad is None or not bool(both.any()):
         return Finding(name, SKIP, figure, "no gradients to compare", numbers)
-    gap = (subject.first.grad[both] - twin.first.grad[both]).norm(dim=1)
-    length = torch.maximum(subject.first.grad[both].norm(dim=1), twin.first.grad[both].norm(dim=1))
-    error = float((gap / length).nan_to_num(nan=0.0).quantile(0.5))  # nan: both are exactly zero
+    space, flat = subject.objective.space, max(one.flat(one.first.loss[both]) for one in (subject, twin))
+    width = space.upper - space.lower
+    ours, theirs = (grad[both] * width for grad in (subject.first.grad, twin.first.grad))
+    length = torch.maximum(ours.norm(dim=1), theirs.norm(dim=1))
+    apart = torch.where(length > flat, (ours - theirs).norm(dim=1) / length, 0.0)
+    error = float(apart.quantile(0.5))
     limit = 10 * max(subject.eps, twin.eps) ** (1 / 3)
     found = verdict(name, error <= limit, f"{figure}, gradients {error:.1e} (median)", f"wanted: at most {limit:.0e}")
     return replace(found, numbers={**numbers, "gradient": error, "limit": limit})

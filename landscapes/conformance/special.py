@@ -62,7 +62,8 @@ def check_special_places(subject: Subject, name: str) -> Finding:
     largest = torch.maximum(beside.abs().amax(dim=1), exact.abs())
     outside = torch.maximum(low - exact, exact - high) > APART * largest
     noise = torch.tensor([_noise(subject, here.loss, step) for step in STEPS], dtype=torch.float64)
-    seen = beside.isfinite().all(dim=1) & exact.isfinite() & (largest > CLEAR * noise[:, None, None])
+    flat = subject.flat(here.loss)
+    seen = beside.isfinite().all(dim=1) & exact.isfinite() & (largest > (CLEAR * noise).clamp(min=flat)[:, None, None])
     wrong = seen.any(dim=0) & (outside | ~seen).all(dim=0)
     if not bool(seen.any()):
         return Finding(name, SKIP, "no slope to compare", "all are flat, lost in noise, or failed")

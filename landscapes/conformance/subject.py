@@ -68,6 +68,14 @@ class Subject:
         """Largest component of the gradients at the points."""
         return size(self.first.grad)
 
+    def flat(self, loss: Float[Tensor, " batch"]) -> float:
+        """Return the slope [loss unit per side of the box] below which a landscape of such losses is flat.
+
+        It changes them by less than half of their digits over the whole box: solvers that iterate end no nearer.
+        """
+        finite = loss[loss.isfinite()].abs()
+        return self.rounding * (float(finite.max()) if len(finite) else 0.0)
+
     def evaluate(self, x: Float[Tensor, "batch dim"]) -> Evaluation:
         """Return losses and gradients at other points, held against the protocol."""
         return evaluate(self.objective, x, grad=True)

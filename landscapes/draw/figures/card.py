@@ -75,7 +75,7 @@ def _draw_map(ax: Axes, grade: Grade, cut: CardSlice | None, scale: style.Scale)
     ax.set(xticks=[], yticks=[], facecolor=style.UNSAMPLED)
     ax.set_box_aspect(1)
     ax.spines[:].set(color=look, linewidth=1.6 * sheet.weight)
-    said = f"{grade.engine}\n{grade.outcome}"
+    said = grade.engine.replace(", ", ",\n") + f"\n{grade.outcome}"
     if cut is not None:
         opposed, share = opposing(cut)
         said += f"; {share:.0%} oppose" if np.isfinite(share) else ""
@@ -87,7 +87,7 @@ def _draw_map(ax: Axes, grade: Grade, cut: CardSlice | None, scale: style.Scale)
         panel.name_axes(ax, *cut.labels)
         for label in (ax.xaxis.label, ax.yaxis.label):
             label.set_fontsize(sheet.small)
-    page.write_over(ax, said, size=sheet.small, color=look)
+    ax.set_title(said, size=sheet.small, color=look, parse_math=False)
 
 
 def _draw_arrows(ax: Axes, cut: CardSlice, opposed: NDArray[np.bool_]) -> None:
