@@ -88,9 +88,9 @@ def plane_along(
 
 
 def _reach(space: ParameterSpace, point: Tensor, spans: Tensor) -> tuple[list[float], list[float]]:
-    """Return how far the box reaches along each direction from a point, at most half a width of it to either side.
+    """Return how far the box reaches along each direction from a point, and no farther than half a width of it.
 
-    A direction of many parameters has a little of each: there it is an eighth of a width for each of them.
+    A direction of many parameters has a little of each: there it is an eighth of the root of their number, if more.
     """
     most = max(HALF, SPREAD * space.dim**0.5)
     ends = [[(bound - point) / span for bound in (space.lower, space.upper)] for span in spans]
