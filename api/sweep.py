@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
-from ..jobs.scene import SceneSpec, plane_through
+from ..jobs.cut import cut, describe_cut
+from ..jobs.scene import SceneSpec
 from .progress import default_watch
 from .scene import SceneKeywords, environment, say_call
 
@@ -20,9 +21,10 @@ if TYPE_CHECKING:
 
 def sweep(
     scene: str | type[Environment] | Environment | SceneSpec,
-    dims: Sequence[int | str],
-    over: int | str,
+    dims: Sequence[int | str] | None = None,
+    over: int | str | None = None,
     *,
+    along: str | None = None,
     frames: int = 24,
     resolution: int = 16,
     through: str | Float[Tensor, " dim"] = "center",
@@ -35,19 +37,33 @@ def sweep(
     """Sample a slice for each of `frames` values of what `over` names, film them, and return them.
 
     `over` is a third parameter, by number or by name, or horizon, the episode's duration, or smoothing, of one slice.
-    The samples and the films lie in the folder `out`, by default one under out/ named after the sweep: the same call
-    goes on there where it stopped. The rest is that of `slice`.
+    Along directions, which `along` names instead of `dims` as for `slice`, a parameter is moved at the point that the
+    slices go through, and what lies off the box is left out. The samples and the films lie in the folder `out`, by
+    default one under out/ named after the sweep: the same call goes on there where it stopped. The rest is that of
+    `slice`.
 
-    Raises ValueError for what the scene does not have or cannot be swept, and where the folder holds something else or
-    another sweep, which `force` replaces; Stopped where it is interrupted.
+    Raises ValueError for what the scene does not have or cannot be swept, where nothing is to move, and where the
+    folder holds something else or another sweep, which `force` replaces; Stopped where it is interrupted.
     """
+    if over is None:
+        raise ValueError("a sweep takes over: a third parameter, horizon or smoothing; got None")
     watch = default_watch()
     env = environment(scene, keywords, watch)
-    plane = plane_through(env, dims, through=through, extent=extent, resolution=resolution)
-    command = say_call("sweep", scene, tuple(dims), over, frames=frames, resolution=resolution, **keywords)
+    plane = cut(env, dims, along, through=through, extent=extent, resolution=resolution)
     from ..jobs.sweep import SweepJob
 
-    folder = Path(out) if out is not None else None
-    job = SweepJob.of(env, plane, over, frames, command=command, out=folder, grad=gradients, force=force)
+    point = through if isinstance(through, str) else through.tolist()
+    said: dict[str, Any] = {"over": over, "frames": frames, "resolution": resolution, "along": along}
+    said |= {
+        "through": None if point == "center" else point,
+        "extent": extent,
+        "gradients": None if gradients else False,
+    }
+    settings: dict[str, Any] = {
+        "command": say_call("sweep", scene, *([tuple(dims)] if dims else []), **said, **keywords),
+        "out": Path(out) if out is not None else None,
+        "cut": describe_cut(along, through, extent),
+    }
+    job = SweepJob.of(env, plane, over, frames, grad=gradients, force=force, **settings)
     job.run(watch)
     return job.sample()

@@ -82,8 +82,8 @@ Extent = Annotated[
 Through = Annotated[
     str,
     typer.Option(
-        help="The point it goes through: center, random:SEED, example:NAME, best, best:RUN or a file of numbers; slice "
-        "takes several, A,B."
+        help="The point it goes through: center, random:SEED, example:NAME, best, best:RUN, a file of numbers, or a "
+        "row of a table, TABLE.csv:ROW, by default the one of the least loss; slice takes several, A,B."
     ),
 ]
 Scheduler = Annotated[

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..jobs.scene import SceneSpec
-from .arguments import Dims, Extent, Json, NoGradients, Through, read_extent, takes_scene
+from .arguments import Along, Extent, Json, NoGradients, SomeDims, Through, read_extent, takes_scene
 
 if TYPE_CHECKING:
     from ..gallery.figures import Figure
@@ -25,7 +25,8 @@ RESOLUTION = 16  # that of `landscape slice`
 def plan(
     scene: SceneSpec,
     what: Annotated[str, typer.Argument(metavar="ENV|FIGURES.toml", help="An environment, or a list of figures.")],
-    dims: Dims = ["0", "1"],  # noqa: B006 -- typer reads it, nobody changes it
+    dims: SomeDims = None,
+    along: Along = None,
     over: Annotated[
         str | None, typer.Option(help="Plan a sweep: what moves from frame to frame, as for `landscape sweep`.")
     ] = None,
@@ -41,7 +42,8 @@ def plan(
 ) -> None:
     """Predict episodes, time, memory and disk of a slice, a sweep or the gallery's slices, without making them.
 
-    A few episodes, tiles and pictures are made and thrown away; nothing is written. For a CUDA device that is not here,
+    Without --dims and --along it is of parameters 0 and 1. A few episodes, tiles and pictures are made and thrown away;
+    nothing is written. For a CUDA device that is not here,
     what `landscape tradeoff` kept of one counts.
 
     Example: landscape plan fluid --dims 6 8 --resolution 48 --fidelity standard
@@ -52,12 +54,13 @@ def plan(
 
     bars, scene = Bars(), replace(scene, name=what)
     if what.endswith(".toml"):
-        _refuse_more(bool(over or extent or scene.options or through != "center"))
+        _refuse_more(bool(over or extent or scene.options or along or through != "center"))
         jobs = _figure_jobs(what, resolution, scene, grad=not no_gradients)
         _print_figures(list(_figures(jobs, bars, began, workers)), as_json=json_)
         return
     where: dict[str, Any] = {"through": through, "extent": read_extent(extent), "grad": not no_gradients}
-    job = PlanJob(scene, dims, resolution or RESOLUTION, **where, over=over, frames=frames)
+    first = dims if dims or along else ["0", "1"]
+    job = PlanJob(scene, first, resolution or RESOLUTION, **where, over=over, frames=frames, along=along)
     found = job.run(bars, began=began)
     if json_:
         print_json(found.record(workers), command=command_line())
@@ -68,7 +71,7 @@ def plan(
 def _refuse_more(said: bool) -> None:
     """Raise ValueError where more is said of figures than they say themselves."""
     if said:
-        raise ValueError("figures say what they are; leave out --over, --extent, --through and --set")
+        raise ValueError("figures say what they are; leave out --over, --along, --extent, --through and --set")
 
 
 def _figure_jobs(path: str, resolution: int | None, scene: SceneSpec, *, grad: bool) -> list[tuple[Figure, PlanJob]]:
@@ -110,7 +113,7 @@ def _figures(
 def _kind(job: PlanJob) -> str:
     import json
 
-    return json.dumps([job.scene.name, job.scene.options, job.scene.fidelity, job.resolution, len(job.dims)])
+    return json.dumps([job.scene.name, job.scene.options, job.scene.fidelity, job.resolution, len(job.dims or ())])
 
 
 def _print(found: Forecast, workers: int) -> None:

@@ -9,17 +9,29 @@ from typing import Annotated, Any
 import typer
 
 from ..jobs.scene import SceneSpec
-from .arguments import Dims, Extent, Json, NoGradients, Resolution, Scheduler, Through, read_extent, takes_scene
+from .arguments import (
+    Along,
+    Extent,
+    Json,
+    NoGradients,
+    Resolution,
+    Scheduler,
+    SomeDims,
+    Through,
+    read_extent,
+    takes_scene,
+)
 
 
 @takes_scene("tolerance")
 def sweep(
     scene: SceneSpec,
-    dims: Dims,
     over: Annotated[
         str,
         typer.Option(help="What moves from frame to frame: a third parameter over its bounds, horizon, or smoothing."),
     ],
+    dims: SomeDims = None,
+    along: Along = None,
     frames: Annotated[int, typer.Option(min=2, help="Number of its values, both ends included.")] = 24,
     resolution: Resolution = 16,
     through: Through = "center",
@@ -40,15 +52,17 @@ def sweep(
 
     Example: landscape sweep fluid --dims 6 8 --over 7 --frames 12
     """
-    from ..jobs.scene import plane_through
+    from ..jobs.cut import cut, describe_cut
     from ..jobs.sweep import SweepJob
     from ..jobs.workers import workers
     from .terminal import Bars, command_line, print_json
 
     bars = Bars()
     env, folder = scene.make(bars), Path(out) if out else None
-    plane = plane_through(env, dims, through=through, extent=read_extent(extent), resolution=resolution)
+    where: dict[str, Any] = {"through": through, "extent": read_extent(extent)}
+    plane = cut(env, dims, along, **where, resolution=resolution)
     how: dict[str, Any] = {"command": command_line(), "grad": not no_gradients, "force": force}
+    how["cut"] = describe_cut(along, **where)
     with bars.busy(f"opening {frames} slices"):
         job = SweepJob.of(env, plane, over, frames, out=folder, **how)
     with workers(scheduler, env.device) as executor:

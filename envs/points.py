@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .base import Environment
 
-FORMS = "center, random:SEED, example:NAME, best:RUN or a file with its parameters (.json, .npy or text)"
+FORMS = "center, random:SEED, example:NAME, best:RUN or a file with its parameters (.json, .npy, .csv, .parquet, text)"
 
 
 def point(environment: Environment, text: str) -> Float[Tensor, " dim"]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from ..landscapes.foreign import SUFFIXES
 from ..landscapes.plain import plain_name
 from .scene import named_point, plane_through, runs_in
 from .slice_summary import JOINED
@@ -136,9 +137,10 @@ def joined_points(along: str) -> list[str]:
 
 
 def points_in(text: str) -> list[str]:
-    """Return the names of points in A:B or A:B:C, of which example:, random: and best: take what follows them."""
+    """Return the names of points in A:B or A:B:C; example:, random:, best: and TABLE.csv:ROW take what follows them."""
     parts, names = text.split(":"), list[str]()
     while parts:
         name = parts.pop(0)
-        names.append(f"{name}:{parts.pop(0)}" if name in ("example", "random", "best") and parts else name)
+        row = name.lower().endswith(SUFFIXES) and bool(parts) and parts[0].isdecimal()
+        names.append(f"{name}:{parts.pop(0)}" if (name in ("example", "random", "best") or row) and parts else name)
     return names

@@ -12,7 +12,7 @@ from .. import __version__
 from ..landscapes.objective import Status
 from ..landscapes.storage.files import tidy, write_json
 from .folder import EPISODE, folder_named
-from .scene import point_of, provenance
+from .scene import named_point, provenance
 from .watch import Watch
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class EpisodeJob:
 
         Raises ValueError where there is no such point, and where `out` holds something else.
         """
-        x = point_of(env, params)
+        x = named_point(env, params)
         folder = out or folder_named(["replay", env.name], [env.identity(), x.tolist()])
         EPISODE.check(folder)
         return cls(env, x, params, folder, command, film, prints)

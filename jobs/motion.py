@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from ..landscapes.plane import Plane
 
 SMOOTHING, WIDEST = "smoothing", 0.25  # the widest Gaussian's standard deviation, as a fraction of the box's sides
+SAME = 1e-9  # of a parameter's unit: as near as rounding lets a point on a plane be to it
 HORIZON = "horizon"  # a scene option: the episode's duration as a multiple of the scene's own
 STORE_MEMORY, STORE_FILES = 100e3, 25  # what a slice takes beside its samples: bytes of its arrays' records, and files
 FRAMES, ONLY = SWEEP.files[:2]  # the folder of a sweep's slices, and the slice where there is one
@@ -87,7 +88,7 @@ def _parameter(name: int | str, env: Environment, plane: Plane, frames: int) -> 
     import torch
 
     number = env.space.index(name)
-    if bool(plane.basis[:, number].any()):
+    if _holds(plane, number):
         raise ValueError(
             f"a sweep moves a third parameter, {HORIZON} or {SMOOTHING}; got --over {name}, which the slice varies"
         )
@@ -120,6 +121,15 @@ def _smoothing(env: Environment, plane: Plane, frames: int) -> Motion:
 
     label = "smoothing width [% of the box's sides]"
     return Motion(label, tuple(100 * width for width in widths), (plane,), lambda _: env, slices)
+
+
+def _holds(plane: Plane, number: int) -> bool:
+    """Say whether moving a parameter leads from a plane to itself."""
+    import torch
+
+    step = torch.zeros(plane.dim, dtype=torch.float64)
+    step[number] = 1.0
+    return bool(plane.distance(plane.origin + step) < SAME)
 
 
 def _with(origin: Tensor, number: int, value: float) -> Tensor:

@@ -114,16 +114,20 @@ class Forecast:
 
 @dataclass(frozen=True)
 class PlanJob:
-    """A slice of a scene, or a sweep `over` something in so many `frames`, to foretell; nothing of it is kept."""
+    """A slice of a scene, or a sweep `over` something in so many `frames`, to foretell; nothing of it is kept.
+
+    What lies off the box, of one `along` directions, is taken to cost an episode like the rest.
+    """
 
     scene: SceneSpec
-    dims: Sequence[int | str]
+    dims: Sequence[int | str] | None
     resolution: int
     through: str = "center"
     extent: float | tuple[float, float] | None = None
     grad: bool = True
     over: str | None = None
     frames: int = 1
+    along: str | None = None
 
     def run(self, watch: Watch | None = None, *, began: float | None = None) -> Forecast:
         """Rehearse it, and foretell what it takes.
@@ -132,12 +136,12 @@ class PlanJob:
         device that is not here, what `landscape tradeoff` kept of one counts. Raises ValueError for what the scene does
         not have, and where nothing is known of the device that is asked for.
         """
-        from .scene import plane_through
+        from .cut import cut
 
         began = time.perf_counter() if began is None else began
         env, device = make_here(self.scene)
         how: dict[str, Any] = {"extent": self.extent, "resolution": self.resolution}
-        plane = plane_through(env, self.dims, through=self.through, **how)
+        plane = cut(env, self.dims, self.along, through=self.through, **how)
         with (watch or Watch()).busy(f"{env.name}: rehearsing {env.fidelity.name} episodes, tiles and pictures"):
             found = self._rehearse(env, plane, began)
         return Forecast(

@@ -192,8 +192,11 @@ def runs_in(objective: Objective, run: str) -> list[xr.Dataset]:
 def named_point(objective: Objective, text: str) -> Tensor:
     """Return the point that `text` names, of any objective. Raises ValueError where there is no such point."""
     from ..envs.base import Environment
+    from ..landscapes.foreign import table_point
     from ..landscapes.objective import name_of
 
+    if (found := table_point(objective.space, text)) is not None:
+        return found
     if isinstance(objective, Environment):
         return point_of(objective, text)
     kind, _, seed = text.partition(":")
@@ -201,5 +204,5 @@ def named_point(objective: Objective, text: str) -> Tensor:
         return objective.space.center
     if kind == "random" and seed.isdecimal():
         return objective.space.uniform(1, seed=int(seed))[0]
-
-    raise ValueError(f"{name_of(objective)} can be cut through center, random:SEED or a tensor; got {text!r}")
+    forms = "center, random:SEED, a table (.csv, .parquet) or a tensor"
+    raise ValueError(f"{name_of(objective)} can be cut through {forms}; got {text!r}")

@@ -2,29 +2,34 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import time
+from collections import Counter
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
+from ..landscapes.adapters import within_box
 from ..landscapes.capacity import size
 from ..landscapes.cost import duration
-from ..landscapes.objective import Status
+from ..landscapes.objective import Objective, Status
+from ..landscapes.plain import plain_name
 from ..landscapes.sampling.fill import Progress, sample
 from ..landscapes.storage.files import discard, tidy, visible_files, write_json
 from ..landscapes.storage.ownership import refuse_others
-from ..landscapes.storage.paths import check_replaceable, filling_path
+from ..landscapes.storage.paths import check_replaceable, filling_path, slice_exists
 from ..landscapes.storage.store import SliceStore
 from .folder import ROOT, SWEEP, folder_named
 from .motion import HORIZON, SMOOTHING, Motion, refuse_too_large
 from .scene import provenance
-from .slice import SliceCost, estimate_cost
+from .slice import MOST, SliceCost, estimate_cost
 from .slice_summary import count_statuses, flat_points, range_of, say_range
 from .watch import PREPARING, Advance, Watch, resumable
 from .workers import recipe
@@ -75,16 +80,21 @@ class SweepSummary:
 
     def outcome(self) -> str:
         """Say in a line what the sweep cost and what came out."""
-        failed = sum(count for frame in self.frames for kind, count in frame.status.items() if kind != "ok")
+        ended = Counter[str]()
+        for frame in self.frames:
+            ended.update(frame.status)
         losses = say_range(self.loss)
-        failures = f"; {failed} failed" if failed else ""
+        failures = "".join(f"; {count} {kind}" for kind, count in ended.items() if count and kind != "ok")
         done = f"{self.episodes} episodes in {duration(self.seconds)}"
         return f"{done}; {len(self.frames)} frames; {losses}{failures}"
 
 
 @dataclass(frozen=True)
 class SweepJob:
-    """A sweep to sample into `folder`, slice by slice, and to film; `executor` is that of `sample`."""
+    """A sweep to sample into `folder`, slice by slice, and to film; `executor` is that of `sample`.
+
+    A `boxed` one leaves out what lies beyond the parameters' bounds.
+    """
 
     env: Environment
     motion: Motion
@@ -92,24 +102,37 @@ class SweepJob:
     stores: tuple[SliceStore, ...]
     command: str
     executor: Executor | None = None
+    boxed: bool = False
 
     @classmethod
     def open(
-        cls, env: Environment, motion: Motion, folder: Path, *, command: str, grad: bool = True, force: bool = False
+        cls,
+        env: Environment,
+        motion: Motion,
+        folder: Path,
+        *,
+        command: str,
+        grad: bool = True,
+        force: bool = False,
+        cut: Mapping[str, Any] | None = None,
     ) -> SweepJob:
         """Go on with the sweep in `folder`, or begin it there; `force` begins anew where another one is.
 
-        Raises ValueError where the folder holds something else, StoreMismatchError where it holds another sweep.
+        With a `cut`, how it was cut along directions, it is boxed. Raises ValueError where the folder holds something
+        else, StoreMismatchError where it holds another sweep.
         """
         check_folder(folder)
         if force:
             _clear(folder)
         how: dict[str, Any] = {"grad": grad, "provenance": provenance(env, command)}
+        oblique: dict[str, Any] = {"boxed": True, "cut": dict(cut)} if cut else {}
         stores = tuple(
-            SliceStore.open_or_create(folder / name, plane, env.space, identity=motion.env_at(number).identity(), **how)
+            SliceStore.open_or_create(
+                folder / name, plane, env.space, identity=motion.env_at(number).identity() | oblique, **how
+            )
             for number, (name, plane) in enumerate(zip(motion.stores, motion.planes, strict=True))
         )
-        return cls(env, motion, folder, stores, command)
+        return cls(env, motion, folder, stores, command, boxed=bool(cut))
 
     @classmethod
     def of(
@@ -123,10 +146,13 @@ class SweepJob:
         out: Path | None = None,
         grad: bool = True,
         force: bool = False,
+        cut: Mapping[str, Any] | None = None,
     ) -> SweepJob:
         """Open the sweep of an environment in `out`, by default a folder named after it under out/.
 
-        Raises ValueError for what cannot be swept, TooLargeError for what has no room here, and as `open` does.
+        With a `cut` it is boxed, and one that was begun goes on along its own directions: on a GPU they come out a
+        little different each time. Raises ValueError for what cannot be swept, TooLargeError for what has no room here,
+        and as `open` does.
         """
         if plane.rank != 2 or frames < 2:
             dims = ", ".join(plane.names)
@@ -134,8 +160,10 @@ class SweepJob:
         grad = grad and over != SMOOTHING  # of smoothed losses there are no gradients to show
         refuse_too_large(plane, frames, out or ROOT, grad=grad, over=over)
         motion = Motion.of(env, plane, over, frames)
-        folder = out or sweep_folder(env, motion, over, grad=grad)
-        return cls.open(env, motion, folder, command=command, grad=grad, force=force)
+        folder = out or sweep_folder(env, motion, over, grad=grad, cut=cut)
+        if cut and not force:
+            motion = Motion.of(env, _along_kept(folder / motion.stores[0], plane, cut), over, frames)
+        return cls.open(env, motion, folder, command=command, grad=grad, force=force, cut=cut)
 
     @cached_property
     def total(self) -> int:
@@ -153,8 +181,8 @@ class SweepJob:
         if not work:
             return SliceCost(0, 0.0, 0)
         last = max(work)
-        env = self.motion.env_at(last)
-        cost = estimate_cost(env, self.stores[last], self.executor, recipe(env))
+        objective, made = self._sampled(last)
+        cost = estimate_cost(objective, self.stores[last], self.executor, made)
         return SliceCost(sum(pending.values()), cost.seconds * sum(work.values()) / work[last], cost.memory)
 
     def run(self, watch: Watch | None = None) -> SweepSummary:
@@ -206,11 +234,16 @@ class SweepJob:
         watch.note(f"{left} {kind} of {slices} to compute{kept}: {takes}")
 
     def _sample(self, number: int, count: _Count) -> xr.Dataset:
-        env, store = self.motion.env_at(number), self.stores[number]
-        how: dict[str, Any] = {"grad": store.grad, "executor": self.executor, "made": recipe(env)}
-        dataset = sample(env, self.motion.planes[number], store, progress=count.follow, **how)
+        (objective, made), store = self._sampled(number), self.stores[number]
+        how: dict[str, Any] = {"grad": store.grad, "executor": self.executor, "made": made}
+        dataset = sample(objective, self.motion.planes[number], store, progress=count.follow, **how)
         count.add(dataset)
         return dataset
+
+    def _sampled(self, number: int) -> tuple[Objective, Callable[[], Objective] | None]:
+        """Return what is sampled on a plane, and how workers make it, None where they are sent it."""
+        env = self.motion.env_at(number)
+        return (within_box(env), None) if self.boxed else (env, recipe(env))
 
     def _film(self, drawn: Sweep) -> None:
         from ..landscapes.draw.figures.sweep import save_films
@@ -265,14 +298,28 @@ class _Count:
         self.failed += int((dataset["status"] != Status.OK).sum())
 
 
-def sweep_folder(env: Environment, motion: Motion, over: int | str, *, grad: bool = True) -> Path:
+def sweep_folder(
+    env: Environment, motion: Motion, over: int | str, *, grad: bool = True, cut: Mapping[str, Any] | None = None
+) -> Path:
     """Return a folder of its own for every different sweep, the same for the same one."""
     planes = [plane.record() for plane in motion.planes]
-    axes = [int(row.nonzero()[0]) for row in motion.planes[0].basis]
+    axes: list[Any] = [int(row.nonzero()[0]) for row in motion.planes[0].basis]
     what = over if over in (SMOOTHING, HORIZON) else env.space.index(over)
     points = "x".join(map(str, (*planes[0]["resolution"], len(motion.values))))
-    parts = ["sweep", env.name, *axes, "over", what, env.fidelity.name, points]
-    return folder_named(parts, [env.identity(), planes, motion.values, grad])
+    known: list[Any] = [env.identity(), planes, motion.values, grad]
+    if cut is not None:
+        axes, known = [plain_name(cut["along"])[:MOST]], [env.identity(), dict(cut), points, motion.values, grad]
+    return folder_named(["sweep", env.name, *axes, "over", what, env.fidelity.name, points], known)
+
+
+def _along_kept(path: Path, plane: Plane, cut: Mapping[str, Any]) -> Plane:
+    """Return a plane along the directions of a sweep that was begun with the same cut, else the plane as it is."""
+    if not slice_exists(path):
+        return plane
+    kept = SliceStore.open(path)
+    if kept.identity.get("cut") != json.loads(json.dumps(dict(cut))) or kept.plane.resolution != plane.resolution:
+        return plane
+    return replace(kept.plane, origin=plane.origin)
 
 
 def check_folder(folder: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 import xarray as xr
 from numpy.typing import NDArray
 
@@ -20,10 +21,12 @@ from .storage.layout import flags
 
 if TYPE_CHECKING:
     import pandas as pd
+    from torch import Tensor
 
 SUFFIXES = (".csv", ".parquet")
 LOSS = "loss"
 LISTED = 8  # columns that a message names
+DIGITS = 9  # of a row's number, more than any table has
 
 
 class GivenKind(IntEnum):
@@ -45,6 +48,43 @@ def read_points(path: Path) -> pd.DataFrame:
         raise ValueError(f"there is no table of points at {path}") from None
     except Exception as error:  # whatever pandas or Arrow raise of a file that is no table
         raise ValueError(f"{path} cannot be read as a table: {' '.join(str(error).split())}") from None
+
+
+def table_point(space: ParameterSpace, text: str) -> Tensor | None:
+    """Return the point in a row of a table, FILE:ROW, counted from 1; FILE alone is its row of the least loss.
+
+    The table is a CSV or Parquet file whose columns are called as the parameters, with or without their units in
+    brackets. None is returned where `text` names no such file: a CSV file without a name of a parameter is none.
+    Raises ValueError where a column is missing or the row is not there, holds no numbers, or is not said: of several
+    rows without a loss none is best.
+    """
+    place, colon, number = text.rpartition(":")
+    path, row = (Path(place), number) if colon and number.isdecimal() and len(number) <= DIGITS else (Path(text), "")
+    if path.suffix.lower() not in SUFFIXES or not path.is_file():
+        return None
+    frame = read_points(path)
+    named = [names for names in zip(space.names, space.labels, strict=True) if set(names) & set(frame.columns)]
+    if not named and path.suffix.lower() == ".csv":
+        return None
+    at = int(row) - 1 if row else _best_row(frame, path)
+    if not 0 <= at < len(frame):
+        raise ValueError(f"{path} has {len(frame)} rows of points, counted from 1; got row {row or 1}")
+    one = frame.iloc[[at]]
+    found = [_column(one, *names, name=str(path))[0] for names in zip(space.names, space.labels, strict=True)]
+    return torch.tensor(found, dtype=torch.float64)
+
+
+def _best_row(frame: pd.DataFrame, path: Path) -> int:
+    """Return the number of the row with the least loss, from 0."""
+    name = next((name for name in frame.columns if str(name) == LOSS or str(name).startswith(f"{LOSS} [")), None)
+    if name is None:
+        if len(frame) > 1:
+            raise ValueError(f"{path} has {len(frame)} rows and no column {LOSS!r}; say which one, {path}:ROW, from 1")
+        return 0
+    losses = _column(frame, str(name), name=str(path), gaps=True)
+    if not np.isfinite(losses).any():
+        raise ValueError(f"no row of {path} has a {LOSS}; say which one, {path}:ROW, counted from 1")
+    return int(np.nanargmin(np.where(np.isfinite(losses), losses, np.nan)))
 
 
 def study_frame(study: Any) -> pd.DataFrame:

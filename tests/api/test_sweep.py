@@ -4,10 +4,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 import xarray as xr
 
 import gradscape
 from gradscape.api.sweep import sweep
+from gradscape.landscapes.directions import random_directions
+from gradscape.landscapes.identity import plane_of, stored_provenance
+from gradscape.landscapes.objective import Status
 
 from ..command import Said
 
@@ -29,6 +33,39 @@ def test_a_sweep_from_python_is_the_commands_and_goes_on_in_its_folder(
         xr.testing.assert_identical(dataset, gradscape.open_slice(folder / f"frames/{number:03d}.zarr").data)
 
 
+def test_a_sweep_along_directions_is_the_slices_at_its_points(
+    run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is off the box is left out, and the command and the call make one folder of the same samples."""
+    monkeypatch.chdir(tmp_path)
+    how = ["--along", "random:1", "--over", "2", *SMALL]
+    assert run("sweep", "bounce", *how, cwd=tmp_path).returncode == 0
+    env = gradscape.make("bounce", device="cpu")
+    found = sweep("bounce", over=2, along="random:1", frames=2, resolution=3, through="example:aim", device="cpu")
+    assert len(list(Path("out").iterdir())) == 1
+    directions, _ = random_directions(env.space, 1)
+    for bound, dataset in zip((env.space.lower[2], env.space.upper[2]), found.slices, strict=True):
+        plane = plane_of(dataset)
+        assert torch.allclose(plane.basis, torch.tensor(directions) * (env.space.upper - env.space.lower))
+        point = env.example("aim")
+        point[2] = bound
+        assert torch.equal(plane.origin, point)
+        points = plane.lift(torch.cartesian_prod(*plane.axes())).reshape(3, 3, 3)
+        inside = ((points >= env.space.lower) & (points <= env.space.upper)).all(dim=-1)
+        assert 0 < int(inside.sum()) < 9
+        assert ((dataset["status"].transpose("u", "v").to_numpy() == Status.OK) == inside.numpy()).all()
+
+
+def test_a_sweep_says_how_it_is_made_again(tmp_path: Path) -> None:
+    how = {"through": "random:1", "extent": 0.5, "gradients": False, "frames": 2, "resolution": 3}
+    found = sweep("bounce", (0, 1), 2, out=tmp_path / "far", device="cpu", **how)
+    command = stored_provenance(found.slices[0])["command"]
+    again = eval(command.replace("resolution=3", f"resolution=3, out={str(tmp_path / 'again')!r}"))
+    for one, other in zip(found.slices, again.slices, strict=True):
+        xr.testing.assert_equal(one, other)
+    assert "grad" not in again.slices[0]
+
+
 @pytest.mark.drawn
 def test_a_frame_shows_in_a_notebook(run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -45,4 +82,10 @@ def test_what_cannot_be_swept_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
     for dims, over, said in (((0, 1), 1, "which the slice varies"), ((0,), 2, "a sweep has two dims")):
         with pytest.raises(ValueError, match=said):
             sweep("bounce", dims, over, frames=2, resolution=3, device="cpu")
+    with pytest.raises(ValueError, match="a sweep takes over"):
+        sweep("bounce", (0, 1))
+    with pytest.raises(ValueError, match="give one of them"):
+        sweep("bounce", (0, 1), 2, along="random:1")
+    with pytest.raises(ValueError, match="two dims and two frames"):
+        sweep("bounce", over=2, along="center:random:1", device="cpu")
     assert not list(tmp_path.iterdir())

@@ -26,6 +26,7 @@ from ..command import Said
 JOBS = {
     "bounce": ["bounce", "--dims", "0", "1", "--resolution", "32", "--fidelity", "draft"],
     "flip": ["flip", "--dims", "0", "1", "--resolution", "14", "--fidelity", "draft"],
+    "along": ["bounce", "--along", "random:1", "--extent", "0.2", "--resolution", "32", "--fidelity", "draft"],
     "sweep": ["bounce", "--dims", "0", "1", "--over", "2", "--frames", "4", "--resolution", "16"],
 }
 EPISODE, TILE, PICTURE = 0.05, 0.035, 0.5  # seconds that it takes to simulate, write and draw one
