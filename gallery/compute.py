@@ -16,6 +16,7 @@ from ..landscapes.capacity import require
 from ..landscapes.cost import duration
 from ..landscapes.storage.disk import full, is_full
 from ..landscapes.storage.files import tidy
+from .companions import CompanionPart
 from .episodes import EpisodePart
 from .figures import Figure
 from .measures import ReportPart, TradeoffPart
@@ -24,6 +25,7 @@ from .parts import FigurePart, SearchPart, SlicePart, SweepPart
 T = TypeVar("T")
 PARTS: dict[str, type[FigurePart]] = {
     "slices": SlicePart,
+    "companions": CompanionPart,
     "sweeps": SweepPart,
     "episodes": EpisodePart,
     "searches": SearchPart,

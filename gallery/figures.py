@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 KINDS: dict[str, type] = {  # of a figure's fields in TOML
     **dict.fromkeys(("id", "env", "through", "fidelity", "over"), str),
-    **{"dims": list, "resolution": int, "options": dict},
+    **{"dims": list, "resolution": int, "options": dict, "searched": dict},
 }
 SCENE_OPTIONS = {"fidelity", "device", "engine", "deterministic"}  # of a SceneSpec, so none of a scene's own
 
@@ -29,7 +29,9 @@ class Figure:
     """A slice of an environment to show, and what the paper says of it.
 
     One dimension makes a line, two a plane; `through`, `options` and `fidelity` are those of `landscape slice`, and
-    `over` is what its sweep moves, nothing if empty.
+    `over` is what its sweep moves, nothing if empty. `searched` is what the search for `through` found, as
+    benchmarks/base_points.py writes it: the ends of the `losses` [loss unit], the `paper`'s, their `distance`, and how
+    many `candidates` there were; nothing where none was searched for.
     """
 
     id: str
@@ -41,6 +43,7 @@ class Figure:
     fidelity: str = "standard"
     options: Mapping[str, Any] = field(default_factory=dict)
     over: str = "horizon"
+    searched: Mapping[str, Any] = field(default_factory=dict)
 
     def scene(self, device: str, fidelity: str | None = None) -> SceneSpec:
         """Return the scene that is sliced, on a device, at the figure's fidelity or another."""

@@ -1,8 +1,9 @@
 """The files of the gallery: what it shows, what the paper says, and what is computed of both, each named here alone.
 
 Of the data, a figure's folder holds `slice.zarr` and what else was made of it: `sweep.mp4` with `sweep.json`,
-`episodes.json` with a film and a picture of each episode, and the files of `landscape report`. Searches lie in
-`runs/ENVIRONMENT-OPTIONS/`, trade-offs in `tradeoff/`: figures share them. The report card of gradients is in `card/`.
+`episodes.json` with a film and a picture of each episode, `companions.json` and `companions.png` of the same cut
+through other points, and the files of `landscape report`. Searches lie in `runs/ENVIRONMENT-OPTIONS/`, trade-offs in
+`tradeoff/`: figures share them. The report card of gradients is in `card/`.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ SWEEP_FILM, SWEEP_RECORD = "sweep.mp4", "sweep.json"
 EPISODES = "episodes.json"
 EPISODE_KINDS = ("mp4", "webp")  # a film, and its last frame
 REPORT, MEASURES, QUALITY, QUALITY_ARRAYS = REPORT_FILES.files
+COMPANIONS, COMPANION_PICTURE = "companions.json", "companions.png"
 SURFACES = ("surface.png", "surface.html", "surface.gltf", "surface.glb")
 RUNS, RUN_SUFFIX = "runs", ".zarr.zip"
 TRADEOFFS = "tradeoff"

@@ -21,6 +21,7 @@ Mode = Literal["reverse", "forward"]
 Batch = Literal["vmap", "map"]
 Precision = Literal["float64", "float32"]
 GROWTH = 4
+_TRACED: dict[str, str] = {}  # the precision that JAX has last traced a function in
 
 
 def from_jax(
@@ -62,7 +63,7 @@ class JaxObjective(FunctionObjective):
 
     def __post_init__(self) -> None:
         _import_jax()
-        self._compiled: dict[bool, Callable[[Any], Any]] = {}
+        self._compiled: dict[tuple[bool, int], Callable[[Any], Any]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what was compiled: another process compiles it anew."""
@@ -74,7 +75,7 @@ class JaxObjective(FunctionObjective):
         size = next(size for size in _sizes(self.preferred_batch) if size >= len(x))
         padded = torch.cat([x, x[-1:].expand(size - len(x), -1)]).numpy()
         with computing_in(self.precision), self._explained():
-            found = self._function(grad)(jnp.asarray(padded, dtype=self.precision))
+            found = self._function(grad, size)(jnp.asarray(padded, dtype=self.precision))
         loss, slope = found if grad else (found, None)
         return Evaluation.from_results(_tensor(loss)[: len(x)], None if slope is None else _tensor(slope)[: len(x)])
 
@@ -86,8 +87,8 @@ class JaxObjective(FunctionObjective):
         import jax
         import jax.numpy as jnp
 
-        function = self._function(grad)
         with computing_in(self.precision):
+            function = self._function(grad, self.preferred_batch)
             ready = [jnp.asarray(part.numpy(), dtype=self.precision) for part in torch.split(x, self.preferred_batch)]
 
         def call() -> object:
@@ -96,16 +97,18 @@ class JaxObjective(FunctionObjective):
 
         return call
 
-    def _function(self, grad: bool) -> Callable[[Any], Any]:
-        """Return the compiled function of a batch: losses, or losses and gradients."""
+    def _function(self, grad: bool, size: int) -> Callable[[Any], Any]:
+        """Return the compiled function of so many points: losses, or losses and gradients."""
         import jax
 
-        if grad not in self._compiled:
+        if (grad, size) not in self._compiled:
             both = jax.value_and_grad if self.mode == "reverse" else _value_and_tangents
             at: Callable[[Any], Any] = both(self._one) if grad else self._one
             whole = jax.vmap(at) if self.batch == "vmap" else lambda x: jax.lax.map(at, x)
-            self._compiled[grad] = jax.jit(whole)
-        return self._compiled[grad]
+            points = jax.ShapeDtypeStruct((size, self.space.dim), self.precision)
+            forget_other_precision(self.precision)
+            self._compiled[grad, size] = jax.jit(whole).lower(points).compile()
+        return self._compiled[grad, size]
 
     def _one(self, x: Any) -> Any:
         """Return the loss of one point, held against what it must be."""
@@ -172,6 +175,19 @@ def computing_in(name: str) -> Iterator[None]:
 
     with jax.enable_x64(name == "float64"):
         yield
+
+
+def forget_other_precision(name: str) -> None:
+    """Let JAX forget what it has traced, where that was last for another precision; what is compiled stays.
+
+    It finds traces of functions of NumPy arrays again in the other precision, where they do not fit: compiling
+    mjx.step by Runge-Kutta steps failed so.
+    """
+    import jax
+
+    if _TRACED.get("precision", name) != name:
+        jax.clear_caches()
+    _TRACED["precision"] = name
 
 
 def _tensor(values: Any) -> Tensor:

@@ -32,8 +32,9 @@ from ...landscapes.storage.ownership import check_ours
 from ...landscapes.storage.paths import is_slice
 from ...landscapes.storage.records import reading
 from ...landscapes.storage.store import SliceStore, open_slice
+from ..companions import Companion, read_companions
 from ..figures import Figure
-from ..files import MEASURES, PICTURE, QUALITY, REMAKE, REPORT, STORE, SURFACES, SWEEP_FILM
+from ..files import COMPANION_PICTURE, MEASURES, PICTURE, QUALITY, REMAKE, REPORT, STORE, SURFACES, SWEEP_FILM
 from .card import place_card
 from .manifest import SCHEMA, FigureEntry, Manifest, ModelEntry, TradeoffEntry, as_json
 from .measured import dark_name, place_tradeoffs, read_report
@@ -96,6 +97,7 @@ def _templates() -> Environment:
     )  # fmt: skip
     pages.filters["number"] = _number
     pages.filters["dark"] = dark_name
+    pages.filters["beside"] = _beside
     pages.filters["times"] = lambda text: re.sub(r"(?<=\d) x (?=[\d(])", " \N{MULTIPLICATION SIGN} ", text)
     return pages
 
@@ -103,6 +105,13 @@ def _templates() -> Environment:
 def _number(value: Any, digits: int = 4) -> str:
     """Write a number with a minus sign, and anything else as it is."""
     return f"{value:z.{digits}g}".replace("-", "\N{MINUS SIGN}") if isinstance(value, int | float) else str(value)
+
+
+def _beside(one: Companion, unit: str) -> str:
+    """Say what the losses of a slice beside a page's own range over."""
+    if one.lowest is None or one.highest is None:
+        return f"through {one.through} all failed"
+    return f"through {one.through} from {_number(one.lowest)} to {_number(one.highest)}{unit}"
 
 
 @dataclass(frozen=True)
@@ -136,6 +145,7 @@ class _Site:
         given = [name for name in (*SURFACES, SWEEP_FILM) if (source / name).exists()]
         given += [name for episode in episodes for name in episode.files]
         given += [name for name in (REPORT, MEASURES, QUALITY) if (source / name).exists()]
+        given += [COMPANION_PICTURE] if read_companions(source) else []
         entry = replace(
             _entry(figure, dataset, source),
             files=[NODES, "index.html", *_place(given, source, folder)],
@@ -194,6 +204,7 @@ def _entry(figure: Figure, dataset: xr.Dataset, source: Path) -> FigureEntry:
         labels=identity["plane"]["labels"],
         through=figure.through,
         says=figure.caption.says,
+        searched=figure.searched,
         resolution=identity["plane"]["resolution"],
         loss_unit=provenance.get("loss_unit", ""),
         numbers=count_numbers(dataset),
@@ -203,6 +214,7 @@ def _entry(figure: Figure, dataset: xr.Dataset, source: Path) -> FigureEntry:
         files=[],
         episodes=[],
         sweep=read_sweep(source),
+        companions=read_companions(source),
         runs=[],
         measures=read_measures(source),
         report=read_report(source),

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
+from ..companions import Companion
 from ..records import SweepRecord
 
 SCHEMA = 2  # counts up whenever the meaning of a name in the manifest changes
@@ -273,6 +274,7 @@ class FigureEntry:
     labels: Sequence[str]
     through: str
     says: str
+    searched: Mapping[str, Any]
     resolution: Sequence[int]
     loss_unit: str
     numbers: Numbers
@@ -282,6 +284,7 @@ class FigureEntry:
     files: Sequence[str]
     episodes: Sequence[EpisodeEntry]
     sweep: SweepRecord | None
+    companions: Sequence[Companion]
     runs: Sequence[Search]
     measures: Mapping[str, str | float]
     report: ReportEntry | None

@@ -145,7 +145,8 @@ def _try(name: str, run: Callable[[], Finding]) -> Finding:
 
 
 def _failure(name: str, error: Exception) -> Finding:
-    return Finding(name, FAIL, f"raised {type(error).__name__}", " ".join(str(error).split()))
+    first = (str(error).strip().splitlines() or [""])[0]  # others' messages may go on for pages
+    return Finding(name, FAIL, f"raised {type(error).__name__}", first.rstrip(":"))
 
 
 def _check_shapes(objective: Objective, x: Float[Tensor, "batch dim"]) -> Finding:

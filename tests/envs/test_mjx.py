@@ -67,6 +67,21 @@ def test_parameters_set_the_state_the_model_and_the_controls_they_name(dart):
     torch.testing.assert_close(found.grad[:, [0, 1, 3, 4]], wanted.grad[:, [0, 1, 3, 4]], rtol=1e-7, atol=1e-9)
 
 
+def test_precisions_take_turns_in_one_process():
+    """What JAX has traced in one precision does not fit the other: by Runge-Kutta it could not be compiled."""
+
+    class Kutta(Dart):
+        mjcf = POINT.replace("<option", '<option integrator="RK4"')
+
+    single = replace(STEP, precision="float32")
+    x = torch.tensor([[2.0, 1.5, 0.0, 1.0, -1.0]], dtype=torch.float64)
+    found = [Kutta(fidelity=fidelity).evaluate(x) for fidelity in (STEP, single, STEP, single)]
+    for one in found[1:]:
+        torch.testing.assert_close(one.loss, found[0].loss, rtol=1e-5, atol=0)
+        torch.testing.assert_close(one.grad, found[0].grad, rtol=1e-4, atol=1e-5)
+    assert torch.equal(found[2].grad, found[0].grad)
+
+
 def test_reverse_is_forward_where_nothing_touches(dart):
     x = dart.space.uniform(3, seed=1)
     torch.testing.assert_close(Dart(fidelity=STEP, mode="reverse").evaluate(x).grad, dart.evaluate(x).grad)

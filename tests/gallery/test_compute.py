@@ -8,6 +8,7 @@ import pytest
 
 from gradscape.cli import main
 from gradscape.envs.bounce import Bounce
+from gradscape.gallery import companions as gallery_companions
 from gradscape.gallery import episodes as gallery_episodes
 from gradscape.gallery import measures as gallery_measures
 from gradscape.gallery import parts as gallery_parts
@@ -28,6 +29,7 @@ def small(blank: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setattr("gradscape.gallery.figures.read_figures", lambda: list(FIGURES))
     for name, value in (("FRAMES", 2), ("COARSE", 4), ("DPI", 40), ("METHODS", ("random", "cma-es")), ("BUDGET", 9)):
         monkeypatch.setattr(gallery_parts, name, value)
+    monkeypatch.setattr(gallery_companions, "RESOLUTION", 4)
     for name, value in (("HEIGHT", 60), ("LONGEST", 2)):
         monkeypatch.setattr(gallery_episodes, name, value)
     for name, value in (("REPORT_POINTS", 2), ("TRADEOFF_POINTS", 4), ("TURNED", ["precision"])):
@@ -60,6 +62,12 @@ def test_everything_is_made_once(small: Path, capsys: pytest.CaptureFixture[str]
     assert (sweep["low"], sweep["high"], sweep["frames"]) == (50.0, 100.0, 2)
     assert sweep["command"].startswith("landscape sweep bounce --dims 0 1 --over horizon")
     assert not (small / "ball-y/sweep.mp4").exists()
+    for figure in ("ball", "ball-y"):
+        (beside,) = json.loads((small / figure / "companions.json").read_text())["slices"]
+        assert (beside["through"], beside["failed"]) == ("center", 0.0)
+        assert 0 < beside["lowest"] < beside["highest"]
+        assert (small / figure / "companions.png").read_bytes().startswith(b"\x89PNG")
+    assert not (small / "branin/companions.json").exists()  # its slice is the same through any point
     kept = sorted(str(file.relative_to(small)) for file in small.glob("runs/*/*"))
     methods = ("cma-es", "random")
     assert kept == [f"runs/{env}/{method}-0.zarr.zip" for env in ("bounce", "branin") for method in methods]
@@ -92,6 +100,6 @@ def test_films_of_other_nodes_go_when_the_slice_changes(small: Path) -> None:
 
 def test_an_unknown_part_is_refused(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert compute(small, "--part", "films") == 2
-    assert "--part takes slices, sweeps, episodes, searches, reports, tradeoffs; got films" in " ".join(
+    assert "--part takes slices, companions, sweeps, episodes, searches, reports, tradeoffs; got films" in " ".join(
         capsys.readouterr().err.split()
     )

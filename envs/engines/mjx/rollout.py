@@ -16,7 +16,7 @@ from mujoco import mjx
 from numpy.typing import NDArray
 from platformdirs import user_cache_dir
 
-from ..jax_functions import computing_in
+from ..jax_functions import computing_in, forget_other_precision
 from ..jax_functions import from_jax as from_jax
 
 if jax.config.values.get("jax_compilation_cache_dir") is None:  # a scene takes long to compile
@@ -123,6 +123,7 @@ class Rollout:
 
         Shapes (frame, geom, 3) and (frame, geom, 3, 3).
         """
+        forget_other_precision(self.precision)
         with computing_in(self.precision):
             at, turn = jax.jit(partial(self._frames, course=course))(jnp.asarray(x, dtype=self.precision))
         return np.asarray(at, dtype=np.float64), np.asarray(turn, dtype=np.float64)

@@ -291,7 +291,7 @@ def refusing():
 
 
 def broken():
-    raise RuntimeError("a kernel failed")
+    raise RuntimeError("a kernel failed:\n\tin one of somebody's files")
 
 
 class Escaping(Sound):
@@ -321,6 +321,11 @@ def test_a_variant_answers_with_a_number_a_status_or_a_refusal(make, outcome, fi
     found = outcomes(Sound(), variants=[ExtremeCase("dt 8x", make)])["dt 8x"]
     assert found.outcome == outcome
     assert found.figure.startswith(figure)
+
+
+def test_what_a_variant_raises_is_said_in_a_line():
+    found = outcomes(Sound(), variants=[ExtremeCase("dt 8x", broken)])["dt 8x"]
+    assert (found.figure, found.why) == ("raised RuntimeError", "a kernel failed")
 
 
 def test_an_expected_failure_is_excused_until_it_passes():

@@ -18,6 +18,7 @@ from gradscape.landscapes import draw
 from gradscape.landscapes.draw.figures import page, typesetting
 from gradscape.landscapes.draw.figures.card import card_figure
 from gradscape.landscapes.draw.figures.census import census_figure
+from gradscape.landscapes.draw.figures.companions import Cut, companions_figure
 from gradscape.landscapes.draw.figures.comparison import comparison_figure
 from gradscape.landscapes.draw.figures.contact import Caption, episode_figure
 from gradscape.landscapes.draw.figures.contour import landscape_figure
@@ -93,6 +94,7 @@ CAPTION = Caption(
     "episode.json", COMMAND,
 )  # fmt: skip
 PARTS = {f"the walls' friction, number {number}": 0.01 * 1.5**number for number in range(12)}
+CUTS = [Cut("center", np.full((4, 4), np.nan)), Cut("random:3", np.arange(16.0).reshape(4, 4))]
 MIXED = mixed()
 CHOSEN = {"draft": MIXED["rungs"][-1]["name"], "standard": MIXED["rungs"][10]["name"]}
 FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
@@ -131,6 +133,12 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
     ],
     "convergence_figure": [lambda width: convergence_figure(convergence(), width=width)],
     "model_figure": [lambda width: model_figure(study(PARTS, failing=True), width=width)],
+    "companions_figure": [
+        lambda width: companions_figure([Cut("example:aim", PLANE["loss"].to_numpy()), *CUTS], PLANE, width=width),
+        lambda width: companions_figure(
+            [Cut("center", LONG["loss"].to_numpy()), Cut("random:3", LONG["loss"].to_numpy())], LONG, width=width
+        ),
+    ],
     "card_figure": [lambda width: card_figure(card(), width=width)],
     "census_figure": [lambda width: census_figure(census(), width=width)],
     "extremes_figure": [lambda width: extremes_figure(extremes(), width=width)],

@@ -1,0 +1,178 @@
+"""Search for the point that each of the gallery's figures goes through: where its losses come nearest to the paper's.
+
+    python -m benchmarks.base_points [FIGURE|ENV ...] [--resolution 8] [--random 32] [--fidelity standard]
+        [--device auto] [--out out/base-points] [--write]
+
+The paper says what its colour bars end at, and not which points its slices go through. Of each figure whose environment
+has such ends in gallery/paper.toml, losses are evaluated on a small grid over the figure's plane through the centre,
+each example of the scene, and random:1 to random:32. The point is taken whose lowest and highest loss are least off:
+
+    (|lowest - paper's lowest| + |highest - paper's highest|) / (paper's highest - paper's lowest)
+
+How rugged it looks is never asked. A point through which a tenth of the episodes or more fail is not taken. What was
+found is kept in the folder --out, a file for each figure, and a search that is there is not made again; --write puts
+points and results into gallery/figures.toml.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gradscape.envs.base import Environment
+from gradscape.envs.points import point
+from gradscape.gallery.figures import Figure, choose_figures, read_figures
+from gradscape.gallery.files import FIGURES
+from gradscape.gallery.paper import read_paper
+from gradscape.landscapes.objective import Status, evaluate
+from gradscape.landscapes.plane import Plane
+from gradscape.landscapes.storage.records import read_json, write_record
+
+MOST_FAILED = 0.1  # of a candidate's episodes
+DIGITS = 4
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A point that a figure could go through: the ends of its losses, its share of failures, its distance."""
+
+    through: str
+    lowest: float
+    highest: float
+    failed: float
+    distance: float
+
+    @classmethod
+    def of(cls, through: str, loss: Tensor, failed: Tensor, paper: tuple[float, float]) -> Candidate:
+        """Measure the losses of a grid, in the objective's unit; the distance is infinite where too many failed."""
+        share = float(failed.double().mean())
+        if share >= MOST_FAILED:
+            return cls(through, math.nan, math.nan, share, math.inf)
+        lowest, highest = float(loss[~failed].min()), float(loss[~failed].max())
+        return cls(through, lowest, highest, share, distance((lowest, highest), paper))
+
+    def record(self) -> dict[str, Any]:
+        """Return it as plain JSON: null for what is not known."""
+        plain = {
+            name: value if math.isfinite(value) else None for name, value in vars(self).items() if name != "through"
+        }
+        return {"through": self.through, **plain}
+
+
+def distance(found: tuple[float, float], paper: tuple[float, float]) -> float:
+    """Return how far both ends of a range of losses are off the paper's, in widths of the paper's."""
+    return (abs(found[0] - paper[0]) + abs(found[1] - paper[1])) / (paper[1] - paper[0])
+
+
+def names_of(env: Environment, count: int) -> list[str]:
+    """Return the points that figures may go through: the centre, the examples, and so many random ones."""
+    return ["center", *(f"example:{name}" for name in env.examples), *(f"random:{n}" for n in range(1, count + 1))]
+
+
+def search(
+    figure: Figure, env: Environment, resolution: int, count: int, paper: tuple[float, float]
+) -> list[Candidate]:
+    """Measure all candidates of a figure, their grids in common batches; the nearest first."""
+    names = names_of(env, count)
+    points = torch.cat([_grid(figure, env, name, resolution) for name in names])
+    parts = [evaluate(env, part, grad=False) for part in _batches(points, env.preferred_batch, figure.id)]
+    loss = torch.cat([part.loss for part in parts]).reshape(len(names), -1)
+    failed = torch.cat([part.status for part in parts]).reshape(len(names), -1) != Status.OK
+    rows = zip(names, loss, failed, strict=True)
+    return sorted((Candidate.of(*row, paper) for row in rows), key=lambda one: one.distance)
+
+
+def _grid(figure: Figure, env: Environment, name: str, resolution: int) -> Tensor:
+    """Return the points of a grid over the figure's plane through a named point."""
+    plane = Plane.through(env.space, point(env, name), figure.dims, resolution=resolution)
+    axes = torch.meshgrid(*plane.axes(), indexing="ij")
+    return plane.lift(torch.stack(axes, dim=-1).reshape(-1, plane.rank))
+
+
+def _batches(points: Tensor, size: int, name: str) -> Iterator[Tensor]:
+    parts = torch.split(points, size)
+    for number, part in enumerate(parts):
+        print(f"\r{name}: {number * size} of {len(points)} episodes", end="", file=sys.stderr, flush=True)
+        yield part
+    print(f"\r{name}: {len(points)} of {len(points)} episodes", file=sys.stderr)
+
+
+def write_choice(path: Path, figure: str, found: dict[str, Any]) -> None:
+    """Put the point and its result into the figure's table of a list of figures, in the place of those before."""
+    text = path.read_text()
+    heads = [match.start() for match in re.finditer(r"^\[\[figure\]\]$", text, flags=re.MULTILINE)] + [len(text)]
+    blocks = [text[: heads[0]], *(text[low:high] for low, high in pairwise(heads))]
+    (number,) = (n for n, block in enumerate(blocks) if f'\nid = "{figure}"\n' in block)
+    kept = [line for line in blocks[number].rstrip("\n").split("\n") if not re.match(r"(through|searched) = ", line)]
+    best = found["candidates"][0]
+    result = {
+        "losses": [round(best["lowest"], DIGITS), round(best["highest"], DIGITS)],
+        "paper": found["paper"],
+        "distance": round(best["distance"], DIGITS),
+        "candidates": len(found["candidates"]),
+    }
+    plain = ", ".join(f"{key} = {json.dumps(value)}" for key, value in result.items())
+    kept += [f'through = "{best["through"]}"', f"searched = {{ {plain} }}"]
+    end = "\n\n" if number < len(blocks) - 1 else "\n"
+    path.write_text("".join([*blocks[:number], "\n".join(kept) + end, *blocks[number + 1 :]]))
+
+
+def _measure(figure: Figure, asked: argparse.Namespace, paper: tuple[float, float], path: Path) -> dict[str, Any]:
+    """Return what was found of a figure, from the folder where it was kept with these settings."""
+    settings = {
+        **{"figure": figure.id, "dims": list(figure.dims), "options": dict(figure.options), "paper": list(paper)},
+        **{"fidelity": asked.fidelity, "resolution": asked.resolution, "random": asked.random},
+    }
+    if path.exists() and {name: (kept := read_json(path)).get(name) for name in settings} == settings:
+        print(f"{figure.id}: there already", file=sys.stderr)
+        return dict(kept)
+    env = figure.scene(asked.device, asked.fidelity).make()
+    found = search(figure, env, asked.resolution, asked.random, paper)
+    record = {**settings, "device": env.device, "candidates": [one.record() for one in found]}
+    write_record(path, record)
+    return record
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Search, print what was found, and write it into the list of figures if asked to."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("only", nargs="*", metavar="FIGURE|ENV", help="figures or environments, by default all")
+    parser.add_argument("--resolution", type=int, default=8, help="points along each axis of a grid")
+    parser.add_argument("--random", type=int, default=32, help="random points")
+    parser.add_argument("--fidelity", default="standard")
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--out", type=Path, default=Path("out/base-points"))
+    parser.add_argument("--figures", type=Path, default=FIGURES, help="the list of figures")
+    parser.add_argument("--write", action="store_true", help="write what was found into the list of figures")
+    asked = parser.parse_args(arguments)
+    words = read_paper().words
+    asked.out.mkdir(parents=True, exist_ok=True)
+    for figure in choose_figures(read_figures(asked.figures), asked.only):
+        paper = words[figure.env].losses if figure.env in words else None
+        if paper is None:
+            print(f"{figure.id}: the paper has no colour bar of {figure.env}; it keeps {figure.through}")
+            continue
+        found = _measure(figure, asked, paper, asked.out / f"{figure.id}.json")
+        if (best := found["candidates"][0])["distance"] is None:
+            print(f"{figure.id}: a tenth of the episodes or more fail through every point; it keeps {figure.through}")
+            continue
+        ends = f"{best['lowest']:.4g} to {best['highest']:.4g}, the paper's {paper[0]:g} to {paper[1]:g}"
+        print(f"{figure.id}: {best['through']}, losses {ends}, distance {best['distance']:.3g}")
+        if asked.write:
+            write_choice(asked.figures, figure.id, found)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,151 @@
+"""The same cut elsewhere: a figure's dimensions through the centre and through an example, beside the figure's own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from ..envs.registry import environment_class
+from ..jobs.scene import SceneSpec
+from ..jobs.watch import Watch
+from ..landscapes.objective import Status, evaluate
+from ..landscapes.plain import number, optional, text
+from ..landscapes.storage.records import read_json, reading, write_record
+from .figures import Figure
+from .files import COMPANION_PICTURE, COMPANIONS, REMAKE, STORE
+from .parts import FigurePart, seconds_of_one
+from .records import read_if_sound
+
+if TYPE_CHECKING:
+    from ..envs.base import Environment
+    from ..landscapes.plane import Plane
+
+RESOLUTION = 24  # points along each axis
+
+
+@dataclass(frozen=True)
+class Companion:
+    """A slice beside a figure's: the point it goes through, the ends of its losses, the share of episodes that failed.
+
+    The ends are None where all failed.
+    """
+
+    through: str
+    lowest: float | None
+    highest: float | None
+    failed: float
+
+    @classmethod
+    def of_record(cls, record: Mapping[str, Any]) -> Companion:
+        """Read it. Raises ValueError, TypeError or LookupError where it is not of this form."""
+        low, high = (optional(number, record[name]) for name in ("lowest", "highest"))
+        return cls(text(record["through"]), low, high, number(record["failed"]))
+
+
+def read_companions(folder: Path) -> list[Companion]:
+    """Return the slices beside a figure's, none where none are made, or none has another place than the figure's."""
+    path = folder / COMPANIONS
+    if not path.exists() or not (folder / COMPANION_PICTURE).exists():
+        return []
+    with reading(path, REMAKE.format("companions")):
+        return [Companion.of_record(one) for one in read_json(path)["slices"]]
+
+
+def points_beside(figure: Figure) -> list[str]:
+    """Return the points that a figure's dimensions are also cut through: the centre and the scene's first example.
+
+    A figure that varies all parameters has the same slice everywhere, so there are none.
+    """
+    kind = environment_class(figure.env)
+    space = getattr(kind, "space", None) or SceneSpec(figure.env, device="cpu", options=figure.options).make().space
+    if space.dim == len(figure.dims):
+        return []
+    examples = [f"example:{name}" for name in kind.examples][:1]
+    return [name for name in ("center", *examples) if name != figure.through]
+
+
+class CompanionPart(FigurePart):
+    """The losses of the same cut through other points, at the figure's fidelity, and a picture on one scale."""
+
+    def label(self) -> str:
+        """Say what is sampled."""
+        return f"the same dims through {' and '.join(points_beside(self.figure))}, losses"
+
+    def count_left(self) -> int:
+        """Count the episodes where there are no such slices of these settings, of this slice."""
+        names = points_beside(self.figure)
+        if not names or self._key() is None:
+            return 0
+        record = read_if_sound(read_json, self.folder / COMPANIONS)
+        there = record is not None and record.get("key") == self._key() and (self.folder / COMPANION_PICTURE).exists()
+        return 0 if there else len(names) * RESOLUTION ** len(self.figure.dims)
+
+    def seconds_each(self) -> float:
+        """Time an episode."""
+        return seconds_of_one(self._scene().make())
+
+    def make(self, watch: Watch) -> str:
+        """Sample them, draw them beside the slice, and keep what they are."""
+        from ..landscapes.draw.figures.companions import Cut, companions_figure
+        from ..landscapes.draw.figures.page import save
+        from ..landscapes.draw.film import lighten
+        from ..landscapes.storage.store import open_slice
+
+        dataset, env = open_slice(self.folder / STORE), self._scene().make()
+        names, cuts = points_beside(self.figure), [Cut(self.figure.through, dataset["loss"].to_numpy())]
+        found = list[Companion]()
+        with watch.progress(self.count_left(), "episodes") as advance:
+            for name in names:
+                loss = sample(env, self._plane(env, name))
+                cuts.append(Cut(name, loss))
+                found.append(_companion(name, loss))
+                advance(len(found) * loss.size, "")
+        save(companions_figure(cuts, dataset), self.folder / COMPANION_PICTURE)
+        lighten(self.folder / COMPANION_PICTURE)
+        known = {"key": self._key(), "device": env.device, "slices": [asdict(one) for one in found]}
+        write_record(self.folder / COMPANIONS, known)
+        return "; ".join(f"through {one.through}: {_say(one)}" for one in found)
+
+    def _plane(self, env: Environment, name: str) -> Plane:
+        from ..envs.points import point
+        from ..landscapes.plane import Plane
+
+        return Plane.through(env.space, point(env, name), self.figure.dims, resolution=RESOLUTION)
+
+    def _key(self) -> dict[str, Any] | None:
+        """Return what decides these slices and their picture; None where the figure has no slice yet."""
+        from ..jobs.report import digest_of
+        from ..landscapes.storage.paths import is_slice
+        from ..landscapes.storage.store import open_slice
+
+        store = self.folder / STORE
+        if not is_slice(store):
+            return None
+        settings = {"slice": digest_of(open_slice(store)), "fidelity": self.figure.fidelity, "resolution": RESOLUTION}
+        return {**settings, "through": points_beside(self.figure)}
+
+
+def sample(env: Environment, plane: Plane) -> np.ndarray[Any, np.dtype[np.float32]]:
+    """Return the losses on a plane or a line, indexed (v, u) or (u), NaN where an episode failed."""
+    axes = torch.meshgrid(*reversed(plane.axes()), indexing="ij")
+    points = plane.lift(torch.stack(axes[::-1], dim=-1).reshape(-1, plane.rank))
+    parts = [evaluate(env, part, grad=False) for part in torch.split(points, env.preferred_batch)]
+    loss = torch.cat([part.loss for part in parts])
+    loss[torch.cat([part.status for part in parts]) != Status.OK] = torch.nan
+    return loss.reshape(plane.resolution[::-1]).to(torch.float32).numpy()
+
+
+def _companion(name: str, loss: np.ndarray[Any, Any]) -> Companion:
+    finite = loss[np.isfinite(loss)]
+    if not finite.size:
+        return Companion(name, None, None, 1.0)
+    return Companion(name, float(finite.min()), float(finite.max()), 1 - finite.size / loss.size)
+
+
+def _say(one: Companion) -> str:
+    return "all failed" if one.lowest is None else f"losses from {one.lowest:.4g} to {one.highest:.4g}"
