@@ -13,15 +13,15 @@ from itertools import pairwise
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .adapters import check_points
 from .capacity import Need, require
-from .objective import Evaluation
+from .objective import Evaluation, Status
 from .space import ParameterSpace
 
-FORM = re.compile(r"mlp:([1-9]\d*(?:x[1-9]\d*)*)")
+FORM = re.compile(r"mlp:([1-9]\d{0,8}(?:x[1-9]\d{0,8})*)")
 REACH = 3.0  # times as far as torch draws weights at first: where learning may take them
 COPIES = 8  # of the weights of all rows, at most
 
@@ -66,6 +66,11 @@ class PolicyObjective:
         """Make the first evaluation as quick as the next."""
         self._env.prepare()
 
+    def shrink(self, rows: int) -> None:
+        """Let the environment take at most `rows` episodes at once from now on."""
+        self._env.shrink(rows)
+        self.preferred_batch = self._env.preferred_batch
+
     def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
         needed: int = self._env.memory()
@@ -74,26 +79,38 @@ class PolicyObjective:
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
         """Return the losses of episodes that are played with these weights, a row for each policy.
 
-        Raises ValueError where gradients are asked for.
+        A policy that sees what is not finite decides on the middles of the boxes then, and its row has failed. Raises
+        ValueError where gradients are asked for.
         """
         if grad:
             raise ValueError(
                 f"{self.name} has no gradients, as what a policy sees is not differentiated; sample losses only, with "
                 "--no-gradients, along random:SEED or parameters"
             )
-        found: Evaluation = self._env.evaluate(self.decide(x), grad=False)
-        return found
+        decided, blind = self._play(x)
+        found: Evaluation = self._env.evaluate(decided, grad=False)
+        lost = blind & (found.status == Status.OK)
+        status = found.status.masked_fill(lost, Status.NONFINITE)
+        return Evaluation(found.loss.masked_fill(lost, torch.nan), None, status)
 
     def decide(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch decided"]:
         """Return the environment's parameters that policies with these weights decide on, one after another."""
+        return self._play(x)[0]
+
+    def _play(self, x: Float[Tensor, "batch dim"]) -> tuple[Float[Tensor, "batch decided"], Bool[Tensor, " batch"]]:
+        """Return what policies decide on, and which of them saw what is not finite."""
         x = check_points(x, self.space, self.name)
         space, count = self._env.space, self._env.space.dim // self._env.decisions
         decided: Tensor = space.center.repeat(len(x), 1)
+        blind = torch.zeros(len(x), dtype=torch.bool)
         for decision in range(self._env.decisions if len(x) else 0):
             own = slice(decision * count, (decision + 1) * count)
-            share = (1 + self._act(x, self._env.observe(decided, decision))) / 2
+            seen = self._env.observe(decided, decision)
+            blind |= ~seen.isfinite().all(dim=1)
+            share = (1 + self._act(x, seen)) / 2
+            share[blind] = 0.5
             decided[:, own] = space.lower[own] + share * (space.upper - space.lower)[own]
-        return decided
+        return decided, blind
 
     def _act(self, x: Float[Tensor, "batch dim"], seen: Float[Tensor, "batch feature"]) -> Float[Tensor, "batch act"]:
         """Return what each row's own perceptron answers to what it sees."""

@@ -10,8 +10,9 @@ import torch
 import gradscape as gs
 from gradscape.jobs.scene import environment_of
 from gradscape.landscapes.capacity import TooLargeError
-from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.policies import REACH, PolicyObjective
+from gradscape.landscapes.sampling.memory import MemoryBound
 from gradscape.landscapes.space import ParameterSpace
 
 from ..command import Said
@@ -103,3 +104,53 @@ def test_a_slice_over_weights_goes_on_and_is_none_of_the_scenes_own(run, tmp_pat
     assert hessian.returncode == 2
     assert "has no gradients" in hessian.stderr
     assert not (tmp_path / "other").exists()
+
+
+def test_a_policy_that_sees_what_is_not_finite_fails_alone() -> None:
+    class Blinding(Cart):
+        """It cannot be seen beyond a place, and refuses points that are not finite."""
+
+        def observe(self, x, decision):
+            assert bool(x.isfinite().all())
+            seen = super().observe(x, decision)
+            return torch.where(seen[:, :1] > 4.5, torch.nan, seen)
+
+        def evaluate(self, x, *, grad=True):
+            assert bool(x.isfinite().all())
+            return super().evaluate(x, grad=grad)
+
+    seeing, blinding = PolicyObjective(Cart(), "mlp:2"), PolicyObjective(Blinding(), "mlp:2")
+    x = seeing.space.uniform(64, seed=1)
+    place = 2 + seeing.decide(x).cumsum(dim=1)[:, : STEPS - 1]
+    far = (place > 4.5).any(dim=1)
+    assert 0 < int(far.sum()) < 64
+    found, wanted = blinding.evaluate(x, grad=False), seeing.evaluate(x, grad=False)
+    assert torch.equal(found.status == Status.NONFINITE, far)
+    assert bool(found.loss[far].isnan().all())
+    assert torch.equal(found.loss[~far], wanted.loss[~far])
+    assert bool((found.status[~far] == Status.OK).all())
+
+
+def test_more_digits_than_any_layer_has_are_no_form() -> None:
+    with pytest.raises(ValueError, match="--policy takes mlp"):
+        PolicyObjective(Cart(), f"mlp:{'9' * 5000}")
+
+
+def test_where_memory_runs_out_the_environment_takes_fewer_rows() -> None:
+    class Crowded(Cart):
+        def shrink(self, rows):
+            self.preferred_batch = rows
+
+        def evaluate(self, x, *, grad=True):
+            if len(x) > 3:
+                raise MemoryError("out of memory")
+            return super().evaluate(x, grad=grad)
+
+    policy = PolicyObjective(Crowded(), "mlp:1")
+    x = policy.space.uniform(8, seed=2)
+    bound = MemoryBound(policy)
+    assert torch.equal(
+        bound.evaluate(x, grad=False).loss, PolicyObjective(Cart(), "mlp:1").evaluate(x, grad=False).loss
+    )
+    assert policy.preferred_batch == 2
+    assert len(bound.take_notes()) == 2
