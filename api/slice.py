@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
-from ..jobs.cut import cut, describe_cut
+from ..jobs.cut import cut_or_kept, describe_cut
 from ..jobs.scene import SceneSpec, environment_of, with_policy
 from ..jobs.watch import Watch
 from ..landscapes.adapters import within_box
@@ -68,28 +68,28 @@ def slice(
         if not is_environment(objective):
             raise ValueError(f"a policy decides in an environment; got the objective {name_of(objective)}")
         objective, gradients = with_policy(objective, policy), False
-    plane = cut(objective, dims, along, through=through, extent=extent, resolution=resolution)
     from ..landscapes.sampling.refine import Refinement
 
-    fine = Refinement.of(refine, budget)
-    if out is None and policy is None and not is_environment(objective):
+    fine, folder = Refinement.of(refine, budget), Path(out) if out is not None else None
+    in_memory = out is None and policy is None and not is_environment(objective)
+    begun: dict[str, Any] = {"out": folder, "grad": gradients, "refinement": fine, "force": force or in_memory}
+    where: dict[str, Any] = {"through": through, "extent": extent, "resolution": resolution}
+    plane = cut_or_kept(objective, dims, along, **where, **begun)
+    if in_memory:
         return _sample_in_memory(within_box(objective) if along else objective, plane, gradients, fine, watch)
     from ..jobs.slice import SliceJob
 
     point = through if isinstance(through, str) else through.tolist()
-    where = {"along": along, "through": None if point == "center" else point, "extent": extent}
     how = {
         "refine": refine,
         "budget": budget,
         "policy": policy,
-        **where,
+        **{"along": along, "through": None if point == "center" else point, "extent": extent},
         "gradients": None if gradients or policy else False,
     }
     command = say_call("slice", scene, *([tuple(dims)] if dims else []), resolution=resolution, **how, **keywords)
-    settings: dict[str, Any] = {"out": Path(out) if out is not None else None, "grad": gradients, "force": force}
-    job = SliceJob.of(
-        objective, plane, command=command, refinement=fine, cut=describe_cut(along, through, extent), **settings
-    )
+    settings: dict[str, Any] = {**begun, "cut": describe_cut(along, through, extent)}
+    job = SliceJob.of(objective, plane, command=command, **settings)
     job.run(watch)
     return _open(job.folder, lambda: objective)
 

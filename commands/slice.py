@@ -111,14 +111,13 @@ def _sample(
     bars = Bars()
     env = scene.make(bars)
     subject = with_policy(env, policy)
-    from ..jobs.cut import cut, describe_cut, folder_for, split_points
+    from ..jobs.cut import cut_or_kept, describe_cut, folder_for, split_points
     from ..jobs.slice import SliceJob
     from ..jobs.workers import workers
     from ..landscapes.sampling.refine import Refinement
 
     points = split_points(through)
     where: dict[str, Any] = {"extent": read_extent(extent), "resolution": resolution}
-    planes = {point: cut(subject, dims, along, through=point, **where) for point in points}  # or none is sampled
     how: dict[str, Any] = {
         "command": command_line(),
         "grad": grad and policy is None,
@@ -126,12 +125,17 @@ def _sample(
         "prints": prints or [],
     }
     how["refinement"] = Refinement.of(read_share(refine, "--refine"), budget)
+    folders = {point: folder_for(Path(out), point, points) if out else None for point in points}
+    begun = {name: how[name] for name in ("grad", "refinement", "force")}
+    planes = {  # all of them, or none is sampled
+        point: cut_or_kept(subject, dims, along, through=point, out=folder, **where, **begun)
+        for point, folder in folders.items()
+    }
     said = list[dict[str, Any]]()
     with workers(scheduler, env.device) as executor:
         for point, plane in planes.items():
-            folder = folder_for(Path(out), point, points) if out else None
             named = describe_cut(along, point, where["extent"])
-            job = SliceJob.of(subject, plane, out=folder, cut=named, executor=executor, **how)
+            job = SliceJob.of(subject, plane, out=folders[point], cut=named, executor=executor, **how)
             summary = job.run(bars)
             bars.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
             said.append({**asdict(summary), "folder": str(job.folder)})

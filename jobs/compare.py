@@ -25,7 +25,8 @@ from ..landscapes.storage.paths import slice_exists
 from ..landscapes.storage.records import read_json, reading, write_record
 from ..landscapes.storage.store import open_slice
 from .folder import COMPARISON, SLICE_STORE, folder_named
-from .slice import SliceJob, identity_of
+from .slice import SliceJob
+from .slice_place import identity_of
 from .watch import Watch, resumable
 
 if TYPE_CHECKING:

@@ -12,6 +12,7 @@ from torch import Tensor
 from ..landscapes.foreign import SUFFIXES
 from ..landscapes.plain import plain_name
 from .scene import named_point, plane_through, runs_in
+from .slice_place import kept_plane
 from .slice_summary import JOINED
 
 if TYPE_CHECKING:
@@ -44,6 +45,30 @@ def cut(
     if not isinstance(resolution, int):
         raise ValueError(f"a slice along {along} takes one resolution for its axes; got {list(resolution)}")
     return plane_along(objective, along, through=through, extent=extent, resolution=resolution)
+
+
+def cut_or_kept(
+    objective: Objective,
+    dims: Sequence[int | str] | None,
+    along: str | None,
+    *,
+    through: str | Tensor,
+    extent: float | tuple[float, float] | None,
+    resolution: int | Sequence[int],
+    force: bool = False,
+    **kept: Any,
+) -> Plane:
+    """Return what `cut` does, or the plane of a slice along the same directions that was begun, unless by `force`.
+
+    `kept` says where that is, as for `kept_plane`. Raises as `cut` does.
+    """
+    where: dict[str, Any] = {"through": through, "extent": extent}
+    named = None if force or dims else describe_cut(along, **where)
+    if named is not None and isinstance(resolution, int):
+        rank = len(named[JOINED]) - 1 if JOINED in named else 2
+        if (found := kept_plane(objective, named, (resolution,) * rank, **kept)) is not None:
+            return found
+    return cut(objective, dims, along, **where, resolution=resolution)
 
 
 def plane_along(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import resource
 import sys
@@ -22,8 +21,7 @@ from ..landscapes.adapters import within_box
 from ..landscapes.capacity import size
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.measures.unresolved import probes, stored_unresolved
-from ..landscapes.objective import Objective, Status, name_of
-from ..landscapes.plain import plain_name
+from ..landscapes.objective import Objective, Status
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.distribution import RemoteSite, Site, evaluator, run_tasks, workers_of
 from ..landscapes.sampling.fill import Progress, sample
@@ -32,11 +30,12 @@ from ..landscapes.sampling.refine import Refined, Refinement, partly_refined, re
 from ..landscapes.storage.arrays import need_of
 from ..landscapes.storage.checkpoint import Checkpoint
 from ..landscapes.storage.files import clear, tidy, write_json
-from ..landscapes.storage.paths import is_slice, slice_exists
+from ..landscapes.storage.paths import slice_exists
 from ..landscapes.storage.store import SliceStore
 from ..landscapes.storage.tiles import Tile
-from .folder import ROOT, SLICE, SUMMARY, folder_named
+from .folder import ROOT, SLICE, SUMMARY
 from .scene import provenance
+from .slice_place import default_folder, identity_of
 from .slice_summary import SliceSummary, barrier_of, count_statuses, flat_points, look_between, range_of
 from .watch import PREPARING, Watch, resumable
 from .workers import recipe
@@ -45,7 +44,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STORE, PICTURE, REFINING = SLICE.store, SLICE.picture, "slice.refining"
-MOST = 40  # letters of a folder's name that say along what a slice was cut
 PAUSE, DRAWING = 10.0, 0.1  # between pictures of an unfinished slice: least seconds, and most of the time for them
 Draw = Callable[..., "Figure"]  # draw(dataset, width=None): a slice for a screen, or for a page so wide [mm]
 
@@ -136,14 +134,12 @@ class SliceJob:
         That folder is under `root`.
 
         `boxed` leaves out what lies beyond the parameters' bounds. With a `cut`, how it was cut along directions, it is
-        boxed, and one that was begun goes on along its own: on a GPU directions come out a little different each time.
-        With an `executor` its workers compute. Raises as `open` does.
+        boxed; of one that was begun, `kept_plane` has the plane. With an `executor` its workers compute. Raises as
+        `open` does.
         """
         boxed = boxed or cut is not None
         identity = identity_of(objective) | ({"boxed": True} if boxed else {}) | ({"cut": dict(cut)} if cut else {})
-        out = out or _default_folder(identity, plane, grad, root, refinement)
-        if cut and not force:
-            plane = _kept_plane(out / STORE, plane, identity)
+        out = out or default_folder(identity, plane.resolution, plane, grad, root, refinement)
         return cls.open(
             within_box(objective) if boxed else objective,
             plane,
@@ -299,37 +295,6 @@ def picture_of(objective: Objective, plane: Plane) -> Draw:
 def pieces_in(folder: Path) -> Checkpoint:
     """Return what is kept of a slice in a folder while it is refined."""
     return Checkpoint(folder / REFINING)
-
-
-def _default_folder(
-    identity: dict[str, Any], plane: Plane, grad: bool, root: Path, refinement: Refinement | None
-) -> Path:
-    """Return a folder of its own for every different slice, the same for the same one."""
-    aligned = all(len(row.nonzero()) == 1 for row in plane.basis)
-    axes = [str(int(row.nonzero()[0])) for row in plane.basis] if aligned else ["plane"]
-    axes = [plain_name(identity["cut"]["along"])[:MOST]] if "cut" in identity else axes
-    points = "x".join(map(str, plane.resolution))
-    fidelity = [identity["fidelity"]] if "fidelity" in identity else []
-    parts = [identity["objective"], *axes, *fidelity, points]
-    refined = [asdict(refinement)] if refinement else []
-    where = plane.resolution if "cut" in identity else plane.record()  # directions may differ by rounding
-    return folder_named([*parts, *["refined" for _ in refined]], [identity, where, grad, *refined], root)
-
-
-def _kept_plane(path: Path, plane: Plane, identity: Mapping[str, Any]) -> Plane:
-    """Return the plane of a slice that was begun with the same cut, and else the one that is asked for."""
-    if not is_slice(path):
-        return plane
-    kept = SliceStore.open(path).identity
-    same = all(kept.get(name) == json.loads(json.dumps(value)) for name, value in identity.items())
-    found = Plane.from_record(kept["plane"])
-    return found if same and found.resolution == plane.resolution else plane
-
-
-def identity_of(objective: Objective) -> dict[str, Any]:
-    """Return what decides an objective's numbers, as far as it says: an environment all, any other its name."""
-    say: Callable[[], dict[str, Any]] = getattr(objective, "identity", lambda: {"objective": name_of(objective)})
-    return say()
 
 
 def _gpu_memory(objective: Objective) -> str:

@@ -29,7 +29,8 @@ from ..landscapes.storage.store import SliceStore
 from .folder import ROOT, SWEEP, folder_named
 from .motion import HORIZON, SMOOTHING, Motion, refuse_too_large
 from .scene import provenance
-from .slice import MOST, SliceCost, estimate_cost
+from .slice import SliceCost, estimate_cost
+from .slice_place import MOST
 from .slice_summary import count_statuses, flat_points, range_of, say_range
 from .watch import PREPARING, Advance, Watch, resumable
 from .workers import recipe

@@ -59,7 +59,8 @@ def test_a_point_and_an_extent_cut_what_they_say() -> None:
     line = gs.slice(bowl(), ("b",), resolution=3, through=torch.tensor([0.5, 0.0]), extent=(-0.5, 0.5))
     np.testing.assert_array_equal(line.data["loss"], [0.5, 0.25, 0.5])
     assert "1 points" not in repr(line)
-    with pytest.raises(ValueError, match="can be cut through center, random:SEED or a tensor; got 'example:aim'"):
+    forms = r"center, random:SEED, a table \(.csv, .parquet\) or a tensor; got 'example:aim'"
+    with pytest.raises(ValueError, match=f"can be cut through {forms}"):
         gs.slice(bowl(), (0,), through="example:aim")
 
 
