@@ -30,8 +30,8 @@ COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 BLOCKS = [
     block
     for block in re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL)
-    if "dask_jobqueue" not in block and "from brax" not in block
-]  # what a batch system and Brax need is installed by no test
+    if not any(name in block for name in ("dask_jobqueue", "from brax", "import genesis"))
+]  # what a batch system, Brax and Genesis need is installed by no test
 PLACEHOLDER = re.compile(r"\.{3}|[\[\]|]|\b(?!CUDA)[A-Z]{1,}\b")  # in what a command may look like
 
 # What makes them small: words in the place of others, the values of options, and options that are added.
