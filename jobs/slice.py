@@ -56,6 +56,10 @@ class SliceCost:
     seconds: float
     memory: int
 
+    def less(self, done: int) -> SliceCost:
+        """Return what is left where so many of the episodes are done."""
+        return replace(self, episodes=self.episodes - done, seconds=self.seconds * (1 - done / self.episodes))
+
 
 @dataclass(frozen=True)
 class SliceJob:
@@ -198,6 +202,8 @@ class SliceJob:
         env = str(about.get("objective"))
         with watch.busy(f"{env}: {PREPARING}"):
             cost = self.cost()
+            if self.refinement and cost.episodes:
+                cost = cost.less(int((self._so_far()["status"] > 0).sum()))
         total = math.prod(self.plane.resolution)
         kind = "episodes with gradients" if self.store.grad else "episodes"
         watch.note(" · ".join([env, str(about.get("fidelity")), str(about.get("device")), str(self.folder)]))

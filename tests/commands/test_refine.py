@@ -90,6 +90,15 @@ class Impatient(Watch):
         return counting()
 
 
+class Noted(Watch):
+    """Hear what is said of a job."""
+
+    said = ""
+
+    def note(self, text: str) -> None:
+        self.said += text
+
+
 def test_a_job_that_is_stopped_keeps_what_it_has_and_draws_it(tmp_path: Path) -> None:
     from gradscape.envs.registry import make
     from gradscape.jobs.scene import plane_through
@@ -105,7 +114,10 @@ def test_a_job_that_is_stopped_keeps_what_it_has_and_draws_it(tmp_path: Path) ->
     with pytest.raises(Stopped, match="of 1089 points are kept"):
         job("two").run(Impatient())
     assert (tmp_path / "two" / "landscape.png").exists()
-    rest = job("two").run()
+    kept, patient = job("two").say_kept(), Noted()
+    rest = job("two").run(patient)
+    assert f"{rest.resumed} of 1089 points are kept" in kept
+    assert f"up to {1089 - rest.resumed} episodes with gradients to compute, {rest.resumed} are there" in patient.said
     assert rest.resumed > 0
     assert rest.episodes + rest.resumed == whole.episodes
     one, two = (open_slice(tmp_path / name) for name in ("one", "two"))
