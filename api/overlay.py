@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .progress import default_watch
 from .slice import open_slice
@@ -26,7 +26,15 @@ if TYPE_CHECKING:
         def trials_dataframe(self, attrs: tuple[str, ...]) -> pd.DataFrame:
             """Return its trials as a table."""
 
-    Points: TypeAlias = str | Path | Run | pd.DataFrame | Study
+    class Experiment(Protocol):
+        """An experiment of Ax, or a client that holds one, as far as an overlay knows it."""
+
+        name: str
+
+        def lookup_data(self) -> Any:
+            """Return what its metrics measured."""
+
+    Points: TypeAlias = str | Path | Run | pd.DataFrame | Study | Experiment
 
 
 def overlay(
@@ -43,7 +51,8 @@ def overlay(
 
     Slice and runs are folders, a race's for all of its runs, or what `gradscape.slice` and `gradscape.optimize` return.
     Points that another program evaluated are a CSV or Parquet file or a pandas table, with a column for each parameter,
-    called as it is, and one called loss, which is missing where an evaluation failed; or an Optuna study.
+    called as it is, and one called loss, which is missing where an evaluation failed; or an Optuna study; or an
+    experiment of Ax, or its client.
     The slice is cut anew `through` the best point of all runs (best) or of one run's folder, and along the runs' two
     principal directions with `plane` pca, with `resolution` points along each axis, on `device`. The files lie in the
     folder `out`, by default one under out/ named after the overlay.

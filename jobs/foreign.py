@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
-from ..landscapes.foreign import SUFFIXES, points_table, read_points, study_frame
+from ..landscapes.foreign import SUFFIXES, experiment_frame, points_table, read_points, study_frame
 from ..landscapes.plain import plain_name
 from .folder import run_tables
 from .scene import environment_of
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 
     from ..landscapes.slice import Slice
 
-TABLE, STUDY = "table", "optuna"  # what points in memory are called
+TABLE, STUDY, EXPERIMENT = "table", "optuna", "ax"  # what points in memory are called
 
 
 def tables_over(slice: Slice, given: Sequence[Any]) -> list[xr.Dataset]:
     """Return what runs evaluated, and tables of points, as they are laid over a slice: first runs on disk, then others.
 
-    Each is the folder of a run or a race, a CSV or Parquet file, a `Run`, a pandas table or an Optuna study. Runs
-    without an episode are left out.
+    Each is the folder of a run or a race, a CSV or Parquet file, a `Run`, a pandas table, an Optuna study, or a client
+    or an experiment of Ax. Runs without an episode are left out.
 
     Raises ValueError where a path holds none of these, a table lacks a column, or there is no episode at all.
     """
@@ -35,8 +35,8 @@ def tables_over(slice: Slice, given: Sequence[Any]) -> list[xr.Dataset]:
     for one in runs:
         if not isinstance(getattr(one, "data", None), xr.Dataset):
             raise ValueError(
-                "what is laid over a slice are runs, their folders, CSV and Parquet files, pandas tables and Optuna "
-                f"studies; got {one!r}"
+                "what is laid over a slice are runs, their folders, CSV and Parquet files, pandas tables, Optuna's "
+                f"studies and Ax's experiments; got {one!r}"
             )
     found = [*(run_tables(paths) if paths else []), *(run.data for run in runs if run.data.sizes["evaluation"])]
     if tables:
@@ -50,7 +50,13 @@ def tables_over(slice: Slice, given: Sequence[Any]) -> list[xr.Dataset]:
 def _is_table(one: Any) -> bool:
     if isinstance(one, str | Path):
         return Path(one).suffix.lower() in SUFFIXES
-    return hasattr(one, "trials_dataframe") or hasattr(one, "columns")
+    return hasattr(one, "trials_dataframe") or hasattr(one, "columns") or _experiment_of(one) is not None
+
+
+def _experiment_of(one: Any) -> Any:
+    """Return the experiment of Ax that this is, or that its client holds; None where it is none."""
+    held = getattr(one, "experiment", None) or getattr(one, "_experiment", None) or one
+    return held if hasattr(held, "lookup_data") else None
 
 
 def _frame(one: Any) -> tuple[pd.DataFrame, str]:
@@ -59,4 +65,6 @@ def _frame(one: Any) -> tuple[pd.DataFrame, str]:
         return read_points(Path(one)), plain_name(Path(one).stem)
     if hasattr(one, "trials_dataframe"):
         return study_frame(one), plain_name(f"{STUDY}-{one.study_name}")
+    if (experiment := _experiment_of(one)) is not None:
+        return experiment_frame(experiment), plain_name(f"{EXPERIMENT}-{experiment.name}")
     return one, TABLE

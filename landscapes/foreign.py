@@ -1,4 +1,4 @@
-"""Points that other programs evaluated, as a table laid over a slice like a run: CSV, Parquet, pandas, Optuna."""
+"""Points that other programs evaluated, as a table laid over a slice like a run: CSV, Parquet, pandas, Optuna, Ax."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 SUFFIXES = (".csv", ".parquet")
 LOSS = "loss"
 LISTED = 8  # columns that a message names
+ENDED = ("COMPLETED", "FAILED", "ABANDONED", "EARLY_STOPPED")  # of a trial of Ax
 DIGITS = 9  # of a row's number, more than any table has
 
 
@@ -105,6 +106,34 @@ def study_frame(study: Any) -> pd.DataFrame:
     values = ended["value"].where(ended["state"] == "COMPLETE")
     names = [str(name) for name in ended.columns if str(name).startswith("params_")]
     return ended[names].rename(columns=lambda name: name.removeprefix("params_")).assign(**{LOSS: values})
+
+
+def experiment_frame(experiment: Any) -> pd.DataFrame:
+    """Return the arms of an Ax experiment's trials that have ended, a column for each parameter and one for the loss.
+
+    An arm of a trial that failed or was abandoned has no loss; of one that was measured step by step the last counts.
+
+    Raises ValueError where the experiment has several goals, or looks for the greatest value.
+    """
+    import pandas as pd
+
+    config = experiment.optimization_config
+    objective = None if config is None else config.objective
+    if objective is None or len(objective.metric_names) != 1 or not objective.minimize:
+        raise ValueError(
+            f"Ax's experiment {experiment.name!r} has the objective {objective}; a loss is one metric that is "
+            "minimised, so give a table with a column loss instead"
+        )
+    data = experiment.lookup_data().df
+    measured = data[data["metric_name"] == objective.metric_names[0]]
+    losses = dict(zip(measured["arm_name"], measured["mean"], strict=True))  # the last of each arm's
+    rows = [
+        {**arm.parameters, LOSS: losses.get(arm.name, np.nan) if trial.status.name == "COMPLETED" else np.nan}
+        for trial in experiment.trials.values()
+        if trial.status.name in ENDED
+        for arm in trial.arms
+    ]
+    return pd.DataFrame(rows)
 
 
 def points_table(frame: pd.DataFrame, dataset: xr.Dataset, space: ParameterSpace, name: str) -> xr.Dataset:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace as Named
 from typing import Any
 
 import numpy as np
@@ -132,3 +133,30 @@ def test_a_study_of_optuna_is_laid_over_a_slice(cut: gs.Slice, tmp_path: Path) -
     np.testing.assert_allclose(float(laid.runs[0]["best"][-1]), study.best_value)
     with pytest.raises(ValueError, match="MAXIMIZE"):
         gs.overlay(cut, optuna.create_study(direction="maximize"))
+
+
+def experiment_of_ax(names: tuple[str, ...], *, minimize: bool = True) -> Any:
+    """What Ax 1.3.1 has of an experiment of five trials: one is measured twice, one failed and one goes on."""
+    ends = ("COMPLETED", "COMPLETED", "FAILED", "COMPLETED", "RUNNING")
+    points = gs.make("branin").space.uniform(len(ends), seed=3).tolist()
+    arms = [Named(name=f"{n}_0", parameters=dict(zip(names, x, strict=True))) for n, x in enumerate(points)]
+    trials = {n: Named(status=Named(name=end), arms=[arms[n]]) for n, end in enumerate(ends)}
+    measured = pd.DataFrame(
+        [("0_0", "time", 1.0), ("0_0", "miss", 9.0), ("0_0", "miss", 4.0), ("1_0", "miss", 2.0), ("3_0", "miss", 8.0)],
+        columns=["arm_name", "metric_name", "mean"],
+    )
+    objective = Named(metric_names=["miss"], minimize=minimize)
+    held = {"optimization_config": Named(objective=objective), "lookup_data": lambda: Named(df=measured)}
+    return Named(name="of branin", trials=trials, **held)
+
+
+def test_an_experiment_of_ax_and_its_client_are_laid_over_a_slice(cut: gs.Slice, tmp_path: Path) -> None:
+    names = tuple(map(str, cut.data["dim"].to_numpy()))
+    experiment = experiment_of_ax(names)
+    for number, given in enumerate((experiment, Named(_experiment=experiment), Named(experiment=experiment))):
+        laid = gs.overlay(cut, given, out=tmp_path / f"over-{number}")
+        assert (laid.summary.points, laid.summary.failed) == (4, 1)
+        assert laid.runs[0].attrs["label"] == "ax-of-branin"
+        np.testing.assert_array_equal(laid.runs[0]["best"], [4.0, 2.0, 2.0, 2.0])
+    with pytest.raises(ValueError, match="Ax's experiment 'of branin' has the objective"):
+        gs.overlay(cut, experiment_of_ax(names, minimize=False))
