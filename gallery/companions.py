@@ -48,7 +48,7 @@ class Companion:
 
 
 def read_companions(folder: Path) -> list[Companion]:
-    """Return the slices beside a figure's, none where none are made, or none has another place than the figure's."""
+    """Return the slices beside a figure's, none where none are made."""
     path = folder / COMPANIONS
     if not path.exists() or not (folder / COMPANION_PICTURE).exists():
         return []
