@@ -9,9 +9,10 @@ each example of the scene, and random:1 to random:32. The point is taken whose l
 
     (|lowest - paper's lowest| + |highest - paper's highest|) / (paper's highest - paper's lowest)
 
-How rugged it looks is never asked. A point through which a tenth of the episodes or more fail is not taken. What was
-found is kept in the folder --out, a file for each figure, and a search that is there is not made again; --write puts
-points and results into gallery/figures.toml.
+How rugged it looks is never asked. A figure that varies all parameters is the same through every point. A point through
+which a tenth of the episodes or more fail is not taken. What was found is kept in the folder --out, a file for each
+figure, and a search that is there, of the same code of the scene, is not made again; --write puts points and results
+into gallery/figures.toml.
 """
 
 from __future__ import annotations
@@ -31,7 +32,10 @@ import torch
 from torch import Tensor
 
 from gradscape.envs.base import Environment
+from gradscape.envs.code import code_digest
 from gradscape.envs.points import point
+from gradscape.envs.registry import environment_class
+from gradscape.gallery.companions import points_beside
 from gradscape.gallery.figures import Figure, choose_figures, read_figures
 from gradscape.gallery.files import FIGURES
 from gradscape.gallery.paper import read_paper
@@ -133,6 +137,7 @@ def _measure(figure: Figure, asked: argparse.Namespace, paper: tuple[float, floa
     settings = {
         **{"figure": figure.id, "dims": list(figure.dims), "options": dict(figure.options), "paper": list(paper)},
         **{"fidelity": asked.fidelity, "resolution": asked.resolution, "random": asked.random},
+        "code": code_digest(environment_class(figure.env)),
     }
     if path.exists() and {name: (kept := read_json(path)).get(name) for name in settings} == settings:
         print(f"{figure.id}: there already", file=sys.stderr)
@@ -159,6 +164,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = read_paper().words
     asked.out.mkdir(parents=True, exist_ok=True)
     for figure in choose_figures(read_figures(asked.figures), asked.only):
+        if not points_beside(figure):
+            print(f"{figure.id}: it varies all parameters, so it is the same through every point")
+            continue
         paper = words[figure.env].losses if figure.env in words else None
         if paper is None:
             print(f"{figure.id}: the paper has no colour bar of {figure.env}; it keeps {figure.through}")

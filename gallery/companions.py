@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ..envs.base import Environment
     from ..landscapes.plane import Plane
 
-RESOLUTION = 24  # points along each axis
+RESOLUTION = 24  # points along each axis of a plane; a line has the figure's own
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class CompanionPart(FigurePart):
             return 0
         record = read_if_sound(read_json, self.folder / COMPANIONS)
         there = record is not None and record.get("key") == self._key() and (self.folder / COMPANION_PICTURE).exists()
-        return 0 if there else len(names) * RESOLUTION ** len(self.figure.dims)
+        return 0 if there else len(names) * self._resolution ** len(self.figure.dims)
 
     def seconds_each(self) -> float:
         """Time an episode."""
@@ -115,7 +115,11 @@ class CompanionPart(FigurePart):
         from ..envs.points import point
         from ..landscapes.plane import Plane
 
-        return Plane.through(env.space, point(env, name), self.figure.dims, resolution=RESOLUTION)
+        return Plane.through(env.space, point(env, name), self.figure.dims, resolution=self._resolution)
+
+    @property
+    def _resolution(self) -> int:
+        return RESOLUTION if len(self.figure.dims) == 2 else self.figure.resolution
 
     def _key(self) -> dict[str, Any] | None:
         """Return what decides these slices and their picture; None where the figure has no slice yet."""
@@ -126,8 +130,8 @@ class CompanionPart(FigurePart):
         store = self.folder / STORE
         if not is_slice(store):
             return None
-        settings = {"slice": digest_of(open_slice(store)), "fidelity": self.figure.fidelity, "resolution": RESOLUTION}
-        return {**settings, "through": points_beside(self.figure)}
+        settings = {"fidelity": self.figure.fidelity, "resolution": self._resolution}
+        return {"slice": digest_of(open_slice(store)), **settings, "through": points_beside(self.figure)}
 
 
 def sample(env: Environment, plane: Plane) -> np.ndarray[Any, np.dtype[np.float32]]:

@@ -49,8 +49,9 @@ def test_what_was_found_is_kept_and_written_into_the_list(
     figures.write_text(FIGURES.read_text())
     out = tmp_path / "kept"
     how = ["--resolution", "2", "--random", "3", "--fidelity", "draft", "--device", "cpu", "--figures", str(figures)]
-    assert main(["pinball-16-13-14", "bounce-x", *how, "--out", str(out), "--write"]) == 0
+    assert main(["pinball-16-13-14", "pinball-2", "bounce-x", *how, "--out", str(out), "--write"]) == 0
     said = capsys.readouterr().out
+    assert "pinball-2-0-1: it varies all parameters" in said
     assert "bounce-x: the paper has no colour bar of bounce" in said
     best = read_json(out / "pinball-16-13-14.json")["candidates"][0]
     before, after = ({one.id: one for one in read_figures(path)} for path in (FIGURES, figures))
@@ -63,6 +64,9 @@ def test_what_was_found_is_kept_and_written_into_the_list(
     written = figures.read_text()
     assert main(["pinball-16-13-14", *how, "--out", str(out), "--write"]) == 0
     assert figures.read_text() == written
+    monkeypatch.setattr("benchmarks.base_points.code_digest", lambda kind: "another")
+    with pytest.raises(pytest.fail.Exception, match="searched again"):
+        main(["pinball-16-13-14", *how, "--out", str(out)])
 
 
 def test_the_last_figure_of_a_list_can_be_written(tmp_path: Path) -> None:

@@ -147,6 +147,12 @@ def film(path: Path) -> None:
     picture(Path(f"{path}.webp"))
 
 
+COMPANIONS = [
+    {"through": "center", "lowest": 0.25, "highest": 3.5, "failed": 0.0},
+    {"through": "example:scoop", "lowest": None, "highest": None, "failed": 1.0},
+]
+
+
 @pytest.fixture(scope="session")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Leave what `landscape gallery compute` does: a full figure, a line with searches, a bare one."""
@@ -169,6 +175,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (full / "measures.json").write_text(json.dumps(MEASURES))
     (full / "report.json").write_text(json.dumps(REPORT))
     picture(full / "gradient-quality.png")
+    (full / "companions.json").write_text(json.dumps({"slices": COMPANIONS}))
+    picture(full / "companions.png")
     (folder / "tradeoff").mkdir()
     for device in ("cuda", "cpu"):
         identity = {**TRADEOFF["identity"], "device": device}

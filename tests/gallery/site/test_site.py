@@ -99,6 +99,15 @@ def test_a_page_shows_what_each_part_of_the_model_is_for(site: Path) -> None:
     assert all(said in page for said in ("What each part of the model is for", "wall (missing)", "no drag"))
 
 
+def test_a_page_shows_the_same_cut_elsewhere_where_that_was_sampled(site: Path) -> None:
+    page = (site / "full/index.html").read_text()
+    assert "The same cut elsewhere" in page
+    assert "through center from 0.25 to 3.5" in page
+    assert "through example:scoop all failed" in page
+    assert 'href="companions.png"' in page
+    assert "The same cut elsewhere" not in (site / "bare/index.html").read_text()
+
+
 def test_the_report_card_says_what_was_found_of_which_version(site: Path) -> None:
     page = " ".join((site / "card.html").read_text().split())
     assert "2 engines in scenes, measured on 2030-01-01 on cpu by the same checks, ours included: 1 fail." in page
