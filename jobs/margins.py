@@ -65,8 +65,9 @@ def _margin(fidelity: str, limit: dict[str, Any]) -> str:
         return f"no step as long as {fidelity}'s was stable, nor a shorter one that was tried"
     if limit["failed"] is None:
         return f"{fidelity}'s step is stable, and so is one {limit['stable'] / limit['base']:.3g} times as long"
-    share = f"{fidelity}'s step is {limit['margin']:.2g} of the largest stable one, {limit['stable']:.3g} s"
-    return f"{share} ({limit['beyond']} at {limit['failed']:.3g} s)"
+    share = "" if limit["stable"] == limit["base"] else f"{limit['margin']:.2g} of "
+    stable = f"{fidelity}'s step is {share}the largest stable one, {limit['stable']:.3g} s"
+    return f"{stable} ({limit['beyond']} at {limit['failed']:.3g} s)"
 
 
 def _accuracy(record: dict[str, Any], limit: dict[str, Any]) -> str:
