@@ -23,7 +23,7 @@ import math
 import re
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -33,14 +33,12 @@ from torch import Tensor
 
 from gradscape.envs.base import Environment
 from gradscape.envs.code import code_digest
-from gradscape.envs.points import point
 from gradscape.envs.registry import environment_class
 from gradscape.gallery.companions import points_beside
 from gradscape.gallery.figures import Figure, choose_figures, read_figures
 from gradscape.gallery.files import FIGURES
 from gradscape.gallery.paper import read_paper
-from gradscape.landscapes.objective import Status, evaluate
-from gradscape.landscapes.plane import Plane
+from gradscape.landscapes.objective import Evaluation, Status, evaluate
 from gradscape.landscapes.storage.records import read_json, write_record
 
 MOST_FAILED = 0.1  # of a candidate's episodes
@@ -89,19 +87,13 @@ def search(
 ) -> list[Candidate]:
     """Measure all candidates of a figure, their grids in common batches; the nearest first."""
     names = names_of(env, count)
-    points = torch.cat([_grid(figure, env, name, resolution) for name in names])
-    parts = [evaluate(env, part, grad=False) for part in _batches(points, env.preferred_batch, figure.id)]
-    loss = torch.cat([part.loss for part in parts]).reshape(len(names), -1)
-    failed = torch.cat([part.status for part in parts]).reshape(len(names), -1) != Status.OK
-    rows = zip(names, loss, failed, strict=True)
+    grids = [replace(figure, through=name).plane(env, resolution).grid() for name in names]
+    points = torch.stack(grids).reshape(-1, env.space.dim)
+    parts = (evaluate(env, x, grad=False) for x in _batches(points, env.preferred_batch, figure.id))
+    found = Evaluation.join(parts, dim=env.space.dim, grad=False)
+    failed = found.status != Status.OK
+    rows = zip(names, found.loss.reshape(len(names), -1), failed.reshape(len(names), -1), strict=True)
     return sorted((Candidate.of(*row, paper) for row in rows), key=lambda one: one.distance)
-
-
-def _grid(figure: Figure, env: Environment, name: str, resolution: int) -> Tensor:
-    """Return the points of a grid over the figure's plane through a named point."""
-    plane = Plane.through(env.space, point(env, name), figure.dims, resolution=resolution)
-    axes = torch.meshgrid(*plane.axes(), indexing="ij")
-    return plane.lift(torch.stack(axes, dim=-1).reshape(-1, plane.rank))
 
 
 def _batches(points: Tensor, size: int, name: str) -> Iterator[Tensor]:

@@ -10,25 +10,21 @@ to be so. With --check nothing is written: exit code 1 says that the page differ
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gradscape.envs.registry import entries, environment_class
 from gradscape.gallery.files import DEVICES
 from gradscape.gallery.paper import read_paper
-from gradscape.jobs.report_tables import markdown
 from gradscape.landscapes.statistics import Estimate
 from gradscape.landscapes.storage.records import read_json
 
-from .pages import DATA, DOCS, UNMEASURED, is_present, settle
+from .pages import DATA, DOCS, MISSING, UNMEASURED, is_present, scenes, settle_measured
 
 PAGE, NAME = DOCS / "measures.md", "censuses"
 HEAD = ("environment", "slices", "measured: share of the slices (95 % interval)", "the paper's words")
-MISSING = "not measured"
 
 
 @dataclass(frozen=True)
@@ -54,9 +50,7 @@ class Shares:
 def censuses(data: Path = DATA) -> dict[str, Shares | str]:
     """Return the kept census of each scene, or why there is none."""
     found: dict[str, Shares | str] = {}
-    for name, entry in sorted(entries().items()):
-        if entry.extra or len(environment_class(name).fidelities) == 1:
-            continue  # others' engines, and functions
+    for name in scenes():
         files = (data / "census" / f"{name}-{device}.json" for device in DEVICES)
         record = next((read_json(file) for file in files if file.exists()), None)
         if record is None:
@@ -83,13 +77,8 @@ def rows(found: Mapping[str, Shares | str]) -> Iterator[list[str]]:
 
 def main() -> int:
     """Write the page, or say what is not so."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="write nothing, say what is not so")
-    asked = parser.parse_args()
     found = censuses()
-    wrong = [f"{name}: {one}" for name, one in found.items() if isinstance(one, str)]
-    fine = f"all {len(found)} scenes are measured"
-    return settle(markdown(HEAD, list(rows(found))), PAGE, NAME, wrong, check=asked.check, fine=fine)
+    return settle_measured(__doc__ or "", found, HEAD, rows(found), PAGE, NAME)
 
 
 if __name__ == "__main__":

@@ -20,13 +20,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from gradscape.envs.registry import entries, environment_class
+from gradscape.envs.registry import environment_class
 from gradscape.gallery.files import TradeoffFiles
 from gradscape.jobs.report_tables import markdown
 from gradscape.landscapes.measures.choice import CLAIMS, Claim, Shortfall
 from gradscape.landscapes.measures.fidelity import Comparison
 
-from .pages import DATA, DOCS, ROOT, UNMEASURED, is_present, records, settle
+from .pages import DATA, DOCS, ROOT, UNMEASURED, is_present, records, scenes, settle
 
 PAGE, NAME = DOCS / "fidelities.md", "fidelities"
 BEFORE = ROOT / "benchmarks" / "data" / "fidelities-before.json"
@@ -62,13 +62,6 @@ class Row:
     def shortfall(self, claim: Claim) -> Shortfall:
         """Return how far it falls short of a claim."""
         return Shortfall.of(self.comparison, claim, chaotic=self.scene in CHAOTIC)
-
-
-def scenes() -> list[str]:
-    """Return the registered scenes that have draft and standard, by name."""
-    wanted = {claim.name for claim in CLAIMS}
-    ours = sorted(name for name, entry in entries().items() if not entry.extra)  # others' engines promise nothing
-    return [name for name in ours if wanted <= set(environment_class(name).fidelities)]
 
 
 def kept(data: Path = DATA) -> list[Row]:

@@ -10,30 +10,24 @@ exit code 1 says that the page differs, or that a scene is not measured.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from gradscape.envs.registry import entries, environment_class
 from gradscape.gallery.files import DEVICES
-from gradscape.jobs.report_tables import markdown
 from gradscape.landscapes.storage.records import read_json
 
-from .pages import DATA, DOCS, UNMEASURED, is_present, settle
+from .pages import DATA, DOCS, MISSING, UNMEASURED, is_present, scenes, settle_measured
 
 PAGE, NAME = DOCS / "measures.md", "margins"
 HEAD = ("scene", "device", "precision", "standard's step [s]", "longest stable [s]", "margin", "beyond", "95 % error")
-MISSING = "not measured"
 
 
 def margins(data: Path = DATA) -> dict[str, list[Mapping[str, Any]] | str]:
     """Return the kept records of each scene's extremes, or why there is none."""
     found: dict[str, list[Mapping[str, Any]] | str] = {}
-    for name, entry in sorted(entries().items()):
-        if entry.extra or len(environment_class(name).fidelities) == 1:
-            continue  # others' engines, and functions
+    for name in scenes():
         files = (data / "extremes" / f"{name}-{device}.json" for device in DEVICES)
         records = [read_json(file) for file in files if file.exists()]
         present = [one for one in records if is_present(name, one["identity"]["code"], one["identity"]["engine"])]
@@ -67,13 +61,8 @@ def _cells(limit: Mapping[str, Any]) -> list[str]:
 
 def main() -> int:
     """Write the page, or say what is not so."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="write nothing, say what is not so")
-    asked = parser.parse_args()
     found = margins()
-    wrong = [f"{name}: {one}" for name, one in found.items() if isinstance(one, str)]
-    fine = f"all {len(found)} scenes are measured"
-    return settle(markdown(HEAD, list(rows(found))), PAGE, NAME, wrong, check=asked.check, fine=fine)
+    return settle_measured(__doc__ or "", found, HEAD, rows(found), PAGE, NAME)
 
 
 if __name__ == "__main__":

@@ -5,19 +5,21 @@ A table stands between two marks, <!-- NAME --> and <!-- /NAME -->.
 
 from __future__ import annotations
 
+import argparse
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from gradscape.envs.code import code_digest
-from gradscape.envs.registry import environment_class
+from gradscape.envs.registry import entries, environment_class
 from gradscape.gallery.files import DEVICES, TradeoffFiles
+from gradscape.jobs.report_tables import markdown
 from gradscape.landscapes.storage.records import read_json
 
 ROOT = Path(__file__).parents[1]
 DATA, DOCS = ROOT / "gallery" / "data", ROOT / "docs"
-UNMEASURED = "not measured since the scene changed"
+UNMEASURED, MISSING = "not measured since the scene changed", "not measured"
 
 
 def records(
@@ -27,6 +29,12 @@ def records(
     for device in DEVICES:
         if (path := files(data, scene, device).record).is_file():
             yield read_json(path)
+
+
+def scenes() -> list[str]:
+    """Return the scenes of ours that are simulated, by name: functions have no fidelities to choose from."""
+    ours = sorted(name for name, entry in entries().items() if not entry.extra)  # others' engines promise nothing
+    return [name for name in ours if len(environment_class(name).fidelities) > 1]
 
 
 def is_present(scene: str, code: str, engine: str = "warp") -> bool:
@@ -43,6 +51,21 @@ def written(page: Path, name: str) -> str:
 def write(text: str, page: Path, name: str) -> None:
     """Put a table into a page, in the place of the one of this name."""
     page.write_text(page.read_text().replace(written(page, name), text))
+
+
+def settle_measured(
+    about: str, found: Mapping[str, object], head: Sequence[str], rows: Iterable[Sequence[str]], page: Path, name: str
+) -> int:
+    """Be the program that writes a table of what was `found` of every scene, a text where nothing was measured.
+
+    `about` is its help; return the exit code.
+    """
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing, say what is not so")
+    asked = parser.parse_args()
+    wrong = [f"{scene}: {one}" for scene, one in found.items() if isinstance(one, str)]
+    fine = f"all {len(found)} scenes are measured"
+    return settle(markdown(head, [list(row) for row in rows]), page, name, wrong, check=asked.check, fine=fine)
 
 
 def settle(text: str, page: Path, name: str, wrong: Sequence[str], *, check: bool, fine: str) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ import torch
 from ..envs.registry import environment_class
 from ..jobs.scene import SceneSpec
 from ..jobs.watch import Watch
-from ..landscapes.objective import Status, evaluate
+from ..landscapes.objective import Evaluation, Status, evaluate
 from ..landscapes.plain import number, optional, text
 from ..landscapes.storage.records import read_json, reading, write_record
 from .figures import Figure
@@ -101,7 +101,7 @@ class CompanionPart(FigurePart):
         found = list[Companion]()
         with watch.progress(self.count_left(), "episodes") as advance:
             for name in names:
-                loss = sample(env, self._plane(env, name))
+                loss = sample(env, replace(self.figure, through=name).plane(env, self._resolution))
                 cuts.append(Cut(name, loss))
                 found.append(_companion(name, loss))
                 advance(len(found) * loss.size, "")
@@ -110,12 +110,6 @@ class CompanionPart(FigurePart):
         known = {"key": self._key(), "device": env.device, "slices": [asdict(one) for one in found]}
         write_record(self.folder / COMPANIONS, known)
         return "; ".join(f"through {one.through}: {_say(one)}" for one in found)
-
-    def _plane(self, env: Environment, name: str) -> Plane:
-        from ..envs.points import point
-        from ..landscapes.plane import Plane
-
-        return Plane.through(env.space, point(env, name), self.figure.dims, resolution=self._resolution)
 
     @property
     def _resolution(self) -> int:
@@ -136,12 +130,11 @@ class CompanionPart(FigurePart):
 
 def sample(env: Environment, plane: Plane) -> np.ndarray[Any, np.dtype[np.float32]]:
     """Return the losses on a plane or a line, indexed (v, u) or (u), NaN where an episode failed."""
-    axes = torch.meshgrid(*reversed(plane.axes()), indexing="ij")
-    points = plane.lift(torch.stack(axes[::-1], dim=-1).reshape(-1, plane.rank))
-    parts = [evaluate(env, part, grad=False) for part in torch.split(points, env.preferred_batch)]
-    loss = torch.cat([part.loss for part in parts])
-    loss[torch.cat([part.status for part in parts]) != Status.OK] = torch.nan
-    return loss.reshape(plane.resolution[::-1]).to(torch.float32).numpy()
+    grid = plane.grid()
+    batches = torch.split(grid.reshape(-1, plane.dim), env.preferred_batch)
+    found = Evaluation.join((evaluate(env, x, grad=False) for x in batches), dim=plane.dim, grad=False)
+    loss = found.loss.masked_fill(found.status != Status.OK, torch.nan)
+    return loss.reshape(grid.shape[:-1]).to(torch.float32).numpy()
 
 
 def _companion(name: str, loss: np.ndarray[Any, Any]) -> Companion:

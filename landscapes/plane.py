@@ -207,6 +207,11 @@ class Plane:
             for low, high, count in zip(self.lower, self.upper, self.resolution, strict=True)
         )
 
+    def grid(self) -> Float[Tensor, "*shape dim"]:
+        """Return the parameters at every sample, indexed (v, u, dim), or (u, dim) on a line."""
+        axes = torch.meshgrid(*reversed(self.axes()), indexing="ij")
+        return self.lift(torch.stack(axes[::-1], dim=-1))
+
     def record(self) -> dict[str, Any]:
         """Return the plane as plain numbers and strings, exactly."""
         tensors = {name: getattr(self, name).tolist() for name in ("origin", "basis", "lower", "upper")}

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from benchmarks import censuses
-from benchmarks.censuses import HEAD, MISSING, NAME, PAGE, Shares, rows
-from benchmarks.pages import DATA, UNMEASURED, written
+from benchmarks.censuses import HEAD, NAME, PAGE, Shares, rows
+from benchmarks.pages import DATA, MISSING, UNMEASURED, written
 
 from gradscape.envs.registry import entries, environment_class
 from gradscape.jobs.report_tables import markdown

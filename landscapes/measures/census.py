@@ -158,14 +158,14 @@ def sample(objective: Objective, plane: Plane) -> xr.Dataset:
 
     Raises ValueError where the objective has no gradients.
     """
-    u, v = plane.axes()
-    grid = torch.stack(torch.meshgrid(v, u, indexing="ij")[::-1], dim=-1).reshape(-1, 2)
-    batch = getattr(objective, "preferred_batch", len(grid))
-    parts = [evaluate(objective, part, grad=True) for part in torch.split(plane.lift(grid), batch)]
+    grid = plane.grid()
+    shape, points = grid.shape[:2], grid.reshape(-1, plane.dim)
+    batch = getattr(objective, "preferred_batch", len(points))
+    parts = [evaluate(objective, part, grad=True) for part in torch.split(points, batch)]
     if parts[0].grad is None:
         raise ValueError("a census needs gradients, which this objective does not have")
-    loss = torch.cat([part.loss for part in parts]).reshape(len(v), len(u))
-    grad = torch.cat([part.grad for part in parts if part.grad is not None]).reshape(len(v), len(u), -1)
+    loss = torch.cat([part.loss for part in parts]).reshape(shape)
+    grad = torch.cat([part.grad for part in parts if part.grad is not None]).reshape(*shape, -1)
     return _dataset(plane, loss.numpy(), grad.numpy())
 
 
