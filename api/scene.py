@@ -11,6 +11,8 @@ from ..jobs.watch import Watch
 from ..landscapes.objective import name_of
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from ..envs.base import Environment, Fidelity
     from ..landscapes.objective import Objective
 
@@ -65,6 +67,15 @@ def is_environment(objective: Objective) -> TypeGuard[Environment]:
     from ..envs.base import Environment
 
     return isinstance(objective, Environment)
+
+
+def say_cut(
+    along: str | None, through: str | Tensor, extent: float | tuple[float, float] | None, *, gradients: bool
+) -> dict[str, Any]:
+    """Return what `say_call` is told of where a slice goes and whether it has gradients; None where it need not be."""
+    point = through if isinstance(through, str) else through.tolist()
+    where = {"along": along, "through": None if point == "center" else point, "extent": extent}
+    return {**where, "gradients": None if gradients else False}
 
 
 def say_call(function: str, scene: object, *given: object, **named: object) -> str:

@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
-from ..jobs.cut import cut_or_kept, describe_cut
+from ..jobs.cut import cut, describe_cut
 from ..jobs.scene import SceneSpec, environment_of, with_policy
 from ..jobs.watch import Watch
 from ..landscapes.adapters import within_box
 from ..landscapes.objective import name_of
 from .progress import default_watch
-from .scene import SceneKeywords, is_environment, objective_of, say_call
+from .scene import SceneKeywords, is_environment, objective_of, say_call, say_cut
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -72,24 +72,18 @@ def slice(
 
     fine, folder = Refinement.of(refine, budget), Path(out) if out is not None else None
     in_memory = out is None and policy is None and not is_environment(objective)
-    begun: dict[str, Any] = {"out": folder, "grad": gradients, "refinement": fine, "force": force or in_memory}
+    begun: dict[str, Any] = {"out": folder, "grad": gradients, "refinement": fine}
     where: dict[str, Any] = {"through": through, "extent": extent, "resolution": resolution}
-    plane = cut_or_kept(objective, dims, along, **where, **begun)
+    plane = cut(objective, dims, along, **where, kept=None if force or in_memory else begun)
     if in_memory:
         return _sample_in_memory(within_box(objective) if along else objective, plane, gradients, fine, watch)
     from ..jobs.slice import SliceJob
 
-    point = through if isinstance(through, str) else through.tolist()
-    how = {
-        "refine": refine,
-        "budget": budget,
-        "policy": policy,
-        **{"along": along, "through": None if point == "center" else point, "extent": extent},
-        "gradients": None if gradients or policy else False,
-    }
+    how = {"refine": refine, "budget": budget, "policy": policy}
+    how |= say_cut(along, through, extent, gradients=gradients or policy is not None)
     command = say_call("slice", scene, *([tuple(dims)] if dims else []), resolution=resolution, **how, **keywords)
-    settings: dict[str, Any] = {**begun, "cut": describe_cut(along, through, extent)}
-    job = SliceJob.of(objective, plane, command=command, **settings)
+    named = describe_cut(along, through, extent)
+    job = SliceJob.of(objective, plane, command=command, cut=named, force=force, **begun)
     job.run(watch)
     return _open(job.folder, lambda: objective)
 

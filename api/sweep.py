@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 from ..jobs.cut import cut, describe_cut
 from ..jobs.scene import SceneSpec
 from .progress import default_watch
-from .scene import SceneKeywords, environment, say_call
+from .scene import SceneKeywords, environment, say_call, say_cut
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -52,13 +52,8 @@ def sweep(
     plane = cut(env, dims, along, through=through, extent=extent, resolution=resolution)
     from ..jobs.sweep import SweepJob
 
-    point = through if isinstance(through, str) else through.tolist()
-    said: dict[str, Any] = {"over": over, "frames": frames, "resolution": resolution, "along": along}
-    said |= {
-        "through": None if point == "center" else point,
-        "extent": extent,
-        "gradients": None if gradients else False,
-    }
+    said: dict[str, Any] = {"over": over, "frames": frames, "resolution": resolution}
+    said |= say_cut(along, through, extent, gradients=gradients)
     settings: dict[str, Any] = {
         "command": say_call("sweep", scene, *([tuple(dims)] if dims else []), **said, **keywords),
         "out": Path(out) if out is not None else None,

@@ -43,8 +43,7 @@ def plan(
     """Predict episodes, time, memory and disk of a slice, a sweep or the gallery's slices, without making them.
 
     Without --dims and --along it is of parameters 0 and 1. A few episodes, tiles and pictures are made and thrown away;
-    nothing is written. For a CUDA device that is not here,
-    what `landscape tradeoff` kept of one counts.
+    nothing is written. For a CUDA device that is not here, what `landscape tradeoff` kept of one counts.
 
     Example: landscape plan fluid --dims 6 8 --resolution 48 --fidelity standard
     """

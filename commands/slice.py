@@ -111,7 +111,7 @@ def _sample(
     bars = Bars()
     env = scene.make(bars)
     subject = with_policy(env, policy)
-    from ..jobs.cut import cut_or_kept, describe_cut, folder_for, split_points
+    from ..jobs.cut import cut, describe_cut, folder_for, split_points
     from ..jobs.slice import SliceJob
     from ..jobs.workers import workers
     from ..landscapes.sampling.refine import Refinement
@@ -126,9 +126,9 @@ def _sample(
     }
     how["refinement"] = Refinement.of(read_share(refine, "--refine"), budget)
     folders = {point: folder_for(Path(out), point, points) if out else None for point in points}
-    begun = {name: how[name] for name in ("grad", "refinement", "force")}
+    kept = {name: how[name] for name in ("grad", "refinement")}
     planes = {  # all of them, or none is sampled
-        point: cut_or_kept(subject, dims, along, through=point, out=folder, **where, **begun)
+        point: cut(subject, dims, along, through=point, **where, kept=None if force else {**kept, "out": folder})
         for point, folder in folders.items()
     }
     said = list[dict[str, Any]]()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,10 +32,12 @@ def cut(
     through: str | Tensor,
     extent: float | tuple[float, float] | None,
     resolution: int | Sequence[int],
+    kept: Mapping[str, Any] | None = None,
 ) -> Plane:
     """Return the line or plane along parameters, or along directions that are named.
 
-    Raises ValueError where both or neither are given, and as `plane_through` and `plane_along` do.
+    `kept` says where a slice may have been begun, as for `kept_plane`: it goes on along its own directions. Raises
+    ValueError where both or neither are given, and as `plane_through` and `plane_along` do.
     """
     if (dims is None or len(dims) == 0) == (along is None):
         raise ValueError("a slice takes --dims, one or two parameters, or --along, directions; give one of them")
@@ -44,31 +46,12 @@ def cut(
         return plane_through(objective, dims, through=through, extent=extent, resolution=resolution)
     if not isinstance(resolution, int):
         raise ValueError(f"a slice along {along} takes one resolution for its axes; got {list(resolution)}")
-    return plane_along(objective, along, through=through, extent=extent, resolution=resolution)
-
-
-def cut_or_kept(
-    objective: Objective,
-    dims: Sequence[int | str] | None,
-    along: str | None,
-    *,
-    through: str | Tensor,
-    extent: float | tuple[float, float] | None,
-    resolution: int | Sequence[int],
-    force: bool = False,
-    **kept: Any,
-) -> Plane:
-    """Return what `cut` does, or the plane of a slice along the same directions that was begun, unless by `force`.
-
-    `kept` says where that is, as for `kept_plane`. Raises as `cut` does.
-    """
     where: dict[str, Any] = {"through": through, "extent": extent}
-    named = None if force or dims else describe_cut(along, **where)
-    if named is not None and isinstance(resolution, int):
-        rank = len(named[JOINED]) - 1 if JOINED in named else 2
+    if kept is not None and (named := describe_cut(along, **where)):
+        rank = len(joined_points(along)) - 1 if joined_points(along) else 2
         if (found := kept_plane(objective, named, (resolution,) * rank, **kept)) is not None:
             return found
-    return cut(objective, dims, along, **where, resolution=resolution)
+    return plane_along(objective, along, **where, resolution=resolution)
 
 
 def plane_along(

@@ -304,13 +304,15 @@ def sweep_folder(
 ) -> Path:
     """Return a folder of its own for every different sweep, the same for the same one."""
     planes = [plane.record() for plane in motion.planes]
-    axes: list[Any] = [int(row.nonzero()[0]) for row in motion.planes[0].basis]
     what = over if over in (SMOOTHING, HORIZON) else env.space.index(over)
     points = "x".join(map(str, (*planes[0]["resolution"], len(motion.values))))
-    known: list[Any] = [env.identity(), planes, motion.values, grad]
-    if cut is not None:
-        axes, known = [plain_name(cut["along"])[:MOST]], [env.identity(), dict(cut), points, motion.values, grad]
-    return folder_named(["sweep", env.name, *axes, "over", what, env.fidelity.name, points], known)
+    if cut is None:
+        axes: list[Any] = [int(row.nonzero()[0]) for row in motion.planes[0].basis]
+        where: list[Any] = [planes]
+    else:  # directions may differ by rounding
+        axes, where = [plain_name(cut["along"])[:MOST]], [dict(cut), points]
+    parts = ["sweep", env.name, *axes, "over", what, env.fidelity.name, points]
+    return folder_named(parts, [env.identity(), *where, motion.values, grad])
 
 
 def _along_kept(path: Path, plane: Plane, cut: Mapping[str, Any]) -> Plane:

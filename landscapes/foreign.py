@@ -64,15 +64,13 @@ def table_point(space: ParameterSpace, text: str) -> Tensor | None:
     if path.suffix.lower() not in SUFFIXES or not path.is_file():
         return None
     frame = read_points(path)
-    named = [names for names in zip(space.names, space.labels, strict=True) if set(names) & set(frame.columns)]
+    named = {*space.names, *space.labels} & set(frame.columns)
     if not named and path.suffix.lower() == ".csv":
         return None
     at = int(row) - 1 if row else _best_row(frame, path)
     if not 0 <= at < len(frame):
         raise ValueError(f"{path} has {len(frame)} rows of points, counted from 1; got row {row or 1}")
-    one = frame.iloc[[at]]
-    found = [_column(one, *names, name=str(path))[0] for names in zip(space.names, space.labels, strict=True)]
-    return torch.tensor(found, dtype=torch.float64)
+    return torch.from_numpy(_parameters(frame.iloc[[at]], space, str(path))[0])
 
 
 def _best_row(frame: pd.DataFrame, path: Path) -> int:
@@ -85,7 +83,7 @@ def _best_row(frame: pd.DataFrame, path: Path) -> int:
     losses = _column(frame, str(name), name=str(path), gaps=True)
     if not np.isfinite(losses).any():
         raise ValueError(f"no row of {path} has a {LOSS}; say which one, {path}:ROW, counted from 1")
-    return int(np.nanargmin(np.where(np.isfinite(losses), losses, np.nan)))
+    return int(np.where(np.isfinite(losses), losses, np.inf).argmin())
 
 
 def study_frame(study: Any) -> pd.DataFrame:
@@ -145,9 +143,8 @@ def points_table(frame: pd.DataFrame, dataset: xr.Dataset, space: ParameterSpace
 
     Raises ValueError where a column is missing or holds no numbers, and where there is no point.
     """
-    columns = [_column(frame, *names, name=name) for names in zip(space.names, space.labels, strict=True)]
     unit = str(dataset["loss"].attrs.get("units", ""))
-    x, loss = np.stack(columns, axis=1), _column(frame, LOSS, f"{LOSS} [{unit}]", name=name, gaps=True)
+    x, loss = _parameters(frame, space, name), _column(frame, LOSS, f"{LOSS} [{unit}]", name=name, gaps=True)
     if not len(x):
         raise ValueError(f"{name} holds no point")
     ended = np.where(np.isfinite(loss), Status.OK, Status.NONFINITE).astype(np.int8)
@@ -168,6 +165,12 @@ def points_table(frame: pd.DataFrame, dataset: xr.Dataset, space: ParameterSpace
         "identity": json.dumps(plain_json(identity, "a table's identity")),
     }
     return xr.Dataset(data, {"dim": dataset["dim"].to_numpy()}, about)
+
+
+def _parameters(frame: pd.DataFrame, space: ParameterSpace, name: str) -> NDArray[np.float64]:
+    """Return the parameters in each row, shape (row, dim), which must be finite."""
+    columns = [_column(frame, *names, name=name) for names in zip(space.names, space.labels, strict=True)]
+    return np.stack(columns, axis=1)
 
 
 def _column(frame: pd.DataFrame, *names: str, name: str, gaps: bool = False) -> NDArray[np.float64]:

@@ -145,9 +145,10 @@ class _Site:
         given = [name for name in (*SURFACES, SWEEP_FILM) if (source / name).exists()]
         given += [name for episode in episodes for name in episode.files]
         given += [name for name in (REPORT, MEASURES, QUALITY) if (source / name).exists()]
-        given += [COMPANION_PICTURE] if read_companions(source) else []
+        entry = _entry(figure, dataset, source)
+        given += [COMPANION_PICTURE] if entry.companions else []
         entry = replace(
-            _entry(figure, dataset, source),
+            entry,
             files=[NODES, "index.html", *_place(given, source, folder)],
             episodes=episodes,
             runs=[run.search() for run in runs],
