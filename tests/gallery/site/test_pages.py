@@ -155,8 +155,8 @@ def test_a_click_on_a_ringed_node_plays_its_episode(filed: str, visit: Visit) ->
     page.keyboard.press("PageDown")
     page.keyboard.press("Enter")
     assert page.inner_text("#player figcaption") == "Highest loss: not finite"
+    page.wait_for_function("document.querySelector('#player img').naturalWidth === 160")  # it has no size before
     assert page.is_visible("#player img")
-    page.wait_for_function("document.querySelector('#player img').naturalWidth === 160")
     assert page.eval_on_selector("#player video", "(one) => one.paused")
 
 
