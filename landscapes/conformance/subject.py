@@ -49,6 +49,15 @@ class Subject:
         return math.sqrt(self.eps)
 
     @property
+    def repeatable(self) -> tuple[float, float]:
+        """What repeats may differ by, losses and gradients, as shares.
+
+        Many threads that add in any order make losses differ by rounding. Gradients multiply that, in a contact a
+        thousandfold; a tenth of the error that is allowed of a slope cannot be mistaken for one.
+        """
+        return self.rounding, self.eps ** (1 / 3)
+
+    @property
     def tolerances(self) -> tuple[float, float]:
         """What losses and gradients may differ by where they ought to be the same, as shares.
 

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..objective import Evaluation, Objective, Status, evaluate
+from ..sampling.memory import ADVICE, is_out_of_memory
 from . import extremes
 from . import gradients as gradient_checks
 from .extremes import ExtremeCase
@@ -145,8 +146,9 @@ def _try(name: str, run: Callable[[], Finding]) -> Finding:
 
 
 def _failure(name: str, error: Exception) -> Finding:
-    first = (str(error).strip().splitlines() or [""])[0]  # others' messages may go on for pages
-    return Finding(name, FAIL, f"raised {type(error).__name__}", first.rstrip(":"))
+    first = (str(error).strip().splitlines() or [""])[0].rstrip(":")  # others' messages may go on for pages
+    why = f"{first}; {ADVICE}" if is_out_of_memory(error) else first
+    return Finding(name, FAIL, f"raised {type(error).__name__}", why)
 
 
 def _check_shapes(objective: Objective, x: Float[Tensor, "batch dim"]) -> Finding:
@@ -218,9 +220,10 @@ def _check_determinism(subject: Subject, name: str) -> Finding:
     figure = f"same bits in {REPEATS} repeats"
     if max(loss, grad) > 0:
         figure = f"{REPEATS} repeats differ by {loss:.1e} of the loss range, {grad:.1e} of the largest gradient"
-    limit = subject.rounding
-    found = verdict(name, loss <= limit and grad <= limit, figure, f"at most {limit:.0e} is wanted")
-    return replace(found, numbers={"loss": loss, "gradient": grad, "limit": limit})
+    limits = subject.repeatable
+    ok = loss <= limits[0] and grad <= limits[1]
+    found = verdict(name, ok, figure, f"at most {limits[0]:.0e} and {limits[1]:.0e} is wanted")
+    return replace(found, numbers={"loss": loss, "gradient": grad, "limit": limits[0], "gradient_limit": limits[1]})
 
 
 def _check_rows_alone(subject: Subject, name: str) -> Finding:

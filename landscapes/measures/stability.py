@@ -13,7 +13,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..objective import Evaluation, Objective, Status, evaluate
+from ..objective import Evaluation, Objective, Status
+from ..sampling.memory import MemoryBound
 
 ACCURATE, INACCURATE, UNJUDGED, REFUSED = "accurate", "inaccurate", "not judged", "refused"
 STABLE = (ACCURATE, INACCURATE, UNJUDGED)  # outcomes of a setting at which every point has a finite gradient
@@ -65,27 +66,33 @@ class Answer:
 def ask(objective: Objective, x: Float[Tensor, "point dim"]) -> Answer:
     """Evaluate an objective at the points of a study; whatever it raises is an answer, too.
 
-    A ValueError refuses the setting. Any other error is that of a point: points are then asked one by one.
+    A ValueError refuses the setting, and so does too little memory for a single point, which says nothing of how the
+    setting behaves. Any other error is that of a point: points are then asked one by one.
     """
     try:
-        found, error = evaluate(objective, x, grad=True), ""
-    except ValueError as refusal:
+        found, error = _ask_together(objective, x)
+    except (ValueError, MemoryError) as refusal:
         return Answer.of_refusal(_line(refusal))
-    except OSError:  # of the system, not of the setting
-        raise
-    except Exception as raised:
-        error = _line(raised)
-        parts = [_ask_alone(objective, row[None]) for row in x] if len(x) > 1 else [_failed(x)]
-        found = Evaluation.join(parts, dim=x.shape[1], grad=True)
     widths = objective.space.upper - objective.space.lower
     slope = (cast("Tensor", found.grad) * widths).norm(dim=1)
     return Answer(found.loss.numpy(), slope.numpy(), found.status.numpy().astype(np.int8), error=error)
 
 
+def _ask_together(objective: Objective, x: Float[Tensor, "point dim"]) -> tuple[Evaluation, str]:
+    """Evaluate all points, one by one where that raises, and return what the first of them raised, too."""
+    try:
+        return MemoryBound(objective).evaluate(x, grad=True), ""
+    except (OSError, ValueError, MemoryError):  # of the system or of the setting, not of a point
+        raise
+    except Exception as raised:
+        parts = [_ask_alone(objective, row[None]) for row in x] if len(x) > 1 else [_failed(x)]
+        return Evaluation.join(parts, dim=x.shape[1], grad=True), _line(raised)
+
+
 def _ask_alone(objective: Objective, row: Float[Tensor, "one dim"]) -> Evaluation:
     try:
-        return evaluate(objective, row, grad=True)
-    except OSError:
+        return MemoryBound(objective).evaluate(row, grad=True)
+    except (OSError, MemoryError):
         raise
     except Exception:
         return _failed(row)
@@ -100,7 +107,7 @@ def _errors(count: int) -> Tensor:
 
 
 def _line(error: Exception) -> str:
-    said = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+    said = str(error) if isinstance(error, ValueError | MemoryError) else f"{type(error).__name__}: {error}"
     return " ".join(said.split())
 
 

@@ -13,7 +13,8 @@ from gradscape.envs.registry import make
 from gradscape.landscapes.adapters import from_torch
 from gradscape.landscapes.cost import seconds_per_episode
 from gradscape.landscapes.identity import StoreError
-from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.measures.stability import ask
+from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.sampling.memory import MemoryBound, is_out_of_memory
@@ -118,6 +119,19 @@ def test_memory_for_no_point_at_all_ends_it_and_other_errors_pass():
     with pytest.raises(RuntimeError, match="broken cable"):
         MemoryBound(Small(0, RuntimeError("broken cable"))).evaluate(SPACE.uniform(3, seed=0))
     assert not is_out_of_memory(RuntimeError("the ball is out of the memory foam"))
+
+
+def test_memory_that_runs_out_says_nothing_of_a_setting():
+    points = SPACE.uniform(16, seed=0)
+    small = Small(4, RuntimeError(MESSAGES[1]))
+    assert ask(small, points).stable
+    assert small.asked[:3] == [16, 8, 4]
+    found = ask(Small(0, RuntimeError(MESSAGES[1])), points)
+    assert "wave ran out of memory at a single point" in found.refused
+    assert len(found.status) == 0
+    broken = ask(Small(0, RuntimeError("broken cable")), points)
+    assert (broken.refused, broken.error) == ("", "RuntimeError: broken cable")
+    assert (broken.status == Status.ERROR).all()
 
 
 def test_what_an_episode_costs_is_measured_with_the_memory_that_is_there():
