@@ -2,10 +2,11 @@
 
     python -m benchmarks.censuses [--check]
 
-The table in docs/measures.md has a row for each scene: how many slices were measured, which share of them each word of
-the classification fits, with its interval, and the paper's words with their shares. It is of the records by
-`landscape census ENV --fidelity standard` in gallery/data/census; a scene that has none, or has changed since, is said
-to be so. With --check nothing is written: exit code 1 says that the page differs, or that a scene is not measured.
+The table in docs/measures.md has a row for each scene: how many slices were measured, in which share of them losses
+move by less than a hundredth of what they do in all, which share each word of the classification fits, with its
+interval, and the paper's words with their shares. It is of the records by `landscape census ENV --fidelity standard` in
+gallery/data/census; a scene that has none, or has changed since, is said to be so. With --check nothing is written:
+exit code 1 says that the page differs, or that a scene is not measured.
 """
 
 from __future__ import annotations
@@ -24,21 +25,26 @@ from gradscape.landscapes.storage.records import read_json
 from .pages import DATA, DOCS, MISSING, UNMEASURED, is_present, scenes, settle_measured
 
 PAGE, NAME = DOCS / "measures.md", "censuses"
-HEAD = ("environment", "slices", "measured: share of the slices (95 % interval)", "the paper's words")
+FAINT = 0.01  # of the range of the losses of all slices
+HEAD = ("environment", "slices", "faint", "measured: share of the slices (95 % interval)", "the paper's words")
 
 
 @dataclass(frozen=True)
 class Shares:
-    """Say which share of so many slices each word fits."""
+    """Say which share of so many slices each word fits, and in which losses hardly move."""
 
     slices: int
+    faint: float
     words: Mapping[str, Estimate]
 
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> Shares:
         """Read it from the record of a census."""
         words = {word: Estimate.of_record(one) for word, one in record["words"].items()}
-        return cls(len(record["slices"]), words)
+        ranges = [one["range"] for one in record["slices"] if None not in one["range"]]
+        whole = max(high for _, high in ranges) - min(low for low, _ in ranges)
+        faint = sum(high - low < FAINT * whole for low, high in ranges) / len(record["slices"])
+        return cls(len(record["slices"]), faint, words)
 
     def say(self, word: str) -> str:
         """Say the share of a word."""
@@ -68,11 +74,11 @@ def rows(found: Mapping[str, Shares | str]) -> Iterator[list[str]]:
     for name, one in found.items():
         said = paper[name].words if name in paper else ()
         if isinstance(one, str):
-            yield [f"`{name}`", "", one, ", ".join(said)]
+            yield [f"`{name}`", "", "", one, ", ".join(said)]
             continue
         most = sorted(one.words, key=lambda word, one=one: -one.words[word].value)  # type: ignore[misc]
         measured = ", ".join(one.say(word) for word in most if one.words[word].value > 0)
-        yield [f"`{name}`", str(one.slices), measured, ", ".join(map(one.say, said))]
+        yield [f"`{name}`", str(one.slices), f"{100 * one.faint:.0f} %", measured, ", ".join(map(one.say, said))]
 
 
 def main() -> int:

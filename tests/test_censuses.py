@@ -30,4 +30,19 @@ def test_a_scene_that_changed_or_was_never_measured_is_said_to_be_so(tmp_path: P
     write_record(tmp_path / "census" / "bounce-cpu.json", record)
     found = censuses.censuses(tmp_path)
     assert (found["bounce"], found["cartpole"]) == (UNMEASURED, MISSING)
-    assert dict((line[0], line[2]) for line in rows(found))["`bounce`"] == UNMEASURED
+    assert dict((line[0], line[3]) for line in rows(found))["`bounce`"] == UNMEASURED
+
+
+def test_slices_along_which_losses_hardly_move_are_counted() -> None:
+    record = read_json(DATA / "census" / "bounce-cpu.json")
+    whole = Shares.of_record(record)
+    ends = [end for one in record["slices"] for end in one["range"]]
+    low, step = min(ends), 0.009 * (max(ends) - min(ends))
+    kept = record["slices"][:10]
+    for one in kept[:3]:
+        one["range"] = [low, low + step]
+    kept[9]["range"] = [low, max(ends)]
+    kept[8]["range"] = [None, None]
+    faint = Shares.of_record(record | {"slices": kept}).faint
+    assert faint == 0.3 + sum(high - low < step / 0.9 for low, high in (one["range"] for one in kept[3:8])) / 10
+    assert 0 <= whole.faint < 1
