@@ -69,9 +69,11 @@ def race(
 ) -> Race:
     """Let methods compete on an environment, with the same budget and several seeds each, and return the race.
 
-    `methods` are by default all that can search it here, `method_options` are given by method. `workers` runs
-    are filled at a time, each in a thread. The race lies in the folder `out`, by default one under out/ named after it:
-    the same call goes on there where it stopped, and so do more methods, seeds or episodes.
+    `methods` are by default all that can search it here, `method_options` are given by method. All runs go on in
+    lockstep: what they propose is simulated in one batch. Gaussian processes are computed by as many processes as
+    `workers` says; more than one needs a script whose own work stands under `if __name__ == "__main__":`. The race lies
+    in the folder `out`, by default one under out/ named after it: the same call goes on there where it stopped, and so
+    do more methods, seeds or episodes.
 
     Raises ValueError for what the scene or a method does not have, and where the folder holds something else or other
     runs, which `force` replaces; Stopped where it is interrupted.

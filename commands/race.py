@@ -30,8 +30,12 @@ def race(
     budget: Budget = 1000,
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each method, with seeds 0, 1, ...")] = 10,
     workers: Annotated[
-        int, typer.Option(min=1, help="Runs at a time, each in a thread; losses do not depend on it, seconds do.")
-    ] = 1,
+        int | None,
+        typer.Option(
+            min=1,
+            help="Processes that compute Gaussian processes, by default one a core; losses do not depend on it.",
+        ),
+    ] = None,
     scheduler: Scheduler = None,
     option: Annotated[
         list[str] | None, typer.Option(help="A method's option, METHOD.NAME=VALUE; may be repeated.")
@@ -46,19 +50,21 @@ def race(
 ) -> None:
     """Let methods compete on the same budget, with several seeds each: best loss, targets reached, ranks.
 
+    All runs go on in lockstep: what they propose is simulated in one batch, as many points at once as there are runs.
     The folder then holds race.png, race.json (ranks, differences, curves) and each run in a folder of its own. Stop it
     at any moment: the same command goes on where it stopped. More methods, seeds or episodes go on from there too; runs
     that are finished are not repeated. Refuses --workers beside --scheduler.
 
     Example: landscape race fluid --methods random,bo-leap --budget 200 --seeds 3
     """
+    from ..envs.engines.runtime import cores
     from ..gallery.paper import read_paper
     from ..jobs.race import RaceJob, check_methods
     from ..jobs.workers import workers as cluster
     from .terminal import Bars, command_line, print_json
 
-    if workers > 1 and scheduler:
-        raise ValueError(f"--scheduler has workers of its own, so --workers is 1; got {workers}")
+    if workers and scheduler:
+        raise ValueError(f"--scheduler has workers of its own, so --workers is left out; got {workers}")
     chosen = check_methods([name.strip() for text in methods or [] for name in text.split(",") if name.strip()])
     bars, options = Bars(), _read_options(option or [], chosen)
     env = scene.make(bars)
@@ -67,7 +73,7 @@ def race(
         "claims": read_paper().claims_about(env.name),
         "command": command_line(),
         "options": options,
-        "workers": workers,
+        "workers": workers or cores(),
     }
     job = RaceJob.of(env, chosen, budget=budget, seeds=seeds, **how)
     with cluster(scheduler, env.device) as executor:

@@ -1,9 +1,9 @@
-"""A race of methods to run in a folder: what it will cost, its picture, its figures; in threads or by workers."""
+"""A race of methods to run in a folder: what it will cost, its picture, its figures; here or by workers."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import cloudpickle
 
-from ..landscapes.cost import EpisodeCost, duration, episode_cost
+from ..landscapes.cost import EpisodeCost, duration, episode_cost, seconds_per_episode
 from ..landscapes.plain import plain
 from ..landscapes.sampling.distribution import make_objective as objective_of
 from ..landscapes.sampling.distribution import run_tasks, workers_of
@@ -20,10 +20,11 @@ from ..landscapes.storage.files import clear, tidy, visible_files, write_json
 from ..landscapes.storage.ownership import refuse_others
 from ..optim.claims import ClaimFinding, Claims, check_claims
 from ..optim.memory import SearchSize, require_method, require_runs
+from ..optim.processes import processes
 from ..optim.race import Competitor, Race, name_seeds, race
 from ..optim.registry import find_method, methods, optimizer_class
 from ..optim.runs.store import RunStore
-from ..optim.search import SearchProgress, search
+from ..optim.search import SearchProgress
 from .folder import RACE, RACE_FIGURES, ROOT, RUN_STORE, folder_named
 from .scene import provenance
 from .search import make_optimizer, one_torch_thread, open_run_store
@@ -81,9 +82,10 @@ class RaceSummary:
 
 @dataclass(frozen=True)
 class RaceJob:
-    """A race to run in `folder`, and to hold claims against; `workers` runs are filled at a time, each in a thread.
+    """A race to run in `folder`, and to hold claims against; methods compute in so many processes, `workers`.
 
-    With an `executor` its workers search instead, a run each.
+    Its runs go on in lockstep, their proposals evaluated in one batch. With an `executor` its workers search instead,
+    a share of the runs each.
     """
 
     env: Environment
@@ -115,15 +117,13 @@ class RaceJob:
     ) -> RaceJob:
         """Go on with the race in `out`, by default a folder named after it, or begin it there; `force` begins anew.
 
-        `methods` are by default all that can search the environment here. Seeds go by turns, so that methods stay
-        level. Raises ValueError where the folder holds something else, where
-        the environment cannot be simulated in several threads at once and for methods and options that are not there,
-        StoreMismatchError where it holds a run of other settings, and TooLargeError where the race would not fit this
-        machine.
+        `methods` are by default all that can search the environment here. Raises ValueError where the folder holds
+        something else, and for methods and options that are not there, StoreMismatchError where it holds a run of other
+        settings, and TooLargeError where the race would not fit this machine.
         """
         watch, options = watch or Watch(), options or {}
         budget, seeds = as_whole(budget, "a budget", least=1), as_whole(seeds, "a number of seeds", least=1)
-        check_threads(env, as_whole(workers, "a number of workers", least=1))
+        workers = as_whole(workers, "a number of workers", least=1)
         methods = check_methods(methods) or able_methods(env, watch)
         folder = out or race_folder(env, options)
         if not any(folder.glob(f"*-*/{RUN_STORE}")):
@@ -187,17 +187,21 @@ class RaceJob:
             if self.executor:
                 self._distribute(self.executor, ratio, follow)
                 return
-            how: dict[str, Any] = {"workers": self.workers, "gradient_cost": ratio, "progress": follow}
-            race(self.env, self.competitors, budget=self.budget, **how)
+            with processes(self.workers):
+                race(self.env, self.competitors, budget=self.budget, gradient_cost=ratio, progress=follow)
 
     def _distribute(
         self, executor: Executor, ratio: float | None, follow: Callable[[Competitor, SearchProgress], None]
     ) -> None:
-        """Let workers search, and read what they wrote."""
+        """Let workers search, a share of the runs each, and read what they wrote."""
         left = [one for one in self.competitors if self._count_left(one)]
-        for one, now in search_by_workers(executor, self.env, left, budget=self.budget, gradient_cost=ratio):
-            with one.run.lock():  # reads it
-                follow(one, now)
+        there, many = cloudpickle.dumps(recipe(self.env)), min(workers_of(executor), len(left))
+        shares = [list(range(start, len(left), many)) for start in range(many)]
+        tasks = [(there, share, [_recipe_of(left[number]) for number in share], self.budget, ratio) for share in shares]
+        for found in run_tasks(executor, _race_there, tasks):
+            for number, now in found.items():
+                with left[number].run.lock():  # reads it
+                    follow(left[number], now)
 
     def _save(self) -> RaceSummary:
         from ..landscapes.draw.figures.page import save, save_prints
@@ -243,23 +247,27 @@ class RaceJob:
             watch.note(f"{racers}: all {whole} episodes are there already")
             return None
         with watch.busy(f"{env.name}: {PREPARING}"):
-            cost = self._cost(grad=any(needs.values()))
+            cost, seconds = self._cost(left)
         known = [one.run.gradient_cost for one in self.competitors if one.run.gradient_cost]
-        seconds = cost.forward * left[0] + (cost.gradient * left[1] if left[1] else 0.0)
         kept = f", {whole - sum(left.values())} are there already" if sum(left.values()) < whole else ""
-        many = workers_of(self.executor) if self.executor else self.workers
-        at_once = f", {many} runs at a time" if many > 1 else ""
-        watch.note(
-            f"{racers}: {sum(left.values())} episodes to compute{kept}: {duration(seconds)} one by one, "
-            f"and what the methods take themselves{at_once}"
-        )
+        watch.note(f"{racers}: {sum(left.values())} episodes to compute{kept}: {seconds}, and what the methods take")
         return (known[0] if known else cost.ratio) if any(needs.values()) else None
 
-    def _cost(self, *, grad: bool) -> EpisodeCost:
-        if self.executor is None:
-            return episode_cost(self.env, grad=grad)
-        (cost,) = run_tasks(self.executor, _cost_there, [(cloudpickle.dumps(recipe(self.env)), grad)])
-        return cost
+    def _cost(self, left: Mapping[int, int]) -> tuple[EpisodeCost, str]:
+        """Measure an episode alone, and say what so many take, without gradients and with: in lockstep, or by workers.
+
+        A method that asks for gradients asks for them of some of its points only, and all are counted with.
+        """
+        grad = left[1] > 0
+        if self.executor is not None:
+            (alone,) = run_tasks(self.executor, _cost_there, [(cloudpickle.dumps(recipe(self.env)), grad)])
+            whole = left[0] * alone.forward + (left[1] * alone.gradient if grad else 0.0)
+            return alone, f"{duration(whole)} one by one, by {workers_of(self.executor)} workers"
+        alone, abreast = episode_cost(self.env, grad=grad), sum(self._count_left(one) > 0 for one in self.competitors)
+        x = self.env.space.uniform(min(abreast, self.env.preferred_batch), seed=0)
+        ways = [way for way in (0, 1) if left[way]]
+        each = sum(left[way] * seconds_per_episode(self.env, x, grad=bool(way)) for way in ways)
+        return alone, f"{duration(each)} in batches of one point a run"
 
     def _count_left(self, one: Competitor) -> int:
         return max(0, self.budget - one.run.count)
@@ -309,26 +317,10 @@ def check_methods(names: Sequence[str]) -> list[str]:
     return [find_method(name).name for name in dict.fromkeys(names)]
 
 
-def check_threads(env: Environment, workers: int) -> None:
-    """Raise ValueError where an environment's engine runs in one thread, and several are to simulate it."""
-    if workers > 1 and not env.capabilities.concurrent:
-        raise ValueError(f"engine {env.engine} runs in one thread only, so --workers is 1; got {workers}")
-
-
 def race_folder(env: Environment, options: Options, root: Path = ROOT) -> Path:
     """Return a folder of its own for every different race; more methods, seeds or episodes go on in the same one."""
     texts = {method: {name: str(value) for name, value in chosen.items()} for method, chosen in options.items()}
     return folder_named(["race", env.name, env.fidelity.name], [env.identity(), texts], root)
-
-
-def search_by_workers(
-    executor: Executor, env: Environment, competitors: Sequence[Competitor], *, budget: int, gradient_cost: float | None
-) -> Iterator[tuple[Competitor, SearchProgress]]:
-    """Let workers fill runs, and yield each with how far it came as it ends."""
-    there = cloudpickle.dumps(recipe(env))
-    tasks = [(number, there, *_recipe_of(one), budget, gradient_cost) for number, one in enumerate(competitors)]
-    for number, now in run_tasks(executor, _search_there, tasks):
-        yield competitors[number], now
 
 
 def _recipe_of(one: Competitor) -> tuple[str, str, dict[str, Any]]:
@@ -337,15 +329,27 @@ def _recipe_of(one: Competitor) -> tuple[str, str, dict[str, Any]]:
     return str(one.run.path), one.method, {"seed": one.seed, "options": dict(how["options"])}
 
 
-def _search_there(
-    number: int, there: bytes, path: str, method: str, how: dict[str, Any], budget: int, gradient_cost: float | None
-) -> tuple[int, SearchProgress]:
+def _race_there(
+    there: bytes,
+    numbers: Sequence[int],
+    recipes: Sequence[tuple[str, str, dict[str, Any]]],
+    budget: int,
+    gradient_cost: float | None,
+) -> dict[int, SearchProgress]:
+    """Fill a worker's share of the runs in lockstep, and return how far each came, by its number."""
     env: Any = objective_of(there).objective
-    seen: list[SearchProgress] = []
+    share = [
+        Competitor(method, how["seed"], RunStore.open(path), partial(make_optimizer, method, env, **how))
+        for path, method, how in recipes
+    ]
+    number_of, seen = dict(zip(map(id, share), numbers, strict=True)), {}
+
+    def follow(one: Competitor, now: SearchProgress) -> None:
+        seen[number_of[id(one)]] = now
+
     with one_torch_thread():
-        optimizer = make_optimizer(method, env, **how)
-        search(env, optimizer, RunStore.open(path), budget=budget, gradient_cost=gradient_cost, progress=seen.append)
-    return number, seen[-1]
+        race(env, share, budget=budget, gradient_cost=gradient_cost, progress=follow)
+    return seen
 
 
 def _cost_there(there: bytes, grad: bool) -> EpisodeCost:

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import json
 import math
-import threading
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
+from ..landscapes.cost import episode_cost
 from ..landscapes.objective import Objective
 from . import statistics
 from .base import Optimizer
+from .meeting import Meeting, MeetingEnded
 from .runs.run import Run
 from .runs.store import RunStore
 from .search import SearchProgress, search
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ..landscapes.draw.figures.page import Picture
+
+
+ABREAST = 200  # runs at most that go on in lockstep: each has a thread, and its folder is open
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,52 +42,63 @@ class Competitor:
     make: Callable[[], Optimizer]
 
 
-class RaceStopped(Exception):  # noqa: N818 -- no error: it ends the other runs
-    """End a run between two proposals, because the race is stopped."""
-
-
 def race(
     objective: Objective,
     competitors: Sequence[Competitor],
     *,
     budget: int,
-    workers: int = 1,
     gradient_cost: float | None = None,
     progress: Callable[[Competitor, SearchProgress], None] | None = None,
 ) -> None:
     """Let every competitor search until its run holds `budget` episodes; runs that do already are not touched.
 
-    `workers` runs are filled at a time, each in a thread, in the order given; what comes out does not depend on it but
-    for the seconds. More than one needs an objective that several threads may evaluate at once. `gradient_cost`, what
-    an episode with gradient costs in episodes without, is measured by the first run that needs it if not given.
-    `progress` may be called from any of the threads. Stop it at any instant: the same call goes on.
+    Runs go on in lockstep: all propose, what they propose is evaluated in one batch, and all are told. So a simulator
+    that is quicker at many points at once is used well, and what comes out is what each run gives alone but for the
+    seconds, given an objective whose rows do not depend on their batch. Each run has a thread, `ABREAST` of them at
+    most at a time; the objective is only used by the thread that calls this, `progress` by any. `gradient_cost`, what
+    an episode with gradient costs in episodes without, is measured if a run needs it. Stop it at any instant: the same
+    call goes on.
     """
     left = [one for one in competitors if one.run.count < budget]
-    stop = threading.Event()
+    for start in range(0, len(left), ABREAST):
+        _run_abreast(objective, left[start : start + ABREAST], budget, gradient_cost, progress)
 
-    def fill(one: Competitor) -> None:
-        def follow(now: SearchProgress) -> None:
-            if progress is not None:
-                progress(one, now)
-            if stop.is_set():
-                raise RaceStopped
 
-        if not stop.is_set():
-            search(objective, one.make(), one.run, budget=budget, gradient_cost=gradient_cost, progress=follow)
+def _run_abreast(
+    objective: Objective,
+    left: Sequence[Competitor],
+    budget: int,
+    gradient_cost: float | None,
+    progress: Callable[[Competitor, SearchProgress], None] | None,
+) -> None:
+    optimizers = [one.make() for one in left]
+    getattr(objective, "prepare", lambda: None)()
+    pairs = zip(optimizers, left, strict=True)
+    if gradient_cost is None and any(made.needs_grad and one.run.gradient_cost is None for made, one in pairs):
+        gradient_cost = episode_cost(objective).ratio
+    meeting = Meeting(objective, len(left))
 
-    if workers == 1:
-        for one in left:
-            fill(one)
-        return
-    with ThreadPoolExecutor(workers) as threads:
-        futures = [threads.submit(fill, one) for one in left]
+    def fill(number: int) -> None:
+        one = left[number]
+        follow = None if progress is None else partial(progress, one)
+        meeting.seat(number)
+        one.run.abreast = len(left)
         try:
-            for future in as_completed(futures):
-                future.result()
-        except BaseException:  # an interrupt too
-            stop.set()
-            threads.shutdown(cancel_futures=True)
+            how: dict[str, Any] = {"gradient_cost": gradient_cost, "progress": follow, "clock": meeting.clock}
+            search(meeting, optimizers[number], one.run, budget=budget, **how)
+        except BaseException:
+            meeting.end()  # the others are not to go on without it
             raise
+        finally:
+            meeting.leave()
+
+    with ThreadPoolExecutor(len(left)) as threads:
+        futures = [threads.submit(fill, number) for number in range(len(left))]
+        meeting.serve()
+    broken = [error for error in (future.exception() for future in futures) if error is not None]
+    for error in broken:
+        if not isinstance(error, MeetingEnded):
+            raise error
 
 
 @dataclass(frozen=True, eq=False, repr=False)

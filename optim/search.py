@@ -36,13 +36,15 @@ def search(
     budget: int,
     gradient_cost: float | None = None,
     progress: Callable[[SearchProgress], None] | None = None,
+    clock: Callable[[], float] | None = None,
 ) -> RunStore:
     """Let a method evaluate `budget` episodes, not one more, and return the run; what it holds already is not repeated.
 
     A method is an optimiser or the name of one, made with the run's seed. Without a run one is made in memory. Stop it
     at any instant: the same call goes on, and the rows are those of an uninterrupted one but for their `seconds`, given
     an objective whose rows do not depend on their batch. A proposal that does not fit into the budget is cut short.
-    `gradient_cost` is what an episode with gradient costs in episodes without; it is measured if not given.
+    `gradient_cost` is what an episode with gradient costs in episodes without; it is measured if not given. `clock`
+    says which time [s] the rows' seconds are of; by default that on the wall.
 
     Raises ValueError for a budget, a method or a gradient cost that cannot be, and StoreError where the run on disk
     cannot be gone on from.
@@ -63,7 +65,7 @@ def search(
         report()
         if optimizer is not None:
             run.extend(budget)
-            _fill(objective, optimizer, run, budget, report)
+            _fill(objective, optimizer, run, budget, report, clock or time.perf_counter)
     return run
 
 
@@ -73,8 +75,15 @@ def _in_memory(objective: Objective, method: Optimizer | str, budget: int) -> Ru
     return RunStore.in_memory(objective.space, identity=identity, budget=budget)
 
 
-def _fill(objective: Objective, optimizer: Optimizer, run: RunStore, budget: int, report: Callable[[], None]) -> None:
-    mark = time.perf_counter()
+def _fill(
+    objective: Objective,
+    optimizer: Optimizer,
+    run: RunStore,
+    budget: int,
+    report: Callable[[], None],
+    clock: Callable[[], float],
+) -> None:
+    mark = clock()
     complete, largest = True, 0
     while run.count < budget:
         if budget - run.count < largest:  # the next proposal may be cut short, and is proposed again by who goes on
@@ -85,7 +94,8 @@ def _fill(objective: Objective, optimizer: Optimizer, run: RunStore, budget: int
         x = proposal.x[: budget - run.count]
         complete = len(x) == len(proposal.x)
         evaluation = evaluate(objective, x, grad=proposal.grad)
-        seconds, mark = time.perf_counter() - mark, time.perf_counter()
+        now = clock()
+        seconds, mark = now - mark, now
         if complete:
             optimizer.tell(x, evaluation)
         run.append(x, evaluation, proposal.kind, seconds, optimizer.state if complete else None)

@@ -17,7 +17,6 @@ from botorch.models import SingleTaskGP
 from botorch.models.utils.gpytorch_modules import get_covar_module_with_dim_scaled_prior
 from botorch.optim.fit import fit_gpytorch_mll_scipy
 from botorch.optim.optimize import optimize_acqf
-from botorch.posteriors.gpytorch import GPyTorchPosterior
 from gpytorch.means import ZeroMean
 from gpytorch.mlls import ExactMarginalLogLikelihood
 from gpytorch.utils.warnings import GPInputWarning
@@ -29,6 +28,7 @@ from torch import Tensor
 from ..base import Points
 from ..memory import FLOAT, SearchSize
 from ..options import MANY, MethodOptions, number
+from ..processes import compute
 from .magnitude import tame
 
 Rows = NDArray[np.intp]
@@ -39,6 +39,7 @@ GROWTH = 1.1  # hyper-parameters are fitted anew when there are this many times 
 FIT_STEPS = 30  # of L-BFGS, from where the last fit ended
 BOUND_STEPS = 30  # of L-BFGS on the bound, from each start
 FIT_POINTS = 300  # points to fit them to, evenly spread over the run: each step's cost grows with their cube
+WORTH = 100  # points of a process from which on handing it to another process is worth while
 STARTS, SPREAD, NEAR, JITTER = 6, 512, 64, 0.02  # of the search for the bound's least value: see `_starts`
 # GPyTorch's settings and Python's warning filters belong to the process, not to a thread.
 ONE_AT_A_TIME = threading.RLock()
@@ -107,6 +108,14 @@ class Surrogate:
         """Return where mean - coefficient * standard deviation is least, shape (dim,); a random point before."""
         if not self.informed:
             return np.asarray(random.uniform(-1.0, 1.0, self.z.shape[1]))
+        if len(self.loss) < WORTH:
+            return self._minimise(random)
+        dim, drawn = self.z.shape[1], random.bit_generator.state
+        least, self._fitted, self._hyper, drawn = compute(_minimise_of, dim, self.options, self.state(), drawn)
+        random.bit_generator.state = drawn
+        return least
+
+    def _minimise(self, random: np.random.Generator) -> Points:
         with _exclusive():
             model = self.model()
             bound = NegativeBound(model, self.options.coefficient)
@@ -173,6 +182,16 @@ class Surrogate:
             return torch.cat([u[bound(u[:, None]).topk(STARTS // 2).indices] for u in map(_unit, groups)])
 
 
+def _minimise_of(
+    dim: int, options: SurrogateOptions, state: Mapping[str, Any], drawn: Mapping[str, Any]
+) -> tuple[Points, int, dict[str, Points], Mapping[str, Any]]:
+    """Return where the bound of a surrogate in this state is least, what it has fitted, and its random numbers then."""
+    surrogate, random = Surrogate(dim, options), np.random.default_rng(0)
+    surrogate.restore(state)
+    random.bit_generator.state = drawn
+    return surrogate._minimise(random), surrogate._fitted, surrogate._hyper, random.bit_generator.state
+
+
 def surrogate_memory(max_points: int, size: SearchSize) -> float:
     """Return what the process takes at the end of a search [bytes]."""
     points = min(max_points, size.budget)
@@ -182,19 +201,28 @@ def surrogate_memory(max_points: int, size: SearchSize) -> float:
 class NegativeBound(AcquisitionFunction):
     """The lower confidence bound's negative, which BoTorch makes as large as it can.
 
-    Its own `UpperConfidenceBound` repeats the training points for every point it is asked for; this does not.
+    It is that of BoTorch's `UpperConfidenceBound` for a model of one loss whose parameters are not transformed. What
+    does not change from point to point is taken from GPyTorch: weights of the losses, a root of the inverse covariance.
     """
 
     def __init__(self, model: SingleTaskGP, coefficient: float) -> None:
         super().__init__(model)
         self.coefficient = coefficient
+        with torch.no_grad():
+            model.posterior(model.train_inputs[0][:1])  # makes the prediction strategy
+        strategy = cast(Any, model.prediction_strategy)
+        self.kernel, self.known = model.covar_module, model.train_inputs[0]
+        self.weights, self.root = strategy.mean_cache.detach(), strategy.covar_cache.detach()
+        scale = cast(Any, model.outcome_transform)
+        self.mean, self.spread = scale.means.squeeze(), scale.stdvs.squeeze()
 
     def forward(self, X: Float[Tensor, "count 1 dim"]) -> Float[Tensor, " count"]:
         """Return coefficient * standard deviation - mean."""
-        posterior = cast(GPyTorchPosterior, self.model.posterior(X[:, 0]))
-        deviation = posterior.variance.clamp_min(1e-20).sqrt()
-        bound: Tensor = self.coefficient * deviation - posterior.mean
-        return bound[:, 0]
+        x = X[:, 0]
+        covariance = self.kernel(x, self.known).to_dense()
+        variance = self.kernel(x, diag=True) - (covariance @ self.root).square().sum(dim=1)
+        bound = self.coefficient * variance.clamp_min(1e-20).sqrt() - covariance @ self.weights
+        return cast(Tensor, self.spread * bound - self.mean)
 
 
 def _thin(rows: Rows, count: int) -> Rows:

@@ -55,7 +55,7 @@ from .run import Run
 from .state import decode, encode
 
 PAUSE = 1.0  # least seconds between two writes, so that quick episodes are not held up
-SHARE = 0.05  # most of the time that may go into writing, so that a large state is not written too often
+SHARE = 0.05  # most of the time that may go into writing, that of all runs that go on abreast
 RUN = "run.zarr"  # what the store of a run is called in its folder
 
 
@@ -78,6 +78,7 @@ class RunStore:
         self._written = 0  # rows known to be on disk
         self._saved_at = time.monotonic()
         self._next_save = PAUSE  # seconds after that
+        self.abreast = 1  # runs that are filled beside each other, this one included
         if path:
             self._inode = path.stat().st_ino
             self._load(path)
@@ -290,7 +291,7 @@ class RunStore:
         if self.path:
             self._write()
         self._saved_at = time.monotonic()
-        self._next_save = max(PAUSE, (self._saved_at - began) / SHARE)
+        self._next_save = max(PAUSE, self.abreast * (self._saved_at - began) / SHARE)
 
     def _rows(
         self, x: Float[Tensor, "count dim"], evaluation: Evaluation, kind: Kind, seconds: float

@@ -97,7 +97,7 @@ def test_options_of_a_method_reach_it_and_make_another_race(run: Callable[..., S
         ),
         (["race", "branin", "--methods", "cma-es", "--option", "cma-es.speed=1"], "cma-es has no option 'speed'"),
         (["race", "branin", "--seeds", "0"], "--seeds"),
-        (["race", "swing-velocity", "--engine", "taichi", "--workers", "2"], "engine taichi runs in one thread only"),
+        (["race", "branin", "--workers", "2", "--scheduler", "local:2"], "--scheduler has workers of its own"),
     ],
 )
 def test_bad_input_gets_one_line_and_leaves_nothing(

@@ -1,6 +1,5 @@
 import dataclasses
 import math
-import threading
 from functools import partial
 from types import SimpleNamespace
 
@@ -18,6 +17,7 @@ from gradscape.optim.claims import ClaimVerdict, check_claims
 from gradscape.optim.race import Competitor, picture, race
 from gradscape.optim.registry import optimizer_class
 from gradscape.optim.runs.store import RunStore
+from gradscape.optim.search import search
 from gradscape.optim.statistics import difference
 
 NAN = math.nan
@@ -175,13 +175,13 @@ class Bowl:
 
     def __init__(self, stop_after: float = math.inf):
         self.asked, self.stop_after = 0, stop_after
-        self._lock = threading.Lock()
+        self.batches: list[int] = []
 
     def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
-        with self._lock:
-            if self.asked >= self.stop_after:
-                raise KeyboardInterrupt
-            self.asked += len(x)
+        if self.asked >= self.stop_after:
+            raise KeyboardInterrupt
+        self.asked += len(x)
+        self.batches.append(len(x))
         failed = torch.where((x > 1).all(dim=1), Status.ESCAPED, Status.OK)
         return Evaluation.from_results((x**2).sum(dim=1), 2 * x if grad else None, failed)
 
@@ -214,7 +214,8 @@ def bits(entries: list[Competitor]) -> dict[tuple[str, int], tuple[bytes, ...]]:
 
 def alone() -> list[Competitor]:
     entries = field()
-    race(Bowl(), entries, budget=BUDGET, gradient_cost=2.0)
+    for entry in entries:
+        search(Bowl(), entry.make(), entry.run, budget=BUDGET, gradient_cost=2.0)
     return entries
 
 
@@ -226,22 +227,32 @@ def test_every_run_has_the_budget_to_the_episode_and_seeds_differ():
     assert len(set(bits(entries).values())) == len(entries)
 
 
-@pytest.mark.parametrize("workers", [2, 5])
-def test_workers_change_no_bit(workers):
+def test_runs_in_lockstep_are_those_of_each_alone():
+    objective, entries = Bowl(), field()
+    race(objective, entries, budget=BUDGET, gradient_cost=2.0)
+    assert bits(entries) == bits(alone())
+    assert objective.batches[:2] == [2 * (16 + 6), 2 * 4]  # of both seeds: populations, then descents with gradient
+    assert len(objective.batches) < BUDGET * 2  # a run that has ended is not waited for
+
+
+@pytest.mark.parametrize("abreast", [1, 4])
+def test_more_runs_than_go_on_abreast_take_turns(monkeypatch, abreast):
+    monkeypatch.setattr("gradscape.optim.race.ABREAST", abreast)
     entries = field()
-    race(Bowl(), entries, budget=BUDGET, workers=workers, gradient_cost=2.0)
+    race(Bowl(), entries, budget=BUDGET, gradient_cost=2.0)
     assert bits(entries) == bits(alone())
 
 
-@pytest.mark.parametrize("workers", [1, 3])
-def test_a_race_that_was_stopped_goes_on_to_the_same_rows(tmp_path, workers):
+def test_a_race_that_was_stopped_goes_on_to_the_same_rows(tmp_path, monkeypatch):
+    monkeypatch.setattr("gradscape.optim.runs.store.PAUSE", 0.0)
+    monkeypatch.setattr("gradscape.optim.runs.store.SHARE", math.inf)
     for stop in (20, 150):
         with pytest.raises(KeyboardInterrupt):
-            race(Bowl(stop), field(tmp_path), budget=BUDGET, workers=workers, gradient_cost=2.0)
+            race(Bowl(stop), field(tmp_path), budget=BUDGET, gradient_cost=2.0)
     kept = sum(entry.run.count for entry in field(tmp_path))
     assert 0 < kept < BUDGET * 6
     objective, entries = Bowl(), field(tmp_path)
-    race(objective, entries, budget=BUDGET, workers=workers, gradient_cost=2.0)
+    race(objective, entries, budget=BUDGET, gradient_cost=2.0)
     assert objective.asked == BUDGET * 6 - kept
     assert bits(entries) == bits(alone())
 
@@ -251,31 +262,78 @@ def test_a_finished_race_computes_nothing_and_touches_no_file(tmp_path):
     before = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*")}
     objective, made = Bowl(), []
     again = [dataclasses.replace(entry, make=partial(made.append, entry)) for entry in field(tmp_path)]
-    race(objective, again, budget=BUDGET, workers=2, gradient_cost=2.0)
+    race(objective, again, budget=BUDGET, gradient_cost=2.0)
     assert (objective.asked, made) == (0, [])
     assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*")} == before
 
 
-def test_a_run_that_breaks_ends_those_under_way(monkeypatch):
-    stop = threading.Event()
-    monkeypatch.setattr("gradscape.optim.race.threading", SimpleNamespace(Event=lambda: stop))
-
+def test_what_the_objective_raises_ends_all_runs():
     class Broken(Bowl):
         def evaluate(self, x, *, grad=True):
             if grad:
                 raise ValueError("no gradients here")
-            stop.wait()  # until the race has heard of it
             return super().evaluate(x, grad=grad)
 
     objective = Broken()
-    entries = [entry for entry in field(seeds=8) if entry.method != "cma-es"]
     with pytest.raises(ValueError, match="no gradients here"):
-        race(objective, entries, budget=BUDGET, workers=2, gradient_cost=2.0)
-    assert 0 < objective.asked < BUDGET  # one proposal of the run beside it
+        race(objective, field(seeds=8), budget=BUDGET, gradient_cost=2.0)
+    assert len(objective.batches) <= 1
+
+
+def test_a_method_that_breaks_ends_the_others():
+    objective, entries = Bowl(), field()
+
+    def broken(made=entries[1].make):
+        optimizer = made()
+        optimizer._ask = lambda: 1 / 0
+        return optimizer
+
+    entries[1] = dataclasses.replace(entries[1], make=broken)
+    with pytest.raises(ZeroDivisionError):
+        race(objective, entries, budget=BUDGET, gradient_cost=2.0)
+    assert len(objective.batches) <= 2
+    race(Bowl(), field(), budget=BUDGET, gradient_cost=2.0)  # and nothing of it is left
+
+
+def test_seconds_are_a_runs_own_and_its_share_of_each_batch():
+    class Slow(Bowl):
+        def evaluate(self, x, *, grad=True):
+            now[0] += 0.01 * len(x)
+            return super().evaluate(x, grad=grad)
+
+    now = [0.0]
+    clock = SimpleNamespace(perf_counter=lambda: now[0])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gradscape.optim.meeting.time", clock)
+        entries = field()
+        race(Slow(), entries, budget=BUDGET, gradient_cost=2.0)
+    for entry in entries:
+        assert entry.run.dataset()["seconds"].to_numpy()[-1] == pytest.approx(0.01 * BUDGET)
+
+
+def test_what_a_gradient_costs_is_measured_once_before_the_race():
+    objective, entries = Bowl(), field()
+    race(objective, entries, budget=BUDGET)
+    costs = {entry.run.gradient_cost for entry in entries if entry.method == "descents"}
+    assert len(costs) == 1
+    assert costs.pop() > 0
+
+
+def test_an_interrupt_while_methods_compute_ends_them(monkeypatch):
+    objective, entries = Bowl(), field()
+
+    def interrupted(self):
+        self.end()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gradscape.optim.meeting.Meeting._wait_for_all", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        race(objective, entries, budget=BUDGET, gradient_cost=2.0)
+    assert objective.asked == 0
 
 
 def test_progress_tells_which_run_it_is_of():
     entries, seen = field(), {}
-    race(Bowl(), entries, budget=BUDGET, workers=2, gradient_cost=2.0, progress=lambda e, now: seen.update({e: now}))
+    race(Bowl(), entries, budget=BUDGET, gradient_cost=2.0, progress=lambda e, now: seen.update({e: now}))
     assert {(e.method, e.seed): now.done for e, now in seen.items()} == {(e.method, e.seed): BUDGET for e in entries}
     assert all(now.best == e.run.best_loss for e, now in seen.items())
