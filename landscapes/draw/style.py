@@ -59,6 +59,12 @@ METHODS: dict[str, dict[str, Any]] = {
     "bo": {"color": "#009e73", "linestyle": (0, (2.5, 1.2)), "marker": "^"},
     "bo-descents": {"color": "#0072b2", "linestyle": "solid", "marker": "D"},
     "bo-leap": {"color": "#d55e00", "linestyle": "solid", "marker": "o"},
+    "l-bfgs-b": {"color": "#882255", "linestyle": (0, (6, 1, 1, 1, 1, 1)), "marker": "p"},
+    "basin-hopping": {"color": "#332288", "linestyle": (0, (1, 0.8)), "marker": "H"},
+    "adam": {"color": "#44aa99", "linestyle": (0, (9, 1.5)), "marker": "<"},
+    "cma-es-gradient": {"color": "#997700", "linestyle": (0, (3, 1, 1, 1)), "marker": "d"},
+    "turbo": {"color": "#117733", "linestyle": "solid", "marker": ">"},
+    "bo-gradient": {"color": "#999933", "linestyle": (0, (2, 0.8)), "marker": "8"},
     "ppo": {"color": "#cc79a7", "linestyle": (0, (8, 1.5, 1, 1.5, 1, 1.5)), "marker": "P"},
     "sac": {"color": "#5b2a86", "linestyle": (0, (8, 2.5)), "marker": "*", "markersize": 9.0},
 }

@@ -104,12 +104,16 @@ class CMAES(Optimizer):
         self.random.bit_generator.state = own["began"]
         self._start()
         for points, loss in zip(own["points"], own["losses"], strict=True):
+            self._repeat()
             self._asked = self.strategy.ask()
             if not np.array_equal(self._asked, points):
                 warnings.warn(OTHERS, RuntimeWarning, stacklevel=2)
                 self._asked = list(points)
             self._take(loss)
             self.strategy.stop()
+
+    def _repeat(self) -> None:
+        """Repeat what was done before a population was drawn: nothing, but of those who derive from this."""
 
 
 def population_memory(population: int, dim: int) -> float:

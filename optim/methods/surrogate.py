@@ -21,6 +21,7 @@ from gpytorch.means import ZeroMean
 from gpytorch.mlls import ExactMarginalLogLikelihood
 from gpytorch.utils.warnings import GPInputWarning
 from jaxtyping import Float
+from linear_operator.utils.cholesky import psd_safe_cholesky
 from linear_operator.utils.warnings import NumericalWarning
 from numpy.typing import NDArray
 from torch import Tensor
@@ -116,7 +117,7 @@ class Surrogate:
         return least
 
     def _minimise(self, random: np.random.Generator) -> Points:
-        with _exclusive():
+        with exclusive():
             model = self.model()
             bound = NegativeBound(model, self.options.coefficient)
             best, _ = optimize_acqf(
@@ -132,7 +133,7 @@ class Surrogate:
 
     def model(self) -> SingleTaskGP:
         """Return the process over [0, 1]^dim given the points, its hyper-parameters fitted if that is due."""
-        with _exclusive():
+        with exclusive():
             count = len(self.loss)
             if self._fitted == 0 or count >= GROWTH * self._fitted:
                 self._fit(_thin(np.arange(count), FIT_POINTS))
@@ -201,18 +202,20 @@ def surrogate_memory(max_points: int, size: SearchSize) -> float:
 class NegativeBound(AcquisitionFunction):
     """The lower confidence bound's negative, which BoTorch makes as large as it can.
 
-    It is that of BoTorch's `UpperConfidenceBound` for a model of one loss whose parameters are not transformed. What
-    does not change from point to point is taken from GPyTorch: weights of the losses, a root of the inverse covariance.
+    It is that of BoTorch's `UpperConfidenceBound` for a model of one loss with zero mean, whose parameters are not
+    transformed. What does not change from point to point is computed once: weights of the losses, and a root of the
+    inverse covariance.
     """
 
     def __init__(self, model: SingleTaskGP, coefficient: float) -> None:
         super().__init__(model)
         self.coefficient = coefficient
-        with torch.no_grad():
-            model.posterior(model.train_inputs[0][:1])  # makes the prediction strategy
-        strategy = cast(Any, model.prediction_strategy)
         self.kernel, self.known = model.covar_module, model.train_inputs[0]
-        self.weights, self.root = strategy.mean_cache.detach(), strategy.covar_cache.detach()
+        with torch.no_grad():
+            one = torch.eye(len(self.known), dtype=torch.float64)
+            root = psd_safe_cholesky(self.kernel(self.known).to_dense() + model.likelihood.noise * one)
+            self.root = torch.linalg.solve_triangular(root, one, upper=False).T.contiguous()
+            self.weights = torch.cholesky_solve(model.train_targets[:, None], root)[:, 0]
         scale = cast(Any, model.outcome_transform)
         self.mean, self.spread = scale.means.squeeze(), scale.stdvs.squeeze()
 
@@ -235,7 +238,7 @@ def _unit(z: Points) -> Float[Tensor, "count dim"]:
 
 
 @contextmanager
-def _exclusive() -> Iterator[None]:
+def exclusive() -> Iterator[None]:
     """Keep other threads out, and quiet what is no news: iteration limits reached, jitter added to a covariance."""
     with ONE_AT_A_TIME, warnings.catch_warnings():
         for category in (BotorchWarning, NumericalWarning, GPInputWarning):

@@ -1,0 +1,188 @@
+"""L-BFGS-B from random starts, and basin hopping, by scipy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+
+from ..base import Kind, Optimizer, Points, Proposal
+from ..memory import FLOAT, SearchSize
+from ..options import MANY, MethodOptions, number
+
+MEMORY = 10  # pairs of steps and gradients that the Hessian is made of, as scipy's default has it
+INTERVAL, TARGET, FACTOR = 50, 0.5, 0.9  # of hops, of those accepted, of a hop's length: scipy's defaults
+
+
+class _Unknown(Exception):  # noqa: N818 -- no error: it ends a minimisation that has come to where nothing is known
+    def __init__(self, z: Points) -> None:
+        self.z = z
+
+
+class LocalSearch:
+    """Minimise by scipy's L-BFGS-B from `start`, in the scaled box: `at` is the point it asks for next, until `done`.
+
+    scipy calls a function and waits for its value. So it is called anew for each point with the values that are known
+    by then, all of which it asks for again in the same order, and is ended where it asks for the first that is not.
+    `failed` says that it ended as scipy does not call a success.
+    """
+
+    def __init__(self, start: Points, evaluations: int) -> None:
+        self.start, self.evaluations = np.clip(start, -1.0, 1.0), evaluations
+        self.z: list[Points] = []
+        self.loss: list[float] = []
+        self.grad: list[Points] = []
+        self.at, self.best, self.best_loss = self.start, self.start, math.inf
+        self.done = self.failed = False
+
+    def tell(self, loss: float, grad: Points) -> None:
+        """Take in the loss and the gradient, shape (dim,), of the point asked for."""
+        self.z.append(self.at)
+        self.loss.append(loss)
+        self.grad.append(grad)
+        known = iter(zip(self.loss, self.grad, strict=True))
+
+        def at(z: Points) -> tuple[float, Points]:
+            try:
+                return next(known)
+            except StopIteration:
+                raise _Unknown(z.copy()) from None
+
+        try:
+            found = minimize(
+                at,
+                self.start,
+                jac=True,
+                method="L-BFGS-B",
+                bounds=[(-1.0, 1.0)] * len(self.start),
+                options={"maxcor": MEMORY, "maxfun": self.evaluations},
+            )
+        except _Unknown as unknown:
+            self.at = unknown.z
+        else:
+            self.done, self.failed = True, not found.success
+            self.best, self.best_loss = np.asarray(found.x), float(found.fun)
+
+    def state(self) -> dict[str, Any]:
+        """Return where the search stands, as data."""
+        dim = len(self.start)
+        return vars(self) | {
+            "z": np.array(self.z).reshape(-1, dim),
+            "loss": np.array(self.loss),
+            "grad": np.array(self.grad).reshape(-1, dim),
+        }
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> LocalSearch:
+        """Return the search that had this state."""
+        search = cls(state["start"], int(state["evaluations"]))
+        for name in vars(search):
+            value = state[name]
+            setattr(search, name, list(value) if name in ("z", "grad") else value)
+        search.loss = [float(loss) for loss in state["loss"]]
+        return search
+
+
+@dataclass(frozen=True)
+class LBFGSBOptions(MethodOptions):
+    """A search that has not ended by itself ends after `evaluations` episodes."""
+
+    method = "l-bfgs-b"
+
+    evaluations: int = number(200, 2, MANY)
+
+
+class LBFGSB(Optimizer):
+    """Minimise by scipy's L-BFGS-B from uniformly random starts: where one search ends, the next begins.
+
+    Every episode is with gradient. A failed one counts as the worst loss so far, on a plain.
+    """
+
+    name = "l-bfgs-b"
+    Options: ClassVar[type[Any]] = LBFGSBOptions
+    needs_grad = True
+
+    @classmethod
+    def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
+        """Estimate what is kept of the longest search [bytes]."""
+        points = min(options["evaluations"], size.budget or MANY) + 2 * MEMORY
+        return float(3 * FLOAT * size.dim * points)
+
+    def _setup(self) -> None:
+        self.local = self._begin(self.random.uniform(-1.0, 1.0, self.space.dim))
+
+    def _begin(self, start: Points) -> LocalSearch:
+        return LocalSearch(start, self.options.evaluations)
+
+    def _ask(self) -> Proposal:
+        return Proposal(torch.from_numpy(self.local.at[None]), Kind.DESCENT, grad=True)
+
+    def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
+        assert grad is not None  # as asked
+        self.local.tell(float(self.penalise(loss)[0]), grad[0])
+        if self.local.done:
+            self.local = self._begin(self._next_start())
+
+    def _next_start(self) -> Points:
+        """Return where the next search begins, now that one has ended."""
+        return self.random.uniform(-1.0, 1.0, self.space.dim)
+
+    def _state(self) -> dict[str, Any]:
+        return super()._state() | {"local": self.local.state()}
+
+    def _restore(self, own: Mapping[str, Any]) -> None:
+        super()._restore({name: value for name, value in own.items() if name != "local"})
+        self.local = LocalSearch.from_state(own["local"])
+
+
+@dataclass(frozen=True)
+class BasinHoppingOptions(LBFGSBOptions):
+    """How the search goes from minimum to minimum; the defaults are scipy's.
+
+    A hop is uniform, up to `step` along each parameter of the box scaled to [-1, 1]; its length is adapted every 50
+    hops so that half of them are accepted. A minimum that is worse by `temperature` [loss unit] is accepted with
+    probability 1/e.
+    """
+
+    method = "basin-hopping"
+
+    step: float = number(0.5, 1e-12, 1000)
+    temperature: float = number(1.0, 1e-300, 1e300)
+
+
+class BasinHopping(LBFGSB):
+    """Hop from minimum to minimum as scipy's `basinhopping` does: displace, minimise by L-BFGS-B, accept or go back.
+
+    It is written here to propose points one by one; on what scipy minimises itself it evaluates the same points.
+    """
+
+    name = "basin-hopping"
+    Options: ClassVar[type[Any]] = BasinHoppingOptions
+
+    def _setup(self) -> None:
+        super()._setup()
+        self.here = self.local.start
+        self.here_loss, self.here_failed = math.inf, True
+        self.length, self.hops, self.accepted = self.options.step, 0, 0
+
+    def _next_start(self) -> Points:
+        if self.hops == 0 or self._accept():
+            self.accepted += self.hops > 0
+            self.here, self.here_loss, self.here_failed = self.local.best, self.local.best_loss, self.local.failed
+        self.hops += 1
+        if self.hops % INTERVAL == 0:
+            self.length *= 1 / FACTOR if self.accepted / self.hops > TARGET else FACTOR
+        return self.here + self.random.uniform(-self.length, self.length, self.space.dim)
+
+    def _accept(self) -> bool:
+        """Accept the minimum found as Metropolis does, unless its search failed and that before did not."""
+        worse = max(0.0, self.local.best_loss - self.here_loss)
+        drawn = self.random.uniform()
+        return bool(
+            math.exp(-worse / self.options.temperature) >= drawn and (not self.local.failed or self.here_failed)
+        )
