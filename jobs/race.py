@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from ..optim.base import Optimizer
 
 PICTURE = RACE.picture
+ALL = "all"  # methods that can search an environment here
 Options = Mapping[str, Mapping[str, Any]]  # method -> name -> value, which may be text
 
 
@@ -313,8 +314,9 @@ def able_methods(env: Environment, watch: Watch) -> list[str]:
 
 
 def check_methods(names: Sequence[str]) -> list[str]:
-    """Return methods without repetitions. Raises ValueError where one is not registered."""
-    return [find_method(name).name for name in dict.fromkeys(names)]
+    """Return methods without repetitions, none for `all`. Raises ValueError where one is not registered."""
+    found = [find_method(name).name for name in dict.fromkeys(names) if name != ALL]
+    return [] if ALL in names else found
 
 
 def race_folder(env: Environment, options: Options, root: Path = ROOT) -> Path:

@@ -52,7 +52,8 @@ class TuRBOOptions(MethodOptions):
 class TuRBO(Optimizer):
     """Search a trust region around the best point of a Gaussian process of its own (Eriksson et al., NeurIPS 2019).
 
-    A search begins with 2 dim points of a scrambled Sobol sequence. Then a process with a Matern-5/2 kernel is fitted
+    A search begins with 2 dim uniformly random points, of which the first search shares as many as it can with other
+    methods of its seed; the paper's are a Latin hypercube. Then a process with a Matern-5/2 kernel is fitted
     to all its points, the region is a box around the best of them, longer where the length-scales are, and each point
     of a batch is where another sample of the process is least (Thompson sampling) among Sobol points of the region,
     which differ from the best in 20 parameters at most on average. A search whose region has become too short is given
@@ -76,7 +77,7 @@ class TuRBO(Optimizer):
         self.surrogate = Surrogate(self.space.dim, MODELLED)
         self.length, self.best = self.options.length, math.inf
         self.succeeded = self.failed = 0
-        self.first: Points = 2.0 * scrambled(2 * self.space.dim, self.space.dim, self.random) - 1.0
+        self.first: Points = self.random.uniform(-1.0, 1.0, (2 * self.space.dim, self.space.dim))
 
     def _ask(self) -> Proposal:
         if len(self.first):
@@ -153,12 +154,7 @@ def region(surrogate: Surrogate, scales: Points, length: float, count: int, rand
     weights = scales / scales.mean()
     weights = weights / np.prod(weights ** (1.0 / dim))
     low, high = (np.clip(best + sign * weights * length / 2.0, 0.0, 1.0) for sign in (-1.0, 1.0))
-    drawn = low + (high - low) * scrambled(count, dim, random)
+    drawn = low + (high - low) * sobol(count, dim, seed=int(random.integers(1 << 31))).numpy()
     exchanged = random.uniform(size=(count, dim)) <= min(PERTURBED / dim, 1.0)
     exchanged[np.arange(count), random.integers(dim, size=count)] |= ~exchanged.any(axis=1)
     return np.asarray(np.where(exchanged, drawn, best))
-
-
-def scrambled(count: int, dim: int, random: np.random.Generator) -> Points:
-    """Return the first points of a scrambled Sobol sequence in [0, 1]^dim, shape (count, dim)."""
-    return np.asarray(sobol(count, dim, seed=int(random.integers(1 << 31))).numpy())

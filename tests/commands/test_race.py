@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gradscape.optim.registry import methods
 from gradscape.optim.runs.store import RunStore
 
 from ..command import Said
@@ -84,6 +85,16 @@ def test_options_of_a_method_reach_it_and_make_another_race(run: Callable[..., S
     other = json.loads(run(*short, "--option", "cma-es.population=9", cwd=tmp_path).stdout)
     assert other["method_options"]["cma-es"]["population"] == 9
     assert plain["folder"] != other["folder"]
+
+
+def test_all_methods_that_can_run_here_race_by_default_and_by_name(run: Callable[..., Said], tmp_path: Path) -> None:
+    small = ["race", "branin", "--budget", "3", "--seeds", "1", "--json"]
+    named, default = (
+        json.loads(run(*small, *more, "--out", name, cwd=tmp_path).stdout)["methods"]
+        for name, more in (("named", ["--methods", "all"]), ("default", []))
+    )
+    assert named == default
+    assert {name for name, one in methods().items() if not one.extra} <= set(named)
 
 
 @pytest.mark.parametrize(
