@@ -1,7 +1,7 @@
 """Search for the point that each of the gallery's figures goes through: where its losses come nearest to the paper's.
 
     python -m benchmarks.base_points [FIGURE|ENV ...] [--resolution 8] [--random 32] [--fidelity standard]
-        [--device auto] [--out out/base-points] [--write]
+        [--device auto] [--out benchmarks/data/base-points] [--write]
 
 The paper says what its colour bars end at, and not which points its slices go through. Of each figure whose environment
 has such ends in gallery/paper.toml, losses are evaluated on a small grid over the figure's plane through the centre,
@@ -41,6 +41,7 @@ from gradscape.gallery.paper import read_paper
 from gradscape.landscapes.objective import Evaluation, Status, evaluate
 from gradscape.landscapes.storage.records import read_json, write_record
 
+DATA = Path(__file__).parent / "data" / "base-points"
 MOST_FAILED = 0.1  # of a candidate's episodes
 DIGITS = 4
 
@@ -149,7 +150,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--random", type=int, default=32, help="random points")
     parser.add_argument("--fidelity", default="standard")
     parser.add_argument("--device", default="auto")
-    parser.add_argument("--out", type=Path, default=Path("out/base-points"))
+    parser.add_argument("--out", type=Path, default=DATA)
     parser.add_argument("--figures", type=Path, default=FIGURES, help="the list of figures")
     parser.add_argument("--write", action="store_true", help="write what was found into the list of figures")
     asked = parser.parse_args(arguments)
