@@ -67,7 +67,8 @@ class TuRBO(Optimizer):
     def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
         """Estimate what process and samples take [bytes]."""
         candidates = candidates_of(options["candidates"], size.dim)
-        return float(surrogate_memory(MODELLED.max_points, size) + 8 * FLOAT * candidates**2)
+        samples = 8 * FLOAT * (candidates**2 + candidates * size.dim)
+        return float(surrogate_memory(MODELLED.max_points, size) + samples + 4 * FLOAT * size.dim**2)
 
     def _setup(self) -> None:
         self.failures = math.ceil(max(4.0, self.space.dim) / self.options.batch_size)
