@@ -9,7 +9,10 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    import numpy as np
 
 Result = TypeVar("Result")
 
@@ -37,6 +40,21 @@ def processes(count: int) -> Iterator[None]:
 def compute(function: Callable[..., Result], *arguments: Any) -> Result:
     """Return what a function of a module returns, computed by a process if there are any, and here otherwise."""
     return function(*arguments) if _pool is None else _pool.submit(function, *arguments).result()
+
+
+def compute_drawing(random: np.random.Generator, function: Callable[..., Result], *arguments: Any) -> Result:
+    """Return what function(*arguments, random) returns, by `compute`; `random` draws the same numbers wherever."""
+    result: Result
+    result, drawn = compute(_draw, random, function, arguments)
+    random.bit_generator.state = drawn
+    return result
+
+
+def _draw(
+    random: np.random.Generator, function: Callable[..., Result], arguments: tuple[Any, ...]
+) -> tuple[Result, Any]:
+    result = function(*arguments, random)
+    return result, random.bit_generator.state
 
 
 def _begin() -> None:

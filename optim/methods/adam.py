@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, Self
 
 import numpy as np
 import torch
 
-from ..base import Kind, Optimizer, Points, Proposal
-from ..memory import FLOAT, SearchSize
+from ..base import Points
 from ..options import MANY, MethodOptions, number
+from .descent import Descending, Descents
 
 
 @dataclass(frozen=True)
@@ -36,37 +36,23 @@ class AdamOptions(MethodOptions):
     batch_size: int = number(4, 1, 10_000)
 
 
-class AdamDescent:
-    """Follow gradients by torch's Adam from `start`: `at` is the iterate to evaluate next, until `done`.
-
-    It stays inside the box. A failed episode ends it.
-    """
+class AdamDescent(Descending):
+    """Follow gradients by torch's Adam from `start`. It stays inside the box; a failed episode ends it."""
 
     def __init__(self, start: Points, options: AdamOptions) -> None:
-        self.options = options
-        self._z = torch.from_numpy(start.copy())
+        super().__init__(start, options)
+        self._z = torch.from_numpy(self.at.copy())
         self._adam = torch.optim.Adam([self._z], lr=options.rate, betas=(options.beta1, options.beta2), foreach=False)
-        self.best, self.done = math.inf, False
-        self._evaluated = self._stalled = 0
-
-    @property
-    def at(self) -> Points:
-        """The iterate to evaluate next, shape (dim,)."""
-        return np.asarray(self._z.numpy().copy())
 
     def tell(self, loss: float, grad: Points) -> None:
         """Take in the iterate's loss, +inf where the episode failed, and gradient, shape (dim,); move on or end."""
         if not math.isfinite(loss):
             self.done = True
             return
-        self._evaluated += 1
-        improved = math.isinf(self.best) or loss < self.best - self.options.tolerance * abs(self.best)
-        self._stalled = 0 if improved else self._stalled + 1
-        self.best = min(self.best, loss)
+        self.done = self._ends_with(loss)
         self._z.grad = torch.from_numpy(np.nan_to_num(grad))
         self._adam.step()
-        self._z.clamp_(-1.0, 1.0)
-        self.done = self._stalled > self.options.patience or self._evaluated >= self.options.steps
+        self.at = self._z.clamp_(-1.0, 1.0).numpy().copy()
 
     def state(self) -> dict[str, Any]:
         """Return where the descent stands, as data."""
@@ -75,7 +61,7 @@ class AdamDescent:
         return {"at": self.at, "moments": moments, **numbers}
 
     @classmethod
-    def from_state(cls, state: Mapping[str, Any], options: AdamOptions) -> AdamDescent:
+    def from_state(cls, state: Mapping[str, Any], options: AdamOptions) -> Self:
         """Return the descent that had this state."""
         descent = cls(state["at"], options)
         moments = {name: torch.from_numpy(np.array(value)) for name, value in state["moments"].items()}
@@ -86,35 +72,9 @@ class AdamDescent:
         return descent
 
 
-class Adam(Optimizer):
+class Adam(Descents):
     """Descend by torch's Adam from uniformly random starts; where one descent ends the next begins."""
 
     name = "adam"
-    Options: ClassVar[type[AdamOptions]] = AdamOptions
-    needs_grad = True
-
-    @classmethod
-    def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
-        """Estimate what the descents of a batch take [bytes]."""
-        return float(options["batch_size"] * (10_000 + 20 * FLOAT * size.dim))
-
-    def _setup(self) -> None:
-        self.descents = [self._begin() for _ in range(self.options.batch_size)]
-
-    def _ask(self) -> Proposal:
-        return Proposal(torch.from_numpy(np.stack([one.at for one in self.descents])), Kind.DESCENT, grad=True)
-
-    def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
-        assert grad is not None  # as asked
-        for descent, one_loss, one_grad in zip(self.descents, loss, grad, strict=True):
-            descent.tell(float(one_loss), one_grad)
-        self.descents = [self._begin() if one.done else one for one in self.descents]
-
-    def _state(self) -> dict[str, Any]:
-        return {"descents": [one.state() for one in self.descents]}
-
-    def _restore(self, own: Mapping[str, Any]) -> None:
-        self.descents = [AdamDescent.from_state(one, self.options) for one in own["descents"]]
-
-    def _begin(self) -> AdamDescent:
-        return AdamDescent(self.random.uniform(-1.0, 1.0, self.space.dim), self.options)
+    Options = AdamOptions
+    Descent = AdamDescent

@@ -8,26 +8,22 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from botorch.acquisition.acquisition import AcquisitionFunction
 from botorch.models.gpytorch import GPyTorchModel
 from botorch.models.utils.gpytorch_modules import get_covar_module_with_dim_scaled_prior
-from botorch.optim.fit import fit_gpytorch_mll_scipy
-from botorch.optim.optimize import optimize_acqf
 from gpytorch.distributions import MultitaskMultivariateNormal
 from gpytorch.kernels import RBFKernelGrad
 from gpytorch.likelihoods import MultitaskGaussianLikelihood
 from gpytorch.means import ConstantMeanGrad
-from gpytorch.mlls import ExactMarginalLogLikelihood
 from gpytorch.models import ExactGP
 from jaxtyping import Float
-from linear_operator.utils.cholesky import psd_safe_cholesky
 from torch import Tensor
 
 from ..base import Kind, Optimizer, Points, Proposal
 from ..memory import FLOAT, SearchSize
 from ..options import MANY, MethodOptions, number
-from ..processes import compute
-from .surrogate import ARRAYS, BOUND_STEPS, FIT_STEPS, GROWTH, JITTER, NEAR, SPREAD, STARTS, exclusive
+from ..processes import compute_drawing
+from .bound import NEAR, SPREAD, NegativeBound, exclusive, least_point, unit
+from .surrogate import ARRAYS, GROWTH, fitted, select, with_parameters
 
 ROWS, LEAST = 1000, 20  # losses and slopes that are modelled; points of them at least: so many parameters at most
 FIT_ROWS = 400  # of them that hyper-parameters are fitted to
@@ -76,18 +72,18 @@ class BOGradient(Optimizer):
         self.z: Points = np.empty((0, self.space.dim))
         self.loss: Points = np.empty(0)
         self.grad: Points = np.empty((0, self.space.dim))
-        self.fitted, self.hyper = 0, dict[str, Points]()
+        self.fitted = 0
+        self.hyper: Mapping[str, Points] = {}
 
     def _ask(self) -> Proposal:
         if len(self.loss) < self.options.initial or not np.isfinite(self.loss).any():
             z = self.random.uniform(-1.0, 1.0, (1, self.space.dim))
             return Proposal(torch.from_numpy(z), Kind.RANDOM, grad=True)
         known = (self.z, self.loss, self.grad)
-        drawn = self.random.bit_generator.state
         fit = self.fitted == 0 or len(self.loss) >= GROWTH * self.fitted
-        z, self.hyper, drawn = compute(_minimise, *known, self.options.coefficient, self.hyper, fit, self.points, drawn)
+        how = (self.options.coefficient, self.hyper, fit, self.points)
+        z, self.hyper = compute_drawing(self.random, _minimise, *known, *how)
         self.fitted = len(self.loss) if fit else self.fitted
-        self.random.bit_generator.state = drawn
         return Proposal(torch.from_numpy(z[None]), Kind.ACQUISITION, grad=True)
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
@@ -117,30 +113,6 @@ class GradientProcess(ExactGP, GPyTorchModel):  # type: ignore[misc]
         return MultitaskMultivariateNormal(self.mean_module(u), self.covar_module(u))
 
 
-class NegativeGradientBound(AcquisitionFunction):
-    """The lower confidence bound's negative of the function alone, in the unit of the standardised losses."""
-
-    def __init__(self, model: GradientProcess, coefficient: float) -> None:
-        super().__init__(model)
-        self.coefficient = coefficient
-        known: Any = model  # which of its parts are modules, torch's types do not say
-        self.kernel, self.known = known.covar_module, known.train_inputs[0]
-        with torch.no_grad():
-            values = known.train_targets.reshape(-1, 1)
-            one = torch.eye(len(values), dtype=torch.float64)
-            root = psd_safe_cholesky(self.kernel(self.known).to_dense() + known.likelihood.noise * one)
-            self.root = torch.linalg.solve_triangular(root, one, upper=False).T.contiguous()
-            self.weights = torch.cholesky_solve(values, root)[:, 0]
-
-    def forward(self, X: Float[Tensor, "count 1 dim"]) -> Float[Tensor, " count"]:
-        """Return coefficient * standard deviation - mean."""
-        x = X[:, 0]
-        covariance = self.kernel(x, self.known).to_dense()[:: x.shape[1] + 1]
-        variance = 1.0 - (covariance @ self.root).square().sum(dim=1)
-        bound: Tensor = self.coefficient * variance.clamp_min(1e-20).sqrt() - covariance @ self.weights
-        return bound
-
-
 def _minimise(
     z: Points,
     loss: Points,
@@ -149,27 +121,19 @@ def _minimise(
     hyper: Mapping[str, Points],
     fit: bool,
     points: int,
-    drawn: Mapping[str, Any],
-) -> tuple[Points, dict[str, Points], Mapping[str, Any]]:
-    """Return where the bound is least, the hyper-parameters, and the random numbers then."""
-    random = np.random.default_rng(0)
-    random.bit_generator.state = drawn
+    random: np.random.Generator,
+) -> tuple[Points, Mapping[str, Points]]:
+    """Return where the bound is least, and the hyper-parameters."""
     rows = standardised(loss, grad)
+
+    def condition(count: int) -> GradientProcess:
+        chosen = select(loss, count)
+        return with_parameters(GradientProcess(unit(z[chosen]), torch.from_numpy(rows[chosen])), hyper)
+
     with exclusive():
         if fit:
-            hyper = _fitted(z, rows, loss, hyper, max(LEAST, FIT_ROWS // rows.shape[1]))
-        model = _condition(z, rows, select(loss, points), hyper).eval()
-        bound = NegativeGradientBound(model, coefficient)
-        best, _ = optimize_acqf(
-            bound,
-            bounds=torch.tensor([[0.0], [1.0]], dtype=torch.float64).expand(2, z.shape[1]),
-            q=1,
-            num_restarts=STARTS,
-            batch_initial_conditions=_starts(bound, z, loss, random)[:, None],
-            options={"maxiter": BOUND_STEPS},
-            retry_on_optimization_warning=False,
-        )
-    return np.asarray(2.0 * best[0].numpy() - 1.0), dict(hyper), random.bit_generator.state
+            hyper = fitted(condition(max(LEAST, FIT_ROWS // rows.shape[1])))
+        return least_point(NegativeBound(condition(points).eval(), coefficient), z, loss, random), hyper
 
 
 def standardised(loss: Points, grad: Points) -> Points:
@@ -183,42 +147,3 @@ def standardised(loss: Points, grad: Points) -> Points:
     spread = float((known / large).std()) * large or 1.0
     slopes = np.clip(2.0 * (grad / spread), -STEEPEST, STEEPEST)  # z is twice as wide as the unit box
     return np.concatenate([((known - known.mean()) / spread)[:, None], slopes], axis=1)
-
-
-def select(loss: Points, count: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """Return which points are modelled: all, or half those with the least losses and half of the others, spread."""
-    if len(loss) <= count:
-        return np.arange(len(loss))
-    best, others = np.split(np.argsort(loss, kind="stable"), [count // 2])
-    spread = np.sort(others)[np.linspace(0, len(others) - 1, count - len(best)).astype(int)]
-    return np.sort(np.concatenate([best, spread]))
-
-
-def _condition(z: Points, rows: Points, chosen: Any, hyper: Mapping[str, Points]) -> GradientProcess:
-    model = GradientProcess(torch.from_numpy((z[chosen] + 1.0) / 2.0), torch.from_numpy(rows[chosen]))
-    with torch.no_grad():
-        for name, value in model.named_parameters():
-            if name in hyper:
-                value.copy_(torch.from_numpy(hyper[name]))
-    return model
-
-
-def _fitted(z: Points, rows: Points, loss: Points, hyper: Mapping[str, Points], count: int) -> dict[str, Points]:
-    model = _condition(z, rows, select(loss, count), hyper)
-    fit_gpytorch_mll_scipy(ExactMarginalLogLikelihood(model.likelihood, model).train(), options={"maxiter": FIT_STEPS})
-    return {name: value.detach().numpy().copy() for name, value in model.named_parameters()}
-
-
-def _starts(
-    bound: NegativeGradientBound, z: Points, loss: Points, random: np.random.Generator
-) -> Float[Tensor, "start dim"]:
-    """Return where the search for the least bound starts: the best of points all over, and near the best losses."""
-    leaders = z[np.argsort(loss, kind="stable")[:8]]
-    near = np.resize(leaders, (NEAR, z.shape[1])) + 2 * JITTER * random.standard_normal((NEAR, z.shape[1]))
-    near[: len(leaders)] = leaders
-    found = []
-    for group in (random.uniform(-1.0, 1.0, (SPREAD, z.shape[1])), near.clip(-1.0, 1.0)):
-        u = torch.from_numpy((group + 1.0) / 2.0)
-        with torch.no_grad():
-            found.append(u[bound(u[:, None]).topk(min(STARTS // 2, len(u))).indices])
-    return torch.cat(found)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -36,38 +37,62 @@ class DescentOptions(MethodOptions):
     tolerance: float = number(1e-4, 0, 1)
 
 
-class Descent:
-    """Follow gradients from `start`: `at` is the iterate to evaluate next, in the scaled box, until `done`.
+class Descending(ABC):
+    """A descent in the scaled box: `at` is the iterate to evaluate next, until `done`; `best` is the least loss so far.
+
+    By its options it ends after `steps` iterates, or after more than `patience` in a row that have not lowered the best
+    loss by `tolerance`, a fraction of it.
+    """
+
+    def __init__(self, start: Points, options: Any) -> None:
+        self.options = options
+        self.at = np.clip(start, -1.0, 1.0)
+        self.best, self.done = math.inf, False
+        self._evaluated = self._stalled = 0
+
+    @abstractmethod
+    def tell(self, loss: float, grad: Points) -> None:
+        """Take in the iterate's loss, +inf where the episode failed, and gradient, shape (dim,); move on or end."""
+
+    @abstractmethod
+    def state(self) -> dict[str, Any]:
+        """Return where the descent stands, as data."""
+
+    @classmethod
+    @abstractmethod
+    def from_state(cls, state: Mapping[str, Any], options: Any) -> Self:
+        """Return the descent that had this state."""
+
+    def _ends_with(self, loss: float) -> bool:
+        """Count an iterate with this loss; return whether it is the last."""
+        self._evaluated += 1
+        improved = math.isinf(self.best) or loss < self.best - self.options.tolerance * abs(self.best)
+        self._stalled = 0 if improved else self._stalled + 1
+        self.best = min(self.best, loss)
+        return bool(self._stalled > self.options.patience or self._evaluated >= self.options.steps)
+
+
+class Descent(Descending):
+    """Follow gradients from `start`, by steps along them.
 
     Every iterate is evaluated once, loss and gradient, and both are used; the one that ends it stays in `at`, unless
     its episode failed: then the one before, the last that has a loss.
     """
 
     def __init__(self, start: Points, options: DescentOptions) -> None:
-        self.options = options
-        self.at = np.clip(start, -1.0, 1.0)
-        self.best = math.inf
-        self.done = False
+        super().__init__(start, options)
         self._last, self._last_loss = self.at, math.inf
         self._scale = 1.0
-        self._evaluated = self._stalled = 0
 
     def tell(self, loss: float, grad: Points) -> None:
         """Take in the iterate's loss, +inf where the episode failed, and gradient, shape (dim,); move on or end."""
         if not math.isfinite(loss):
             self.at, self.done = self._last, True
             return
-        self._evaluated += 1
-        improved = math.isinf(self.best) or loss < self.best - self.options.tolerance * abs(self.best)
-        self._stalled = 0 if improved else self._stalled + 1
+        last = self._ends_with(loss)
         self._scale *= self.options.shrink if loss > self._last_loss else 1.0
-        self.best = min(self.best, loss)
         moved = self._move(grad)
-        self.done = (
-            self._stalled > self.options.patience
-            or self._evaluated >= self.options.steps
-            or np.array_equal(moved, self.at)  # at a stationary point, or pushed against the border
-        )
+        self.done = last or np.array_equal(moved, self.at)  # at a stationary point, or pushed against the border
         if not self.done:
             self._last, self._last_loss, self.at = self.at, loss, moved
 
@@ -91,7 +116,7 @@ class Descent:
         if not math.isfinite(excess):  # too long to be counted: its direction is all that matters
             finite = np.nan_to_num(grad)
             move, excess = -self.options.max_step * (finite / np.abs(finite).max()), 1.0
-        return np.clip(self.at + self._scale * move / max(excess, 1.0), -1.0, 1.0)
+        return np.asarray(np.clip(self.at + self._scale * move / max(excess, 1.0), -1.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -107,13 +132,14 @@ class Descents(Optimizer):
     """Descend from uniformly random starts; where one descent ends the next begins, until the budget is spent."""
 
     name = "descents"
-    Options = DescentsOptions
+    Options: ClassVar[type[Any]] = DescentsOptions
+    Descent: ClassVar[type[Any]] = Descent
     needs_grad = True
 
     @classmethod
     def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
         """Estimate what the descents of a batch take [bytes]."""
-        return float(options["batch_size"] * (1000 + 20 * FLOAT * size.dim))
+        return float(options["batch_size"] * (10_000 + 20 * FLOAT * size.dim))
 
     def _setup(self) -> None:
         self.descents = [self._begin() for _ in range(self.options.batch_size)]
@@ -131,7 +157,8 @@ class Descents(Optimizer):
         return {"descents": [one.state() for one in self.descents]}
 
     def _restore(self, own: Mapping[str, Any]) -> None:
-        self.descents = [Descent.from_state(one, self.options) for one in own["descents"]]
+        self.descents = [self.Descent.from_state(one, self.options) for one in own["descents"]]
 
-    def _begin(self) -> Descent:
-        return Descent(self.random.uniform(-1.0, 1.0, self.space.dim), self.options)
+    def _begin(self) -> Descending:
+        descent: Descending = self.Descent(self.random.uniform(-1.0, 1.0, self.space.dim), self.options)
+        return descent

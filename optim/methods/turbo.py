@@ -15,8 +15,9 @@ from ...landscapes.space import sobol
 from ..base import Kind, Optimizer, Points, Proposal
 from ..memory import FLOAT, SearchSize
 from ..options import MANY, MethodOptions, number
-from ..processes import compute
-from .surrogate import Surrogate, SurrogateOptions, exclusive, surrogate_memory
+from ..processes import compute_drawing
+from .bound import exclusive
+from .surrogate import Surrogate, SurrogateOptions, surrogate_memory
 
 LONGEST, PERTURBED = 1.6, 20  # of a region's side, in widths of the box; parameters of a candidate that differ
 IMPROVEMENT = 1e-3  # of the best loss, that a success lowers it by at least
@@ -86,11 +87,8 @@ class TuRBO(Optimizer):
         if not np.isfinite(self.surrogate.loss).any():
             z = self.random.uniform(-1.0, 1.0, (self.options.batch_size, self.space.dim))
             return Proposal(torch.from_numpy(z), Kind.RANDOM)
-        drawn = self.random.bit_generator.state
-        state = self.surrogate.state()
-        z, learnt, drawn = compute(_sample, self.space.dim, self.options, self.length, state, drawn)
+        z, learnt = compute_drawing(self.random, _sample, self.surrogate, self.options, self.length)
         self.surrogate.restore(learnt)
-        self.random.bit_generator.state = drawn
         return Proposal(torch.from_numpy(z), Kind.ACQUISITION)
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
@@ -123,24 +121,21 @@ MODELLED = SurrogateOptions(kernel="matern", initial=1)
 
 
 def _sample(
-    dim: int, options: TuRBOOptions, length: float, state: Mapping[str, Any], drawn: Mapping[str, Any]
-) -> tuple[Points, dict[str, Any], Mapping[str, Any]]:
-    """Return a batch of points of the region, what the process has learnt, and the random numbers then."""
-    surrogate, random = Surrogate(dim, MODELLED), np.random.default_rng(0)
-    surrogate.restore(state)
-    random.bit_generator.state = drawn
+    surrogate: Surrogate, options: TuRBOOptions, length: float, random: np.random.Generator
+) -> tuple[Points, dict[str, Any]]:
+    """Return a batch of points of the region, and what the process knows then."""
     with exclusive(), torch.no_grad():
         with torch.enable_grad():
             model = surrogate.model()
         scales = model.covar_module.lengthscale.detach().squeeze(0).numpy()
-        count = candidates_of(options.candidates, dim)
+        count = candidates_of(options.candidates, surrogate.z.shape[1])
         candidates = torch.from_numpy(region(surrogate, scales, length, count, random))
         posterior: Any = model.posterior(candidates)
         mean, covariance = posterior.mean[:, 0].numpy(), posterior.distribution.covariance_matrix
         root = psd_safe_cholesky(covariance).numpy()
         samples = mean[:, None] + root @ random.standard_normal((len(mean), options.batch_size))
     chosen = candidates.numpy()[samples.argmin(axis=0)]
-    return 2.0 * chosen - 1.0, surrogate.state(), random.bit_generator.state
+    return 2.0 * chosen - 1.0, surrogate.state()
 
 
 def candidates_of(option: int, dim: int) -> int:

@@ -12,7 +12,8 @@ from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
 from gradscape.optim.methods.adam import Adam, AdamOptions
 from gradscape.optim.methods.bayes import BO
-from gradscape.optim.methods.bayes_gradient import BOGradient, GradientProcess, NegativeGradientBound, standardised
+from gradscape.optim.methods.bayes_gradient import BOGradient, GradientProcess, standardised
+from gradscape.optim.methods.bound import NegativeBound
 from gradscape.optim.methods.cmaes import CMAES
 from gradscape.optim.methods.cmaes_gradient import CMAESGradient
 from gradscape.optim.methods.quasi_newton import LBFGSB, BasinHopping
@@ -127,7 +128,7 @@ def test_basin_hopping_evaluates_scipys_points():
 def test_adam_takes_torchs_steps():
     optimizer = Adam.on(VALLEY, seed=6, options=AdamOptions(batch_size=1, rate=0.02, patience=1000))
     at, _ = scaled(VALLEY)
-    z = torch.from_numpy(optimizer.descents[0].at)
+    z = torch.from_numpy(optimizer.descents[0].at.copy())
     adam = torch.optim.Adam([z], lr=0.02)
     wanted = []
     for _ in range(100):
@@ -238,7 +239,7 @@ def test_the_process_of_losses_and_slopes_is_that_of_the_closed_form():
     inverse, cross = np.linalg.inv(k(u, u) + noise * np.eye(21)), k(new, u)[::3]
     mean = cross @ inverse @ standardised(loss, grad).ravel()
     deviation = np.sqrt(1.0 - np.einsum("ij,jk,ik->i", cross, inverse, cross))
-    found = NegativeGradientBound(model.eval(), 2.0)(torch.from_numpy(new)[:, None])
+    found = NegativeBound(model.eval(), 2.0)(torch.from_numpy(new)[:, None])
     np.testing.assert_allclose(found.detach(), 2.0 * deviation - mean, rtol=1e-8)
 
 

@@ -6,7 +6,8 @@ import pytest
 import torch
 from botorch.acquisition.analytic import UpperConfidenceBound
 
-from gradscape.optim.methods.surrogate import GROWTH, NegativeBound, Surrogate, SurrogateOptions
+from gradscape.optim.methods.bound import NegativeBound
+from gradscape.optim.methods.surrogate import GROWTH, Surrogate, SurrogateOptions
 from gradscape.optim.runs.state import decode, encode
 
 
