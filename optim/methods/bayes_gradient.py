@@ -81,9 +81,10 @@ class BOGradient(Optimizer):
             return Proposal(torch.from_numpy(z), Kind.RANDOM, grad=True)
         known = (self.z, self.loss, self.grad)
         fit = self.fitted == 0 or len(self.loss) >= GROWTH * self.fitted
-        how = (self.options.coefficient, self.hyper, fit, self.points)
+        first = len(self.loss) if fit else self.fitted
+        how = (self.options.coefficient, self.hyper, first, self.points)
         z, self.hyper = compute_drawing(self.random, _minimise, *known, *how)
-        self.fitted = len(self.loss) if fit else self.fitted
+        self.fitted = first
         return Proposal(torch.from_numpy(z[None]), Kind.ACQUISITION, grad=True)
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
@@ -119,11 +120,11 @@ def _minimise(
     grad: Points,
     coefficient: float,
     hyper: Mapping[str, Points],
-    fit: bool,
+    first: int,
     points: int,
     random: np.random.Generator,
 ) -> tuple[Points, Mapping[str, Points]]:
-    """Return where the bound is least, and the hyper-parameters."""
+    """Return where the bound is least, and the hyper-parameters: of the `first` points, now if these are all."""
     rows = standardised(loss, grad)
 
     def condition(count: int) -> GradientProcess:
@@ -131,9 +132,10 @@ def _minimise(
         return with_parameters(GradientProcess(unit(z[chosen]), torch.from_numpy(rows[chosen])), hyper)
 
     with exclusive():
-        if fit:
+        if first == len(loss):
             hyper = fitted(condition(max(LEAST, FIT_ROWS // rows.shape[1])))
-        return least_point(NegativeBound(condition(points).eval(), coefficient), z, loss, random), hyper
+        held = first if len(loss) <= points else None
+        return least_point(NegativeBound(condition(points).eval(), coefficient, held), z, loss, random), hyper
 
 
 def standardised(loss: Points, grad: Points) -> Points:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import threading
 import warnings
+from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, cast
@@ -23,9 +25,11 @@ from torch import Tensor
 from ..base import Points
 
 STEPS = 30  # of L-BFGS on the bound, from each start
-STARTS, SPREAD, NEAR, JITTER = 6, 512, 64, 0.02  # of the search for its least value: see `_starts`
+STARTS, SPREAD, NEAR, JITTER = 6, 128, 32, 0.02  # of the search for its least value: see `_starts`
+KEPT = 16  # roots, of the searches that go on abreast
 # GPyTorch's settings and Python's warning filters belong to the process, not to a thread.
 ONE_AT_A_TIME = threading.RLock()
+_roots: OrderedDict[bytes, Tensor] = OrderedDict()
 
 
 class NegativeBound(AcquisitionFunction):
@@ -33,20 +37,19 @@ class NegativeBound(AcquisitionFunction):
 
     It is that of BoTorch's `UpperConfidenceBound` for a model of one function, alone or with its slopes, with zero mean
     and a variance of one where nothing is known, whose parameters are not transformed. What does not change from point
-    to point is computed once: weights of what is known, and a root of the inverse covariance.
+    to point is computed once: weights of what is known, and a root of the inverse covariance. The root of the `first`
+    points, which the process was fitted to, is kept for the next bound of the same process.
     """
 
-    def __init__(self, model: ExactGP, coefficient: float) -> None:
+    def __init__(self, model: ExactGP, coefficient: float, first: int | None = None) -> None:
         super().__init__(model)
         known: Any = model  # which of its parts are modules, torch's types do not say
         self.coefficient = coefficient
         self.kernel, self.known = known.covar_module, known.train_inputs[0]
         with torch.no_grad():
-            values = known.train_targets.reshape(-1, 1)
-            one = torch.eye(len(values), dtype=torch.float64)
-            root = psd_safe_cholesky(self.kernel(self.known).to_dense() + known.likelihood.noise * one)
-            self.root = torch.linalg.solve_triangular(root, one, upper=False).T.contiguous()
-            self.weights = torch.cholesky_solve(values, root)[:, 0]
+            values = known.train_targets.reshape(-1)
+            self.root = inverse_root(self.kernel, self.known, known.likelihood.noise, first)
+            self.weights = self.root @ (self.root.T @ values)
         self.rows = len(values) // len(self.known)  # of a point: its value, and slopes where they are modelled
         scale = getattr(known, "outcome_transform", None)
         self.mean: Tensor | float = scale.means.squeeze() if scale else 0.0
@@ -58,6 +61,52 @@ class NegativeBound(AcquisitionFunction):
         variance = 1.0 - (covariance @ self.root).square().sum(dim=1)
         bound = self.coefficient * variance.clamp_min(1e-20).sqrt() - covariance @ self.weights
         return cast(Tensor, self.spread * bound - self.mean)
+
+
+def inverse_root(
+    kernel: Any, points: Float[Tensor, "point dim"], noise: Tensor, first: int | None
+) -> Float[Tensor, "row row"]:
+    """Return R, upper triangular, with R R^T the inverse of the points' covariance and noise.
+
+    That of the first points is computed once for each process and so many of them; R of all follows by blocks.
+    """
+    if first is None:
+        return _root_of(kernel(points).to_dense(), noise)
+    head, tail = points[:first], points[first:]
+    known = _kept_root(kernel, head, noise)
+    if not len(tail):
+        return known
+    across = kernel(tail, head).to_dense() @ known
+    own = _root_of(kernel(tail).to_dense() - across @ across.T, noise)
+    root = torch.zeros((len(known) + len(own),) * 2, dtype=torch.float64)
+    root[: len(known), : len(known)] = known
+    root[: len(known), len(known) :] = -known @ (across.T @ own)
+    root[len(known) :, len(known) :] = own
+    return root
+
+
+def _kept_root(kernel: Any, points: Float[Tensor, "point dim"], noise: Tensor) -> Float[Tensor, "row row"]:
+    key = _digest(type(kernel).__name__, points, noise, *kernel.state_dict().values())
+    if key not in _roots:
+        _roots[key] = _root_of(kernel(points).to_dense(), noise)
+    _roots.move_to_end(key)
+    if len(_roots) > KEPT:
+        _roots.popitem(last=False)
+    return _roots[key]
+
+
+def _root_of(covariance: Float[Tensor, "row row"], noise: Tensor) -> Float[Tensor, "row row"]:
+    one = torch.eye(len(covariance), dtype=torch.float64)
+    lower = psd_safe_cholesky(covariance + noise * one)
+    return cast(Tensor, torch.linalg.solve_triangular(lower, one, upper=False).T.contiguous())
+
+
+def _digest(name: str, *arrays: Tensor) -> bytes:
+    """Return what tells a name and arrays from others."""
+    found = hashlib.blake2b(name.encode(), digest_size=16)
+    for array in arrays:
+        found.update(str(tuple(array.shape)).encode() + array.detach().contiguous().numpy().tobytes())
+    return found.digest()
 
 
 def least_point(bound: NegativeBound, z: Points, loss: Points, random: np.random.Generator) -> Points:

@@ -26,7 +26,7 @@ from .magnitude import tame
 Rows = NDArray[np.intp]
 Process = TypeVar("Process", bound=ExactGP)
 
-ARRAYS = 10  # of points x points, that a Gaussian process makes (measured with BoTorch 0.16)
+ARRAYS = 16  # of points x points: ten that a process makes (measured with BoTorch 0.16), and roots that are kept
 GROWTH = 1.1  # hyper-parameters are fitted anew when there are this many times more points than at the last fit
 FIT_STEPS = 30  # of L-BFGS, from where the last fit ended
 FIT_POINTS = 300  # points to fit them to, evenly spread over the run: each step's cost grows with their cube
@@ -111,6 +111,11 @@ class Surrogate:
                 self._fitted = count
             return self._condition(select(self.loss, self.options.max_points)).eval()
 
+    @property
+    def first(self) -> int | None:
+        """How many of the points, the first, it was fitted to last; None where it no longer holds all of them."""
+        return self._fitted if len(self.loss) <= self.options.max_points else None
+
     def _condition(self, rows: Rows) -> SingleTaskGP:
         """Return the process given some of the points, with the hyper-parameters of the last fit."""
         finite = np.isfinite(self.loss)
@@ -128,7 +133,7 @@ class Surrogate:
 def _minimise(surrogate: Surrogate, random: np.random.Generator) -> tuple[Points, dict[str, Any]]:
     """Return where the bound of a surrogate is least, and what it knows then."""
     with exclusive():
-        bound = NegativeBound(surrogate.model(), surrogate.options.coefficient)
+        bound = NegativeBound(surrogate.model(), surrogate.options.coefficient, surrogate.first)
         return least_point(bound, surrogate.z, surrogate.loss, random), surrogate.state()
 
 

@@ -239,8 +239,9 @@ def test_the_process_of_losses_and_slopes_is_that_of_the_closed_form():
     inverse, cross = np.linalg.inv(k(u, u) + noise * np.eye(21)), k(new, u)[::3]
     mean = cross @ inverse @ standardised(loss, grad).ravel()
     deviation = np.sqrt(1.0 - np.einsum("ij,jk,ik->i", cross, inverse, cross))
-    found = NegativeBound(model.eval(), 2.0)(torch.from_numpy(new)[:, None])
-    np.testing.assert_allclose(found.detach(), 2.0 * deviation - mean, rtol=1e-8)
+    for first in (None, 4):  # at once, or going on from four points
+        found = NegativeBound(model.eval(), 2.0, first)(torch.from_numpy(new)[:, None])
+        np.testing.assert_allclose(found.detach(), 2.0 * deviation - mean, rtol=1e-8)
 
 
 def test_slopes_tell_the_process_more_than_losses_alone():

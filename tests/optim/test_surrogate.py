@@ -6,6 +6,7 @@ import pytest
 import torch
 from botorch.acquisition.analytic import UpperConfidenceBound
 
+from gradscape.optim.methods import bound
 from gradscape.optim.methods.bound import NegativeBound
 from gradscape.optim.methods.surrogate import GROWTH, Surrogate, SurrogateOptions
 from gradscape.optim.runs.state import decode, encode
@@ -155,3 +156,30 @@ def test_threads_find_what_one_alone_finds():
     alone = [lowest(seed) for seed in range(4)]
     with ThreadPoolExecutor(4) as executor:
         np.testing.assert_array_equal(list(executor.map(lowest, range(4))), alone)
+
+
+@pytest.mark.parametrize("first", [1, 30, 39, 40])
+def test_a_bound_goes_on_from_the_root_of_the_first_points(first):
+    surrogate = Surrogate(3, SurrogateOptions())
+    z = np.random.default_rng(0).uniform(-1.0, 1.0, (40, 3))
+    surrogate.add(z, (z**2).sum(axis=1))
+    points = torch.rand(50, 1, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    model = surrogate.model()
+    found = [NegativeBound(model, 1.5, first)(points) for _ in range(2)]
+    torch.testing.assert_close(found[0], NegativeBound(model, 1.5)(points), rtol=1e-9, atol=1e-9)
+    assert torch.equal(*found)  # the root was kept
+    bound._roots.clear()
+    assert torch.equal(NegativeBound(model, 1.5, first)(points), found[0])  # and is the same when it was not
+
+
+def test_roots_of_other_processes_are_told_apart():
+    points = torch.rand(20, 1, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    z = np.random.default_rng(1).uniform(-1.0, 1.0, (30, 2))
+    bounds = []
+    for kernel in ("rbf", "matern"):
+        surrogate = Surrogate(2, SurrogateOptions(kernel=kernel))
+        surrogate.add(z, np.sin(5 * z).sum(axis=1))
+        model = surrogate.model()
+        bounds.append((NegativeBound(model, 1.0, 20)(points), NegativeBound(model, 1.0)(points)))
+    for kept, whole in bounds:
+        torch.testing.assert_close(kept, whole, rtol=1e-8, atol=1e-8)
