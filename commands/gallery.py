@@ -18,7 +18,8 @@ def compute(
     part: Annotated[
         list[str] | None,
         typer.Option(
-            help="slices, sweeps, episodes, searches, reports or tradeoffs; may be repeated. By default all of them."
+            help="slices, companions (the same cut through other points), sweeps, episodes, searches, reports or "
+            "tradeoffs; may be repeated. By default all of them."
         ),
     ] = None,
     fidelity: Fidelity = None,
@@ -29,10 +30,11 @@ def compute(
 ) -> None:
     """Compute what is missing of the figures, and say first what it should cost.
 
-    The folder of the data then holds a folder for each figure: slice.zarr at the figure's fidelity, episode-*.mp4 at
-    some of its nodes, sweep.mp4 at draft fidelity, report.json and measures.json. In runs/ are searches at draft
-    fidelity, in tradeoff/ the accuracy of each environment against its time. Stop it at any moment: the same command
-    goes on where it stopped. A figure that fails does not stop the others.
+    The folder of the data then holds a folder for each figure: slice.zarr at the figure's fidelity, companions.json of
+    the same cut through other points, episode-*.mp4 at some of its nodes, sweep.mp4 at draft fidelity, report.json and
+    measures.json. In runs/ are searches at draft fidelity, in tradeoff/ the accuracy of each environment against its
+    time. Stop it at any moment: the same command goes on where it stopped. A figure that fails does not stop the
+    others.
 
     Example: landscape gallery compute --only fluid --part slices --device cuda
     """

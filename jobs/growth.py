@@ -12,6 +12,7 @@ from torch import Tensor
 from ..landscapes.adapters import within_box
 from ..landscapes.identity import plane_of, stored_identity
 from ..landscapes.objective import evaluate
+from .motion import HORIZON
 from .scene import SceneSpec
 from .watch import Watch
 
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 
 SHARES = (0.2, 0.4, 0.6, 0.8, 1.0)  # of the episode
 POINTS = 16
-HORIZON = "horizon"
 
 
 def effort(env: Environment) -> int:

@@ -10,12 +10,13 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from ..landscapes.measures.stability import Axis
+from .motion import HORIZON
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
     from .scene import SceneSpec
 
-DT, RESOLUTION, BOX, HORIZON = "dt", "resolution", "box", "horizon"
+DT, RESOLUTION, BOX = "dt", "resolution", "box"
 FACTORS = {DT: 2.0, RESOLUTION: math.sqrt(2.0), BOX: 2.0, HORIZON: 2.0}  # from rung to rung; else of an option:
 OPTION = 4.0
 RUNGS = {DT: 6, RESOLUTION: 4, BOX: 6, HORIZON: 3}  # beyond the base; else of an option:

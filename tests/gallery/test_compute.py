@@ -98,6 +98,13 @@ def test_films_of_other_nodes_go_when_the_slice_changes(small: Path) -> None:
     assert not stale.exists()
 
 
+def test_the_help_names_every_part(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["gallery", "compute", "--help"])
+    said = capsys.readouterr().out
+    assert [part for part in PARTS if part not in said] == []
+
+
 def test_an_unknown_part_is_refused(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert compute(small, "--part", "films") == 2
     assert "--part takes slices, companions, sweeps, episodes, searches, reports, tradeoffs; got films" in " ".join(
