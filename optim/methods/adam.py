@@ -78,3 +78,4 @@ class Adam(Descents):
     name = "adam"
     Options = AdamOptions
     Descent = AdamDescent
+    held = 10_000

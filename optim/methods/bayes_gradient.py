@@ -82,7 +82,7 @@ class BOGradient(Optimizer):
         known = (self.z, self.loss, self.grad)
         fit = self.fitted == 0 or len(self.loss) >= GROWTH * self.fitted
         first = len(self.loss) if fit else self.fitted
-        how = (self.options.coefficient, self.hyper, first, self.points)
+        how = (self.options.coefficient, self.hyper, fit, first, self.points)
         z, self.hyper = compute_drawing(self.random, _minimise, *known, *how)
         self.fitted = first
         return Proposal(torch.from_numpy(z[None]), Kind.ACQUISITION, grad=True)
@@ -120,11 +120,12 @@ def _minimise(
     grad: Points,
     coefficient: float,
     hyper: Mapping[str, Points],
+    fit: bool,
     first: int,
     points: int,
     random: np.random.Generator,
 ) -> tuple[Points, Mapping[str, Points]]:
-    """Return where the bound is least, and the hyper-parameters: of the `first` points, now if these are all."""
+    """Return where the bound is least, and the hyper-parameters, which were fitted to the `first` points or now are."""
     rows = standardised(loss, grad)
 
     def condition(count: int) -> GradientProcess:
@@ -132,7 +133,7 @@ def _minimise(
         return with_parameters(GradientProcess(unit(z[chosen]), torch.from_numpy(rows[chosen])), hyper)
 
     with exclusive():
-        if first == len(loss):
+        if fit:
             hyper = fitted(condition(max(LEAST, FIT_ROWS // rows.shape[1])))
         held = first if len(loss) <= points else None
         return least_point(NegativeBound(condition(points).eval(), coefficient, held), z, loss, random), hyper

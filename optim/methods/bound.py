@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import threading
 import warnings
 from collections import OrderedDict
@@ -26,10 +25,10 @@ from ..base import Points
 
 STEPS = 30  # of L-BFGS on the bound, from each start
 STARTS, SPREAD, NEAR, JITTER = 6, 128, 32, 0.02  # of the search for its least value: see `_starts`
-KEPT = 16  # roots, of the searches that go on abreast
+KEPT = 64  # roots; fewer than the searches that go on abreast would be lost before they are asked for again
 # GPyTorch's settings and Python's warning filters belong to the process, not to a thread.
 ONE_AT_A_TIME = threading.RLock()
-_roots: OrderedDict[bytes, Tensor] = OrderedDict()
+_roots: OrderedDict[tuple[Any, ...], Tensor] = OrderedDict()  # by kernel and bytes of points, noise, parameters
 
 
 class NegativeBound(AcquisitionFunction):
@@ -86,7 +85,8 @@ def inverse_root(
 
 
 def _kept_root(kernel: Any, points: Float[Tensor, "point dim"], noise: Tensor) -> Float[Tensor, "row row"]:
-    key = _digest(type(kernel).__name__, points, noise, *kernel.state_dict().values())
+    arrays = (points, noise, *kernel.state_dict().values())
+    key = (type(kernel), *(array.detach().contiguous().numpy().tobytes() for array in arrays))
     if key not in _roots:
         _roots[key] = _root_of(kernel(points).to_dense(), noise)
     _roots.move_to_end(key)
@@ -99,14 +99,6 @@ def _root_of(covariance: Float[Tensor, "row row"], noise: Tensor) -> Float[Tenso
     one = torch.eye(len(covariance), dtype=torch.float64)
     lower = psd_safe_cholesky(covariance + noise * one)
     return cast(Tensor, torch.linalg.solve_triangular(lower, one, upper=False).T.contiguous())
-
-
-def _digest(name: str, *arrays: Tensor) -> bytes:
-    """Return what tells a name and arrays from others."""
-    found = hashlib.blake2b(name.encode(), digest_size=16)
-    for array in arrays:
-        found.update(str(tuple(array.shape)).encode() + array.detach().contiguous().numpy().tobytes())
-    return found.digest()
 
 
 def least_point(bound: NegativeBound, z: Points, loss: Points, random: np.random.Generator) -> Points:

@@ -134,12 +134,13 @@ class Descents(Optimizer):
     name = "descents"
     Options: ClassVar[type[Any]] = DescentsOptions
     Descent: ClassVar[type[Any]] = Descent
+    held: ClassVar[int] = 1000  # by a descent of no parameters [bytes]
     needs_grad = True
 
     @classmethod
     def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
         """Estimate what the descents of a batch take [bytes]."""
-        return float(options["batch_size"] * (10_000 + 20 * FLOAT * size.dim))
+        return float(options["batch_size"] * (cls.held + 20 * FLOAT * size.dim))
 
     def _setup(self) -> None:
         self.descents = [self._begin() for _ in range(self.options.batch_size)]
