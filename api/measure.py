@@ -165,6 +165,7 @@ def census(
     *,
     slices: int = 64,
     resolution: int = 24,
+    gradients: int = 1,
     along: Literal["pairs", "random"] = "pairs",
     also: str | None = None,
     seed: int = 0,
@@ -175,7 +176,7 @@ def census(
     """Sample many slices through random points along random cuts, measure each, and say what they have in common.
 
     Slices are of every one of some random base points along every one of as many cuts: `along` pairs of parameters or
-    random directions, with `resolution` points per axis. One slice of each base point is measured at the fidelity
+    random directions, with `resolution` points per axis, of which every so many have `gradients`, too. One slice of each base point is measured at the fidelity
     `also`, too. The census lies in `out`, by default a folder under out/ named after it: the same call goes on there.
 
     Raises ValueError where the scene has one parameter, StoreMismatchError where the folder holds another census, which
@@ -184,7 +185,8 @@ def census(
     from ..jobs.census import CensusJob
 
     watch, spec = default_watch(), spec_of(scene, keywords)
-    how: dict[str, Any] = {"slices": slices, "resolution": resolution, "along": along, "also": also, "seed": seed}
+    how: dict[str, Any] = {"slices": slices, "resolution": resolution, "gradients": gradients, "along": along}
+    how |= {"also": also, "seed": seed}
     command = say_call("census", scene, **how, **keywords)
     return CensusJob.open(spec.resolve(watch), **how, out=_path(out), force=force, command=command).run(watch)
 

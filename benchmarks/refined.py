@@ -1,6 +1,6 @@
 """How many episodes a refined slice saves against full grids, at equal error at points that neither has seen.
 
-    python -m benchmarks.refined [--share 0.02] [--resolution 129] [--points 2000] [NAME ...]
+    python -m benchmarks.refined [--share 0.02] [--resolution 129] [--points 2000] [--device cpu] [NAME ...]
 
 Each subject is sampled on its finest grid once. A refined slice of it takes its samples from there, and so do the
 grids of every second, fourth ... sample. Errors are at random points between samples, which are evaluated for it: the
@@ -30,6 +30,8 @@ from gradscape.landscapes.sampling.quadtree import Quadtree
 from gradscape.landscapes.sampling.refine import Refinement, Refining
 from gradscape.landscapes.storage.store import SliceStore
 
+from .pages import scenes
+
 BOX = ParameterSpace.box(("x", "y"), -1.0, 1.0)
 FUNCTIONS = {
     "bowl": lambda x: x.square().sum(dim=1) + x[:, 0] * x[:, 1],
@@ -40,14 +42,9 @@ FUNCTIONS = {
     "thin ridge": lambda x: x.square().sum(dim=1) + 2 * torch.exp(-(((x[:, 0] + 0.37 * x[:, 1] - 0.1) / 0.01) ** 2)),
     "noise": lambda x: torch.sin(1e4 * torch.sin(x[:, 0] * 12.9898 + x[:, 1] * 78.233)),
 }
-SCENES = {  # with their planes, and the finest grid that a CPU samples in minutes, as a share of the resolution
-    "bounce": ((0, 1), 1),
-    "cartpole": ((0, 1), 1),
-    "pinball-2": ((0, 1), 1),
-    "pinball-16": ((0, 1), 1),
-    "flip": ((0, 1), 4),
-    "torus": ((0, 1), 4),
-}
+DIMS = (0, 1)  # of a scene's parameters
+QUICK = ("bounce", "cartpole", "pinball-2", "pinball-16")  # scenes whose finest grid a CPU samples in minutes
+COARSER = 4  # times coarser are the other scenes' on a CPU
 
 
 @dataclass(frozen=True)
@@ -88,16 +85,17 @@ class Known:
         return Evaluation(*parts)
 
 
-def subjects(names: list[str], resolution: int) -> Iterator[tuple[str, Objective, Plane]]:
+def subjects(names: list[str], resolution: int, device: str) -> Iterator[tuple[str, Objective, Plane]]:
     """Yield the functions and scenes that are named, all of them if none is, each with its plane."""
     for name, function in FUNCTIONS.items():
         if not names or name in names:
             yield name, from_torch(function, BOX), Plane.through(BOX, BOX.center, (0, 1), resolution=resolution)
-    for name, (dims, part) in SCENES.items():
+    for name in scenes():
         if not names or name in names:
-            env = make(name, fidelity="draft", device="cpu")
+            env = make(name, fidelity="draft", device="cpu" if name in QUICK else device)
+            part = COARSER if name not in QUICK and device == "cpu" else 1
             points = (resolution - 1) // part + 1
-            yield name, env, Plane.through(env.space, env.space.center, dims, resolution=points)
+            yield name, env, Plane.through(env.space, env.space.center, DIMS, resolution=points)
 
 
 def full_grid(known: Quadtree, stride: int) -> Quadtree:
@@ -170,10 +168,11 @@ def main() -> None:
     parser.add_argument("--share", type=float, default=0.02)
     parser.add_argument("--resolution", type=int, default=129)
     parser.add_argument("--points", type=int, default=2000)
+    parser.add_argument("--device", default="cpu", help="of the soft bodies: cuda for their whole resolution")
     given = parser.parse_args()
     headings = ("", "points", "sampled", "error", "error of all", "saved of all", "saved, linear", "saved, cubic")
     rows = []
-    for name, objective, plane in subjects(given.names, given.resolution):
+    for name, objective, plane in subjects(given.names, given.resolution, given.device):
         rows.append(measure(name, objective, plane, given.share, given.points).cells())
         print(markdown(headings, rows[-1:]).splitlines()[-1], flush=True)
     print(markdown(headings, rows))

@@ -68,6 +68,7 @@ class CensusJob:
         *,
         slices: int = SLICES,
         resolution: int = RESOLUTION,
+        gradients: int = 1,
         along: str = "pairs",
         also: str | None = None,
         seed: int = 0,
@@ -79,8 +80,8 @@ class CensusJob:
     ) -> CensusJob:
         """Go on with the census in its folder, by default one named after it under `root`, or begin it there.
 
-        Raises ValueError for what the scene does not have, for fewer than six samples along an axis, and where the
-        scene has one parameter; TooLargeError for more slices than there is memory for; StoreMismatchError where the
+        Raises ValueError for what the scene does not have, for fewer than six samples along an axis or three of them
+        with gradients, and where the scene has one parameter; TooLargeError for more slices than there is memory for; StoreMismatchError where the
         folder holds another census.
         """
         from ..landscapes.measures.census import CensusDesign
@@ -91,11 +92,19 @@ class CensusJob:
             raise ValueError(
                 f"a census measures every second sample, too, so it takes 6 along an axis; got {resolution}"
             )
+        if gradients < 1 or gradients > resolution // 3:
+            raise ValueError(
+                "a census takes gradients at every sample, 1, or every so many along each axis, up to a third of the "
+                f"resolution, {resolution // 3}; got {gradients}"
+            )
         require("resolution", resolution, lambda side: Need(8.0 * COPIES * (1 + env.space.dim) * side**2))
         require("slices", slices, lambda count: Need(8.0 * count * resolution**2, 8.0 * count * resolution**2))
-        design = CensusDesign.draw(env.space, slices, along=along, resolution=resolution, seed=seed)
+        cut: dict[str, Any] = {"along": along, "resolution": resolution, "gradients": gradients, "seed": seed}
+        design = CensusDesign.draw(env.space, slices, **cut)
         other = replace(scene, fidelity=also, tolerance=None).make() if also else None
         identity = {**env.identity(), "slices": slices, "resolution": resolution, "along": along, "seed": seed}
+        if gradients > 1:  # a census that was begun when all had them goes on
+            identity["gradients"] = gradients
         identity["other"] = other.identity()["settings"] if other else None
         folder = out or folder_named(["census", env.name, env.fidelity.name, slices], identity, root)
         pieces = Checkpoint.open(folder, identity, what="census", force=force)
@@ -162,15 +171,19 @@ class CensusJob:
         left, samples = self.left(), self.design.resolution**2
         bases, cuts = len(self.design.bases), len(self.design.cuts)
         watch.note(f"{self.env.name} · {self.env.fidelity.name} · {self.env.device} · {self.folder}")
+        without, having = self.design.samples
         what = (
             f"{len(self.design.places)} slices: {bases} base points, each along {cuts} cuts, {samples} samples a slice"
+            f"{f', {having} of them with gradients' if without else ''}"
         )
         kept = f"; {len(self.tasks) - len(left)} are there already" if len(left) < len(self.tasks) else ""
         watch.note(f"{what}{kept}")
         if left:
             x = self.env.space.uniform(min(self.env.preferred_batch, samples), seed=0)
-            each = seconds_per_episode(self.env, x, grad=True)
-            watch.note(f"about {duration(len(left) * samples * each)} here; --slices and --resolution lower it")
+            each = having * seconds_per_episode(self.env, x, grad=True)
+            each += without * seconds_per_episode(self.env, x, grad=False) if without else 0.0
+            lower = "--slices, --resolution and --gradients"
+            watch.note(f"about {duration(len(left) * each)} here; {lower} change it")
 
     def _survey(self, deviation: float, watch: Watch) -> dict[str, SurveyedSlice]:
         from ..landscapes.measures.census import SurveyedSlice
@@ -187,6 +200,7 @@ class CensusJob:
 
     def _do(self, tasks: Sequence[Task], deviation: float) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """Survey slices, here one after another or by workers, and yield what each one's piece holds."""
+        how = {"deviation": deviation, "seed": self.seed, "gradients": self.design.gradients}
         for other in (False, True):
             env = self.other if other else self.env
             chosen = [task for task in tasks if task.other == other]
@@ -195,10 +209,10 @@ class CensusJob:
                 continue
             if self.executor is None:
                 for piece, plane in todo:
-                    yield _survey(env, piece, plane, deviation, self.seed)
+                    yield _survey(env, piece, plane, how)
                 continue
             there = cloudpickle.dumps(recipe(env))
-            yield from run_tasks(self.executor, _survey_there, [(there, *one, deviation, self.seed) for one in todo])
+            yield from run_tasks(self.executor, _survey_there, [(there, *one, how) for one in todo])
 
     def _conclude(self, found: Mapping[str, SurveyedSlice]) -> Census:
         from ..landscapes.measures.census_record import conclude
@@ -231,12 +245,12 @@ def open_census(folder: Path) -> Census:
         return Census.of_record(read_json(folder / RECORD), losses)
 
 
-def _survey(env: Any, piece: str, plane: Plane, deviation: float, seed: int) -> tuple[str, dict[str, Any]]:
+def _survey(env: Any, piece: str, plane: Plane, how: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     from ..landscapes.measures.census import survey
 
-    return piece, survey(env, plane, deviation=deviation, seed=seed).arrays()
+    return piece, survey(env, plane, **how).arrays()
 
 
-def _survey_there(there: bytes, piece: str, plane: Plane, deviation: float, seed: int) -> tuple[str, dict[str, Any]]:
+def _survey_there(there: bytes, piece: str, plane: Plane, how: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     """Survey a slice on a worker, which keeps the environment that it has made."""
-    return _survey(make_objective(there).objective, piece, plane, deviation, seed)
+    return _survey(make_objective(there).objective, piece, plane, how)

@@ -73,16 +73,20 @@ class Cut:
 class CensusDesign:
     """Hold what is sliced: every cut through every base point, so that what either does can be told apart.
 
-    `bases` [parameters' units] has shape (base, dim).
+    `bases` [parameters' units] has shape (base, dim). A slice has gradients at every so many samples along each axis,
+    `gradients`.
     """
 
     space: ParameterSpace
     bases: Float[Tensor, "base dim"]
     cuts: tuple[Cut, ...]
     resolution: int
+    gradients: int = 1
 
     @classmethod
-    def draw(cls, space: ParameterSpace, slices: int, *, along: str, resolution: int, seed: int) -> CensusDesign:
+    def draw(
+        cls, space: ParameterSpace, slices: int, *, along: str, resolution: int, seed: int, gradients: int = 1
+    ) -> CensusDesign:
         """Draw about as many base points as cuts, so many slices in all at most.
 
         Of pairs of parameters there may be fewer than that takes, and then there are more base points; of two
@@ -102,7 +106,13 @@ class CensusDesign:
             cuts = [Cut(every[at]) for at in sorted(generator.permutation(len(every))[:count])]
         many = 1 if along == PAIRS and space.dim == 2 else slices // len(cuts)
         bases = space.from_unit(torch.from_numpy(generator.random((many, space.dim))))
-        return cls(space, bases, tuple(cuts), resolution)
+        return cls(space, bases, tuple(cuts), resolution, gradients)
+
+    @property
+    def samples(self) -> tuple[int, int]:
+        """How many samples of a slice are without a gradient, and how many have one."""
+        having = (-(-self.resolution // self.gradients)) ** 2
+        return self.resolution**2 - having, having
 
     @property
     def places(self) -> list[tuple[int, int]]:
@@ -139,33 +149,40 @@ class SurveyedSlice:
         return cls(arrays["loss"], arrays["measures"], arrays["halved"], words, int(arrays["episodes"]))
 
 
-def survey(objective: Objective, plane: Plane, *, deviation: float, seed: int) -> SurveyedSlice:
+def survey(objective: Objective, plane: Plane, *, deviation: float, seed: int, gradients: int = 1) -> SurveyedSlice:
     """Sample and measure a slice; `deviation` [loss unit] is that of the losses' noise.
 
     Measures are those of a report, without their intervals within the slice: what counts here is how they differ from
-    slice to slice. Jumps are looked for in at most `STEEP` pairs of samples.
+    slice to slice. Those of gradients are of every so many samples along each axis, `gradients`, and hold them against
+    the losses of all. Jumps are looked for in at most `STEEP` pairs of samples.
     """
     counted = _Counted(objective)
-    whole = sample(counted, plane)
+    whole = sample(counted, plane, gradients=gradients)
     found, verdict = _measure(counted, whole, deviation, seed, jumps=True)
     halved, _ = _measure(counted, thin_out(whole), deviation, seed, jumps=False)
     loss = whole["loss"].to_numpy()
     return SurveyedSlice(loss, found, halved, verdict.words, counted.asked)
 
 
-def sample(objective: Objective, plane: Plane) -> xr.Dataset:
+def sample(objective: Objective, plane: Plane, *, gradients: int = 1) -> xr.Dataset:
     """Evaluate a plane of an objective, in batches that it prefers; points outside its box are left out, as NaN.
 
-    Raises ValueError where the objective has no gradients.
+    Gradients are NaN but at every so many samples along each axis, `gradients`. Raises ValueError where the objective
+    has none.
     """
     grid = plane.grid()
-    shape, points = grid.shape[:2], grid.reshape(-1, plane.dim)
-    batch = getattr(objective, "preferred_batch", len(points))
-    parts = [evaluate(objective, part, grad=True) for part in torch.split(points, batch)]
-    if parts[0].grad is None:
-        raise ValueError("a census needs gradients, which this objective does not have")
-    loss = torch.cat([part.loss for part in parts]).reshape(shape)
-    grad = torch.cat([part.grad for part in parts if part.grad is not None]).reshape(*shape, -1)
+    loss, grad = torch.full(grid.shape[:2], torch.nan).double(), torch.full_like(grid, torch.nan)
+    having = torch.zeros(grid.shape[:2], dtype=torch.bool)
+    having[::gradients, ::gradients] = True
+    batch = getattr(objective, "preferred_batch", len(loss) ** 2)
+    for chosen in (having, ~having) if gradients > 1 else (having,):
+        parts = [evaluate(objective, part, grad=chosen is having) for part in torch.split(grid[chosen], batch)]
+        if chosen is having and parts[0].grad is None:
+            raise ValueError("a census needs gradients, which this objective does not have")
+        for part, where in zip(parts, torch.split(chosen.nonzero(), batch), strict=True):
+            loss[*where.T] = part.loss
+            if part.grad is not None:
+                grad[*where.T] = part.grad
     return _dataset(plane, loss.numpy(), grad.numpy())
 
 

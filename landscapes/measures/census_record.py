@@ -43,7 +43,8 @@ class Census:
 
     `words` says of every word which share of the slices it fits, `spreads` and `parts` say of every measure how it is
     distributed and what its variance goes with. `other` is the fidelity that some slices were measured at, too, empty
-    where there is none. `losses` [loss unit] are those of the slices, shape (slice, v, u), in a file of their own.
+    where there is none. Slices have gradients at every so many samples along each axis, `gradients`. `losses`
+    [loss unit] are those of the slices, shape (slice, v, u), in a file of their own.
     """
 
     env: str
@@ -52,6 +53,7 @@ class Census:
     loss_unit: str
     along: str
     resolution: int
+    gradients: int
     seed: int
     episodes: int
     slices: tuple[CensusedSlice, ...]
@@ -73,6 +75,7 @@ class Census:
             loss_unit=text(record["loss_unit"]),
             along=text(record["along"]),
             resolution=int(number(record["resolution"])),
+            gradients=int(number(record.get("gradients", 1))),  # 0.1 had them everywhere
             seed=int(number(record["seed"])),
             episodes=int(number(record["episodes"])),
             command=text(record["command"]),
@@ -150,6 +153,7 @@ def conclude(
     return Census(
         along="random" if design.cuts[0].dims is None else "pairs",
         resolution=design.resolution,
+        gradients=design.gradients,
         seed=seed,
         episodes=sum(one.episodes for one in (*found, *others.values())),
         slices=tuple(_sum_up(one, *place, design.plane(*place).labels) for place, one in places),

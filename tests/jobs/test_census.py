@@ -107,3 +107,26 @@ def test_the_verb_and_python_say_the_same(run: Callable[..., Said], tmp_path: Pa
     found = gs.census("ackley", slices=4, resolution=8, out=tmp_path / "called", device="cpu", options={"dim": 3})
     for name in ("slices", "words", "parts"):
         assert json.loads(said.stdout)[name] == found.record()[name]
+
+
+def test_gradients_at_every_second_sample_change_what_is_said_of_gradients_alone(tmp_path: Path) -> None:
+    scene = replace(SCENE, name="levy")  # of which, other than of Ackley's, even samples do not mirror odd ones
+    every = CensusJob.open(scene, **HOW, out=tmp_path / "every").run()
+    job = CensusJob.open(scene, **HOW, gradients=2, out=tmp_path / "second")
+    assert job.design.samples == (48, 16)
+    second = job.run()
+    assert np.array_equal(second.losses, every.losses)
+    of_gradients = {MEASURES.index(name) for name in ("gradient zero", "cosine", "uphill")}
+    for one, other in zip(second.slices, every.slices, strict=True):
+        differing = {k for k in range(len(MEASURES)) if one.measures[k] != other.measures[k]}
+        assert differing <= of_gradients
+        assert differing & of_gradients
+        assert one.measures[MEASURES.index("cosine")] is not None
+    assert open_census(tmp_path / "second").gradients == 2
+    with pytest.raises(ValueError, match="gradients"):
+        CensusJob.open(scene, **HOW, out=tmp_path / "second")
+
+
+def test_gradients_are_at_three_samples_along_each_axis_and_more(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"up to a third of the resolution, 2; got 3"):
+        CensusJob.open(SCENE, **HOW, gradients=3, out=tmp_path / "made")
