@@ -176,8 +176,9 @@ def census(
     """Sample many slices through random points along random cuts, measure each, and say what they have in common.
 
     Slices are of every one of some random base points along every one of as many cuts: `along` pairs of parameters or
-    random directions, with `resolution` points per axis, of which every so many have `gradients`, too. One slice of each base point is measured at the fidelity
-    `also`, too. The census lies in `out`, by default a folder under out/ named after it: the same call goes on there.
+    random directions, with `resolution` points per axis, of which every so many have `gradients`, too. One slice of
+    each base point is measured at the fidelity `also`, too. The census lies in `out`, by default a folder under out/
+    named after it: the same call goes on there.
 
     Raises ValueError where the scene has one parameter, StoreMismatchError where the folder holds another census, which
     `force` replaces; Stopped where it is interrupted.

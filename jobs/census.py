@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import cloudpickle
@@ -13,7 +15,7 @@ import numpy as np
 
 from ..landscapes.capacity import Need, require
 from ..landscapes.cost import duration, seconds_per_episode
-from ..landscapes.sampling.distribution import make_objective, run_tasks
+from ..landscapes.sampling.distribution import make_objective, run_tasks, workers_of
 from ..landscapes.storage.files import replacing, tidy
 from ..landscapes.storage.records import read_json, reading, write_record
 from .folder import CENSUS, ROOT, folder_named
@@ -22,9 +24,13 @@ from .watch import PREPARING, Watch, resumable
 from .workers import recipe
 
 if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
     from ..envs.base import Environment
     from ..landscapes.measures.census import CensusDesign, SurveyedSlice
     from ..landscapes.measures.census_record import Census
+    from ..landscapes.objective import Evaluation, Objective
     from ..landscapes.plane import Plane
     from ..landscapes.storage.checkpoint import Checkpoint
 
@@ -81,8 +87,8 @@ class CensusJob:
         """Go on with the census in its folder, by default one named after it under `root`, or begin it there.
 
         Raises ValueError for what the scene does not have, for fewer than six samples along an axis or three of them
-        with gradients, and where the scene has one parameter; TooLargeError for more slices than there is memory for; StoreMismatchError where the
-        folder holds another census.
+        with gradients, and where the scene has one parameter; TooLargeError for more slices than there is memory for;
+        StoreMismatchError where the folder holds another census.
         """
         from ..landscapes.measures.census import CensusDesign
         from ..landscapes.storage.checkpoint import Checkpoint
@@ -199,20 +205,24 @@ class CensusJob:
         return {name: SurveyedSlice.of_arrays(arrays) for name, arrays in pieces.items() if arrays is not None}
 
     def _do(self, tasks: Sequence[Task], deviation: float) -> Iterator[tuple[str, Mapping[str, Any]]]:
-        """Survey slices, here one after another or by workers, and yield what each one's piece holds."""
+        """Survey slices, here or by workers, so many abreast as fill a batch, and yield what each one's piece holds."""
         how = {"deviation": deviation, "seed": self.seed, "gradients": self.design.gradients}
+        workers = workers_of(self.executor) if self.executor else 1
         for other in (False, True):
             env = self.other if other else self.env
             chosen = [task for task in tasks if task.other == other]
             todo = [(task.piece, self.design.plane(*self.design.places[task.number])) for task in chosen]
             if env is None or not todo:
                 continue
+            size = min(_abreast(env), -(-len(todo) // workers))
+            groups = [todo[start : start + size] for start in range(0, len(todo), size)]
             if self.executor is None:
-                for piece, plane in todo:
-                    yield _survey(env, piece, plane, how)
+                for group in groups:
+                    yield from _survey(env, group, how)
                 continue
             there = cloudpickle.dumps(recipe(env))
-            yield from run_tasks(self.executor, _survey_there, [(there, *one, how) for one in todo])
+            for found in run_tasks(self.executor, _survey_there, [(there, group, how) for group in groups]):
+                yield from found
 
     def _conclude(self, found: Mapping[str, SurveyedSlice]) -> Census:
         from ..landscapes.measures.census_record import conclude
@@ -245,12 +255,47 @@ def open_census(folder: Path) -> Census:
         return Census.of_record(read_json(folder / RECORD), losses)
 
 
-def _survey(env: Any, piece: str, plane: Plane, how: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+Piece = tuple[str, dict[str, Any]]  # its name, and what it holds
+
+
+def _abreast(env: Environment) -> int:
+    """Return how many slices are surveyed at once, so that looking for jumps in all of them fills a batch."""
+    from ..landscapes.measures.census import STEEP
+
+    return -(-env.preferred_batch // STEEP)
+
+
+def _survey(env: Any, group: Sequence[tuple[str, Plane]], how: Mapping[str, Any]) -> list[Piece]:
+    """Survey slices, what all of them ask simulated in one batch, and return what their pieces hold."""
     from ..landscapes.measures.census import survey
+    from ..optim.meeting import Meeting, work_abreast
 
-    return piece, survey(env, plane, **how).arrays()
+    turn = Lock()  # measuring is for one thread at a time
+
+    def work(piece: str, plane: Plane, meeting: Meeting) -> Piece:
+        with turn:
+            return piece, survey(_InTurn(meeting, turn), plane, **how).arrays()
+
+    return work_abreast(env, [partial(work, *one) for one in group])
 
 
-def _survey_there(there: bytes, piece: str, plane: Plane, how: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Survey a slice on a worker, which keeps the environment that it has made."""
-    return _survey(make_objective(there).objective, piece, plane, how)
+def _survey_there(there: bytes, group: Sequence[tuple[str, Plane]], how: Mapping[str, Any]) -> list[Piece]:
+    """Survey slices on a worker, which keeps the environment that it has made."""
+    return _survey(make_objective(there).objective, group, how)
+
+
+class _InTurn:
+    """An objective whose askers let others work while they wait for an answer."""
+
+    def __init__(self, objective: Objective, turn: Lock) -> None:
+        self._objective, self._turn = objective, turn
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._objective, name)
+
+    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
+        self._turn.release()
+        try:
+            return self._objective.evaluate(x, grad=grad)
+        finally:
+            self._turn.acquire()

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -15,6 +17,7 @@ from ..landscapes.objective import Evaluation, Objective, name_of
 from ..landscapes.sampling.memory import MemoryBound
 
 Key = tuple[str, int]  # what is asked, and of which kind
+T = TypeVar("T")
 
 
 class MeetingEnded(Exception):  # noqa: N818 -- no error: it ends those who still wait
@@ -132,3 +135,30 @@ class Meeting:
             raise MeetingEnded
         self._own.waited += time.perf_counter() - began - question.seconds
         return question.answer
+
+
+def work_abreast(objective: Objective, tasks: Sequence[Callable[[Meeting], T]]) -> list[T]:
+    """Return what each task returns, given a meeting to ask in the objective's place; each has a thread.
+
+    The objective is only used by the thread that calls this. What a task or the objective raises ends them all.
+    """
+    meeting = Meeting(objective, len(tasks))
+
+    def work(number: int) -> T:
+        meeting.seat(number)
+        try:
+            return tasks[number](meeting)
+        except BaseException:
+            meeting.end()  # the others are not to go on without it
+            raise
+        finally:
+            meeting.leave()
+
+    with ThreadPoolExecutor(len(tasks)) as threads:
+        futures = [threads.submit(work, number) for number in range(len(tasks))]
+        meeting.serve()
+    broken = [error for error in (future.exception() for future in futures) if error is not None]
+    for error in broken:
+        if not isinstance(error, MeetingEnded):
+            raise error
+    return [future.result() for future in futures]

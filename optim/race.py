@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -18,7 +17,7 @@ from ..landscapes.cost import episode_cost
 from ..landscapes.objective import Objective
 from . import statistics
 from .base import Optimizer
-from .meeting import Meeting, MeetingEnded
+from .meeting import Meeting, work_abreast
 from .runs.run import Run
 from .runs.store import RunStore
 from .search import SearchProgress, search
@@ -76,29 +75,14 @@ def _run_abreast(
     pairs = zip(optimizers, left, strict=True)
     if gradient_cost is None and any(made.needs_grad and one.run.gradient_cost is None for made, one in pairs):
         gradient_cost = episode_cost(objective).ratio
-    meeting = Meeting(objective, len(left))
 
-    def fill(number: int) -> None:
-        one = left[number]
+    def fill(optimizer: Optimizer, one: Competitor, meeting: Meeting) -> None:
         follow = None if progress is None else partial(progress, one)
-        meeting.seat(number)
         one.run.abreast = len(left)
-        try:
-            how: dict[str, Any] = {"gradient_cost": gradient_cost, "progress": follow, "clock": meeting.clock}
-            search(meeting, optimizers[number], one.run, budget=budget, **how)
-        except BaseException:
-            meeting.end()  # the others are not to go on without it
-            raise
-        finally:
-            meeting.leave()
+        how: dict[str, Any] = {"gradient_cost": gradient_cost, "progress": follow, "clock": meeting.clock}
+        search(meeting, optimizer, one.run, budget=budget, **how)
 
-    with ThreadPoolExecutor(len(left)) as threads:
-        futures = [threads.submit(fill, number) for number in range(len(left))]
-        meeting.serve()
-    broken = [error for error in (future.exception() for future in futures) if error is not None]
-    for error in broken:
-        if not isinstance(error, MeetingEnded):
-            raise error
+    work_abreast(objective, [partial(fill, *pair) for pair in zip(optimizers, left, strict=True)])
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -8,12 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import gradscape as gs
+from gradscape.envs.base import Environment
 from gradscape.jobs import census as module
 from gradscape.jobs.census import CensusJob, open_census
 from gradscape.jobs.scene import SceneSpec
-from gradscape.landscapes.measures.census import MEASURES
+from gradscape.landscapes.measures.census import MEASURES, CensusDesign
+from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.storage.records import read_json
 
 from ..command import Said
@@ -44,7 +47,7 @@ def test_a_stopped_census_goes_on_with_the_next_slice(tmp_path: Path, monkeypatc
     def stop_at_the_third(*args: object) -> object:
         if len(surveyed) == 2:
             raise KeyboardInterrupt
-        surveyed.append(args[1])
+        surveyed.append(args[1])  # one slice: as many of its pairs of samples are looked into as a batch has points
         return survey(*args)  # type: ignore[arg-type]
 
     monkeypatch.setattr(module, "_survey", stop_at_the_third)
@@ -130,3 +133,35 @@ def test_gradients_at_every_second_sample_change_what_is_said_of_gradients_alone
 def test_gradients_are_at_three_samples_along_each_axis_and_more(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"up to a third of the resolution, 2; got 3"):
         CensusJob.open(SCENE, **HOW, gradients=3, out=tmp_path / "made")
+
+
+def test_slices_surveyed_abreast_are_those_surveyed_alone_in_fewer_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = replace(SCENE, name="levy")
+    env, asked = scene.make(), list[int]()
+    design = CensusDesign.draw(env.space, 4, along="pairs", resolution=8, seed=0)
+    group = [(f"slice-{number}", design.plane(*place)) for number, place in enumerate(design.places)]
+    how = {"deviation": 0.0, "seed": 0, "gradients": 2}
+    alone = [module._survey(env, [one], how)[0] for one in group]
+    evaluate = type(env).evaluate
+
+    def count(self: Environment, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
+        asked.append(len(x))
+        return evaluate(self, x, grad=grad)
+
+    monkeypatch.setattr(type(env), "evaluate", count)
+    together = module._survey(env, group, how)
+    batches, asked[:] = len(asked), []
+    for one in group:
+        module._survey(env, [one], how)
+    assert [piece for piece, _ in together] == [piece for piece, _ in group]
+    assert batches < len(asked) / 3
+    for (_, found), (_, wanted) in zip(together, alone, strict=True):
+        assert all(np.array_equal(found[key], wanted[key], equal_nan=found[key].dtype.kind == "f") for key in wanted)
+
+
+def test_what_a_slice_raises_ends_all_of_its_group() -> None:
+    env = SCENE.make()
+    design = CensusDesign.draw(env.space, 4, along="pairs", resolution=8, seed=0)
+    group = [(f"slice-{number}", design.plane(*place)) for number, place in enumerate(design.places)]
+    with pytest.raises(TypeError, match="deviation"):
+        module._survey(env, group, {"seed": 0})
