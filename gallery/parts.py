@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -114,7 +115,8 @@ class SlicePart(FigurePart):
         if not is_slice(store) and not has_lost_root(store, FILES):
             return State(points, 0)
         stored = SliceStore.open(store)
-        return State(points, int((stored.status() > 0).sum()) if _same(self.figure, stored.identity) else None)
+        same = _same(self.figure, stored.identity) and _through(stored.provenance) == self.figure.through
+        return State(points, int((stored.status() > 0).sum()) if same else None)
 
     def seconds_each(self) -> float:
         """Time a point."""
@@ -243,6 +245,12 @@ def _same(figure: Figure, identity: Mapping[str, Any]) -> bool:
     same = identity["objective"] == figure.env and identity["fidelity"] == figure.fidelity and dims == figure.dims
     options = {name: identity["options"].get(name) for name in figure.options}
     return bool(same and options == figure.options and plane["resolution"] == [figure.resolution] * len(dims))
+
+
+def _through(provenance: Mapping[str, Any]) -> str:
+    """Return the point that a slice's command names, which no environment has to be made for."""
+    words = shlex.split(provenance["command"])
+    return words[words.index("--through") + 1] if "--through" in words else "center"
 
 
 def seconds_of_one(env: Environment) -> float:

@@ -110,3 +110,12 @@ def test_an_unknown_part_is_refused(small: Path, capsys: pytest.CaptureFixture[s
     assert "--part takes slices, companions, sweeps, episodes, searches, reports, tradeoffs; got films" in " ".join(
         capsys.readouterr().err.split()
     )
+
+
+def test_a_figure_through_another_point_is_not_there(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    part = gallery_parts.SlicePart(FIGURES[0], small, "cpu")
+    assert compute(small, "--only", "ball", "--part", "slices") == 0
+    assert part.there()
+    moved = replace(part, figure=replace(part.figure, through="random:3"))
+    assert str(moved.state()) == "other settings"
+    assert not replace(part, figure=replace(part.figure, through="center")).there()
