@@ -60,15 +60,15 @@ def pytest_sessionfinish(session: pytest.Session) -> Generator[None]:
             reporter.write_line(f"{skipped} browser tests were skipped; {NO_BROWSER}")
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def blank(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave pictures blank, but in tests marked `drawn`."""
+    """Leave pictures blank, but in tests marked `drawn`: what a test does draws more of them than it looks at."""
     if request.node.get_closest_marker("drawn") is None:
         leave_blank(monkeypatch.setattr)
 
 
 @pytest.fixture
-def run(blank: None, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Said]:
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Said]:
     """Run the command in this process, in a folder of its own, on a wide screen unless another width is given.
 
     What a job takes is foretold by one episode or two and no more.

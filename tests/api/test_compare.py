@@ -23,6 +23,7 @@ def bowl(x: torch.Tensor) -> torch.Tensor:
 SPACE = gs.ParameterSpace(("x", "y"), -torch.ones(2).double(), torch.ones(2).double(), ("m", "m"))
 
 
+@pytest.mark.drawn
 def test_slices_are_compared_as_they_are_or_from_their_folders(tmp_path: Path) -> None:
     a = gs.slice("bounce", (0, 1), resolution=5, out=tmp_path / "a")
     b = gs.slice("bounce", (0, 1), resolution=5, fidelity="standard", out=tmp_path / "b")
@@ -50,6 +51,7 @@ def test_an_environment_or_anyones_objective_is_sampled_where_a_slice_is(tmp_pat
     assert twice.slopes.ratio.value == pytest.approx(2.0)
 
 
+@pytest.mark.drawn
 def test_a_slice_without_gradients_asks_for_none(tmp_path: Path) -> None:
     a = gs.slice("bounce", (0, 1), resolution=4, gradients=False, out=tmp_path / "a")
     found = gs.compare(a, "bounce", fidelity="standard", out=tmp_path / "both")

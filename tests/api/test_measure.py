@@ -21,6 +21,7 @@ def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             monkeypatch.setattr(module, name, 0.0)
 
 
+@pytest.mark.drawn
 def test_a_slice_and_its_folder_have_the_same_report_which_is_read_again(tmp_path: Path) -> None:
     cut = gs.slice("branin", (0, 1), resolution=24, out=tmp_path / "cut")
     told = gs.report(cut, points=2, out=tmp_path / "told")
@@ -80,6 +81,7 @@ def test_a_class_is_checked_and_its_findings_are_a_table() -> None:
     assert [one["check"] for one in failed.record()["checks"]] == list(table.index)
 
 
+@pytest.mark.drawn
 def test_a_tradeoff_has_a_front_a_table_and_a_picture(tmp_path: Path) -> None:
     how = {"points": 2, "variants": ("precision",), "device": "cpu", "options": {"horizon": 0.05}}
     found = gs.tradeoff("bounce", **how, out=tmp_path / "trade")  # type: ignore[arg-type]

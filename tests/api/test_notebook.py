@@ -56,6 +56,7 @@ def _run(cell: str, space: dict[str, Any]) -> Any:
     return eval(last, space)
 
 
+@pytest.mark.drawn
 def test_every_picture_is_shown_as_one(shown: list[Any]) -> None:
     for number in PICTURES:
         assert shown[number]._repr_png_().startswith(b"\x89PNG"), CELLS[number]

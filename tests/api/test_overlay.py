@@ -20,6 +20,7 @@ def cut(tmp_path: Path) -> gs.Slice:
     return gs.slice("branin", (0, 1), resolution=6, out=tmp_path / "cut")
 
 
+@pytest.mark.drawn
 def test_runs_are_laid_over_a_slice_as_they_are_or_from_their_folders(cut: gs.Slice, tmp_path: Path) -> None:
     found = gs.optimize("branin", "random", budget=8, out=tmp_path / "run")
     laid = gs.overlay(cut, [found], out=tmp_path / "over")

@@ -59,6 +59,7 @@ def test_a_table_has_a_row_for_each_episode_and_names_units(tmp_path: Path) -> N
     assert (table["status"] == "ok").all()
 
 
+@pytest.mark.drawn
 def test_a_run_is_drawn_for_a_notebook(tmp_path: Path) -> None:
     found = gs.optimize("branin", "random", budget=8, out=tmp_path / "run")
     assert found.plot()._repr_png_().startswith(b"\x89PNG")
@@ -133,6 +134,7 @@ def test_a_race_of_python_is_the_command_s(run: Callable[..., Said], tmp_path: P
     )
 
 
+@pytest.mark.drawn
 def test_a_race_has_a_table_a_picture_and_a_line(tmp_path: Path) -> None:
     found = gs.race("branin", "random", budget=6, seeds=2, out=tmp_path / "race")
     table = found.table()

@@ -71,6 +71,7 @@ def test_a_report_has_words_and_needs_gradients() -> None:
         gs.slice(bowl(), (0, 1), resolution=8, gradients=False).report()
 
 
+@pytest.mark.drawn
 def test_a_picture_shows_in_a_notebook_with_events_along_a_line(tmp_path: Path) -> None:
     cut = gs.slice("branin", (0, 1), resolution=4, out=tmp_path / "cut")
     assert cut.plot()._repr_png_().startswith(b"\x89PNG")

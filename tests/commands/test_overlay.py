@@ -49,7 +49,6 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(
-    blank: None,
     results: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],

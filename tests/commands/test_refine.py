@@ -126,6 +126,7 @@ def test_a_job_that_is_stopped_keeps_what_it_has_and_draws_it(tmp_path: Path) ->
     assert one.attrs["unresolved"] == two.attrs["unresolved"]
 
 
+@pytest.mark.drawn
 def test_pictures_draw_each_sample_as_large_as_what_it_stands_for(tmp_path: Path) -> None:
     cut = gs.slice("branin", (0, 1), resolution=65, refine=0.02, out=tmp_path / "map")
     picture = landscape_figure(cut.data)
@@ -143,6 +144,7 @@ def test_pictures_draw_each_sample_as_large_as_what_it_stands_for(tmp_path: Path
     assert len(drawn.get_xdata()) == int((line.data["status"] == Status.OK).sum()) < 257
 
 
+@pytest.mark.drawn
 def test_a_slice_says_at_its_foot_and_on_its_page_what_it_hides(tmp_path: Path) -> None:
     cut = gs.slice("pinball-2", (0, 1), resolution=12, fidelity="draft", device="cpu", out=tmp_path / "cut")
     numbers = count_numbers(cut.data)

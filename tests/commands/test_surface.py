@@ -11,7 +11,7 @@ from gradscape.cli import main
 
 @pytest.fixture
 def run(
-    blank: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> Callable[[str], tuple[int, str]]:
     monkeypatch.chdir(tmp_path)
 

@@ -29,7 +29,7 @@ Command = Callable[[str], Said]
 
 
 @pytest.fixture
-def run(blank: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+def run(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
     """Run the command in this process, in a folder of its own."""
     monkeypatch.chdir(tmp_path)
 

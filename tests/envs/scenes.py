@@ -4,6 +4,7 @@ A new one is found by its family.
 """
 
 from dataclasses import replace
+from functools import cache
 
 from gradscape.envs.base import Environment, Fidelity
 from gradscape.envs.functions import Function
@@ -11,7 +12,7 @@ from gradscape.envs.mjx.scene import MjxScene
 from gradscape.envs.mpm.fluid import Fluid
 from gradscape.envs.mpm.plasticine import Plasticine
 from gradscape.envs.newton.scene import NewtonScene
-from gradscape.envs.registry import entries, environment_class
+from gradscape.envs.registry import entries, environment_class, make
 from gradscape.envs.sheets.sheets import SheetScene
 
 COARSE = {  # families whose cheapest fidelity takes too long
@@ -45,3 +46,17 @@ SHORT = {name: {"horizon": 0.4} for name in SOFT}
 # Where vertices strike a surface their losses jump, by little but often: differences need a step between the jumps.
 SMALL_STEPS = dict.fromkeys(of_family(SheetScene), 1e-8)
 SMALL_STEPS["pinball-16"] = 1e-8  # many impacts amplify: at a slope of 5e5 m/rad, differences over 1e-6 rad err by 2 %
+
+
+def made(name: str) -> Environment:
+    """Make a scene as the contract's tests take it."""
+    return make(name, device="cpu", **SETTINGS.get(name, {}), **SHORT.get(name, {}))
+
+
+@cache
+def made_once(name: str) -> Environment:
+    """Return one such scene for all tests of a process: JAX takes up to a minute to trace one, and four to compile it.
+
+    The contract's fixture is another one.
+    """
+    return made(name)

@@ -8,7 +8,7 @@ import pytest
 
 from gradscape.envs import code
 from gradscape.envs.base import Environment
-from gradscape.envs.code import code_digest, computes_losses, find_files, find_imports
+from gradscape.envs.code import code_digest, computes_losses, find_files
 from gradscape.envs.mpm.plasticine import Plasticine
 from gradscape.envs.registry import BUILTIN, environment_class, make
 from gradscape.landscapes.code import bare
@@ -101,6 +101,16 @@ def test_another_engine_is_other_code() -> None:
     assert make("bounce", device="cpu").identity()["code"] == code_digest(environment_class("bounce"))
 
 
+def texts(name: str, folder: Path) -> list[str]:
+    return [bare(folder / one, code.NO_LOSS) for one in sorted(files_of(name, folder=folder))]
+
+
+@pytest.fixture(scope="module")
+def as_it_is() -> dict[str, list[str]]:
+    """Return the code of every scene before a test changes its copy."""
+    return {name: texts(name, code.HERE) for name in SCENES}
+
+
 @pytest.mark.parametrize(
     ("file", "added", "changes"),
     [
@@ -116,12 +126,8 @@ def test_another_engine_is_other_code() -> None:
         ("sheets/lattice.py", "G = 9.8", {"swing-velocity", "swing-stiffness", "flip"}),
     ],
 )
-def test_a_change_is_told_to_the_scenes_it_may_matter_to(copy: Path, file: str, added: str, changes: set[str]) -> None:
-    def texts(name: str) -> list[str]:
-        return [bare(copy / one, code.NO_LOSS) for one in sorted(files_of(name, folder=copy))]
-
-    before = {name: texts(name) for name in SCENES}
+def test_a_change_is_told_to_the_scenes_it_may_matter_to(
+    as_it_is: dict[str, list[str]], copy: Path, file: str, added: str, changes: set[str]
+) -> None:
     (copy / file).write_text((copy / file).read_text() + added)
-    for remembered in (bare, find_imports, computes_losses):
-        remembered.cache_clear()
-    assert {name for name in SCENES if texts(name) != before[name]} == changes
+    assert {name for name in SCENES if texts(name, copy) != as_it_is[name]} == changes

@@ -8,13 +8,9 @@ import torch
 from gradscape.envs.registry import entries, environment_class, make
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 
-from .scenes import SETTINGS, SHORT, SMALL_STEPS
+from .scenes import SMALL_STEPS, made, made_once
 
 ROWS = 5
-
-
-def made(name):
-    return make(name, device="cpu", **SETTINGS.get(name, {}), **SHORT.get(name, {}))
 
 
 @pytest.fixture(scope="module", params=sorted(entries()))
@@ -102,7 +98,8 @@ def test_an_empty_batch_gives_an_empty_evaluation(env, points):
 
 def test_the_same_point_gives_the_same_bits(env, points, result):
     assert_same_bits(env.evaluate(points), result)
-    assert_same_bits(made(env.name).evaluate(points), result)
+    assert made_once(env.name) is not env
+    assert_same_bits(made_once(env.name).evaluate(points), result)
 
 
 def test_a_second_backward_adds_the_same_gradient(env, points, result):

@@ -24,7 +24,7 @@ FIGURES = [
 
 
 @pytest.fixture
-def small(blank: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """Let all there is to make be little, and steps of time long."""
     monkeypatch.setattr("gradscape.gallery.figures.read_figures", lambda: list(FIGURES))
     for name, value in (("FRAMES", 2), ("COARSE", 4), ("DPI", 40), ("METHODS", ("random", "cma-es")), ("BUDGET", 9)):

@@ -22,6 +22,7 @@ def test_every_engine_of_the_card_is_registered_and_has_a_name_of_its_own() -> N
     assert {entries()[one.env].extra for one in ENTRANTS} >= extras
 
 
+@pytest.mark.drawn
 def test_what_is_known_to_be_right_passes(tmp_path: Path) -> None:
     found = gs.card([CONTROL], resolution=5, out=tmp_path / "card")
     (grade,) = found.grades

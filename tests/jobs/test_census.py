@@ -25,6 +25,7 @@ HOW = {"slices": 4, "resolution": 8}
 SCENE = SceneSpec("ackley", device="cpu", options={"dim": 3})
 
 
+@pytest.mark.drawn
 def test_a_census_is_written_read_and_drawn(tmp_path: Path) -> None:
     found = CensusJob.open(SCENE, **HOW, out=tmp_path / "made").run()
     assert found.losses.shape == (4, 8, 8)

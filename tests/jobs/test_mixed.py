@@ -118,7 +118,6 @@ def settings(found: MixedTradeoff, number: int) -> tuple[float, int]:
     return round(1 / chosen["dt"]), chosen["resolution"]
 
 
-@pytest.mark.usefixtures("blank")
 def test_the_known_optimum_is_found_and_nothing_dearer_than_the_limit_is_measured(tmp_path: Path) -> None:
     found = search(tmp_path / "s")
     assert found.complete
@@ -134,7 +133,6 @@ def test_the_known_optimum_is_found_and_nothing_dearer_than_the_limit_is_measure
     assert eval(found.lines[0].split(":", 1)[1].rstrip(","), {"Fidelity": Fidelity}).dt == 1 / settings(found, 0)[0]
 
 
-@pytest.mark.usefixtures("blank")
 def test_a_variant_that_fails_is_given_up_at_the_first_points_and_never_chosen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -194,7 +192,6 @@ def test_the_verb_prints_both_names_draws_and_goes_on_after_a_stop(
     assert json.loads(run(*words, "--out", "half", cwd=tmp_path).stdout)["choices"] == ours["choices"]
 
 
-@pytest.mark.usefixtures("blank")
 def test_a_budget_ends_the_search_and_says_so(tmp_path: Path) -> None:
     found = search(tmp_path / "s", budget=1e-6)
     assert not found.complete
@@ -203,7 +200,6 @@ def test_a_budget_ends_the_search_and_says_so(tmp_path: Path) -> None:
     assert {found.choices[0].variant, found.choices[0].kept} == {"draft", False}
 
 
-@pytest.mark.usefixtures("blank")
 def test_where_the_limit_leaves_none_the_nearest_is_taken(tmp_path: Path) -> None:
     found = search(tmp_path / "s", at_most=1.0)
     draft = found.choices[0]
@@ -214,7 +210,6 @@ def test_where_the_limit_leaves_none_the_nearest_is_taken(tmp_path: Path) -> Non
     assert draft.shortfall == short[draft.variant] > 1
 
 
-@pytest.mark.usefixtures("blank")
 def test_gradients_count_unless_the_motion_is_chaotic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     finer = Trading.fidelities | {"draft": Fidelity("draft", dt=1 / 10, resolution=8)}
     monkeypatch.setattr(Trading, "fidelities", finer)
@@ -229,7 +224,6 @@ def test_gradients_count_unless_the_motion_is_chaotic(tmp_path: Path, monkeypatc
     assert loose.chaotic
 
 
-@pytest.mark.usefixtures("blank")
 def test_an_option_that_makes_it_cheaper_is_told_but_not_chosen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,6 +11,7 @@ AT = torch.tensor([[[0.0, 0.1, 0.0]], [[1.0, 0.3, 0.0]], [[2.0, 0.1, 0.5]]])
 EPISODE = Episode(torch.tensor([0.0, 0.5, 1.0]), {"ball": AT}, parts=(Part("sphere", "rubber", AT, (0.1,)),))
 
 
+@pytest.mark.drawn
 def test_an_episode_shows_its_key_frames_in_a_notebook_without_pyplot() -> None:
     picture = EPISODE.show(keys=2)
     assert picture._repr_png_().startswith(b"\x89PNG")

@@ -145,6 +145,7 @@ def test_runs_of_other_parameters_and_lines_are_refused():
         overlay(line, [run(SPREAD, [0] * 30)])
 
 
+@pytest.mark.drawn
 def test_runs_of_one_method_and_seed_are_told_apart():
     tables = [run(SPREAD, [0] * 30), run(SPREAD, [0] * 30), run(SPREAD, [0] * 30, seed=1)]
     assert [laid.attrs["label"] for laid in overlay(SLICE, tables)] == ["bo-leap-s0-1", "bo-leap-s0-2", "bo-leap-s1"]
@@ -193,6 +194,7 @@ def test_kinds_have_their_markers_and_descents_their_lines():
     np.testing.assert_allclose(by_count[5].get_colors()[0, :3], to_rgba(style.METHODS["descents"]["color"])[:3])
 
 
+@pytest.mark.drawn
 def test_failures_are_crosses_and_neither_points_nor_best():
     (crosses,) = drawn(MAP, "failed")
     np.testing.assert_array_equal(crosses.get_offsets(), np.stack([LAID[0]["u"], LAID[0]["v"]], 1)[-2:])
@@ -204,6 +206,7 @@ def test_failures_are_crosses_and_neither_points_nor_best():
     assert "bo-leap, seed 0: no episode succeeded" in [text.get_text() for text in figure.legends[0].get_texts()]
 
 
+@pytest.mark.drawn
 def test_points_beyond_the_map_are_hollow_at_its_border_and_counted():
     small = Plane.through(SPACE, SPACE.center, ("speed", "force"), resolution=5, extent=0.5)
     dataset = sample(Bowl(), small)
@@ -256,6 +259,7 @@ def test_distances_have_their_unit_wherever_they_are_written():
 
 
 @pytest.mark.parametrize("count", [1, 12])
+@pytest.mark.drawn
 def test_what_was_the_best_so_far_is_joined_in_its_order_and_numbered_where_there_is_room(count):
     tables = [
         run(np.random.default_rng(seed).uniform(-0.7, 0.7, (30, 3)), [1] * 30, seed=seed) for seed in range(count)

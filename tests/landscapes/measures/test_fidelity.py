@@ -175,6 +175,7 @@ def figure(tmp_path: Any) -> Figure:
     return drawn
 
 
+@pytest.mark.drawn
 def test_the_picture_draws_the_front_and_stands_broken_rungs_on_the_edge(figure: Figure) -> None:
     (ax,) = figure.axes
     lines = {line.get_gid(): line for line in ax.lines if line.get_gid()}
@@ -185,6 +186,7 @@ def test_the_picture_draws_the_front_and_stands_broken_rungs_on_the_edge(figure:
     assert "dt (1 failed too often: on the edge)" in [text.get_text() for text in legend.get_texts()]
 
 
+@pytest.mark.drawn
 def test_no_legend_is_wider_than_its_page(tmp_path: Any) -> None:
     lost = [
         rung(f"{ladder} {number}", 0.05, None, ladder) for ladder in ("resolution", "particles") for number in range(12)
@@ -200,6 +202,7 @@ def test_no_legend_is_wider_than_its_page(tmp_path: Any) -> None:
     assert 0 <= box.x0 < box.x1 <= drawn.bbox.width
 
 
+@pytest.mark.drawn
 def test_names_of_fidelities_cover_nothing(figure: Figure) -> None:
     (ax,) = figure.axes
     names = [text for text in ax.texts if text.get_text() in ("draft", "standard")]
@@ -215,6 +218,7 @@ def test_names_of_fidelities_cover_nothing(figure: Figure) -> None:
 
 @pytest.mark.parametrize("width", [None, 85.0])
 @pytest.mark.parametrize("crowd", [0, 8])
+@pytest.mark.drawn
 def test_every_rung_is_named_beside_its_mark_or_by_number_in_the_legend(width: float | None, crowd: int) -> None:
     crowded = [rung(f"standard-resolution-{n}", 1.0 + 0.02 * n, 0.021 + 0.002 * n, "resolution") for n in range(crowd)]
     report = {**REPORT, "rungs": [*REPORT["rungs"], *crowded]}

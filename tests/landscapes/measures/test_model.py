@@ -98,6 +98,7 @@ PARTS = {f"part {number}": 0.01 * 1.1**number for number in range(9)} | {"nothin
 
 
 @pytest.mark.parametrize("width", [None, 85.0])
+@pytest.mark.drawn
 def test_every_part_is_named_once_and_no_name_covers_another(width: float | None) -> None:
     picture = model_figure(study(PARTS, failing=True), width=width)
     found = names(picture)
@@ -109,6 +110,7 @@ def test_every_part_is_named_once_and_no_name_covers_another(width: float | None
     assert not any(a.overlaps(b) for number, a in enumerate(boxes) for b in boxes[:number])
 
 
+@pytest.mark.drawn
 def test_missing_parts_are_hollow_and_what_cannot_be_placed_is_on_the_edges() -> None:
     (ax,) = model_figure(study({"drag": 1.0, "nothing": 0.0, "not there": 5.0}, failing=True)).axes
     marks = [line for line in ax.lines if len(line.get_xdata()) == 1]

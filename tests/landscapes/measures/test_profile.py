@@ -101,6 +101,7 @@ def test_no_more_is_evaluated_than_is_announced() -> None:
 
 
 @pytest.mark.parametrize("dims", [(0, 1), (0,)])
+@pytest.mark.drawn
 def test_the_picture_of_gradient_quality_is_written(tmp_path: Path, dims: tuple[int, ...]) -> None:
     space = ParameterSpace.box(("x", "y"), -1.0, 1.0, "m")
     objective = from_torch(lambda x: torch.where(x[:, 0] > 0.8, torch.nan, rastrigin(x)), space, name="half [a] $x$")
