@@ -22,7 +22,7 @@ from ..base import Kind, Optimizer, Points, Proposal
 from ..memory import FLOAT, SearchSize
 from ..options import MANY, MethodOptions, number
 from ..processes import compute_drawing
-from .bound import NEAR, SPREAD, NegativeBound, exclusive, least_point, unit
+from .bound import NEAR, SPREAD, LowerBound, exclusive, least_point, unit
 from .surrogate import ARRAYS, GROWTH, fitted, select, with_parameters
 
 ROWS, LEAST = 1000, 20  # losses and slopes that are modelled; points of them at least: so many parameters at most
@@ -136,7 +136,7 @@ def _minimise(
         if fit:
             hyper = fitted(condition(max(LEAST, FIT_ROWS // rows.shape[1])))
         held = first if len(loss) <= points else None
-        return least_point(NegativeBound(condition(points).eval(), coefficient, held), z, loss, random), hyper
+        return least_point(LowerBound(condition(points).eval(), coefficient, held), z, loss, random), hyper
 
 
 def standardised(loss: Points, grad: Points) -> Points:
