@@ -92,6 +92,9 @@ class BOGradient(Optimizer):
         self.z, self.grad = np.concatenate([self.z, z]), np.concatenate([self.grad, grad])
         self.loss = np.concatenate([self.loss, loss])
 
+    def _inform(self, z: Points, loss: Points, grad: Points | None) -> None:
+        self._tell(z, loss, grad)
+
 
 class GradientProcess(ExactGP, GPyTorchModel):  # type: ignore[misc]
     """A Gaussian process of a function with zero mean and its slopes, of points in [0, 1]^dim."""
