@@ -12,6 +12,7 @@ import typer
 
 from ..jobs.scene import SceneSpec
 from .arguments import Along, Extent, Json, NoGradients, SomeDims, Through, read_extent, takes_scene
+from .plan_race import print_race_plan
 
 if TYPE_CHECKING:
     from ..gallery.figures import Figure
@@ -37,13 +38,30 @@ def plan(
     through: Through = "center",
     extent: Extent = None,
     no_gradients: NoGradients = False,
-    workers: Annotated[int, typer.Option(min=1, help="Workers, each with a device such as this one.")] = 1,
+    methods: Annotated[
+        list[str] | None,
+        typer.Option(help="Plan a race of these methods, a,b or repeated, or of all, as for `landscape race`."),
+    ] = None,
+    seeds: Annotated[int | None, typer.Option(min=1, help="Seeds of a race's methods, by default 10.")] = None,
+    budget: Annotated[int | None, typer.Option(min=1, help="Episodes of a race's runs, by default 1000.")] = None,
+    option: Annotated[
+        list[str] | None, typer.Option(help="A method's option, METHOD.NAME=VALUE; may be repeated.")
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Workers, each with a device such as this one, by default 1; of a race, processes that compute "
+            "Gaussian processes, by default one a core.",
+        ),
+    ] = None,
     json_: Json = False,
 ) -> None:
-    """Predict episodes, time, memory and disk of a slice, a sweep or the gallery's slices, without making them.
+    """Predict episodes, time, memory and disk of a slice, a sweep, the gallery's slices or a race, without making them.
 
     Without --dims and --along it is of parameters 0 and 1. A few episodes, tiles and pictures are made and thrown away;
-    nothing is written. For a CUDA device that is not here, what `landscape tradeoff` kept of one counts.
+    nothing is written. For a CUDA device that is not here, what `landscape tradeoff` kept of one counts. With --methods
+    it is of a race, and each method searches a made-up landscape a little; then --seeds and --budget count.
 
     Example: landscape plan fluid --dims 6 8 --resolution 48 --fidelity standard
     """
@@ -52,6 +70,11 @@ def plan(
     from .terminal import Bars, command_line, print_json
 
     bars, scene = Bars(), replace(scene, name=what)
+    cut = bool(dims or along or over or extent or resolution or no_gradients or through != "center")
+    if methods or seeds or budget or option:
+        print_race_plan(scene, methods or [], option or [], seeds, budget, workers, began=began, cut=cut, as_json=json_)
+        return
+    workers = workers or 1
     if what.endswith(".toml"):
         _refuse_more(bool(over or extent or scene.options or along or through != "center"))
         jobs = _figure_jobs(what, resolution, scene, grad=not no_gradients)

@@ -65,8 +65,8 @@ def race(
 
     if workers and scheduler:
         raise ValueError(f"--scheduler has workers of its own, so --workers is left out; got {workers}")
-    chosen = check_methods([name.strip() for text in methods or [] for name in text.split(",") if name.strip()])
-    bars, options = Bars(), _read_options(option or [], chosen)
+    chosen = check_methods(read_names(methods or []))
+    bars, options = Bars(), read_method_options(option or [], chosen)
     env = scene.make(bars)
     how: dict[str, Any] = {"out": Path(out) if out else None, "force": force, "prints": print_ or [], "watch": bars}
     how |= {
@@ -86,7 +86,12 @@ def race(
     bars.note(f"{job.folder}: {', '.join(summary.files)}")
 
 
-def _read_options(settings: Sequence[str], chosen: Sequence[str]) -> dict[str, dict[str, str]]:
+def read_names(texts: Sequence[str]) -> list[str]:
+    """Return names given as a,b or repeated."""
+    return [name.strip() for text in texts for name in text.split(",") if name.strip()]
+
+
+def read_method_options(settings: Sequence[str], chosen: Sequence[str]) -> dict[str, dict[str, str]]:
     """Return options given as METHOD.NAME=VALUE, method -> name -> value. Raises ValueError for other methods'."""
     from ..optim.registry import methods
 

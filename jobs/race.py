@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import cloudpickle
 
-from ..landscapes.cost import EpisodeCost, duration, episode_cost, seconds_per_episode
+from ..landscapes.cost import EpisodeCost, duration, episode_cost
 from ..landscapes.plain import plain
 from ..landscapes.sampling.distribution import make_objective as objective_of
 from ..landscapes.sampling.distribution import run_tasks, workers_of
@@ -251,24 +251,26 @@ class RaceJob:
             cost, seconds = self._cost(left)
         known = [one.run.gradient_cost for one in self.competitors if one.run.gradient_cost]
         kept = f", {whole - sum(left.values())} are there already" if sum(left.values()) < whole else ""
-        watch.note(f"{racers}: {sum(left.values())} episodes to compute{kept}: {seconds}, and what the methods take")
+        watch.note(f"{racers}: {sum(left.values())} episodes to compute{kept}: {seconds}")
         return (known[0] if known else cost.ratio) if any(needs.values()) else None
 
     def _cost(self, left: Mapping[int, int]) -> tuple[EpisodeCost, str]:
-        """Measure an episode alone, and say what so many take, without gradients and with: in lockstep, or by workers.
+        """Measure an episode alone, and say what the race takes: in lockstep, or by workers.
 
-        A method that asks for gradients asks for them of some of its points only, and all are counted with.
+        Of workers, all episodes of a method that asks for gradients are counted with.
         """
+        from .plan_race import outlook
+
         grad = left[1] > 0
         if self.executor is not None:
             (alone,) = run_tasks(self.executor, _cost_there, [(cloudpickle.dumps(recipe(self.env)), grad)])
             whole = left[0] * alone.forward + (left[1] * alone.gradient if grad else 0.0)
-            return alone, f"{duration(whole)} one by one, by {workers_of(self.executor)} workers"
-        alone, abreast = episode_cost(self.env, grad=grad), sum(self._count_left(one) > 0 for one in self.competitors)
-        x = self.env.space.uniform(min(abreast, self.env.preferred_batch), seed=0)
-        ways = [way for way in (0, 1) if left[way]]
-        each = sum(left[way] * seconds_per_episode(self.env, x, grad=bool(way)) for way in ways)
-        return alone, f"{duration(each)} in batches of one point a run"
+            by = workers_of(self.executor)
+            return alone, f"{duration(whole)} one by one, by {by} workers, and what the methods take"
+        runs = [one for one in self.competitors if self._count_left(one)]
+        counts = {one.method: [self._count_left(other) for other in runs if other.method == one.method] for one in runs}
+        makers = {one.method: one.make for one in runs}
+        return episode_cost(self.env, grad=grad), outlook(self.env, makers, counts, self.budget, workers=self.workers)
 
     def _count_left(self, one: Competitor) -> int:
         return max(0, self.budget - one.run.count)

@@ -92,6 +92,20 @@ class Optimizer(abc.ABC):
     @final
     def tell(self, x: Float[Tensor, "count dim"], evaluation: Evaluation) -> None:
         """Take what the points that were asked for came out as; `x` are all of them, in their order."""
+        self._tell(*self._take_in(x, evaluation))
+
+    @final
+    def inform(self, x: Float[Tensor, "count dim"], evaluation: Evaluation) -> None:
+        """Take in points that it did not ask for, before it asks: what later proposals take is measured by that."""
+        self._inform(*self._take_in(x, evaluation))
+
+    @property
+    def remembers(self) -> bool:
+        """Whether what a proposal takes depends on all points so far, so that `inform` makes it that of a late one."""
+        return type(self)._inform is not Optimizer._inform
+
+    def _take_in(self, x: Float[Tensor, "count dim"], evaluation: Evaluation) -> tuple[Points, Points, Points | None]:
+        """Return points and what they came out as, as the hooks see them."""
         ok = (evaluation.status == Status.OK).numpy()
         loss = np.where(ok, evaluation.loss.numpy(), math.inf)
         if ok.any():
@@ -100,8 +114,7 @@ class Optimizer(abc.ABC):
             self._told_any = True
         half = ((self.space.upper - self.space.lower) / 2).numpy()
         grad = None if evaluation.grad is None else np.where(ok[:, None], evaluation.grad.numpy() * half, 0.0)
-        z = (2.0 * self.space.to_unit(x) - 1.0).numpy()
-        self._tell(z, loss, grad)
+        return (2.0 * self.space.to_unit(x) - 1.0).numpy(), loss, grad
 
     @final
     def state(self) -> dict[str, Any]:
@@ -133,6 +146,9 @@ class Optimizer(abc.ABC):
     def penalise(self, loss: Points) -> Points:
         """Return losses for models that take finite numbers only: a failure counts as the worst loss so far."""
         return np.where(np.isfinite(loss), loss, self.worst)
+
+    def _inform(self, z: Points, loss: Points, grad: Points | None) -> None:  # noqa: B027 -- most do not remember
+        """Take in points as `_tell` does, of a method that keeps all of them."""
 
     def _setup(self) -> None:  # noqa: B027 -- nothing, for the simplest methods
         """Prepare the first `_ask`."""

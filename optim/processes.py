@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 
 _pool: ProcessPoolExecutor | None = None
+_seconds = 0.0  # see `seconds_computed`
 
 
 @contextmanager
@@ -39,7 +41,18 @@ def processes(count: int) -> Iterator[None]:
 
 def compute(function: Callable[..., Result], *arguments: Any) -> Result:
     """Return what a function of a module returns, computed by a process if there are any, and here otherwise."""
-    return function(*arguments) if _pool is None else _pool.submit(function, *arguments).result()
+    global _seconds
+    if _pool is not None:
+        return _pool.submit(function, *arguments).result()
+    began = time.perf_counter()
+    result = function(*arguments)
+    _seconds += time.perf_counter() - began
+    return result
+
+
+def seconds_computed() -> float:
+    """Return how long `compute` has taken here [s]: what processes would take over. It is of one thread's calls."""
+    return _seconds
 
 
 def compute_drawing(random: np.random.Generator, function: Callable[..., Result], *arguments: Any) -> Result:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from .base import Optimizer
 
 GROUP = "gradscape.optimizers"
-NO_NUMBERS = frozenset({"memory"})  # functions of a method that no point depends on
+NO_NUMBERS = frozenset({"memory", "inform", "_inform", "remembers"})  # functions of a method that no point depends on
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,9 @@ class BO(Optimizer):
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
         self.surrogate.add(z, loss)
 
+    def _inform(self, z: Points, loss: Points, grad: Points | None) -> None:
+        self.surrogate.add(z, loss)
+
     def _state(self) -> dict[str, Any]:
         return {"surrogate": self.surrogate.state()}
 
@@ -86,6 +89,9 @@ class BODescents(Optimizer):
         self.descent.tell(float(loss[0]), grad[0])
         if self.descent.done:
             self.descent = None
+
+    def _inform(self, z: Points, loss: Points, grad: Points | None) -> None:
+        self.surrogate.add(z, loss)
 
     def _state(self) -> dict[str, Any]:
         return {"surrogate": self.surrogate.state(), "descent": self.descent and self.descent.state()}

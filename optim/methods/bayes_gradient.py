@@ -22,7 +22,7 @@ from ..base import Kind, Optimizer, Points, Proposal
 from ..memory import FLOAT, SearchSize
 from ..options import MANY, MethodOptions, number
 from ..processes import compute_drawing
-from .bound import NEAR, SPREAD, NegativeBound, exclusive, least_point, unit
+from .bound import NEAR, SPREAD, LowerBound, exclusive, least_point, unit
 from .surrogate import ARRAYS, GROWTH, fitted, select, with_parameters
 
 ROWS, LEAST = 1000, 20  # losses and slopes that are modelled; points of them at least: so many parameters at most
@@ -92,6 +92,9 @@ class BOGradient(Optimizer):
         self.z, self.grad = np.concatenate([self.z, z]), np.concatenate([self.grad, grad])
         self.loss = np.concatenate([self.loss, loss])
 
+    def _inform(self, z: Points, loss: Points, grad: Points | None) -> None:
+        self._tell(z, loss, grad)
+
 
 class GradientProcess(ExactGP, GPyTorchModel):  # type: ignore[misc]
     """A Gaussian process of a function with zero mean and its slopes, of points in [0, 1]^dim."""
@@ -136,7 +139,7 @@ def _minimise(
         if fit:
             hyper = fitted(condition(max(LEAST, FIT_ROWS // rows.shape[1])))
         held = first if len(loss) <= points else None
-        return least_point(NegativeBound(condition(points).eval(), coefficient, held), z, loss, random), hyper
+        return least_point(LowerBound(condition(points).eval(), coefficient, held), z, loss, random), hyper
 
 
 def standardised(loss: Points, grad: Points) -> Points:

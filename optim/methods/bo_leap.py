@@ -93,6 +93,9 @@ class BOLeap(Optimizer):
             self.local.leap(self.descent.at)
             self.descent = None
 
+    def _inform(self, z: Points, loss: Points, grad: Points | None) -> None:
+        self.surrogate.add(z, loss)
+
     def _state(self) -> dict[str, Any]:
         return {
             "surrogate": self.surrogate.state(),

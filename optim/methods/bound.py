@@ -5,15 +5,16 @@ from __future__ import annotations
 import threading
 import warnings
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, cast
+from dataclasses import dataclass
+from typing import Any, Protocol, cast
 
 import numpy as np
 import torch
-from botorch.acquisition.acquisition import AcquisitionFunction
 from botorch.exceptions.warnings import BotorchWarning
-from botorch.optim.optimize import optimize_acqf
+from botorch.optim.batched_lbfgs_b import fmin_l_bfgs_b_batched
+from gpytorch.kernels import Kernel
 from gpytorch.models import ExactGP
 from gpytorch.utils.warnings import GPInputWarning
 from jaxtyping import Float
@@ -22,107 +23,189 @@ from linear_operator.utils.warnings import NumericalWarning
 from torch import Tensor
 
 from ..base import Points
+from .radial import Matrix, Pull, Radial
 
 STEPS = 30  # of L-BFGS on the bound, from each start
 STARTS, SPREAD, NEAR, JITTER = 6, 128, 32, 0.02  # of the search for its least value: see `_starts`
-KEPT = 64  # roots; fewer than the searches that go on abreast would be lost before they are asked for again
+KEPT = 64  # factors; fewer than the searches that go on abreast would be lost before they are asked for again
 # GPyTorch's settings and Python's warning filters belong to the process, not to a thread.
 ONE_AT_A_TIME = threading.RLock()
-_roots: OrderedDict[tuple[Any, ...], Tensor] = OrderedDict()  # by kernel and bytes of points, noise, parameters
+_factors: OrderedDict[tuple[Any, ...], Tensor] = OrderedDict()  # by kernel and bytes of points, noise, parameters
 
 
-class NegativeBound(AcquisitionFunction):
-    """The lower confidence bound's negative, which BoTorch makes as large as it can.
+class Covariance(Protocol):
+    """What a bound asks of a kernel, of `rows` rows for each point."""
 
-    It is that of BoTorch's `UpperConfidenceBound` for a model of one function, alone or with its slopes, with zero mean
-    and a variance of one where nothing is known, whose parameters are not transformed. What does not change from point
-    to point is computed once: weights of what is known, and a root of the inverse covariance. The root of the `first`
-    points, which the process was fitted to, is kept for the next bound of the same process.
+    def dense(self, u: Float[Tensor, "point dim"], v: Float[Tensor, "other dim"]) -> Matrix:
+        """Return the covariances of all rows of points."""
+
+    def across(self, u: Float[Tensor, "point dim"], v: Float[Tensor, "other dim"]) -> tuple[Matrix, Pull]:
+        """Return those of the points' values with all rows of others, and what pulls slopes by them back to `u`."""
+
+
+@dataclass(frozen=True)
+class Differentiated:
+    """Any kernel of GPyTorch, by reverse differentiation; the first of a point's rows is its value."""
+
+    kernel: Kernel
+    rows: int
+
+    def dense(self, u: Float[Tensor, "point dim"], v: Float[Tensor, "other dim"]) -> Matrix:
+        """Return the covariances of all rows of points."""
+        return cast(Tensor, self.kernel(u, v).to_dense().detach())
+
+    def across(self, u: Float[Tensor, "point dim"], v: Float[Tensor, "other dim"]) -> tuple[Matrix, Pull]:
+        """Return those of the points' values with all rows of others, and what pulls slopes by them back to `u`."""
+        with torch.enable_grad():
+            at = u.detach().clone().requires_grad_()
+            found = self.kernel(at, v).to_dense()[:: self.rows]
+        return found.detach(), lambda weights: torch.autograd.grad(found, at, weights)[0]
+
+
+class LowerBound:
+    """The lower confidence bound of a process, in standard deviations of the losses from their average.
+
+    It is that of BoTorch's `UpperConfidenceBound` with `maximize=False`, before the losses' scale is put back: of a
+    model of one function, alone or with its slopes, with zero mean and a variance of one where nothing is known. What
+    does not change from point to point is computed once: weights of what is known, and a factor of the covariance.
+    That of the `first` points, which the process was fitted to, is kept for the next bound of the same process.
     """
 
     def __init__(self, model: ExactGP, coefficient: float, first: int | None = None) -> None:
-        super().__init__(model)
         known: Any = model  # which of its parts are modules, torch's types do not say
         self.coefficient = coefficient
-        self.kernel, self.known = known.covar_module, known.train_inputs[0]
+        self.known = known.train_inputs[0]
+        values = known.train_targets.reshape(-1)
+        rows = len(values) // len(self.known)
         with torch.no_grad():
-            values = known.train_targets.reshape(-1)
-            self.root = inverse_root(self.kernel, self.known, known.likelihood.noise, first)
-            self.weights = self.root @ (self.root.T @ values)
-        self.rows = len(values) // len(self.known)  # of a point: its value, and slopes where they are modelled
-        scale = getattr(known, "outcome_transform", None)
-        self.mean: Tensor | float = scale.means.squeeze() if scale else 0.0
-        self.spread: Tensor | float = scale.stdvs.squeeze() if scale else 1.0
+            kernel, noise = known.covar_module, known.likelihood.noise.detach()
+            self.covariance: Covariance = Radial.of(kernel) if rows == 1 else Differentiated(kernel, rows)
+            parameters = list(kernel.state_dict().values())
+            self.factor = Factor.of(self.covariance, self.known, noise, first, parameters)
+            self.weights = self.factor.solve_whitened(self.factor.whiten(values[None]))[0]
 
-    def forward(self, X: Float[Tensor, "count 1 dim"]) -> Float[Tensor, " count"]:
-        """Return coefficient * standard deviation - mean."""
-        covariance = self.kernel(X[:, 0], self.known).to_dense()[:: self.rows]
-        variance = 1.0 - (covariance @ self.root).square().sum(dim=1)
-        bound = self.coefficient * variance.clamp_min(1e-20).sqrt() - covariance @ self.weights
-        return cast(Tensor, self.spread * bound - self.mean)
+    @torch.no_grad()
+    def __call__(self, u: Float[Tensor, "count dim"]) -> Float[Tensor, " count"]:
+        """Return mean - coefficient * standard deviation at points."""
+        covariance = self.covariance.across(u, self.known)[0]
+        deviation = _deviation(self.factor.whiten(covariance))
+        return covariance @ self.weights - self.coefficient * deviation
+
+    @torch.no_grad()
+    def with_slope(self, u: Float[Tensor, "count dim"]) -> tuple[Float[Tensor, " count"], Float[Tensor, "count dim"]]:
+        """Return the bound at points, and its slopes there."""
+        covariance, pull = self.covariance.across(u, self.known)
+        white = self.factor.whiten(covariance)
+        deviation = _deviation(white)
+        # variance = 1 - c K^-1 c, so that the deviation's slope by c is -K^-1 c / deviation
+        by_covariance = self.weights + self.factor.solve_whitened(white) * (self.coefficient / deviation)[:, None]
+        return covariance @ self.weights - self.coefficient * deviation, pull(by_covariance)
 
 
-def inverse_root(
-    kernel: Any, points: Float[Tensor, "point dim"], noise: Tensor, first: int | None
-) -> Float[Tensor, "row row"]:
-    """Return R, upper triangular, with R R^T the inverse of the points' covariance and noise.
+def _deviation(white: Matrix) -> Float[Tensor, " count"]:
+    return (1.0 - white.square().sum(dim=1)).clamp_min(1e-20).sqrt()
 
-    That of the first points is computed once for each process and so many of them; R of all follows by blocks.
+
+@dataclass(frozen=True)
+class Factor:
+    """The Cholesky factor L of a covariance with noise, in blocks: `head` of the first rows, `across` and `own` below.
+
+    To solve with it takes half as long as to multiply with its inverse, for the few points that a bound is asked of.
     """
-    if first is None:
-        return _root_of(kernel(points).to_dense(), noise)
-    head, tail = points[:first], points[first:]
-    known = _kept_root(kernel, head, noise)
-    if not len(tail):
-        return known
-    across = kernel(tail, head).to_dense() @ known
-    own = _root_of(kernel(tail).to_dense() - across @ across.T, noise)
-    root = torch.zeros((len(known) + len(own),) * 2, dtype=torch.float64)
-    root[: len(known), : len(known)] = known
-    root[: len(known), len(known) :] = -known @ (across.T @ own)
-    root[len(known) :, len(known) :] = own
-    return root
+
+    head: Matrix
+    across: Matrix
+    own: Matrix
+
+    @classmethod
+    def of(
+        cls,
+        covariance: Covariance,
+        points: Float[Tensor, "point dim"],
+        noise: Tensor,
+        first: int | None,
+        parameters: Sequence[Tensor],
+    ) -> Factor:
+        """Return the factor for points; that of the `first` is computed once for each process and so many of them.
+
+        `parameters` are all that the covariance depends on beside the points.
+        """
+        head, tail = points[:first], points[len(points) if first is None else first :]
+        keys = None if first is None else (head, noise, *parameters)
+        known = _head_of(covariance, head, noise, keys)
+        if not len(tail):
+            return cls(known, known[:0], known[:0, :0])
+        across = _solve(known, covariance.dense(head, tail)).T
+        return cls(known, across, _factor_of(covariance.dense(tail, tail) - across @ across.T, noise))
+
+    def whiten(self, rows: Matrix) -> Matrix:
+        """Return L^-1 times the transpose of rows, transposed: their squares add up to what rows explain."""
+        count = len(self.head)
+        first = _solve(self.head, rows[:, :count].T)
+        if not len(self.own):
+            return first.T
+        last = _solve(self.own, rows[:, count:].T - self.across @ first)
+        return torch.cat([first, last]).T
+
+    def solve_whitened(self, rows: Matrix) -> Matrix:
+        """Return L^-T times the transpose of rows, transposed: of whitened rows, the inverse covariance times rows."""
+        count = len(self.head)
+        if not len(self.own):
+            return _solve_transposed(self.head, rows.T).T
+        last = _solve_transposed(self.own, rows[:, count:].T)
+        first = _solve_transposed(self.head, rows[:, :count].T - self.across.T @ last)
+        return torch.cat([first, last]).T
 
 
-def _kept_root(kernel: Any, points: Float[Tensor, "point dim"], noise: Tensor) -> Float[Tensor, "row row"]:
-    arrays = (points, noise, *kernel.state_dict().values())
-    key = (type(kernel), *(array.detach().contiguous().numpy().tobytes() for array in arrays))
-    if key not in _roots:
-        _roots[key] = _root_of(kernel(points).to_dense(), noise)
-    _roots.move_to_end(key)
-    if len(_roots) > KEPT:
-        _roots.popitem(last=False)
-    return _roots[key]
+def _head_of(
+    covariance: Covariance, points: Float[Tensor, "point dim"], noise: Tensor, keys: Sequence[Tensor] | None
+) -> Matrix:
+    """Return the factor for points, kept for the next time if there is something to know it by."""
+    if keys is None:
+        return _factor_of(covariance.dense(points, points), noise)
+    kind = covariance.profile if isinstance(covariance, Radial) else type(covariance)
+    key = (kind, *(array.detach().contiguous().numpy().tobytes() for array in keys))
+    if key not in _factors:
+        _factors[key] = _factor_of(covariance.dense(points, points), noise)
+    _factors.move_to_end(key)
+    if len(_factors) > KEPT:
+        _factors.popitem(last=False)
+    return _factors[key]
 
 
-def _root_of(covariance: Float[Tensor, "row row"], noise: Tensor) -> Float[Tensor, "row row"]:
-    one = torch.eye(len(covariance), dtype=torch.float64)
-    lower = psd_safe_cholesky(covariance + noise * one)
-    return cast(Tensor, torch.linalg.solve_triangular(lower, one, upper=False).T.contiguous())
+def _factor_of(covariance: Matrix, noise: Tensor) -> Matrix:
+    covariance.diagonal().add_(noise)
+    return cast(Tensor, psd_safe_cholesky(covariance))
 
 
-def least_point(bound: NegativeBound, z: Points, loss: Points, random: np.random.Generator) -> Points:
+def _solve(lower: Matrix, columns: Matrix) -> Matrix:
+    return cast(Tensor, torch.linalg.solve_triangular(lower, columns, upper=False))
+
+
+def _solve_transposed(lower: Matrix, columns: Matrix) -> Matrix:
+    return cast(Tensor, torch.linalg.solve_triangular(lower.T, columns, upper=True))
+
+
+def least_point(bound: LowerBound, z: Points, loss: Points, random: np.random.Generator) -> Points:
     """Return where in [-1, 1]^dim the bound is least, shape (dim,), given the points z and their losses so far."""
-    best, _ = optimize_acqf(
-        bound,
-        bounds=torch.tensor([[0.0], [1.0]], dtype=torch.float64).expand(2, z.shape[1]),
-        q=1,
-        num_restarts=STARTS,
-        batch_initial_conditions=_starts(bound, z, loss, random)[:, None],
-        options={"maxiter": STEPS},
-        retry_on_optimization_warning=False,
-    )
-    return np.asarray(2.0 * best[0].numpy() - 1.0)
+
+    def at(x: Points) -> tuple[Points, Points]:
+        value, slope = bound.with_slope(torch.from_numpy(x))
+        return value.numpy(), slope.numpy()
+
+    starts = _starts(bound, z, loss, random).numpy()
+    minimise: Any = fmin_l_bfgs_b_batched  # untyped
+    found, least, _ = minimise(at, starts, bounds=[(0.0, 1.0)] * z.shape[1], maxiter=STEPS)
+    return np.asarray(2.0 * found[np.argmin(least)] - 1.0)
 
 
-def _starts(bound: NegativeBound, z: Points, loss: Points, random: np.random.Generator) -> Float[Tensor, "start dim"]:
+def _starts(bound: LowerBound, z: Points, loss: Points, random: np.random.Generator) -> Float[Tensor, "start dim"]:
     """Return where the search for the least bound starts: the best of many points all over, and near the best."""
     leaders = z[np.argsort(loss, kind="stable")[:8]]
     near = np.resize(leaders, (NEAR, z.shape[1])) + 2 * JITTER * random.standard_normal((NEAR, z.shape[1]))
     near[: len(leaders)] = leaders
     groups = (random.uniform(-1.0, 1.0, (SPREAD, z.shape[1])), near.clip(-1.0, 1.0))
-    with torch.no_grad():
-        return torch.cat([u[bound(u[:, None]).topk(STARTS // 2).indices] for u in map(unit, groups)])
+    return torch.cat([u[bound(u).topk(STARTS // 2, largest=False).indices] for u in map(unit, groups)])
 
 
 def unit(z: Points) -> Float[Tensor, "count dim"]:

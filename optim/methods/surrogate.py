@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar, get_args, get_type_hints
 
@@ -15,13 +15,15 @@ from gpytorch.means import ZeroMean
 from gpytorch.mlls import ExactMarginalLogLikelihood
 from gpytorch.models import ExactGP
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ..base import Points
 from ..memory import FLOAT, SearchSize
 from ..options import MANY, MethodOptions, number
 from ..processes import compute_drawing
-from .bound import NEAR, SPREAD, NegativeBound, exclusive, least_point, unit
+from .bound import NEAR, SPREAD, LowerBound, exclusive, least_point, unit
 from .magnitude import tame
+from .radial import Radial, marginal_likelihood
 
 Rows = NDArray[np.intp]
 Process = TypeVar("Process", bound=ExactGP)
@@ -29,6 +31,8 @@ Process = TypeVar("Process", bound=ExactGP)
 ARRAYS = 16  # of points x points: ten that a process makes (measured with BoTorch 0.16), and roots that are kept
 GROWTH = 1.1  # hyper-parameters are fitted anew when there are this many times more points than at the last fit
 FIT_STEPS = 30  # of L-BFGS, from where the last fit ended
+FIT_GAIN = 1e-6  # of a step, below which it ends: of the logarithm of likelihood times priors, for each point
+FIT = {"maxiter": FIT_STEPS, "ftol": FIT_GAIN}
 FIT_POINTS = 300  # points to fit them to, evenly spread over the run: each step's cost grows with their cube
 WORTH = 100  # points of a process from which on handing it to another process is worth while
 
@@ -133,7 +137,7 @@ class Surrogate:
 def _minimise(surrogate: Surrogate, random: np.random.Generator) -> tuple[Points, dict[str, Any]]:
     """Return where the bound of a surrogate is least, and what it knows then."""
     with exclusive():
-        bound = NegativeBound(surrogate.model(), surrogate.options.coefficient, surrogate.first)
+        bound = LowerBound(surrogate.model(), surrogate.options.coefficient, surrogate.first)
         return least_point(bound, surrogate.z, surrogate.loss, random), surrogate.state()
 
 
@@ -158,8 +162,31 @@ def select(loss: Points, count: int) -> Rows:
 
 def fitted(model: ExactGP) -> dict[str, Points]:
     """Return the parameters at which marginal likelihood times priors is largest, from where they are, by name."""
-    fit_gpytorch_mll_scipy(ExactMarginalLogLikelihood(model.likelihood, model).train(), options={"maxiter": FIT_STEPS})
+    likelihood = ExactMarginalLogLikelihood(model.likelihood, model).train()
+    how: dict[str, Any] = {"closure": closure_of(likelihood)} if isinstance(model, SingleTaskGP) else {}
+    fit_gpytorch_mll_scipy(likelihood, dict(likelihood.named_parameters()), options=FIT, **how)
     return {name: value.detach().numpy().copy() for name, value in model.named_parameters()}
+
+
+def closure_of(likelihood: ExactMarginalLogLikelihood) -> Callable[[], tuple[Tensor, list[Tensor]]]:
+    """Return what gives minus the logarithm of likelihood times priors, for each point, and its slopes by parameters.
+
+    It is what BoTorch's closure gives for a process without mean whose parameters are not transformed.
+    """
+    model = likelihood.model
+    u, values, parameters = model.train_inputs[0], model.train_targets, list(likelihood.parameters())
+
+    def closure() -> tuple[Tensor, list[Tensor]]:
+        kernel, noise = model.covar_module, model.likelihood.noise
+        with torch.no_grad():
+            found = marginal_likelihood(Radial.of(kernel), float(noise), u, values)
+        # what is linear in the parameters with these slopes has the likelihood's slopes
+        linear = (kernel.lengthscale.reshape(-1) * found.scale).sum() + (noise * found.noise).sum()
+        priors = sum(prior.log_prob(of(module)).sum() for _, module, prior, of, _ in model.named_priors())
+        slopes = torch.autograd.grad(-(linear + priors) / len(values), parameters)
+        return -(found.value + priors.detach()) / len(values), list(slopes)
+
+    return closure
 
 
 def with_parameters(model: Process, parameters: Mapping[str, Points]) -> Process:

@@ -13,7 +13,7 @@ from gradscape.optim.base import Kind
 from gradscape.optim.methods.adam import Adam, AdamOptions
 from gradscape.optim.methods.bayes import BO
 from gradscape.optim.methods.bayes_gradient import BOGradient, GradientProcess, standardised
-from gradscape.optim.methods.bound import NegativeBound
+from gradscape.optim.methods.bound import LowerBound
 from gradscape.optim.methods.cmaes import CMAES
 from gradscape.optim.methods.cmaes_gradient import CMAESGradient
 from gradscape.optim.methods.quasi_newton import LBFGSB, BasinHopping
@@ -240,8 +240,13 @@ def test_the_process_of_losses_and_slopes_is_that_of_the_closed_form():
     mean = cross @ inverse @ standardised(loss, grad).ravel()
     deviation = np.sqrt(1.0 - np.einsum("ij,jk,ik->i", cross, inverse, cross))
     for first in (None, 4):  # at once, or going on from four points
-        found = NegativeBound(model.eval(), 2.0, first)(torch.from_numpy(new)[:, None])
-        np.testing.assert_allclose(found.detach(), 2.0 * deviation - mean, rtol=1e-8)
+        bound, points = LowerBound(model.eval(), 2.0, first), torch.from_numpy(new)
+        value, slope = bound.with_slope(points)
+        np.testing.assert_allclose(value, mean - 2.0 * deviation, rtol=1e-8)
+        np.testing.assert_allclose(bound(points), value)
+        step = 1e-5 * torch.eye(2, dtype=torch.float64)
+        differences = [(bound(points + one) - bound(points - one)) / 2e-5 for one in step]
+        np.testing.assert_allclose(slope, torch.stack(differences, dim=1), rtol=1e-5, atol=1e-6)
 
 
 def test_slopes_tell_the_process_more_than_losses_alone():

@@ -5,10 +5,14 @@ import numpy as np
 import pytest
 import torch
 from botorch.acquisition.analytic import UpperConfidenceBound
+from botorch.optim.closures import get_loss_closure_with_grads
+from gpytorch.kernels import MaternKernel
+from gpytorch.mlls import ExactMarginalLogLikelihood
 
 from gradscape.optim.methods import bound
-from gradscape.optim.methods.bound import NegativeBound
-from gradscape.optim.methods.surrogate import GROWTH, Surrogate, SurrogateOptions
+from gradscape.optim.methods.bound import LowerBound
+from gradscape.optim.methods.radial import Radial
+from gradscape.optim.methods.surrogate import GROWTH, Surrogate, SurrogateOptions, closure_of
 from gradscape.optim.runs.state import decode, encode
 
 
@@ -56,11 +60,50 @@ def test_the_process_is_the_posterior_of_a_zero_mean_with_squared_exponential_co
     np.testing.assert_allclose(posterior.variance.detach()[:, 0], spread**2 * variance, rtol=1e-4, atol=1e-8)
 
 
-def test_the_bound_lies_the_coefficient_below_the_mean():
-    model = informed().model()
-    points = torch.rand(7, 1, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    wanted = UpperConfidenceBound(model, beta=2.5**2, maximize=False)(points)
-    torch.testing.assert_close(NegativeBound(model, 2.5)(points), wanted, rtol=1e-9, atol=1e-9)
+@pytest.mark.parametrize("first", [None, 30, 40])
+@pytest.mark.parametrize("kernel", ["rbf", "matern"])
+def test_the_bound_and_its_slopes_are_those_of_botorch(kernel, first):
+    model = informed(kernel=kernel).model()
+    points = torch.rand(7, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64).requires_grad_()
+    wanted = -UpperConfidenceBound(model, beta=2.5**2, maximize=False)(points[:, None])
+    (slopes,) = torch.autograd.grad(wanted.sum(), points)
+    bound, scale = LowerBound(model, 2.5, first), model.outcome_transform
+    value, slope = bound.with_slope(points.detach())
+    torch.testing.assert_close(scale.untransform(value[:, None])[0][:, 0], wanted.detach(), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(scale.stdvs[0] * slope, slopes, rtol=1e-7, atol=1e-7)
+    torch.testing.assert_close(bound(points.detach()), value)
+
+
+@pytest.mark.parametrize("kernel", ["rbf", "matern"])
+def test_fits_climb_the_likelihood_that_botorch_has(kernel):
+    model = informed(kernel=kernel).model()
+    likelihood = ExactMarginalLogLikelihood(model.likelihood, model).train()
+    parameters = dict(likelihood.named_parameters())
+    for factor in (1.0, 1.7):  # where the last fit ended, and elsewhere
+        with torch.no_grad():
+            for parameter in parameters.values():
+                parameter.mul_(factor)
+        wanted, slopes = get_loss_closure_with_grads(likelihood, parameters)()
+        value, found = closure_of(likelihood)()
+        torch.testing.assert_close(value, wanted.detach(), rtol=1e-9, atol=1e-9)
+        for one, other in zip(found, slopes, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-7)
+
+
+def test_a_covariance_that_is_not_radial_is_refused():
+    with pytest.raises(ValueError, match="an RBFKernel or a MaternKernel of 5/2; got"):
+        Radial.of(MaternKernel(nu=0.5))
+
+
+def test_losses_of_another_scale_are_searched_alike():
+    """The bound is searched in deviations of the losses, so that small losses are no reason to stop early."""
+
+    def least(scale: float) -> np.ndarray:
+        surrogate = informed()
+        surrogate.loss = scale * surrogate.loss
+        return surrogate.minimise(np.random.default_rng(0))
+
+    np.testing.assert_array_equal(least(2.0**-20), least(1.0))
 
 
 def test_more_exploration_goes_further_from_what_is_known():
@@ -159,27 +202,27 @@ def test_threads_find_what_one_alone_finds():
 
 
 @pytest.mark.parametrize("first", [1, 30, 39, 40])
-def test_a_bound_goes_on_from_the_root_of_the_first_points(first):
+def test_a_bound_goes_on_from_the_factor_of_the_first_points(first):
     surrogate = Surrogate(3, SurrogateOptions())
     z = np.random.default_rng(0).uniform(-1.0, 1.0, (40, 3))
     surrogate.add(z, (z**2).sum(axis=1))
-    points = torch.rand(50, 1, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    points = torch.rand(50, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     model = surrogate.model()
-    found = [NegativeBound(model, 1.5, first)(points) for _ in range(2)]
-    torch.testing.assert_close(found[0], NegativeBound(model, 1.5)(points), rtol=1e-9, atol=1e-9)
-    assert torch.equal(*found)  # the root was kept
-    bound._roots.clear()
-    assert torch.equal(NegativeBound(model, 1.5, first)(points), found[0])  # and is the same when it was not
+    found = [LowerBound(model, 1.5, first)(points) for _ in range(2)]
+    torch.testing.assert_close(found[0], LowerBound(model, 1.5)(points), rtol=1e-9, atol=1e-9)
+    assert torch.equal(*found)  # the factor was kept
+    bound._factors.clear()
+    assert torch.equal(LowerBound(model, 1.5, first)(points), found[0])  # and is the same when it was not
 
 
-def test_roots_of_other_processes_are_told_apart():
-    points = torch.rand(20, 1, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+def test_factors_of_other_processes_are_told_apart():
+    points = torch.rand(20, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     z = np.random.default_rng(1).uniform(-1.0, 1.0, (30, 2))
     bounds = []
     for kernel in ("rbf", "matern"):
         surrogate = Surrogate(2, SurrogateOptions(kernel=kernel))
         surrogate.add(z, np.sin(5 * z).sum(axis=1))
         model = surrogate.model()
-        bounds.append((NegativeBound(model, 1.0, 20)(points), NegativeBound(model, 1.0)(points)))
+        bounds.append((LowerBound(model, 1.0, 20)(points), LowerBound(model, 1.0)(points)))
     for kept, whole in bounds:
         torch.testing.assert_close(kept, whole, rtol=1e-8, atol=1e-8)
