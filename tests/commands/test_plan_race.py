@@ -1,4 +1,4 @@
-"""`landscape plan ENV --methods`: what a race takes is added up from what its methods and its simulator were seen to."""
+"""`landscape plan ENV --methods`: what a race takes is added up from what its methods and simulator were seen to."""
 
 import json
 import math
