@@ -28,7 +28,7 @@ from .radial import Radial, marginal_likelihood
 Rows = NDArray[np.intp]
 Process = TypeVar("Process", bound=ExactGP)
 
-ARRAYS = 16  # of points x points: ten that a process makes (measured with BoTorch 0.16), and roots that are kept
+ARRAYS = 16  # of points x points: ten that a process makes (measured with BoTorch 0.16), and factors kept
 GROWTH = 1.1  # hyper-parameters are fitted anew when there are this many times more points than at the last fit
 FIT_STEPS = 30  # of L-BFGS, from where the last fit ended
 FIT_POINTS = 300  # points to fit them to, evenly spread over the run: each step's cost grows with their cube
