@@ -1,9 +1,10 @@
 """Hold what `landscape plan` predicts against what jobs then take, everything in a process of its own.
 
-    python benchmarks/plan.py [--tries 5] [--json]
+    python benchmarks/plan.py [--tries 5] [--json] [--only "race of bounce"]
 
 Prints predicted / taken, the medians of some tries, plan and job in turn: `wall` from start to end, `work` without the
-start, `memory` of the host at its peak, `bytes` and `files` on the disk.
+start, `memory` of the host at its peak, `bytes` and `files` on the disk. Of a race, planned and run in one process:
+`work`, its parts `simulating` and `methods`, and `bytes`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ import os
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from statistics import median
 from subprocess import Popen
@@ -26,6 +29,7 @@ JOBS = {
     "slice of cartpole": "slice cartpole --dims 0 1 --resolution 128",  # a third of its memory is gradients
     "sweep of bounce": "sweep bounce --dims 0 1 --over 2 --frames 6 --resolution 16",
 }
+RACERS, SEEDS, BUDGET = ("random", "cma-es", "descents", "bo", "bo-leap"), 3, 200  # of a race of bounce
 WORK = ("simulating", "writing", "drawing", "between")
 
 
@@ -67,13 +71,57 @@ def ratios(job: str, folder: Path) -> dict[str, float]:
     }
 
 
-def tried(job: str, tries: int) -> dict[str, float]:
+def tried(find: Callable[[Path], dict[str, float]], tries: int) -> dict[str, float]:
     """Return the median of each ratio."""
     found = []
     for _ in range(tries):
         with tempfile.TemporaryDirectory() as folder:
-            found.append(ratios(job, Path(folder)))
+            found.append(find(Path(folder)))
     return {name: median(one[name] for one in found) for name in found[0]}
+
+
+class Timed:
+    """An objective that counts the seconds in which it is asked for losses."""
+
+    def __init__(self, objective: Any) -> None:
+        self._objective, self.space, self.seconds = objective, objective.space, 0.0
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what else the objective says of itself."""
+        return getattr(self._objective, name)
+
+    def evaluate(self, x: Any, *, grad: bool = True) -> Any:
+        """Return what the objective returns."""
+        began = time.perf_counter()
+        found = self._objective.evaluate(x, grad=grad)
+        self.seconds += time.perf_counter() - began
+        return found
+
+
+def race_ratios(folder: Path) -> dict[str, float]:
+    """Plan a race, let it run, and return what was predicted by what it took."""
+    from gradscape.envs.engines.runtime import cores
+    from gradscape.jobs.plan_race import RacePlanJob
+    from gradscape.jobs.race import RaceJob
+    from gradscape.jobs.scene import SceneSpec
+    from gradscape.jobs.search import one_torch_thread
+    from gradscape.optim.processes import processes
+    from gradscape.optim.race import race
+
+    scene, workers = SceneSpec("bounce", "draft", device="cpu"), cores()
+    plan = RacePlanJob(scene, RACERS, SEEDS, BUDGET, workers).run().plan
+    env = scene.make()
+    job = RaceJob.of(env, RACERS, budget=BUDGET, seeds=SEEDS, command="", out=folder / "race")
+    timed, began = Timed(env), time.perf_counter()
+    with one_torch_thread(), processes(workers):
+        race(timed, job.competitors, budget=BUDGET, gradient_cost=1.0)
+    wall = time.perf_counter() - began
+    return {
+        "work": (plan.simulating + plan.searching) / wall,
+        "simulating": plan.simulating / timed.seconds,
+        "methods": plan.searching / (wall - timed.seconds),
+        "bytes": plan.disk / sum(512 * one.stat().st_blocks for one in (folder / "race").rglob("*")),
+    }
 
 
 def main() -> None:
@@ -81,15 +129,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tries", type=int, default=5)
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--only", help="the name of one job")
     given = parser.parse_args()
-    found = {name: tried(job, given.tries) for name, job in JOBS.items()}
+    finders: dict[str, Callable[[Path], dict[str, float]]] = {name: partial(ratios, job) for name, job in JOBS.items()}
+    finders["race of bounce"] = race_ratios
+    chosen = finders if given.only is None else {given.only: finders[given.only]}
+    found = {name: tried(find, given.tries) for name, find in chosen.items()}
     if given.json:
         print(json.dumps(found))
         return
-    columns = list(next(iter(found.values())))
+    columns = list(dict.fromkeys(column for one in found.values() for column in one))
     print(f"| predicted / taken | {' | '.join(columns)} |\n|---{'|---' * len(columns)}|")
     for name, one in found.items():
-        print(f"| {name} | {' | '.join(f'{one[column]:.2f}' for column in columns)} |")
+        print(f"| {name} | {' | '.join(f'{one[column]:.2f}' if column in one else '' for column in columns)} |")
 
 
 if __name__ == "__main__":

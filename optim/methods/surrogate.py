@@ -28,11 +28,9 @@ from .radial import Radial, marginal_likelihood
 Rows = NDArray[np.intp]
 Process = TypeVar("Process", bound=ExactGP)
 
-ARRAYS = 16  # of points x points: ten that a process makes (measured with BoTorch 0.16), and roots that are kept
+ARRAYS = 16  # of points x points: ten that a process makes (measured with BoTorch 0.16), and factors kept
 GROWTH = 1.1  # hyper-parameters are fitted anew when there are this many times more points than at the last fit
 FIT_STEPS = 30  # of L-BFGS, from where the last fit ended
-FIT_GAIN = 1e-6  # of a step, below which it ends: of the logarithm of likelihood times priors, for each point
-FIT = {"maxiter": FIT_STEPS, "ftol": FIT_GAIN}
 FIT_POINTS = 300  # points to fit them to, evenly spread over the run: each step's cost grows with their cube
 WORTH = 100  # points of a process from which on handing it to another process is worth while
 
@@ -164,7 +162,7 @@ def fitted(model: ExactGP) -> dict[str, Points]:
     """Return the parameters at which marginal likelihood times priors is largest, from where they are, by name."""
     likelihood = ExactMarginalLogLikelihood(model.likelihood, model).train()
     how: dict[str, Any] = {"closure": closure_of(likelihood)} if isinstance(model, SingleTaskGP) else {}
-    fit_gpytorch_mll_scipy(likelihood, dict(likelihood.named_parameters()), options=FIT, **how)
+    fit_gpytorch_mll_scipy(likelihood, dict(likelihood.named_parameters()), options={"maxiter": FIT_STEPS}, **how)
     return {name: value.detach().numpy().copy() for name, value in model.named_parameters()}
 
 

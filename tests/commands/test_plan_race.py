@@ -1,4 +1,4 @@
-"""`landscape plan ENV --methods`: what a race takes is added up from what its methods and its simulator were seen to."""
+"""`landscape plan ENV --methods`: what a race takes is added up from what its methods and simulator were seen to."""
 
 import json
 import math
@@ -16,6 +16,7 @@ from gradscape.jobs.search import make_optimizer
 from gradscape.landscapes.objective import Evaluation
 from gradscape.optim import rehearsal
 from gradscape.optim.base import Optimizer
+from gradscape.optim.methods import surrogate
 from gradscape.optim.registry import methods
 from gradscape.optim.rehearsal import BLOCK, LEAST, LOADING, MadeUp, Pace, Rehearsal, places, rehearse
 
@@ -116,6 +117,25 @@ def test_what_late_proposals_take_is_known_without_going_there(
     assert (found.together, found.gradients, apart) == (1.0, 0.0, 0.0)
     assert here == pytest.approx(sum(1e-3 * known for known in range(600)), rel=0.03)
     assert sum(1 for slept in clock.slept if slept) < 300
+
+
+def test_what_processes_would_compute_is_told_apart(
+    monkeypatch: pytest.MonkeyPatch, clock: Clock, tmp_path: Path
+) -> None:
+    """A process of fewer than `WORTH` points is minimised where it is asked, one of more by whoever computes."""
+    minimise = surrogate._minimise
+
+    def slow(*given: Any) -> Any:
+        clock.sleep(0.25)
+        return minimise(*given)
+
+    monkeypatch.setattr(surrogate, "_minimise", slow)
+    env = gradscape.make("branin")
+    found = rehearse(env, lambda: make_optimizer("bo", env), 2 * surrogate.WORTH, tmp_path)
+    early, late = found.paces[1], found.paces[-1]
+    assert early.known < surrogate.WORTH < late.known
+    assert (early.here, early.apart) == pytest.approx((0.25, 0.0))
+    assert (late.here, late.apart) == pytest.approx((0.0, 0.25))
 
 
 def test_a_method_that_forgets_is_rehearsed_once_and_no_longer_than_a_moment(
