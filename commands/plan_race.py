@@ -27,8 +27,8 @@ def print_race_plan(
 ) -> None:
     """Plan a race and print it. Raises ValueError where no methods are named, and for what is said of a slice."""
     from ..envs.engines.runtime import cores
+    from ..jobs.methods import check_methods
     from ..jobs.plan_race import RacePlanJob
-    from ..jobs.race import check_methods
     from .race import read_method_options, read_names
     from .terminal import Bars, command_line, print_json
 

@@ -59,7 +59,8 @@ def race(
     """
     from ..envs.engines.runtime import cores
     from ..gallery.paper import read_paper
-    from ..jobs.race import RaceJob, check_methods
+    from ..jobs.methods import check_methods
+    from ..jobs.race import RaceJob
     from ..jobs.workers import workers as cluster
     from .terminal import Bars, command_line, print_json
 

@@ -16,6 +16,7 @@ from ..optim.memory import SearchSize, run_need
 from ..optim.race import ABREAST
 from ..optim.registry import optimizer_class
 from ..optim.rehearsal import BLOCK, Rehearsal, rehearse
+from .methods import able_methods, check_methods
 from .plan import HERE, make_here
 from .scene import SceneSpec
 from .search import make_optimizer, one_torch_thread
@@ -180,8 +181,6 @@ class RacePlanJob:
         device that is not here, what `landscape tradeoff` kept of one counts. Raises ValueError for what the scene or a
         method does not have, and where nothing is known of the device that is asked for.
         """
-        from .race import able_methods, check_methods
-
         began = time.perf_counter() if began is None else began
         watch, seeds = watch or Watch(), as_whole(self.seeds, "a number of seeds", least=1)
         budget, workers = as_whole(self.budget, "a budget", least=1), as_whole(self.workers, "workers", least=1)

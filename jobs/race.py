@@ -22,10 +22,11 @@ from ..optim.claims import ClaimFinding, Claims, check_claims
 from ..optim.memory import SearchSize, require_method, require_runs
 from ..optim.processes import processes
 from ..optim.race import Competitor, Race, name_seeds, race
-from ..optim.registry import find_method, methods, optimizer_class
+from ..optim.registry import optimizer_class
 from ..optim.runs.store import RunStore
 from ..optim.search import SearchProgress
 from .folder import RACE, RACE_FIGURES, ROOT, RUN_STORE, folder_named
+from .methods import able_methods, check_methods
 from .scene import provenance
 from .search import make_optimizer, one_torch_thread, open_run_store
 from .watch import PREPARING, Watch, resumable
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
     from ..optim.base import Optimizer
 
 PICTURE = RACE.picture
-ALL = "all"  # methods that can search an environment here
 Options = Mapping[str, Mapping[str, Any]]  # method -> name -> value, which may be text
 
 
@@ -300,25 +300,6 @@ class Lines:
         failed = sum(count for _, count, _ in mine)
         best = "no loss yet" if math.isnan(least) else f"best loss {least:.4g}"
         return f"{method}: {best}{f', {failed} failed' if failed else ''}"
-
-
-def able_methods(env: Environment, watch: Watch) -> list[str]:
-    """Return the methods that can search an environment here, and say of the others why they cannot."""
-    able = []
-    for method in methods():
-        try:
-            make_optimizer(method, env)
-        except ValueError as error:
-            watch.note(f"without {method}: {error}")
-        else:
-            able.append(method)
-    return able
-
-
-def check_methods(names: Sequence[str]) -> list[str]:
-    """Return methods without repetitions, none for `all`. Raises ValueError where one is not registered."""
-    found = [find_method(name).name for name in dict.fromkeys(names) if name != ALL]
-    return [] if ALL in names else found
 
 
 def race_folder(env: Environment, options: Options, root: Path = ROOT) -> Path:
