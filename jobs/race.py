@@ -230,10 +230,7 @@ class RaceJob:
             whole = left[0] * alone.forward + (left[1] * alone.gradient if grad else 0.0)
             return alone, f"{duration(whole)} one by one, by {workers_of(self.executor)} workers"
         alone, abreast = episode_cost(self.env, grad=grad), sum(self._count_left(one) > 0 for one in self.competitors)
-        x = self.env.space.uniform(min(abreast, self.env.preferred_batch), seed=0)
-        ways = [way for way in (0, 1) if left[way]]
-        each = sum(left[way] * seconds_per_episode(self.env, x, grad=bool(way)) for way in ways)
-        return alone, f"{duration(each)} in batches of one point a run"
+        return alone, f"{duration(lockstep_seconds(self.env, left, abreast))} in batches of one point a run"
 
     def _count_left(self, one: Competitor) -> int:
         return max(0, self.budget - one.run.count)
@@ -267,15 +264,30 @@ class Lines:
 
 def able_methods(env: Environment, watch: Watch) -> list[str]:
     """Return the methods that can search an environment here, and say of the others why they cannot."""
-    able = []
-    for method in methods():
+    able, unable = divide_methods(env)
+    for method, why in unable.items():
+        watch.note(f"without {method}: {why}")
+    return able
+
+
+def divide_methods(env: Environment, names: Sequence[str] = (), *, budget: int = 0) -> tuple[list[str], dict[str, str]]:
+    """Return which methods, by default of all, can search an environment here, and why the others cannot."""
+    able, unable = list[str](), dict[str, str]()
+    for method in names or methods():
         try:
-            make_optimizer(method, env)
+            made = make_optimizer(method, env)
+            require_method(type(made), made.options, SearchSize(env.space.dim, env.decisions, budget))
         except ValueError as error:
-            watch.note(f"without {method}: {error}")
+            unable[method] = " ".join(str(error).split())
         else:
             able.append(method)
-    return able
+    return able, unable
+
+
+def lockstep_seconds(env: Environment, left: Mapping[int, int], abreast: int) -> float:
+    """Measure what so many episodes take to simulate, without gradients (0) and with (1), so many in a batch [s]."""
+    x = env.space.uniform(max(1, min(abreast, env.preferred_batch)), seed=0)
+    return sum(count * seconds_per_episode(env, x, grad=bool(way)) for way, count in left.items() if count)
 
 
 def check_methods(names: Sequence[str]) -> list[str]:

@@ -145,10 +145,11 @@ def point_of(env: Environment, text: str) -> Tensor:
 
 def _known_runs(env: Environment) -> list[xr.Dataset]:
     """Return all runs of an environment under the default folder. Raises ValueError where there is none."""
-    from .folder import ROOT
+    from .folder import LEAGUE, ROOT
 
     found = list[Any]()
-    for folder in sorted(path for path in ROOT.glob("*") if path.is_dir()):
+    races = ROOT.glob(f"{LEAGUE.kind}-*/*")  # of leagues, one folder deeper than others
+    for folder in sorted(path for path in (*ROOT.glob("*"), *races) if path.is_dir()):
         try:
             found += runs_in(env, str(folder))
         except ValueError:
