@@ -29,6 +29,8 @@ from .watch import PREPARING, Stopped, Watch, resumable
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
+    from ..optim.race import Race
+
 RECORD, PICTURE = LEAGUE.files
 AT = "@"  # between a scene and its fidelity
 
@@ -142,7 +144,7 @@ class LeagueJob:
         """Say of each scene how many episodes are there and what the others take to simulate, and the sum."""
         total = 0.0
         for fixture in self.fixtures:
-            total += self._attempt(fixture, self._forecast, watch) or 0.0
+            total += self._attempt(fixture, self.forecast, watch) or 0.0
         racers = f"{len(self.methods)} methods, {self.seeds} seeds, {self.budget} episodes each"
         watch.note(
             f"{self.folder}: {len(self._sound())} of {len(self.fixtures)} scenes, {racers}: "
@@ -150,7 +152,15 @@ class LeagueJob:
         )
 
     def race(self, fixture: Fixture, watch: Watch) -> SceneStandings:
-        """Race in one scene, or read what is there, and return how the methods came off."""
+        """Race in one scene, or read what is there, and return how the methods came off; raises as `run_race` does."""
+        race, unable = self.run_race(fixture, watch)
+        return SceneStandings.of(race, left_out=unable, command=self.command)
+
+    def run_race(self, fixture: Fixture, watch: Watch) -> tuple[Race, dict[str, str]]:
+        """Race in one scene, or read what is there; return the race, and why methods were left out.
+
+        Raises ValueError where no method can search it here.
+        """
         env = fixture.scene.make(watch)
         able, unable = divide_methods(env, self.methods, budget=self.budget)
         if not able:
@@ -159,8 +169,7 @@ class LeagueJob:
             env, able, budget=self.budget, seeds=self.seeds, command=self.command, out=fixture.folder,
             claims=self.claims.get(env.name), workers=self.workers, force=self.force, prints=self.prints, watch=watch,
         )  # fmt: skip
-        race = replace(job, executor=self.executor).run(watch).race
-        return SceneStandings.of(race, env.identity(), left_out=unable, command=self.command)
+        return replace(job, executor=self.executor).run(watch).race, unable
 
     def say_kept(self) -> str:
         """Say how much of it is on disk."""
@@ -168,7 +177,7 @@ class LeagueJob:
         whole = len(self.fixtures) * len(self.methods) * self.seeds * self.budget
         return f"{kept} of {whole} episodes are kept in {self.folder}"
 
-    def _forecast(self, fixture: Fixture, watch: Watch) -> float:
+    def forecast(self, fixture: Fixture, watch: Watch) -> float:
         """Say what is there of a scene and what is left, and return the seconds that it takes to simulate."""
         env = fixture.scene.make(watch)
         able, unable = divide_methods(env, self.methods, budget=self.budget)

@@ -17,6 +17,8 @@ from .claims import ClaimFinding, Claims, check_claims
 from .comparison import Superiority
 from .targets import times_record
 
+OF_METHOD = ("method", "method_options", "method_code", "seed")  # of a run's identity, what is not of its scene
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -112,10 +114,9 @@ class SceneStandings:
     command: str
 
     @classmethod
-    def of(
-        cls, race: Race, identity: Mapping[str, Any], *, left_out: Mapping[str, str] | None = None, command: str = ""
-    ) -> SceneStandings:
-        """Return what a race says, in an environment of this identity."""
+    def of(cls, race: Race, *, left_out: Mapping[str, str] | None = None, command: str = "") -> SceneStandings:
+        """Return what a race says."""
+        identity = {name: value for name, value in race.identity.items() if name not in OF_METHOD}
         figures, some = race.statistics, race.statistics.targets.some
         times = {method: times_record(one[some]) for method, one in figures.times.items()}
         return cls(

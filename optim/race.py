@@ -132,6 +132,11 @@ class Race:
         """The unit of the losses, empty where they have none."""
         return str(self._about["loss_unit"])
 
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What decides the numbers of its first run, as plain JSON."""
+        return self.runs[self.methods[0]][0].identity
+
     @cached_property
     def statistics(self) -> RaceStatistics:
         """Ranks, comparisons of every two methods, targets reached and curves, with intervals over the seeds."""

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 
 import gradscape as gs
 
@@ -29,20 +30,26 @@ def test_a_league_of_the_command_is_that_of_python(
     assert ours.plot()._repr_png_().startswith(b"\x89PNG")
 
 
-def test_it_prints_ranks_and_the_papers_claims_and_keeps_the_best_points(
-    run: Callable[..., Said], tmp_path: Path
-) -> None:
+def test_it_prints_ranks_and_the_papers_claims(run: Callable[..., Said], tmp_path: Path) -> None:
     done = run("league", "branin", "--methods", "random", "--budget", "6", "--seeds", "1", "--report", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     for shown in ("mean ranks", "branin (exact)", "all scenes", "branin: least loss", "compares no optimisers"):
         assert shown in done.stdout
-    through = run(
-        *["slice", "branin", "--dims", "0", "1", "--resolution", "2", "--through", "best", "--out", "s"], cwd=tmp_path
-    )
+
+
+def test_the_best_point_of_a_league_is_known_to_slices(run: Callable[..., Said], tmp_path: Path) -> None:
+    short = ["--methods", "random", "--budget", "6", "--seeds", "1", "--device", "cpu", "--json"]
+    league = run("league", "bounce@draft", *short, cwd=tmp_path)
+    best = json.loads(league.stdout)["scenes"][0]["best"]
+    cut = ["--resolution", "2", "--through", "best", "--fidelity", "draft", "--device", "cpu", "--out", "s"]
+    through = run("slice", "bounce", "--dims", "0", "1", *cut, cwd=tmp_path)
     assert through.returncode == 0, through.stderr
-    best = json.loads(next(tmp_path.glob("out/league-*/league.json")).read_text())["scenes"][0]["best"]
-    origin = json.loads(gs.open_slice(tmp_path / "s").data.attrs["identity"])["plane"]["origin"]
-    assert origin == best["x"]
+    plane = json.loads(gs.open_slice(tmp_path / "s").data.attrs["identity"])["plane"]
+    assert plane["origin"][2] == best["x"][2]
+    found = gs.make("bounce", fidelity="draft", device="cpu").evaluate(
+        torch.tensor([best["x"]], dtype=torch.float64), grad=False
+    )
+    assert float(found.loss) == best["loss"]
 
 
 def test_a_scene_that_cannot_be_raced_ends_with_exit_code_1(run: Callable[..., Said], tmp_path: Path) -> None:
