@@ -24,6 +24,7 @@ from .commands.envs import envs
 from .commands.export import export
 from .commands.extremes import extremes
 from .commands.info import info
+from .commands.league import league
 from .commands.optimize import methods, optimize
 from .commands.overlay import overlay
 from .commands.pairs import pairs
@@ -63,7 +64,7 @@ STOPPED = 130  # the exit code of what Ctrl-C has ended
 LONG = 200  # characters of a path that an error shows
 _VERBS = (
     envs, info, slice_, sweep,
-    methods, optimize, race, overlay,
+    methods, optimize, race, league, overlay,
     compare, surface, replay, export, view, bounce,
     plan, bench, check, card, tradeoff, extremes, pairs, report_, census,
 )  # fmt: skip

@@ -63,14 +63,16 @@ def race(
     seeds: int = 10,
     method_options: Mapping[str, Mapping[str, Any]] | None = None,
     workers: int = 1,
+    best_known: float | None = None,
     out: str | Path | None = None,
     force: bool = False,
     **keywords: Unpack[SceneKeywords],
 ) -> Race:
     """Let methods compete on an environment, with the same budget and several seeds each, and return the race.
 
-    `methods` are by default all that can search it here, `method_options` are given by method. All runs go on in
-    lockstep: what they propose is simulated in one batch. Gaussian processes are computed by as many processes as
+    `methods` are by default all that can search it here, `method_options` are given by method. Targets go down to the
+    least loss of the race, or to `best_known`, where less is known from elsewhere. All runs go on in lockstep: what
+    they propose is simulated in one batch. Gaussian processes are computed by as many processes as
     `workers` says; more than one needs a script whose own work stands under `if __name__ == "__main__":`. The race lies
     in the folder `out`, by default one under out/ named after it: the same call goes on there where it stopped, and so
     do more methods, seeds or episodes.
@@ -90,6 +92,7 @@ def race(
         command=say_call("race", scene, named, budget=budget, seeds=seeds, **keywords),
         options=method_options,
         workers=workers,
+        best_known=best_known,
         out=Path(out) if out is not None else None,
         force=force,
         watch=watch,

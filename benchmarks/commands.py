@@ -47,6 +47,7 @@ optimize branin --method cma-es --budget 5 --seed 1 --option sigma=0.2
 optimize ackley --method bo-leap --budget 12 --set dim=3 --option initial=4
 optimize cartpole --method descents --budget 4 --fidelity draft --option learning_rate=0.1
 race branin --methods random,cma-es --budget 5 --seeds 2 --workers 2 --option cma-es.sigma=0.2
+league branin ackley@exact --methods random,cma-es --budget 5 --seeds 2 --workers 2
 overlay cut run --resolution 3 --plane pca
 overlay cut race --through best
 surface cut run

@@ -25,10 +25,11 @@ from gradscape.envs.base import Environment
 from gradscape.envs.registry import make
 from gradscape.jobs.search import make_optimizer, one_torch_thread
 from gradscape.landscapes.storage.records import write_record
+from gradscape.optim.bootstrap import interval
+from gradscape.optim.comparison import difference
 from gradscape.optim.processes import processes
 from gradscape.optim.race import Competitor, race
 from gradscape.optim.runs.store import RunStore
-from gradscape.optim.statistics import difference, interval
 
 VARIED = ("sigma=0.125,0.25,0.5,2", "step=0.01,0.1,10", "population=6,20,40")
 DEFAULTS = "defaults"

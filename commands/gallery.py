@@ -18,8 +18,8 @@ def compute(
     part: Annotated[
         list[str] | None,
         typer.Option(
-            help="slices, companions (the same cut through other points), sweeps, episodes, searches, reports or "
-            "tradeoffs; may be repeated. By default all of them."
+            help="slices, companions (the same cut through other points), sweeps, episodes, searches, reports, "
+            "tradeoffs or league; may be repeated. By default all of them but the league, which takes longest."
         ),
     ] = None,
     fidelity: Fidelity = None,
@@ -33,7 +33,8 @@ def compute(
     The folder of the data then holds a folder for each figure: slice.zarr at the figure's fidelity, companions.json of
     the same cut through other points, episode-*.mp4 at some of its nodes, sweep.mp4 at draft fidelity, report.json and
     measures.json. In runs/ are searches at draft fidelity, in tradeoff/ the accuracy of each environment against its
-    time. Stop it at any moment: the same command goes on where it stopped. A figure that fails does not stop the
+    time, in league/ races of nine methods at the figures' fidelity. Stop it at any moment: the same command goes on
+    where it stopped. A figure that fails does not stop the
     others.
 
     Example: landscape gallery compute --only fluid --part slices --device cuda

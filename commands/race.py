@@ -15,7 +15,7 @@ from .arguments import Budget, Json, Print, Scheduler, read_settings, takes_scen
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from ..jobs.race import RaceSummary
+    from ..jobs.race_summary import RaceSummary
 
 ENOUGH = 10  # seeds, as the paper has
 
@@ -43,6 +43,9 @@ def race(
     out: Annotated[
         str | None, typer.Option(help="Folder for the results; by default one under out/ named after the race.")
     ] = None,
+    best_known: Annotated[
+        float | None, typer.Option(help="The least loss known from elsewhere, down to which targets go.")
+    ] = None,
     print_: Print = None,
     json_: Json = False,
     report: Annotated[bool, typer.Option("--report", help="Say which of the paper's orderings hold.")] = False,
@@ -51,7 +54,8 @@ def race(
     """Let methods compete on the same budget, with several seeds each: best loss, targets reached, ranks.
 
     All runs go on in lockstep: what they propose is simulated in one batch, as many points at once as there are runs.
-    The folder then holds race.png, race.json (ranks, differences, curves) and each run in a folder of its own. Stop it
+    The folder then holds race.png, race.json (ranks, how every two methods compare, running times, curves) and each run
+    in a folder of its own. Stop it
     at any moment: the same command goes on where it stopped. More methods, seeds or episodes go on from there too; runs
     that are finished are not repeated. Refuses --workers beside --scheduler.
 
@@ -75,6 +79,7 @@ def race(
         "command": command_line(),
         "options": options,
         "workers": workers or cores(),
+        "best_known": best_known,
     }
     job = RaceJob.of(env, chosen, budget=budget, seeds=seeds, **how)
     with cluster(scheduler, env.device) as executor:
@@ -114,8 +119,10 @@ def _print(summary: RaceSummary, *, claims: bool) -> None:
 
     console = Console(soft_wrap=True, highlight=False)
     console.print(_ranks(summary))
-    for method, others in _beaten(summary).items():
-        console.print(f"{method} is better than {', '.join(others)}")
+    if len(summary.race.statistics.targets.loss):
+        console.print(_running_times(summary))
+    for line in _comparisons(summary):
+        console.print(line)
     if summary.seeds < ENOUGH:
         console.print(_doubt(summary.seeds))
     if claims:
@@ -145,15 +152,33 @@ def _ranks(summary: RaceSummary) -> Table:
     return shown
 
 
-def _beaten(summary: RaceSummary) -> dict[str, list[str]]:
-    """Return the methods that are better than others, by rank: the intervals of these differences exclude zero."""
+def _running_times(summary: RaceSummary) -> Table:
+    """Show the expected running time of every method for some of the targets, the easiest first."""
+    from math import isfinite
+
+    from .terminal import table
+
     figures = summary.race.statistics
-    found: dict[str, list[str]] = {}
+    some = figures.targets.some[::-1]
+    losses = [f"{figures.targets.loss[number]:.3g}" for number in some]
+    title = f"episodes that a method takes to reach a loss{_unit(summary)}, by restarts until it does"
+    shown = table("method", *losses, title=title)
+    for rank in figures.ranks:
+        times = figures.times[rank.method][some]
+        shown.add_row(rank.method, *(f"{one:.0f}" if isfinite(one) else "never" for one in times))
+    return shown
+
+
+def _comparisons(summary: RaceSummary) -> list[str]:
+    """Say of each method, by rank, which others it is better than, and how often it wins against each."""
+    figures, lines = summary.race.statistics, list[str]()
+    pairs = list(zip(figures.differences, figures.superiorities, strict=True))
     for better in (rank.method for rank in figures.ranks):
-        pairs = [{one.first, one.second} for one in figures.differences if one.better == better]
-        if pairs:
-            found[better] = [(pair - {better}).pop() for pair in pairs]
-    return found
+        seen = [chance if chance.first == better else chance.reversed for one, chance in pairs if one.better == better]
+        if seen:
+            said = (f"{one.second} (wins {one.probability:.0%}, corrected p {one.corrected:.2g})" for one in seen)
+            lines.append(f"{better} is better than {', '.join(said)}")
+    return lines
 
 
 def _doubt(seeds: int) -> str:
@@ -171,12 +196,15 @@ def _doubt(seeds: int) -> str:
 def _claims(summary: RaceSummary) -> Table:
     from .terminal import table
 
-    headings = ("claim", "this race", f"difference of mean losses{_unit(summary)}", "where the paper says so")
+    means = f"difference of mean losses{_unit(summary)}"
+    headings = ("claim", "this race", "wins", "corrected p", means, "where the paper says so")
     shown = table(*headings, title="what the paper claims, and this race")
     for finding in summary.claims:
         one = finding.difference
         numbers = _format_interval(one.mean, one.low, one.high, 3) if one else ""
-        shown.add_row(str(finding.claim), finding.verdict, numbers, finding.claim.source)
+        chance = finding.superiority
+        wins, p = (f"{chance.probability:.0%}", f"{chance.corrected:.2g}") if chance else ("", "")
+        shown.add_row(str(finding.claim), finding.verdict, wins, p, numbers, finding.claim.source)
     return shown
 
 

@@ -19,6 +19,7 @@ from ..landscapes.storage.files import tidy
 from .companions import CompanionPart
 from .episodes import EpisodePart
 from .figures import Figure
+from .league import LeaguePart
 from .measures import ReportPart, TradeoffPart
 from .parts import FigurePart, SearchPart, SlicePart, SweepPart
 
@@ -31,7 +32,9 @@ PARTS: dict[str, type[FigurePart]] = {
     "searches": SearchPart,
     "reports": ReportPart,
     "tradeoffs": TradeoffPart,
+    "league": LeaguePart,
 }
+IF_NAMED = {"league"}  # parts that take so long that they are made where they are asked for, and not with all others
 
 
 def compute_parts(
@@ -45,9 +48,9 @@ def compute_parts(
 ) -> list[str]:
     """Make what is missing of these figures in `root`, and return the names of those that failed.
 
-    It makes all kinds of parts where no `parts` are named. A figure that fails, by whatever cause, leaves the others to
-    be made. Raises ValueError for a part or a device that there is not, Stopped where it is interrupted, and
-    DiskFullError; the same call goes on then.
+    It makes all kinds of parts but the league where no `parts` are named. A figure that fails, by whatever cause,
+    leaves the others to be made. Raises ValueError for a part or a device that there is not, Stopped where it is
+    interrupted, and DiskFullError; the same call goes on then.
     """
     if unknown := set(parts) - set(PARTS):
         raise ValueError(f"--part takes {', '.join(PARTS)}; got {', '.join(sorted(unknown))}")
@@ -55,7 +58,7 @@ def compute_parts(
     work = _Work(root, watch)
     with workers(scheduler, device) as executor:
         for name, kind in PARTS.items():
-            if name in parts or not parts:
+            if name in parts or (not parts and name not in IF_NAMED):
                 sound = [figure for figure in figures if figure.id not in work.failed]
                 work.make(name, [kind(figure, root, device, executor) for figure in sound])
     tidy(root)
@@ -109,7 +112,7 @@ class _Work:
         """Say what all of it should take, from the first figure of each scene."""
         rates: dict[str, float] = {}
         total = 0.0
-        for part in parts:
+        for part in {part.shared: part for part in parts}.values():
             kind = json.dumps([part.figure.env, part.figure.options])
             if kind not in rates:
                 rate = self._try(part, part.seconds_each)

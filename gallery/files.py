@@ -3,7 +3,7 @@
 Of the data, a figure's folder holds `slice.zarr` and what else was made of it: `sweep.mp4` with `sweep.json`,
 `episodes.json` with a film and a picture of each episode, `companions.json` and `companions.png` of the same cut
 through other points, and the files of `landscape report`. Searches lie in `runs/ENVIRONMENT-OPTIONS/`, trade-offs in
-`tradeoff/`: figures share them. The report card of gradients is in `card/`.
+`tradeoff/`, the races of the league in `league/`: figures share them. The report card of gradients is in `card/`.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..jobs.folder import CARD as CARD_FILES
+from ..jobs.folder import LEAGUE as LEAGUE_FILES
 from ..jobs.folder import REPORT as REPORT_FILES
 from ..jobs.folder import SLICE as SLICE_FILES
 from ..jobs.folder import TRADEOFF as TRADEOFF_FILES
@@ -34,6 +35,8 @@ RUNS, RUN_SUFFIX = "runs", ".zarr.zip"
 TRADEOFFS = "tradeoff"
 CARD = "card"  # the folder of the report card of gradients
 CARD_RECORD, CARD_PICTURE = CARD_FILES.files
+LEAGUE = "league"  # the folder of the league
+LEAGUE_RECORD, LEAGUE_PICTURE = LEAGUE_FILES.files
 TRADEOFF_PICTURE = TRADEOFF_FILES.picture  # in the folder of `landscape tradeoff`
 DEVICES = ("cuda", "cpu")  # that trade-offs are shown of
 REMAKE = "delete it, and `landscape gallery compute --part {}` makes it anew"
@@ -85,3 +88,18 @@ class TradeoffFiles:
         """The files of the study of convergence of the same scene, which may be missing."""
         record = self.record.with_suffix(CONVERGED)
         return TradeoffFiles(record, record.with_suffix(".png"))
+
+
+@dataclass(frozen=True)
+class LeagueFiles:
+    """Name the files of an environment's race in the league: the record, the picture, and what is kept of its runs."""
+
+    record: Path
+    picture: Path
+    runs: Path
+
+    @classmethod
+    def of(cls, root: Path, env: str) -> LeagueFiles:
+        """Return where the race in an environment is, in the gallery's data or in its site."""
+        record = root / LEAGUE / f"{env}.json"
+        return cls(record, record.with_suffix(".png"), record.with_suffix(".npz"))

@@ -68,6 +68,11 @@ class ReportPart(FigurePart):
 class TradeoffPart(FigurePart):
     """Accuracy against time of the figure's environment, which its other figures share."""
 
+    @property
+    def shared(self) -> str:
+        """The environment."""
+        return self.figure.env
+
     def label(self) -> str:
         """Return the command that measures it elsewhere."""
         turned = ",".join(TURNED)

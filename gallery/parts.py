@@ -65,6 +65,11 @@ class FigurePart(abc.ABC):
         """Where the figure's data is."""
         return self.root / self.figure.id
 
+    @property
+    def shared(self) -> str:
+        """What figures have in common that share what is made: by default nothing but themselves."""
+        return self.figure.id
+
     @abc.abstractmethod
     def label(self) -> str:
         """Say what is made."""
@@ -192,6 +197,11 @@ class SweepPart(FigurePart):
 
 class SearchPart(FigurePart):
     """A run of each method in the figure's environment, which its other figures share."""
+
+    @property
+    def shared(self) -> str:
+        """The environment and its options."""
+        return self._where.name
 
     def label(self) -> str:
         """Name methods, budget and scene."""

@@ -49,6 +49,7 @@ RUN = Results("run", (RUN_STORE, "progress.png", SUMMARY), "progress.png", RUN_S
 SWEEP = Results("sweep", ("frames", SLICE_STORE, "sweep.mp4", "sweep.gif", "sweep.rrd", SUMMARY))
 RACE_FIGURES = "race.json"
 RACE = Results("race", ("race.png", RACE_FIGURES), "race.png")
+LEAGUE = Results("league", ("league.json", "league.png"), "league.png")
 OVERLAY = Results("overlay", ("overlay.png", "overlay.rrd"), "overlay.png")
 COMPARISON = Results("comparison", ("compare.json", "compare.png"), "compare.png")
 SURFACE = Results("surface", ("surface.png", "surface.gltf"), "surface.png")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from ..optim.memory import SearchSize, require_method
 from ..optim.registry import find_method, methods
 from .search import make_optimizer
 from .watch import Watch
@@ -17,15 +18,24 @@ ALL = "all"  # methods that can search an environment here
 
 def able_methods(env: Environment, watch: Watch) -> list[str]:
     """Return the methods that can search an environment here, and say of the others why they cannot."""
-    able = []
-    for method in methods():
+    able, unable = divide_methods(env)
+    for method, why in unable.items():
+        watch.note(f"without {method}: {why}")
+    return able
+
+
+def divide_methods(env: Environment, names: Sequence[str] = (), *, budget: int = 0) -> tuple[list[str], dict[str, str]]:
+    """Return which methods, by default of all, can search an environment here, and why the others cannot."""
+    able, unable = list[str](), dict[str, str]()
+    for method in names or methods():
         try:
-            make_optimizer(method, env)
+            made = make_optimizer(method, env)
+            require_method(type(made), made.options, SearchSize(env.space.dim, env.decisions, budget))
         except ValueError as error:
-            watch.note(f"without {method}: {error}")
+            unable[method] = " ".join(str(error).split())
         else:
             able.append(method)
-    return able
+    return able, unable
 
 
 def check_methods(names: Sequence[str]) -> list[str]:

@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import cloudpickle
 
-from ..landscapes.cost import EpisodeCost, duration, episode_cost
-from ..landscapes.plain import plain
+from ..landscapes.cost import EpisodeCost, duration, episode_cost, seconds_per_episode
 from ..landscapes.sampling.distribution import make_objective as objective_of
 from ..landscapes.sampling.distribution import run_tasks, workers_of
 from ..landscapes.space import as_whole
 from ..landscapes.storage.files import clear, tidy, visible_files, write_json
 from ..landscapes.storage.ownership import refuse_others
-from ..optim.claims import ClaimFinding, Claims, check_claims
+from ..optim.claims import Claims, check_claims
 from ..optim.memory import SearchSize, require_method, require_runs
 from ..optim.processes import processes
 from ..optim.race import Competitor, Race, name_seeds, race
@@ -27,6 +26,7 @@ from ..optim.runs.store import RunStore
 from ..optim.search import SearchProgress
 from .folder import RACE, RACE_FIGURES, ROOT, RUN_STORE, folder_named
 from .methods import able_methods, check_methods
+from .race_summary import RaceSummary
 from .scene import provenance
 from .search import make_optimizer, one_torch_thread, open_run_store
 from .watch import PREPARING, Watch, resumable
@@ -43,50 +43,11 @@ Options = Mapping[str, Mapping[str, Any]]  # method -> name -> value, which may 
 
 
 @dataclass(frozen=True)
-class RaceSummary:
-    """Say what a race found, as `race.json` in its folder has it; `race` holds the runs, whose figures are in it, too.
-
-    `silence` says why there is no claim.
-    """
-
-    env: str
-    fidelity: str
-    device: str
-    engine: str
-    options: dict[str, Any]
-    loss_unit: str
-    methods: list[str]
-    method_options: dict[str, dict[str, Any]]
-    budget: int
-    seeds: int
-    race: Race
-    claims: list[ClaimFinding]
-    silence: str | None
-    command: str
-    files: list[str]
-
-    def record(self) -> dict[str, Any]:
-        """Return the summary as its file has it."""
-        figures = self.race.statistics.record()
-        about = ("env", "fidelity", "device", "engine", "options", "loss_unit")
-        whole = {
-            **{name: getattr(self, name) for name in (*about, "methods", "method_options", "budget", "seeds")},
-            **{name: figures[name] for name in ("ranks", "differences")},
-            "claims": [_claim_record(finding) for finding in self.claims],
-            "silence": self.silence,
-            **{name: figures[name] for name in ("targets", "ecdf", "curves")},
-            "command": self.command,
-            "files": self.files,
-        }
-        return {name: plain(value) for name, value in whole.items()}
-
-
-@dataclass(frozen=True)
 class RaceJob:
     """A race to run in `folder`, and to hold claims against; methods compute in so many processes, `workers`.
 
     Its runs go on in lockstep, their proposals evaluated in one batch. With an `executor` its workers search instead,
-    a share of the runs each.
+    a share of the runs each. `best_known` is the least loss that is known from elsewhere, down to which targets go.
     """
 
     env: Environment
@@ -98,6 +59,7 @@ class RaceJob:
     workers: int = 1
     executor: Executor | None = None
     prints: Sequence[float] = ()
+    best_known: float | None = None
 
     @classmethod
     def of(
@@ -114,6 +76,7 @@ class RaceJob:
         out: Path | None = None,
         force: bool = False,
         prints: Sequence[float] = (),
+        best_known: float | None = None,
         watch: Watch | None = None,
     ) -> RaceJob:
         """Go on with the race in `out`, by default a folder named after it, or begin it there; `force` begins anew.
@@ -141,7 +104,8 @@ class RaceJob:
             ]
         if force:
             clear(folder, (PICTURE, RACE_FIGURES), PICTURE)
-        return cls(env, competitors, folder, budget, command, claims or Claims(), workers, None, prints)
+        known = _check_loss(best_known)
+        return cls(env, competitors, folder, budget, command, claims or Claims(), workers, None, prints, known)
 
     @property
     def methods(self) -> list[str]:
@@ -167,7 +131,7 @@ class RaceJob:
     def result(self) -> Race:
         """Return the race as one works with it."""
         runs = {method: [one.run.read() for one in self.competitors if one.method == method] for method in self.methods}
-        return Race(runs, self.budget, self.folder, provenance(self.env, self.command))
+        return Race(runs, self.budget, self.folder, provenance(self.env, self.command), self.best_known)
 
     def say_kept(self) -> str:
         """Say how much of it is on disk."""
@@ -216,6 +180,7 @@ class RaceJob:
         return summary
 
     def _summary(self, result: Race, files: list[str]) -> RaceSummary:
+        figures = result.statistics
         return RaceSummary(
             env=self.env.name,
             fidelity=self.env.fidelity.name,
@@ -228,7 +193,7 @@ class RaceJob:
             budget=self.budget,
             seeds=self.seeds,
             race=result,
-            claims=check_claims(self.claims.claims, result.statistics.differences),
+            claims=check_claims(self.claims.claims, figures.differences, figures.superiorities),
             silence=self.claims.silence,
             command=self.command,
             files=files,
@@ -302,6 +267,12 @@ class Lines:
         return f"{method}: {best}{f', {failed} failed' if failed else ''}"
 
 
+def lockstep_seconds(env: Environment, left: Mapping[int, int], abreast: int) -> float:
+    """Measure what so many episodes take to simulate, without gradients (0) and with (1), so many in a batch [s]."""
+    x = env.space.uniform(max(1, min(abreast, env.preferred_batch)), seed=0)
+    return sum(count * seconds_per_episode(env, x, grad=bool(way)) for way, count in left.items() if count)
+
+
 def race_folder(env: Environment, options: Options, root: Path = ROOT) -> Path:
     """Return a folder of its own for every different race; more methods, seeds or episodes go on in the same one."""
     texts = {method: {name: str(value) for name, value in chosen.items()} for method, chosen in options.items()}
@@ -368,10 +339,11 @@ def _open_competitor(
     return Competitor(method, seed, store, make)
 
 
-def _claim_record(finding: ClaimFinding) -> dict[str, Any]:
-    difference = None if finding.difference is None else asdict(finding.difference)
-    said = {"claim": str(finding.claim), "verdict": finding.verdict, "difference": difference}
-    return asdict(finding.claim) | said
+def _check_loss(best_known: float | None) -> float | None:
+    """Refuse a best known loss that is not finite."""
+    if best_known is not None and not math.isfinite(best_known):
+        raise ValueError(f"the best known loss is a finite number; got {best_known}")
+    return best_known
 
 
 def _least(losses: Sequence[float]) -> float:

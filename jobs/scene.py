@@ -131,6 +131,7 @@ def environment_of(dataset: xr.Dataset, device: str) -> Environment:
 def point_of(env: Environment, text: str) -> Tensor:
     """Return the parameters that `text` names: a point, as `envs.points` has it, or best:RUN, the best of a run.
 
+    Without a run it is the best of all that are known: those under out/, and the one that the gallery's league found.
     Raises ValueError where there is no such point, or where the run searched another environment.
     """
     kind, _, run = text.partition(":")
@@ -140,20 +141,30 @@ def point_of(env: Environment, text: str) -> Tensor:
         return point(env, text)
     from ..landscapes.overlay import best_point
 
-    return best_point(runs_in(env, run) if run else _known_runs(env))[0]
+    if run:
+        return best_point(runs_in(env, run))[0]
+    from .known import best_of_league
+
+    kept = best_of_league(env)
+    runs = _known_runs(env, needed=kept is None)
+    if kept is None:
+        return best_point(runs)[0]
+    found = [kept, *([best_point(runs)] if any(table["loss"].notnull().any() for table in runs) else [])]
+    return min(found, key=lambda one: one[1])[0]
 
 
-def _known_runs(env: Environment) -> list[xr.Dataset]:
-    """Return all runs of an environment under the default folder. Raises ValueError where there is none."""
-    from .folder import ROOT
+def _known_runs(env: Environment, *, needed: bool) -> list[xr.Dataset]:
+    """Return all runs of an environment under the default folder. Raises ValueError for none, if it is `needed`."""
+    from .folder import LEAGUE, ROOT
 
     found = list[Any]()
-    for folder in sorted(path for path in ROOT.glob("*") if path.is_dir()):
+    races = ROOT.glob(f"{LEAGUE.kind}-*/*")  # of leagues, one folder deeper than others
+    for folder in sorted(path for path in (*ROOT.glob("*"), *races) if path.is_dir()):
         try:
             found += runs_in(env, str(folder))
         except ValueError:
             continue  # no run, or one of another environment
-    if not found:
+    if needed and not found:
         raise ValueError(f"no run of {env.name} is known under {ROOT}/; `landscape optimize {env.name}` makes one")
     return found
 

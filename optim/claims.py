@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from .statistics import Difference
+from .comparison import Difference, Superiority
 
 
 @dataclass(frozen=True)
@@ -41,24 +41,32 @@ class ClaimVerdict(StrEnum):
 
 @dataclass(frozen=True)
 class ClaimFinding:
-    """A claim, what the race makes of it, and the difference it was measured by, None where it was not run."""
+    """A claim, what the race makes of it, and how the two compare, seen from the first; None where one was not run."""
 
     claim: Claim
     verdict: ClaimVerdict
     difference: Difference | None
+    superiority: Superiority | None
 
 
-def check_claims(claims: Sequence[Claim], differences: Sequence[Difference]) -> list[ClaimFinding]:
-    """Return what a race, by the differences of its methods, makes of each claim."""
-    measured = {(found.first, found.second): found for one in differences for found in (one, one.reversed)}
-    return [_check(claim, measured.get((claim.first, claim.second))) for claim in claims]
+def check_claims(
+    claims: Sequence[Claim], differences: Sequence[Difference], superiorities: Sequence[Superiority]
+) -> list[ClaimFinding]:
+    """Return what a race makes of each claim, by the rank tests of its methods, corrected for all pairs of the race."""
+    means = {(found.first, found.second): found for one in differences for found in (one, one.reversed)}
+    chances = {(found.first, found.second): found for one in superiorities for found in (one, one.reversed)}
+    pairs = [(claim.first, claim.second) for claim in claims]
+    return [
+        ClaimFinding(claim, judge(claim, chances.get(pair)), means.get(pair), chances.get(pair))
+        for claim, pair in zip(claims, pairs, strict=True)
+    ]
 
 
-def _check(claim: Claim, difference: Difference | None) -> ClaimFinding:
-    """Check a claim; that two are alike can be refuted by an interval, never shown."""
-    if difference is None:
-        return ClaimFinding(claim, ClaimVerdict.NOT_RUN, None)
-    if difference.better is None:
-        return ClaimFinding(claim, ClaimVerdict.UNDECIDED, difference)
-    holds = not claim.alike and difference.better == claim.first
-    return ClaimFinding(claim, ClaimVerdict.HOLDS if holds else ClaimVerdict.FAILS, difference)
+def judge(claim: Claim, superiority: Superiority | None) -> ClaimVerdict:
+    """Return what is to be made of a claim, by its two methods; that two are alike can be refuted, never shown."""
+    if superiority is None:
+        return ClaimVerdict.NOT_RUN
+    if superiority.better is None:
+        return ClaimVerdict.UNDECIDED
+    holds = not claim.alike and superiority.better == claim.first
+    return ClaimVerdict.HOLDS if holds else ClaimVerdict.FAILS

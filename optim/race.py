@@ -15,12 +15,14 @@ import xarray as xr
 
 from ..landscapes.cost import episode_cost
 from ..landscapes.objective import Objective
-from . import statistics
 from .base import Optimizer
+from .curves import Tables, final_losses
 from .meeting import Meeting, work_abreast
 from .runs.run import Run
 from .runs.store import RunStore
 from .search import SearchProgress, search
+from .statistics import RaceStatistics
+from .targets import hits
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -90,13 +92,14 @@ class Race:
     """Hold the runs of a race, method -> one run per seed, of which the first `budget` episodes count.
 
     `folder` is where its files are, None of one in memory; `provenance` is how it came about, by default as its first
-    run did.
+    run did. `best_known` is the least loss that is known from elsewhere, down to which its targets go.
     """
 
     runs: Mapping[str, Sequence[Run]]
     budget: int
     folder: Path | None = None
     provenance: Mapping[str, Any] | None = None
+    best_known: float | None = None
 
     @property
     def methods(self) -> list[str]:
@@ -113,10 +116,15 @@ class Race:
         """The unit of the losses, empty where they have none."""
         return str(self._about["loss_unit"])
 
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What decides the numbers of its first run, as plain JSON."""
+        return self.runs[self.methods[0]][0].identity
+
     @cached_property
-    def statistics(self) -> statistics.RaceStatistics:
-        """Ranks, differences, targets reached and curves, with their bootstrap intervals over the seeds."""
-        return statistics.RaceStatistics.of(self._tables)
+    def statistics(self) -> RaceStatistics:
+        """Ranks, comparisons of every two methods, targets reached and curves, with intervals over the seeds."""
+        return RaceStatistics.of(self._tables, self.best_known)
 
     def table(self) -> pd.DataFrame:
         """Return a row for each method, the best mean rank first, with 95 % intervals; columns name their units."""
@@ -141,6 +149,41 @@ class Race:
             for rank in self.statistics.ranks
         ]
         return pd.DataFrame(rows)
+
+    def pairs(self) -> pd.DataFrame:
+        """Return a row for every two methods: the difference of their mean best losses, and who wins how often.
+
+        The probability is that the first has the lesser best loss, a tie half; p is that of Mann and Whitney's rank
+        test, corrected for all pairs by Holm's rule in the last column.
+        """
+        import pandas as pd
+
+        unit, figures = f" [{self.loss_unit}]" if self.loss_unit else "", self.statistics
+        rows = [
+            {
+                "first": one.first,
+                "second": one.second,
+                f"difference{unit}": one.mean,
+                f"difference, low{unit}": one.low,
+                f"difference, high{unit}": one.high,
+                "probability": chance.probability,
+                "p": chance.p,
+                "corrected p": chance.corrected,
+            }
+            for one, chance in zip(figures.differences, figures.superiorities, strict=True)
+        ]
+        return pd.DataFrame(rows)
+
+    def running_times(self) -> pd.DataFrame:
+        """Return the expected running time of every method [episodes], a column for each, a row for each target loss.
+
+        It is infinite where no run reached the target.
+        """
+        import pandas as pd
+
+        figures = self.statistics
+        index = pd.Index(figures.targets.loss, name=f"loss [{self.loss_unit}]" if self.loss_unit else "loss")
+        return pd.DataFrame(figures.times, index=index)
 
     def plot(self, *, width: float | None = None) -> Picture:
         """Draw best losses against episodes, and the share of targets reached.
@@ -189,7 +232,7 @@ class Race:
         )
 
 
-def picture(tables: statistics.Tables, figures: statistics.RaceStatistics) -> xr.Dataset:
+def picture(tables: Tables, figures: RaceStatistics) -> xr.Dataset:
     """Return what `landscapes.draw.figures.race` draws of a race, its attributes aside."""
     curves = list(figures.curves["episodes"].values())
     steps = max(len(curve.cost) for curve in curves)
@@ -197,12 +240,12 @@ def picture(tables: statistics.Tables, figures: statistics.RaceStatistics) -> xr
         key: [np.pad(getattr(curve, name), (0, steps - len(curve.cost)), constant_values=np.nan) for curve in curves]
         for key, name in (("episodes", "cost"), ("mean", "mean"), ("low", "low"), ("high", "high"))
     }
-    hits = [statistics.hits(runs, figures.targets).ravel() for runs in tables.values()]
-    missing = [int(np.isnan(losses).sum()) for losses in statistics.final_losses(tables)]
+    reached = [hits(runs, figures.targets).ravel() for runs in tables.values()]
+    missing = [int(np.isnan(losses).sum()) for losses in final_losses(tables)]
     return xr.Dataset(
         {
             **{key: (("method", "step"), np.stack(values)) for key, values in padded.items()},
-            "hit": (("method", "pair"), np.stack(hits)),
+            "hit": (("method", "pair"), np.stack(reached)),
             "unsuccessful": ("method", missing),
         },
         {"method": list(tables)},

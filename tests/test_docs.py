@@ -47,6 +47,7 @@ WORDS |= {
 VALUES = {"--resolution": "2", "--budget": "3", "--seeds": "1", "--frames": "2"}
 ADDED = {
     "race": ["--seeds", "1", "--budget", "3", "--device", "cpu"],
+    "league": ["--seeds", "1", "--budget", "3", "--device", "cpu"],
     "tradeoff": ["--points", "2", "--variants", "precision"],
     "extremes": ["--points", "4", "--knobs", "dt", "--device", "cpu", "--set", "horizon=0.05"],
     "replay": ["--no-film"],
@@ -62,6 +63,7 @@ ADDED = {
     "gallery serve": ["--out", "served", "--port", "0"],
 }
 SCENES = {verb: {"fluid": "bounce", "flip": "bounce"} for verb in ("race", "optimize", "tradeoff", "extremes")}
+SCENES["league"] = {"fluid@standard": "branin"}
 SCENES["--tolerance"] = {"fluid": "bounce", "6": "0", "8": "1"}
 SHORT = {
     "slice": {"fluid", "assembly"},

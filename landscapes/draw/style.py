@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +30,7 @@ MID_GREY = "#777777"  # as far from white as from black: lines and labels in a v
 BEYOND, LOST = "#9a7b00", "#c94f4f"  # points there that are outside the window, or failed
 
 LOSS_MAP: Colormap = colormaps["viridis"]
+RANK_MAP: Colormap = ListedColormap(colormaps["viridis_r"](np.linspace(0.0, 0.92, 256)), "viridis, 1 is light")
 SLOPE_MAP: Colormap = ListedColormap(colormaps["magma"](np.linspace(0.08, 0.77, 256)), "magma, legible on white")
 SLOPE_MAP_DARK: Colormap = ListedColormap(colormaps["magma"](np.linspace(0.42, 1.0, 256)), "magma, legible on black")
 
@@ -78,6 +79,7 @@ POINT_MARKS: dict[str, dict[str, Any]] = {  # what a run evaluated a point for
     "policy": {"color": "#5b2a86", "marker": "s"},
     "given": {"color": "#c47a00", "marker": "^"},  # by another program
 }
+NOT_RUN: dict[str, Any] = {"facecolor": UNSAMPLED, "edgecolor": QUIET, "linewidth": 0.0, "hatch": "////"}
 METHOD_BAND: dict[str, Any] = {"alpha": 0.12, "linewidth": 0.0}
 OVERLAID: dict[str, Any] = {"linewidths": 0.6, "zorder": 3, "rasterized": True}  # the points of a run over a map
 HALO: dict[str, Any] = OVERLAID | {"linewidths": 1.5, "zorder": 2.9, "facecolors": "none", "edgecolors": "white"}
@@ -332,6 +334,13 @@ def point_areas(distance: NDArray[np.float64], reach: float, points: int) -> NDA
 def number(value: float, form: str = ".4g") -> str:
     """Write a number, with four digits unless `form` says otherwise, the ticks' minus sign, and no negative zero."""
     return f"{value:z{form}}".replace("-", "\N{MINUS SIGN}")
+
+
+def text_on(colour: Sequence[float]) -> str:
+    """Return the ink that is legible on a colour, red, green and blue of 0 to 1: dark on light, light on dark."""
+    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in colour[:3]]
+    luminance = float(np.dot(linear, (0.2126, 0.7152, 0.0722)))  # WCAG 2
+    return "white" if 1.05 / (luminance + 0.05) > (luminance + 0.05) / 0.05 else "black"
 
 
 def power(value: float, plain: int = 4) -> str:

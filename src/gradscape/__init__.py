@@ -8,6 +8,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from .api.compare import compare
     from .api.environments import list_envs
+    from .api.league import league
     from .api.measure import card, census, check, extremes, pairs, report
     from .api.overlay import overlay
     from .api.search import open_run, optimize, race
@@ -51,6 +52,7 @@ _HOMES = {
     "from_numpy": "landscapes.adapters",
     "from_torch": "landscapes.adapters",
     "from_warp": "envs.engines.warp_functions",
+    "league": "api.league",
     "list_envs": "api.environments",
     "make": "envs.registry",
     "open_run": "api.search",
@@ -91,6 +93,7 @@ __all__ = [
     "from_numpy",
     "from_torch",
     "from_warp",
+    "league",
     "list_envs",
     "make",
     "open_run",

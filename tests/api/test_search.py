@@ -147,6 +147,21 @@ def test_a_race_has_a_table_a_picture_and_a_line(tmp_path: Path) -> None:
     assert more.methods == ["random", "cma-es"]
 
 
+def test_a_race_tells_pairs_and_running_times(tmp_path: Path) -> None:
+    found = gs.race("branin", ("random", "cma-es"), budget=6, seeds=2, best_known=0.25, out=tmp_path / "race")
+    (pair,) = found.pairs().to_dict("records")
+    finals = {method: [one.best.loss for one in runs] for method, runs in found.runs.items()}
+    won = [a < b for a in finals["random"] for b in finals["cma-es"]]
+    assert pair["probability"] == np.mean(won)
+    assert pair["difference"] == pytest.approx(np.mean(finals["random"]) - np.mean(finals["cma-es"]))
+    times = found.running_times()
+    assert times.columns.tolist() == ["random", "cma-es"]
+    assert (times.index[0], len(times)) == (0.25, 51)
+    assert np.isinf(times.iloc[0]).all()  # less than any point of branin has
+    with pytest.raises(ValueError, match="the best known loss is a finite number; got nan"):
+        gs.race("branin", "random", budget=6, seeds=2, best_known=np.nan, out=tmp_path / "race")
+
+
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [

@@ -10,9 +10,10 @@ from gradscape.cli import main
 from gradscape.envs.bounce import Bounce
 from gradscape.gallery import companions as gallery_companions
 from gradscape.gallery import episodes as gallery_episodes
+from gradscape.gallery import league as gallery_league
 from gradscape.gallery import measures as gallery_measures
 from gradscape.gallery import parts as gallery_parts
-from gradscape.gallery.compute import PARTS
+from gradscape.gallery.compute import IF_NAMED, PARTS
 from gradscape.gallery.figures import Figure
 from gradscape.gallery.paper import PaperCaption
 
@@ -34,6 +35,8 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         monkeypatch.setattr(gallery_episodes, name, value)
     for name, value in (("REPORT_POINTS", 2), ("TRADEOFF_POINTS", 4), ("TURNED", ["precision"])):
         monkeypatch.setattr(gallery_measures, name, value)
+    for name, value in (("METHODS", ("random", "descents")), ("BUDGET", 12), ("SEEDS", 3)):
+        monkeypatch.setattr(gallery_league, name, value)
     for name in ("REPETITION", "LARGEST"):
         monkeypatch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", 0.01)
     longer = {name: replace(one, dt=4 * one.dt) for name, one in Bounce.fidelities.items()}
@@ -84,7 +87,9 @@ def test_everything_is_made_once(small: Path, capsys: pytest.CaptureFixture[str]
     assert compute(small) == 0
     assert {file: file.stat().st_mtime_ns for file in small.rglob("*") if file.is_file()} == before
     said = capsys.readouterr().err
-    assert all(f"{part}: 3 of 3 are there already" in said for part in PARTS)
+    assert all(f"{part}: 3 of 3 are there already" in said for part in PARTS if part not in IF_NAMED)
+    assert not any(f"{part}:" in said for part in IF_NAMED)
+    assert not (small / "league").exists()
 
 
 def test_films_of_other_nodes_go_when_the_slice_changes(small: Path) -> None:
@@ -107,8 +112,9 @@ def test_the_help_names_every_part(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_an_unknown_part_is_refused(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert compute(small, "--part", "films") == 2
-    assert "--part takes slices, companions, sweeps, episodes, searches, reports, tradeoffs; got films" in " ".join(
-        capsys.readouterr().err.split()
+    assert (
+        "--part takes slices, companions, sweeps, episodes, searches, reports, tradeoffs, league; got films"
+        in " ".join(capsys.readouterr().err.split())
     )
 
 

@@ -15,6 +15,7 @@ from .. import style
 from . import page, panel
 
 PITCH, SHAPE = 4.9, 0.95  # room of a panel on a screen [inch]; its height, against its width
+DECADE = 10.0  # an axis is logarithmic where targets are, and span at least this factor
 MARK_SPACING = 0.3  # between two markers of a line, as a share of the panel's diagonal
 
 
@@ -75,14 +76,14 @@ def _where_finite(values: xr.DataArray, where: xr.DataArray) -> NDArray[np.float
 def _frame_losses(ax: Axes, dataset: xr.Dataset) -> None:
     unit, seeds = dataset.attrs["loss_unit"], dataset.attrs["seeds"]
     panel.name_axes(ax, y=f"best loss so far [{unit}]" if unit else "best loss so far")
+    count, hardest, easiest = dataset.attrs["targets"]
     said = "one seed: no interval" if seeds == 1 else f"mean of {seeds} seeds and 95 % bootstrap interval"
     if not np.isfinite(dataset["mean"]).any():
         said = "no method succeeded with every seed: no mean"
         ax.set_yticks([])
-    elif dataset.attrs["spacing"] == "log":
+    elif dataset.attrs["spacing"] == "log" and easiest >= DECADE * hardest:
         style.log_axis(ax.yaxis)
-    elif dataset.attrs["targets"][0] > 1:
-        _, hardest, easiest = dataset.attrs["targets"]
+    elif count > 1:
         ax.set_ylim(top=min(ax.get_ylim()[1], 2 * easiest - hardest))
     look: dict[str, Any] = {"size": page.sheet_of(ax).small, "color": style.QUIET, "ha": "right", "va": "top"}
     ax.text(0.98, 0.98, said, transform=ax.transAxes, **look)

@@ -1,0 +1,41 @@
+"""The best point that is known of a scene from the gallery's league."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from ..landscapes.plain import plain_json
+from ..landscapes.storage.records import read_json, reading
+from ..optim.league import SceneStandings
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ..envs.base import Environment
+
+
+def best_of_league(env: Environment) -> tuple[Tensor, float] | None:
+    """Return the best point that the gallery's league found in an environment of the same options, and its loss.
+
+    It is None where there is none, or one of another fidelity's number of parameters. Raises DamagedError where the
+    file is not what was written.
+    """
+    path = league_file(env.name)
+    if not path.is_file():
+        return None
+    with reading(path, "delete it, and `landscape gallery compute --part league` makes it anew"):
+        found = SceneStandings.of_record(read_json(path))
+    same = found.identity.get("options") == plain_json(asdict(env.options), "options")
+    if found.best is None or not same or len(found.best.x) != env.space.dim:
+        return None
+    return torch.tensor(found.best.x, dtype=torch.float64), found.best.loss
+
+
+def league_file(env: str) -> Path:
+    """Return where the gallery keeps the race in an environment."""
+    return Path(str(resources.files("gradscape.gallery"))) / "data" / "league" / f"{env}.json"

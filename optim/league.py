@@ -1,0 +1,296 @@
+"""A league: what races of the same methods over several scenes say, a row for each scene and method."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from itertools import chain
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from ..landscapes.plain import finite, number, optional, or_nan, plain, text
+from .bootstrap import interval
+from .claims import ClaimFinding, Claims, check_claims
+from .comparison import Superiority
+from .targets import times_record
+
+OF_METHOD = ("method", "method_options", "method_code", "seed")  # of a run's identity, what is not of its scene
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from ..landscapes.draw.figures.page import Picture
+    from .race import Race
+    from .statistics import Rank
+
+
+@dataclass(frozen=True)
+class BestPoint:
+    """The point of least loss in a scene: its parameters `x`, each in its own unit, and the episode that found it."""
+
+    loss: float
+    method: str
+    seed: int
+    episode: int
+    x: tuple[float, ...]
+
+    @classmethod
+    def of(cls, race: Race) -> BestPoint | None:
+        """Return that of a race, None where no episode succeeded."""
+        found = list[BestPoint]()
+        for run in chain.from_iterable(race.runs.values()):
+            loss = run.data["loss"].to_numpy()[: race.budget]
+            if np.isfinite(loss).any():
+                row = int(np.nanargmin(loss))
+                x = tuple(map(float, run.data["x"].to_numpy()[row]))
+                found.append(cls(float(loss[row]), run.method, run.seed, row + 1, x))
+        return min(found, key=lambda one: one.loss, default=None)
+
+    @classmethod
+    def of_record(cls, record: Mapping[str, Any]) -> BestPoint:
+        """Read it from plain JSON; raises TypeError, KeyError and ValueError for what is none."""
+        seed, episode = (int(number(record[name])) for name in ("seed", "episode"))
+        return cls(number(record["loss"]), text(record["method"]), seed, episode, tuple(map(number, record["x"])))
+
+
+@dataclass(frozen=True)
+class Standing:
+    """How a method came off in a scene: mean rank and mean best loss with their intervals over seeds.
+
+    `unsuccessful` counts the seeds without a successful episode, `failed` the episodes that failed; `times` are the
+    expected running times for the scene's `goals` [episodes], None where no run reached one.
+    """
+
+    method: str
+    rank: float
+    rank_low: float
+    rank_high: float
+    mean: float
+    low: float
+    high: float
+    unsuccessful: int
+    failed: int
+    times: tuple[float | None, ...]
+
+    @classmethod
+    def of(cls, rank: Rank, times: Sequence[float | None]) -> Standing:
+        """Return that of a method in a race, by its rank and its running times."""
+        kept = {name: getattr(rank, name) for name in cls.__dataclass_fields__ if name != "times"}
+        return cls(**kept, times=tuple(times))
+
+    @classmethod
+    def of_record(cls, record: Mapping[str, Any]) -> Standing:
+        """Read it from plain JSON; raises TypeError, KeyError and ValueError for what is none."""
+        numbers = ("rank", "rank_low", "rank_high", "mean", "low", "high")
+        known: dict[str, Any] = {name: or_nan(record[name]) for name in numbers}
+        known |= {name: int(number(record[name])) for name in ("unsuccessful", "failed")}
+        times = tuple(optional(number, one) for one in record["times"])
+        return cls(method=text(record["method"]), times=times, **known)
+
+
+@dataclass(frozen=True)
+class SceneStandings:
+    """What a race in one scene says: `standings`, the best mean rank first, and how every two methods stand (`pairs`).
+
+    `identity` decides the numbers: scene, options, fidelity, device, engine, code. `goals` are some of the race's
+    targets, the hardest first, `best` is the best point that any run found. `left_out` says why methods did not run.
+    """
+
+    env: str
+    fidelity: str
+    device: str
+    loss_unit: str
+    identity: Mapping[str, Any]
+    budget: int
+    seeds: int
+    goals: tuple[float, ...]
+    standings: tuple[Standing, ...]
+    pairs: tuple[Superiority, ...]
+    best: BestPoint | None
+    left_out: Mapping[str, str]
+    command: str
+
+    @classmethod
+    def of(cls, race: Race, *, left_out: Mapping[str, str] | None = None, command: str = "") -> SceneStandings:
+        """Return what a race says."""
+        identity = {name: value for name, value in race.identity.items() if name not in OF_METHOD}
+        figures, some = race.statistics, race.statistics.targets.some
+        times = {method: times_record(one[some]) for method, one in figures.times.items()}
+        return cls(
+            **{name: str(identity[key]) for name, key in (("env", "objective"), ("fidelity", "fidelity"))},
+            device=str(identity["device"]),
+            loss_unit=race.loss_unit,
+            identity=identity,
+            budget=race.budget,
+            seeds=race.seeds,
+            goals=tuple(map(float, figures.targets.loss[some])),
+            standings=tuple(Standing.of(rank, times[rank.method]) for rank in figures.ranks),
+            pairs=tuple(figures.superiorities),
+            best=BestPoint.of(race),
+            left_out=dict(left_out or {}),
+            command=command,
+        )
+
+    @property
+    def methods(self) -> list[str]:
+        """The methods that raced, the best mean rank first."""
+        return [one.method for one in self.standings]
+
+    def findings(self, claims: Claims) -> list[ClaimFinding]:
+        """Return what the race makes of claims about its scene."""
+        return check_claims(claims.claims, (), self.pairs)
+
+    def probabilities(self, method: str) -> dict[str, float]:
+        """Return the probability that a method ends with a lesser loss than each of the others."""
+        seen = [one if one.first == method else one.reversed for one in self.pairs if method in (one.first, one.second)]
+        return {one.second: one.probability for one in seen}
+
+    def record(self) -> dict[str, Any]:
+        """Return it as plain JSON."""
+        found: dict[str, Any] = plain(asdict(self))
+        return found
+
+    @classmethod
+    def of_record(cls, record: Mapping[str, Any]) -> SceneStandings:
+        """Read it from plain JSON; raises TypeError, KeyError and ValueError for what is none."""
+        words = ("env", "fidelity", "device", "loss_unit", "command")
+        return cls(
+            **{name: text(record[name]) for name in words},
+            identity=dict(record["identity"]),
+            budget=int(number(record["budget"])),
+            seeds=int(number(record["seeds"])),
+            goals=tuple(map(number, record["goals"])),
+            standings=tuple(map(Standing.of_record, record["standings"])),
+            pairs=tuple(map(_pair, record["pairs"])),
+            best=optional(BestPoint.of_record, record["best"]),
+            left_out={text(name): text(why) for name, why in dict(record["left_out"]).items()},
+        )
+
+
+@dataclass(frozen=True)
+class OverallRank:
+    """The mean of a method's mean ranks over the `scenes` it ran in, with its interval by resampling these."""
+
+    method: str
+    rank: float
+    low: float
+    high: float
+    scenes: int
+
+
+@dataclass(frozen=True, eq=False)
+class League:
+    """Hold what the races say, by scene; `failed` says why there is no race in others, `command` how it is made."""
+
+    scenes: Sequence[SceneStandings]
+    failed: Mapping[str, str]
+    command: str
+
+    @cached_property
+    def overall(self) -> list[OverallRank]:
+        """The methods over all scenes, the best first."""
+        ranks: dict[str, list[float]] = {}
+        for one in chain.from_iterable(scene.standings for scene in self.scenes):
+            ranks.setdefault(one.method, []).append(one.rank)
+        found = []
+        for method, values in ranks.items():
+            low, high = map(float, interval(np.array(values)))
+            found.append(OverallRank(method, float(np.mean(values)), low, high, len(values)))
+        return sorted(found, key=lambda one: (one.rank, one.method))
+
+    @property
+    def methods(self) -> list[str]:
+        """The methods that raced anywhere, the best over all scenes first."""
+        return [one.method for one in self.overall]
+
+    def table(self) -> pd.DataFrame:
+        """Return a row for each scene and method: mean rank, mean best loss and their intervals, running times."""
+        import pandas as pd
+
+        return pd.DataFrame([row for scene in self.scenes for row in _rows(scene)])
+
+    def _repr_html_(self) -> str:
+        """Show the table in a notebook."""
+        return str(self.table().to_html())
+
+    def plot(self, *, width: float | None = None) -> Picture:
+        """Draw the mean ranks of methods in scenes as a map; `width` is that of a page for print [mm].
+
+        Raises ValueError where there is no race to draw.
+        """
+        if not self.scenes:
+            raise ValueError("no race of the league was run, so there is nothing to draw")
+        from ..landscapes.draw.figures.league import league_figure
+
+        return league_figure(self._picture(), width=width)
+
+    def record(self) -> dict[str, Any]:
+        """Return it as plain JSON: a row for each scene and method, the races, and all methods over all scenes."""
+        return {
+            "rows": [row for scene in self.scenes for row in plain(_rows(scene))],
+            "overall": plain([asdict(one) for one in self.overall]),
+            "scenes": [scene.record() for scene in self.scenes],
+            "failed": dict(self.failed),
+            "command": self.command,
+        }
+
+    @classmethod
+    def of_record(cls, record: Mapping[str, Any]) -> League:
+        """Read it from plain JSON; raises TypeError, KeyError and ValueError for what is none."""
+        failed = {text(name): text(why) for name, why in dict(record["failed"]).items()}
+        return cls([SceneStandings.of_record(one) for one in record["scenes"]], failed, text(record["command"]))
+
+    def _picture(self) -> xr.Dataset:
+        """Return what `landscapes.draw.figures.league` draws: ranks by scene and method, all scenes together last."""
+        ranks = {(scene.env, scene.fidelity): {one.method: one for one in scene.standings} for scene in self.scenes}
+        rows = [[standings.get(method) for method in self.methods] for standings in ranks.values()]
+        parts = {
+            name: [
+                *([getattr(one, name) if one else np.nan for one in row] for row in rows),
+                [getattr(one, name.removeprefix("rank_")) for one in self.overall],
+            ]
+            for name in ("rank", "rank_low", "rank_high")
+        }
+        fidelities = {scene.fidelity for scene in self.scenes}
+        names = [scene.env if len(fidelities) == 1 else f"{scene.env} ({scene.fidelity})" for scene in self.scenes]
+        seeds, budget = (_range(getattr(scene, name) for scene in self.scenes) for name in ("seeds", "budget"))
+        said = [f"League of {len(self.methods)} methods", *(fidelities if len(fidelities) == 1 else ())]
+        return xr.Dataset(
+            {name: (("scene", "method"), np.array(values, float)) for name, values in parts.items()},
+            {"scene": [*names, "all scenes"], "method": self.methods},
+            {
+                "title": " · ".join([*said, f"{budget} episodes", f"{seeds} seeds" if seeds != "1" else "1 seed"]),
+                "seeds": seeds,
+                "command": self.command,
+            },
+        )
+
+
+def _rows(scene: SceneStandings) -> list[dict[str, Any]]:
+    """Return what is known of each method in a scene, in one row each."""
+    about = {name: getattr(scene, name) for name in ("env", "fidelity", "device", "loss_unit", "budget", "seeds")}
+    best = scene.best
+    return [
+        {
+            **about,
+            **{name: value for name, value in asdict(one).items() if name != "times"},
+            "probability": {other: finite(p) for other, p in scene.probabilities(one.method).items()},
+            "running_times": dict(zip(map("{:.6g}".format, scene.goals), one.times, strict=True)),
+            "best_known": best.loss if best else None,
+        }
+        for one in scene.standings
+    ]
+
+
+def _pair(record: Mapping[str, Any]) -> Superiority:
+    chance, p, corrected = (number(record[name]) for name in ("probability", "p", "corrected"))
+    return Superiority(text(record["first"]), text(record["second"]), chance, p, corrected)
+
+
+def _range(values: Any) -> str:
+    """Return a number, or the least and the largest where they differ."""
+    found = sorted(set(values))
+    return str(found[0]) if len(found) == 1 else f"{found[0]} to {found[-1]}"

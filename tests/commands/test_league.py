@@ -1,0 +1,84 @@
+"""`landscape league` and `gs.league`: what they leave, say and refuse."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+import gradscape as gs
+
+from ..command import Said
+
+LEAGUE = ["league", "branin", "bounce@draft", "--methods", "random,cma-es", "--budget", "6", "--seeds", "2"]
+
+
+def test_a_league_of_the_command_is_that_of_python(
+    run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = run(*LEAGUE, "--device", "cpu", "--json", "--out", "l", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    said, kept = json.loads(done.stdout), json.loads((tmp_path / "l/league.json").read_text())
+    del kept["checksum"]
+    assert said == kept | {"folder": "l"}
+    assert "branin@exact · cpu: 0 of 24 episodes are there" in done.stderr
+    assert (tmp_path / "l/bounce-draft/race.png").exists()
+    monkeypatch.chdir(tmp_path)
+    ours = gs.league(["branin", "bounce@draft"], ["random", "cma-es"], budget=6, seeds=2, device="cpu", out="l")
+    assert ours.record()["rows"] == kept["rows"]
+    assert ours.plot()._repr_png_().startswith(b"\x89PNG")
+
+
+def test_it_prints_ranks_and_the_papers_claims(run: Callable[..., Said], tmp_path: Path) -> None:
+    done = run("league", "branin", "--methods", "random", "--budget", "6", "--seeds", "1", "--report", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for shown in ("mean ranks", "branin (exact)", "all scenes", "branin: least loss", "compares no optimisers"):
+        assert shown in done.stdout
+
+
+def test_the_best_point_of_a_league_is_known_to_slices(run: Callable[..., Said], tmp_path: Path) -> None:
+    short = ["--methods", "random", "--budget", "6", "--seeds", "1", "--device", "cpu", "--json"]
+    league = run("league", "bounce@draft", *short, cwd=tmp_path)
+    best = json.loads(league.stdout)["scenes"][0]["best"]
+    cut = ["--resolution", "2", "--through", "best", "--fidelity", "draft", "--device", "cpu", "--out", "s"]
+    through = run("slice", "bounce", "--dims", "0", "1", *cut, cwd=tmp_path)
+    assert through.returncode == 0, through.stderr
+    plane = json.loads(gs.open_slice(tmp_path / "s").data.attrs["identity"])["plane"]
+    assert plane["origin"][2] == best["x"][2]
+    found = gs.make("bounce", fidelity="draft", device="cpu").evaluate(
+        torch.tensor([best["x"]], dtype=torch.float64), grad=False
+    )
+    assert float(found.loss) == best["loss"]
+
+
+def test_a_scene_that_cannot_be_raced_ends_with_exit_code_1(run: Callable[..., Said], tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(
+        "from gradscape.envs.functions import Branin\n\n\n"
+        "class Own(Branin):\n    name = 'own'\n\n"
+        "    def _evaluate(self, x, *, grad):\n        raise RuntimeError('fire')\n"
+    )
+    done = run("league", "own.py:Own", *LEAGUE[1:2], *LEAGUE[3:], cwd=tmp_path)
+    assert done.returncode == 1
+    assert "own@exact is left out: RuntimeError: fire" in done.stderr
+    assert "1 of 2 scenes were left out: own@exact" in done.stderr
+    assert "all scenes" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["league", "nothing"], "no environment is called 'nothing'"),
+        (["league", "branin@best"], "branin has fidelities exact"),
+        (["league", "branin", "--seeds", "0"], "--seeds"),
+        (["league", "branin", "--workers", "2", "--scheduler", "local:2"], "--scheduler has workers of its own"),
+    ],
+)
+def test_bad_input_gets_one_line_and_leaves_nothing(
+    run: Callable[..., Said], tmp_path: Path, arguments: list[str], said: str
+) -> None:
+    done = run(*arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,205 @@
+"""The gallery's league: what is kept of its races, in how little room, and how it goes on."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gradscape.cli import main
+from gradscape.envs.registry import make
+from gradscape.gallery import league as gallery_league
+from gradscape.gallery.compute import PARTS
+from gradscape.gallery.figures import Figure
+from gradscape.gallery.league import LeaguePart, read_league, read_standings
+from gradscape.gallery.league_runs import PLACES, KeptRun, KeptRuns
+from gradscape.jobs import known
+from gradscape.jobs.race import RaceJob
+from gradscape.jobs.scene import point_of
+from gradscape.jobs.watch import Watch
+from gradscape.landscapes.adapters import from_numpy
+from gradscape.landscapes.identity import DamagedError
+from gradscape.landscapes.overlay import best_point
+from gradscape.landscapes.space import ParameterSpace
+from gradscape.optim.race import Race
+from gradscape.optim.runs.run import Run
+from gradscape.optim.search import search
+
+FIGURES = [
+    Figure("branin", "branin", (0, 1), resolution=8, fidelity="exact", over=""),
+    Figure("again", "branin", (0, 1), resolution=9, fidelity="exact", over=""),
+    Figure("beale", "beale", (0, 1), resolution=8, fidelity="exact", over=""),
+]
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    monkeypatch.setattr("gradscape.gallery.figures.read_figures", lambda: list(FIGURES))
+    for name, value in (("METHODS", ("random", "descents")), ("BUDGET", 12), ("SEEDS", 3)):
+        monkeypatch.setattr(gallery_league, name, value)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "data"
+
+
+def compute(data: Path, *arguments: str) -> int:
+    with pytest.raises(SystemExit) as left:
+        main(["gallery", "compute", "--part", "league", "--device", "cpu", "--data", str(data), *arguments])
+    return int(left.value.code or 0)
+
+
+@pytest.fixture(scope="module")
+def race(tmp_path_factory: pytest.TempPathFactory) -> Race:
+    env = make("branin", device="cpu")
+    out = tmp_path_factory.mktemp("race")
+    return RaceJob.of(env, ("random", "cma-es"), budget=20, seeds=3, command="landscape race", out=out).run().race
+
+
+def test_a_scene_is_raced_once_for_all_its_figures_and_kept(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert compute(small, "--only", "branin") == 0
+    said = capsys.readouterr().err
+    assert "league: 0 of 2 are there already" in said
+    assert said.count("2 methods, 3 seeds, 12 episodes: ") == 1
+    assert {path.name for path in (small / "league").iterdir()} == {
+        *("branin.json", "branin.npz", "branin.png"), *("league.json", "league.png"),
+    }  # fmt: skip
+    assert compute(small) == 0  # and goes on with the scene that is left
+    assert "league: 2 of 3 are there already" in capsys.readouterr().err
+    league = read_league(small)
+    assert league is not None
+    assert [scene.env for scene in league.scenes] == ["beale", "branin"]
+    before = {file: file.stat().st_mtime_ns for file in small.rglob("*") if file.is_file()}
+    assert compute(small) == 0
+    assert "league: 3 of 3 are there already" in capsys.readouterr().err
+    assert {file: file.stat().st_mtime_ns for file in small.rglob("*") if file.is_file()} == before
+
+
+def test_its_races_are_those_of_the_verb_and_neither_repeats_the_other(
+    small: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(
+            [
+                *[
+                    "league",
+                    "branin",
+                    "--methods",
+                    "random,descents",
+                    "--budget",
+                    "12",
+                    "--seeds",
+                    "3",
+                    "--device",
+                    "cpu",
+                    "--json",
+                ]
+            ]
+        )
+    theirs = json.loads(capsys.readouterr().out)["scenes"][0]
+    assert compute(small, "--only", "branin") == 0
+    assert "all 72 episodes are there already" in capsys.readouterr().err
+    ours = read_standings(small / "league/branin.json").record()
+    assert {name: one for name, one in ours.items() if name != "command"} == {
+        name: one for name, one in theirs.items() if name != "command"
+    }
+    assert ours["command"].startswith("landscape league branin@exact --methods random,descents --budget 12 --seeds 3")
+
+
+def test_more_seeds_or_a_damaged_file_make_it_anew(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    part = LeaguePart(FIGURES[0], small, "cpu")
+    assert part.count_left() == 1
+    part.make(Watch())
+    assert part.count_left() == 0
+    monkeypatch.setattr(gallery_league, "SEEDS", 4)
+    assert part.count_left() == 1
+    monkeypatch.setattr(gallery_league, "SEEDS", 2)
+    assert part.count_left() == 0
+    (small / "league/branin.npz").write_bytes(b"torn")
+    assert part.count_left() == 1
+
+
+def test_what_is_kept_of_a_run_is_each_improvement_and_its_best_point(race: Race) -> None:
+    for run in (run for runs in race.runs.values() for run in runs):
+        kept, losses = KeptRun.of(run, race.budget), run.data["loss"].to_numpy()
+        least = np.minimum.accumulate(losses)
+        assert kept.loss[-1] == losses.min() == run.best.loss
+        np.testing.assert_array_equal(kept.best, run.best.x)
+        assert (np.diff(kept.loss) < 0).all()
+        rebuilt = kept.loss[np.searchsorted(kept.episode, np.arange(1, race.budget + 1), side="right") - 1]
+        np.testing.assert_array_equal(rebuilt, least)
+        assert kept.spent == run.data["forwards"][-1]
+
+
+def test_kept_runs_come_back_and_the_median_run_has_all_its_points(race: Race, tmp_path: Path) -> None:
+    kept = KeptRuns.of(race)
+    kept.write(tmp_path / "branin.npz")
+    again = KeptRuns.read(tmp_path / "branin.npz")
+    for one, two in zip(kept.runs, again.runs, strict=True):
+        assert (one.method, one.seed, one.episodes, one.spent) == (two.method, two.seed, two.episodes, two.spent)
+        for name in ("episode", "forwards", "loss", "best"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    for method, table in again.medians.items():
+        finals = sorted((run.best.loss, run.seed) for run in race.runs[method])
+        assert table.attrs["seed"] == finals[1][1]
+        truth = race.runs[method][table.attrs["seed"]].data
+        width = np.array(truth.attrs["upper"]) - np.array(truth.attrs["lower"])
+        assert (np.abs(table["x"] - truth["x"]) <= width / PLACES / 1.99).all()
+        np.testing.assert_allclose(table["loss"], truth["loss"], rtol=1e-7)
+        assert table.identical(kept.medians[method])
+        assert best_point([table])[1] == pytest.approx(finals[1][0], rel=1e-7)
+
+
+def test_a_run_without_success_has_no_improvement(race: Race, tmp_path: Path) -> None:
+    run = race.runs["random"][0]
+    failed = KeptRun.of(type(run)(run.data.assign(loss=run.data["loss"] * np.nan)), race.budget)
+    assert (len(failed.loss), failed.episodes) == (0, 20)
+    assert np.isnan(failed.best).all()
+    KeptRuns([failed], {"random": KeptRuns.of(race).medians["random"]}).write(tmp_path / "one.npz")
+    assert len(KeptRuns.read(tmp_path / "one.npz").runs[0].loss) == 0
+
+
+def test_a_league_of_sixteen_scenes_is_light_enough(tmp_path: Path) -> None:
+    """A race of the paper's size in a tenth of the 690 parameters of all scenes, at points that do not compress."""
+    space = ParameterSpace.box([f"x{number}" for number in range(69)], -1.0, 1.0)
+    objective = from_numpy(lambda x: (x**2).sum(axis=1), space)
+    run = search(objective, "random", budget=1000).read()
+    methods = [f"method-{number}" for number in range(9)]
+    named = {name: [Run(run.data.assign_attrs(method=name)) for _ in range(10)] for name in methods}
+    KeptRuns.of(Race(named, 1000)).write(tmp_path / "scene.npz")
+    assert 10 * (tmp_path / "scene.npz").stat().st_size < 20e6
+
+
+def test_the_best_point_of_the_gallery_is_known_to_slices(
+    small: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    env = make("branin", device="cpu")
+    with pytest.raises(ValueError, match="no run of branin is known"):
+        point_of(env, "best")
+    LeaguePart(FIGURES[0], small, "cpu").make(Watch())
+    found = read_standings(small / "league/branin.json").best
+    assert found is not None
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")  # where no race is known
+    monkeypatch.setattr(known, "league_file", lambda name: small / "league" / f"{name}.json")
+    best = point_of(env, "best")
+    assert best.tolist() == list(found.x)
+    assert float(env.evaluate(best[None], grad=False).loss) == found.loss  # the episode, again
+    assert known.best_of_league(make("ackley", device="cpu")) is None
+    torn = small / "league/branin.json"
+    torn.write_text(torn.read_text().replace('"budget": 12', '"budget": 13'))
+    with pytest.raises(DamagedError, match="is damaged"):
+        point_of(env, "best")
+
+
+def test_a_better_run_is_preferred_to_the_gallery_s(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = make("branin", device="cpu")
+    LeaguePart(FIGURES[0], small, "cpu").make(Watch())
+    own = point_of(env, "best")
+    for loss, expected in ((1e9, own), (-1e9, torch.zeros(2, dtype=torch.float64))):
+        monkeypatch.setattr(known, "best_of_league", lambda env, loss=loss: (torch.zeros(2, dtype=torch.float64), loss))
+        assert torch.equal(point_of(env, "best"), expected)
+
+
+def test_the_league_is_a_part_that_figures_share() -> None:
+    parts = [PARTS["league"](figure, Path("data"), "cpu") for figure in FIGURES]
+    assert [part.shared for part in parts] == ["branin", "branin", "beale"]
