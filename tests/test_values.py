@@ -32,6 +32,7 @@ slice branin --dims 0 1 --resolution 3
 sweep ackley --dims 0 1 --over 2 --set dim=3 --frames 2 --resolution 3
 optimize branin --method random --budget 5
 race branin --methods random --budget 5 --seeds 2
+league branin --methods random --budget 5 --seeds 2
 overlay cut run
 compare cut branin
 surface cut
