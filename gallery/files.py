@@ -51,6 +51,11 @@ def data_folder(named: str | None) -> Path:
     return DATA if any(DATA.glob(f"*/{STORE}")) else ELSEWHERE
 
 
+def dark_name(picture: str) -> str:
+    """Return the name of a picture for pages that are dark."""
+    return picture.removesuffix(".png") + "-dark.png"
+
+
 def episode_name(row: int, column: int) -> str:
     """Return the name of the files of an episode at a node, without their ending."""
     return f"episode-{row}-{column}"
@@ -92,14 +97,20 @@ class TradeoffFiles:
 
 @dataclass(frozen=True)
 class LeagueFiles:
-    """Name the files of an environment's race in the league: the record, the picture, and what is kept of its runs."""
+    """Name the files of an environment's race in the league: record, pictures, and what is kept of its runs."""
 
     record: Path
     picture: Path
+    dark: Path  # the picture for a dark page
     runs: Path
 
     @classmethod
     def of(cls, root: Path, env: str) -> LeagueFiles:
         """Return where the race in an environment is, in the gallery's data or in its site."""
         record = root / LEAGUE / f"{env}.json"
-        return cls(record, record.with_suffix(".png"), record.with_suffix(".npz"))
+        picture = record.with_suffix(".png")
+        return cls(record, picture, picture.with_name(dark_name(picture.name)), record.with_suffix(".npz"))
+
+    def there(self) -> bool:
+        """Say whether all are there."""
+        return all(one.is_file() for one in (self.record, self.picture, self.dark, self.runs))

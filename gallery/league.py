@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from ..jobs.folder import RACE
 from ..jobs.league import Fixture, LeagueJob
 from ..jobs.scene import SceneSpec
 from ..jobs.watch import Watch
 from ..landscapes.storage.files import make_folder
 from ..landscapes.storage.records import read_json, reading, write_record
 from ..optim.league import League, SceneStandings
-from .files import LEAGUE, LEAGUE_PICTURE, LEAGUE_RECORD, REMAKE, LeagueFiles
+from .files import LEAGUE, REMAKE, LeagueFiles, dark_name
 from .league_runs import KeptRuns
 from .parts import FigurePart
 from .records import read_if_sound
+
+if TYPE_CHECKING:
+    from ..landscapes.draw.figures.page import Picture
 
 METHODS = (
     *("random", "cma-es", "descents", "bo-descents", "bo-leap"),  # the paper's
@@ -38,12 +41,12 @@ class LeaguePart(FigurePart):
     def label(self) -> str:
         """Return the command that runs it elsewhere."""
         how = f"--methods {','.join(METHODS)} --budget {BUDGET} --seeds {SEEDS} --device {self.device}"
-        return f"landscape league {self._fixture} {how}"
+        return f"landscape league {Fixture.of(self._own_scene, self.root)} {how}"
 
     def count_left(self) -> int:
         """Return 1 where no race of these methods, seeds and episodes at this fidelity is kept."""
         kept = read_if_sound(read_standings, self._files.record)
-        if kept is None or read_if_sound(KeptRuns.read, self._files.runs) is None or not self._files.picture.is_file():
+        if kept is None or read_if_sound(KeptRuns.read, self._files.runs) is None or not self._files.there():
             return 1
         known = {*kept.methods, *kept.left_out}
         whole = known >= set(METHODS) and kept.budget >= BUDGET and kept.seeds >= SEEDS
@@ -54,7 +57,7 @@ class LeaguePart(FigurePart):
         return self._job.forecast(self._fixture, Watch())
 
     def make(self, watch: Watch) -> str:
-        """Race, or go on with it, keep what is needed of it, and write the league of all scenes that are kept."""
+        """Race, or go on with it, and keep what is needed of it."""
         from ..landscapes.draw.film import lighten
 
         race, left_out = self._job.run_race(self._fixture, watch)
@@ -62,11 +65,11 @@ class LeaguePart(FigurePart):
         files = self._files
         make_folder(files.record.parent)
         files.record.unlink(missing_ok=True)  # which says that the others are whole
-        shutil.copyfile(self._fixture.folder / RACE.picture, files.picture)
-        lighten(files.picture)
+        save_both(race.plot(), files.picture)
+        for picture in (files.picture, files.dark):
+            lighten(picture)
         KeptRuns.of(race).write(files.runs)
         write_record(files.record, found.record())
-        write_league(self.root)
         return (
             f"{len(found.methods)} methods, {found.seeds} seeds, {found.budget} episodes: {found.methods[0]} is first"
         )
@@ -81,11 +84,13 @@ class LeaguePart(FigurePart):
 
     @property
     def _job(self) -> LeagueJob:
-        scene = SceneSpec(self.figure.env, self._scene().fidelity, device=self.device)
-        return LeagueJob.of(
-            [scene], METHODS, budget=BUDGET, seeds=SEEDS, command=f"landscape league --device {self.device}",
-            workers=_cores(), executor=self.executor,
-        )  # fmt: skip
+        how = {"budget": BUDGET, "seeds": SEEDS, "command": self.label()}
+        return LeagueJob.of([self._own_scene], METHODS, **how, workers=_cores(), executor=self.executor)  # type: ignore[arg-type] # each of its kind
+
+    @property
+    def _own_scene(self) -> SceneSpec:
+        """The figure's scene with the options that it has by default."""
+        return replace(self._scene(), options={})
 
 
 def read_standings(path: Path) -> SceneStandings:
@@ -99,23 +104,21 @@ def read_league(root: Path) -> League | None:
 
     Raises ValueError, naming the file, where one is not what was written.
     """
-    folder = root / LEAGUE
-    scenes = [read_standings(path) for path in sorted(folder.glob("*.json")) if path.name != LEAGUE_RECORD]
+    scenes = [read_standings(path) for path in sorted((root / LEAGUE).glob("*.json"))]
     if not scenes:
         return None
     return League(scenes, {}, "landscape gallery compute --part league")
 
 
-def write_league(root: Path) -> None:
-    """Write and draw the league of the scenes that are kept."""
+def save_both(picture: Picture, path: Path) -> None:
+    """Write a picture, and the same for a dark page beside it."""
+    from ..landscapes.draw.figures.dark import darken
     from ..landscapes.draw.figures.page import save
-    from ..landscapes.draw.film import lighten
 
-    league = read_league(root)
-    if league is not None:
-        write_record(root / LEAGUE / LEAGUE_RECORD, league.record())
-        save(league.plot(), root / LEAGUE / LEAGUE_PICTURE)
-        lighten(root / LEAGUE / LEAGUE_PICTURE)
+    dark = path.with_name(dark_name(path.name))
+    save(picture, path)
+    darken(picture)
+    save(picture, dark)
 
 
 def _cores() -> int:

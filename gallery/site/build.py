@@ -34,17 +34,30 @@ from ...landscapes.storage.records import reading
 from ...landscapes.storage.store import SliceStore, open_slice
 from ..companions import Companion, read_companions
 from ..figures import Figure
-from ..files import COMPANION_PICTURE, MEASURES, PICTURE, QUALITY, REMAKE, REPORT, STORE, SURFACES, SWEEP_FILM
+from ..files import (
+    COMPANION_PICTURE,
+    MEASURES,
+    PICTURE,
+    QUALITY,
+    REMAKE,
+    REPORT,
+    STORE,
+    SURFACES,
+    SWEEP_FILM,
+    dark_name,
+)
+from ..paper import read_paper
 from .card import place_card
+from .league import LeaguePage, place_league
 from .manifest import SCHEMA, FigureEntry, Manifest, ModelEntry, TradeoffEntry, as_json
-from .measured import dark_name, place_tradeoffs, read_report
+from .measured import place_tradeoffs, read_report
 from .models import place_models
 from .page_data import count_numbers, read_episodes, read_measures, read_off_nodes, read_sweep
 from .trajectories import lay_runs, read_runs
 
 HERE = Path(__file__).parent
 MANIFEST, NODES, THUMBNAIL = "manifest.json", "nodes.js", "thumbnail.png"
-CARD_PAGE = "card.html"
+CARD_PAGE, LEAGUE_PAGE = "card.html", "league.html"
 
 
 def build_site(
@@ -69,6 +82,7 @@ def build_site(
         site = _Site(new, _templates(), tables, place_tradeoffs(data, new, envs), place_models(data, new, envs))
         shown = [site.write_page(figure, data / figure.id) for figure in there]
         site.write_card(place_card(data, new))
+        site.write_league(place_league(data, new, read_paper()))
         return site.write_index(shown, [figure.id for figure in figures if figure not in there])
 
 
@@ -164,12 +178,17 @@ class _Site:
         if card is not None:
             (self.folder / CARD_PAGE).write_text(self.pages.get_template(CARD_PAGE).render(card=card))
 
+    def write_league(self, page: LeaguePage | None) -> None:
+        """Write the page of the league, where there is one."""
+        if page is not None:
+            (self.folder / LEAGUE_PAGE).write_text(self.pages.get_template(LEAGUE_PAGE).render(page=page))
+
     def write_index(self, shown: Sequence[FigureEntry], missing: Sequence[str]) -> Manifest:
         """Write the page of all pages and the manifest, and return that."""
         manifest = Manifest(SCHEMA, __version__, shown, missing, [])
         groups = [(env, list(group)) for env, group in groupby(shown, key=lambda entry: entry.env)]
-        card = CARD_PAGE if (self.folder / CARD_PAGE).exists() else ""
-        about = {"groups": groups, "manifest": manifest, "scenes": entries(), "card": card}
+        card, league = (name if (self.folder / name).exists() else "" for name in (CARD_PAGE, LEAGUE_PAGE))
+        about = {"groups": groups, "manifest": manifest, "scenes": entries(), "card": card, "league": league}
         index = self.pages.get_template("index.html").render(**about)
         (self.folder / "index.html").write_text(index)
         files = [file.relative_to(self.folder).as_posix() for file in self.folder.rglob("*") if file.is_file()]

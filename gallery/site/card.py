@@ -7,8 +7,7 @@ from pathlib import Path
 
 from ...landscapes.measures.card import Card
 from ...landscapes.storage.records import read_json, reading
-from ..files import CARD, CARD_PICTURE, CARD_RECORD
-from .measured import dark_name
+from ..files import CARD, CARD_PICTURE, CARD_RECORD, dark_name
 
 REMAKE = "delete it, and `landscape card --out {}` measures it anew"
 

@@ -13,7 +13,7 @@ from ...landscapes.measures.convergence_record import Convergence
 from ...landscapes.measures.fidelity import cheapest, p95, pareto_front
 from ...landscapes.plain import number, optional, text
 from ...landscapes.storage.records import read_json, reading
-from ..files import DEVICES, REMAKE, REPORT, TRADEOFFS, TradeoffFiles
+from ..files import DEVICES, REMAKE, REPORT, TRADEOFFS, TradeoffFiles, dark_name
 from .manifest import ConvergenceEntry, Interval, ReportEntry, Rung, SecondsEntry, TradeoffEntry, Word
 
 Record = Mapping[str, Any]
@@ -71,11 +71,6 @@ def _small(rows: Sequence[Record]) -> Record | None:
 
 def _format_signed(value: float) -> str:
     return f"{value:z.2f}".replace("-", "\N{MINUS SIGN}")
-
-
-def dark_name(picture: str) -> str:
-    """Return the name of a picture for pages that are dark."""
-    return picture.removesuffix(".png") + "-dark.png"
 
 
 def place_tradeoffs(data: Path, out: Path, envs: Sequence[str]) -> dict[str, list[TradeoffEntry]]:

@@ -9,9 +9,8 @@ from pathlib import Path
 
 from ...landscapes.measures.model import Effect, MeasuredPart, ModelStudy
 from ...landscapes.storage.records import read_json, reading
-from ..files import DEVICES, TRADEOFFS, TradeoffFiles
+from ..files import DEVICES, TRADEOFFS, TradeoffFiles, dark_name
 from .manifest import Interval, ModelEntry, PartRow
-from .measured import dark_name
 
 REMAKE = "delete it, and `landscape tradeoff {} --ladder model` measures it anew"
 

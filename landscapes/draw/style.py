@@ -79,6 +79,7 @@ POINT_MARKS: dict[str, dict[str, Any]] = {  # what a run evaluated a point for
     "policy": {"color": "#5b2a86", "marker": "s"},
     "given": {"color": "#c47a00", "marker": "^"},  # by another program
 }
+TINTED = ("#0b0b18", "#ffffdc")  # inks on a colour that are no greys, so that they stay where a page is dark
 NOT_RUN: dict[str, Any] = {"facecolor": UNSAMPLED, "edgecolor": QUIET, "linewidth": 0.0, "hatch": "////"}
 METHOD_BAND: dict[str, Any] = {"alpha": 0.12, "linewidth": 0.0}
 OVERLAID: dict[str, Any] = {"linewidths": 0.6, "zorder": 3, "rasterized": True}  # the points of a run over a map
@@ -336,11 +337,11 @@ def number(value: float, form: str = ".4g") -> str:
     return f"{value:z{form}}".replace("-", "\N{MINUS SIGN}")
 
 
-def text_on(colour: Sequence[float]) -> str:
-    """Return the ink that is legible on a colour, red, green and blue of 0 to 1: dark on light, light on dark."""
+def text_on(colour: Sequence[float], inks: tuple[str, str] = ("black", "white")) -> str:
+    """Return the ink, the dark or the light one, that is legible on a colour, red, green and blue of 0 to 1."""
     linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in colour[:3]]
     luminance = float(np.dot(linear, (0.2126, 0.7152, 0.0722)))  # WCAG 2
-    return "white" if 1.05 / (luminance + 0.05) > (luminance + 0.05) / 0.05 else "black"
+    return inks[1.05 / (luminance + 0.05) > (luminance + 0.05) / 0.05]
 
 
 def power(value: float, plain: int = 4) -> str:

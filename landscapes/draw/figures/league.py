@@ -58,7 +58,8 @@ def _write_cells(ax: Axes, dataset: xr.Dataset, most: float, *, told: bool) -> N
             ax.add_patch(Rectangle(corner, 1, 1, **style.NOT_RUN))
             continue
         share = (rank - 1) / (most - 1)
-        look: dict[str, Any] = {"ha": "center", "color": style.text_on(style.RANK_MAP(share)), "parse_math": False}
+        ink = style.text_on(style.RANK_MAP(share), style.TINTED)
+        look: dict[str, Any] = {"ha": "center", "color": ink, "parse_math": False}
         within = told and np.isfinite(low)
         form, size = (".2f", sheet.tick) if told else (".1f", sheet.small)
         ax.text(column, row - 0.16 * within, style.number(rank, form), va="center", size=size, **look)

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from gradscape.gallery.figures import Figure
-from gradscape.gallery.files import RUN_SUFFIX, RUNS
+from gradscape.gallery.files import RUN_SUFFIX, RUNS, LeagueFiles
 from gradscape.gallery.paper import PaperCaption
 from gradscape.gallery.runs import save_run
 from gradscape.gallery.site.build import build_site
@@ -20,7 +20,11 @@ from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
+from gradscape.landscapes.storage.records import write_record
 from gradscape.landscapes.storage.store import SliceStore
+from gradscape.optim.league import SceneStandings
+from gradscape.optim.race import Race
+from gradscape.optim.runs.run import Run
 from gradscape.optim.runs.store import RunStore
 from gradscape.optim.search import search
 
@@ -147,6 +151,29 @@ def film(path: Path) -> None:
     picture(Path(f"{path}.webp"))
 
 
+def scene_standings(env: str, left_out: dict[str, str]) -> SceneStandings:
+    """Return what a race of made-up runs says, of three methods and five seeds that are far apart."""
+    space, runs = Bowl(env).space, dict[str, list[Run]]()
+    for number, method in enumerate(("bo-leap", "cma-es", "random")):
+        for seed in range(5):
+            about = {"objective": env, "options": {}, "method": method, "seed": seed, "fidelity": "draft"}
+            store = RunStore.in_memory(space, identity={**about, "device": "cpu"}, budget=12)
+            data = search(Bowl(env), "random", store, budget=12, gradient_cost=2.0).dataset()
+            loss = data["loss"] + number * 10 + seed
+            runs.setdefault(method, []).append(Run(data.assign(loss=loss).assign_attrs(method=method, seed=seed)))
+    return SceneStandings.of(Race(runs, 12), left_out=left_out, command=f"landscape league {env}")
+
+
+def league(folder: Path) -> None:
+    """Leave a league of two scenes, in one of which a method did not run."""
+    (folder / "league").mkdir()
+    for env, left_out in (("fluid", {}), ("bounce", {"turbo": "turbo is <not> here"})):
+        files = LeagueFiles.of(folder, env)
+        write_record(files.record, scene_standings(env, left_out).record())
+        picture(files.picture)
+        picture(files.dark)
+
+
 COMPANIONS = [
     {"through": "center", "lowest": 0.25, "highest": 3.5, "failed": 0.0},
     {"through": "example:scoop", "lowest": None, "highest": None, "failed": 1.0},
@@ -189,6 +216,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "card").mkdir()
     (folder / "card/card.json").write_text(json.dumps(CARD))
     picture(folder / "card/card.png")
+    league(folder)
     for name in ("episode-6-5", "episode-11-11", "sweep"):
         film(full / name)
     (full / "episode-11-11.mp4").unlink()

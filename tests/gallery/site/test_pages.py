@@ -265,8 +265,9 @@ def test_dark_screens_have_the_dark_pictures_and_print_the_light_ones(filed: str
         page.wait_for_function("!Array.from(document.images).some((one) => one.currentSrc.endsWith('-dark.png'))")
 
 
-def test_every_table_shows_all_of_its_columns_on_a_phone(filed: str, visit: Visit) -> None:
-    page = visit(filed, "full/index.html", width=360)
+@pytest.mark.parametrize("path", ["full/index.html", "league.html"])
+def test_every_table_shows_all_of_its_columns_on_a_phone(filed: str, visit: Visit, path: str) -> None:
+    page = visit(filed, path, width=360)
     page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
     boxes = page.evaluate(
         """() => Array.from(document.querySelectorAll('tbody th, tbody td')).filter((one) => one.textContent.trim())
@@ -285,7 +286,7 @@ def test_every_table_shows_all_of_its_columns_on_a_phone(filed: str, visit: Visi
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_pages_fit_a_phone_in_light_and_dark(filed: str, visit: Visit, scheme: str) -> None:
-    for path in ("index.html", "card.html", "full/index.html", "line/index.html"):
+    for path in ("index.html", "card.html", "league.html", "full/index.html", "line/index.html"):
         page = visit(filed, path, width=360, color_scheme=scheme, device_scale_factor=2)
         assert page.evaluate("document.documentElement.scrollWidth") <= 360
         ground = page.evaluate("getComputedStyle(document.body).backgroundColor")

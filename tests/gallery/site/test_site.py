@@ -10,6 +10,8 @@ from urllib.parse import urldefrag
 import numpy as np
 import pytest
 
+from gradscape.gallery.league import read_standings
+from gradscape.gallery.paper import read_paper
 from gradscape.gallery.runs import open_run
 from gradscape.gallery.site.build import HERE, build_site
 from gradscape.landscapes.identity import stored_identity
@@ -42,7 +44,7 @@ class Page(HTMLParser):
 
 def test_every_link_and_picture_is_in_the_site(site: Path) -> None:
     pages = {path: Page(path) for path in site.rglob("*.html")}
-    assert len(pages) == 2 + len(FIGURES)  # the index and the report card
+    assert len(pages) == 3 + len(FIGURES)  # the index, the report card and the league
     for path, page in pages.items():
         assert len(set(page.ids)) == len(page.ids)
         assert set(page.named) <= set(page.ids)
@@ -115,6 +117,46 @@ def test_the_report_card_says_what_was_found_of_which_version(site: Path) -> Non
     assert "special places: 1 of 9 slopes &lt; all are wrong" in page
     assert "landscape check bowl --set solver=fast" in page
     assert 'href="card.html"' in (site / "index.html").read_text()
+
+
+def test_the_league_holds_claims_against_pairs_and_says_what_did_not_run(site: Path, data: Path) -> None:
+    page = bare_cells((site / "league.html").read_text())
+    assert "3 methods, 5 seeds each, 12 episodes a run" in page
+    claims = read_paper().claims_about("fluid").claims
+    found = read_standings(data / "league/fluid.json")
+    pairs = {(one.first, one.second): one for one in found.pairs}
+    for claim in claims:
+        row = re.search(rf"{claim}</th>(.*?)</tr>", page)
+        assert row is not None
+        chance = pairs.get((claim.first, claim.second))
+        assert ("not run" in row[1]) == (chance is None)
+        if chance:  # of five seeds that are ten apart, each less than each
+            assert ("confirmed" in row[1], chance.probability) == (chance.corrected < 0.05, 1.0)
+            assert "100 %" in row[1]
+    assert "2 confirmed, 2 not run" in page
+    assert "bounce: The paper compares no optimisers here" in page
+    assert "Without turbo: turbo is &lt;not&gt; here" in page
+    assert 'href="league.html"' in (site / "index.html").read_text()
+    assert {path.name for path in (site / "league").iterdir()} == {
+        f"{name}{kind}" for name in ("league", "fluid", "bounce") for kind in (".json", ".png", "-dark.png")
+    }
+
+
+def test_ranks_are_legible_on_their_colours(site: Path) -> None:
+    page = (site / "league.html").read_text()
+    cells = re.findall(r"background: (#\w{6}); color: (\w+)", page)
+    assert len(cells) == 3 * 3  # of two scenes, and of all
+    inks = {"white": 1.0, "black": 0.0}
+    for ground, ink in cells:
+        low, high = sorted((luminance(ground), inks[ink]))
+        assert (high + 0.05) / (low + 0.05) >= 4.5
+
+
+def test_without_races_there_is_no_league(data: Path, tmp_path: Path) -> None:
+    few = shutil.copytree(data / "bare", tmp_path / "data/bare").parent
+    build_site(FIGURES, few, tmp_path / "site")
+    assert not (tmp_path / "site/league.html").exists()
+    assert "league.html" not in (tmp_path / "site/index.html").read_text()
 
 
 def test_words_are_beside_the_papers_and_a_trade_off_is_ranked(site: Path) -> None:

@@ -1,0 +1,138 @@
+"""The page of the league: methods against scenes, what the paper claims of them, and each scene's race."""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ...landscapes.storage.records import write_record
+from ...optim.claims import ClaimFinding, ClaimVerdict
+from ...optim.league import League, OverallRank, SceneStandings, Standing
+from ..files import LEAGUE, LEAGUE_PICTURE, LEAGUE_RECORD, LeagueFiles
+from ..league import read_league, save_both
+from ..paper import Paper
+
+VERDICTS = {
+    ClaimVerdict.HOLDS: "confirmed",
+    ClaimVerdict.FAILS: "refuted",
+    ClaimVerdict.UNDECIDED: "not decided",
+    ClaimVerdict.NOT_RUN: "not run",
+}
+
+
+@dataclass(frozen=True)
+class RankCell:
+    """A mean rank with its interval, NaN where there is none, and the colours of its cell."""
+
+    method: str
+    rank: float
+    low: float
+    high: float
+    ground: str
+    ink: str
+
+    @property
+    def known(self) -> bool:
+        """Whether there is an interval."""
+        return self.low == self.low
+
+
+@dataclass(frozen=True)
+class RankRow:
+    """A scene's mean ranks in the order of the methods, None where one did not run; `anchor` is its place below."""
+
+    name: str
+    anchor: str
+    fidelity: str
+    cells: Sequence[RankCell | None]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A claim of the paper in a scene, and what the league makes of it."""
+
+    env: str
+    fidelity: str
+    finding: ClaimFinding
+
+    @property
+    def word(self) -> str:
+        """What the league makes of it."""
+        return VERDICTS[self.finding.verdict]
+
+
+@dataclass(frozen=True)
+class LeaguePage:
+    """All that the page says: ranks, verdicts on claims, why others are none, and the races themselves."""
+
+    league: League
+    rows: Sequence[RankRow]
+    verdicts: Sequence[Verdict]
+    silences: Sequence[tuple[str, str]]
+
+    @classmethod
+    def of(cls, league: League, paper: Paper) -> LeaguePage:
+        """Return what is to be said of a league beside the paper."""
+        count = len(league.methods)
+        rows = [_row(scene, league.methods, count) for scene in league.scenes]
+        overall = RankRow("all scenes", "", "", [_cell(one, count) for one in league.overall])
+        found = [(scene, paper.claims_about(scene.env)) for scene in league.scenes]
+        verdicts = [
+            Verdict(scene.env, scene.fidelity, one) for scene, claims in found for one in scene.findings(claims)
+        ]
+        silences = [(scene.env, claims.silence) for scene, claims in found if claims.silence]
+        return cls(league, [*rows, overall], verdicts, silences)
+
+    @property
+    def counts(self) -> str:
+        """How many claims are confirmed, refuted, and so on, in words."""
+        found = Counter(one.word for one in self.verdicts)
+        return ", ".join(f"{found[word]} {word}" for word in VERDICTS.values() if found[word])
+
+    @property
+    def size(self) -> str:
+        """How many methods, seeds and episodes it has, by its first scene."""
+        first = self.league.scenes[0]
+        return f"{len(self.league.methods)} methods, {first.seeds} seeds each, {first.budget} episodes a run"
+
+    def describe(self) -> str:
+        """Say what the map of ranks shows."""
+        best = self.league.overall[0]
+        return (
+            f"Mean ranks of {len(self.league.methods)} methods in {len(self.league.scenes)} scenes; over all scenes "
+            f"{best.method} is first with {best.rank:.2f}"
+        )
+
+
+def place_league(data: Path, out: Path, paper: Paper) -> LeaguePage | None:
+    """Put the league of the figures' data into the site, and return what its page says; None where there is none."""
+    league = read_league(data)
+    if league is None:
+        return None
+    folder = out / LEAGUE
+    folder.mkdir()
+    for source, target in ((LeagueFiles.of(data, one.env), LeagueFiles.of(out, one.env)) for one in league.scenes):
+        for name in ("record", "picture", "dark"):
+            shutil.copyfile(getattr(source, name), getattr(target, name))
+    write_record(folder / LEAGUE_RECORD, league.record())
+    save_both(league.plot(), folder / LEAGUE_PICTURE)
+    return LeaguePage.of(league, paper)
+
+
+def _row(scene: SceneStandings, methods: Sequence[str], count: int) -> RankRow:
+    by = {one.method: one for one in scene.standings}
+    cells = [_cell(by[method], count) if method in by else None for method in methods]
+    return RankRow(scene.env, scene.env, scene.fidelity, cells)
+
+
+def _cell(one: Standing | OverallRank, count: int) -> RankCell:
+    """Return the cell of a mean rank among so many methods, in the colours of the league's picture."""
+    from ...landscapes.draw.style import RANK_MAP, text_on
+
+    low, high = (one.rank_low, one.rank_high) if isinstance(one, Standing) else (one.low, one.high)
+    colour = RANK_MAP((one.rank - 1) / max(count - 1, 1))
+    ground = "#" + bytes(round(255 * part) for part in colour[:3]).hex()
+    return RankCell(one.method, one.rank, low, high, ground, text_on(colour))
