@@ -29,6 +29,10 @@ WRITING = {  # the command, the file for which there is no room any more, what i
     "race": (
         "race branin --methods random --seeds 1 --budget 4 --out made", "race.json", "4 of 4 episodes are kept in made"
     ),
+    "league": (
+        "league branin --methods random --seeds 1 --budget 4 --out made", "league.json",
+        "4 of 4 episodes are kept in made",
+    ),
     "tradeoff": (
         "tradeoff bounce --set horizon=0.05 --points 2 --variants precision --device cpu --out made", "tradeoff.json",
         "variants are kept in made",

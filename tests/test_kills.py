@@ -17,6 +17,10 @@ JOBS = {
     "slice": ("slice bounce --dims 0 1 --resolution 12 --fidelity draft --out made", "landscape.png"),
     "sweep": ("sweep bounce --dims 0 1 --over 2 --frames 2 --resolution 8 --fidelity draft --out made", "sweep.gif"),
     "race": ("race bounce --methods random,descents --seeds 2 --budget 12 --fidelity draft --out made", "race.png"),
+    "league": (
+        "league bounce@draft branin --methods random,descents --seeds 2 --budget 12 --device cpu --out made",
+        "league.json",
+    ),
     "pairs": ("pairs bounce --samples 2 --fidelity draft --device cpu --out made", "pairs.json"),
     "gallery": (
         "gallery compute --only bounce --part slices --resolution 24 --fidelity draft --device cpu --data made",

@@ -30,6 +30,7 @@ sweep bounce --dims 0 1 --over 2 --frames 2 --resolution 2 --fidelity draft --de
 methods
 optimize bounce --method random --budget 4 --fidelity draft --device cpu --out run
 race bounce --methods random --seeds 1 --budget 2 --fidelity draft --device cpu
+league branin --methods random --seeds 1 --budget 2 --device cpu
 overlay cut run --out over
 surface cut run
 compare cut bounce --fidelity draft --device cpu
