@@ -129,6 +129,7 @@ class LeagueJob:
         it is interrupted, and DiskFullError; the same job goes on from what is kept then.
         """
         watch = watch or Watch()
+        self.failed.clear()
         with resumable(self.say_kept):
             self.announce(watch)
             scenes = list[SceneStandings]()
