@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from gradscape.gallery.site import build
+from gradscape.gallery.site import build, league
 from gradscape.gallery.site.build import build_site
 from gradscape.landscapes.draw.figures import dark
 
@@ -25,6 +25,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave pictures out."""
     monkeypatch.setattr(build, "_draw", lambda dataset, source, folder: (folder / "landscape.png").touch())
     monkeypatch.setattr(dark, "save_dark", lambda source, target: target.touch())
+    monkeypatch.setattr(league, "save_both", lambda picture, path: path.touch())
 
 
 def changed(value: Any) -> Iterator[Any]:
