@@ -15,7 +15,7 @@ def test_a_kept_record_is_whole_and_its_command_is_anybodys(path: Path) -> None:
     record = read_json(path)
     assert path.name.startswith(f"{record['env']}-{record['identity']['device']}")
     for command in (record["command"], record["provenance"]["command"]):
-        assert command.startswith("landscape ")
+        assert command.startswith(("landscape ", f"gradscape.{path.parent.name}("))  # of the command line, of Python
         assert " /" not in command
 
 
