@@ -52,8 +52,13 @@ def forgotten() -> Iterator[None]:
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_sessionfinish(session: pytest.Session) -> Generator[None]:
-    """Say last of all what was left out for want of a browser."""
+    """Let Taichi keep what it has compiled for the next run, and say last of all what was left out for want of a browser.
+
+    Taichi does so as its program is taken down, which no interpreter does that has frozen what holds it.
+    """
     yield
+    if taichi := sys.modules.get("taichi"):
+        taichi.reset()
     if reporter := session.config.pluginmanager.get_plugin("terminalreporter"):
         skipped = sum(NO_BROWSER in str(report.longrepr) for report in reporter.stats.get("skipped", []))
         if skipped:
