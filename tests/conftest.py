@@ -52,9 +52,9 @@ def forgotten() -> Iterator[None]:
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_sessionfinish(session: pytest.Session) -> Generator[None]:
-    """Let Taichi keep what it has compiled for the next run, and say last of all what was left out for want of a browser.
+    """Let Taichi keep what it has compiled, and say last of all what was left out for want of a browser.
 
-    Taichi does so as its program is taken down, which no interpreter does that has frozen what holds it.
+    Taichi keeps it as its program is taken down, which never happens where what holds the program is frozen.
     """
     yield
     if taichi := sys.modules.get("taichi"):
