@@ -112,8 +112,8 @@ def small(command: str) -> list[str]:
     pairs = [added[at : at + 2] for at in range(0, len(added), 2)] if verb != "replay" else [added]
     pairs = [pair for pair in pairs if not (pair[0] == "--variants" and "--ladder" in found)]  # which go not together
     if "mixed" in found:  # whose budget is in seconds
-        found = [*found, *(["--budget", "1"] if "--budget" not in found else [])]
-        found[found.index("--budget") + 1] = "1"
+        found += [] if "--budget" in found else ["--budget", ""]
+        found[found.index("--budget") + 1] = "0.01"
     short = TENTH if SHORT.get(kind, set()) & {*found} else []
     return [*found, *(word for pair in pairs if pair[0] not in found for word in pair), *short]
 
