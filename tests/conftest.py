@@ -23,8 +23,9 @@ from .command import NO_BROWSER, Said
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # A scene spreads a batch over a thread for each core. Two workers that do so on two cores take turns four abreast, and
-# need half as long again; each gets a core of its own.
-if (worker := os.environ.get("PYTEST_XDIST_WORKER")) and hasattr(os, "sched_setaffinity"):
+# need half as long again; each gets a core of its own. One alone goes where there is room.
+alone = os.environ.get("PYTEST_XDIST_WORKER_COUNT") == "1"
+if (worker := os.environ.get("PYTEST_XDIST_WORKER")) and not alone and hasattr(os, "sched_setaffinity"):
     cores = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {cores[int(worker.removeprefix("gw")) % len(cores)]})
 
