@@ -1,8 +1,14 @@
-"""What tests of the command share: what it printed and what it imports."""
+"""What tests of the command share: what it makes, what it printed and what it imports."""
 
 import subprocess
 import sys
 from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from benchmarks.results import leave_blank
+
+from gradscape.cli import main
 
 NO_BROWSER = "there is no Chromium here: `apt-get install -y chromium` (or your system's) lets them run"
 
@@ -12,6 +18,19 @@ class Said:
     returncode: int
     stdout: str
     stderr: str
+
+
+def make(folder: Path, *commands: str) -> Path:
+    """Run commands in this process and in a folder, their pictures blank: for tests of a module, which copy it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        leave_blank(patch.setattr)
+        for command in commands:
+            patch.setattr(sys, "argv", ["landscape", *command.split()])
+            with pytest.raises(SystemExit) as left:
+                main(command.split())
+            assert not left.value.code, command
+    return folder
 
 
 def modules(arguments: list[str]) -> set[str]:

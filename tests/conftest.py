@@ -23,8 +23,9 @@ from .command import NO_BROWSER, Said
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # A scene spreads a batch over a thread for each core. Two workers that do so on two cores take turns four abreast, and
-# need half as long again; each gets a core of its own.
-if (worker := os.environ.get("PYTEST_XDIST_WORKER")) and hasattr(os, "sched_setaffinity"):
+# need half as long again; each gets a core of its own. One alone goes where there is room.
+alone = os.environ.get("PYTEST_XDIST_WORKER_COUNT") == "1"
+if (worker := os.environ.get("PYTEST_XDIST_WORKER")) and not alone and hasattr(os, "sched_setaffinity"):
     cores = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {cores[int(worker.removeprefix("gw")) % len(cores)]})
 
@@ -52,8 +53,13 @@ def forgotten() -> Iterator[None]:
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_sessionfinish(session: pytest.Session) -> Generator[None]:
-    """Say last of all what was left out for want of a browser."""
+    """Let Taichi keep what it has compiled, and say last of all what was left out for want of a browser.
+
+    Taichi keeps it as its program is taken down, which never happens where what holds the program is frozen.
+    """
     yield
+    if taichi := sys.modules.get("taichi"):
+        taichi.reset()
     if reporter := session.config.pluginmanager.get_plugin("terminalreporter"):
         skipped = sum(NO_BROWSER in str(report.longrepr) for report in reporter.stats.get("skipped", []))
         if skipped:

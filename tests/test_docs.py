@@ -44,7 +44,7 @@ WORDS |= {
     "gallery/data/flip-0-1": str(DATA / "flip-0-1"),
     "triple-move": "bounce",
 }
-VALUES = {"--resolution": "2", "--budget": "3", "--seeds": "1", "--frames": "2"}
+VALUES = {"--resolution": "2", "--budget": "3", "--seeds": "1", "--frames": "2", "--points": "2", "--slices": "1"}
 ADDED = {
     "race": ["--seeds", "1", "--budget", "3", "--device", "cpu"],
     "league": ["--seeds", "1", "--budget", "3", "--device", "cpu"],
@@ -71,6 +71,11 @@ SHORT = {
     "sweep": {"fluid"},
     "replay": {"fluid"},
     "plan": {"fluid"},
+    "race": {"bounce"},
+    "optimize": {"bounce"},
+    "tradeoff": {"bounce", "cartpole"},
+    "census": {"bounce"},
+    "--tolerance": {"bounce"},
 }
 TENTH = ["--set", "horizon=0.1"]  # of an episode
 TAICHI = ["--no-gradients"]  # whose kernels take minutes to compile with gradients
@@ -98,15 +103,18 @@ def small(command: str) -> list[str]:
     """Return a command's words, as small as it can be and still be the same command."""
     words = shlex.split(command)
     verb = verb_of(words)
-    scenes = SCENES.get("--tolerance" if "--tolerance" in words else verb, {})
+    kind = "--tolerance" if "--tolerance" in words else verb
+    scenes = SCENES.get(kind, {})
     found = [scenes.get(word, WORDS.get(word, word)) for word in words[1:]]
     for at, word in enumerate(found[:-1]):
         found[at + 1] = VALUES.get(word, found[at + 1])
     added = ADDED.get(verb, []) + (TAICHI if "taichi" in found else [])
     pairs = [added[at : at + 2] for at in range(0, len(added), 2)] if verb != "replay" else [added]
     pairs = [pair for pair in pairs if not (pair[0] == "--variants" and "--ladder" in found)]  # which go not together
-    pairs += [["--budget", "1"]] if "mixed" in found else []
-    short = TENTH if SHORT.get(verb, set()) & {*found} else []
+    if "mixed" in found:  # whose budget is in seconds
+        found += [] if "--budget" in found else ["--budget", ""]
+        found[found.index("--budget") + 1] = "0.01"
+    short = TENTH if SHORT.get(kind, set()) & {*found} else []
     return [*found, *(word for pair in pairs if pair[0] not in found for word in pair), *short]
 
 

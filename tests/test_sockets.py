@@ -41,11 +41,11 @@ bounce --axis y --resolution 3 --fidelity draft --device cpu
 plan bounce --resolution 2 --fidelity draft --device cpu
 bench bounce --batch 2 --seconds 0 --fidelity draft --device cpu
 check branin --points 2
-tradeoff cartpole --points 2 --variants precision --device cpu
-tradeoff cartpole --set horizon=0.02 --points 2 --ladder mixed --chaotic --budget 1 --device cpu
-extremes bounce --points 4 --knobs dt --precisions float64 --fidelity draft --device cpu
+tradeoff cartpole --set horizon=0.02 --points 2 --variants precision --device cpu
+tradeoff cartpole --set horizon=0.02 --points 2 --ladder mixed --chaotic --budget 0.01 --device cpu
+extremes bounce --set horizon=0.05 --points 4 --knobs dt --precisions float64 --fidelity draft --device cpu
 pairs bounce --samples 2 --fidelity draft --device cpu
-report cut --device cpu
+report cut --points 2 --device cpu
 census branin --slices 1 --resolution 6
 card --scene control --resolution 3
 gallery compute --only bounce-y --part slices --resolution 4 --fidelity draft --device cpu --data data

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from types import SimpleNamespace as Named
 from typing import Any
@@ -14,10 +15,18 @@ import torch
 import gradscape as gs
 from gradscape.landscapes.export import save_as
 
+from ..command import make
+
+
+@pytest.fixture(scope="module")
+def sampled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make a slice of Branin's function."""
+    return make(tmp_path_factory.mktemp("sampled"), "slice branin --dims 0 1 --resolution 6 --out cut")
+
 
 @pytest.fixture
-def cut(tmp_path: Path) -> gs.Slice:
-    return gs.slice("branin", (0, 1), resolution=6, out=tmp_path / "cut")
+def cut(sampled: Path, tmp_path: Path) -> gs.Slice:
+    return gs.open_slice(shutil.copytree(sampled / "cut", tmp_path / "cut"))
 
 
 @pytest.mark.drawn

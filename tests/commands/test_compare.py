@@ -1,6 +1,7 @@
 """`landscape compare`: what it leaves, samples, goes on with, and refuses."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 
 from gradscape.landscapes.storage.store import open_slice
 
-from ..command import Said
+from ..command import Said, make
 
 Run = Callable[..., Said]
 CUT = "slice bounce --dims 0 1 --resolution 5 --device cpu"
@@ -17,12 +18,16 @@ CUT = "slice bounce --dims 0 1 --resolution 5 --device cpu"
 STANDARD = "compare a bounce --fidelity standard --device cpu --out made"
 
 
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make a slice at draft and one of the same plane at standard."""
+    return make(tmp_path_factory.mktemp("both"), f"{CUT} --out a", f"{CUT} --fidelity standard --out b")
+
+
 @pytest.fixture
-def desk(run: Run, tmp_path: Path) -> Path:
-    """A folder with a slice at draft and one of the same plane at standard."""
-    for more in ("--out a", "--fidelity standard --out b"):
-        assert run(*CUT.split(), *more.split(), cwd=tmp_path).returncode == 0
-    return tmp_path
+def desk(both: Path, tmp_path: Path) -> Path:
+    """A folder with the two slices."""
+    return shutil.copytree(both, tmp_path, dirs_exist_ok=True)
 
 
 def test_two_slices_are_compared_and_nothing_is_sampled(run: Run, desk: Path) -> None:

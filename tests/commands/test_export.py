@@ -8,13 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
-from benchmarks.results import leave_blank
 
 import gradscape
-from gradscape.cli import main
 from gradscape.landscapes.export import SUFFIXES
 
-from ..command import Said
+from ..command import Said, make
 
 READ = {"csv": pd.read_csv, "parquet": pd.read_parquet}
 
@@ -22,20 +20,12 @@ READ = {"csv": pd.read_csv, "parquet": pd.read_parquet}
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Leave a slice, a line and a run of the bouncing ball."""
-    folder = tmp_path_factory.mktemp("made")
-    how = ["--fidelity", "draft", "--device", "cpu"]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        leave_blank(patch.setattr)
-        for verb, more, out in (
-            (["slice", "bounce", "--dims", "0", "2"], ["--resolution", "5"], "cut"),
-            (["bounce", "--axis", "y"], ["--resolution", "6"], "line"),
-            (["optimize", "bounce", "--method", "descents"], ["--budget", "7"], "searched"),
-        ):
-            with pytest.raises(SystemExit) as left:
-                main([*verb, *more, *how, "--out", out])
-            assert not left.value.code
-    return folder
+    return make(
+        tmp_path_factory.mktemp("made"),
+        "slice bounce --dims 0 2 --resolution 5 --fidelity draft --device cpu --out cut",
+        "bounce --axis y --resolution 6 --fidelity draft --device cpu --out line",
+        "optimize bounce --method descents --budget 7 --fidelity draft --device cpu --out searched",
+    )
 
 
 @pytest.fixture

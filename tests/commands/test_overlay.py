@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from benchmarks.results import leave_blank
 
 import gradscape
 from gradscape.cli import main
@@ -17,6 +16,8 @@ from gradscape.landscapes.identity import plane_of
 from gradscape.landscapes.overlay import best_point, overlay
 from gradscape.landscapes.storage.store import open_slice
 from gradscape.optim.runs.store import RunStore
+
+from ..command import make
 
 
 @dataclass(frozen=True)
@@ -28,23 +29,14 @@ class Said:
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Make a slice of bounce off the runs' best point, two runs of it, and a slice and a run of another landscape."""
-    folder = tmp_path_factory.mktemp("results")
-    commands = (
+    return make(
+        tmp_path_factory.mktemp("results"),
         "slice bounce --dims 0 1 --resolution 6 --out cut --device cpu",
         "optimize bounce --method cma-es --budget 24 --out race/cma-es-0 --device cpu",
         "optimize bounce --method descents --budget 16 --out race/descents-0 --device cpu",
         "slice ackley --dims 0 1 --resolution 3 --set dim=3 --out other",
         "optimize ackley --method random --budget 4 --out small",
     )
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        leave_blank(patch.setattr)
-        for command in commands:
-            patch.setattr(sys, "argv", ["landscape", *command.split()])
-            with pytest.raises(SystemExit) as left:
-                main(command.split())
-            assert not left.value.code
-    return folder
 
 
 @pytest.fixture

@@ -15,15 +15,20 @@ from gradscape.jobs.report_record import Report
 from gradscape.jobs.report_tables import environments_markdown
 from gradscape.landscapes.storage.records import read_json, write_record
 
-from ..command import Said
+from ..command import Said, make
 
 Run = Callable[..., Said]
 
 
+@pytest.fixture(scope="module")
+def sampled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make a slice of Branin's function."""
+    return make(tmp_path_factory.mktemp("sampled"), "slice branin --dims 0 1 --resolution 24 --out cut")
+
+
 @pytest.fixture
-def cut(run: Run, tmp_path: Path) -> Path:
-    run("slice", "branin", "--dims", "0", "1", "--resolution", "24", "--out", "cut", cwd=tmp_path)
-    return tmp_path / "cut"
+def cut(sampled: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(sampled / "cut", tmp_path / "cut")
 
 
 @pytest.mark.drawn

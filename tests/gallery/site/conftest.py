@@ -223,6 +223,11 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
+def blank() -> None:
+    """Leave no picture blank: a browser looks at those of the site, which the first test to ask for it builds."""
+
+
 @pytest.fixture(scope="session")
 def site(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site") / "deep" / "gallery"
