@@ -18,6 +18,7 @@ from ..landscapes.storage.ownership import refuse_others
 from ..landscapes.storage.records import write_record
 from ..optim.claims import Claims
 from ..optim.league import League, SceneStandings
+from ..optim.memory import require_runs
 from ..optim.registry import methods as all_methods
 from ..optim.registry import optimizer_class
 from ..optim.runs.journal import Journal
@@ -111,7 +112,8 @@ class LeagueJob:
 
         `methods` are by default all; those that cannot search a scene are left out there. More scenes, methods, seeds
         or episodes go on in the same folder. Raises ValueError for scenes, fidelities and methods that there are not,
-        for a scene that is named twice, and where the folder holds something else.
+        for a scene that is named twice, and where the folder holds something else; TooLargeError for more seeds or
+        episodes than fit this machine.
         """
         budget, seeds = as_whole(budget, "a budget", least=1), as_whole(seeds, "a number of seeds", least=1)
         folder = out or league_folder(scenes, root)
@@ -120,7 +122,9 @@ class LeagueJob:
         if not fixtures or (twice := {name for name in names if names.count(name) > 1}):
             raise ValueError(f"a league has scenes, each once; got {', '.join(sorted(twice)) if fixtures else 'none'}")
         _refuse_others(folder)
-        return cls(fixtures, check_methods(methods) or list(all_methods()), folder, budget, seeds, command, **how)
+        named = check_methods(methods) or list(all_methods())
+        require_runs(1, budget, seeds, folder, abreast=len(named))  # what the smallest scene takes, before any is made
+        return cls(fixtures, named, folder, budget, seeds, command, **how)
 
     def run(self, watch: Watch | None = None) -> League:
         """Say what is there and what is left, race in one scene after another, draw, write and return the league.

@@ -18,6 +18,7 @@ from ..optim.registry import optimizer_class
 from ..optim.rehearsal import BLOCK, Rehearsal, rehearse
 from .methods import able_methods, check_methods
 from .plan import HERE, make_here
+from .race import require_room
 from .scene import SceneSpec
 from .search import make_optimizer, one_torch_thread
 from .slice import peak_memory
@@ -179,7 +180,8 @@ class RacePlanJob:
 
         `began` is when its command would have begun, on the clock of `time.perf_counter`; now, by default. For a CUDA
         device that is not here, what `landscape tradeoff` kept of one counts. Raises ValueError for what the scene or a
-        method does not have, and where nothing is known of the device that is asked for.
+        method does not have, and where nothing is known of the device that is asked for; TooLargeError for a race that
+        would not fit this machine.
         """
         began = time.perf_counter() if began is None else began
         watch, seeds = watch or Watch(), as_whole(self.seeds, "a number of seeds", least=1)
@@ -187,6 +189,7 @@ class RacePlanJob:
         named = check_methods(self.methods)
         env, device = make_here(self.scene)
         methods = named or able_methods(env, watch)
+        require_room(env, methods, self.options, seeds=seeds, budget=budget, folder=Path())
         with watch.busy(f"{env.name}: rehearsing {env.fidelity.name} episodes and {', '.join(methods)}"):
             env.prepare()
             start = time.perf_counter() - began

@@ -94,7 +94,7 @@ class RaceJob:
             refuse_others(
                 folder, (one for one in visible_files(folder) if not one.is_dir() or visible_files(one)), RACE.kind
             )
-        _require_room(env, methods, options, seeds=seeds, budget=budget, folder=folder)
+        require_room(env, methods, options, seeds=seeds, budget=budget, folder=folder)
         how: dict[str, Any] = {"budget": budget, "command": command, "force": force}
         with watch.busy(f"opening {len(methods) * seeds} runs"):
             competitors = [
@@ -312,10 +312,10 @@ def _cost_there(there: bytes, grad: bool) -> EpisodeCost:
     return episode_cost(objective_of(there).objective, grad=grad)
 
 
-def _require_room(
+def require_room(
     env: Environment, methods: Sequence[str], options: Options, *, seeds: int, budget: int, folder: Path
 ) -> None:
-    """Refuse a race that is larger than this machine."""
+    """Raise TooLargeError where a race is larger than this machine."""
     require_runs(env.space.dim, budget, seeds, folder, abreast=len(methods))
     for method in methods:
         optimizer = make_optimizer(method, env, options=options.get(method))

@@ -12,8 +12,8 @@ from matplotlib.patches import Patch, Rectangle
 from .. import style
 from . import page, panel
 
-CELL, LABELS, ROW = 0.95, 2.3, 0.52  # room of a method, and of the scenes' names with the bar; height of a row [inch]
-NARROW = 0.55  # room of a cell on a screen's scale of type, under which its interval is left out [inch]
+CELL, LABELS, ROW = 0.95, 2.3, 0.44  # room of a method, and of the scenes' names with the bar; height of a row [inch]
+NARROW = 0.8  # room of a cell on a screen's scale of type, under which its interval is left out [inch]
 LOW = 0.5  # height of a row without intervals, against one with them
 SHORT = 8  # letters of a method's name that stands in one line
 
@@ -37,12 +37,11 @@ def league_figure(dataset: xr.Dataset, *, width: float | None = None) -> page.Pi
     )
     _write_cells(ax, dataset, most, told=told)
     _frame(ax, dataset, upright=told)
-    place: dict[str, Any] = {"aspect": 30} if told else {"location": "bottom", "aspect": 30}
+    place: dict[str, Any] = {"aspect": 30} if told else {"location": "bottom", "aspect": 30, "shrink": 0.9}
     bar = panel.colour_bar(ax, drawn, f"mean rank among {methods} methods, 1 is best", **place)
     if told:
         bar.ax.invert_yaxis()
     page.entitle(picture, dataset.attrs["title"])
-    page.remark(ax, dataset.attrs["command"])
     page.finish(picture, _legend(dataset, told=told), columns=1)
     return picture
 
@@ -61,7 +60,7 @@ def _write_cells(ax: Axes, dataset: xr.Dataset, most: float, *, told: bool) -> N
         ink = style.text_on(style.RANK_MAP(share), style.TINTED)
         look: dict[str, Any] = {"ha": "center", "color": ink, "parse_math": False}
         within = told and np.isfinite(low)
-        form, size = (".2f", sheet.tick) if told else (".1f", sheet.small)
+        form, size = (".2f", sheet.tick) if told else (".2g", sheet.small)
         ax.text(column, row - 0.16 * within, style.number(rank, form), va="center", size=size, **look)
         if within:
             said = f"{style.number(low, '.1f')} to {style.number(high, '.1f')}"
@@ -94,7 +93,7 @@ def _legend(dataset: xr.Dataset, *, told: bool) -> list[Patch]:
     known = [Patch(**blank, label=f"mean rank over {_seeds(dataset)}; {below}")]
     if not np.isfinite(dataset["rank"]).all():
         known.append(Patch(**style.NOT_RUN, label="did not run here"))
-    return known
+    return [*known, Patch(**blank, label=dataset.attrs["command"])]
 
 
 def _in_two(name: str) -> str:

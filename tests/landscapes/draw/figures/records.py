@@ -4,7 +4,9 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
+from gradscape.jobs.league import simulated_scenes
 from gradscape.landscapes.draw import style
 from gradscape.landscapes.measures.card import Card, CardSlice, Grade
 from gradscape.landscapes.measures.census import MEASURES, CensusDesign, SurveyedSlice
@@ -24,11 +26,25 @@ from gradscape.landscapes.measures.extremes import Extremes, Limit, StabilityMap
 from gradscape.landscapes.measures.fidelity import Bootstrap
 from gradscape.landscapes.measures.stability import STABLE, Cell
 from gradscape.landscapes.space import ParameterSpace
+from gradscape.optim.registry import methods
 
 from ...measures.test_fidelity import REPORT, rung
 
 MEASURED = {"device": "cuda", "engine": "warp", "created": "2026-11-21"}
 COMMAND = "landscape {} triple-move --fidelity reference --device cuda --points 64 --out studies/triple-move-reference"
+
+
+def league() -> xr.Dataset:
+    """Return the ranks of every method in every scene, all ranks between best and worst; one did not run."""
+    scenes, racers = [*(f"{name} (reference)" for name in simulated_scenes()), "all scenes"], methods()
+    rank = 1.0 + np.add.outer(np.arange(len(scenes)), np.arange(len(racers))) % len(racers)
+    rank[0, -1] = np.nan
+    parts = {"rank": rank, "rank_low": rank - 0.5, "rank_high": rank + 0.5}
+    return xr.Dataset(
+        {name: (("scene", "method"), value) for name, value in parts.items()},
+        {"scene": scenes, "method": list(racers)},
+        {"title": "League of all methods · 1000 episodes · 10 seeds", "seeds": "10", "command": COMMAND},
+    )
 
 
 def near(value: float) -> Bootstrap:

@@ -25,6 +25,7 @@ from gradscape.landscapes.draw.figures.contour import landscape_figure
 from gradscape.landscapes.draw.figures.convergence import convergence_figure
 from gradscape.landscapes.draw.figures.curve import run_figure
 from gradscape.landscapes.draw.figures.extremes import extremes_figure
+from gradscape.landscapes.draw.figures.league import league_figure
 from gradscape.landscapes.draw.figures.model import model_figure
 from gradscape.landscapes.draw.figures.overlay import overlay_figure
 from gradscape.landscapes.draw.figures.profile import profile_figure
@@ -46,7 +47,7 @@ from gradscape.optim.registry import methods
 from ....studies import study
 from ...measures.test_fidelity import REPORT
 from ...test_overlay import LAID, SLICE
-from .records import card, census, convergence, extremes, mixed
+from .records import card, census, convergence, extremes, league, mixed
 from .test_contour import BOUNCES, DATASET, LINE, Bowl, plane
 from .test_curve import table
 from .test_race import race
@@ -142,6 +143,7 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
     "card_figure": [lambda width: card_figure(card(), width=width)],
     "census_figure": [lambda width: census_figure(census(), width=width)],
     "extremes_figure": [lambda width: extremes_figure(extremes(), width=width)],
+    "league_figure": [lambda width: league_figure(league(), width=width)],
     "frame_figure": [lambda width: frame_figure(SWEEP, 1, Scales.of(SWEEP), width=width)],
     "episode_figure": [lambda width: episode_figure(EPISODE, caption=CAPTION, width=width)],
     "thumbnail_figure": [lambda width: thumbnail_figure(DATASET, width=width)],
