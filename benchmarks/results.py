@@ -97,6 +97,7 @@ KINDS = {
         (f"overlay cut {MADE} --out {READ}",),
         needs=(f"{CUT} cut",),
     ),
+    "league": Kind(f"league branin ackley --methods random,descents --seeds 2 --budget 8 --device cpu --out {MADE}"),
     "pairs": Kind(f"pairs ackley --set dim=3 --samples 2 --out {MADE} --json"),
     "census": Kind(f"census ackley --set dim=3 --slices 4 --resolution 6 --out {MADE} --json"),
     "card": Kind(f"card --scene control --resolution 3 --out {MADE} --json"),

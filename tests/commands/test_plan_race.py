@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pytest
@@ -93,14 +94,15 @@ def slowed(monkeypatch: pytest.MonkeyPatch, clock: Clock, method: str) -> Callab
     """Make a method that takes a millisecond for each point it knows when it asks, and make it."""
     env = gradscape.make("branin")
     kind = type(make_optimizer(method, env))
-    ask, take_in, known = kind._ask, kind._take_in, {}
+    ask, take_in = kind._ask, kind._take_in
+    known = WeakKeyDictionary[Optimizer, int]()
 
     def slow_ask(self: Optimizer) -> Any:
-        clock.sleep(1e-3 * known.get(id(self), 0))
+        clock.sleep(1e-3 * known.get(self, 0))
         return ask(self)
 
     def count(self: Optimizer, x: torch.Tensor, evaluation: Evaluation) -> Any:
-        known[id(self)] = known.get(id(self), 0) + len(x)
+        known[self] = known.get(self, 0) + len(x)
         return take_in(self, x, evaluation)
 
     monkeypatch.setattr(kind, "_ask", slow_ask)
