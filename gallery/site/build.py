@@ -154,8 +154,8 @@ class _Site:
         dataset = open_slice(source / STORE)
         _draw(dataset, source, folder)
         episodes, runs = read_episodes(source, dataset), lay_runs(dataset, self.tables)
-        shown = json.dumps(as_json(read_off_nodes(dataset, episodes, runs)), separators=(",", ":"))
-        (folder / NODES).write_text(f"const SLICE = {shown};\n")
+        nodes = read_off_nodes(dataset, episodes, runs)
+        (folder / NODES).write_text(f"const SLICE = {json.dumps(as_json(nodes), separators=(',', ':'))};\n")
         given = [name for name in (*SURFACES, SWEEP_FILM) if (source / name).exists()]
         given += [name for episode in episodes for name in episode.files]
         given += [name for name in (REPORT, MEASURES, QUALITY) if (source / name).exists()]
@@ -170,6 +170,7 @@ class _Site:
             models=self.models.get(figure.env, []),
         )
         about = {"entry": entry, "held": list(_held_parameters(dataset)), "scene": entries().get(figure.env)}
+        about["finer"] = nodes.finer is not None
         (folder / "index.html").write_text(self.pages.get_template("slice.html").render(**about))
         return entry
 

@@ -124,23 +124,31 @@ class ColourScale:
 
 @dataclass(frozen=True)
 class Nodes:
-    """A slice as plain lists, row by row from the lowest v: what the map draws and says of a node.
+    """A slice as the map draws it, row by row from the lowest v; `page_data.pack` packs its arrays.
 
-    `slope` is the gradient along the axes, `gradient` its length in all dimensions; `azimuth` is where the surface is
-    seen from at first [degrees].
+    `loss` [unit] is packed float32, NaN where there is none, and `status` packed uint8, by the numbers of `statuses`.
+    `cells` and `looks` are the same as they are drawn, where a refined slice was not sampled everywhere. `slope` is the
+    gradient along the axes, `gradient` its length in all dimensions, packed float32 both. `finer` are packed flags of
+    the cells between four samples whose gradients contradict their losses. `scales` are those that the map can have,
+    by name, `scale` that which it begins with. `azimuth` is where the surface is seen from at first [degrees].
     """
 
     axes: Sequence[Axis]
     unit: str
-    loss: Column
-    status: Sequence[str]
-    scale: ColourScale
+    loss: str
+    status: str
+    statuses: Mapping[int, str]
+    scale: str
+    scales: Mapping[str, ColourScale]
     palette: Sequence[str]
     episodes: Sequence[EpisodeEntry]
     runs: Sequence[Trajectory]
     azimuth: float | None = field(default=None, metadata=LEFT_OUT)
-    slope: Sequence[Column] | None = field(default=None, metadata=LEFT_OUT)
-    gradient: Column | None = field(default=None, metadata=LEFT_OUT)
+    slope: Sequence[str] | None = field(default=None, metadata=LEFT_OUT)
+    gradient: str | None = field(default=None, metadata=LEFT_OUT)
+    cells: str | None = field(default=None, metadata=LEFT_OUT)
+    looks: str | None = field(default=None, metadata=LEFT_OUT)
+    finer: str | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True)

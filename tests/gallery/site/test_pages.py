@@ -43,6 +43,8 @@ def filed(site: Path) -> str:
 
 
 def pixels(page: Any, canvas: str) -> np.ndarray[Any, Any]:
+    """Return what is on a canvas once it has been drawn: what is asked for is drawn in the next frame."""
+    page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
     picture = page.evaluate("(id) => document.getElementById(id).toDataURL()", canvas)
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(picture.partition(",")[2]))))
 
