@@ -68,6 +68,6 @@ function pinch(before, now, other) {
   const apart = ([x, y]) => Math.hypot(x - other[0], y - other[1]);
   const middle = ([x, y]) => [(x + other[0]) / 2, (y + other[1]) / 2];
   const [from, to] = [middle(before), middle(now)];
+  if (apart(before) > 0.01) zoomAt(apart(now) / apart(before), from);
   pan(from[0] - to[0], from[1] - to[1]);
-  if (apart(before) > 0.01) zoomAt(apart(now) / apart(before), to);
 }

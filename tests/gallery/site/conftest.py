@@ -235,6 +235,11 @@ def site(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
+def filed(site: Path) -> str:
+    return f"file://{site}/"
+
+
 @pytest.fixture(scope="session")
 def browser():  # type: ignore[no-untyped-def]
     program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
