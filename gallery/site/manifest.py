@@ -287,6 +287,7 @@ class FigureEntry:
     loss_unit: str
     numbers: Numbers
     command: str
+    python: str
     identity: Mapping[str, Any]
     provenance: Mapping[str, Any]
     files: Sequence[str]
@@ -301,11 +302,60 @@ class FigureEntry:
 
 
 @dataclass(frozen=True)
+class WordShare:
+    """A word, the share of an environment's slices that it fits, and its interval, None where there is none."""
+
+    word: str
+    share: float
+    low: float | None = None
+    high: float | None = None
+
+    def said(self) -> str:
+        """Say it with its share."""
+        return f"{self.word} {self.share:.0%}".replace("%", "\N{NO-BREAK SPACE}%")
+
+
+@dataclass(frozen=True)
+class Tile:
+    """An environment on the wall: the slice that is shown, and which words fit which share of how many slices.
+
+    They are those of its `census`, with the command, the picture and the table of that, or of the gallery's own slices.
+    """
+
+    env: str
+    figure: str
+    page: str
+    labels: Sequence[str]
+    dim: int
+    engine: str
+    slices: int
+    census: bool
+    words: Sequence[WordShare]
+    picture: str = ""
+    table: str = ""
+    command: str = ""
+
+    def fitting(self, least: float) -> list[str]:
+        """Return the words that fit such a share of the slices, or more."""
+        return [one.word for one in self.words if one.share >= least]
+
+    def best(self, among: Sequence[str], most: int = 3) -> list[WordShare]:
+        """Return the words of these that fit most slices, the most frequent first, none that fits none."""
+        found = [one for one in self.words if one.word in among and one.share > 0]
+        return sorted(found, key=lambda one: -one.share)[:most]
+
+    def share(self, word: str) -> WordShare | None:
+        """Return the share of a word, None where nothing is known of it."""
+        return next((one for one in self.words if one.word == word), None)
+
+
+@dataclass(frozen=True)
 class Manifest:
-    """All of a site: its slices, those that are not sampled yet, and its files."""
+    """All of a site: its environments, its slices, those that are not sampled yet, and its files."""
 
     schema: int
     gradscape: str
+    wall: Sequence[Tile]
     figures: Sequence[FigureEntry]
     missing: Sequence[str]
     files: Sequence[str]

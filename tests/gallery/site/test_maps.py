@@ -28,7 +28,9 @@ from gradscape.landscapes.storage.store import SliceStore, open_slice
 from .browsing import DRAWN, pixels, point_at, told
 
 Visit = Callable[..., Any]
-SPACE = ParameterSpace(("speed", "angle"), torch.tensor([-1.0, 0]).double(), torch.tensor([1.0, 2]).double(), ("m/s", ""))
+SPACE = ParameterSpace(
+    ("speed", "angle"), torch.tensor([-1.0, 0]).double(), torch.tensor([1.0, 2]).double(), ("m/s", "")
+)
 FIGURES = [Figure(name, "ledge", (0, 1), PaperCaption("Made up."), resolution=size) for name, size in
            (("fine", 256), ("coarse", 16))]  # fmt: skip
 
@@ -101,7 +103,9 @@ def test_colours_are_those_of_the_scale_that_is_chosen(
     page.select_option("#scale", name)
     finite = np.isfinite(losses)
     low, high = np.nanmin(losses), np.nanmax(losses)
-    shares = {"linear": Normalize(low, high), "logarithmic": LogNorm(low, high)}.get(name, lambda values: values)(losses)
+    shares = {"linear": Normalize(low, high), "logarithmic": LogNorm(low, high)}.get(name, lambda values: values)(
+        losses
+    )
     if name == "rank":
         shares = np.full(losses.shape, np.nan)
         shares[finite] = (rankdata(losses[finite].astype(np.float32)) - 1) / (finite.sum() - 1)
@@ -325,7 +329,9 @@ def test_a_chart_of_a_line_is_hatched_where_a_node_failed(
     picture = pixels(page, "profile")
     failed = np.isnan(losses[15])
     assert 0 < failed.sum() < 16
-    left, right, top, bottom = page.evaluate("[EDGE.left, chart.clientWidth - EDGE.right, EDGE.top, chart.clientHeight - EDGE.bottom]")
+    left, right, top, bottom = page.evaluate(
+        "[EDGE.left, chart.clientWidth - EDGE.right, EDGE.top, chart.clientHeight - EDGE.bottom]"
+    )
     for column in range(1, 15):
         middle = round(left + column / 15 * (right - left))
         dark = (picture[top + 4 : bottom - 4, middle - 4 : middle + 5, :3].max(axis=-1) < 140).mean()
@@ -355,7 +361,9 @@ def test_a_link_opens_the_view_that_it_was_taken_of(ledges: str, visit: Visit) -
     assert told(place, "angle") == 2
 
 
-@pytest.mark.parametrize("junk", ["node=x,y", "node=99,-4", "window=1,2", "camera=Infinity,1,1", "line=1", "scale=pink", "layers="])
+@pytest.mark.parametrize(
+    "junk", ["node=x,y", "node=99,-4", "window=1,2", "camera=Infinity,1,1", "line=1", "scale=pink", "layers="]
+)
 def test_a_link_of_something_else_opens_the_page(junk: str, ledges: str, visit: Visit) -> None:
     page = visit(ledges, f"coarse/index.html#{junk}")
     assert len(np.unique(pixels(page, "map").reshape(-1, 4), axis=0)) > 40
@@ -430,7 +438,11 @@ def test_a_frame_of_the_map_costs_the_same_however_fine_the_slice_is(counted: di
         assert not NEVER & calls.keys()
         assert calls["drawImage"] == 1 + 2  # the losses; the failures, cut out of their stripes
         assert "putImageData" not in calls
-    steady = {name for name in found["fine"] if name not in ("measureText", "fillText", "moveTo", "lineTo", "beginPath", "stroke")}
+    steady = {
+        name
+        for name in found["fine"]
+        if name not in ("measureText", "fillText", "moveTo", "lineTo", "beginPath", "stroke")
+    }
     assert {name: found["fine"][name] for name in steady} == {name: found["coarse"][name] for name in steady}
     for name in ("fillText", "lineTo"):  # ticks, which are as many as there is room for
         assert abs(found["fine"][name] - found["coarse"][name]) <= 8
