@@ -238,7 +238,7 @@ def _place(given: Sequence[str], drawn: Sequence[str], source: Path, folder: Pat
 
 def _save_tables(entry: FigureEntry, source: Path, folder: Path) -> list[str]:
     """Write what a figure's other pictures show as tables, and return their names."""
-    tables = {COMPANION_TABLE: [asdict(one) for one in entry.companions]}
+    tables: dict[str, Sequence[Mapping[str, Any]]] = {COMPANION_TABLE: [asdict(one) for one in entry.companions]}
     if (source / QUALITY).exists() and entry.report is not None:
         tables[QUALITY_TABLE] = quality_rows(source)
     there = {name: rows for name, rows in tables.items() if rows}

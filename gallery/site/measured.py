@@ -113,7 +113,8 @@ def _read_convergence(files: TradeoffFiles, record: Record, table: Path) -> Conv
     todo = f"delete it, and `landscape tradeoff {record['env']} --ladder convergence` measures it anew"
     with reading(files.record, todo):
         found = Convergence.of_record(read_json(files.record))
-    save_table([{"knob": one.knob, **asdict(move)} for one in found.knobs for move in one.moves], table)
+    moves = [{"knob": one.knob, **asdict(move)} for one in found.knobs for move in one.moves]
+    save_table([*moves, *({"left of": one.name, **asdict(one)} for one in found.remainders)], table)
     if found.identity["code"] != record["identity"].get("code"):
         return None
     knobs = ", ".join(knob.knob for knob in found.knobs)

@@ -1,4 +1,4 @@
-"""Where a site's pictures are made while its pages are written: slices are drawn by processes, dark variants by a thread.
+"""Where a site's pictures are made while its pages are written: slices by processes, dark variants by a thread.
 
     python -m gradscape.gallery.site.studio SOURCE FOLDER [SOURCE FOLDER ...]
 
@@ -27,7 +27,7 @@ Reading = Callable[[], AbstractContextManager[Any]]
 
 
 class Studio:
-    """Draw slices and recolour pictures; leaving it waits for all of them, and raises what the first that failed did."""
+    """Draw slices and recolour pictures; leaving it waits for all, and raises what the first that failed did."""
 
     def __init__(self, places: Sequence[tuple[Path, Path]]) -> None:
         self._thread = ThreadPoolExecutor(1)  # what recolours lets go of Python
@@ -53,7 +53,7 @@ class Studio:
                 one.result()
 
     def develop(self, source: Path, target: Path, within: Reading = nullcontext) -> None:
-        """Make the dark variant of a picture beside where it goes, within what names the file that a failure is about."""
+        """Make the dark variant of a picture beside where that goes, within what names the file of a failure."""
         self._begun.append(self._thread.submit(_develop, source, target, within))
 
 
@@ -84,7 +84,7 @@ def _develop(source: Path, target: Path, within: Reading) -> None:
 
 
 def draws(source: Path, rank: int) -> list[str]:
-    """Return which pictures of a slice are drawn: of a line, whose events need episodes, the one made with it is kept."""
+    """Return which pictures of a slice are drawn; a line has the one made with it, as its events need episodes."""
     return [THUMBNAIL] if rank == 1 and (source / PICTURE).exists() else [THUMBNAIL, PICTURE]
 
 

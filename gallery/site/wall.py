@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from ...landscapes.measures.classify import GOOD, NOISY, OPPOSITE, WORDS, ZERO
 from ...landscapes.storage.records import read_json, reading
 from ...landscapes.storage.store import open_slice
 from ..files import CENSUSES, DEVICES, STORE, WALL_PICTURE, WALL_TABLE
+from ..league import save_both
 from .downloads import save_table
 from .manifest import FigureEntry, Tile, WordShare
 from .studio import Studio
@@ -46,8 +46,8 @@ def _tile(env: str, group: Sequence[FigureEntry], data: Path, out: Path, studio:
     if found := _place_census(env, data, out, studio):
         census, table, picture = found
         words = [WordShare(word, one.value, one.low, one.high) for word, one in census.words.items()]
-        kept = {"picture": picture, "table": table, "command": census.command}
-        return Tile(**about, slices=len(census.slices), census=True, words=words, **kept)
+        about |= {"picture": picture, "table": table, "command": census.command}
+        return Tile(**about, slices=len(census.slices), census=True, words=words)
     reported = [entry.report for entry in group if entry.report is not None]
     said = [{one.word for one in report.words if one.measured} for report in reported]
     words = [WordShare(word, sum(word in one for one in said) / len(said)) for word in WORDS] if said else []
@@ -94,7 +94,6 @@ def _rows(census: Census) -> Iterator[Mapping[str, Any]]:
 def draw_wall(tiles: Sequence[Tile], data: Path, out: Path) -> None:
     """Draw the wall, and write its table."""
     from ...landscapes.draw.figures.wall import Landscape, wall_figure
-    from ..league import save_both
 
     hung = [
         Landscape(tile.env, ", ".join(one.said() for one in tile.best(SHAPES)), open_slice(data / tile.figure / STORE))

@@ -74,5 +74,10 @@ document.getElementById("link").addEventListener("click", async () => {
   const copied = await copy(field.value);
   say(copied ? "Link copied." : "Link selected.", 0);
 });
-addEventListener("hashchange", follow);
+addEventListener("hashchange", () => {
+  if (!location.hash.includes("=")) return;
+  follow();
+  canvas.scrollIntoView({ block: "nearest" });
+  canvas.focus({ preventScroll: true });
+});
 if (location.hash.includes("=")) follow();

@@ -64,5 +64,5 @@ def _draw(ax: Axes, dataset: xr.Dataset) -> None:
         return
     loss = own_cells(dataset)["loss"].to_numpy()
     norm = style.Scale.of_loss(loss).norm
-    how = {"origin": "lower", "aspect": "auto", "interpolation": "nearest", "cmap": style.LOSS_MAP, "norm": norm}
-    ax.imshow(np.ma.masked_invalid(loss), **how)
+    shown = np.ma.masked_invalid(loss)
+    ax.imshow(shown, origin="lower", aspect="auto", interpolation="nearest", cmap=style.LOSS_MAP, norm=norm)

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import xarray as xr
 from matplotlib.colors import LogNorm, Normalize
 from PIL import Image
 from scipy.stats import rankdata
 
 from gradscape.gallery.figures import Figure
 from gradscape.gallery.paper import PaperCaption
-from gradscape.gallery.site import build
+from gradscape.gallery.site import build, studio
 from gradscape.landscapes.draw.style import LOSS_MAP
 from gradscape.landscapes.measures.unresolved import contradicted_cells
 from gradscape.landscapes.objective import Evaluation
@@ -59,19 +58,19 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def ledges(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def ledges(data: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     """Build a site of the ledges without the pictures that are no canvases."""
     folder = tmp_path_factory.mktemp("maps") / "site"
     blank = Image.new("RGB", (160, 120), "white")
 
-    def leave_out(dataset: xr.Dataset, source: Path, folder: Path) -> None:
+    def leave_out(source: Path, folder: Path) -> None:
         for name in ("landscape", "thumbnail", "landscape-dark", "thumbnail-dark"):
             blank.save(folder / f"{name}.png")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(build, "_draw", leave_out)
+        patch.setattr(studio, "draw_slice", leave_out)
         build.build_site(FIGURES, data, folder)
-    yield f"file://{folder}/"
+    return f"file://{folder}/"
 
 
 @pytest.fixture
@@ -262,7 +261,8 @@ def test_arrows_are_thinned_by_the_zoom(ledges: str, visit: Visit) -> None:
     assert steps == sorted(steps, reverse=True)
     assert (steps[0], steps[-1]) == (16, 1)
     thinned = """step => {
-        gradients.forEach((_, k) => { if ((k % columns) % step || Math.floor(k / columns) % step) gradients[k] = NaN; });
+        const off = (k) => (k % columns) % step || Math.floor(k / columns) % step;
+        gradients.forEach((_, k) => { if (off(k)) gradients[k] = NaN; });
         return spacing();
     }"""
     assert [page.evaluate(thinned, step) for step in (1, 4)] == [1, 4]
@@ -356,6 +356,8 @@ def test_a_link_opens_the_view_that_it_was_taken_of(ledges: str, visit: Visit) -
     for canvas in ("map", "surface", "profile"):
         ours, theirs = (pixels(one, canvas).astype(int) for one in (page, other))
         assert (np.abs(ours - theirs).max(axis=-1) > 8).mean() < 0.005  # of numbers that the link rounds
+    other.evaluate("location.hash = 'node=5,6'")
+    other.wait_for_function("node === 5 * columns + 6 && document.activeElement === canvas")
     place = visit(ledges, "coarse/index.html#node=15,2")
     assert place.evaluate("at(node)") == [2, 15]
     assert told(place, "angle") == 2
@@ -396,8 +398,9 @@ COUNT = """() => {
         const plain = window[name];
         window[name] = (...given) => { count(name); return plain(...given); };
     }
-    for (const name of ["Float32Array", "Float64Array", "Uint32Array", "Uint8Array", "Uint8ClampedArray", "ImageData"]) {
-        window[name] = new Proxy(window[name], { construct(kind, given) { count("arrays"); return new kind(...given); } });
+    const construct = (kind, given) => { count("arrays"); return new kind(...given); };
+    for (const name of ["Float32Array", "Uint32Array", "Uint8Array", "Uint8ClampedArray", "ImageData"]) {
+        window[name] = new Proxy(window[name], { construct });
     }
 }"""
 NEVER = {"resized", "atob", "getComputedStyle", "arrays", "createImageData", "createPattern", "getImageData"}
@@ -476,7 +479,8 @@ def test_from_above_the_surface_is_the_map(ledges: str, losses: np.ndarray[Any, 
         picture = pixels(page, "surface")
         for row, column in np.ndindex(losses.shape):
             right, down = page.evaluate(
-                "([row, column]) => flat([(column + 0.5) / columns, (row + 0.5) / rows, rise(column, row)])", [row, column]
+                "([row, column]) => flat([(column + 0.5) / columns, (row + 0.5) / rows, rise(column, row)])",
+                [row, column],
             )  # fmt: skip
             if np.isfinite(losses[row, column]):
                 colour = picture[int(down), int(right), :3]

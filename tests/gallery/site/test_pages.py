@@ -39,9 +39,9 @@ def served(site: Path) -> Iterator[str]:
 def test_every_page_opens(way: str, visit: Visit, request: pytest.FixtureRequest) -> None:
     page = visit(request.getfixturevalue(way), "index.html")
     page.wait_for_function("Array.from(document.images).every((one) => one.naturalWidth > 100)")
-    assert page.locator(".card").count() == len(FIGURES)
+    assert page.locator(".slice").count() == len(FIGURES)
     for figure in FIGURES:
-        page.click(f"a[href='{figure.id}/index.html']")
+        page.click(f".slice a[href='{figure.id}/index.html']")
         page.wait_for_url(f"**/{figure.id}/index.html")
         shown = "img:not([hidden]):not(#player img)"
         assert page.locator(shown).count()
@@ -60,11 +60,11 @@ def test_every_page_opens(way: str, visit: Visit, request: pytest.FixtureRequest
 def test_the_index_is_filtered_by_words(filed: str, visit: Visit) -> None:
     page = visit(filed, "index.html")
     page.fill("#filter", "figure 10 DESC")
-    assert page.locator(".card:visible").count() == 1
+    assert page.locator(".slice:visible").count() == 1
     assert page.locator("section:visible[data-env]").count() == 1
     page.wait_for_function("document.getElementById('count').textContent === '1 of 3 slices'")
     page.fill("#filter", "")
-    assert page.locator(".card:visible").count() == 3
+    assert page.locator(".slice:visible").count() == 3
     assert "ball" in page.inner_text("section[aria-labelledby=bounce] p >> nth=0")
 
 
