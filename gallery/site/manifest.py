@@ -344,6 +344,13 @@ class Tile:
         found = [one for one in self.words if one.word in among and one.share > 0]
         return sorted(found, key=lambda one: -one.share)[:most]
 
+    def sentence(self, among: Sequence[str]) -> str:
+        """Say which words of these fit which shares of how many slices."""
+        if not self.slices:
+            return "not measured yet"
+        said = ", ".join(one.said() for one in self.best(among)) or "none of the words"
+        return f"{said} of {self.slices} slice{'s' if self.slices > 1 else ''}{'' if self.census else ' here'}"
+
     def share(self, word: str) -> WordShare | None:
         """Return the share of a word, None where nothing is known of it."""
         return next((one for one in self.words if one.word == word), None)

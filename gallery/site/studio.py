@@ -112,7 +112,7 @@ def main() -> None:
             draw_slice(source, folder)
     except Exception as error:  # to be raised where it is waited for
         sys.stdout.buffer.write(pickle.dumps(error))
-        raise SystemExit(1) from error
+        sys.exit(1)
 
 
 if __name__ == "__main__":

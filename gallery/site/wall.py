@@ -95,10 +95,7 @@ def draw_wall(tiles: Sequence[Tile], data: Path, out: Path) -> None:
     """Draw the wall, and write its table."""
     from ...landscapes.draw.figures.wall import Landscape, wall_figure
 
-    hung = [
-        Landscape(tile.env, ", ".join(one.said() for one in tile.best(SHAPES)), open_slice(data / tile.figure / STORE))
-        for tile in tiles
-    ]
+    hung = [Landscape(tile.env, tile.sentence(SHAPES), open_slice(data / tile.figure / STORE)) for tile in tiles]
     save_both(wall_figure(hung), out / WALL_PICTURE)
     save_table([_row(tile, one) for tile in tiles for one in tile.words], out / WALL_TABLE)
 

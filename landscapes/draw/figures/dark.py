@@ -23,9 +23,9 @@ from .page import Picture
 Colours = NDArray[np.float64]
 
 COLOURS = ("color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor")  # that an artist may have
-PALE_GREY, GREY = (0.07, 0.12), (0.015, 0.04)  # up to which difference of its channels a colour is grey, and from which
-# on it is none, where it is pale and where it is not: bands are tinted and pale; cividis has colours that are nearly grey
-# and not pale
+# Up to which difference of its channels a colour is grey, and from which on it is none, where it is pale and where
+# not: bands are tinted and pale; cividis has colours that are nearly grey and not pale.
+PALE_GREY, GREY = (0.07, 0.12), (0.015, 0.04)
 MIDDLE = (0.40, 0.53)  # lightness of greys that stay: turned over they would hardly change, and cividis has them
 PAPER, PALE = 0.975, 0.6  # lightness of the page, and of colours that it shines through
 NEIGHBOURHOOD = 3  # pixels within which such colours are near the page

@@ -30,6 +30,7 @@ from gradscape.optim.search import search
 
 from ...command import NO_BROWSER
 from ...studies import study
+from .ledges import build_ledges, keep_ledges
 
 SPACE = ParameterSpace(
     ("speed", "force", "mass"), torch.tensor([-1.0, 0, -10]).double(), torch.tensor([1.0, 20, 10]).double(),
@@ -253,6 +254,20 @@ def site(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site") / "deep" / "gallery"
     build_site([*FIGURES, Figure("later", "rope", (0, 1), PaperCaption("Not yet."))], data, folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def ledge_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("ledges")
+    keep_ledges(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def ledges(ledge_data: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    folder = tmp_path_factory.mktemp("maps") / "site"
+    build_ledges(ledge_data, folder)
+    return f"file://{folder}/"
 
 
 @pytest.fixture

@@ -2,80 +2,30 @@
 
 import csv
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from matplotlib.colors import LogNorm, Normalize
 from PIL import Image
 from scipy.stats import rankdata
 
-from gradscape.gallery.figures import Figure
-from gradscape.gallery.paper import PaperCaption
-from gradscape.gallery.site import build, studio
-from gradscape.landscapes.draw.style import LOSS_MAP
+from gradscape.landscapes.draw.style import LOSS_MAP, Scale
+from gradscape.landscapes.lattice import own_cells
 from gradscape.landscapes.measures.unresolved import contradicted_cells
-from gradscape.landscapes.objective import Evaluation
-from gradscape.landscapes.plane import Plane
-from gradscape.landscapes.sampling.fill import sample
-from gradscape.landscapes.space import ParameterSpace
-from gradscape.landscapes.storage.store import SliceStore, open_slice
+from gradscape.landscapes.objective import Status
+from gradscape.landscapes.storage.store import open_slice
 
 from .browsing import DRAWN, pixels, point_at, told
 
 Visit = Callable[..., Any]
-SPACE = ParameterSpace(
-    ("speed", "angle"), torch.tensor([-1.0, 0]).double(), torch.tensor([1.0, 2]).double(), ("m/s", "")
-)
-FIGURES = [Figure(name, "ledge", (0, 1), PaperCaption("Made up."), resolution=size) for name, size in
-           (("fine", 256), ("coarse", 16))]  # fmt: skip
-
-
-class Ledge:
-    """A bowl with a ledge that its gradients do not show, and a corner that is not finite."""
-
-    name, space = "ledge", SPACE
-
-    def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
-        z = 2 * self.space.to_unit(x) - 1
-        loss, slope = 0.02 + z.square().sum(dim=1) + (z[:, 0] > 0.43), 2 * z
-        loss[(z > 0.75).all(dim=1)] = torch.nan
-        return Evaluation.from_results(loss, slope if grad else None)
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("ledges")
-    for figure in FIGURES:
-        plane = Plane.through(SPACE, SPACE.center, figure.dims, resolution=figure.resolution)
-        identity = {"objective": "ledge", "options": {}, "fidelity": "exact"}
-        where = folder / figure.id / "slice.zarr"
-        sample(Ledge(), plane, SliceStore.create(where, plane, SPACE, identity=identity, provenance={}))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def ledges(data: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Build a site of the ledges without the pictures that are no canvases."""
-    folder = tmp_path_factory.mktemp("maps") / "site"
-    blank = Image.new("RGB", (160, 120), "white")
-
-    def leave_out(source: Path, folder: Path) -> None:
-        for name in ("landscape", "thumbnail", "landscape-dark", "thumbnail-dark"):
-            blank.save(folder / f"{name}.png")
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(studio, "draw_slice", leave_out)
-        build.build_site(FIGURES, data, folder)
-    return f"file://{folder}/"
 
 
 @pytest.fixture
-def losses(data: Path) -> np.ndarray[Any, Any]:
-    return open_slice(data / "coarse/slice.zarr")["loss"].to_numpy()
+def losses(ledge_data: Path) -> np.ndarray[Any, Any]:
+    return open_slice(ledge_data / "coarse/slice.zarr")["loss"].to_numpy()
 
 
 def colours_of(shares: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
@@ -268,8 +218,8 @@ def test_arrows_are_thinned_by_the_zoom(ledges: str, visit: Visit) -> None:
     assert [page.evaluate(thinned, step) for step in (1, 4)] == [1, 4]
 
 
-def test_cells_whose_gradients_contradict_their_losses_are_dotted(ledges: str, data: Path, visit: Visit) -> None:
-    where = contradicted_cells(open_slice(data / "coarse/slice.zarr"))
+def test_cells_whose_gradients_contradict_their_losses_are_dotted(ledges: str, ledge_data: Path, visit: Visit) -> None:
+    where = contradicted_cells(open_slice(ledge_data / "coarse/slice.zarr"))
     assert set(np.argwhere(where)[:, 1]) == {10}  # of 16 columns, the ledge lies between two
     page = visit(ledges, "coarse/index.html")
     plain = pixels(page, "map").astype(int)
@@ -383,94 +333,6 @@ def test_a_view_is_saved_as_it_is_seen(canvas: str, ledges: str, visit: Visit) -
     assert (np.asarray(Image.open(waiting.value.path())) == drawn).all()
 
 
-COUNT = """() => {
-    window.work = {};
-    const count = (name, size = 1) => { work[name] = (work[name] || 0) + size; };
-    const pens = CanvasRenderingContext2D.prototype;
-    for (const name of Object.getOwnPropertyNames(pens)) {
-        const of = Object.getOwnPropertyDescriptor(pens, name);
-        if (typeof of.value !== "function") continue;
-        pens[name] = function (...given) { count(name); return of.value.apply(this, given); };
-    }
-    const sizes = HTMLCanvasElement.prototype, wide = Object.getOwnPropertyDescriptor(sizes, "width");
-    Object.defineProperty(sizes, "width", { ...wide, set(value) { count("resized"); wide.set.call(this, value); } });
-    for (const name of ["atob", "getComputedStyle"]) {
-        const plain = window[name];
-        window[name] = (...given) => { count(name); return plain(...given); };
-    }
-    const construct = (kind, given) => { count("arrays"); return new kind(...given); };
-    for (const name of ["Float32Array", "Uint32Array", "Uint8Array", "Uint8ClampedArray", "ImageData"]) {
-        window[name] = new Proxy(window[name], { construct });
-    }
-}"""
-NEVER = {"resized", "atob", "getComputedStyle", "arrays", "createImageData", "createPattern", "getImageData"}
-
-
-def work(page: Any, move: str, frames: int = 12) -> dict[str, int]:
-    """Return how often what costs something is called in one frame, the same in each of several."""
-    page.evaluate(DRAWN)
-    page.evaluate(move, 0)
-    page.evaluate(DRAWN)  # what is made once is there
-    page.evaluate("work = {}")
-    page.evaluate(
-        """async ([move, frames]) => {
-            for (let k = 1; k <= frames; k++) {
-                (0, eval)(move)(k);
-                await new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)));
-            }
-        }""",
-        [move, frames],
-    )
-    return {name: count / frames for name, count in page.evaluate("work").items()}
-
-
-@pytest.fixture
-def counted(ledges: str, visit: Visit) -> Iterator[dict[str, Any]]:
-    pages = {name: visit(ledges, f"{name}/index.html") for name in ("coarse", "fine")}
-    for page in pages.values():
-        page.clock.install()  # so that it never rests
-        page.evaluate(COUNT)
-    return pages
-
-
-def test_a_frame_of_the_map_costs_the_same_however_fine_the_slice_is(counted: dict[str, Any]) -> None:
-    """Nothing is decoded, laid out, resized or allocated while the map moves, and its data are one picture."""
-    moves = "(k) => setView(2 + (k % 3) / 8, 0.2 + k / 200, 0.1)"
-    found = {name: work(page, moves) for name, page in counted.items()}
-    for calls in found.values():
-        assert not NEVER & calls.keys()
-        assert calls["drawImage"] == 1 + 2  # the losses; the failures, cut out of their stripes
-        assert "putImageData" not in calls
-    steady = {
-        name
-        for name in found["fine"]
-        if name not in ("measureText", "fillText", "moveTo", "lineTo", "beginPath", "stroke")
-    }
-    assert {name: found["fine"][name] for name in steady} == {name: found["coarse"][name] for name in steady}
-    for name in ("fillText", "lineTo"):  # ticks, which are as many as there is room for
-        assert abs(found["fine"][name] - found["coarse"][name]) <= 8
-
-
-def test_layers_over_a_moving_map_are_pictures_too(counted: dict[str, Any]) -> None:
-    for page in counted.values():
-        page.check("input[name=isolines]")
-        page.check("input[name=finer]")
-    moves = "(k) => setView(2, 0.2 + k / 200, 0.1)"
-    for page in counted.values():
-        calls = work(page, moves)
-        assert not NEVER & calls.keys()
-        assert calls["drawImage"] == 1 + 2 + 2 + 1
-        assert calls["lineTo"] < 100
-
-
-def test_a_frame_of_the_surface_makes_nothing_anew(counted: dict[str, Any]) -> None:
-    for page in counted.values():
-        calls = work(page, "(k) => { turning = true; turn(0.05, 0.001); }")
-        assert not NEVER & calls.keys()
-        assert (calls["putImageData"], calls["drawImage"]) == (1, 1)
-        assert calls["lineTo"] < 40
-
-
 def test_from_above_the_surface_is_the_map(ledges: str, losses: np.ndarray[Any, Any], visit: Visit) -> None:
     page = visit(ledges, "coarse/index.html")
     norm = Normalize(np.nanmin(losses), np.nanmax(losses))
@@ -487,3 +349,21 @@ def test_from_above_the_surface_is_the_map(ledges: str, losses: np.ndarray[Any, 
                 np.testing.assert_allclose(colour, colours_of(norm(losses[row, column])), atol=4)
         middle = page.evaluate("flat([15 / 16, 15 / 16, 0])")
         assert picture[int(middle[1]), int(middle[0]), :3].min() > 250  # open where losses are missing
+
+
+def test_a_refined_slice_is_drawn_as_its_nearest_samples_and_says_where_it_was_not_sampled(
+    ledges: str, ledge_data: Path, visit: Visit
+) -> None:
+    dataset = open_slice(ledge_data / "refined/slice.zarr")
+    skipped = dataset["status"].to_numpy() == Status.INTERPOLATED
+    assert 100 < skipped.sum() < 33 * 33 - 100
+    drawn = own_cells(dataset)["loss"].to_numpy()
+    norm = Scale.of_loss(dataset["loss"].to_numpy()).norm
+    page = visit(ledges, "refined/index.html")
+    nodes, node = seen(page), page.evaluate("node")
+    for (row, column), colour in nodes.items():
+        if np.isfinite(drawn[row, column]) and np.hypot(*np.subtract((row, column), divmod(node, 33))) > 2:
+            np.testing.assert_allclose(colour, colours_of(norm(drawn[row, column])), atol=4)
+    row, column = np.argwhere(skipped)[0]
+    page.mouse.move(*point_at(page, int(row), int(column)))
+    assert "Loss: interpolated" in page.inner_text("#readout")
