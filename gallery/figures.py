@@ -66,6 +66,14 @@ class Figure:
         how = ["--resolution", str(self.resolution), "--fidelity", self.fidelity, "--through", self.through]
         return shlex.join(["landscape", *axis, *how, *self._set, "--device", device])
 
+    def python(self, device: str) -> str:
+        """Return the lines of Python that make this slice alone, draw it and say what it is like."""
+        options = {"options": dict(self.options)} if self.options else {}
+        how = {"resolution": self.resolution, "through": self.through, "fidelity": self.fidelity, "device": device}
+        said = ", ".join(f"{name}={value!r}" for name, value in {**how, **options}.items())
+        lines = ["import gradscape as gs", "", f"s = gs.slice({self.env!r}, {self.dims!r}, {said})"]
+        return "\n".join([*lines, "s.plot()", "print(s.report().words)"])
+
     def sweep_command(self, *, frames: int, resolution: int, fidelity: str, device: str) -> str:
         """Return the command that makes its sweep."""
         axes = ["--dims", *map(str, self.dims), "--over", self.over, "--frames", str(frames)]

@@ -3,7 +3,8 @@
 Of the data, a figure's folder holds `slice.zarr` and what else was made of it: `sweep.mp4` with `sweep.json`,
 `episodes.json` with a film and a picture of each episode, `companions.json` and `companions.png` of the same cut
 through other points, and the files of `landscape report`. Searches lie in `runs/ENVIRONMENT-OPTIONS/`, trade-offs in
-`tradeoff/`, the races of the league in `league/`: figures share them. The report card of gradients is in `card/`.
+`tradeoff/`, censuses in `census/`, the races of the league in `league/`: figures share them. The report card of
+gradients is in `card/`.
 """
 
 from __future__ import annotations
@@ -37,6 +38,11 @@ CARD = "card"  # the folder of the report card of gradients
 CARD_RECORD, CARD_PICTURE = CARD_FILES.files
 LEAGUE = "league"  # the folder of the league
 LEAGUE_RECORD, LEAGUE_PICTURE = LEAGUE_FILES.files
+CENSUSES = "census"  # the folder of what many slices of an environment are like
+WALL_PICTURE, WALL_TABLE = "wall.png", "wall.csv"  # of a slice of every environment, in a site
+THUMBNAIL = "thumbnail.png"  # of a slice, in a site
+COMPANION_TABLE, QUALITY_TABLE = "companions.csv", "gradient-quality.csv"  # of those pictures, in a site
+CSV, ZARR = "slice.csv", "slice.zarr.zip"  # a slice's data in a site
 TRADEOFF_PICTURE = TRADEOFF_FILES.picture  # in the folder of `landscape tradeoff`
 DEVICES = ("cuda", "cpu")  # that trade-offs are shown of
 REMAKE = "delete it, and `landscape gallery compute --part {}` makes it anew"
@@ -87,6 +93,11 @@ class TradeoffFiles:
     def there(self) -> bool:
         """Say whether both are there."""
         return self.record.exists() and self.picture.exists()
+
+    @property
+    def table(self) -> Path:
+        """What the record holds as a table, in the site alone."""
+        return self.record.with_suffix(".csv")
 
     @property
     def convergence(self) -> TradeoffFiles:

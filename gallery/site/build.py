@@ -13,9 +13,8 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -36,27 +35,34 @@ from ..companions import Companion, read_companions
 from ..figures import Figure
 from ..files import (
     COMPANION_PICTURE,
+    COMPANION_TABLE,
     MEASURES,
     PICTURE,
     QUALITY,
+    QUALITY_TABLE,
     REMAKE,
     REPORT,
     STORE,
     SURFACES,
     SWEEP_FILM,
+    THUMBNAIL,
     dark_name,
 )
 from ..paper import read_paper
 from .card import place_card
+from .downloads import save_slice, save_table
+from .front import Front
 from .league import LeaguePage, place_league
 from .manifest import SCHEMA, FigureEntry, Manifest, ModelEntry, TradeoffEntry, as_json
-from .measured import place_tradeoffs, read_report
+from .measured import place_tradeoffs, quality_rows, read_report
 from .models import place_models
 from .page_data import count_numbers, read_episodes, read_measures, read_off_nodes, read_sweep
+from .studio import Studio, draws
 from .trajectories import lay_runs, read_runs
+from .wall import draw_wall, hang
 
 HERE = Path(__file__).parent
-MANIFEST, NODES, THUMBNAIL = "manifest.json", "nodes.js", "thumbnail.png"
+MANIFEST, NODES = "manifest.json", "nodes.js"
 CARD_PAGE, LEAGUE_PAGE = "card.html", "league.html"
 
 
@@ -78,12 +84,17 @@ def build_site(
     with placing(out, overwrite=True, check=partial(_check, out)) as new:
         follow(len(there))
         shutil.copytree(HERE / "static", new / "static")
-        envs = [figure.env for figure in there]
-        site = _Site(new, _templates(), tables, place_tradeoffs(data, new, envs), place_models(data, new, envs))
-        shown = [site.write_page(figure, data / figure.id) for figure in there]
-        site.write_card(place_card(data, new))
-        site.write_league(place_league(data, new, read_paper()))
-        return site.write_index(shown, [figure.id for figure in figures if figure not in there])
+        places = [(data / figure.id, new / figure.id) for figure in there]
+        for _, folder in places:
+            folder.mkdir()
+        with Studio(places) as studio:
+            site = _Site.begin(new, data, [figure.env for figure in there], tables, studio)
+            shown = [site.write_page(figure, data / figure.id) for figure in there]
+            card = site.write_card(place_card(data, new, studio))
+            league = site.write_league(place_league(data, new, read_paper()))
+            tiles = hang(shown, data, new, studio)
+            draw_wall(tiles, data, new)
+        return site.write_index(Front(shown, tiles, card, league), [one.id for one in figures if one not in there])
 
 
 def _check(out: Path) -> None:
@@ -146,50 +157,63 @@ class _Site:
     tables: Sequence[xr.Dataset]
     tradeoffs: Mapping[str, Sequence[TradeoffEntry]]
     models: Mapping[str, Sequence[ModelEntry]]
+    studio: Studio
+
+    @classmethod
+    def begin(
+        cls, folder: Path, data: Path, envs: Sequence[str], tables: Sequence[xr.Dataset], studio: Studio
+    ) -> _Site:
+        """Place what the pages of these environments share."""
+        studies = place_tradeoffs(data, folder, envs, studio), place_models(data, folder, envs, studio)
+        return cls(folder, _templates(), tables, *studies, studio)
 
     def write_page(self, figure: Figure, source: Path) -> FigureEntry:
         """Write a slice's page and all it shows, and return its entry in the manifest."""
         folder = self.folder / figure.id
-        folder.mkdir()
         dataset = open_slice(source / STORE)
-        _draw(dataset, source, folder)
         episodes, runs = read_episodes(source, dataset), lay_runs(dataset, self.tables)
-        shown = json.dumps(as_json(read_off_nodes(dataset, episodes, runs)), separators=(",", ":"))
-        (folder / NODES).write_text(f"const SLICE = {shown};\n")
+        nodes = read_off_nodes(dataset, episodes, runs)
+        (folder / NODES).write_text(f"const SLICE = {json.dumps(as_json(nodes), separators=(',', ':'))};\n")
         given = [name for name in (*SURFACES, SWEEP_FILM) if (source / name).exists()]
         given += [name for episode in episodes for name in episode.files]
         given += [name for name in (REPORT, MEASURES, QUALITY) if (source / name).exists()]
         entry = _entry(figure, dataset, source)
         given += [COMPANION_PICTURE] if entry.companions else []
+        taken = [*save_slice(dataset, source / STORE, folder), *_save_tables(entry, source, folder)]
         entry = replace(
             entry,
-            files=[NODES, "index.html", *_place(given, source, folder)],
+            files=[
+                NODES,
+                "index.html",
+                *taken,
+                *_place(given, draws(source, len(dataset["loss"].dims)), source, folder, self.studio),
+            ],
             episodes=episodes,
             runs=[run.search() for run in runs],
             tradeoffs=self.tradeoffs.get(figure.env, []),
             models=self.models.get(figure.env, []),
         )
         about = {"entry": entry, "held": list(_held_parameters(dataset)), "scene": entries().get(figure.env)}
+        about["finer"] = nodes.finer is not None
         (folder / "index.html").write_text(self.pages.get_template("slice.html").render(**about))
         return entry
 
-    def write_card(self, card: Card | None) -> None:
-        """Write the page of the report card of gradients, where there is one."""
+    def write_card(self, card: Card | None) -> Card | None:
+        """Write the page of the report card of gradients, where there is one, and return it."""
         if card is not None:
             (self.folder / CARD_PAGE).write_text(self.pages.get_template(CARD_PAGE).render(card=card))
+        return card
 
-    def write_league(self, page: LeaguePage | None) -> None:
-        """Write the page of the league, where there is one."""
+    def write_league(self, page: LeaguePage | None) -> LeaguePage | None:
+        """Write the page of the league, where there is one, and return it."""
         if page is not None:
             (self.folder / LEAGUE_PAGE).write_text(self.pages.get_template(LEAGUE_PAGE).render(page=page))
+        return page
 
-    def write_index(self, shown: Sequence[FigureEntry], missing: Sequence[str]) -> Manifest:
-        """Write the page of all pages and the manifest, and return that."""
-        manifest = Manifest(SCHEMA, __version__, shown, missing, [])
-        groups = [(env, list(group)) for env, group in groupby(shown, key=lambda entry: entry.env)]
-        card, league = (name if (self.folder / name).exists() else "" for name in (CARD_PAGE, LEAGUE_PAGE))
-        about = {"groups": groups, "manifest": manifest, "scenes": entries(), "card": card, "league": league}
-        index = self.pages.get_template("index.html").render(**about)
+    def write_index(self, front: Front, missing: Sequence[str]) -> Manifest:
+        """Write the front page and the manifest, and return that."""
+        manifest = Manifest(SCHEMA, __version__, front.tiles, front.shown, missing, [])
+        index = self.pages.get_template("index.html").render(front=front, manifest=manifest, scenes=entries())
         (self.folder / "index.html").write_text(index)
         files = [file.relative_to(self.folder).as_posix() for file in self.folder.rglob("*") if file.is_file()]
         manifest = replace(manifest, files=sorted([*files, MANIFEST]))
@@ -197,19 +221,30 @@ class _Site:
         return manifest
 
 
-def _place(given: Sequence[str], source: Path, folder: Path) -> list[str]:
-    """Copy files of a figure's data, draw pictures for dark pages, and return the names of all but those drawn."""
-    from ...landscapes.draw.figures.dark import save_dark
+def _place(given: Sequence[str], drawn: Sequence[str], source: Path, folder: Path, studio: Studio) -> list[str]:
+    """Copy files of a figure's data, and return their names, those of pictures with those of their dark variants.
 
+    What is `drawn` has its own.
+    """
     for name in given:
         shutil.copyfile(source / name, folder / name)
-    pictures = [PICTURE, THUMBNAIL, *(name for name in given if name.endswith(".png"))]
+    pictures = [name for name in dict.fromkeys([PICTURE, THUMBNAIL, *given]) if name.endswith(".png")]
     for name in pictures:
-        if not (folder / dark_name(name)).exists():
-            with reading(source / name, REMAKE.format("slices")):
-                save_dark(folder / name, folder / dark_name(name))
+        if name not in drawn:
+            studio.develop(source / name, folder / name, partial(reading, source / name, REMAKE.format("slices")))
     copied = [name for name in given if name not in pictures]
     return [*copied, *(name for one in pictures for name in (one, dark_name(one)))]
+
+
+def _save_tables(entry: FigureEntry, source: Path, folder: Path) -> list[str]:
+    """Write what a figure's other pictures show as tables, and return their names."""
+    tables: dict[str, Sequence[Mapping[str, Any]]] = {COMPANION_TABLE: [asdict(one) for one in entry.companions]}
+    if (source / QUALITY).exists() and entry.report is not None:
+        tables[QUALITY_TABLE] = quality_rows(source)
+    there = {name: rows for name, rows in tables.items() if rows}
+    for name, rows in there.items():
+        save_table(rows, folder / name)
+    return list(there)
 
 
 def _entry(figure: Figure, dataset: xr.Dataset, source: Path) -> FigureEntry:
@@ -229,6 +264,7 @@ def _entry(figure: Figure, dataset: xr.Dataset, source: Path) -> FigureEntry:
         loss_unit=provenance.get("loss_unit", ""),
         numbers=count_numbers(dataset),
         command=provenance.get("command") or figure.command(identity.get("device", "auto")),
+        python=figure.python(identity.get("device", "auto")),
         identity={name: value for name, value in identity.items() if name != "plane"},
         provenance=provenance,
         files=[],
@@ -241,25 +277,6 @@ def _entry(figure: Figure, dataset: xr.Dataset, source: Path) -> FigureEntry:
         tradeoffs=[],
         models=[],
     )
-
-
-def _draw(dataset: xr.Dataset, source: Path, folder: Path) -> None:
-    """Draw a slice for light and for dark; a line's picture is the one made with it, since its events need episodes."""
-    from ...landscapes.draw.figures.contour import landscape_figure
-    from ...landscapes.draw.figures.dark import darken
-    from ...landscapes.draw.figures.page import save
-    from ...landscapes.draw.figures.profile import profile_figure
-    from ...landscapes.draw.figures.thumbnail import thumbnail_figure
-
-    drawn = {THUMBNAIL: thumbnail_figure(dataset)}
-    if len(dataset["loss"].dims) == 1 and (source / PICTURE).exists():
-        shutil.copyfile(source / PICTURE, folder / PICTURE)
-    else:
-        drawn[PICTURE] = (landscape_figure if len(dataset["loss"].dims) == 2 else profile_figure)(dataset)
-    for name, picture in drawn.items():
-        save(picture, folder / name)
-        darken(picture)
-        save(picture, folder / dark_name(name))
 
 
 def _held_parameters(dataset: xr.Dataset) -> Iterator[Held]:

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 
 from ...landscapes.measures.card import Card
 from ...landscapes.storage.records import read_json, reading
-from ..files import CARD, CARD_PICTURE, CARD_RECORD, dark_name
+from ..files import CARD, CARD_PICTURE, CARD_RECORD
+from .downloads import save_table
+from .studio import Studio
 
+CARD_TABLE = "card.csv"
 REMAKE = "delete it, and `landscape card --out {}` measures it anew"
 
 
-def place_card(data: Path, out: Path) -> Card | None:
+def place_card(data: Path, out: Path, studio: Studio) -> Card | None:
     """Copy the report card of the figures' data into the site, and return it; None where there is none."""
-    from ...landscapes.draw.figures.dark import save_dark
-
     source, target = data / CARD, out / CARD
     if not (source / CARD_RECORD).exists() or not (source / CARD_PICTURE).exists():
         return None
@@ -24,5 +26,6 @@ def place_card(data: Path, out: Path) -> Card | None:
     target.mkdir()
     for name in (CARD_RECORD, CARD_PICTURE):
         shutil.copyfile(source / name, target / name)
-    save_dark(source / CARD_PICTURE, target / dark_name(CARD_PICTURE))
+    studio.develop(source / CARD_PICTURE, target / CARD_PICTURE)
+    save_table([asdict(one) for one in card.grades], target / CARD_TABLE)
     return card

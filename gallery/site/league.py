@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from ...landscapes.storage.records import write_record
 from ...optim.claims import ClaimFinding, ClaimVerdict
@@ -14,7 +15,9 @@ from ...optim.league import League, OverallRank, SceneStandings, Standing
 from ..files import LEAGUE, LEAGUE_PICTURE, LEAGUE_RECORD, LeagueFiles
 from ..league import read_league, save_both
 from ..paper import Paper
+from .downloads import save_table
 
+LEAGUE_TABLE = "league.csv"
 VERDICTS = {
     ClaimVerdict.HOLDS: "confirmed",
     ClaimVerdict.FAILS: "refuted",
@@ -98,6 +101,16 @@ class LeaguePage:
         first = self.league.scenes[0]
         return f"{len(self.league.methods)} methods, {first.seeds} seeds each, {first.budget} episodes a run"
 
+    @property
+    def python(self) -> str:
+        """The lines of Python that make it again, as large as its first scene."""
+        first = self.league.scenes[0]
+        scenes = [f"{scene.env}@{scene.fidelity}" for scene in self.league.scenes]
+        call = (
+            f"league = gs.league({scenes!r}, {list(self.league.methods)!r}, budget={first.budget}, seeds={first.seeds})"
+        )
+        return "\n".join(["import gradscape as gs", "", call, "league.plot()"])
+
     def describe(self) -> str:
         """Say what the map of ranks shows."""
         best = self.league.overall[0]
@@ -119,6 +132,9 @@ def place_league(data: Path, out: Path, paper: Paper) -> LeaguePage | None:
             shutil.copyfile(getattr(source, name), getattr(target, name))
     write_record(folder / LEAGUE_RECORD, league.record())
     save_both(league.plot(), folder / LEAGUE_PICTURE)
+    save_table([_rank(one) for one in league.overall], folder / LEAGUE_TABLE)
+    for scene in league.scenes:
+        save_table([_came_off(scene, one) for one in scene.standings], folder / f"{scene.env}.csv")
     return LeaguePage.of(league, paper)
 
 
@@ -136,3 +152,15 @@ def _cell(one: Standing | OverallRank, count: int) -> RankCell:
     colour = RANK_MAP((one.rank - 1) / max(count - 1, 1))
     ground = "#" + bytes(round(255 * part) for part in colour[:3]).hex()
     return RankCell(one.method, one.rank, low, high, ground, text_on(colour))
+
+
+def _rank(one: OverallRank) -> Mapping[str, Any]:
+    return {"method": one.method, "mean rank": one.rank, "low": one.low, "high": one.high}
+
+
+def _came_off(scene: SceneStandings, one: Standing) -> Mapping[str, Any]:
+    """Return how a method came off in a scene: its best loss, its rank, and its episodes to each goal."""
+    times = {f"episodes to {goal:.6g}": time for goal, time in zip(scene.goals, one.times, strict=True)}
+    best = {"mean best loss": one.mean, "low": one.low, "high": one.high, "unsuccessful seeds": one.unsuccessful}
+    rank = {"mean rank": one.rank, "rank low": one.rank_low, "rank high": one.rank_high}
+    return {"method": one.method, **best, **rank, **times, "failed episodes": one.failed}

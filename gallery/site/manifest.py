@@ -124,23 +124,31 @@ class ColourScale:
 
 @dataclass(frozen=True)
 class Nodes:
-    """A slice as plain lists, row by row from the lowest v: what the map draws and says of a node.
+    """A slice as the map draws it, row by row from the lowest v; `page_data.pack` packs its arrays.
 
-    `slope` is the gradient along the axes, `gradient` its length in all dimensions; `azimuth` is where the surface is
-    seen from at first [degrees].
+    `loss` [unit] is packed float32, NaN where there is none, and `status` packed uint8, by the numbers of `statuses`.
+    `cells` and `looks` are the same as they are drawn, where a refined slice was not sampled everywhere. `slope` is the
+    gradient along the axes, `gradient` its length in all dimensions, packed float32 both. `finer` are packed flags of
+    the cells between four samples whose gradients contradict their losses. `scales` are those that the map can have,
+    by name, `scale` that which it begins with. `azimuth` is where the surface is seen from at first [degrees].
     """
 
     axes: Sequence[Axis]
     unit: str
-    loss: Column
-    status: Sequence[str]
-    scale: ColourScale
+    loss: str
+    status: str
+    statuses: Mapping[int, str]
+    scale: str
+    scales: Mapping[str, ColourScale]
     palette: Sequence[str]
     episodes: Sequence[EpisodeEntry]
     runs: Sequence[Trajectory]
     azimuth: float | None = field(default=None, metadata=LEFT_OUT)
-    slope: Sequence[Column] | None = field(default=None, metadata=LEFT_OUT)
-    gradient: Column | None = field(default=None, metadata=LEFT_OUT)
+    slope: Sequence[str] | None = field(default=None, metadata=LEFT_OUT)
+    gradient: str | None = field(default=None, metadata=LEFT_OUT)
+    cells: str | None = field(default=None, metadata=LEFT_OUT)
+    looks: str | None = field(default=None, metadata=LEFT_OUT)
+    finer: str | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True)
@@ -279,6 +287,7 @@ class FigureEntry:
     loss_unit: str
     numbers: Numbers
     command: str
+    python: str
     identity: Mapping[str, Any]
     provenance: Mapping[str, Any]
     files: Sequence[str]
@@ -293,11 +302,67 @@ class FigureEntry:
 
 
 @dataclass(frozen=True)
+class WordShare:
+    """A word, the share of an environment's slices that it fits, and its interval, None where there is none."""
+
+    word: str
+    share: float
+    low: float | None = None
+    high: float | None = None
+
+    def said(self) -> str:
+        """Say it with its share."""
+        return f"{self.word} {self.share:.0%}".replace("%", "\N{NO-BREAK SPACE}%")
+
+
+@dataclass(frozen=True)
+class Tile:
+    """An environment on the wall: the slice that is shown, and which words fit which share of how many slices.
+
+    They are those of its `census`, with the command, the picture and the table of that, or of the gallery's own slices.
+    """
+
+    env: str
+    figure: str
+    page: str
+    labels: Sequence[str]
+    dim: int
+    engine: str
+    slices: int
+    census: bool
+    words: Sequence[WordShare]
+    picture: str = ""
+    table: str = ""
+    command: str = ""
+
+    def fitting(self, least: float) -> list[str]:
+        """Return the words that fit such a share of the slices, or more."""
+        return [one.word for one in self.words if one.share >= least]
+
+    def best(self, among: Sequence[str], most: int = 3) -> list[WordShare]:
+        """Return the words of these that fit most slices, the most frequent first, none that fits none."""
+        found = [one for one in self.words if one.word in among and one.share > 0]
+        return sorted(found, key=lambda one: -one.share)[:most]
+
+    def sentence(self, among: Sequence[str]) -> str:
+        """Say which words of these fit which shares of how many slices."""
+        if not self.slices:
+            return "not measured yet"
+        said = ", ".join(one.said() for one in self.best(among)) or "none of the words"
+        return f"{said} of {self.slices} slice{'s' if self.slices > 1 else ''}{'' if self.census else ' here'}"
+
+    def share(self, word: str) -> WordShare | None:
+        """Return the share of a word, None where nothing is known of it."""
+        return next((one for one in self.words if one.word == word), None)
+
+
+@dataclass(frozen=True)
 class Manifest:
-    """All of a site: its slices, those that are not sampled yet, and its files."""
+    """All of a site: its environments, its slices, those that are not sampled yet, and its files."""
 
     schema: int
     gradscape: str
+    wall: Sequence[Tile]
     figures: Sequence[FigureEntry]
     missing: Sequence[str]
     files: Sequence[str]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,10 @@ from ...landscapes.measures.convergence_record import Convergence
 from ...landscapes.measures.fidelity import cheapest, p95, pareto_front
 from ...landscapes.plain import number, optional, text
 from ...landscapes.storage.records import read_json, reading
-from ..files import DEVICES, REMAKE, REPORT, TRADEOFFS, TradeoffFiles, dark_name
+from ..files import DEVICES, REMAKE, REPORT, TRADEOFFS, TradeoffFiles
+from .downloads import save_table
 from .manifest import ConvergenceEntry, Interval, ReportEntry, Rung, SecondsEntry, TradeoffEntry, Word
+from .studio import Studio
 
 Record = Mapping[str, Any]
 TOLERANCE = 0.05  # of the loss error that a picture's description names the quickest rung for
@@ -65,6 +68,14 @@ def _describe_quality(record: Record) -> str:
     return "Gradient quality over the slice: " + ("; ".join(parts) or "no slope above the noise")
 
 
+def quality_rows(folder: Path) -> list[Record]:
+    """Return what the picture of gradient quality shows by scale, a row for each scale of each of its three parts."""
+    with reading(folder / REPORT, REMAKE.format("reports")):
+        record = read_json(folder / REPORT)
+        parts = ("differences", "differences_of_samples", "smoothing")
+        return [{"part": part.replace("_", " "), **row} for part in parts for row in record[part]]
+
+
 def _small(rows: Sequence[Record]) -> Record | None:
     return next((row for row in rows if row["points"] >= row["of"] / 2), None)
 
@@ -73,35 +84,37 @@ def _format_signed(value: float) -> str:
     return f"{value:z.2f}".replace("-", "\N{MINUS SIGN}")
 
 
-def place_tradeoffs(data: Path, out: Path, envs: Sequence[str]) -> dict[str, list[TradeoffEntry]]:
+def place_tradeoffs(data: Path, out: Path, envs: Sequence[str], studio: Studio) -> dict[str, list[TradeoffEntry]]:
     """Copy what was measured of these environments' accuracy into the site, and return it by environment."""
-    from ...landscapes.draw.figures.dark import save_dark
-
     placed: dict[str, list[TradeoffEntry]] = {}
     for env, device in ((env, device) for env in dict.fromkeys(envs) for device in DEVICES):
         source, target = (TradeoffFiles.of(root, env, device) for root in (data, out))
         if not source.there():
             continue
+        target.record.parent.mkdir(exist_ok=True)
         with reading(source.record, REMAKE.format("tradeoffs")):
             record = read_json(source.record)
-            study = _read_convergence(source.convergence, record)
+            study = _read_convergence(source.convergence, record, target.convergence.table)
             placed.setdefault(env, []).append(_tradeoff(record, target, study))
-        target.record.parent.mkdir(exist_ok=True)
         for one, there in ((source, target), (source.convergence, target.convergence)):
             if one.there():
                 shutil.copyfile(one.record, there.record)
                 shutil.copyfile(one.picture, there.picture)
-                save_dark(one.picture, there.picture.with_name(dark_name(there.picture.name)))
+                studio.develop(one.picture, there.picture)
+        with reading(source.record, REMAKE.format("tradeoffs")):
+            save_table(record["rungs"], target.table)
     return placed
 
 
-def _read_convergence(files: TradeoffFiles, record: Record) -> ConvergenceEntry | None:
+def _read_convergence(files: TradeoffFiles, record: Record, table: Path) -> ConvergenceEntry | None:
     """Return what a study of convergence says, None where there is none of the code that the trade-off is of."""
     if not files.there():
         return None
     todo = f"delete it, and `landscape tradeoff {record['env']} --ladder convergence` measures it anew"
     with reading(files.record, todo):
         found = Convergence.of_record(read_json(files.record))
+    moves = [{"knob": one.knob, **asdict(move)} for one in found.knobs for move in one.moves]
+    save_table([*moves, *({"left of": one.name, **asdict(one)} for one in found.remainders)], table)
     if found.identity["code"] != record["identity"].get("code"):
         return None
     knobs = ", ".join(knob.knob for knob in found.knobs)

@@ -9,16 +9,16 @@ from pathlib import Path
 
 from ...landscapes.measures.model import Effect, MeasuredPart, ModelStudy
 from ...landscapes.storage.records import read_json, reading
-from ..files import DEVICES, TRADEOFFS, TradeoffFiles, dark_name
-from .manifest import Interval, ModelEntry, PartRow
+from ..files import DEVICES, TRADEOFFS, TradeoffFiles
+from .downloads import save_table
+from .manifest import Interval, ModelEntry, PartRow, as_json
+from .studio import Studio
 
 REMAKE = "delete it, and `landscape tradeoff {} --ladder model` measures it anew"
 
 
-def place_models(data: Path, out: Path, envs: Sequence[str]) -> dict[str, list[ModelEntry]]:
+def place_models(data: Path, out: Path, envs: Sequence[str], studio: Studio) -> dict[str, list[ModelEntry]]:
     """Copy what was measured of the parts of these environments' models into the site; return it by environment."""
-    from ...landscapes.draw.figures.dark import save_dark
-
     placed: dict[str, list[ModelEntry]] = {}
     for env, device in ((env, device) for env in dict.fromkeys(envs) for device in DEVICES):
         source, target = (TradeoffFiles.of_model(root, env, device) for root in (data, out))
@@ -29,7 +29,8 @@ def place_models(data: Path, out: Path, envs: Sequence[str]) -> dict[str, list[M
         target.record.parent.mkdir(exist_ok=True)
         shutil.copyfile(source.record, target.record)
         shutil.copyfile(source.picture, target.picture)
-        save_dark(source.picture, target.picture.with_name(dark_name(target.picture.name)))
+        studio.develop(source.picture, target.picture)
+        save_table(as_json(placed[env][-1].parts), target.table)
     return placed
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,8 @@ import xarray as xr
 
 from ...jobs.slice_summary import count_statuses, flat_points
 from ...landscapes.identity import plane_of
-from ...landscapes.measures.unresolved import stored_unresolved
+from ...landscapes.lattice import own_cells
+from ...landscapes.measures.unresolved import contradicted_cells, stored_unresolved
 from ...landscapes.objective import NOT_EVALUATED, Status
 from ...landscapes.plain import number
 from ...landscapes.plane import Plane
@@ -21,6 +23,8 @@ from ...landscapes.storage.records import read_json, reading
 from ..files import EPISODE_KINDS, EPISODES, MEASURES, REMAKE, SWEEP_FILM, SWEEP_RECORD
 from ..records import Node, SweepRecord, read_nodes
 from .manifest import Axis, ColourScale, EpisodeEntry, Nodes, Numbers, Trajectory
+
+LINEAR, LOGARITHMIC = "linear", "logarithmic"
 
 
 def count_numbers(dataset: xr.Dataset) -> Numbers:
@@ -44,22 +48,39 @@ def read_off_nodes(dataset: xr.Dataset, episodes: Sequence[EpisodeEntry], runs: 
     from ...landscapes.draw.style import LOSS_MAP, Scale
 
     plane, loss = plane_of(dataset), dataset["loss"].to_numpy()
+    own = Scale.of_loss(loss)
     nodes = Nodes(
         axes=_axes(plane),
         unit=str(dataset["loss"].attrs.get("units", "")),
-        loss=round_off(loss.ravel()),
-        status=[Status(code).name for code in dataset["status"].to_numpy().ravel()],
-        scale=_scale(loss, [run.best for run in runs if run.best is not None]),
+        loss=pack(loss),
+        status=pack(dataset["status"].to_numpy(), "u1"),
+        statuses={int(code): code.name for code in Status},
+        scale=LOGARITHMIC if own.logarithmic and plane.rank == 2 else LINEAR,
+        scales=_scales(loss, [run.best for run in runs if run.best is not None]),
         palette=[bytes(round(255 * part) for part in LOSS_MAP(level)[:3]).hex() for level in range(256)],
         episodes=episodes,
         runs=runs,
-        azimuth=azimuth(Relief(plane, Scale.of_loss(loss)), dataset) if plane.rank == 2 else None,
+        azimuth=azimuth(Relief(plane, own), dataset) if plane.rank == 2 else None,
     )
+    if (dataset["status"] == Status.INTERPOLATED).any() and plane.rank == 2:
+        drawn = own_cells(dataset)
+        nodes = replace(nodes, cells=pack(drawn["loss"].to_numpy()), looks=pack(drawn["status"].to_numpy(), "u1"))
     if "grad" not in dataset:
         return nodes
     grad = dataset["grad"].to_numpy().reshape(loss.size, -1)
-    slope = [round_off(column) for column in plane.slope(torch.from_numpy(grad)).numpy().T]
-    return replace(nodes, slope=slope, gradient=round_off(np.linalg.norm(grad, axis=1)))
+    slope = [pack(column) for column in plane.slope(torch.from_numpy(grad)).numpy().T]
+    finer = contradicted_cells(dataset) if plane.rank == 2 else np.zeros(0)
+    return replace(
+        nodes,
+        slope=slope,
+        gradient=pack(np.linalg.norm(grad, axis=1)),
+        finer=pack(finer, "u1") if finer.any() else None,
+    )
+
+
+def pack(values: np.ndarray[Any, Any], kind: str = "f4") -> str:
+    """Return an array, in its own order, as little-endian numbers in base64: a browser decodes it once."""
+    return base64.b64encode(values.astype(f"<{kind}").tobytes()).decode()
 
 
 def _axes(plane: Plane) -> list[Axis]:
@@ -69,17 +90,23 @@ def _axes(plane: Plane) -> list[Axis]:
     return [Axis(label, values, round_values(values[0], values[-1])) for label, values in labelled]
 
 
-def _scale(loss: np.ndarray[Any, Any], below: Sequence[float]) -> ColourScale:
-    """Return the scale of a map's colours, or of a line's height: that is linear and goes down to what lies below."""
+def _scales(loss: np.ndarray[Any, Any], below: Sequence[float]) -> dict[str, ColourScale]:
+    """Return the scales that a map's colours can have, or a line's height, which goes down to what lies below.
+
+    A logarithmic one is there where all losses are positive.
+    """
     from ...landscapes.draw.style import Scale
 
-    scale = Scale.of_loss(loss)
-    if loss.ndim == 1 and np.isfinite(loss).any():
-        low, high = float(np.nanmin([*loss, *below])), float(np.nanmax(loss))
+    scale, finite = Scale.of_loss(loss), loss[np.isfinite(loss)]
+    low, high = scale.ends
+    found = {LINEAR: Scale.between(low, high, logarithmic=False, extend=scale.extend)}
+    if loss.ndim == 1 and finite.size:
+        low, high = min([float(finite.min()), *below]), float(finite.max())
         room = 0.04 * (high - low) or 0.5
-        scale = Scale.linear(low - room, high + room)
-    ends = float(scale.norm.vmin or 0.0), float(scale.norm.vmax or 0.0)
-    return ColourScale(*ends, scale.logarithmic, scale.extend, scale.ticks())
+        found = {LINEAR: Scale.linear(low - room, high + room)}
+    if finite.size and 0 < low < high and finite.min() > 0:
+        found[LOGARITHMIC] = Scale.between(low, high, logarithmic=True, extend=scale.extend)
+    return {name: ColourScale(*one.ends, one.logarithmic, one.extend, one.ticks()) for name, one in found.items()}
 
 
 def read_episodes(folder: Path, dataset: xr.Dataset) -> list[EpisodeEntry]:

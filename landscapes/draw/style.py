@@ -243,6 +243,11 @@ class Scale:
         return cls(Normalize(low, high), "neither")
 
     @classmethod
+    def between(cls, low: float, high: float, *, logarithmic: bool, extend: str = "neither") -> Scale:
+        """Span a range, of positive values where it is logarithmic; `extend` says where values go on beyond it."""
+        return cls(LogNorm(low, high) if logarithmic else Normalize(low, high), extend)
+
+    @classmethod
     def symmetric(cls, values: NDArray[np.float64]) -> Scale:
         """Span finite values to both sides of zero alike, without the largest few where they are far out."""
         _, most, _ = _span(np.abs(values))

@@ -80,9 +80,7 @@ def find_unresolved(
     """
     loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
     slope = _step_slopes(dataset, loss)
-    known, whole = np.isfinite(loss), span(loss)
-    least = max(floor, np.nan_to_num(whole) / (max(loss.shape) - 1) / 2)
-    least = float(max(least, ROUNDING * np.abs(loss[known]).max())) if known.any() else least
+    least = _least(loss, floor)
     strata = _strata(loss, slope, least)
     budget = probes(_evaluated(dataset), grad="grad" in dataset)
     cells = sum(map(len, strata.values()))
@@ -158,6 +156,26 @@ def say_share(record: UnresolvedRecord | None) -> str:
 
 def _round(percent: float) -> str:
     return f"{percent:.1f}" if 0 < percent < 1 else f"{percent:.0f}"
+
+
+def contradicted_cells(dataset: xr.Dataset) -> NDArray[np.bool_]:
+    """Return which cells between the samples of a slice are contradicted, with a corner less along each axis.
+
+    A cell with a corner that failed or was not sampled is none. A difference counts from what the slice's own record
+    says on, and without a record from half a step of a ramp through the range.
+    """
+    record, loss = stored_unresolved(dataset), dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+    least = _least(loss, 0.0) if record is None or record["least"] is None else record["least"]
+    found = np.zeros([points - 1 for points in loss.shape], dtype=bool)
+    found[tuple(_strata(loss, _step_slopes(dataset, loss), least)[CONTRADICTED].T)] = True
+    return found
+
+
+def _least(loss: Values, floor: float) -> float:
+    """Return the difference that counts from on: half a step of a ramp, and no less than the noise and rounding."""
+    known = np.isfinite(loss)
+    least = max(floor, np.nan_to_num(span(loss)) / (max(loss.shape) - 1) / 2)
+    return float(max(least, ROUNDING * np.abs(loss[known]).max())) if known.any() else float(least)
 
 
 def _step_slopes(dataset: xr.Dataset, loss: Values) -> Values:

@@ -1,63 +1,163 @@
-// The map of a slice on a canvas, a node at a time under the pointer or the arrow keys.
+// The map of a slice on a canvas. What goes with the data is painted into bitmaps when it changes; a frame stretches
+// them over the window and draws what has a size of its own on the screen.
 "use strict";
 
 const canvas = document.getElementById("map");
-const readout = document.getElementById("readout");
-const spoken = document.getElementById("spoken");
-const player = document.getElementById("player");
-const still = matchMedia("(prefers-reduced-motion: reduce)");
 const PAD = { left: 62, right: up ? 84 : 14, top: 12, bottom: 46 };
 const BAR = { gap: 14, width: 13 };
-const REACH = 14; // pixels from which a click finds a ring
-const HATCHES = { NONFINITE: [[0, 8, 8, 0]], ESCAPED: [[0, 0, 8, 8]], ERROR: [[0, 8, 8, 0], [0, 0, 8, 8]] };
+const STRIPES = { NONFINITE: [[0, 8, 8, 0]], ESCAPED: [[0, 0, 8, 8]], ERROR: [[0, 8, 8, 0], [0, 0, 8, 8]] };
 const box = { width: 1, height: 1 }; // of what lies between the axes
+const SETTLED = 120; // milliseconds without a change of the view after which iso-lines are drawn sharp again
 let node = lowest;
 let pen;
 
-// The window of a plane reaches half a cell beyond its outermost nodes.
-function place(value, axis, length) {
+// The window of a plane reaches half a cell beyond its outermost nodes. Here a place is in shares of that.
+function share(value, axis) {
   const [low, high] = ends(axis);
-  const share = (value - low) / (high - low);
-  const cell = length / axis.values.length;
-  return up ? cell / 2 + share * (length - cell) : share * length;
+  const along = (value - low) / (high - low);
+  return up ? (0.5 + along * (axis.values.length - 1)) / axis.values.length : along;
 }
-const x = (value) => PAD.left + place(value, across, box.width);
-function y(value) {
-  if (up) return PAD.top + box.height - place(value, up, box.height);
-  return PAD.top + box.height * (1 - level(value));
+function valueAt(place, axis) {
+  const [low, high] = ends(axis);
+  const count = axis.values.length;
+  return low + (high - low) * (up ? (place * count - 0.5) / (count - 1) : place);
 }
-const at = (index) => [index % columns, Math.floor(index / columns)];
+const rightOf = (place) => PAD.left + (place - view.right) * view.zoom * box.width;
+const heightOf = (place) => PAD.top + box.height * (1 - (up ? (place - view.up) * view.zoom : place));
+const x = (value) => rightOf(share(value, across));
+const y = (value) => heightOf(up ? share(value, up) : level(value));
 function spot(index) {
   const [column, row] = at(index);
-  const loss = SLICE.loss[index];
-  return [x(across.values[column]), up ? y(up.values[row]) : loss === null ? PAD.top + box.height : y(loss)];
+  const loss = losses[index];
+  if (up) return [rightOf((column + 0.5) / columns), heightOf((row + 0.5) / rows)];
+  return [rightOf(columns > 1 ? column / (columns - 1) : 0), loss === loss ? y(loss) : PAD.top + box.height];
+}
+const inside = ([right, down], slack = 0.5) =>
+  right >= PAD.left - slack && right <= PAD.left + box.width + slack && down >= PAD.top - slack && down <= PAD.top + box.height + slack;
+// A pointer's place in shares of the window.
+function placeOf(event) {
+  const [right, down] = pointed(canvas, event);
+  return [(right - PAD.left) / box.width, 1 - (down - PAD.top) / box.height];
 }
 
-function hatch(lines) {
-  const tile = document.createElement("canvas");
-  tile.width = tile.height = 8;
+// A pattern of stripes or dots in pixels of the screen, however deep the zoom is.
+function pattern(paint, ground) {
+  const tile = offscreen(8, 8);
   const brush = tile.getContext("2d");
-  brush.fillStyle = "#ffffff";
-  brush.fillRect(0, 0, 8, 8);
-  brush.strokeStyle = "#5f5f5f";
-  brush.beginPath();
-  for (const [fromX, fromY, toX, toY] of lines) {
-    brush.moveTo(fromX, fromY);
-    brush.lineTo(toX, toY);
+  if (ground) {
+    brush.fillStyle = ground;
+    brush.fillRect(0, 0, 8, 8);
   }
-  brush.stroke();
-  return pen.createPattern(tile, "repeat");
+  paint(brush);
+  return brush.createPattern(tile, "repeat");
+}
+function striped(lines) {
+  return pattern((brush) => {
+    brush.strokeStyle = "#5f5f5f";
+    brush.beginPath();
+    for (const [fromX, fromY, toX, toY] of lines) {
+      brush.moveTo(fromX, fromY);
+      brush.lineTo(toX, toY);
+    }
+    brush.stroke();
+  }, "#ffffff");
+}
+function dotted(brush) {
+  for (const [size, colour] of [[2, "#1a1a1a"], [1.1, "#ffffff"]]) {
+    brush.fillStyle = colour;
+    brush.beginPath();
+    brush.arc(4, 4, size, 0, 2 * Math.PI);
+    brush.fill();
+  }
 }
 
-function drawCells() {
-  const [width, tall] = [box.width / columns, box.height / rows];
-  const failed = Object.fromEntries(Object.entries(HATCHES).map(([kind, lines]) => [kind, hatch(lines)]));
-  SLICE.loss.forEach((loss, index) => {
-    const [column, row] = at(index);
-    if (SLICE.status[index] === "MISSING") pen.fillStyle = "#ececec";
-    else pen.fillStyle = loss === null ? failed[SLICE.status[index]] || failed.ERROR : shade(level(loss));
-    pen.fillRect(PAD.left + column * width, PAD.top + box.height - (row + 1) * tall, width + 0.6, tall + 0.6);
-  });
+// A bitmap of the nodes, of a pixel each, from numbers of 32 bits; row 0 is its lowest.
+function bitmap(wide, tall, colourOf) {
+  const canvas_ = offscreen(wide, tall);
+  const brush = canvas_.getContext("2d");
+  const image = brush.createImageData(wide, tall);
+  const held = new Uint32Array(image.data.buffer);
+  for (let row = 0; row < tall; row++) {
+    for (let column = 0; column < wide; column++) held[(tall - 1 - row) * wide + column] = colourOf(row * wide + column);
+  }
+  brush.putImageData(image, 0, 0);
+  return canvas_;
+}
+
+const layers = { map: null, failures: [], finer: null, lines: [] };
+const mask = (wide, tall, where) => bitmap(wide, tall, (index) => (where(index) ? 0xff000000 : 0));
+function paintLayers() {
+  if (!up) return;
+  layers.map = bitmap(columns, rows, (index) => colours[index]);
+  layers.lines = [];
+  sharp.stale = true;
+  if (layers.failures.length || layers.finer) return; // they do not depend on the scale
+  for (const [kind, lines] of Object.entries(STRIPES)) {
+    const code = Number(Object.keys(SLICE.statuses).find((one) => SLICE.statuses[one] === kind));
+    if (!drawnStatuses.includes(code)) continue;
+    layers.failures.push({ fill: striped(lines), mask: mask(columns, rows, (index) => drawnStatuses[index] === code) });
+  }
+  if (finer) layers.finer = { fill: pattern(dotted), mask: mask(columns - 1, rows - 1, (index) => finer[index]) };
+}
+
+// Stretch a picture of part of the slice, in shares of it from its lower left corner, over the window.
+function stretch(brush, picture, left, low, wide, tall, offX = PAD.left, offY = PAD.top) {
+  const [right, down] = [(left - view.right) * view.zoom * box.width, box.height * (1 - (low + tall - view.up) * view.zoom)];
+  brush.drawImage(picture, offX + right, offY + down, wide * view.zoom * box.width, tall * view.zoom * box.height);
+}
+
+// What is patterned: on a canvas of its own, where a mask cuts the pattern out.
+const scratch = offscreen(1, 1);
+const scratchPen = scratch.getContext("2d");
+function drawPatterned({ fill, mask: where }, left, low, wide, tall, dots) {
+  sized(scratch, dots);
+  scratchPen.setTransform(dots, 0, 0, dots, 0, 0);
+  scratchPen.imageSmoothingEnabled = false;
+  scratchPen.globalCompositeOperation = "copy";
+  scratchPen.fillStyle = fill;
+  scratchPen.fillRect(0, 0, box.width, box.height);
+  scratchPen.globalCompositeOperation = "destination-in";
+  stretch(scratchPen, where, left, low, wide, tall, 0, 0);
+  pen.drawImage(scratch, PAD.left, PAD.top, box.width, box.height);
+}
+function sized(canvas_, dots) {
+  const [wide, tall] = [Math.ceil(box.width * dots), Math.ceil(box.height * dots)];
+  if (canvas_.width !== wide || canvas_.height !== tall) [canvas_.width, canvas_.height] = [wide, tall];
+}
+
+function drawCells(dots) {
+  pen.imageSmoothingEnabled = false;
+  for (const failure of layers.failures) drawPatterned(failure, 0, 0, 1, 1, dots);
+  stretch(pen, layers.map, 0, 0, 1, 1);
+  if (layers.finer && shown.has("finer")) {
+    drawPatterned(layers.finer, 0.5 / columns, 0.5 / rows, 1 - 1 / columns, 1 - 1 / rows, dots);
+  }
+  if (shown.has("isolines")) drawIsolines(dots);
+}
+
+// Iso-lines are drawn for a view on a canvas of their own, which goes along with the map until it rests.
+const sharp = { canvas: offscreen(1, 1), stale: true, right: 0, up: 0, zoom: 1 };
+function drawIsolines(dots) {
+  if (sharp.stale) drawSharp(dots);
+  pen.imageSmoothingEnabled = true;
+  stretch(pen, sharp.canvas, sharp.right, sharp.up, 1 / sharp.zoom, 1 / sharp.zoom);
+}
+function drawSharp(dots) {
+  if (!layers.lines.length) layers.lines = ISOLINES.map(isoline);
+  Object.assign(sharp, { stale: false, right: view.right, up: view.up, zoom: view.zoom });
+  sized(sharp.canvas, dots);
+  const brush = sharp.canvas.getContext("2d");
+  brush.setTransform(1, 0, 0, 1, 0, 0);
+  brush.clearRect(0, 0, sharp.canvas.width, sharp.canvas.height);
+  brush.setTransform(dots, 0, 0, dots, -PAD.left * dots, -PAD.top * dots);
+  brush.beginPath();
+  for (const line of layers.lines) {
+    for (let part = 0; part < line.length; part += 4) {
+      brush.moveTo(rightOf((line[part] + 0.5) / columns), heightOf((line[part + 1] + 0.5) / rows));
+      brush.lineTo(rightOf((line[part + 2] + 0.5) / columns), heightOf((line[part + 3] + 0.5) / rows));
+    }
+  }
+  doubled(brush, "#ffffff", 1, "#00000066");
 }
 
 function drawLine() {
@@ -65,10 +165,11 @@ function drawLine() {
   pen.lineWidth = 1.5;
   pen.beginPath();
   let on = false;
-  SLICE.loss.forEach((loss, index) => {
-    if (loss !== null) on ? pen.lineTo(...spot(index)) : pen.moveTo(...spot(index));
-    on = loss !== null;
-  });
+  for (let index = 0; index < losses.length; index++) {
+    const there = losses[index] === losses[index];
+    if (there) on ? pen.lineTo(...spot(index)) : pen.moveTo(...spot(index));
+    on = there;
+  }
   pen.stroke();
 }
 
@@ -85,246 +186,93 @@ function arrow(from, direction, length) {
   }
 }
 
+// How many nodes lie from one that has a gradient to the next: a fine slice has them at some nodes alone.
+function spacing() {
+  let least = Infinity;
+  for (let index = 0, last = -Infinity; index < gradients.length && least > 1; index++) {
+    if (index % columns === 0) last = -Infinity;
+    if (gradients[index] !== gradients[index]) continue;
+    least = Math.min(least, index - last);
+    last = index;
+  }
+  return Number.isFinite(least) ? least : 1;
+}
+const given = slopes && up ? spacing() : 1;
+
+// How many nodes lie from arrow to arrow: as few as leave room for them, doubled so that zooming adds arrows.
+function thinned() {
+  const fit_ = clamp(Math.floor(box.width / 20), 8, 24);
+  let step = given;
+  while (Math.max(columns, rows) / view.zoom / step > fit_) step *= 2;
+  return step;
+}
+
 // Steepest descent in fractions of the picture's sides, as in the picture below the map.
 function drawArrows() {
-  const step = Math.ceil(Math.max(columns, rows) / clamp(Math.floor(box.width / 20), 8, 24));
-  const sides = [across, up].map((axis) => ends(axis)[1] - ends(axis)[0]);
+  const step = thinned();
+  const sides = [sideOf(across), sideOf(up)];
+  const window_ = (begin, count) => [Math.ceil((Math.max(0, begin * count - 1)) / step) * step, Math.min(count, (begin + 1 / view.zoom) * count + 1)];
+  const [[left, right], [low, high]] = [window_(view.right, columns), window_(view.up, rows)];
   pen.beginPath();
-  for (let index = 0; index < SLICE.loss.length; index++) {
-    const [column, row] = at(index);
-    if (column % step || row % step || SLICE.slope[0][index] === null) continue;
-    const down = [-SLICE.slope[0][index] * sides[0], SLICE.slope[1][index] * sides[1]];
-    const size = Math.hypot(...down);
-    if (size > 0) arrow(spot(index), [down[0] / size, down[1] / size], (0.8 * step * box.width) / columns);
+  for (let row = low; row < high; row += step) {
+    for (let column = left; column < right; column += step) {
+      const index = row * columns + column;
+      const down = [-slopes[0][index] * sides[0], slopes[1][index] * sides[1]];
+      const size = Math.hypot(...down);
+      if (size > 0) arrow(spot(index), [down[0] / size, down[1] / size], (0.8 * step * view.zoom * box.width) / columns);
+    }
   }
   doubled(pen, "#ffffff", 1.4, "#1a1a1a");
 }
 
 function ring(index, radius, colour, around) {
+  if (!inside(spot(index))) return;
   pen.beginPath();
   pen.arc(...spot(index), radius, 0, 2 * Math.PI);
   doubled(pen, colour, 2, around);
 }
 
-function write(text, left, top, align) {
-  pen.textAlign = align;
-  pen.fillText(text, left, top);
-}
-
-function upright(text, left) {
-  pen.save();
-  pen.translate(left, PAD.top + box.height / 2);
-  pen.rotate(-Math.PI / 2);
-  write(text, 0, 0, "center");
-  pen.restore();
-}
-
-function tick(fromX, fromY, toX, toY) {
-  pen.beginPath();
-  pen.moveTo(fromX, fromY);
-  pen.lineTo(toX, toY);
-  pen.stroke();
-}
-
-// Ticks whose labels do not run into the one before.
-function apart(ticks, where, room) {
-  let last = null;
-  return ticks.filter((value) => {
-    if (last !== null && Math.abs(where(value) - last) < room(value)) return false;
-    last = where(value);
-    return true;
-  });
-}
-
-function drawAxes() {
-  const [bottom, right] = [PAD.top + box.height, PAD.left + box.width];
-  pen.fillStyle = ink("ink");
-  pen.strokeStyle = ink("quiet");
-  pen.lineWidth = 1;
-  pen.strokeRect(PAD.left, PAD.top, box.width, box.height);
-  pen.font = "12px system-ui, sans-serif";
-  for (const value of apart(across.ticks, x, (one) => pen.measureText(number(one)).width + 10)) {
-    tick(x(value), bottom, x(value), bottom + 4);
-    write(number(value), x(value), bottom + 17, "center");
-  }
-  for (const value of apart(up ? up.ticks : SLICE.scale.ticks, y, () => 15)) {
-    tick(PAD.left - 4, y(value), PAD.left, y(value));
-    write(number(value), PAD.left - 7, y(value) + 4, "right");
-  }
-  pen.font = "13px system-ui, sans-serif";
-  write(across.label, PAD.left + box.width / 2, bottom + 37, "center");
-  upright(up ? up.label : lossLabel, 15);
-  if (up) drawBar(right + BAR.gap, bottom);
-}
-
-function drawBar(left, bottom) {
-  const high = (share) => bottom - share * box.height;
-  for (let step = 0; step < box.height; step++) {
-    pen.fillStyle = shade(1 - step / box.height);
-    pen.fillRect(left, PAD.top + step, BAR.width, 1.5);
-  }
-  pen.strokeRect(left, PAD.top, BAR.width, box.height);
-  const beyond = { min: [0], max: [1], both: [0, 1], neither: [] }[SLICE.scale.extend];
-  for (const end of beyond) { // losses go on beyond this end
-    pen.fillStyle = shade(end);
-    pen.beginPath();
-    pen.moveTo(left, high(end));
-    pen.lineTo(left + BAR.width / 2, high(end) + (end ? -9 : 9));
-    pen.lineTo(left + BAR.width, high(end));
-    pen.closePath();
-    pen.fill();
-    pen.stroke();
-  }
-  pen.fillStyle = ink("ink");
-  pen.font = "12px system-ui, sans-serif";
-  for (const value of apart(SLICE.scale.ticks, (one) => high(level(one)), () => 15)) {
-    tick(left + BAR.width, high(level(value)), left + BAR.width + 4, high(level(value)));
-    write(number(value), left + BAR.width + 7, high(level(value)) + 4, "left");
-  }
-  pen.font = "13px system-ui, sans-serif";
-  upright(lossLabel, left + PAD.right - BAR.gap - 5);
-}
-
 function where(run, row) {
-  if (up) return [x(run.u[row]), y(run.v[row])];
-  return [x(run.u[row]), run.loss[row] === null ? PAD.top + box.height : y(run.loss[row])];
+  const there = up ? [x(run.u[row]), y(run.v[row])] : [x(run.u[row]), run.loss[row] === null ? PAD.top + box.height : y(run.loss[row])];
+  return inside(there, 10) ? there : null;
 }
 
-const redraw = fit(canvas, (brush, width, height) => {
+function drawWindow(dots) {
+  pen.save();
+  pen.beginPath();
+  pen.rect(PAD.left, PAD.top, box.width, box.height);
+  pen.clip();
+  if (up) drawCells(dots);
+  else drawLine();
+  if (up && shown.has("arrows")) drawArrows();
+  if (view.zoom > 1) drawRuns();
+  pen.restore();
+  if (view.zoom === 1) drawRuns(); // marks at the edge are whole
+}
+const drawRuns = () => SLICE.runs.filter((run) => shown.has(run.label)).forEach((run) => drawRun(pen, run, where));
+
+const redraw = fit(canvas, (brush, width, height, dots) => {
   pen = brush;
-  box.width = width - PAD.left - PAD.right;
-  box.height = height - PAD.top - PAD.bottom;
+  const room = [width - PAD.left - PAD.right, height - PAD.top - PAD.bottom];
+  if (room[0] !== box.width || room[1] !== box.height) [box.width, box.height, sharp.stale] = [...room, true];
   pen.fillStyle = ink("ground");
   pen.fillRect(0, 0, width, height);
-  if (up) drawCells();
-  else if (finite.length) drawLine();
+  drawWindow(dots);
   drawAxes();
-  if (shown.has("arrows")) drawArrows();
-  SLICE.runs.filter((run) => shown.has(run.label)).forEach((run) => drawRun(pen, run, where));
+  if (up) drawProfileLine();
   for (const episode of SLICE.episodes) ring(episode.row * columns + episode.column, 6, "#ffffff", "#1a1a1a");
   ring(node, 9, "#b5367a", "#ffffff");
 });
 
-const SAID = { MISSING: "not sampled yet", NONFINITE: "not finite", ESCAPED: "outside the domain", ERROR: "error", INTERPOLATED: "interpolated" };
-const lossSaid = (loss, status) => (loss === null ? SAID[status] : number(loss) + (SLICE.unit ? " " + SLICE.unit : ""));
-
-function episodeAt(index) {
-  const [column, row] = at(index);
-  return SLICE.episodes.find((one) => one.row === row && one.column === column);
-}
-
-function tell() {
-  const [column, row] = at(node);
-  const lines = [across, up].filter(Boolean).map((axis, rank) => {
-    return axis.label + ": " + number(axis.values[rank ? row : column]);
-  });
-  lines.push("Loss: " + lossSaid(SLICE.loss[node], SLICE.status[node]));
-  if (SLICE.slope && SLICE.slope[0][node] !== null) {
-    lines.push("Gradient along the slice: " + SLICE.slope.map((part) => number(part[node])).join(", "));
-    lines.push("Gradient\u2019s length in all dimensions: " + number(SLICE.gradient[node]));
-  }
-  if (node === lowest && finite.length) lines.push("The lowest loss of the slice");
-  const episode = episodeAt(node);
-  if (episode) lines.push("Episode here: " + episode.why);
-  readout.textContent = lines.join("\n");
-}
-
-// Said once the keys rest, so that a screen reader is not flooded; the pointer says nothing.
-let saying;
-function say(text, wait = 400) {
-  clearTimeout(saying);
-  saying = setTimeout(() => (spoken.textContent = text), wait);
-}
-
-function go(to) {
-  if (to === node) return;
-  node = to;
+let settling;
+document.addEventListener("viewed", () => {
   redraw();
-  tell();
-}
-
-function pointed(event) {
-  const frame = canvas.getBoundingClientRect();
-  return [event.clientX - frame.left - canvas.clientLeft, event.clientY - frame.top - canvas.clientTop];
-}
-
-function nearest([right, down]) {
-  const cell = (share, count) => clamp(up ? Math.floor(share * count) : Math.round(share * (count - 1)), 0, count - 1);
-  const row = up ? cell(1 - (down - PAD.top) / box.height, rows) : 0;
-  return row * columns + cell((right - PAD.left) / box.width, columns);
-}
-
-function ringed(point) {
-  const found = SLICE.episodes.map((one) => {
-    const index = one.row * columns + one.column;
-    return [Math.hypot(...spot(index).map((part, axis) => part - point[axis])), index];
-  });
-  return found.filter(([distance]) => distance < REACH).sort((one, other) => one[0] - other[0])[0];
-}
-
-function showEpisode() {
-  const episode = episodeAt(node);
-  if (!episode) return;
-  const [film, picture] = [player.querySelector("video"), player.querySelector("img")];
-  const caption = `${episode.why[0].toUpperCase()}${episode.why.slice(1)}: ${lossSaid(episode.loss, episode.status)}`;
-  player.hidden = false;
-  film.hidden = !episode.mp4;
-  picture.hidden = Boolean(episode.mp4);
-  player.querySelector("figcaption").textContent = caption;
-  if (episode.mp4) {
-    film.poster = episode.webp || "";
-    film.src = episode.mp4;
-    film.loop = !still.matches;
-    film.setAttribute("aria-label", "Episode. " + caption);
-    if (!still.matches) film.play().catch(() => {}); // a browser may refuse to play until asked by its own button
-  } else {
-    film.pause();
-    picture.src = episode.webp;
-    picture.alt = "Episode. " + caption;
-  }
-  player.scrollIntoView({ block: "nearest" });
-  say("Episode shown. " + caption, 0);
-}
-
-const MOVES = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowDown: [0, -1], ArrowUp: [0, 1] };
-canvas.addEventListener("keydown", (event) => {
-  const [column, row] = at(node);
-  const ring_ = { PageDown: 1, PageUp: -1 }[event.key];
-  if (event.key === "Enter" || event.key === " ") {
-    event.preventDefault();
-    showEpisode();
-    return;
-  }
-  if (event.key === "Home") go(lowest);
-  else if (ring_ && SLICE.episodes.length) {
-    const places = SLICE.episodes.map((one) => one.row * columns + one.column);
-    const next = places.indexOf(node) < 0 ? (ring_ > 0 ? 0 : -1) : places.indexOf(node) + ring_;
-    go(places[(next + places.length) % places.length]);
-  } else if (event.key in MOVES) {
-    const [right, upwards] = MOVES[event.key].map((step) => step * (event.shiftKey ? 5 : 1));
-    go(clamp(row + upwards, 0, rows - 1) * columns + clamp(column + right, 0, columns - 1));
-  } else return;
-  event.preventDefault();
-  say(readout.textContent.replaceAll("\n", ". "));
+  clearTimeout(settling);
+  settling = setTimeout(() => {
+    sharp.stale = true;
+    redraw();
+    document.dispatchEvent(new Event("settled"));
+  }, SETTLED);
 });
-canvas.addEventListener("pointermove", (event) => go(nearest(pointed(event))));
-canvas.addEventListener("click", (event) => {
-  const found = ringed(pointed(event));
-  go(found ? found[1] : nearest(pointed(event)));
-  showEpisode();
-});
-
-for (const input of document.querySelectorAll("#switches input")) {
-  const change = () => {
-    if (input.checked) shown.add(input.name);
-    else shown.delete(input.name);
-  };
-  change();
-  input.addEventListener("change", () => {
-    change();
-    document.dispatchEvent(new Event("shown"));
-  });
-}
-document.getElementById("switches")?.removeAttribute("disabled");
-document.dispatchEvent(new Event("shown"));
-tell();
+document.addEventListener("scaled", paintLayers);
+paintLayers();

@@ -1,111 +1,104 @@
-// What the map and the surface of a slice share: SLICE (nodes.js), its scale, its colours, canvases that fit the page.
+// What the pictures of a slice share: SLICE (nodes.js) as typed arrays, numbers in words, canvases that fit the page.
 "use strict";
+
+// Arrays are packed as base64 so that a page needs no request, and are decoded here, once.
+function unpacked(text, Kind) {
+  if (text === undefined) return null;
+  const bytes = atob(text);
+  const held = new Uint8Array(bytes.length);
+  for (let at = 0; at < bytes.length; at++) held[at] = bytes.charCodeAt(at);
+  return new Kind(held.buffer);
+}
 
 const [across, up] = SLICE.axes;
 const columns = across.values.length;
 const rows = up ? up.values.length : 1;
-const finite = SLICE.loss.map((loss, node) => [loss, node]).filter(([loss]) => loss !== null);
-const lowest = finite.reduce((best, one) => (one[0] < best[0] ? one : best), finite[0] || [null, 0])[1];
+const losses = unpacked(SLICE.loss, Float32Array);
+const statuses = unpacked(SLICE.status, Uint8Array);
+const drawnLosses = unpacked(SLICE.cells, Float32Array) || losses; // of a refined slice, each node's nearest sample's
+const drawnStatuses = unpacked(SLICE.looks, Uint8Array) || statuses;
+const slopes = SLICE.slope ? SLICE.slope.map((part) => unpacked(part, Float32Array)) : null;
+const gradients = unpacked(SLICE.gradient, Float32Array);
+const finer = unpacked(SLICE.finer, Uint8Array); // cells between four nodes
+const lowest = losses.reduce((best, loss, at) => (loss < losses[best] || !(losses[best] === losses[best]) ? at : best), 0);
 const lossLabel = "loss" + (SLICE.unit ? ` [${SLICE.unit}]` : "");
 const shown = new Set(); // what the switches let through
 
 const ends = (axis) => [axis.values[0], axis.values[axis.values.length - 1]];
+const sideOf = (axis) => ends(axis)[1] - ends(axis)[0];
+const statusOf = (at) => SLICE.statuses[statuses[at]];
+const clamp = (value, low, high) => Math.max(low, Math.min(high, value));
+const at = (index) => [index % columns, Math.floor(index / columns)];
+
 function number(value) {
-  if (value === null) return "none";
+  if (value === null || Number.isNaN(value)) return "none";
   const small = value !== 0 && Math.abs(value) < 1e-4;
   const text = small ? value.toExponential(3).replace(/\.?0+e/, "e") : Number(value.toPrecision(4)).toString();
   return text.replaceAll("-", "\u2212");
 }
-const clamp = (value, low, high) => Math.max(low, Math.min(high, value));
-const ink = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 
-// How far up the scale a loss is: 0 at its lower end, 1 at its upper.
-function level(loss) {
-  const { low, high, logarithmic } = SLICE.scale;
-  if (!logarithmic) return (loss - low) / (high - low);
-  return loss > 0 ? Math.log(loss / low) / Math.log(high / low) : -1;
+// About so many round values in a range.
+function roundValues(low, high, count) {
+  const rough = (high - low) / count;
+  if (!(rough > 0)) return [low];
+  const ten = 10 ** Math.floor(Math.log10(rough));
+  const step = ten * ([1, 2, 2.5, 5].find((one) => one * ten >= rough) || 10);
+  const found = [];
+  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k++) found.push(k * step);
+  return found;
 }
-const shade = (share) => "#" + SLICE.palette[Math.round(255 * clamp(share, 0, 1))];
 
-// Draw a canvas in pixels of the screen, anew whenever its size, the colour scheme or a switch changes.
+// Colours of the style sheet, read once for each colour scheme.
+const dark = matchMedia("(prefers-color-scheme: dark)");
+let inks = {};
+dark.addEventListener("change", () => (inks = {}));
+function ink(name) {
+  inks[name] ||= getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+  return inks[name];
+}
+
+// Draw a canvas in pixels of the screen: at most once a frame, whenever its size, the colour scheme, a switch or what
+// it shows changes. Returns what asks for that.
 function fit(canvas, draw) {
   const pen = canvas.getContext("2d");
-  const redraw = () => {
+  let asked = 0;
+  const frame = () => {
+    asked = 0;
+    if (document.readyState === "loading") return; // scripts are still coming that it may need
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
     if (!width || !height) return;
     const dots = window.devicePixelRatio || 1;
-    canvas.width = Math.round(width * dots);
-    canvas.height = Math.round(height * dots);
+    const [wide, tall] = [Math.round(width * dots), Math.round(height * dots)];
+    if (canvas.width !== wide || canvas.height !== tall) [canvas.width, canvas.height] = [wide, tall];
     pen.setTransform(dots, 0, 0, dots, 0, 0);
-    draw(pen, width, height);
+    draw(pen, width, height, dots);
   };
+  const redraw = () => (asked ||= requestAnimationFrame(frame));
   new ResizeObserver(redraw).observe(canvas);
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+  dark.addEventListener("change", redraw);
   document.addEventListener("shown", redraw);
+  document.addEventListener("scaled", redraw);
+  document.addEventListener("DOMContentLoaded", redraw);
   redraw();
   return redraw;
 }
 
-// A mark of a search: filled with the loss it had, rimmed with its method's colour.
-function mark(pen, at, radius, fill, rim, around) {
-  for (const [size, colour] of [[radius + 1.6, around], [radius + 0.9, rim], [Math.max(radius - 0.6, 0.8), fill]]) {
-    pen.fillStyle = colour;
-    pen.beginPath();
-    pen.arc(...at, size, 0, 2 * Math.PI);
-    pen.fill();
-  }
+// A canvas that is on no page.
+function offscreen(width, height) {
+  const canvas = document.createElement("canvas");
+  canvas.width = width;
+  canvas.height = height;
+  return canvas;
 }
 
-function star(pen, [x, y], radius, fill, rim, around) {
-  pen.beginPath();
-  for (let point = 0; point < 10; point++) {
-    const [angle, reach] = [(point * Math.PI) / 5 - Math.PI / 2, point % 2 ? 0.45 * radius : radius];
-    pen.lineTo(x + reach * Math.cos(angle), y + reach * Math.sin(angle));
-  }
-  pen.closePath();
-  pen.lineJoin = "round";
-  for (const [width, colour] of [[5, around], [2.4, rim]]) {
-    pen.lineWidth = width;
-    pen.strokeStyle = colour;
-    pen.stroke();
-  }
-  pen.fillStyle = fill;
-  pen.fill();
+// Said once the keys rest, so that a screen reader is not flooded; the pointer says nothing.
+let saying;
+function say(text, wait = 400) {
+  clearTimeout(saying);
+  saying = setTimeout(() => (document.getElementById("spoken").textContent = text), wait);
 }
 
-function cross(pen, [x, y]) {
-  pen.beginPath();
-  pen.moveTo(x - 3.5, y - 3.5);
-  pen.lineTo(x + 3.5, y + 3.5);
-  pen.moveTo(x - 3.5, y + 3.5);
-  pen.lineTo(x + 3.5, y - 3.5);
-  doubled(pen, "#1a1a1a", 1.4);
-}
-
-// A stroke that shows on every colour of the map.
-function doubled(pen, colour, width, around = "#ffffff") {
-  for (const [thick, paint] of [[width + 2.2, around], [width, colour]]) {
-    pen.lineWidth = thick;
-    pen.strokeStyle = paint;
-    pen.stroke();
-  }
-}
-
-// A search: the line joins what was the best so far. `where` gives a row's place, or null where it is not drawn. On a
-// plane a mark's fill is its loss; on a line its height is.
-function drawRun(pen, run, where) {
-  const around = up ? "#ffffff" : ink("ground");
-  const fill = (row) => (up ? shade(level(run.loss[row])) : run.colour);
-  const hidden = new Set(run.hidden);
-  const places = run.u.map((_, row) => (hidden.has(row) ? null : where(run, row)));
-  pen.beginPath();
-  run.path.map((row) => places[row]).filter(Boolean).forEach((at) => pen.lineTo(...at));
-  doubled(pen, run.colour, 1.5, around);
-  places.forEach((at, row) => {
-    if (!at) return;
-    if (run.loss[row] === null) cross(pen, at);
-    else mark(pen, at, run.radius[row], fill(row), run.colour, around);
-  });
-  const best = run.path[run.path.length - 1];
-  if (best !== undefined && places[best]) star(pen, places[best], 9, fill(best), run.colour, around);
+function pointed(canvas, event) {
+  const frame = canvas.getBoundingClientRect();
+  return [event.clientX - frame.left - canvas.clientLeft, event.clientY - frame.top - canvas.clientTop];
 }

@@ -23,8 +23,9 @@ from .page import Picture
 Colours = NDArray[np.float64]
 
 COLOURS = ("color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor")  # that an artist may have
-PALE_GREY, GREY = (0.04, 0.12), (0.015, 0.04)  # up to which difference of its channels a colour is grey, and from which
-# on it is none, where it is pale and where it is not: cividis has colours that are nearly grey, and not pale
+# Up to which difference of its channels a colour is grey, and from which on it is none, where it is pale and where
+# not: bands are tinted and pale; cividis has colours that are nearly grey and not pale.
+PALE_GREY, GREY = (0.07, 0.12), (0.015, 0.04)
 MIDDLE = (0.40, 0.53)  # lightness of greys that stay: turned over they would hardly change, and cividis has them
 PAPER, PALE = 0.975, 0.6  # lightness of the page, and of colours that it shines through
 NEIGHBOURHOOD = 3  # pixels within which such colours are near the page
@@ -62,28 +63,48 @@ def _gc(effect: Any) -> dict[str, Any]:
 
 
 def invert_greys(colours: Colours) -> Colours:
-    """Return colours, shape (..., 3 or 4), greys among them as light on the dark ground as they were dark on white."""
+    """Return colours, shape (..., 3 or 4), greys among them as light on the dark ground as they were dark on white.
+
+    What tint a pale grey has it keeps.
+    """
     rgb, rest = colours[..., :3], colours[..., 3:]
     level, chroma = rgb.mean(axis=-1, keepdims=True), np.ptp(rgb, axis=-1, keepdims=True)
     ground, ink = (to_rgba_array(name)[0, :3] for name in (style.NIGHT, style.NIGHT_INK))
     least, most = (np.where(level > PALE, *ends) for ends in zip(PALE_GREY, GREY, strict=True))
     grey = np.clip((most - chroma) / (most - least), 0.0, 1.0)
     grey = np.where((level > MIDDLE[0]) & (level < MIDDLE[1]), 0.0, grey)
-    found: Colours = np.concatenate([grey * (ground + (1 - level) * (ink - ground)) + (1 - grey) * rgb, rest], axis=-1)
+    turned = ground + (1 - level) * (ink - ground) + np.where(level > PALE, rgb - level, 0.0)
+    found: Colours = np.concatenate([grey * turned + (1 - grey) * rgb, rest], axis=-1)
     return found
 
 
 def save_dark(source: Path, target: Path) -> None:
     """Write a picture that is there as PNG for a dark page: where a colour meets the paper, the paper is taken out."""
     with Image.open(source) as picture:
-        light = np.asarray(picture.convert("RGB"), dtype=np.float64) / 255
+        pixels = np.asarray(picture.convert("RGB"), dtype=np.uint32)
+    packed, place = np.unique((pixels << (16, 8, 0)).sum(axis=-1, dtype=np.uint32), return_inverse=True)
+    light = (packed[:, None] >> (16, 8, 0) & 255) / 255  # a picture has far fewer colours than pixels
     level, chroma = light.mean(axis=-1), np.ptp(light, axis=-1)
     paper, pale = (level > PAPER) & (chroma < PALE_GREY[0]), (level > PALE) & (chroma > PALE_GREY[0])
-    edge = binary_dilation(paper, iterations=NEIGHBOURHOOD) & pale
+    place = place.reshape(pixels.shape[:2])
+    edge = binary_dilation(paper[place], iterations=NEIGHBOURHOOD) & pale[place]
     ground = to_rgba_array(style.NIGHT)[0, :3]
-    dark = invert_greys(light)
-    dark[edge] = light[edge] - light[edge].min(axis=-1, keepdims=True) * (1 - ground)
-    pixels = Image.fromarray(np.rint(255 * np.clip(dark, 0.0, 1.0)).astype(np.uint8))
+    dark = _as_bytes(invert_greys(light))[place]
+    dark[edge] = _as_bytes(light - light.min(axis=-1, keepdims=True) * (1 - ground))[place[edge]]
+    few = Image.fromarray(dark).quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    _keep_ground(few, paper[place], _as_bytes(ground))
     with replacing(target) as partial:
-        few = pixels.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-        few.save(partial, "PNG", optimize=True)
+        few.save(partial, "PNG")
+
+
+def _keep_ground(few: Image.Image, paper: NDArray[np.bool_], ground: NDArray[np.uint8]) -> None:
+    """Give the paper of a picture of few colours the page's own, of which it may have got a neighbour."""
+    palette, places = few.getpalette() or [], np.asarray(few)[paper]
+    if places.size:
+        most = int(np.bincount(places).argmax())
+        palette[3 * most : 3 * most + 3] = ground.tolist()
+        few.putpalette(palette)
+
+
+def _as_bytes(colours: Colours) -> NDArray[np.uint8]:
+    return np.rint(255 * np.clip(colours, 0.0, 1.0)).astype(np.uint8)

@@ -30,6 +30,7 @@ from gradscape.optim.search import search
 
 from ...command import NO_BROWSER
 from ...studies import study
+from .ledges import build_ledges, keep_ledges
 
 SPACE = ParameterSpace(
     ("speed", "force", "mass"), torch.tensor([-1.0, 0, -10]).double(), torch.tensor([1.0, 20, 10]).double(),
@@ -130,7 +131,8 @@ class Bowl:
 
 def keep(figure: Figure, folder: Path) -> None:
     """Sample a figure's slice."""
-    bowl, identity = Bowl(figure.env), {"objective": figure.env, "options": {}, "fidelity": "standard"}
+    bowl, engine = Bowl(figure.env), {"fluid": "warp"}.get(figure.env, "taichi")
+    identity = {"objective": figure.env, "options": {}, "fidelity": "standard", "engine": engine}
     plane = Plane.through(SPACE, SPACE.center, figure.dims, resolution=figure.resolution)
     path = folder / figure.id / "slice.zarr"
     store = SliceStore.create(path, plane, SPACE, identity=identity, provenance={"loss_unit": "J"})
@@ -172,6 +174,24 @@ def league(folder: Path) -> None:
         write_record(files.record, scene_standings(env, left_out).record())
         picture(files.picture)
         picture(files.dark)
+
+
+def census(folder: Path) -> None:
+    """Leave what many slices of an environment are like."""
+    shares = {"rugged": 0.75, "discontinuous": 0.5, "very smooth": 0.0, "gradients noisy": 0.9, "gradients good": 0.1}
+    each = {"axes": ["speed [m/s]", "force [N]"], "range": [0.5, 2.5], "failed": 0.0, "measures": [0.4, None]}
+    about = {"fidelity": "standard", "other": "", "loss_unit": "J", "along": "pairs", "resolution": 24, "gradients": 1}
+    unknown = {"value": None, "low": None, "high": None}
+    record = {
+        "env": "fluid", **about, "seed": 0, "episodes": 1152, "command": "landscape census fluid",
+        "slices": [{"base": k, "cut": 0, **each, "words": ["rugged", "discontinuous"]} for k in range(2)],
+        "words": {word: {"value": one, "low": one / 2, "high": (1 + one) / 2} for word, one in shares.items()},
+        "spreads": {name: {"quantiles": [None] * 5, "median": unknown} for name in ("turns", "minima")},
+        "parts": {}, "identity": {}, "provenance": {},
+    }  # fmt: skip
+    (folder / "census").mkdir()
+    write_record(folder / "census/fluid-cuda.json", record)
+    picture(folder / "census/fluid-cuda.png")
 
 
 COMPANIONS = [
@@ -217,6 +237,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "card/card.json").write_text(json.dumps(CARD))
     picture(folder / "card/card.png")
     league(folder)
+    census(folder)
     for name in ("episode-6-5", "episode-11-11", "sweep"):
         film(full / name)
     (full / "episode-11-11.mp4").unlink()
@@ -233,6 +254,25 @@ def site(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site") / "deep" / "gallery"
     build_site([*FIGURES, Figure("later", "rope", (0, 1), PaperCaption("Not yet."))], data, folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def ledge_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("ledges")
+    keep_ledges(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def ledges(ledge_data: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    folder = tmp_path_factory.mktemp("maps") / "site"
+    build_ledges(ledge_data, folder)
+    return f"file://{folder}/"
+
+
+@pytest.fixture
+def filed(site: Path) -> str:
+    return f"file://{site}/"
 
 
 @pytest.fixture(scope="session")

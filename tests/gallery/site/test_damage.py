@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from gradscape.gallery.site import build, league
+from gradscape.gallery.site import league, studio, wall
 from gradscape.gallery.site.build import build_site
 from gradscape.landscapes.draw.figures import dark
 
@@ -23,7 +23,8 @@ EVERY = 37  # of the damages that are thought of, since each takes a site; with 
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave pictures out."""
-    monkeypatch.setattr(build, "_draw", lambda dataset, source, folder: (folder / "landscape.png").touch())
+    monkeypatch.setattr(studio, "draw_slice", lambda source, folder: None)
+    monkeypatch.setattr(wall, "save_both", lambda picture, path: path.touch())
     monkeypatch.setattr(dark, "save_dark", lambda source, target: target.touch())
     monkeypatch.setattr(league, "save_both", lambda picture, path: path.touch())
 
@@ -63,6 +64,8 @@ def maker(file: Path) -> str:
     """Return the command that makes a file again: a study of a scene is none of the gallery's parts."""
     if file.name == "card.json":
         return f"card --out {file.parent}` measures it anew"
+    if file.parent.name == "census":
+        return f"census {file.stem.removesuffix('-cuda')} --device cuda` measures it anew"
     scene, _, study = file.stem.partition("-cuda.")
     return f"tradeoff {scene} --ladder {study}` measures it anew" if study else "gallery compute --part "
 

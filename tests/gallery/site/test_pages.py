@@ -1,7 +1,5 @@
 """What a browser makes of the site: from files and from a server, with the pointer, with keys, on a phone."""
 
-import base64
-import io
 import json
 import re
 import threading
@@ -12,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from gradscape.gallery.site.server import SiteHandler
 from gradscape.landscapes.draw.loopback import LoopbackServer
@@ -21,6 +18,7 @@ from gradscape.landscapes.draw.style import LOSS_MAP, Scale
 from gradscape.landscapes.identity import plane_of
 from gradscape.landscapes.storage.store import open_slice
 
+from .browsing import pixels, point_at, told
 from .conftest import FIGURES
 
 Visit = Callable[..., Any]
@@ -37,40 +35,13 @@ def served(site: Path) -> Iterator[str]:
         thread.join()
 
 
-@pytest.fixture
-def filed(site: Path) -> str:
-    return f"file://{site}/"
-
-
-def pixels(page: Any, canvas: str) -> np.ndarray[Any, Any]:
-    picture = page.evaluate("(id) => document.getElementById(id).toDataURL()", canvas)
-    return np.asarray(Image.open(io.BytesIO(base64.b64decode(picture.partition(",")[2]))))
-
-
-def told(page: Any, what: str) -> float:
-    line = next(line for line in page.inner_text("#readout").splitlines() if line.startswith(what))
-    return float(line.split(": ")[1].split()[0].rstrip(",").replace("\N{MINUS SIGN}", "-"))
-
-
-def point_at(page: Any, row: int, column: int) -> tuple[float, float]:
-    """Return where a node of the map is on the screen."""
-    page.locator("#map").scroll_into_view_if_needed()
-    return tuple(page.evaluate(
-        """([row, column]) => {
-            const frame = canvas.getBoundingClientRect(), [left, top] = spot(row * columns + column);
-            return [frame.left + canvas.clientLeft + left, frame.top + canvas.clientTop + top];
-        }""",
-        [row, column],
-    ))  # fmt: skip
-
-
 @pytest.mark.parametrize("way", ["filed", "served"])
 def test_every_page_opens(way: str, visit: Visit, request: pytest.FixtureRequest) -> None:
     page = visit(request.getfixturevalue(way), "index.html")
     page.wait_for_function("Array.from(document.images).every((one) => one.naturalWidth > 100)")
-    assert page.locator(".card").count() == len(FIGURES)
+    assert page.locator(".slice").count() == len(FIGURES)
     for figure in FIGURES:
-        page.click(f"a[href='{figure.id}/index.html']")
+        page.click(f".slice a[href='{figure.id}/index.html']")
         page.wait_for_url(f"**/{figure.id}/index.html")
         shown = "img:not([hidden]):not(#player img)"
         assert page.locator(shown).count()
@@ -89,11 +60,11 @@ def test_every_page_opens(way: str, visit: Visit, request: pytest.FixtureRequest
 def test_the_index_is_filtered_by_words(filed: str, visit: Visit) -> None:
     page = visit(filed, "index.html")
     page.fill("#filter", "figure 10 DESC")
-    assert page.locator(".card:visible").count() == 1
+    assert page.locator(".slice:visible").count() == 1
     assert page.locator("section:visible[data-env]").count() == 1
     page.wait_for_function("document.getElementById('count').textContent === '1 of 3 slices'")
     page.fill("#filter", "")
-    assert page.locator(".card:visible").count() == 3
+    assert page.locator(".slice:visible").count() == 3
     assert "ball" in page.inner_text("section[aria-labelledby=bounce] p >> nth=0")
 
 
@@ -298,18 +269,26 @@ def test_pages_fit_a_phone_in_light_and_dark(filed: str, visit: Visit, scheme: s
 
 
 def test_every_control_has_a_name_and_can_be_reached_by_keys(filed: str, visit: Visit) -> None:
-    page = visit(filed, "full/index.html")
-    names = page.eval_on_selector_all(
-        "button:not([hidden]), canvas, video:not([hidden]), input",
-        "all => all.map((one) => one.getAttribute('aria-label') || one.labels?.[0]?.textContent.trim() || '')",
-    )
-    assert len(names) > 6
-    assert all(names)
-    reached = set()
-    for _ in range(40):
-        page.keyboard.press("Tab")
-        reached.add(page.evaluate("document.activeElement.id || document.activeElement.name"))
-    assert {"map", "surface", "arrows", "random, seed 0", "command", "sweep-command"} <= reached
+    for path in ("index.html", "full/index.html", "line/index.html"):
+        page = visit(filed, path)
+        names = page.eval_on_selector_all(
+            "button, canvas, video, input, select",
+            """all => all.filter((one) => one.checkVisibility()).map((one) => one.getAttribute('aria-label')
+                || one.labels?.[0]?.textContent.trim() || one.textContent.trim())""",
+        )
+        assert names
+        assert all(names)
+        controls = page.evaluate("""() => {
+            const all = document.querySelectorAll("a, button, canvas[tabindex], input, select, summary, pre[tabindex]");
+            const seen = Array.from(all).filter((one) => one.checkVisibility());
+            seen.forEach((one, k) => { one.dataset.k = k; });
+            return seen.length;
+        }""")
+        reached = set()
+        for _ in range(2 * controls + 20):
+            page.keyboard.press("Tab")
+            reached.add(page.evaluate("document.activeElement.dataset.k"))
+        assert {str(k) for k in range(controls)} <= reached
 
 
 def test_print_is_dark_on_white_and_has_the_picture(filed: str, visit: Visit) -> None:

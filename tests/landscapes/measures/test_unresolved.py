@@ -16,6 +16,7 @@ from gradscape.landscapes.adapters import from_numpy, from_torch
 from gradscape.landscapes.measures.unresolved import (
     UNRESOLVED,
     Unresolved,
+    contradicted_cells,
     find_unresolved,
     probes,
     say_unresolved,
@@ -88,6 +89,32 @@ def test_the_cells_of_a_jump_are_the_share_that_is_found(grad: bool) -> None:
     share = look(jumping, grad=grad).share
     assert share.low <= crossed <= share.high
     assert share.value == pytest.approx(crossed, rel=0.6)
+
+
+@pytest.mark.parametrize("dims", [(0, 1), (0,)])
+def test_cells_of_a_jump_and_no_others_are_contradicted(dims: tuple[int, ...]) -> None:
+    _, dataset = cut(jumping, dims=dims)
+    loss = dataset["loss"].to_numpy()
+    found = contradicted_cells(dataset)
+    assert found.shape == tuple(points - 1 for points in loss.shape)
+    places = np.argwhere(found)
+    assert len(places) >= 31 * (len(dims) - 1) + 1
+    u = dataset["u"].to_numpy()
+    v = dataset["v"].to_numpy() if "v" in dataset else np.zeros(1)
+    for place in places:
+        left, low = u[place[-1]], v[place[0]] if len(dims) == 2 else 0.0
+        right, high = u[place[-1] + 1], v[place[0] + 1] if len(dims) == 2 else 0.0
+        assert left + 0.3 * low <= 0.11 <= right + 0.3 * high
+    assert not contradicted_cells(cut(steep, dims=dims)[1]).any()
+
+
+def test_no_cell_beside_a_failure_is_contradicted() -> None:
+    _, dataset = cut(jumping)
+    loss = dataset["loss"].to_numpy().copy()
+    loss[10:20] = np.nan
+    found = contradicted_cells(dataset.assign(loss=dataset["loss"].copy(data=loss)))
+    assert found.any()
+    assert not found[9:20].any()
 
 
 def test_a_jump_in_the_middle_of_an_interval_is_one() -> None:

@@ -82,3 +82,16 @@ def test_a_picture_that_is_there_is_turned_over_pixel_by_pixel(tmp_path: Path) -
     np.testing.assert_allclose(dark[20, 45], style.LOSS_MAP(0.3)[:3], atol=0.01)
     assert dark[9, 45].mean() < light[9, 45].mean() - 0.2
     assert not list(tmp_path.glob(".*"))
+
+
+def test_a_faint_band_is_faint_on_the_dark_too_without_a_seam(tmp_path: Path) -> None:
+    light = np.full((60, 90, 3), 255, dtype=np.uint8)
+    light[15:45, 20:70] = np.rint(255 * np.array(to_rgb(style.BAND[0])))
+    Image.fromarray(light).save(tmp_path / "light.png")
+    save_dark(tmp_path / "light.png", tmp_path / "dark.png")
+    dark = pixels(tmp_path / "dark.png")
+    band = dark[15:45, 20:70].reshape(-1, 3)
+    assert np.ptp(band, axis=0).max() == 0
+    assert 0.02 < band[0].mean() - NIGHT.mean() < 0.12  # it is 0.1 below white on the light page
+    assert band[0, 2] > band[0, 0]  # and blue
+    np.testing.assert_allclose(dark[0, 0], NIGHT, atol=1 / 255)

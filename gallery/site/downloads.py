@@ -1,0 +1,68 @@
+"""What a visitor takes along of a picture: its data as CSV, and a slice's as zarr."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from zipfile import ZIP_STORED, ZipFile
+
+import numpy as np
+import torch
+import xarray as xr
+
+from ...landscapes.export import frame
+from ...landscapes.identity import plane_of
+from ..files import CSV, ZARR
+
+DIGITS = 7  # of a number of single precision
+
+
+def save_slice(dataset: xr.Dataset, store: Path, folder: Path) -> list[str]:
+    """Write a slice as CSV and, as it lies in its finished store, as zarr in one file; return their names.
+
+    The CSV has a row for each sample: its place, its loss, its status and, where there are gradients, the loss's slope
+    along each axis and the gradient's length in all dimensions. A slice that is not finished has no zarr.
+    """
+    table = frame(dataset.drop_vars("grad", errors="ignore"))
+    for name, column in _slopes(dataset).items():
+        table[name] = column
+    table.to_csv(folder / CSV, index=False, float_format=f"%.{DIGITS}g")
+    if not store.is_dir():
+        return [CSV]
+    with ZipFile(folder / ZARR, "w", ZIP_STORED) as packed:  # chunks are compressed already
+        for file in sorted(one for one in store.rglob("*") if one.is_file()):
+            packed.write(file, file.relative_to(store).as_posix())
+    return [CSV, ZARR]
+
+
+def _slopes(dataset: xr.Dataset) -> dict[str, np.ndarray[Any, Any]]:
+    if "grad" not in dataset:
+        return {}
+    plane = plane_of(dataset)
+    grad = dataset["grad"].to_numpy().reshape(dataset["loss"].size, -1)
+    along = plane.slope(torch.from_numpy(grad)).numpy().T
+    slopes = {f"slope along {label}": column for label, column in zip(plane.labels, along, strict=True)}
+    return {**slopes, "length of the gradient in all dimensions": np.linalg.norm(grad, axis=1)}
+
+
+def save_table(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Write records as CSV, a row each; what is in a record of a record has a column of its own, named by both."""
+    flat = [dict(_flatten(row)) for row in rows]
+    columns = list(dict.fromkeys(name for row in flat for name in row))
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns, restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(flat)
+
+
+def _flatten(row: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in row.items():
+        said = f"{within} {name}".strip()
+        if isinstance(value, Mapping):
+            yield from _flatten(value, said)
+        elif isinstance(value, list | tuple):
+            yield said, "; ".join(map(str, value))
+        else:
+            yield said, "" if value is None else value

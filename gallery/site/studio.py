@@ -1,0 +1,119 @@
+"""Where a site's pictures are made while its pages are written: slices by processes, dark variants by a thread.
+
+    python -m gradscape.gallery.site.studio SOURCE FOLDER [SOURCE FOLDER ...]
+
+draws the slices of figures' folders into those of their pages. What it fails at it pickles to its standard output.
+"""
+
+from __future__ import annotations
+
+import pickle
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from ...landscapes.storage.store import open_slice
+from ..files import PICTURE, STORE, THUMBNAIL, dark_name
+
+FEW = 4  # slices that are drawn here: a process takes as long to start
+MOST = 4  # processes
+Reading = Callable[[], AbstractContextManager[Any]]
+
+
+class Studio:
+    """Draw slices and recolour pictures; leaving it waits for all, and raises what the first that failed did."""
+
+    def __init__(self, places: Sequence[tuple[Path, Path]]) -> None:
+        self._thread = ThreadPoolExecutor(1)  # what recolours lets go of Python
+        self._begun: list[Future[None]] = []
+        self._drawers = _start(places) if len(places) > FEW else []
+        if not self._drawers:
+            for source, folder in places:
+                draw_slice(source, folder)
+
+    def __enter__(self) -> Studio:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._thread.shutdown(cancel_futures=kind is not None)
+        for drawer in self._drawers:
+            if kind is not None:
+                drawer.kill()
+            said, _ = drawer.communicate()
+            if kind is None and drawer.returncode:
+                raise _failure(said, drawer.returncode)
+        if kind is None:
+            for one in self._begun:
+                one.result()
+
+    def develop(self, source: Path, target: Path, within: Reading = nullcontext) -> None:
+        """Make the dark variant of a picture beside where that goes, within what names the file of a failure."""
+        self._begun.append(self._thread.submit(_develop, source, target, within))
+
+
+def _start(places: Sequence[tuple[Path, Path]]) -> list[subprocess.Popen[bytes]]:
+    """Start processes that draw the slices, all but one of the cores; none where there is one."""
+    from ...envs.engines.runtime import cores
+
+    count = min(cores() - 1, MOST)
+    shares = [[str(path) for place in places[k::count] for path in place] for k in range(count)]
+    command = [sys.executable, "-m", __name__]
+    return [subprocess.Popen([*command, *share], stdout=subprocess.PIPE) for share in shares]
+
+
+def _failure(said: bytes, code: int) -> Exception:
+    """Return what a process failed at, as it said, or that it ended."""
+    try:
+        error = pickle.loads(said)  # of a process of our own
+        return error if isinstance(error, Exception) else RuntimeError(str(error))
+    except (pickle.UnpicklingError, EOFError, AttributeError, ImportError, IndexError):
+        return RuntimeError(f"a process that draws slices ended with code {code}; see what it said above")
+
+
+def _develop(source: Path, target: Path, within: Reading) -> None:
+    from ...landscapes.draw.figures import dark
+
+    with within():
+        dark.save_dark(source, target.with_name(dark_name(target.name)))
+
+
+def draws(source: Path, rank: int) -> list[str]:
+    """Return which pictures of a slice are drawn; a line has the one made with it, as its events need episodes."""
+    return [THUMBNAIL] if rank == 1 and (source / PICTURE).exists() else [THUMBNAIL, PICTURE]
+
+
+def draw_slice(source: Path, folder: Path) -> None:
+    """Draw a figure's slice for light and for dark."""
+    from ...landscapes.draw.figures.contour import landscape_figure
+    from ...landscapes.draw.figures.profile import profile_figure
+    from ...landscapes.draw.figures.thumbnail import thumbnail_figure
+    from ..league import save_both
+
+    dataset = open_slice(source / STORE)
+    rank = len(dataset["loss"].dims)
+    save_both(thumbnail_figure(dataset), folder / THUMBNAIL)
+    if PICTURE in draws(source, rank):
+        save_both((landscape_figure if rank == 2 else profile_figure)(dataset), folder / PICTURE)
+    else:
+        shutil.copyfile(source / PICTURE, folder / PICTURE)
+
+
+def main() -> None:
+    """Draw what is asked for."""
+    places = [Path(one) for one in sys.argv[1:]]
+    try:
+        for source, folder in zip(places[::2], places[1::2], strict=True):
+            draw_slice(source, folder)
+    except Exception as error:  # to be raised where it is waited for
+        sys.stdout.buffer.write(pickle.dumps(error))
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()
