@@ -1,0 +1,51 @@
+"""The Sphinx extension: writes the pages that are walked, mends links between folders, and takes the gallery in."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+from sphinx.application import Sphinx
+
+from . import mathml
+from .walked import write_pages
+
+ROOT = Path(__file__).resolve().parents[2]
+# Pages of the repository's root that are included by one here, so that links to them lead to it.
+INCLUDED = {"BENCHMARKS.md": "benchmarks.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
+
+
+def lead_to_pages(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Let links to pages of the root lead to those that include them."""
+    for name, here in INCLUDED.items():
+        source[0] = re.sub(rf"\]\(\.\./{re.escape(name)}", f"]({here}", source[0])
+
+
+def take_gallery(app: Sphinx, error: Exception | None) -> None:
+    """Put the gallery's site beside the pages, where there is one."""
+    if error is None and app.builder.format == "html" and (found := gallery_site(app)):
+        shutil.copytree(found, Path(app.outdir) / "gallery", dirs_exist_ok=True)
+
+
+def gallery_site(app: Sphinx) -> Path | None:
+    """Return where the built gallery is, None where there is none."""
+    named = ROOT / app.config.gallery_site
+    return named if (named / "manifest.json").is_file() else None
+
+
+def walk(app: Sphinx) -> None:
+    """Write what is walked."""
+    if app.config.walked:
+        write_pages(Path(app.srcdir) / "generated", gallery=gallery_site(app))
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Say what the extension adds."""
+    app.add_config_value("gallery_site", "out/gallery", "html")
+    app.add_config_value("walked", True, "env")
+    app.connect("builder-inited", walk)
+    app.connect("source-read", lead_to_pages)
+    app.connect("build-finished", take_gallery)
+    mathml.setup(app)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
