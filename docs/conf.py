@@ -42,6 +42,7 @@ nb_execution_raise_on_error = True
 nb_execution_show_tb = True
 nb_merge_streams = True
 
+smartquotes_action = "q"  # two dashes begin an option
 html_math_renderer = "mathml"  # which browsers draw by themselves; MathJax would be another megabyte of scripts
 add_module_names = False
 autodoc_member_order = "bysource"
@@ -66,4 +67,4 @@ html_theme_options = {
     "back_to_top_button": False,
 }
 html_context = {"default_mode": "auto"}
-copybutton_selector = "div.highlight pre"
+copybutton_prompt_text = "$ "

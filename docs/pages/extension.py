@@ -9,17 +9,20 @@ from pathlib import Path
 from sphinx.application import Sphinx
 
 from . import mathml
+from .interface import tidy_shapes, to_rst
 from .walked import write_pages
 
 ROOT = Path(__file__).resolve().parents[2]
 # Pages of the repository's root that are included by one here, so that links to them lead to it.
 INCLUDED = {"BENCHMARKS.md": "benchmarks.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
+PACKAGE = "example_package"  # a folder, to which a link leads where the repository is read
 
 
 def lead_to_pages(app: Sphinx, docname: str, source: list[str]) -> None:
-    """Let links to pages of the root lead to those that include them."""
+    """Let links to pages of the root lead to those that include them, and one to a folder to a page of its files."""
     for name, here in INCLUDED.items():
         source[0] = re.sub(rf"\]\(\.\./{re.escape(name)}", f"]({here}", source[0])
+    source[0] = source[0].replace(f"]({PACKAGE})", f"](generated/{PACKAGE}.md)")
 
 
 def take_gallery(app: Sphinx, error: Exception | None) -> None:
@@ -45,6 +48,8 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_config_value("gallery_site", "out/gallery", "html")
     app.add_config_value("walked", True, "env")
     app.connect("builder-inited", walk)
+    app.connect("autodoc-process-docstring", to_rst)
+    app.connect("autodoc-process-signature", tidy_shapes)
     app.connect("source-read", lead_to_pages)
     app.connect("build-finished", take_gallery)
     mathml.setup(app)

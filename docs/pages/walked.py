@@ -4,10 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from . import commands, interface, package, scenes
+from .kept import Kept
+
+
+PICTURES = "pictures"
+
 
 def write_pages(folder: Path, *, gallery: Path | None) -> None:
     """Write the pages into a folder that holds nothing else: those that are gone from the project go."""
-    pages: dict[str, str] = {}
+    kept = Kept.read(gallery=gallery)
+    pages = commands.pages() | interface.pages() | package.pages() | scenes.pages(kept, folder / PICTURES)
     for old in folder.rglob("*.md"):
         if old.relative_to(folder).as_posix() not in pages:
             old.unlink()
