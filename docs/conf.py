@@ -9,11 +9,14 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
+from tempfile import mkdtemp
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "src")]
 os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # where `landscape` is
-os.environ.setdefault("COLUMNS", "100")  # of what commands print
+# What pages show of commands is what a stranger sees: no colours, no bars, nothing that was measured here before.
+os.environ |= {"COLUMNS": "100", "TTY_COMPATIBLE": "0", "XDG_DATA_HOME": mkdtemp(prefix="gradscape-docs-")}
+os.environ["PYTHONWARNINGS"] = 'ignore:install "ipywidgets"'  # whose scripts a page would load from elsewhere
 
 import gradscape  # noqa: E402 # once it can be found
 
@@ -31,6 +34,7 @@ extensions = [
 ]
 exclude_patterns = ["example_package", "**/__pycache__"]
 bibtex_bibfiles = ["references.bib"]
+bibtex_reference_style = "author_year"
 
 myst_enable_extensions = ["deflist", "dollarmath"]
 myst_heading_anchors = 4  # as GitHub has them, which links are written for

@@ -7,7 +7,7 @@ import inspect
 import re
 from collections.abc import Callable, Iterator
 from importlib import import_module
-from typing import Any
+from typing import Any, get_overloads
 
 import gradscape
 from gradscape.jobs.scene import SceneSpec
@@ -37,7 +37,7 @@ def pages() -> dict[str, str]:
 def returned(functions: Any) -> Iterator[tuple[str, type]]:
     """Yield each class of this package that a function is annotated to return, by its full name, once."""
     seen: set[type] = set()
-    for function in functions:
+    for function in (one for public in functions for one in (public, *get_overloads(public))):
         names = names_of(import_module(function.__module__))
         annotated = str(inspect.signature(function).return_annotation)
         for found in (names.get(word) for word in re.findall(r"\w+", annotated)):

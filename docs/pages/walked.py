@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from . import commands, interface, package, scenes
+from . import commands, interface, package, provenance, reproduction, scenes
 from .kept import Kept
 
 
@@ -14,7 +14,15 @@ PICTURES = "pictures"
 def write_pages(folder: Path, *, gallery: Path | None) -> None:
     """Write the pages into a folder that holds nothing else: those that are gone from the project go."""
     kept = Kept.read(gallery=gallery)
-    pages = commands.pages() | interface.pages() | package.pages() | scenes.pages(kept, folder / PICTURES)
+    pictures = folder / PICTURES
+    pages = {
+        **commands.pages(),
+        **interface.pages(),
+        **package.pages(),
+        **scenes.pages(kept, pictures),
+        **reproduction.pages(kept, pictures),
+        **provenance.pages(kept),
+    }
     for old in folder.rglob("*.md"):
         if old.relative_to(folder).as_posix() not in pages:
             old.unlink()
