@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 from pathlib import Path
 
 from sphinx.application import Sphinx
 
 from . import mathml
+from .included import lead_to_pages
 from .interface import tidy_shapes, to_rst
 from .walked import write_pages
 
 ROOT = Path(__file__).resolve().parents[2]
-# Pages of the repository's root that are included by one here, so that links to them lead to it.
-INCLUDED = {"BENCHMARKS.md": "benchmarks.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
-PACKAGE = "example_package"  # a folder, to which a link leads where the repository is read
 
 
-def lead_to_pages(app: Sphinx, docname: str, source: list[str]) -> None:
-    """Let links to pages of the root lead to those that include them, and one to a folder to a page of its files."""
-    for name, here in INCLUDED.items():
-        source[0] = re.sub(rf"\]\(\.\./{re.escape(name)}", f"]({here}", source[0])
-    source[0] = source[0].replace(f"]({PACKAGE})", f"](generated/{PACKAGE}.md)")
+def mend_links(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Let links lead to pages of the site."""
+    source[0] = lead_to_pages(source[0])
 
 
 def take_gallery(app: Sphinx, error: Exception | None) -> None:
@@ -50,7 +45,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("builder-inited", walk)
     app.connect("autodoc-process-docstring", to_rst)
     app.connect("autodoc-process-signature", tidy_shapes)
-    app.connect("source-read", lead_to_pages)
+    app.connect("source-read", mend_links)
     app.connect("build-finished", take_gallery)
     mathml.setup(app)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
+from .included import INCLUDED
 from .kept import NOT_MEASURED, Kept, KeptFigure
-from .text import cell, page, table
+from .text import page, table
 
 DOCS = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((DOCS.parent / "pyproject.toml").read_text())["project"]
@@ -45,7 +47,8 @@ def _row(one: KeptFigure) -> tuple[str, ...]:
 
 
 def _drawn(made: dict[str, str]) -> Iterator[tuple[str, ...]]:
-    pages = sorted(DOCS.glob("*.md"))
+    pages = {one: one.name for one in sorted(DOCS.glob("*.md"))}
+    pages |= {DOCS.parent / name: here for name, here in INCLUDED.items()}
     for name, command in sorted(made.items()):
-        shown = [f"[{one.stem}](../{one.name})" for one in pages if f"({name})" in one.read_text()]
-        yield f"`{name}`", ", ".join(shown) or cell("the README"), f"`{command}`"
+        shown = [here for file, here in pages.items() if re.search(rf"\((docs/)?{re.escape(name)}\)", file.read_text())]
+        yield f"`{name}`", ", ".join(f"[{Path(one).stem}](../{one})" for one in shown), f"`{command}`"

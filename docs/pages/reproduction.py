@@ -47,7 +47,7 @@ def pages(kept: Kept, pictures: Path) -> dict[str, str]:
         "was never released: scenes, engines and numbers are ours. The page is written by a program from "
         "`gallery/figures.toml`, `gallery/paper.toml`, the reports of the figures and the races of the league.",
         table(("verdict", "what it means"), [(f"**{word}**", prose(said)) for word, said in MEANING.items()]),
-        f"Of its slices {_count(verdict_of(one) for one in kept.figures)}. "
+        f"Of its slices and ours {_count(verdict_of(one) for one in kept.figures)}; {_earlier(kept)}. "
         f"Of its claims about methods {_count(one.verdict for one in claims)}.",
         *_figures(kept, pictures),
         "## Its claims about methods",
@@ -91,6 +91,14 @@ def _count(verdicts: Iterable[str]) -> str:
     return ", ".join(f"{found[word]} {word}" for word in order if found[word]) or "there are none"
 
 
+def _earlier(kept: Kept) -> str:
+    """Say how many slices were sampled before their scene became what it is."""
+    count = sum(one.slice is not None and not one.current for one in kept.figures)
+    return (
+        f"{count} of them were sampled by an earlier version of their scene" if count else "all by their scene as it is"
+    )
+
+
 def _figures(kept: Kept, pictures: Path) -> Iterator[str]:
     """Yield a section for each figure of the supplement, then one for the slices that it does not have."""
     numbers: dict[int | None, list[KeptFigure]] = {}
@@ -114,15 +122,17 @@ def _rows(one: KeptFigure, kept: Kept) -> Mapping[str, str]:
     """Return what stands beside each other, by what it is."""
     words, report = kept.paper.words.get(one.figure.env), one.report
     reasons = report.profile["verdict"]["reasons"] if report else {}
-    missing = [word["word"] for word in report.paper["words"] if not word["measured"]] if report and report.paper else []
-    version = "" if one.current or one.slice is None else ", by an earlier version of the scene, which simulated otherwise"
+    missing = (
+        [word["word"] for word in report.paper["words"] if not word["measured"]] if report and report.paper else []
+    )
+    earlier = "" if one.current or one.slice is None else ", by samples of an earlier version of the scene"
     return {
         "the paper shows": cell(one.figure.caption.says),
         "its words": cell(f"{', '.join(words.words)} ({words.where})") if words else "",
-        "its losses": _span(words.losses) if words and words.losses else "",
+        "ends of its colour bars": _span(words.losses) if words and words.losses else "",
         "measured": ", ".join(report.words) if report else NOT_MEASURED,
-        "losses": _span(one.losses) if one.losses else "",
-        "verdict": f"**{verdict_of(one)}**{version}",
+        "losses here": _span(one.losses) if one.losses else "",
+        "verdict": f"**{verdict_of(one)}**{earlier}",
         "not measured of its words": ", ".join(missing),
         "why": "; ".join(f"{word}: {cell(why)}" for word, why in reasons.items()),
         "scene": f"[{one.figure.env}](scenes/{one.figure.env}.md), {kept.link(one.figure, '../')}",
@@ -131,7 +141,7 @@ def _rows(one: KeptFigure, kept: Kept) -> Mapping[str, str]:
 
 
 def _span(losses: tuple[float, float]) -> str:
-    return f"{losses[0]:.3g} to {losses[1]:.3g}".replace("-", "\N{MINUS SIGN}")
+    return f"{losses[0]:.3g} to {losses[1]:.3g}"
 
 
 def _claims(claims: Sequence[FoundClaim]) -> str:

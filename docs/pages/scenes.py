@@ -85,9 +85,13 @@ def _settings(env: Environment) -> Iterator[str]:
     settings = [asdict(one) for one in env.fidelities.values()]
     yield table([*settings[0]], [[f"{value:.4g}" if isinstance(value, float) else str(value) for value in one.values()]
                                  for one in settings])  # fmt: skip
-    yield f"Engines: {', '.join(f'`{name}`' for name in env.engines)}. Examples: " + (
-        ", ".join(f"`{name}`" for name in env.examples) or "none"
-    ) + ". Unit of the loss: " + (prose(env.loss_unit) or "none") + "."
+    yield (
+        f"Engines: {', '.join(f'`{name}`' for name in env.engines)}. Examples: "
+        + (", ".join(f"`{name}`" for name in env.examples) or "none")
+        + ". Unit of the loss: "
+        + (prose(env.loss_unit) or "none")
+        + "."
+    )
     named, _, explained = in_full(env.Options).removeprefix("options:").strip("\n").partition("\n\n")
     options = [line.strip() for line in named.splitlines() if "=" in line]
     yield "Options: none." if not options else "Options:\n\n" + "\n".join(f"- `{one}`" for one in options)

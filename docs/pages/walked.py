@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from . import commands, interface, package, provenance, reproduction, scenes
+from . import commands, interface, package, provenance, reproduction, scenes, wall
 from .kept import Kept
-
 
 PICTURES = "pictures"
 
@@ -22,6 +21,7 @@ def write_pages(folder: Path, *, gallery: Path | None) -> None:
         **scenes.pages(kept, pictures),
         **reproduction.pages(kept, pictures),
         **provenance.pages(kept),
+        **wall.pages(kept, pictures),
     }
     for old in folder.rglob("*.md"):
         if old.relative_to(folder).as_posix() not in pages:
