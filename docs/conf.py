@@ -61,6 +61,7 @@ html_title = f"gradscape {version}"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
 html_copy_source = False
+html_sidebars = {"start": [], "generated/wall": []}  # which have no pages below them
 html_theme_options = {
     "show_toc_level": 2,
     "navigation_with_keys": False,

@@ -63,7 +63,7 @@ def to_rst(app: Any, what: str, name: str, one: Any, options: Any, lines: list[s
     blocks = re.split(r"\n\n+", "\n".join(lines))
     literal = [all(line.startswith("    ") for line in block.splitlines()) for block in blocks]
     told = ["::\n\n" + block if code else _escape(block) for block, code in zip(blocks, literal, strict=True) if block]
-    lines[:] = "\n\n".join(told).splitlines() + [""]
+    lines[:] = [*"\n\n".join(told).splitlines(), ""]
 
 
 def tidy_shapes(app: Any, what: str, name: str, one: Any, options: Any, said: str | None, back: str | None) -> Any:

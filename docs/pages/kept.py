@@ -62,7 +62,7 @@ class KeptFigure:
 
 @dataclass(frozen=True)
 class Kept:
-    """All that the pages show: the figures and what is kept of them, what the paper says, and the league if there is."""
+    """All that pages show: the figures and what is kept of them, what the paper says, and the league if any."""
 
     figures: Sequence[KeptFigure]
     paper: Paper
@@ -81,6 +81,6 @@ class Kept:
         return {env: [one for one in self.figures if one.figure.env == env] for env in names}
 
     def link(self, figure: Figure, up: str) -> str:
-        """Return the figure's name, as a link to its page of the gallery where that is built; `up` leads to the root."""
+        """Return a figure's name, as a link to its page of the gallery where that is built; `up` leads to the root."""
         shown = self.gallery and (self.gallery / figure.id / "index.html").exists()
         return f'<a href="{up}gallery/{figure.id}/index.html">{figure.id}</a>' if shown else f"`{figure.id}`"

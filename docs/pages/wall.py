@@ -14,8 +14,8 @@ from .text import page
 def pages(kept: Kept, pictures: Path) -> dict[str, str]:
     """Return the page; small pictures are drawn beside."""
     whole = (
-        '<a href="../gallery/index.html">The gallery</a> has a page for each of these: with a map to walk over, a surface, '
-        "films, episodes and what was measured."
+        '<a href="../gallery/index.html">The gallery</a> has a page for each of these: with a map to walk over, a '
+        "surface, films, episodes and what was measured."
         if kept.gallery
         else "`landscape gallery build` makes a page for each of these, with a map to walk over, a surface, films and "
         "episodes. `make docs` takes that site in where it is built."

@@ -1,4 +1,4 @@
-"""What stands beside the pages: cited papers are in the bibliography, the citation is the project's, workflows run what is there."""
+"""Beside the pages: the bibliography has what is cited, the citation is ours, workflows run what is there."""
 
 from __future__ import annotations
 
@@ -53,9 +53,10 @@ def test_papers_are_cited_in_the_code() -> None:
 def test_every_paper_that_is_cited_is_in_the_bibliography(names: str, year: str) -> None:
     last = plain(re.split(r", | & | and ", names)[-1].removeprefix("Van "))
     matches = [people for people, when in bibliography() if when == year and any(last in one for one in people)]
-    title = [entry for entry in parse_file(ROOT / "docs/references.bib").entries.values()
-             if entry.fields["year"] == year and plain(names.split(", ")[0]) in plain(entry.fields["title"])]  # fmt: skip
-    assert matches or title, f"docs/references.bib has nothing of {names} {year}"
+    first = plain(names.split(", ")[0])  # of a title, where a sentence has that before the year
+    entries = parse_file(ROOT / "docs/references.bib").entries.values()
+    titles = [one for one in entries if one.fields["year"] == year and first in plain(one.fields["title"])]
+    assert matches or titles, f"docs/references.bib has nothing of {names} {year}"
 
 
 def test_the_citation_is_of_this_project() -> None:

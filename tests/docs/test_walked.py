@@ -133,8 +133,13 @@ def test_pages_hold_every_figure_and_claim_and_say_what_is_not_measured(nothing:
 
 @pytest.mark.parametrize(
     ("hits", "verdict"),
-    [((True, True), "confirmed"), ((False, False), "refuted"), ((True, False), "different"), ((), "the paper says nothing of it")],
-)  # fmt: skip
+    [
+        ((True, True), "confirmed"),
+        ((False, False), "refuted"),
+        ((True, False), "different"),
+        ((), "the paper says nothing of it"),
+    ],
+)
 def test_a_slice_is_judged_by_which_of_the_paper_s_words_were_measured(
     tmp_path: Path, hits: tuple[bool, ...], verdict: str
 ) -> None:
