@@ -8,14 +8,18 @@ from __future__ import annotations
 
 import os
 import sys
+from atexit import register
 from pathlib import Path
+from shutil import rmtree
 from tempfile import mkdtemp
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "src")]
 os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # where `landscape` is
 # What pages show of commands is what a stranger sees: no colours, no bars, nothing that was measured here before.
-os.environ |= {"COLUMNS": "100", "TTY_COMPATIBLE": "0", "XDG_DATA_HOME": mkdtemp(prefix="gradscape-docs-")}
+measurements = mkdtemp(prefix="gradscape-docs-")
+register(rmtree, measurements, ignore_errors=True)
+os.environ |= {"COLUMNS": "100", "TTY_COMPATIBLE": "0", "XDG_DATA_HOME": measurements}
 os.environ["PYTHONWARNINGS"] = 'ignore:install "ipywidgets"'  # whose scripts a page would load from elsewhere
 
 import gradscape  # noqa: E402 # once it can be found

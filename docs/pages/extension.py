@@ -21,9 +21,12 @@ def mend_links(app: Sphinx, docname: str, source: list[str]) -> None:
 
 
 def take_gallery(app: Sphinx, error: Exception | None) -> None:
-    """Put the gallery's site beside the pages, where there is one."""
-    if error is None and app.builder.format == "html" and (found := gallery_site(app)):
-        shutil.copytree(found, Path(app.outdir) / "gallery", dirs_exist_ok=True)
+    """Put the gallery's site beside the pages, in the place of an earlier one; nothing where there is none."""
+    if error is None and app.builder.format == "html":
+        place = Path(app.outdir) / "gallery"
+        shutil.rmtree(place, ignore_errors=True)
+        if found := gallery_site(app):
+            shutil.copytree(found, place)
 
 
 def gallery_site(app: Sphinx) -> Path | None:

@@ -167,6 +167,18 @@ def test_claims_are_what_the_league_makes_of_them(nothing: Kept) -> None:
     assert len(set(ClaimVerdict)) + 2 == len(reproduction.MEANING)  # each that there is has a meaning
 
 
+def test_pictures_lead_to_the_gallery_where_it_is_built_and_to_scenes_where_not(kept: Kept, tmp_path: Path) -> None:
+    one = next(one for one in kept.figures if one.slice is not None)
+    (tmp_path / "site" / one.figure.id).mkdir(parents=True)
+    (tmp_path / "site" / one.figure.id / "index.html").write_text("")
+    few = replace(kept, figures=[one])
+    assert f":target: scenes/{one.figure.env}.html" in wall.pages(few, tmp_path)["wall.md"]
+    built = replace(few, gallery=tmp_path / "site")
+    assert f":target: ../gallery/{one.figure.id}/index.html" in wall.pages(built, tmp_path)["wall.md"]
+    page = scenes.pages(built, tmp_path)[f"scenes/{one.figure.env}.md"]
+    assert f'<a href="../../gallery/{one.figure.id}/index.html">' in page
+
+
 def test_every_picture_of_the_pages_says_what_made_it() -> None:
     text = provenance.pages(Kept([], read_paper(), None))["figures.md"]
     pictures = {file.name for file in (ROOT / "docs").glob("*.png")}
