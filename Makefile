@@ -4,7 +4,10 @@ PYTHON ?= $(firstword $(foreach p,python3.11 python3.12 python3,$(if $(shell $(p
 BIN := .venv/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test wheel setup setup-test check clean
+# A gallery that was built (`landscape gallery build`) becomes a part of the documentation.
+GALLERY ?= out/gallery
+
+.PHONY: demo test wheel docs setup setup-test setup-docs check clean
 
 demo: setup
 	$(BIN)/landscape slice fluid --dims 6 8 --resolution 14
@@ -25,8 +28,14 @@ check: setup-test
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# Tutorials are run, warnings are errors, and every page that was built is read for links that lead nowhere.
+docs: setup-docs
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -D gallery_site="$(GALLERY)" -d build/doctrees docs build/docs
+	$(BIN)/python -m docs.pages.check build/docs
+
 setup: .venv/.installed
 setup-test: .venv/.installed-test
+setup-docs: .venv/.installed-docs
 
 .venv/bin/python:
 	@test -n "$(PYTHON)" || { echo "gradscape needs CPython 3.11 or 3.12; none was found. Install one, or name it: make PYTHON=/path/to/python3.11" >&2; exit 1; }
@@ -42,5 +51,9 @@ setup-test: .venv/.installed-test
 	$(INSTALL) --editable '.[test,dev]'
 	@touch $@
 
+.venv/.installed-docs: .venv/.installed
+	$(INSTALL) --editable '.[docs]'
+	@touch $@
+
 clean:
-	rm -rf .venv build dist
+	rm -rf .venv build dist docs/generated

@@ -1,4 +1,7 @@
-"""What README and docs say to type: every command and every block of Python is run, with small sizes."""
+"""What README and docs say to type: every command and every block of Python is run, with small sizes.
+
+Cells of tutorials are run when the documentation is built (`make docs`).
+"""
 
 import re
 import shlex
@@ -22,7 +25,8 @@ from gradscape.jobs.report_tables import environments_markdown
 from .command import Said
 
 ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+WALKED = ROOT / "docs/generated"  # by what writes the documentation, and held to what it is written from by tests/docs
+PAGES = [ROOT / "README.md", *(one for one in sorted((ROOT / "docs").rglob("*.md")) if WALKED not in one.parents)]
 README = PAGES[0].read_text()
 TEXT = "\n".join(page.read_text() for page in PAGES)
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -204,11 +208,14 @@ def test_the_two_commands_are_the_makefiles() -> None:
 
 
 def test_what_pip_is_told_to_install_is_there() -> None:
-    said = re.findall(r"pip install '?([^'`\n]+)'?", TEXT)
+    said = [one.partition(" #")[0].strip() for one in re.findall(r"(?:pip|pipx) install '?([^'`\n]+)'?", TEXT)]
     assert len(said) >= 3
     extras = {name for one in said for name in re.findall(r"^\.\[(\w+)\]$", one)}
     assert extras == {"rl", "distributed"} <= set(PROJECT["optional-dependencies"])
-    assert {one for one in said if "[" not in one} == {"."}
+    assert {one for one in said if "[" not in one} == {PROJECT["name"]}
+    assert {one for said_ in re.findall(r"uvx --from (\w+ \w+)", TEXT) for one in said_.split()} == {
+        PROJECT["name"], *PROJECT["scripts"]
+    }  # fmt: skip
 
 
 def test_the_paper_is_named_with_its_address_before_it_is_called_the_paper() -> None:
@@ -233,10 +240,11 @@ def test_the_example_package_registers_an_environment(tmp_path: Path) -> None:
     assert "25 ok" in done.stderr
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_every_picture_and_file_that_a_page_names_is_there(page: Path) -> None:
     text, here = page.read_text(), page.parent
     named = [name for name in re.findall(r"\]\(([^)]+)\)", text) if "://" not in name]
+    named = [name for name in named if "generated/" not in name]  # which are there when the documentation is built
     assert [name for name in named if not (here / name.partition("#")[0]).exists()] == []
     headings = {
         name: _headings(here / name.partition("#")[0] if name[0] != "#" else page) for name in named if "#" in name

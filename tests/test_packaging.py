@@ -34,3 +34,13 @@ def test_every_dependency_states_its_reason() -> None:
 def test_the_version_is_said_in_one_place() -> None:
     assert "version" in PROJECT["project"]["dynamic"]
     assert PROJECT["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "gradscape.__version__"}
+
+
+def test_classifiers_are_of_the_versions_and_the_extras_that_are_tested() -> None:
+    project = PROJECT["project"]
+    low, high = re.fullmatch(r">=3\.(\d+),<3\.(\d+)", project["requires-python"]).groups()  # type: ignore[union-attr]
+    said = {name.rpartition(" :: 3.")[2] for name in project["classifiers"] if " :: 3." in name}
+    assert said == {str(minor) for minor in range(int(low), int(high))}
+    assert len(set(project["classifiers"])) == len(project["classifiers"])
+    assert "Typing :: Typed" in project["classifiers"]
+    assert (ROOT / "src/gradscape/py.typed").exists()

@@ -21,7 +21,8 @@ import pytest
 from gradscape.envs.registry import EXTRAS
 
 ROOT = Path(__file__).parent.parent
-NOT_SENT = {".git", ".venv", "build", "dist", "out", "__pycache__", "node_modules"}
+NOT_SENT = {".git", ".venv", "build", "dist", "out", "__pycache__", "node_modules", "generated"}
+LARGEST = 10_000_000  # bytes of a wheel or an sdist
 LOST = ("*.egg-info", ".*_cache", ".hypothesis")
 TRIED = """
 --version
@@ -67,12 +68,12 @@ print(json.dumps([gradscape.__file__, names, missing]))
 """
 
 
-def tree(folder: Path) -> Path:
-    """Copy what a clone holds, its links as links, without the figures' data."""
+def tree(folder: Path, *, data: bool = False) -> Path:
+    """Copy what a clone holds, its links as links, without the figures' data unless asked."""
 
     def ignored(place: str, names: list[str]) -> set[str]:
         lost = shutil.ignore_patterns(*NOT_SENT, *LOST)(place, names)
-        figures = set(names) - {"tradeoff", "extremes"} if place.endswith("gallery/data") else set()
+        figures = set(names) - {"tradeoff", "extremes"} if place.endswith("gallery/data") and not data else set()
         return lost | figures
 
     shutil.copytree(ROOT, folder, symlinks=True, ignore=ignored)
@@ -88,13 +89,19 @@ def ran(*command: object, cwd: Path, **how: object) -> str:
     return str(done.stdout)
 
 
+def packed(clone: Path, folder: Path) -> Path:
+    """Build the sdist of a clone into a folder, and return it."""
+    ran(sys.executable, "-c", f"from setuptools import build_meta; build_meta.build_sdist({str(folder)!r})", cwd=clone)
+    (sdist,) = folder.glob("*.tar.gz")
+    return sdist
+
+
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Build an sdist of a clone, and a wheel of nothing but the sdist."""
     folder = tmp_path_factory.mktemp("built")
     clone = tree(folder / "clone with a space")
-    ran(sys.executable, "-c", f"from setuptools import build_meta; build_meta.build_sdist({str(folder)!r})", cwd=clone)
-    (sdist,) = folder.glob("*.tar.gz")
+    sdist = packed(clone, folder)
     how = ["--no-deps", "--no-build-isolation", "--no-index", "--no-cache-dir", "--quiet"]
     ran(sys.executable, "-m", "pip", "wheel", *how, "--wheel-dir", folder, sdist, cwd=folder)
     (wheel,) = folder.glob("*.whl")
@@ -145,6 +152,17 @@ def test_every_file_of_the_package_is_sent(built: dict[str, Path], kind: str) ->
     assert names_of(built[kind]) == wanted - pictures
     assert "cli.py" in wanted
     assert len(pictures) > 10
+
+
+def test_what_is_sent_is_small_for_all_that_the_figures_weigh(built: dict[str, Path], tmp_path: Path) -> None:
+    """The index, and whoever installs it, is spared the gallery's data; what `--tolerance` reads is sent."""
+    clone = tree(tmp_path / "whole", data=True)
+    data = [file for file in (clone / "gallery/data").rglob("*") if file.is_file()]
+    assert sum(file.stat().st_size for file in data) > LARGEST
+    sdist = packed(clone, tmp_path)
+    assert names_of(sdist) >= names_of(built["sdist"])
+    assert not any(".zarr" in name for name in names_of(sdist))
+    assert max(sdist.stat().st_size, built["wheel"].stat().st_size) < LARGEST
 
 
 def test_every_module_imports_where_it_is_installed(built: dict[str, Path], python: Path, tmp_path: Path) -> None:

@@ -1,0 +1,86 @@
+"""What is kept of the gallery's figures: where each lies, what was measured, and by which version of its scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+from gradscape.envs.registry import make
+from gradscape.gallery.figures import Figure, read_figures
+from gradscape.gallery.files import DATA, STORE
+from gradscape.gallery.league import read_league
+from gradscape.gallery.paper import Paper, read_paper
+from gradscape.jobs.folder import REPORT
+from gradscape.jobs.report_record import Report
+from gradscape.landscapes.slice import Slice
+from gradscape.landscapes.storage.paths import is_slice
+from gradscape.landscapes.storage.store import open_slice
+from gradscape.optim.league import League
+
+NOT_MEASURED = "not measured yet"
+
+
+@dataclass(frozen=True)
+class KeptFigure:
+    """A figure of the gallery with what there is of it under `root`: its slice and its report, None where not."""
+
+    figure: Figure
+    root: Path = DATA
+
+    @property
+    def folder(self) -> Path:
+        """Where its data are."""
+        return self.root / self.figure.id
+
+    @cached_property
+    def slice(self) -> Slice | None:
+        """Its samples."""
+        return Slice(open_slice(self.folder / STORE), self.folder) if is_slice(self.folder / STORE) else None
+
+    @cached_property
+    def report(self) -> Report | None:
+        """What was measured of it."""
+        return Report.read(self.folder) if (self.folder / REPORT.files[0]).exists() else None
+
+    @cached_property
+    def current(self) -> bool:
+        """Whether its samples are of the scene's code as it is now."""
+        if self.slice is None:
+            return False
+        known = self.slice.identity
+        return bool(known["code"] == make(self.figure.env, device="cpu", engine=known["engine"]).code)
+
+    @property
+    def losses(self) -> tuple[float, float] | None:
+        """The least and the largest loss of its samples, None where there are none [loss unit]."""
+        if self.slice is None or not bool(self.slice.data["loss"].notnull().any()):
+            return None
+        return float(self.slice.data["loss"].min()), float(self.slice.data["loss"].max())
+
+
+@dataclass(frozen=True)
+class Kept:
+    """All that pages show: the figures and what is kept of them, what the paper says, and the league if any."""
+
+    figures: Sequence[KeptFigure]
+    paper: Paper
+    league: League | None
+    gallery: Path | None = field(default=None)
+
+    @classmethod
+    def read(cls, root: Path = DATA, *, gallery: Path | None = None) -> Kept:
+        """Read what lies in a folder of the gallery's data. Raises ValueError, naming it, for a damaged file."""
+        return cls([KeptFigure(one, root) for one in read_figures()], read_paper(), read_league(root), gallery)
+
+    @cached_property
+    def by_env(self) -> Mapping[str, Sequence[KeptFigure]]:
+        """The figures of each environment."""
+        names = dict.fromkeys(one.figure.env for one in self.figures)
+        return {env: [one for one in self.figures if one.figure.env == env] for env in names}
+
+    def link(self, figure: Figure, up: str) -> str:
+        """Return a figure's name, as a link to its page of the gallery where that is built; `up` leads to the root."""
+        shown = self.gallery and (self.gallery / figure.id / "index.html").exists()
+        return f'<a href="{up}gallery/{figure.id}/index.html">{figure.id}</a>' if shown else f"`{figure.id}`"

@@ -1,0 +1,231 @@
+"""The pages that are walked: every command, public name, scene, figure and claim has its place, and says what it is."""
+
+from __future__ import annotations
+
+import html
+import inspect
+import json
+import re
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from docs.pages import commands, interface, package, provenance, reproduction, scenes, wall
+from docs.pages.kept import NOT_MEASURED, Kept, KeptFigure
+from docs.pages.text import prose
+from docs.pages.walked import write_pages
+from hypothesis import given
+from hypothesis import strategies as st
+from markdown_it import MarkdownIt
+
+import gradscape
+from gradscape.cli import app
+from gradscape.envs.registry import BUILTIN, environment_class
+from gradscape.gallery.figures import read_figures
+from gradscape.gallery.files import DATA
+from gradscape.gallery.paper import read_paper
+from gradscape.optim.claims import ClaimVerdict
+from gradscape.optim.league import League
+
+from ..gallery.site.conftest import scene_standings
+
+ROOT = Path(__file__).parents[2]
+REPORTED = "bounce-y"  # a figure whose report is kept
+
+
+def leaves(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+    if hasattr(command, "commands"):
+        for name, one in command.commands.items():
+            yield from leaves(one, (*path, name))
+    else:
+        yield " ".join(path), command
+
+
+VERBS = dict(leaves(typer.main.get_command(app)))
+PUBLIC = {name: getattr(gradscape, name) for name in gradscape.__all__ if not name.startswith("__")}
+
+
+@pytest.fixture(scope="module")
+def kept() -> Kept:
+    return Kept.read()
+
+
+@pytest.fixture
+def nothing(tmp_path: Path) -> Kept:
+    """What there is to show where nothing was measured."""
+    return Kept.read(tmp_path / "empty")
+
+
+def shown(text: str) -> str:
+    """Return what a reader sees of Markdown."""
+    rendered = MarkdownIt().enable("table").render(text)
+    return " ".join(html.unescape(re.sub(r"<[^>]+>", "", rendered)).split())
+
+
+@pytest.mark.parametrize("name", VERBS)
+def test_every_command_has_a_page_with_all_its_options(name: str) -> None:
+    text = commands.pages()[f"commands/{name.replace(' ', '-')}.md"]
+    verb = VERBS[name]
+    assert [
+        one for param in verb.params if not param.hidden for one in param.opts if one[0] == "-" and one not in text
+    ] == []
+    assert " ".join(verb.help.split("\n\n")[0].split()) in shown(text)
+    assert f"$ landscape {name}" in text
+
+
+def test_the_page_of_commands_lists_them_and_nothing_else() -> None:
+    files = set(commands.pages()) - {"commands/index.md"}
+    assert files == {f"commands/{name.replace(' ', '-')}.md" for name in VERBS}
+    assert all(f"({Path(file).name})" in commands.pages()["commands/index.md"] for file in files)
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_every_public_name_has_a_page_and_a_line(name: str) -> None:
+    kind = "classes" if inspect.isclass(PUBLIC[name]) else "functions"
+    pages = interface.pages()
+    directive = "autoclass" if kind == "classes" else "autofunction"
+    assert f".. {directive}:: gradscape.{name}\n" in pages[f"api/{kind}/{name}.md"]
+    first = " ".join((inspect.getdoc(PUBLIC[name]) or "").split("\n\n")[0].split()).replace("`", "")
+    assert first in shown(pages["api/index.md"])
+
+
+def test_what_functions_return_is_documented_though_it_is_not_public() -> None:
+    pages = interface.pages()
+    assert {f"api/records/{name}.md" for name in ("Report", "Census", "Tradeoff", "League")} <= set(pages)
+    assert not any("|" in line and "_MISSING" in line for text in pages.values() for line in text.splitlines())
+
+
+def test_keywords_of_a_scene_are_told_with_types_and_defaults() -> None:
+    text = interface.pages()["api/functions/slice.md"]
+    assert "| `device` | `str` | `'auto'` |" in text
+    assert "| `fidelity` | `str \\| Fidelity \\| None` | `None` |" in text
+    assert "keyword" not in interface.pages()["api/functions/open_slice.md"]
+
+
+def test_every_scene_has_a_page_with_what_it_says_and_where_it_is_bounded(kept: Kept, tmp_path: Path) -> None:
+    pages = scenes.pages(kept, tmp_path)
+    assert set(pages) == {"scenes/index.md", *(f"scenes/{one.name}.md" for one in BUILTIN)}
+    for entry in BUILTIN:
+        kind = environment_class(entry.name)
+        text = shown(pages[f"scenes/{entry.name}.md"])
+        told = " ".join(kind.about().split("\n\n")[0].split())
+        assert told.replace("`", "") in text, entry.name
+        assert all(name in text for name in kind.fidelities)
+    figures = {one.env for one in read_figures()}
+    assert all(f"pictures/{env}" in pages[f"scenes/{env}.md"] for env in figures)
+    assert "measures it" in pages["scenes/mjx-drop.md"]
+
+
+def test_pages_hold_every_figure_and_claim_and_say_what_is_not_measured(nothing: Kept, tmp_path: Path) -> None:
+    text = reproduction.pages(nothing, tmp_path)["reproduction.md"]
+    figures, paper = read_figures(), read_paper()
+    assert [one.id for one in figures if f"### {one.id}\n" not in text] == []
+    assert text.count(f"| **{NOT_MEASURED}** |") >= len(figures) + sum(map(len, paper.claims.values()))
+    assert all(prose(why) in text for why in paper.silences.values())
+    assert {f"## Figure {one.caption.number}" for one in figures if one.caption.number} <= set(text.splitlines())
+    assert f"| {NOT_MEASURED} |" in provenance.pages(nothing)["figures.md"]
+    assert "## " not in wall.pages(nothing, tmp_path)["wall.md"]
+
+
+@pytest.mark.parametrize(
+    ("hits", "verdict"),
+    [
+        ((True, True), "confirmed"),
+        ((False, False), "refuted"),
+        ((True, False), "different"),
+        ((), "the paper says nothing of it"),
+    ],
+)
+def test_a_slice_is_judged_by_which_of_the_paper_s_words_were_measured(
+    tmp_path: Path, hits: tuple[bool, ...], verdict: str
+) -> None:
+    figure = next(one for one in read_figures() if one.id == REPORTED)
+    folder = tmp_path / figure.id
+    folder.mkdir()
+    record = json.loads((DATA / figure.id / "report.json").read_text())
+    words = [{"word": f"word {number}", "measured": hit} for number, hit in enumerate(hits)]
+    (folder / "report.json").write_text(json.dumps(record | {"paper": {"words": words, "where": "nowhere"}}))
+    one = KeptFigure(figure, tmp_path)
+    assert reproduction.verdict_of(one) == verdict
+    page = reproduction.pages(replace(Kept.read(tmp_path / "none"), figures=[one]), tmp_path)["reproduction.md"]
+    assert f"| **verdict** | **{verdict}** |" in page
+    assert all((f"word {number}" in page) == (not hit) for number, hit in enumerate(hits))
+
+
+def test_claims_are_what_the_league_makes_of_them(nothing: Kept) -> None:
+    """In the made-up race bo-leap is ahead of cma-es, and that of random; other methods were not run."""
+    raced = replace(nothing, league=League([scene_standings("fluid", {})], {}, "landscape league"))
+    found = [one for one in reproduction.judge_claims(raced) if one.env == "fluid"]
+    by = {(one.claim.first, one.claim.second): one.verdict for one in found}
+    assert by["bo-leap", "random"] == by["bo-leap", "cma-es"] == "confirmed"
+    assert by["bo-leap", "descents"] == "not run"
+    assert {one.verdict for one in reproduction.judge_claims(raced) if one.env != "fluid"} == {NOT_MEASURED}
+    assert len(set(ClaimVerdict)) + 2 == len(reproduction.MEANING)  # each that there is has a meaning
+
+
+def test_pictures_lead_to_the_gallery_where_it_is_built_and_to_scenes_where_not(kept: Kept, tmp_path: Path) -> None:
+    one = next(one for one in kept.figures if one.slice is not None)
+    (tmp_path / "site" / one.figure.id).mkdir(parents=True)
+    (tmp_path / "site" / one.figure.id / "index.html").write_text("")
+    few = replace(kept, figures=[one])
+    assert f":target: scenes/{one.figure.env}.html" in wall.pages(few, tmp_path)["wall.md"]
+    built = replace(few, gallery=tmp_path / "site")
+    assert f":target: ../gallery/{one.figure.id}/index.html" in wall.pages(built, tmp_path)["wall.md"]
+    page = scenes.pages(built, tmp_path)[f"scenes/{one.figure.env}.md"]
+    assert f'<a href="../../gallery/{one.figure.id}/index.html">' in page
+
+
+def test_every_picture_of_the_pages_says_what_made_it() -> None:
+    text = provenance.pages(Kept([], read_paper(), None))["figures.md"]
+    pictures = {file.name for file in (ROOT / "docs").glob("*.png")}
+    assert pictures == set(re.findall(r"^\| `([\w-]+\.png)` \|", text, flags=re.MULTILINE))
+    for row in (line for line in text.splitlines() if ".png`" in line):
+        assert re.search(r"\| \[[\w-]+\]\(\.\./", row), f"no page shows {row}"
+        verb = re.search(r"`landscape (\w+)", row)
+        assert (verb and verb[1] in VERBS) or "`python -m benchmarks." in row
+
+
+def test_samples_of_another_code_are_called_so(kept: Kept, tmp_path: Path) -> None:
+    one = next(one for one in kept.figures if one.current)
+    shutil.copytree(one.folder, tmp_path / one.figure.id)
+    store = tmp_path / one.figure.id / "slice.zarr/zarr.json"
+    store.write_text(store.read_text().replace(one.slice.identity["code"], "0" * 12))  # type: ignore[union-attr]
+    assert not KeptFigure(one.figure, tmp_path).current
+
+
+def test_the_example_package_is_shown_whole() -> None:
+    text = package.pages()["example_package.md"]
+    for file in (ROOT / "docs/example_package").rglob("*.*"):
+        assert file.suffix == ".pyc" or file.read_text() in text
+
+
+def test_pages_of_what_is_gone_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (scenes, reproduction, wall):
+        monkeypatch.setattr(module, "pages", lambda kept, pictures: {})
+    (tmp_path / "commands").mkdir()
+    (tmp_path / "commands/gone.md").write_text("# gone\n")
+    write_pages(tmp_path, gallery=None)
+    assert not (tmp_path / "commands/gone.md").exists()
+    written = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.md")}
+    write_pages(tmp_path, gallery=None)
+    assert written == {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.md")}  # what is equal stays
+
+
+@given(st.lists(st.text("ab*_[]<>$#|{}~\\! .,=:", min_size=1, max_size=12).filter(str.strip), min_size=1, max_size=3))
+def test_a_text_is_read_as_it_was_written(words: list[str]) -> None:
+    text = "x" + " ".join(words)
+    assert shown(prose(text)) == " ".join(text.split())
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_a_docstring_becomes_what_autodoc_reads_without_complaint(name: str) -> None:
+    from docutils.core import publish_doctree
+
+    lines = (inspect.getdoc(PUBLIC[name]) or "").splitlines()
+    interface.to_rst(None, "", "", None, None, lines)
+    tree = publish_doctree("\n".join(lines), settings_overrides={"report_level": 2, "halt_level": 2})
+    assert "`" not in tree.astext()
