@@ -3,7 +3,7 @@
 "use strict";
 
 const canvas = document.getElementById("map");
-const PAD = { left: 62, right: up ? 84 : 14, top: 12, bottom: 46 };
+const PAD = { left: 62, right: up ? 94 : 14, top: 12, bottom: 46 };
 const BAR = { gap: 14, width: 13 };
 const STRIPES = { NONFINITE: [[0, 8, 8, 0]], ESCAPED: [[0, 0, 8, 8]], ERROR: [[0, 8, 8, 0], [0, 0, 8, 8]] };
 const box = { width: 1, height: 1 }; // of what lies between the axes
