@@ -101,8 +101,7 @@ def place_tradeoffs(data: Path, out: Path, envs: Sequence[str], studio: Studio) 
                 shutil.copyfile(one.record, there.record)
                 shutil.copyfile(one.picture, there.picture)
                 studio.develop(one.picture, there.picture)
-        with reading(source.record, REMAKE.format("tradeoffs")):
-            save_table(record["rungs"], target.table)
+        save_table(record["rungs"], target.table)
     return placed
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import pickle
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -106,6 +107,7 @@ def draw_slice(source: Path, folder: Path) -> None:
 
 def main() -> None:
     """Draw what is asked for."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # who began it ends it
     places = [Path(one) for one in sys.argv[1:]]
     try:
         for source, folder in zip(places[::2], places[1::2], strict=True):

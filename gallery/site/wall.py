@@ -69,13 +69,14 @@ def _place_census(env: str, data: Path, out: Path, studio: Studio) -> tuple[Cens
             continue
         with reading(record, REMAKE.format(env, device)):
             census = Census.of_record(read_json(record), np.zeros(0, np.float32))
+            rows = list(_rows(census))
         folder = out / CENSUSES
         folder.mkdir(exist_ok=True)
         for one in (record, picture):
             shutil.copyfile(one, folder / one.name)
         studio.develop(picture, folder / picture.name)
         table = f"{env}-{device}.csv"
-        save_table(list(_rows(census)), folder / table)
+        save_table(rows, folder / table)
         return census, f"{CENSUSES}/{table}", f"{CENSUSES}/{picture.name}"
     return None
 

@@ -3,7 +3,7 @@
 "use strict";
 
 const canvas = document.getElementById("map");
-const PAD = { left: 62, right: up ? 84 : 14, top: 12, bottom: 46 };
+const PAD = { left: 62, right: up ? 94 : 14, top: 12, bottom: 46 };
 const BAR = { gap: 14, width: 13 };
 const STRIPES = { NONFINITE: [[0, 8, 8, 0]], ESCAPED: [[0, 0, 8, 8]], ERROR: [[0, 8, 8, 0], [0, 0, 8, 8]] };
 const box = { width: 1, height: 1 }; // of what lies between the axes
@@ -32,8 +32,10 @@ function spot(index) {
   if (up) return [rightOf((column + 0.5) / columns), heightOf((row + 0.5) / rows)];
   return [rightOf(columns > 1 ? column / (columns - 1) : 0), loss === loss ? y(loss) : PAD.top + box.height];
 }
-const inside = ([right, down], slack = 0.5) =>
-  right >= PAD.left - slack && right <= PAD.left + box.width + slack && down >= PAD.top - slack && down <= PAD.top + box.height + slack;
+function inside([right, down]) {
+  const [a, b] = [right - PAD.left, down - PAD.top];
+  return a > -0.5 && a < box.width + 0.5 && b > -0.5 && b < box.height + 0.5;
+}
 // A pointer's place in shares of the window.
 function placeOf(event) {
   const [right, down] = pointed(canvas, event);
@@ -233,8 +235,8 @@ function ring(index, radius, colour, around) {
 }
 
 function where(run, row) {
-  const there = up ? [x(run.u[row]), y(run.v[row])] : [x(run.u[row]), run.loss[row] === null ? PAD.top + box.height : y(run.loss[row])];
-  return inside(there, 10) ? there : null;
+  if (up) return [x(run.u[row]), y(run.v[row])];
+  return [x(run.u[row]), run.loss[row] === null ? PAD.top + box.height : y(run.loss[row])];
 }
 
 function drawWindow(dots) {

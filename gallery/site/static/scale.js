@@ -57,7 +57,7 @@ function setScale(name) {
   if (name === RANK) {
     ordered ||= losses.filter((loss) => loss === loss).sort();
     const shares = ordered.length ? [0, 0.25, 0.5, 0.75, 1] : [];
-    scale = { low: 0, high: 1, extend: "neither", ticks: shares.map(lossAt) };
+    scale = { low: 0, high: 1, extend: "neither", ticks: shares.map((share) => Number(lossAt(share).toPrecision(3))) };
   } else scale = SLICE.scales[name];
   const dim = WALLS.map((light) => palette.map((colour) => dimmed(colour, light)));
   for (let node = 0; node < losses.length; node++) {

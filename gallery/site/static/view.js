@@ -1,4 +1,4 @@
-// Which part of the slice the map shows: turned by wheel, pinch, drag and keys, always within the slice.
+// Which part of the slice the map shows: moved by wheel, pinch, drag and keys, always within the slice.
 "use strict";
 
 const DEEPEST = 4; // nodes along the shorter axis that are seen at the least
@@ -49,7 +49,8 @@ function steer(canvas, place, draws, line) {
   });
   canvas.addEventListener("pointermove", (event) => {
     const before = held.get(event.pointerId);
-    if (!before) return;
+    if (!event.buttons) held.delete(event.pointerId); // it was let go where nothing heard of it
+    if (!before || !event.buttons) return;
     const now = place(event);
     if (Math.hypot(event.clientX - begun.x, event.clientY - begun.y) < 5 && !gesture.dragged) return;
     if (!gesture.dragged) canvas.setPointerCapture(event.pointerId);

@@ -30,6 +30,7 @@ from gradscape.optim.search import search
 
 from ...command import NO_BROWSER
 from ...studies import study
+from .browsing import DRAWN
 from .ledges import build_ledges, keep_ledges
 
 SPACE = ParameterSpace(
@@ -309,6 +310,7 @@ def visit(browser) -> Iterator[Callable]:  # type: ignore[no-untyped-def, type-a
         page.on("request", lambda request: asked.append(request.url))
         roots.append(root)
         page.goto(root + path, wait_until="load")
+        page.evaluate(DRAWN)  # where things are on a canvas is known once it was drawn
         return page
 
     yield go

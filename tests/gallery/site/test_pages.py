@@ -18,7 +18,7 @@ from gradscape.landscapes.draw.style import LOSS_MAP, Scale
 from gradscape.landscapes.identity import plane_of
 from gradscape.landscapes.storage.store import open_slice
 
-from .browsing import pixels, point_at, told
+from .browsing import DRAWN, pixels, point_at, told
 from .conftest import FIGURES
 
 Visit = Callable[..., Any]
@@ -165,6 +165,25 @@ def test_switches_show_and_hide_searches(name: str, filed: str, visit: Visit) ->
         assert (pixels(page, "map") != without["map"]).any()
 
 
+@pytest.mark.parametrize("name", ["full", "line"])
+def test_a_search_s_line_leads_out_of_a_window_to_points_that_are_not_in_it(
+    name: str, filed: str, visit: Visit
+) -> None:
+    page = visit(filed, f"{name}/index.html")
+    page.evaluate("setView(2, 0.5, 0.5)")
+    drawn = page.evaluate("""() => {
+        let joined = 0;
+        const plain = pen.lineTo;
+        pen.lineTo = (...at) => { joined += 1; plain.apply(pen, at); };
+        const run = SLICE.runs.find((one) => one.method === "random");
+        drawRun(pen, { ...run, u: run.u, loss: run.loss }, where);
+        delete pen.lineTo;
+        const bends = run.path.filter((row) => !run.hidden.includes(row)).length;
+        return [joined - (bends ? 10 : 0), bends]; // the star has ten
+    }""")
+    assert drawn[0] == drawn[1] > 1
+
+
 def test_arrows_point_downhill(filed: str, visit: Visit) -> None:
     page = visit(filed, "full/index.html")
     page.evaluate("""() => {
@@ -173,6 +192,7 @@ def test_arrows_point_downhill(filed: str, visit: Visit) -> None:
         arrow = (from, direction, length) => { drawn.push([...from, ...direction]); plain(from, direction, length); };
     }""")
     page.check("input[name=arrows]")
+    page.evaluate(DRAWN)
     drawn = np.array(page.evaluate("drawn"))
     lowest = page.evaluate("[x(-0.1), y(9)]")  # of the bowl
     assert len(drawn) > 30
