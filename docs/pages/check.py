@@ -102,7 +102,8 @@ def _fault(address: str, file: Path, read: object) -> str:
     target = target / "index.html" if target.is_dir() else target
     if not target.exists():
         return f"{address} leads nowhere"
-    if parts.fragment and target.suffix == ".html" and unquote(parts.fragment) not in read(target).anchors:  # type: ignore[operator] # Page.read, cached
+    said = "=" in parts.fragment  # what a page is to show, as the gallery's do: #node=3,4 is no anchor
+    if parts.fragment and not said and target.suffix == ".html" and unquote(parts.fragment) not in read(target).anchors:  # type: ignore[operator] # Page.read, cached
         return f"{address} leads to no anchor"
     return ""
 

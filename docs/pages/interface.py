@@ -74,9 +74,8 @@ def tidy_shapes(app: Any, what: str, name: str, one: Any, options: Any, said: st
 def _escape(text: str) -> str:
     parts = CODE.split(text)
     told = "".join(f"\0`{part}`\0" if CODE.fullmatch(part) else RST.sub(r"\\\1", part) for part in parts)
-    return re.sub(r"(?<=\w)\0|\0(?=[\w(])", r"\\ ", told).replace(
-        "\0", ""
-    )  # code that touches a word is parted from it
+    parted = re.sub(r"(?<=\w)\0|\0(?=[\w(])", r"\\ ", told)  # code that touches a word
+    return parted.replace("\0", "")
 
 
 def _index(written: dict[str, str], documented: dict[str, Any]) -> str:

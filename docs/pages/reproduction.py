@@ -95,7 +95,7 @@ def _earlier(kept: Kept) -> str:
     """Say how many slices were sampled before their scene became what it is."""
     count = sum(one.slice is not None and not one.current for one in kept.figures)
     return (
-        f"{count} of them were sampled by an earlier version of their scene" if count else "all by their scene as it is"
+        f"{count} of them were sampled by an earlier version of their scene" if count else "all by the scene as it is"
     )
 
 
@@ -122,9 +122,8 @@ def _rows(one: KeptFigure, kept: Kept) -> Mapping[str, str]:
     """Return what stands beside each other, by what it is."""
     words, report = kept.paper.words.get(one.figure.env), one.report
     reasons = report.profile["verdict"]["reasons"] if report else {}
-    missing = (
-        [word["word"] for word in report.paper["words"] if not word["measured"]] if report and report.paper else []
-    )
+    said = report.paper["words"] if report and report.paper else []
+    missing = [word["word"] for word in said if not word["measured"]]
     earlier = "" if one.current or one.slice is None else ", by samples of an earlier version of the scene"
     return {
         "the paper shows": cell(one.figure.caption.says),

@@ -9,7 +9,8 @@ from docs.pages.check import find_faults, main
 
 SOUND = """<html><head><link rel="stylesheet" href="_static/a.css"><link rel="canonical" href="https://example.org/">
 <script src="_static/a.js?v=1"></script></head><body><h1 id="top">Page</h1><a href="#top">up</a>
-<a href="sub/other.html#there">other</a><a href="https://arxiv.org">away</a><img src="a.png" alt="a circle">
+<a href="sub/other.html#there">other</a><a href="https://arxiv.org">away</a>
+<a href="sub/other.html#node=3,4">a state of a page</a><img src="a.png" alt="a circle">
 <img src="data:image/png;base64,AAAA" alt="a dot"><a href="mailto:a@b">mail</a></body></html>"""
 
 
@@ -47,6 +48,7 @@ def test_a_sound_site_has_no_fault(site: Path, capsys: pytest.CaptureFixture[str
         ('<a href="gone.html">x</a>', "gone.html leads nowhere"),
         ('<a href="sub/other.html#gone">x</a>', "sub/other.html#gone leads to no anchor"),
         ('<a href="#gone">x</a>', "#gone leads to no anchor"),
+        ('<a href="sub/gone.html#node=3,4">x</a>', "sub/gone.html#node=3,4 leads nowhere"),
         ('<img src="gone.png" alt="gone away">', "gone.png leads nowhere"),
         ('<img src="a.png">', "shows a.png without saying what it is"),
         ('<img src="sub/../a.png" alt="_images/a.png">', "without saying what it is"),
