@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from ..optim.memory import SearchSize, require_method
+from ..optim.memory import SearchSize, require_method, require_runs
 from ..optim.registry import find_method, methods
 from .search import make_optimizer
 from .watch import Watch
@@ -42,3 +43,19 @@ def check_methods(names: Sequence[str]) -> list[str]:
     """Return methods without repetitions, none for `all`. Raises ValueError where one is not registered."""
     found = [find_method(name).name for name in dict.fromkeys(names) if name != ALL]
     return [] if ALL in names else found
+
+
+def require_room(
+    env: Environment,
+    methods: Sequence[str],
+    options: Mapping[str, Mapping[str, Any]],
+    *,
+    seeds: int,
+    budget: int,
+    folder: Path,
+) -> None:
+    """Raise TooLargeError where a race of these methods, with these options by method, is larger than this machine."""
+    require_runs(env.space.dim, budget, seeds, folder, abreast=len(methods))
+    for method in methods:
+        optimizer = make_optimizer(method, env, options=options.get(method))
+        require_method(type(optimizer), optimizer.options, SearchSize(env.space.dim, env.decisions, budget))

@@ -16,9 +16,8 @@ from ..optim.memory import SearchSize, run_need
 from ..optim.race import ABREAST
 from ..optim.registry import optimizer_class
 from ..optim.rehearsal import BLOCK, Rehearsal, rehearse
-from .methods import able_methods, check_methods
+from .methods import able_methods, check_methods, require_room
 from .plan import HERE, make_here
-from .race import require_room
 from .scene import SceneSpec
 from .search import make_optimizer, one_torch_thread
 from .slice import peak_memory

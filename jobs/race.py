@@ -18,14 +18,13 @@ from ..landscapes.space import as_whole
 from ..landscapes.storage.files import clear, tidy, visible_files, write_json
 from ..landscapes.storage.ownership import refuse_others
 from ..optim.claims import Claims, check_claims
-from ..optim.memory import SearchSize, require_method, require_runs
 from ..optim.processes import processes
 from ..optim.race import Competitor, Race, name_seeds, race
 from ..optim.registry import optimizer_class
 from ..optim.runs.store import RunStore
 from ..optim.search import SearchProgress
 from .folder import RACE, RACE_FIGURES, ROOT, RUN_STORE, folder_named
-from .methods import able_methods, check_methods
+from .methods import able_methods, check_methods, require_room
 from .race_summary import RaceSummary
 from .scene import provenance
 from .search import make_optimizer, one_torch_thread, open_run_store
@@ -310,16 +309,6 @@ def _race_there(
 
 def _cost_there(there: bytes, grad: bool) -> EpisodeCost:
     return episode_cost(objective_of(there).objective, grad=grad)
-
-
-def require_room(
-    env: Environment, methods: Sequence[str], options: Options, *, seeds: int, budget: int, folder: Path
-) -> None:
-    """Raise TooLargeError where a race is larger than this machine."""
-    require_runs(env.space.dim, budget, seeds, folder, abreast=len(methods))
-    for method in methods:
-        optimizer = make_optimizer(method, env, options=options.get(method))
-        require_method(type(optimizer), optimizer.options, SearchSize(env.space.dim, env.decisions, budget))
 
 
 def _open_competitor(

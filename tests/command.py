@@ -11,6 +11,7 @@ from benchmarks.results import leave_blank
 from gradscape.cli import main
 
 NO_BROWSER = "there is no Chromium here: `apt-get install -y chromium` (or your system's) lets them run"
+PATIENCE = 600_000  # milliseconds until a browser is given up, and no measure of anything
 
 
 @dataclass(frozen=True)

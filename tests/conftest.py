@@ -2,6 +2,7 @@
 
 import gc
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,7 +17,7 @@ from hypothesis import HealthCheck, settings
 from gradscape.cli import main
 from gradscape.envs import registry
 
-from .command import NO_BROWSER, Said
+from .command import NO_BROWSER, PATIENCE, Said
 
 # A shell that is not interactive starts what it sends to the background deaf to Ctrl-C; commands that tests interrupt
 # would inherit that.
@@ -108,3 +109,18 @@ def rerun() -> Callable[..., int]:
         return done.returncode
 
     return command
+
+
+@pytest.fixture(scope="session")
+def browser():  # type: ignore[no-untyped-def]
+    """Start the system's Chromium, one for all tests of a worker: its driver leaves no room for a second."""
+    program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if not program:
+        pytest.skip(NO_BROWSER)
+    from playwright.sync_api import expect, sync_playwright
+
+    expect.set_options(timeout=PATIENCE)
+    with sync_playwright() as driver:
+        opened = driver.chromium.launch(executable_path=program, args=["--disable-gpu"], timeout=PATIENCE)
+        yield opened
+        opened.close()

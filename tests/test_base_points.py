@@ -20,7 +20,7 @@ def test_a_distance_is_in_widths_of_the_papers_range() -> None:
     assert distance((0.0, 7.0), (1.0, 5.0)) == pytest.approx(3 / 4)
 
 
-def test_the_nearest_comes_first_and_its_losses_are_those_of_its_slice() -> None:
+def test_the_nearest_comes_first_and_its_losses_are_those_of_its_slice(tmp_path: Path) -> None:
     env, paper = gs.make("pinball-16", fidelity="draft", device="cpu"), (0.3, 6.8)
     found = search(BOARD, env, 4, 6, paper)
     assert {one.through for one in found} == set(names_of(env, 6)) == {
@@ -28,7 +28,8 @@ def test_the_nearest_comes_first_and_its_losses_are_those_of_its_slice() -> None
     }  # fmt: skip
     assert [one.distance for one in found] == sorted(one.distance for one in found)
     best = found[0]
-    loss = gs.slice(env, (13, 14), through=best.through, resolution=4, gradients=False).data["loss"]
+    cut = gs.slice(env, (13, 14), through=best.through, resolution=4, gradients=False, out=tmp_path / "cut")
+    loss = cut.data["loss"]
     assert (best.lowest, best.highest) == (pytest.approx(float(loss.min())), pytest.approx(float(loss.max())))
     assert best.distance == distance((best.lowest, best.highest), paper)
 

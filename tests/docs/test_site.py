@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from docs.pages.check import find_faults
 
-from ..gallery.site.conftest import PATIENCE, browser
+from ..command import PATIENCE
 
 DOCS = Path(__file__).parents[2] / "docs"
 INDEX = """# Small
@@ -40,7 +40,6 @@ The word zirconium stands here, and an option `--refine`.
 print(6 * 7, "it is")
 ```
 """
-__all__ = ["browser"]  # a fixture
 
 
 @pytest.fixture(scope="module")

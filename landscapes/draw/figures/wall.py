@@ -15,8 +15,8 @@ from ...lattice import own_cells, sampled_line
 from .. import style
 from . import page, panel
 
-PITCH, ACROSS, LEAST = 2.2, 6, 33.0  # room of a landscape: on a screen [inch]; side by side there; in print [mm]
-LINE = 26  # letters in a line under a landscape
+PITCH, ACROSS, LEAST = 2.2, 6, 28.0  # room of a landscape: on a screen [inch]; side by side there; in print [mm]
+LINE = 25  # letters in a line under a landscape
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +42,11 @@ def wall_figure(landscapes: Sequence[Landscape], *, width: float | None = None) 
         width, pitch=PITCH, columns=min(ACROSS, len(landscapes)), panels=len(landscapes), least=LEAST
     )
     rows = -(-len(landscapes) // sheet.columns)
-    picture = page.Picture(sheet, 1.45 * rows * sheet.pitch)
+    picture = page.Picture(sheet, 1.15 * rows * sheet.pitch)
     for ax, one in zip(panel.grid(picture, len(landscapes)), landscapes, strict=True):
         _draw(ax, one.dataset)
         panel.caption(ax, one.name)
-        said = "\n".join(textwrap.wrap(one.said, LINE)) or " "
+        said = "\n".join(textwrap.wrap(one.said.replace(" %", "\N{NO-BREAK SPACE}%"), LINE)) or " "
         ax.set_xlabel(said, size=sheet.small, color=style.QUIET, parse_math=False)
     page.entitle(picture, "Losses, each on its own scale: dark is low, light is high")
     page.finish(picture, [])
@@ -55,7 +55,7 @@ def wall_figure(landscapes: Sequence[Landscape], *, width: float | None = None) 
 
 def _draw(ax: Axes, dataset: xr.Dataset) -> None:
     ax.set(xticks=[], yticks=[], facecolor=style.UNSAMPLED)
-    ax.set_box_aspect(1)
+    ax.set_box_aspect(0.75)
     ax.spines[:].set(color=style.QUIET, linewidth=0.4)
     if plane_of(dataset).rank == 1:
         line = sampled_line(dataset)

@@ -1,7 +1,6 @@
 """A small site with everything a page can have, and the browser that looks at it."""
 
 import json
-import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -28,7 +27,7 @@ from gradscape.optim.runs.run import Run
 from gradscape.optim.runs.store import RunStore
 from gradscape.optim.search import search
 
-from ...command import NO_BROWSER
+from ...command import PATIENCE
 from ...studies import study
 from .browsing import DRAWN
 from .ledges import build_ledges, keep_ledges
@@ -51,7 +50,6 @@ SWEEP = {
     "over": "2", "label": "mass", "low": -10.0, "high": 10.0, "fidelity": "draft", "frames": 12,
     "resolution": [24, 24], "command": "landscape sweep fluid --dims 0 1 --over 2",
 }  # fmt: skip
-PATIENCE = 600_000  # milliseconds until the browser is given up, and no measure of anything
 MEASURES = {"local minima": 7, "noise floor": "none"}
 
 
@@ -274,20 +272,6 @@ def ledges(ledge_data: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.fixture
 def filed(site: Path) -> str:
     return f"file://{site}/"
-
-
-@pytest.fixture(scope="session")
-def browser():  # type: ignore[no-untyped-def]
-    program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if not program:
-        pytest.skip(NO_BROWSER)
-    from playwright.sync_api import expect, sync_playwright
-
-    expect.set_options(timeout=PATIENCE)
-    with sync_playwright() as driver:
-        opened = driver.chromium.launch(executable_path=program, args=["--disable-gpu"], timeout=PATIENCE)
-        yield opened
-        opened.close()
 
 
 @pytest.fixture

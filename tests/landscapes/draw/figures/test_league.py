@@ -36,7 +36,7 @@ def test_each_cell_has_its_rank_and_a_method_that_did_not_run_a_hatch(width: flo
     assert hatched == [(0.5, 0.5)]
     assert len(said) == np.isfinite(RANK).sum()
     first = [one.get_text() for one in ax.texts if round(one.get_position()[1]) == 0]
-    assert {"1.00", "2.25", "3.75"} <= set(first) or {"1.0", "2.2", "3.8"} <= set(first)
+    assert {"1.00", "2.25", "3.75"} <= set(first) or {"1", "2.2", "3.8"} <= set(first)
     assert [one.get_text() for one in ax.get_yticklabels()] == ["fluid", "swing-stiffness", "all scenes"]
 
 

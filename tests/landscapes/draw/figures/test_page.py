@@ -34,6 +34,7 @@ from gradscape.landscapes.draw.figures.race import race_figure
 from gradscape.landscapes.draw.figures.sweep import Scales, frame_figure
 from gradscape.landscapes.draw.figures.thumbnail import thumbnail_figure
 from gradscape.landscapes.draw.figures.tradeoff import tradeoff_figure
+from gradscape.landscapes.draw.figures.wall import Landscape, wall_figure
 from gradscape.landscapes.draw.render.surface import surface_figure
 from gradscape.landscapes.episode import Episode, Part, View
 from gradscape.landscapes.measures import gradient_quality as gradients
@@ -96,6 +97,9 @@ CAPTION = Caption(
 )  # fmt: skip
 PARTS = {f"the walls' friction, number {number}": 0.01 * 1.5**number for number in range(12)}
 CUTS = [Cut("center", np.full((4, 4), np.nan)), Cut("random:3", np.arange(16.0).reshape(4, 4))]
+HUNG = [
+    Landscape("swing-velocity", "smooth with local minima 100 %, discontinuous 100 %, large flat regions 100 %", PLANE)
+]
 MIXED = mixed()
 CHOSEN = {"draft": MIXED["rungs"][-1]["name"], "standard": MIXED["rungs"][10]["name"]}
 FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
@@ -146,6 +150,7 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
     "league_figure": [lambda width: league_figure(league(), width=width)],
     "frame_figure": [lambda width: frame_figure(SWEEP, 1, Scales.of(SWEEP), width=width)],
     "episode_figure": [lambda width: episode_figure(EPISODE, caption=CAPTION, width=width)],
+    "wall_figure": [lambda width: wall_figure(HUNG * 16, width=width), lambda width: wall_figure(HUNG, width=width)],
     "thumbnail_figure": [lambda width: thumbnail_figure(DATASET, width=width)],
 }
 EACH = [pytest.param(make, id=f"{name}-{number}") for name, all_ in FIGURES.items() for number, make in enumerate(all_)]
