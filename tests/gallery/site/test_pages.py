@@ -44,7 +44,7 @@ def test_every_page_opens(way: str, visit: Visit, request: pytest.FixtureRequest
         page.click(f".slice a[href='{figure.id}/index.html']")
         page.wait_for_url(f"**/{figure.id}/index.html")
         shown = "img:not([hidden]):not(#player img)"
-        assert page.locator(shown).count()
+        page.locator(shown).first.wait_for(state="attached")
         page.evaluate("(all) => document.querySelectorAll(all).forEach((one) => { one.loading = 'eager'; })", shown)
         page.wait_for_function(
             "(all) => Array.from(document.querySelectorAll(all)).every((one) => one.naturalWidth > 100)", arg=shown
