@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..envs.registry import environment_class
@@ -26,8 +27,10 @@ class ReportPart(FigurePart):
     """What the slice is like, beside it."""
 
     def label(self) -> str:
-        """Return the command that measures it elsewhere."""
-        return f"landscape report {self.folder} --device {self.device}"
+        """Return the command that measures it elsewhere, which names no folder above this one: its record is kept."""
+        folder, here = self.folder.resolve(), Path.cwd()
+        said = folder.relative_to(here) if folder.is_relative_to(here) else self.folder
+        return f"landscape report {said} --device {self.device}"
 
     def count_left(self) -> int:
         """Return 1 where there is no report of this slice."""

@@ -1,6 +1,10 @@
 """Records that the gallery keeps are what was written, and name no folder of whoever measured them."""
 
+import json
+import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,6 +21,20 @@ def test_a_kept_record_is_whole_and_its_command_is_anybodys(path: Path) -> None:
     for command in (record["command"], record["provenance"]["command"]):
         assert command.startswith(("landscape ", f"gradscape.{path.parent.name}("))  # of the command line, of Python
         assert " /" not in command
+
+
+def texts(value: Any) -> Iterator[str]:
+    """Yield every text in a JSON value."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list):
+        for inner in value.values() if isinstance(value, dict) else value:
+            yield from texts(inner)
+
+
+@pytest.mark.parametrize("path", sorted(DATA.rglob("*.json")), ids=lambda path: path.relative_to(DATA).as_posix())
+def test_no_text_of_what_is_kept_names_a_folder_of_a_machine(path: Path) -> None:
+    assert [text for text in texts(json.loads(path.read_text())) if re.search(r"(?:^|[\s=])/\w", text)] == []
 
 
 def test_every_picture_has_its_record() -> None:
