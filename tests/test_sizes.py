@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import Any, get_args
 
 import pytest
-import typer
 
-from gradscape.cli import app
 from gradscape.envs.registry import make
 from gradscape.jobs import plan
 from gradscape.landscapes.capacity import TooLargeError
 from gradscape.optim.memory import SearchSize, require_method
 from gradscape.optim.registry import methods, optimizer_class
 
+from .command import verbs
 from .processes import Ended, alone, landscape
 
 HUGE = 10**15
@@ -28,16 +27,11 @@ OF_A_RACE = [(("plan",), "seeds"), (("plan",), "budget")]  # those of a plan tha
 NEEDED = {"--dims": "0 1", "--over": "smoothing", "--method": "random", "--axis": "x", "--plane": "pca"}
 
 
-def verbs(command: Any, path: tuple[str, ...] = ()) -> list[tuple[tuple[str, ...], Any]]:
-    if not hasattr(command, "commands"):
-        return [(path, command)]
-    return [found for name, one in command.commands.items() for found in verbs(one, (*path, name))]
-
-
 def sizes() -> list[list[str]]:
     """Return a command for every option that is a whole number without an end, and that alone is huge."""
     found = []
-    for path, command in verbs(typer.main.get_command(app)):
+    for words, command in verbs().items():
+        path = tuple(words.split())
         needed = [word for one in command.params for word in _said(one, path)]
         for one in command.params:
             kind = one.type_descriptor.annotation

@@ -12,13 +12,13 @@ from socket import AF_INET, AF_INET6
 from typing import Any
 
 import pytest
-import typer
 from benchmarks.results import leave_blank
 
-from gradscape.cli import app, main
+from gradscape.cli import main
 from gradscape.jobs import workers as cluster
 from gradscape.landscapes.draw.recordings import viewer
 
+from .command import verbs
 from .processes import FORK
 from .sockets import beyond_loopback, listening
 
@@ -59,15 +59,7 @@ NO_WINDOW = "rerun's viewer could not open a window"
 SERVED = "until Ctrl-C"  # what is said by all that serves
 
 
-def leaves(command: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
-    """Yield every verb of a command with its words."""
-    for name, inner in getattr(command, "commands", {}).items():
-        yield from leaves(inner, (*words, name))
-    if not hasattr(command, "commands"):
-        yield " ".join(words), command
-
-
-VERBS = dict(leaves(typer.main.get_command(app)))
+VERBS = verbs()
 
 
 def verb_of(line: str) -> str:

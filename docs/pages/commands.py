@@ -10,13 +10,13 @@ import typer
 
 from gradscape.cli import app
 
-from .text import cell, contents, page, prose, table
+from .text import cell, code, contents, page, prose, table
 
 
 def pages() -> dict[str, str]:
     """Return the pages of all verbs, and one that lists them, in the order of the command's own help."""
     found = list(verbs())
-    rows = [(f"[`landscape {name}`]({_file(name)})", cell(first_sentence(verb.help))) for name, verb in found]
+    rows = [(f"[`landscape {name}`]({_file(name)})", cell(first_paragraph(verb.help))) for name, verb in found]
     listed = page(
         "The command",
         "Each page has what `landscape VERB --help` prints. [The verbs](../../verbs.md) says what they are for.",
@@ -31,7 +31,7 @@ def verbs() -> Iterator[tuple[str, Any]]:
     yield from _verbs(typer.main.get_command(app), ())
 
 
-def first_sentence(text: str) -> str:
+def first_paragraph(text: str) -> str:
     """Return the first paragraph of a help text in one line."""
     return " ".join(text.split("\n\n")[0].split())
 
@@ -69,10 +69,5 @@ def _block(command: str) -> str:
 
 
 def _section(title: str, records: list[tuple[str, str]]) -> str:
-    rows = [(f"`{cell_code(said)}`", cell(re.sub(r"(?<=\S) {2,}(?=\[)", " ", text))) for said, text in records]
+    rows = [(f"`{code(said)}`", cell(re.sub(r"(?<=\S) {2,}(?=\[)", " ", text))) for said, text in records]
     return f"## {title}\n\n{table(('', 'what it says'), rows)}" if rows else ""
-
-
-def cell_code(text: str) -> str:
-    """Return code for a cell of a table."""
-    return text.replace("|", "\\|")

@@ -12,7 +12,7 @@ from typing import Any, get_overloads
 import gradscape
 from gradscape.jobs.scene import SceneSpec
 
-from .text import CODE, cell, contents, page, table
+from .text import CODE, cell, code, contents, page, table
 
 RST = re.compile(r"([\\*_|])")  # what would be markup in a docstring
 KEYWORDS = re.compile(r"Unpack\[(\w+)\]")
@@ -125,4 +125,4 @@ def _keywords(one: Callable[..., Any]) -> str:
 
 def _type(annotation: Any) -> str:
     said = getattr(annotation, "__forward_arg__", annotation)
-    return str(said).replace("|", "\\|")
+    return code(str(said))

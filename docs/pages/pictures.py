@@ -48,10 +48,14 @@ def draw_function(env: str, folder: Path) -> str:
     return name
 
 
-def shown(name: str, alt: str, up: str) -> str:
-    """Return the Markdown that shows a picture on pages of either kind; `up` leads to where pages are walked."""
+def shown(name: str, alt: str, up: str, *, look: str = "", leads: str = "") -> str:
+    """Return the Markdown that shows a picture on pages of either kind; `up` leads to where pages are walked.
+
+    `look` is a class of the style sheet, and `leads` where a click on it leads.
+    """
+    target = f":target: {leads}\n" if leads else ""
     lines = [
-        f"```{{image}} {up}pictures/{file}\n:alt: {alt}\n:class: only-{kind}\n```"
+        f"```{{image}} {up}pictures/{file}\n:alt: {alt}\n:class: {f'{look} only-{kind}'.strip()}\n{target}```"
         for kind, file in (("light", name), ("dark", dark_name(name)))
     ]
     return "\n\n".join(lines)

@@ -20,6 +20,11 @@ def cell(text: str) -> str:
     return " ".join(re.sub(r"(?<!\\)\|", r"\\|", prose(text)).split())
 
 
+def code(text: str) -> str:
+    """Return what stands between backticks in a cell of a table: its bars end no cell."""
+    return text.replace("|", "\\|")
+
+
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a table of cells that are Markdown already."""
     lines = [headings, ["---"] * len(headings), *rows]

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gradscape.gallery.files import dark_name
-
-from .kept import Kept, KeptFigure
-from .pictures import draw_slice
+from .kept import NOT_MEASURED, Kept, KeptFigure
+from .pictures import draw_slice, shown
 from .text import page
 
 
@@ -33,10 +31,7 @@ def _shown(one: KeptFigure, kept: Kept, pictures: Path) -> str:
     """Return a picture in both colours, with what it shows."""
     name = draw_slice(one, pictures, small=True)
     leads = f"../gallery/{one.figure.id}/index.html" if kept.gallery else f"scenes/{one.figure.env}.html"
-    words = ", ".join(one.report.words) if one.report else "not measured yet"
+    words = ", ".join(one.report.words) if one.report else NOT_MEASURED
     assert one.slice is not None
     alt = f"{one.figure.id}: losses over {' and '.join(one.slice.plane.labels)}; {words}"
-    return "\n\n".join(
-        f"```{{image}} pictures/{file}\n:alt: {alt}\n:class: wall only-{kind}\n:target: {leads}\n```"
-        for kind, file in (("light", name), ("dark", dark_name(name)))
-    )
+    return shown(name, alt, "", look="wall", leads=leads)

@@ -90,8 +90,8 @@ def build_site(
         with Studio(places) as studio:
             site = _Site.begin(new, data, [figure.env for figure in there], tables, studio)
             shown = [site.write_page(figure, data / figure.id) for figure in there]
-            card = site.write_card(place_card(data, new, studio))
-            league = site.write_league(place_league(data, new, read_paper()))
+            site.write_card(card := place_card(data, new, studio))
+            site.write_league(league := place_league(data, new, read_paper()))
             tiles = hang(shown, data, new, studio)
             draw_wall(tiles, data, new)
         return site.write_index(Front(shown, tiles, card, league), [one.id for one in figures if one not in there])
@@ -198,17 +198,15 @@ class _Site:
         (folder / "index.html").write_text(self.pages.get_template("slice.html").render(**about))
         return entry
 
-    def write_card(self, card: Card | None) -> Card | None:
-        """Write the page of the report card of gradients, where there is one, and return it."""
+    def write_card(self, card: Card | None) -> None:
+        """Write the page of the report card of gradients, where there is one."""
         if card is not None:
             (self.folder / CARD_PAGE).write_text(self.pages.get_template(CARD_PAGE).render(card=card))
-        return card
 
-    def write_league(self, page: LeaguePage | None) -> LeaguePage | None:
-        """Write the page of the league, where there is one, and return it."""
+    def write_league(self, page: LeaguePage | None) -> None:
+        """Write the page of the league, where there is one."""
         if page is not None:
             (self.folder / LEAGUE_PAGE).write_text(self.pages.get_template(LEAGUE_PAGE).render(page=page))
-        return page
 
     def write_index(self, front: Front, missing: Sequence[str]) -> Manifest:
         """Write the front page and the manifest, and return that."""

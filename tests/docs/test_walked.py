@@ -7,13 +7,10 @@ import inspect
 import json
 import re
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
-import typer
 from docs.pages import commands, interface, package, provenance, reproduction, scenes, wall
 from docs.pages.kept import NOT_MEASURED, Kept, KeptFigure
 from docs.pages.text import prose
@@ -23,7 +20,6 @@ from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 
 import gradscape
-from gradscape.cli import app
 from gradscape.envs.registry import BUILTIN, environment_class
 from gradscape.gallery.figures import read_figures
 from gradscape.gallery.files import DATA
@@ -31,21 +27,14 @@ from gradscape.gallery.paper import read_paper
 from gradscape.optim.claims import ClaimVerdict
 from gradscape.optim.league import League
 
+from ..command import verbs
 from ..gallery.site.conftest import scene_standings
 
 ROOT = Path(__file__).parents[2]
 REPORTED = "bounce-y"  # a figure whose report is kept
 
 
-def leaves(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
-    if hasattr(command, "commands"):
-        for name, one in command.commands.items():
-            yield from leaves(one, (*path, name))
-    else:
-        yield " ".join(path), command
-
-
-VERBS = dict(leaves(typer.main.get_command(app)))
+VERBS = verbs()
 PUBLIC = {name: getattr(gradscape, name) for name in gradscape.__all__ if not name.startswith("__")}
 
 
