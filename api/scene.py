@@ -70,12 +70,12 @@ def is_environment(objective: Objective) -> TypeGuard[Environment]:
 
 
 def say_cut(
-    along: str | None, through: str | Tensor, extent: float | tuple[float, float] | None, *, gradients: bool
+    along: str | None, through: str | Tensor, extent: float | tuple[float, float] | None, *, gradients: bool | int
 ) -> dict[str, Any]:
     """Return what `say_call` is told of where a slice goes and whether it has gradients; None where it need not be."""
     point = through if isinstance(through, str) else through.tolist()
     where = {"along": along, "through": None if point == "center" else point, "extent": extent}
-    return {**where, "gradients": None if gradients else False}
+    return {**where, "gradients": None if gradients is True or gradients == 1 else gradients or False}
 
 
 def say_call(function: str, scene: object, *given: object, **named: object) -> str:

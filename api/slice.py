@@ -12,6 +12,7 @@ from ..jobs.scene import SceneSpec, environment_of, with_policy
 from ..jobs.watch import Watch
 from ..landscapes.adapters import within_box
 from ..landscapes.objective import name_of
+from ..landscapes.space import as_whole
 from .progress import default_watch
 from .scene import SceneKeywords, is_environment, objective_of, say_call, say_cut
 
@@ -37,7 +38,7 @@ def slice(
     refine: float | None = None,
     budget: int | None = None,
     policy: str | None = None,
-    gradients: bool = True,
+    gradients: bool | int = True,
     out: str | Path | None = None,
     force: bool = False,
     **keywords: Unpack[SceneKeywords],
@@ -51,6 +52,9 @@ def slice(
     line A:B or a plane A:B:C between points; what lies off the box is left out. The samples lie in the folder `out`,
     by default one under out/ named after the slice: the same call goes on there where it stopped. An objective that is
     no environment is sampled in memory without `out`.
+
+    `gradients` says whether it has any, or at every how many samples along each axis: 4 has losses at all samples, and
+    gradients at a sixteenth of them.
 
     With a `policy`, mlp:32x32, it is over the weights of a perceptron that takes the environment's decisions by what it
     sees, not over the environment's own parameters; it has losses only.
@@ -67,20 +71,22 @@ def slice(
     if policy is not None:
         if not is_environment(objective):
             raise ValueError(f"a policy decides in an environment; got the objective {name_of(objective)}")
-        objective, gradients = with_policy(objective, policy), False
+        objective, gradients = with_policy(objective, policy), 0
     from ..landscapes.sampling.refine import Refinement
 
     fine, folder = Refinement.of(refine, budget), Path(out) if out is not None else None
     in_memory = out is None and policy is None and not is_environment(objective)
-    begun: dict[str, Any] = {"out": folder, "grad": gradients, "refinement": fine}
+    stride = as_whole(int(gradients) if isinstance(gradients, bool) else gradients, "gradients")
+    slopes: dict[str, Any] = {"grad": stride > 0, "every": stride or 1}
+    begun: dict[str, Any] = {"out": folder, **slopes, "refinement": fine}
     where: dict[str, Any] = {"through": through, "extent": extent, "resolution": resolution}
     plane = cut(objective, dims, along, **where, kept=None if force or in_memory else begun)
     if in_memory:
-        return _sample_in_memory(within_box(objective) if along else objective, plane, gradients, fine, watch)
+        return _sample_in_memory(within_box(objective) if along else objective, plane, fine, watch, **slopes)
     from ..jobs.slice import SliceJob
 
     how = {"refine": refine, "budget": budget, "policy": policy}
-    how |= say_cut(along, through, extent, gradients=gradients or policy is not None)
+    how |= say_cut(along, through, extent, gradients=gradients if policy is None else True)
     command = say_call("slice", scene, *([tuple(dims)] if dims else []), resolution=resolution, **how, **keywords)
     named = describe_cut(along, through, extent)
     job = SliceJob.of(objective, plane, command=command, cut=named, force=force, **begun)
@@ -106,21 +112,23 @@ def _open(path: Path, remake: Callable[[], Objective] | None) -> Slice:
 
 
 def _sample_in_memory(
-    objective: Objective, plane: Plane, grad: bool, refinement: Refinement | None, watch: Watch
+    objective: Objective, plane: Plane, refinement: Refinement | None, watch: Watch, *, grad: bool, every: int
 ) -> Slice:
     from ..jobs.slice_summary import look_between
+    from ..landscapes.lattice import check_stride
     from ..landscapes.sampling.fill import describe, sample
     from ..landscapes.sampling.refine import refine
     from ..landscapes.slice import Slice
     from ..landscapes.storage.store import SliceStore
 
+    every = check_stride(every, plane, refined=refinement is not None) if grad else 1
     with watch.progress(math.prod(plane.resolution), "evaluations") as advance:
         how: dict[str, Any] = {
             "progress": lambda now: advance(now.done),
             "conclude": lambda whole: look_between(objective, whole),
         }
         if refinement is None:
-            dataset = sample(objective, plane, grad=grad, **how)
+            dataset = sample(objective, plane, grad=grad, every=every, **how)
         else:
             store = SliceStore.in_memory(plane, objective.space, **describe(objective), grad=grad)
             dataset = refine(objective, plane, store, refinement, **how)

@@ -100,6 +100,12 @@ Policy = Annotated[
         "with two hidden layers of 32 that decides by what it sees. Losses only."
     ),
 ]
+Gradients = Annotated[
+    int,
+    typer.Option(
+        "--gradients", min=1, help="Have gradients at every so many samples along each axis, losses at all of them."
+    ),
+]
 NoGradients = Annotated[bool, typer.Option("--no-gradients", help="Sample losses only.")]
 Refine = Annotated[
     str | None,

@@ -14,6 +14,7 @@ from .arguments import (
     Along,
     Extent,
     Force,
+    Gradients,
     Json,
     NoGradients,
     Out,
@@ -42,6 +43,7 @@ def slice_(
     refine: Refine = None,
     budget: RefineBudget = None,
     policy: Policy = None,
+    gradients: Gradients = 1,
     no_gradients: NoGradients = False,
     scheduler: Scheduler = None,
     out: Out = None,
@@ -59,7 +61,7 @@ def slice_(
     Example: landscape slice fluid --dims 6 8 --resolution 24
     """
     how: dict[str, Any] = {"resolution": resolution, "through": through, "grad": not no_gradients}
-    how |= {"refine": refine, "budget": budget, "along": along, "policy": policy}
+    how |= {"refine": refine, "budget": budget, "along": along, "policy": policy, "every": gradients}
     _sample(scene, dims, extent, print_, out, **how, as_json=json_, force=force, scheduler=scheduler)
 
 
@@ -99,6 +101,7 @@ def _sample(
     grad: bool,
     as_json: bool,
     force: bool,
+    every: int = 1,
     scheduler: str | None = None,
     refine: str | None = None,
     budget: int | None = None,
@@ -121,12 +124,13 @@ def _sample(
     how: dict[str, Any] = {
         "command": command_line(),
         "grad": grad and policy is None,
+        "every": every,
         "force": force,
         "prints": prints or [],
     }
     how["refinement"] = Refinement.of(read_share(refine, "--refine"), budget)
     folders = {point: folder_for(Path(out), point, points) if out else None for point in points}
-    kept = {name: how[name] for name in ("grad", "refinement")}
+    kept = {name: how[name] for name in ("grad", "every", "refinement")}
     planes = {  # all of them, or none is sampled
         point: cut(subject, dims, along, through=point, **where, kept=None if force else {**kept, "out": folder})
         for point, folder in folders.items()

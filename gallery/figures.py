@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 KINDS: dict[str, type] = {  # of a figure's fields in TOML
     **dict.fromkeys(("id", "env", "through", "fidelity", "over"), str),
-    **{"dims": list, "resolution": int, "options": dict, "searched": dict},
+    **{"dims": list, "resolution": int, "gradients": int, "options": dict, "searched": dict},
 }
 SCENE_OPTIONS = {"fidelity", "device", "engine", "deterministic"}  # of a SceneSpec, so none of a scene's own
 
@@ -28,8 +28,8 @@ SCENE_OPTIONS = {"fidelity", "device", "engine", "deterministic"}  # of a SceneS
 class Figure:
     """A slice of an environment to show, and what the paper says of it.
 
-    One dimension makes a line, two a plane; `through`, `options` and `fidelity` are those of `landscape slice`, and
-    `over` is what its sweep moves, nothing if empty. `searched` is what the search for `through` found, as
+    One dimension makes a line, two a plane; `through`, `options`, `fidelity` and `gradients` are those of `landscape
+    slice`, and `over` is what its sweep moves, nothing if empty. `searched` is what the search for `through` found, as
     benchmarks/base_points.py writes it: the ends of the `losses` [loss unit], the `paper`'s, their `distance`, and how
     many `candidates` there were; nothing where none was searched for.
     """
@@ -40,6 +40,7 @@ class Figure:
     caption: PaperCaption = field(default_factory=PaperCaption)
     through: str = "center"
     resolution: int = 48
+    gradients: int = 1
     fidelity: str = "standard"
     options: Mapping[str, Any] = field(default_factory=dict)
     over: str = "horizon"
@@ -64,12 +65,14 @@ class Figure:
         else:
             axis = ["slice", self.env, "--dims", *map(str, self.dims)]
         how = ["--resolution", str(self.resolution), "--fidelity", self.fidelity, "--through", self.through]
+        how += ["--gradients", str(self.gradients)] if self.gradients > 1 else []
         return shlex.join(["landscape", *axis, *how, *self._set, "--device", device])
 
     def python(self, device: str) -> str:
         """Return the lines of Python that make this slice alone, draw it and say what it is like."""
         options = {"options": dict(self.options)} if self.options else {}
         how = {"resolution": self.resolution, "through": self.through, "fidelity": self.fidelity, "device": device}
+        how |= {"gradients": self.gradients} if self.gradients > 1 else {}
         said = ", ".join(f"{name}={value!r}" for name, value in {**how, **options}.items())
         lines = ["import gradscape as gs", "", f"s = gs.slice({self.env!r}, {self.dims!r}, {said})"]
         return "\n".join([*lines, "s.plot()", "print(s.report().words)"])

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..envs.registry import environment_class
 from ..jobs.watch import Watch
+from ..landscapes.identity import gradient_stride
 from .figures import Figure
 from .files import PICTURE, RUN_SUFFIX, RUNS, STORE, SWEEP_FILM, SWEEP_RECORD
 from .records import SweepRecord, read_if_sound
@@ -143,6 +144,7 @@ class SlicePart(FigurePart):
         return SliceJob.of(
             env,
             self.figure.plane(env),
+            every=self.figure.gradients,
             command=self.figure.command(self.device),
             out=self.folder,
             # nothing is lost of a store made by other code or for another device
@@ -254,6 +256,7 @@ def _same(figure: Figure, identity: Mapping[str, Any]) -> bool:
     dims = tuple(row.index(1.0) for row in plane["basis"] if row.count(1.0) == 1)
     same = identity["objective"] == figure.env and identity["fidelity"] == figure.fidelity and dims == figure.dims
     options = {name: identity["options"].get(name) for name in figure.options}
+    same &= gradient_stride(identity) == figure.gradients
     return bool(same and options == figure.options and plane["resolution"] == [figure.resolution] * len(dims))
 
 

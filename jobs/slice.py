@@ -20,6 +20,8 @@ from torch import Tensor
 from ..landscapes.adapters import within_box
 from ..landscapes.capacity import size
 from ..landscapes.cost import duration, seconds_per_episode
+from ..landscapes.identity import with_stride
+from ..landscapes.lattice import check_stride
 from ..landscapes.measures.unresolved import probes, stored_unresolved
 from ..landscapes.objective import Objective, Status
 from ..landscapes.plane import Plane
@@ -126,6 +128,7 @@ class SliceJob:
         out: Path | None = None,
         root: Path = ROOT,
         grad: bool = True,
+        every: int = 1,
         force: bool = False,
         boxed: bool = False,
         cut: Mapping[str, Any] | None = None,
@@ -137,12 +140,15 @@ class SliceJob:
 
         That folder is under `root`.
 
-        `boxed` leaves out what lies beyond the parameters' bounds. With a `cut`, how it was cut along directions, it is
-        boxed; of one that was begun, `kept_plane` has the plane. With an `executor` its workers compute. Raises as
-        `open` does.
+        Gradients are at `every` so many samples along each axis, losses at all. `boxed` leaves out what lies beyond the
+        parameters' bounds. With a `cut`, how it was cut along directions, it is boxed; of one that was begun,
+        `kept_plane` has the plane. With an `executor` its workers compute. Raises ValueError where gradients cannot be
+        so far apart, and as `open` does.
         """
         boxed = boxed or cut is not None
-        identity = identity_of(objective) | ({"boxed": True} if boxed else {}) | ({"cut": dict(cut)} if cut else {})
+        every = check_stride(every, plane, refined=refinement is not None) if grad else 1
+        identity = with_stride(identity_of(objective), every)
+        identity |= ({"boxed": True} if boxed else {}) | ({"cut": dict(cut)} if cut else {})
         out = out or default_folder(identity, plane.resolution, plane, grad, root, refinement)
         return cls.open(
             within_box(objective) if boxed else objective,
@@ -204,14 +210,16 @@ class SliceJob:
             cost = self.cost()
             if self.refinement and cost.episodes:
                 cost = cost.less(int((self._so_far()["status"] > 0).sum()))
-        total = math.prod(self.plane.resolution)
-        kind = "episodes with gradients" if self.store.grad else "episodes"
+        total, whole = math.prod(self.plane.resolution), self.store.grad and self.store.every == 1
+        kind = "episodes with gradients" if whole else "episodes"
+        if self.store.every > 1:
+            kind = f"episodes (gradients at every {self.store.every} samples along each axis)"
         watch.note(" · ".join([env, str(about.get("fidelity")), str(about.get("device")), str(self.folder)]))
         if not cost.episodes:
             watch.note(f"all {total} {kind} are there already")
             return
         kept = f", {total - cost.episodes} are there already" if cost.episodes < total else ""
-        most, losses = "up to " if self.refinement else "", probes(total, grad=self.store.grad)
+        most, losses = "up to " if self.refinement else "", probes(total, grad=whole)
         between = f"; then up to {losses} losses between them" if losses else ""
         watch.note(
             f"{most}{cost.episodes} {kind} to compute{kept}: about {duration(cost.seconds)}, "
@@ -265,6 +273,7 @@ class SliceJob:
             options=identity.get("options"),
             resolution=list(self.plane.resolution),
             gradients=self.store.grad,
+            gradients_every=self.store.every,
             episodes=computed,
             resumed=int((status != Status.INTERPOLATED).sum()) - computed,
             seconds=round(seconds, 3),
@@ -338,7 +347,9 @@ def cost_of(objective: Objective, store: SliceStore) -> SliceCost:
         return SliceCost(0, 0.0, peak_memory())
     getattr(objective, "prepare", lambda: None)()
     batch = first_points(store, pending, getattr(objective, "preferred_batch", 1))
-    seconds = left * seconds_per_episode(objective, batch, grad=store.grad)
+    sloped = sum(int(store.sloped(tile).sum()) for tile in pending)
+    counts = {True: sloped, False: left - sloped}
+    seconds = sum(n * seconds_per_episode(objective, batch, grad=grad) for grad, n in counts.items() if n)
     arrays = need_of(store.shape, store.plane.dim, grad=store.grad)
     return SliceCost(left, seconds, peak_memory() + round(arrays.memory))
 

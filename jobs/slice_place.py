@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from ..landscapes.identity import with_stride
 from ..landscapes.objective import Objective, name_of
 from ..landscapes.plain import plain_name
 from ..landscapes.plane import Plane
@@ -54,13 +55,14 @@ def kept_plane(
     out: Path | None = None,
     root: Path = ROOT,
     grad: bool = True,
+    every: int = 1,
     refinement: Refinement | None = None,
 ) -> Plane | None:
     """Return the plane of a slice that was begun with the same cut along directions, None where there is none.
 
     It goes on along these: others may come out a little different each time, on a GPU, and some take many episodes.
     """
-    identity = identity_of(objective) | {"boxed": True, "cut": dict(cut)}
+    identity = with_stride(identity_of(objective), every) | {"boxed": True, "cut": dict(cut)}
     path = (out or default_folder(identity, resolution, None, grad, root, refinement)) / STORE
     if not is_slice(path):
         return None

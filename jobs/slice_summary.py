@@ -27,8 +27,9 @@ JOINED = "joined"  # in the identity of a slice that was cut between points: the
 class SliceSummary:
     """Say what a slice cost, as `summary.json` beside it has it; `status` counts points, `flat` those without slope.
 
-    `episodes` are those of the samples; `unresolved` has those that looked between them, and what they found, None
-    where nothing is known of it. `barrier` [loss unit] is that between the ends of a line.
+    Gradients are at every `gradients_every` samples along each axis. `episodes` are those of the samples; `unresolved`
+    has those that looked between them, and what they found, None where nothing is known of it. `barrier` [loss unit] is
+    that between the ends of a line.
     """
 
     env: str | None
@@ -38,6 +39,7 @@ class SliceSummary:
     options: dict[str, Any] | None
     resolution: list[int]
     gradients: bool
+    gradients_every: int
     episodes: int
     resumed: int
     seconds: float
@@ -56,8 +58,9 @@ class SliceSummary:
         ends = ", ".join(f"{count} {kind}" for kind, count in counts.items())
         refined = f"; {self.refinement.say()}" if self.refinement else ""
         losses = say_range(self.loss)
-        sampled = sum(counts.values()) - counts.get("interpolated", 0)
-        share = (self.flat or 0) / sampled if sampled else 0.0
+        sloped = math.prod(-(-points // self.gradients_every) for points in self.resolution)
+        asked = min(sloped, sum(counts.values()) - counts.get("interpolated", 0))
+        share = (self.flat or 0) / asked if asked else 0.0
         flat = f"; gradient exactly zero at {share:.1%} of points" if share else ""
         barred = "" if self.barrier is None else f"; barrier of {self.barrier:.4g} above the line between its ends"
         hidden = f"; {said}" if (said := say_unresolved(self.unresolved)) else ""

@@ -15,6 +15,7 @@ from .space import ParameterSpace
 if TYPE_CHECKING:
     import xarray as xr
 
+EVERY = "gradients_every"  # of a slice's identity; not there where its gradients are at every sample
 ABSENT = "none"  # in the place of a setting's value
 LISTED_SETTINGS = 6  # settings that differ, in the refusal of a store
 
@@ -49,6 +50,16 @@ def full_identity(identity: Mapping[str, Any], plane: Plane, space: ParameterSpa
     if clash := own.keys() & identity.keys():
         raise ValueError(f"a slice's identity gets {', '.join(sorted(clash))} from the slice; leave them out")
     return plain_json({**identity, **own}, "a slice's identity")
+
+
+def with_stride(identity: Mapping[str, Any], every: int) -> dict[str, Any]:
+    """Add to a slice's settings that it has gradients at every so many samples along each axis, losses at all."""
+    return {**identity, EVERY: every} if every > 1 else dict(identity)
+
+
+def gradient_stride(identity: Mapping[str, Any]) -> int:
+    """Return at every how many samples along each axis a slice of such an identity has gradients: 1 is at all."""
+    return int(identity.get(EVERY, 1))
 
 
 def stored_identity(dataset: xr.Dataset) -> dict[str, Any]:

@@ -10,11 +10,42 @@ import torch
 import xarray as xr
 from numpy.typing import NDArray
 
-from .identity import plane_of, stored_identity
+from .identity import gradient_stride, plane_of, stored_identity
 from .objective import Status
 from .plane import Plane
+from .space import as_whole
 
 DRAWN = ("loss", "status")
+
+
+def has_all_gradients(dataset: xr.Dataset) -> bool:
+    """Whether a slice has a gradient at each of its samples, but for those that failed."""
+    return "grad" in dataset and gradient_stride(stored_identity(dataset)) == 1
+
+
+def check_stride(every: int, plane: Plane, *, refined: bool) -> int:
+    """Return at every how many samples along each axis a slice shall have gradients.
+
+    Raises ValueError where it then has fewer than two along an axis, or is refined, which takes gradients at all.
+    """
+    every = as_whole(every, "gradients", least=1)
+    if every > 1 and refined:
+        raise ValueError(
+            f"a slice is refined by the gradients of all its samples; got gradients at every {every} samples, so leave "
+            "out one of the two"
+        )
+    if every >= min(plane.resolution):
+        shape = " x ".join(map(str, plane.resolution))
+        raise ValueError(
+            f"a slice has gradients at two samples along each axis or more; got {shape} samples and gradients at every "
+            f"{every}, so take a smaller number or a higher resolution"
+        )
+    return every
+
+
+def with_gradients(dataset: xr.Dataset) -> xr.Dataset:
+    """Return the samples of a slice that have a gradient: all, or every so many along each axis."""
+    return dataset[_every(dataset, gradient_stride(stored_identity(dataset)))]
 
 
 def sampled_lattice(dataset: xr.Dataset) -> xr.Dataset:

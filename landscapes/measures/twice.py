@@ -18,7 +18,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..identity import plane_of
-from ..lattice import lift_between
+from ..lattice import has_all_gradients, lift_between
 from ..objective import Objective, evaluate
 from ..statistics import Estimate, Values, mean
 from .classify import judge, likeness
@@ -128,7 +128,8 @@ def _sample(
     own = tuple([slice(None, None, 2)] * rank)
     for number, block in enumerate(drawn):
         losses[number][own], slopes[number][own] = loss[_part(block, 3)], slope[_part(block, 3)]
-    new = np.argwhere((np.indices([SIDE] * rank) % 2).any(axis=0))
+    between = (np.indices([SIDE] * rank) % 2).any(axis=0)
+    new = np.argwhere(between if has_all_gradients(dataset) else np.ones_like(between))
     places = (drawn[:, None, :] + new / 2).reshape(-1, rank)
     answer = evaluate(objective, lift_between(plane, places), grad=True)
     at = tuple([slice(None), *new.T])

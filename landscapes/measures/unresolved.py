@@ -13,8 +13,8 @@ Cells are drawn at random from three strata, with new evaluations of their losse
 - steep: along an edge the loss changes by more than half a step, as its gradients say. The edge is bisected, too.
 - quiet: all others. The loss is asked for in the middle, since what left no trace can only be met.
 
-Of a slice without gradients their place is taken by differences of neighbouring losses. Of a refined slice the cells
-that it interpolates count as resolved; how exact they are is said beside.
+Of a slice that has no gradients, or not at every sample, their place is taken by differences of neighbouring losses. Of
+a refined slice the cells that it interpolates count as resolved; how exact they are is said beside.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..identity import plane_of
-from ..lattice import lift_between
+from ..lattice import has_all_gradients, lift_between
 from ..objective import Objective, Status, evaluate
 from ..plain import finite
 from ..plane import Plane
@@ -82,7 +82,7 @@ def find_unresolved(
     slope = _step_slopes(dataset, loss)
     least = _least(loss, floor)
     strata = _strata(loss, slope, least)
-    budget = probes(_evaluated(dataset), grad="grad" in dataset)
+    budget = probes(_evaluated(dataset), grad=has_all_gradients(dataset))
     cells = sum(map(len, strata.values()))
     if not cells:
         return None
@@ -180,7 +180,7 @@ def _least(loss: Values, floor: float) -> float:
 
 def _step_slopes(dataset: xr.Dataset, loss: Values) -> Values:
     """Return the derivatives by a step from sample to sample along each axis of the array, axis last."""
-    if "grad" not in dataset:
+    if not has_all_gradients(dataset):
         return np.stack([np.gradient(loss, axis=axis) for axis in range(loss.ndim)], axis=-1)
     slopes: Values = (box_slopes(dataset) / (np.array(plane_of(dataset).resolution) - 1))[..., ::-1]
     return slopes

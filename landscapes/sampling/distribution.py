@@ -13,13 +13,14 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
 import cloudpickle
+import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
@@ -72,7 +73,7 @@ class Site:
         if not tiles:
             return
         parts = [self.store.points(tile) for tile in tiles]
-        evaluation = self.objective.evaluate(torch.cat(parts), grad=self.store.grad)
+        evaluation = self._evaluate(torch.cat(parts), np.concatenate([self.store.sloped(tile) for tile in tiles]))
         notes = self.objective.take_notes()
         start = 0
         for tile, part in zip(tiles, parts, strict=True):
@@ -80,6 +81,16 @@ class Site:
             self.store.write(tile, rows)
             yield FilledTile(tile, Counter(map(Status, rows.status.tolist())), notes)
             notes = ()
+
+    def _evaluate(self, x: Float[Tensor, "batch dim"], sloped: NDArray[np.bool_]) -> Evaluation:
+        """Evaluate points, some with a gradient and the others without; those have a gradient of NaN."""
+        if self.store.every == 1:
+            return self.objective.evaluate(x, grad=self.store.grad)
+        having = torch.from_numpy(sloped)
+        both = [self.objective.evaluate(x[rows], grad=grad) for grad, rows in ((True, having), (False, ~having))]
+        order = torch.cat([having.nonzero(), (~having).nonzero()])[:, 0].argsort()
+        both[1] = replace(both[1], grad=torch.full_like(x[~having], torch.nan))
+        return Evaluation.join(both, dim=x.shape[1], grad=True).rows(order)
 
     def __reduce__(self) -> tuple[Any, ...]:
         who = name_of(self.objective)

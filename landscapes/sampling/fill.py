@@ -13,7 +13,7 @@ from typing import Any
 
 import xarray as xr
 
-from ..identity import check_identity
+from ..identity import check_identity, with_stride
 from ..objective import Objective, Status, name_of
 from ..plane import Plane
 from ..space import as_whole
@@ -47,6 +47,7 @@ def sample(
     store: SliceStore | None = None,
     *,
     grad: bool = True,
+    every: int = 1,
     batch: int | None = None,
     progress: Callable[[Progress], None] | None = None,
     executor: Executor | None = None,
@@ -55,10 +56,11 @@ def sample(
 ) -> xr.Dataset:
     """Evaluate an objective on a plane and return the slice; what `store` holds already is not evaluated again.
 
-    Without a store the slice lives in memory. `batch` is the number of points per evaluation, rounded up to whole tiles
-    (default: the objective's `preferred_batch`, else one tile); `progress` is called once at the start and after every
-    tile. Stop it at any instant: the same call goes on, and the result is bit for bit that of an uninterrupted one,
-    given an objective whose rows do not depend on their batch. A batch that does not fit into memory is halved.
+    Without a store the slice lives in memory. Gradients are at `every` so many samples along each axis, losses at all;
+    of a store it says so itself. `batch` is the number of points per evaluation, rounded up to whole tiles (default:
+    the objective's `preferred_batch`, else one tile); `progress` is called once at the start and after every tile. Stop
+    it at any instant: the same call goes on, and the result is bit for bit that of an uninterrupted one, given an
+    objective whose rows do not depend on their batch. A batch that does not fit into memory is halved.
 
     With an `executor` its workers evaluate batches and write them to the store, which processes must see at the same
     path. Threads share the objective; in a process `made`, a function that can be pickled, makes it once, or else it is
@@ -72,7 +74,9 @@ def sample(
     where a single point is too much for the device.
     """
     if store is None:
-        store = SliceStore.in_memory(plane, objective.space, **describe(objective), grad=grad)
+        about = describe(objective)
+        about["identity"] = with_stride(about["identity"], every)
+        store = SliceStore.in_memory(plane, objective.space, **about, grad=grad)
     _check_store(store, objective, plane, grad=grad)
     batch = as_whole(getattr(objective, "preferred_batch", 1) if batch is None else batch, "sample's batch", least=1)
     status = store.status()

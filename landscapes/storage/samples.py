@@ -25,16 +25,26 @@ class Samples:
 
     A tile counts when it decodes, its status has no MISSING, loss and gradient are finite exactly where the status is
     OK, and its checksum is right. Everything else is as if it had never been written. `place` is the store's folder,
-    None of one in memory; `ascending` says that it was finished, so that every tile is there.
+    None of one in memory; `ascending` says that it was finished, so that every tile is there. `sloped` says along each
+    axis which samples have a gradient where the others on it do, too; the gradient of all others is NaN.
     """
 
-    def __init__(self, group: zarr.Group, shape: tuple[int, ...], place: Path | None, *, ascending: bool) -> None:
+    def __init__(
+        self,
+        group: zarr.Group,
+        shape: tuple[int, ...],
+        place: Path | None,
+        *,
+        ascending: bool,
+        sloped: Sequence[NDArray[np.bool_]],
+    ) -> None:
         arrays = dict(group.arrays())
         self.shape = shape
         self.arrays = {name: arrays[name] for name in ("loss", "grad", "status") if name in arrays}
         self.side = self.arrays["status"].chunks[: len(shape)]
         self._sums = Checksums.of(group, self.tile_counts) if place else None
         self._filling = None if ascending else place
+        self._sloped = sloped
 
     @property
     def whole(self) -> Box:
@@ -57,15 +67,22 @@ class Samples:
         sizes = zip(tile.index, self.side, self.shape, strict=True)
         return tuple(slice(at * side, min((at + 1) * side, points)) for at, side, points in sizes)
 
+    def sloped(self, box: Box) -> NDArray[np.bool_]:
+        """Return which samples of a box have a gradient."""
+        found: NDArray[np.bool_] = np.ones((), dtype=bool)
+        for axis, at in zip(self._sloped, box, strict=True):
+            found = found[..., None] & axis[at]
+        return found
+
     def read_tile(self, tile: Tile) -> Arrays | None:
         """Return the arrays of a tile that is finished, None of one that is not."""
         try:
-            values = self._load(self.place(tile))
+            values = self._load(place := self.place(tile))
         except Exception:  # as in `read`
             return None
         if self._sums and self._sums.one(tile.index) != tile_sum(tile.index, values):
             return None
-        return None if (self._check_status(values) == Status.MISSING).any() else values
+        return None if (self._check_status(values, place) == Status.MISSING).any() else values
 
     def write_tile(self, tile: Tile, values: Mapping[str, NDArray[Any]]) -> None:
         """Write the arrays of a tile, status last."""
@@ -92,7 +109,7 @@ class Samples:
             values = self._read_tiles(box, known) if known else self._load(box)
         except Exception:  # a damaged chunk raises whatever its codec does
             values = self._read_tiles(box, {})
-        status = self._check_status(values)
+        status = self._check_status(values, box)
         sums = self._sums.read(self._tiles_begun()) if self._sums else None
         for tile in self.tiles() if self._sums or (status == Status.MISSING).any() else ():
             place = self.place(tile)
@@ -104,11 +121,11 @@ class Samples:
             values[name][status == Status.MISSING] = np.nan
         return values
 
-    def _check_status(self, values: Mapping[str, NDArray[Any]]) -> NDArray[np.int8]:
+    def _check_status(self, values: Mapping[str, NDArray[Any]], box: Box) -> NDArray[np.int8]:
         """Return the status, MISSING where it and the numbers contradict each other."""
         intact = np.isfinite(values["loss"])
         if "grad" in values:
-            intact &= np.isfinite(values["grad"]).all(axis=-1)
+            intact &= np.isfinite(values["grad"]).all(axis=-1) | ~self.sloped(box)
         status: NDArray[np.int8] = values["status"]
         status[(status == Status.OK) != intact] = Status.MISSING
         return status

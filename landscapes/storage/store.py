@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from zarr.storage import MemoryStore
 
-from ..identity import StoreError, StoreExistsError, check_identity, full_identity
+from ..identity import StoreError, StoreExistsError, check_identity, full_identity, gradient_stride
 from ..objective import Evaluation, Status
 from ..plain import plain_json
 from ..plane import Plane
@@ -75,7 +75,13 @@ class SliceStore:
         self._attributes = {name: attributes_of(array) for name, array in arrays.items()}
         self._interpolated = arrays.get(INTERPOLATED)
         shape = tuple(len(self._coordinates[name]) for name in self.dims)
-        self._samples = Samples(group, shape, place, ascending=self.ascending)
+        sloped = [self._has_slopes(name) for name in self.dims]
+        self._samples = Samples(group, shape, place, ascending=self.ascending, sloped=sloped)
+
+    def _has_slopes(self, name: str) -> NDArray[np.bool_]:
+        """Return which samples along an axis, in stored order, may have a gradient."""
+        found: NDArray[np.bool_] = self._coordinates[name].argsort().argsort() % self.every == 0
+        return found
 
     @classmethod
     def create(
@@ -195,6 +201,11 @@ class SliceStore:
         return "grad" in self._samples.arrays
 
     @property
+    def every(self) -> int:
+        """At every how many samples along each axis there is a gradient, in a slice that holds gradients."""
+        return gradient_stride(self.identity)
+
+    @property
     def shape(self) -> tuple[int, ...]:
         """Points per axis, in array order."""
         return self._samples.shape
@@ -227,6 +238,10 @@ class SliceStore:
     def count(self, tile: Tile) -> int:
         """Return how many points a tile has."""
         return math.prod(at.stop - at.start for at in self._samples.place(tile))
+
+    def sloped(self, tile: Tile) -> NDArray[np.bool_]:
+        """Return which points of a tile have a gradient, in the order of `points`, shape (points,)."""
+        return self._samples.sloped(self._samples.place(tile)).ravel() & self.grad
 
     def points(self, tile: Tile) -> Float[Tensor, "points dim"]:
         """Return the parameters at the points of a tile."""
@@ -288,12 +303,17 @@ class SliceStore:
         self._move_on(self.path)
 
     def coarse(self) -> xr.Dataset | None:
-        """Return the largest coarse picture of the whole that is complete, axes ascending; None before the first."""
+        """Return the largest coarse picture of the whole that is complete, axes ascending; None before the first.
+
+        It has no gradients where those of the whole are at every few samples, of which it has some alone.
+        """
         pending = self.pending()
         if not pending:
             return self.dataset()
-        level = 0 if self.ascending else pending[0].level
-        return self._dataset(tuple(slice(level * side) for side in self._samples.side)) if level else None
+        if not (level := 0 if self.ascending else pending[0].level):
+            return None
+        found = self._dataset(tuple(slice(level * side) for side in self._samples.side))
+        return found.drop_vars("grad", errors="ignore") if self.every > 1 else found
 
     def _read_steadily(self, read: Callable[[], T]) -> T:
         """Return what is read, once more where another process has finished the slice meanwhile."""

@@ -16,8 +16,8 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 from numpy.typing import NDArray
 
-from ...identity import plane_of
-from ...lattice import own_cells
+from ...identity import gradient_stride, plane_of, stored_identity
+from ...lattice import own_cells, with_gradients
 from ...objective import Status
 from ...plane import Plane
 from .. import style
@@ -116,8 +116,7 @@ def cell_map(ax: Axes, dataset: xr.Dataset, values: Grid, scale: style.Scale, co
 def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> list[Artist]:
     """Draw the negated gradients as arrows, on the slice's own scale unless given; return the legend's entries."""
     plane = plane_of(dataset)
-    refined = bool((dataset["status"] == Status.INTERPOLATED).any()) if "status" in dataset else False
-    rows, columns = (pick_arrows(dataset.sizes[name], refined=refined) for name in ("v", "u"))
+    rows, columns = (arrows_along(dataset, name) for name in ("v", "u"))
     slope = plane.slope(torch.from_numpy(dataset["grad"].to_numpy())).numpy()
     size, label = magnitude(slope, plane, dataset["loss"].attrs.get("units", ""))
     flat = size == 0
@@ -140,7 +139,8 @@ def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None)
         return []
     look = page.sheet_of(ax).look(style.FLAT_MARK)
     ax.plot(u[flat[at]], v[flat[at]], **look, zorder=2.5)
-    return [Line2D([], [], **look, label=f"gradient exactly zero: {int(flat.sum())} of {page.evaluated(dataset)}")]
+    asked = page.evaluated(with_gradients(dataset))
+    return [Line2D([], [], **look, label=f"gradient exactly zero: {int(flat.sum())} of {asked}")]
 
 
 def log_magnitude(dataset: xr.Dataset) -> Grid:
@@ -202,6 +202,13 @@ def cell_edges(dataset: xr.Dataset) -> tuple[Grid, Grid]:
 
 def _edges(centers: Grid, low: float, high: float) -> Grid:
     return np.concatenate([[low], (centers[1:] + centers[:-1]) / 2, [high]])
+
+
+def arrows_along(dataset: xr.Dataset, name: str) -> NDArray[np.intp]:
+    """Return at which samples along an axis arrows are drawn, of those that have a gradient."""
+    refined = bool((dataset["status"] == Status.INTERPOLATED).any()) if "status" in dataset else False
+    every = gradient_stride(stored_identity(dataset))
+    return every * pick_arrows(-(-dataset.sizes[name] // every), refined=refined)
 
 
 def pick_arrows(points: int, *, refined: bool = False) -> NDArray[np.intp]:

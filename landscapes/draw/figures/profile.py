@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
 
 from ...identity import plane_of
-from ...lattice import sampled_line
+from ...lattice import sampled_line, with_gradients
 from ...plane import Plane
 from .. import style
 from . import page, panel, typesetting
@@ -84,13 +84,15 @@ def _draw_loss(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
 
 
 def _draw_slope(ax: Axes, dataset: xr.Dataset, plane: Plane) -> list[Artist]:
-    u, loss = dataset["u"].to_numpy(), dataset["loss"].to_numpy()
-    slope = plane.slope(torch.from_numpy(dataset["grad"].to_numpy())).numpy()[:, 0]
+    u, loss, sloped = dataset["u"].to_numpy(), dataset["loss"].to_numpy(), with_gradients(dataset)
+    slope = plane.slope(torch.from_numpy(sloped["grad"].to_numpy())).numpy()[:, 0]
     differences = _differences(u, loss)
     ax.axhline(0, color=style.FAINT, linewidth=0.8, zorder=0.5)
     sheet, thin = page.sheet_of(ax), {"color": style.QUIET, "linewidth": 0.7}
     (behind,) = ax.plot(u, differences, **sheet.look(thin), label="central difference of the loss")
-    (line,) = ax.plot(u, slope, color=style.SLOPE_LINE, **sheet.look(style.stroke(len(u))), label="gradient")
+    (line,) = ax.plot(
+        sloped["u"], slope, color=style.SLOPE_LINE, **sheet.look(style.stroke(len(slope))), label="gradient"
+    )
     low, high = style.span_of_line(slope, differences)
     ax.set_ylim(low, high)
     panel.name_axes(ax, y=_slope_label(plane, dataset["loss"].attrs.get("units", "")))

@@ -116,7 +116,7 @@ def surface(scene: Scene, dataset: xr.Dataset) -> rr.Mesh3D:
 
 def descent_arrows(scene: Scene, dataset: xr.Dataset, scale: style.Scale | None = None) -> rr.Arrows3D:
     """Lay the directions of steepest descent on the cells, coloured by the gradient's magnitude."""
-    rows, columns = (contour.pick_arrows(dataset.sizes[name]) for name in ("v", "u"))
+    rows, columns = (contour.arrows_along(dataset, name) for name in ("v", "u"))
     at = np.ix_(rows, columns)
     slope = scene.plane.slope(torch.from_numpy(dataset["grad"].transpose("v", "u", "dim").to_numpy())).numpy()
     logarithm = contour.log_magnitude(dataset)

@@ -1,0 +1,202 @@
+"""Slices with gradients at every so many samples along each axis, and losses at all."""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+from matplotlib.quiver import Quiver
+from torch import Tensor
+
+import gradscape as gs
+from gradscape import ParameterSpace, Plane, from_torch, sample
+from gradscape.jobs.slice import SliceJob
+from gradscape.landscapes.draw.figures.contour import arrows_along, landscape_figure
+from gradscape.landscapes.measures.gradient_quality import compare_samples
+from gradscape.landscapes.measures.ruggedness import ruggedness
+from gradscape.landscapes.measures.twice import Twice, at_twice
+from gradscape.landscapes.measures.unresolved import find_unresolved
+from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.storage.store import SliceStore, open_slice
+
+from ...command import Said
+
+SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
+PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 21))
+LINE = Plane.through(SPACE, SPACE.center, ["y"], resolution=30)
+
+
+class Counted:
+    """A wave that is not finite in a corner; it counts losses and gradients, and stops after so many points."""
+
+    space, name = SPACE, "counted"
+
+    def __init__(self, stop_after: int | None = None) -> None:
+        self.gradients = self.losses = 0
+        self.stop_after = stop_after
+
+    def evaluate(self, x: Tensor, *, grad: bool = True) -> Evaluation:
+        if self.stop_after is not None and self.losses + self.gradients >= self.stop_after:
+            raise KeyboardInterrupt
+        self.gradients += len(x) * grad
+        self.losses += len(x) * (not grad)
+        loss = (3 * x).sin().sum(dim=1)
+        loss[(x > 1.5).all(dim=1)] = torch.nan
+        return Evaluation.from_results(loss, 3 * (3 * x).cos() if grad else None)
+
+
+def slopes_of(dataset: xr.Dataset) -> np.ndarray:
+    return np.isfinite(dataset["grad"].to_numpy()).all(axis=-1)
+
+
+def kept(dataset: xr.Dataset, every: int) -> np.ndarray:
+    """Which samples may have a gradient, by their place alone."""
+    grids = np.indices(dataset["loss"].shape)
+    return (grids % every == 0).all(axis=0)
+
+
+@pytest.mark.parametrize("plane", [PLANE, LINE], ids=["plane", "line"])
+@pytest.mark.parametrize("every", [2, 5])
+def test_gradients_are_those_of_the_whole_slice_where_they_are(plane: Plane, every: int, tmp_path: Path) -> None:
+    whole, counted = sample(Counted(), plane), Counted()
+    job = SliceJob.of(counted, plane, command="", out=tmp_path / "cut", every=every)
+    job.run()
+    found = open_slice(tmp_path / "cut")
+    inside = kept(whole, every)
+    np.testing.assert_array_equal(found["loss"], whole["loss"])
+    np.testing.assert_array_equal(found["status"], whole["status"])
+    np.testing.assert_array_equal(slopes_of(found), inside & (whole["status"] == Status.OK))
+    np.testing.assert_array_equal(found["grad"].to_numpy()[inside], whole["grad"].to_numpy()[inside])
+    assert found.identical(open_slice(tmp_path / "cut"))
+    with ThreadPoolExecutor(2) as threads:
+        job = SliceJob.of(Counted(), plane, command="", out=tmp_path / "threads", every=every, executor=threads)
+        job.run()
+    apart = open_slice(tmp_path / "threads")
+    for name in ("loss", "grad", "status"):
+        np.testing.assert_array_equal(apart[name], found[name])
+
+
+def test_no_more_gradients_are_asked_for_than_are_kept() -> None:
+    counted = Counted()
+    sample(counted, PLANE, every=4)
+    assert counted.gradients == 5 * 6  # of 18 and 21 samples
+    assert counted.losses == 18 * 21 - counted.gradients
+
+
+def test_one_that_was_stopped_goes_on_to_the_same_bits(tmp_path: Path) -> None:
+    SliceJob.of(Counted(), PLANE, command="", out=tmp_path / "whole", every=3).run()
+    for _ in range(100):
+        job = SliceJob.of(Counted(150), PLANE, command="", out=tmp_path / "cut", every=3)
+        try:
+            job.run()
+        except KeyboardInterrupt:
+            continue
+        break
+    one, other = (open_slice(tmp_path / name) for name in ("whole", "cut"))
+    for name in ("loss", "grad", "status"):
+        np.testing.assert_array_equal(one[name], other[name])
+
+
+def strided_store(path: Path) -> SliceStore:
+    return SliceStore.create(path, PLANE, SPACE, identity={"objective": "wave", "gradients_every": 3})
+
+
+@pytest.mark.parametrize("sloped", [True, False])
+def test_a_gradient_that_is_lacking_where_it_belongs_is_a_tile_that_was_torn(tmp_path: Path, sloped: bool) -> None:
+    store = strided_store(tmp_path / "slice.zarr")
+    tile = next(one for one in store.tiles() if store.sloped(one).any() and not store.sloped(one).all())
+    whole = Counted().evaluate(store.points(tile))
+    assert whole.grad is not None
+    row = int(np.flatnonzero((store.sloped(tile) == sloped) & (whole.status == Status.OK).numpy())[0])
+    whole.grad[row] = torch.nan
+    store.write(tile, whole)
+    assert (tile in store.pending()) == sloped
+
+
+def test_other_gradients_are_another_slice(tmp_path: Path) -> None:
+    job = SliceJob.of(Counted(), PLANE, command="", out=tmp_path, every=3)
+    job.run()
+    with pytest.raises(ValueError, match="gradients_every: wanted 4, found 3"):
+        SliceJob.of(Counted(), PLANE, command="", out=tmp_path, every=4)
+    with pytest.raises(ValueError, match="gradients_every: wanted none, found 3"):
+        SliceJob.of(Counted(), PLANE, command="", out=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        ({"gradients": 17}, "got 17 x 17 samples and gradients at every 17"),
+        ({"gradients": 2, "refine": 0.05}, "leave out one of the two"),
+        ({"gradients": -1}, "gradients is a whole number of at least 0; got -1"),
+        ({"gradients": 2.5}, "gradients is a whole number of at least 0; got 2.5"),
+    ],
+)
+def test_what_cannot_be_is_refused(how: dict[str, object], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        gs.slice(from_torch(lambda x: x.sum(dim=1), SPACE), (0, 1), resolution=17, **how)  # type: ignore[arg-type] # on purpose
+
+
+def test_the_command_and_the_call_make_the_same_slice(run: Callable[..., Said], tmp_path: Path) -> None:
+    words = "slice branin --dims 0 1 --resolution 9 --gradients 4 --out cut"
+    done = run(*words.split(), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "81 episodes (gradients at every 4 samples along each axis) to compute" in done.stderr
+    theirs = gs.open_slice(tmp_path / "cut")
+    ours = gs.slice("branin", (0, 1), resolution=9, gradients=4, out=tmp_path / "ours")
+    for name in ("loss", "grad", "status"):
+        np.testing.assert_array_equal(theirs.data[name], ours.data[name])
+    assert "gradients=4" in ours.provenance["command"]
+
+
+def waves(x: Tensor) -> Tensor:
+    return torch.sin(9 * x[:, 0]) * torch.cos(7 * x[:, 1]) + x[:, 0] + (x[:, 0] > 0.3)
+
+
+def both_of(every: int) -> Iterator[xr.Dataset]:
+    plane = Plane.through(SPACE, SPACE.center, (0, 1), resolution=41)
+    return (sample(from_torch(waves, SPACE), plane, **how) for how in ({}, {"every": every}))
+
+
+def test_what_is_finer_than_the_samples_is_looked_for_as_without_gradients() -> None:
+    plane, objective = Plane.through(SPACE, SPACE.center, (0, 1), resolution=41), from_torch(waves, SPACE)
+    _, strided = both_of(4)
+    assert find_unresolved(objective, strided) == find_unresolved(objective, sample(objective, plane, grad=False))
+
+
+def test_twice_the_resolution_is_measured_as_with_all_gradients() -> None:
+    objective = from_torch(waves, SPACE)
+    dense, strided = both_of(4)
+    found, cosine = ruggedness(dense, floor=0.0), compare_samples(dense)["cosine"].isel(scale=0).to_numpy()
+    one, other = (at_twice(objective, data, found, None, cosine, deviation=0.0) for data in (dense, strided))
+    assert isinstance(one, Twice)
+    assert isinstance(other, Twice)
+    assert one.measures == other.measures
+
+
+def test_gradients_are_held_against_the_losses_of_all_samples() -> None:
+    dense, strided = (compare_samples(data) for data in both_of(4))
+    for name in ("cosine", "sign", "error"):
+        some = strided[name].to_numpy()
+        known = np.isfinite(some)
+        np.testing.assert_array_equal(some[known], dense[name].to_numpy()[known])
+        assert 0 < known.sum() <= known.size / 16 * 1.2
+
+
+def test_arrows_stand_where_gradients_are() -> None:
+    _, strided = both_of(4)
+    having = slopes_of(strided)
+    rows, columns = (arrows_along(strided, name) for name in ("v", "u"))
+    assert having[np.ix_(rows, columns)].all()
+    assert len(rows) == 11  # all that there are
+    drawn = [one for ax in landscape_figure(strided).axes for one in ax.collections if isinstance(one, Quiver)]
+    assert [one.N for one in drawn] == [11 * 11]
+
+
+def test_a_line_of_gradients_goes_through_all_that_there_are(tmp_path: Path) -> None:
+    cut = gs.slice(from_torch(waves, SPACE), (0,), resolution=41, gradients=4)
+    (line,) = [one for ax in cut.plot().axes for one in ax.lines if one.get_label() == "gradient"]
+    assert np.isfinite(line.get_ydata()).all()
+    np.testing.assert_array_equal(line.get_xdata(), cut.data["u"][::4])
