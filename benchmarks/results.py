@@ -161,13 +161,12 @@ def hurry(put: Callable[[object, str, Any], object]) -> None:
     `put` is setattr, or what does the same for a while.
     """
     from gradscape.jobs import mixed
-    from gradscape.jobs import rehearsal as of_slices
     from gradscape.landscapes import cost
     from gradscape.landscapes.measures import fidelity, turns
     from gradscape.optim import rehearsal
 
     places = {cost: "MOMENT ENOUGH WARM_UP", fidelity: "REPETITION LARGEST", turns: "LASTING ENOUGH"}
-    places |= {rehearsal: "MOMENT", of_slices: "WRITING SEEN", mixed: "PATIENCE"}
+    places |= {rehearsal: "MOMENT", mixed: "PATIENCE"}
     for module, names in places.items():
         for name in names.split():
             put(module, name, 0.0)
