@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from ..envs.installed import installed_version
@@ -81,9 +82,14 @@ def provenance(objective: Objective, command: str) -> dict[str, Any]:
     return {
         "command": command,
         "created": datetime.now(UTC).strftime("%Y-%m-%d"),
-        "versions": {package: installed_version(package) or ABSENT for package in _packages(objective)},
+        "versions": {package: _version(package) for package in _packages(objective)},
         "loss_unit": getattr(objective, "loss_unit", ""),
     }
+
+
+@cache  # reading the metadata of fifteen packages takes longer than a small job
+def _version(package: str) -> str:
+    return installed_version(package) or ABSENT
 
 
 def _packages(objective: Objective) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -21,6 +21,7 @@ from gradscape.gallery.figures import read_figures
 from gradscape.gallery.files import DATA
 from gradscape.jobs.report_record import Report
 from gradscape.jobs.report_tables import environments_markdown
+from gradscape.jobs.workers import workers
 
 from .command import Said
 
@@ -39,9 +40,9 @@ BLOCKS = [
 PLACEHOLDER = re.compile(r"\.{3}|[\[\]|]|\b(?!CUDA)[A-Z]{1,}\b")  # in what a command may look like
 
 # What makes them small: words in the place of others, the values of options, and options that are added.
-WORDS = {"SLICE": "cut", "RUN": "run", "best:RUN": "best:run", "ADDRESS": "local:1", "local": "local:1", "cuda": "cpu"}
+WORDS = {"SLICE": "cut", "RUN": "run", "best:RUN": "best:run", "local": "local:1", "cuda": "cpu"}
 WORDS |= {
-    "tls://10.0.0.5:8786": "local:1",
+    "tls://10.0.0.5:8786": "ADDRESS",  # of the scheduler that tests start
     "throw": "cut",
     "flight": "control",
     "standard": "draft",
@@ -168,9 +169,22 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    """Give the address of a scheduler with a worker, whose keys Dask's configuration has: one for all commands."""
+    import dask
+
+    with workers("local:1", "cpu") as executor:
+        client = executor._client  # type: ignore[union-attr]
+        keys = client.security
+        named = {"ca-file": keys.tls_ca_file, "client.cert": keys.tls_client_cert, "client.key": keys.tls_client_key}
+        with dask.config.set({f"distributed.comm.tls.{name}": value for name, value in named.items()}):
+            yield client.scheduler.address
+
+
 @pytest.mark.parametrize("command", RUN)
 def test_every_command_runs(
-    run: Callable[..., Said], desk: Path, monkeypatch: pytest.MonkeyPatch, command: str
+    run: Callable[..., Said], desk: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest, command: str
 ) -> None:
     """What serves is stopped at once, what opens a viewer is kept from it."""
     opened: list[Path] = []
@@ -183,19 +197,24 @@ def test_every_command_runs(
     monkeypatch.setattr(view, "show_recording", lambda path, bars, *, serve: opened.append(path))
     for name, value in (("REPETITION", 0.01), ("LARGEST", 0.01), ("RESAMPLES", 9)):
         monkeypatch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", value)
-    done = run(*small(command), cwd=desk)
+    words = [request.getfixturevalue("address") if word == "ADDRESS" else word for word in small(command)]
+    done = run(*words, cwd=desk)
     assert done.returncode == 0, (small(command), done.stderr)
     assert bool(opened) == ("view" in command)
 
 
+@pytest.mark.drawn
 @pytest.mark.parametrize("number", range(len(BLOCKS)))
-def test_every_block_of_python_runs(desk: Path, number: int) -> None:
+def test_every_block_of_python_runs(
+    desk: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], number: int
+) -> None:
+    """As a script of its own does, but in this process: it has none of this module's names."""
     block = BLOCKS[number]
+    monkeypatch.chdir(desk)
     assert sum(bool(line.strip()) for line in block.splitlines()) < 40
-    done = subprocess.run([sys.executable, "-c", block], cwd=desk, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    exec(compile(block, "block", "exec"), {"__name__": "__main__"})
     if "throw.png" in block:
-        assert 0 <= float(done.stdout) < 0.1  # the target can be hit
+        assert 0 <= float(capsys.readouterr().out) < 0.1  # the target can be hit
         assert (desk / "throw.png").read_bytes().startswith(b"\x89PNG")
 
 

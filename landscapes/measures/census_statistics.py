@@ -72,9 +72,18 @@ def spread(values: Array, drawn: NDArray[np.int64]) -> Spread:
     known = np.isfinite(values)
     if not known.any():
         return Spread((np.nan,) * len(QUANTILES), Estimate(np.nan, np.nan, np.nan))
-    medians = [np.median(np.repeat(values[known], counts)) for counts in drawn[:, known] if counts.any()]
-    middle = Estimate(float(np.median(values[known])), *_interval(np.array(medians)))
+    middle = Estimate(float(np.median(values[known])), *_interval(_medians(values[known], drawn[:, known])))
     return Spread(tuple(float(one) for one in np.quantile(values[known], QUANTILES)), middle)
+
+
+def _medians(values: Array, drawn: NDArray[np.int64]) -> Array:
+    """Return the median of each resample in which there are values: the mean of the one or two in its middle."""
+    order = np.argsort(values, kind="stable")
+    upto = np.cumsum(drawn[:, order], axis=1)  # how many of a resample there are up to each value
+    upto = upto[upto[:, -1] > 0]
+    last = upto[:, -1:] - 1
+    below, above = (values[order][(upto <= at).sum(axis=1)] for at in (last // 2, (last + 1) // 2))
+    return np.asarray((below + above) / 2)
 
 
 def _interval(found: Array) -> tuple[float, float]:

@@ -156,8 +156,11 @@ def test_claims_are_what_the_league_makes_of_them(nothing: Kept) -> None:
     assert len(set(ClaimVerdict)) + 2 == len(reproduction.MEANING)  # each that there is has a meaning
 
 
-def test_pictures_lead_to_the_gallery_where_it_is_built_and_to_scenes_where_not(kept: Kept, tmp_path: Path) -> None:
+def test_pictures_lead_to_the_gallery_where_it_is_built_and_to_scenes_where_not(
+    kept: Kept, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     one = next(one for one in kept.figures if one.slice is not None)
+    monkeypatch.setattr(scenes, "BUILTIN", [entry for entry in BUILTIN if entry.name == one.figure.env])
     (tmp_path / "site" / one.figure.id).mkdir(parents=True)
     (tmp_path / "site" / one.figure.id / "index.html").write_text("")
     few = replace(kept, figures=[one])

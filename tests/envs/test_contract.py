@@ -4,7 +4,9 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
+from benchmarks.corners import GOOD, answers, small
 
+from gradscape.envs.mjx.scene import MjxScene
 from gradscape.envs.registry import entries, environment_class, make
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 
@@ -126,6 +128,13 @@ def test_parameters_of_any_precision_get_gradients_of_their_own(env, points):
     assert losses.dtype == x.grad.dtype == torch.float32
     torch.testing.assert_close(losses.detach(), exact.loss.float())
     torch.testing.assert_close(x.grad, exact.grad.float())
+
+
+def test_whatever_is_called_ok_at_corners_and_beyond_is_finite_and_was_simulated_there(env):
+    """And where no float32 goes; `benchmarks/corners.py` asks more. JAX takes up to a minute to trace another scene."""
+    asked = env if isinstance(env, MjxScene) else small(env.name)
+    found = list(answers(asked, outward=(0.0, 0.1, 1e39), most=2))
+    assert not [answer for answer in found if answer.outcome not in GOOD]
 
 
 def refusal(call):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 from matplotlib.axes import Axes
@@ -97,6 +98,7 @@ def _page_size(ax: Axes) -> tuple[float, float]:
     return float(width), float(height)
 
 
+@lru_cache(1024)  # a page is laid out several times, with the same texts
 def wrap_text(text: str, width: float, size: float, *, lines: int = 2) -> str:
     """Break a text in a type size [pt] into so many lines of a width [inch] at most, about equally long."""
     broken, fits = [text], len(text)
@@ -114,6 +116,7 @@ def _break_lines(text: str, fits: int, lines: int) -> list[str]:
     return textwrap.wrap(text, fits, max_lines=lines, placeholder=MORE, break_on_hyphens=False) or [text]
 
 
+@lru_cache(4096)
 def text_width(text: str, size: float) -> float:
     """Return how much room type of a size [pt] takes at most [inch], on a screen or on paper."""
     width, _, _ = text_to_path.get_text_width_height_descent(text, FontProperties(size=size), ismath=False)

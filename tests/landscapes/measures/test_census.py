@@ -114,3 +114,13 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say() -> None:
     found = spread(np.arange(64.0), drawn)
     assert found.quantiles[2] == found.median.value == pytest.approx(31.5)
     assert found.median.low < 31.5 < found.median.high
+
+
+def test_the_median_of_a_resample_is_numpys() -> None:
+    """Of values of which some are equal, in resamples with many, one or none of them."""
+    draw = np.random.default_rng(0)
+    for values in (draw.standard_normal(7), draw.integers(3, size=8).astype(float), np.array([2.0])):
+        drawn = draw.integers(3, size=(99, len(values)))
+        medians = [np.median(np.repeat(values, counts)) for counts in drawn if counts.any()]
+        found = spread(values, drawn).median
+        assert (found.low, found.high) == pytest.approx(tuple(np.quantile(medians, [0.025, 0.975])), rel=1e-12)
