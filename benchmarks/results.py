@@ -155,31 +155,17 @@ def leave_blank(put: Callable[[object, str, Any], object]) -> None:
     put(page, "settle", lambda picture: picture.set_layout_engine("none"))
 
 
-def hurry(put: Callable[[object, str, Any], object]) -> None:
-    """Let what jobs take be foretold by one episode or two and one proposal, and batches be timed once or twice.
-
-    `put` is setattr, or what does the same for a while.
-    """
-    from gradscape.jobs import mixed
-    from gradscape.landscapes import cost
-    from gradscape.landscapes.measures import fidelity, turns
-    from gradscape.optim import rehearsal
-
-    places = {cost: "MOMENT ENOUGH WARM_UP", fidelity: "REPETITION LARGEST", turns: "LASTING ENOUGH"}
-    places |= {rehearsal: "MOMENT", mixed: "PATIENCE"}
-    for module, names in places.items():
-        for name in names.split():
-            put(module, name, 0.0)
-
-
 def small() -> None:
     """Let pictures be blank, nothing be repeated only to be timed, and searches and films of the gallery be few."""
     from gradscape.gallery import episodes as gallery_episodes
     from gradscape.gallery import measures as gallery_measures
     from gradscape.gallery import parts as gallery_parts
+    from gradscape.landscapes import cost
+    from gradscape.landscapes.measures import fidelity as tradeoff
 
     leave_blank(setattr)
-    hurry(setattr)
+    tradeoff.REPETITION = tradeoff.LARGEST = 0.002
+    cost.MOMENT = cost.ENOUGH = cost.WARM_UP = 0.0
     gallery_parts.METHODS, gallery_parts.BUDGET = ("random",), 8
     gallery_parts.FRAMES, gallery_parts.COARSE = 2, 4
     gallery_episodes.LONGEST, gallery_episodes.HEIGHT = 2, 48

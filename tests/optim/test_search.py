@@ -198,10 +198,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return clock
 
 
-def test_what_a_gradient_costs_is_measured_at_its_best_within_a_moment(
-    clock: Clock, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("gradscape.landscapes.cost.MOMENT", MOMENT)  # which other tests do not wait for
+def test_what_a_gradient_costs_is_measured_at_its_best_within_a_moment(clock: Clock) -> None:
     objective = Timed(clock, late=(0.2, 0.1, 0.004, 0.0, 0.0, 0.006))
     cost = episode_cost(objective)
     assert (cost.forward, cost.gradient) == (pytest.approx(0.01), pytest.approx(0.03))
