@@ -38,7 +38,7 @@ def check_stride(every: int, plane: Plane, *, refined: bool) -> int:
         shape = " x ".join(map(str, plane.resolution))
         raise ValueError(
             f"a slice has gradients at two samples along each axis or more; got {shape} samples and gradients at every "
-            f"{every}, so take a smaller number or a higher resolution"
+            f"{every}; {min(plane.resolution) - 1} would fit, or take a higher resolution"
         )
     return every
 
