@@ -73,7 +73,7 @@ class Site:
         if not tiles:
             return
         parts = [self.store.points(tile) for tile in tiles]
-        evaluation = self._evaluate(torch.cat(parts), np.concatenate([self.store.sloped(tile) for tile in tiles]))
+        evaluation = self._evaluate(tiles, torch.cat(parts))
         notes = self.objective.take_notes()
         start = 0
         for tile, part in zip(tiles, parts, strict=True):
@@ -82,11 +82,11 @@ class Site:
             yield FilledTile(tile, Counter(map(Status, rows.status.tolist())), notes)
             notes = ()
 
-    def _evaluate(self, x: Float[Tensor, "batch dim"], sloped: NDArray[np.bool_]) -> Evaluation:
-        """Evaluate points, some with a gradient and the others without; those have a gradient of NaN."""
+    def _evaluate(self, tiles: Sequence[Tile], x: Float[Tensor, "batch dim"]) -> Evaluation:
+        """Evaluate the points of tiles, some with a gradient and the others without; those have a gradient of NaN."""
         if self.store.every == 1:
             return self.objective.evaluate(x, grad=self.store.grad)
-        having = torch.from_numpy(sloped)
+        having = torch.from_numpy(np.concatenate([self.store.sloped(tile) for tile in tiles]))
         both = [self.objective.evaluate(x[rows], grad=grad) for grad, rows in ((True, having), (False, ~having))]
         order = torch.cat([having.nonzero(), (~having).nonzero()])[:, 0].argsort()
         both[1] = replace(both[1], grad=torch.full_like(x[~having], torch.nan))

@@ -76,8 +76,9 @@ class Samples:
 
     def read_tile(self, tile: Tile) -> Arrays | None:
         """Return the arrays of a tile that is finished, None of one that is not."""
+        place = self.place(tile)
         try:
-            values = self._load(place := self.place(tile))
+            values = self._load(place)
         except Exception:  # as in `read`
             return None
         if self._sums and self._sums.one(tile.index) != tile_sum(tile.index, values):
