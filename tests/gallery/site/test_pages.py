@@ -35,20 +35,28 @@ def served(site: Path) -> Iterator[str]:
         thread.join()
 
 
+def load_pictures(page: Any, selector: str) -> None:
+    """Have the browser load pictures that it would leave until they are scrolled to, and wait for them.
+
+    How far below the window it loads them by itself depends on how quick it finds the server to be.
+    """
+    page.evaluate("(all) => document.querySelectorAll(all).forEach((one) => { one.loading = 'eager'; })", selector)
+    page.wait_for_function(
+        "(all) => Array.from(document.querySelectorAll(all)).every((one) => one.naturalWidth > 100)", arg=selector
+    )
+
+
 @pytest.mark.parametrize("way", ["filed", "served"])
 def test_every_page_opens(way: str, visit: Visit, request: pytest.FixtureRequest) -> None:
     page = visit(request.getfixturevalue(way), "index.html")
-    page.wait_for_function("Array.from(document.images).every((one) => one.naturalWidth > 100)")
+    load_pictures(page, "img")
     assert page.locator(".slice").count() == len(FIGURES)
     for figure in FIGURES:
         page.click(f".slice a[href='{figure.id}/index.html']")
         page.wait_for_url(f"**/{figure.id}/index.html")
         shown = "img:not([hidden]):not(#player img)"
         page.locator(shown).first.wait_for(state="attached")
-        page.evaluate("(all) => document.querySelectorAll(all).forEach((one) => { one.loading = 'eager'; })", shown)
-        page.wait_for_function(
-            "(all) => Array.from(document.querySelectorAll(all)).every((one) => one.naturalWidth > 100)", arg=shown
-        )
+        load_pictures(page, shown)
         for film in page.locator("video[src]").all():
             film.evaluate(
                 "(one) => new Promise((done) => { one.onloadeddata = done; one.load(); one.preload = 'auto'; })"
