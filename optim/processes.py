@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
 import os
 import signal
@@ -17,7 +18,9 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
-_pool: ProcessPoolExecutor | None = None
+_pools: list[ProcessPoolExecutor] = []  # of one process each
+_turns = itertools.count()  # of threads that compute for the first time
+_seat = threading.local()  # of each thread: its turn
 _seconds = 0.0  # see `seconds_computed`
 
 
@@ -25,29 +28,41 @@ _seconds = 0.0  # see `seconds_computed`
 def processes(count: int) -> Iterator[None]:
     """Let what is handed to `compute` meanwhile be computed by so many processes, which start as they are needed.
 
-    With one, it is computed where it is called. Results are the same to the last bit.
+    Each thread has its process, which remembers what it has computed for it. With one, it is computed where it is
+    called. Results are the same to the last bit.
     """
-    global _pool
-    if count == 1 or _pool is not None:
+    if count == 1 or _pools:
         yield
         return
-    _pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), initializer=_begin)
+    context = multiprocessing.get_context("spawn")
+    _pools.extend(ProcessPoolExecutor(1, context, initializer=_begin) for _ in range(count))
     try:
         yield
     finally:
-        pool, _pool = _pool, None
-        pool.shutdown(cancel_futures=True)
+        pools = _pools.copy()
+        _pools.clear()
+        for pool in pools:
+            pool.shutdown(wait=False, cancel_futures=True)
+        for pool in pools:
+            pool.shutdown()
 
 
 def compute(function: Callable[..., Result], *arguments: Any) -> Result:
     """Return what a function of a module returns, computed by a process if there are any, and here otherwise."""
     global _seconds
-    if _pool is not None:
-        return _pool.submit(function, *arguments).result()
+    if _pools:
+        return _pool().submit(function, *arguments).result()
     began = time.perf_counter()
     result = function(*arguments)
     _seconds += time.perf_counter() - began
     return result
+
+
+def _pool() -> ProcessPoolExecutor:
+    """Return the process of the thread that calls this."""
+    if not hasattr(_seat, "turn"):
+        _seat.turn = next(_turns)
+    return _pools[int(_seat.turn) % len(_pools)]
 
 
 def seconds_computed() -> float:

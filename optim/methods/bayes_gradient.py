@@ -21,9 +21,10 @@ from torch import Tensor
 from ..base import Kind, Optimizer, Points, Proposal
 from ..memory import FLOAT, SearchSize
 from ..options import MANY, MethodOptions, number
-from ..processes import compute_drawing
-from .bound import NEAR, SPREAD, LowerBound, exclusive, least_point, unit
-from .surrogate import ARRAYS, GROWTH, fitted, select, with_parameters
+from .bound import NEAR, SPREAD, unit
+from .fit import with_parameters
+from .sloped import Sloped
+from .surrogate import ARRAYS, Rows, Surrogate, SurrogateOptions, select
 
 ROWS, LEAST = 1000, 20  # losses and slopes that are modelled; points of them at least: so many parameters at most
 FIT_ROWS = 400  # of them that hyper-parameters are fitted to
@@ -64,36 +65,62 @@ class BOGradient(Optimizer):
         return float(FLOAT * (ARRAYS * ROWS**2 + (SPREAD + NEAR) * ROWS * (size.dim + 1)))
 
     def _setup(self) -> None:
-        self.points = ROWS // (self.space.dim + 1)
-        if self.points < LEAST:
+        points = ROWS // (self.space.dim + 1)
+        if points < LEAST:
             raise ValueError(
                 f"{self.name} models slopes of {ROWS // LEAST - 1} parameters at most; this space has {self.space.dim}"
             )
-        self.z: Points = np.empty((0, self.space.dim))
-        self.loss: Points = np.empty(0)
-        self.grad: Points = np.empty((0, self.space.dim))
-        self.fitted = 0
-        self.hyper: Mapping[str, Points] = {}
+        self.surrogate = SlopeSurrogate(self.space.dim, self.options, points)
 
     def _ask(self) -> Proposal:
-        if len(self.loss) < self.options.initial or not np.isfinite(self.loss).any():
-            z = self.random.uniform(-1.0, 1.0, (1, self.space.dim))
-            return Proposal(torch.from_numpy(z), Kind.RANDOM, grad=True)
-        known = (self.z, self.loss, self.grad)
-        fit = self.fitted == 0 or len(self.loss) >= GROWTH * self.fitted
-        first = len(self.loss) if fit else self.fitted
-        how = (self.options.coefficient, self.hyper, fit, first, self.points)
-        z, self.hyper = compute_drawing(self.random, _minimise, *known, *how)
-        self.fitted = first
-        return Proposal(torch.from_numpy(z[None]), Kind.ACQUISITION, grad=True)
+        kind = Kind.ACQUISITION if self.surrogate.informed else Kind.RANDOM
+        return Proposal(torch.from_numpy(self.surrogate.minimise(self.random)[None]), kind, grad=True)
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
         assert grad is not None  # as asked
-        self.z, self.grad = np.concatenate([self.z, z]), np.concatenate([self.grad, grad])
-        self.loss = np.concatenate([self.loss, loss])
+        self.surrogate.learn(z, loss, grad)
 
     def _inform(self, z: Points, loss: Points, grad: Points | None) -> None:
         self._tell(z, loss, grad)
+
+    def _state(self) -> dict[str, Any]:
+        return {"surrogate": self.surrogate.state()}
+
+    def _restore(self, own: Mapping[str, Any]) -> None:
+        self.surrogate.restore(own["surrogate"])
+
+
+class SlopeSurrogate(Surrogate):
+    """Model losses and their slopes by a process of both; see `Surrogate`."""
+
+    def __init__(self, dim: int, options: BOGradientOptions, most: int) -> None:
+        super().__init__(dim, SurrogateOptions(options.coefficient, initial=options.initial, max_points=most))
+        self.grad: Points = np.empty((0, dim))
+
+    def learn(self, z: Points, loss: Points, grad: Points) -> None:
+        """Take in points and gradients, shape (count, dim), and losses, shape (count,), +inf where one failed."""
+        self.add(z, loss)
+        self.grad = np.concatenate([self.grad, grad])
+
+    def state(self) -> dict[str, Any]:
+        """Return what the process knows, as data."""
+        return super().state() | {"grad": self.grad}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Take back what `state` returned."""
+        super().restore(state)
+        self.grad = state["grad"].reshape(self.z.shape)
+
+    def _to_fit(self) -> GradientProcess:
+        chosen = select(self.loss, max(LEAST, FIT_ROWS // (1 + self.z.shape[1])))
+        rows = torch.from_numpy(standardised(self.loss, self.grad)[chosen])
+        return with_parameters(GradientProcess(unit(self.z[chosen]), rows), self._hyper)
+
+    def _covariance(self) -> Sloped:
+        return Sloped(torch.from_numpy(self._hyper["scale"]))
+
+    def _values(self, rows: Rows) -> Points:
+        return standardised(self.loss, self.grad)[rows].ravel()
 
 
 class GradientProcess(ExactGP, GPyTorchModel):  # type: ignore[misc]
@@ -115,31 +142,6 @@ class GradientProcess(ExactGP, GPyTorchModel):  # type: ignore[misc]
     def forward(self, u: Float[Tensor, "point dim"]) -> MultitaskMultivariateNormal:
         """Return the distribution of the function and its slopes at points."""
         return MultitaskMultivariateNormal(self.mean_module(u), self.covar_module(u))
-
-
-def _minimise(
-    z: Points,
-    loss: Points,
-    grad: Points,
-    coefficient: float,
-    hyper: Mapping[str, Points],
-    fit: bool,
-    first: int,
-    points: int,
-    random: np.random.Generator,
-) -> tuple[Points, Mapping[str, Points]]:
-    """Return where the bound is least, and the hyper-parameters, which were fitted to the `first` points or now are."""
-    rows = standardised(loss, grad)
-
-    def condition(count: int) -> GradientProcess:
-        chosen = select(loss, count)
-        return with_parameters(GradientProcess(unit(z[chosen]), torch.from_numpy(rows[chosen])), hyper)
-
-    with exclusive():
-        if fit:
-            hyper = fitted(condition(max(LEAST, FIT_ROWS // rows.shape[1])))
-        held = first if len(loss) <= points else None
-        return least_point(LowerBound(condition(points).eval(), coefficient, held), z, loss, random), hyper
 
 
 def standardised(loss: Points, grad: Points) -> Points:

@@ -6,18 +6,16 @@ take longer than the numbers themselves where a process has a few hundred points
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from gpytorch.kernels import Kernel, MaternKernel, RBFKernel
 from jaxtyping import Float
-from linear_operator.utils.cholesky import psd_safe_cholesky
 from torch import Tensor
 
 Matrix = Float[Tensor, "row column"]
-Pull = Callable[[Matrix], Float[Tensor, "row dim"]]
+Pull = Callable[[Matrix], Tensor]
 
 
 def squared_exponential(squares: Matrix) -> tuple[Matrix, Matrix]:
@@ -33,20 +31,23 @@ def matern(squares: Matrix) -> tuple[Matrix, Matrix]:
     return (1.0 + root + 5.0 / 3.0 * squares) * decay, -5.0 / 6.0 * (1.0 + root) * decay
 
 
+PROFILES = {"rbf": squared_exponential, "matern": matern}
+
+
 @dataclass(frozen=True)
 class Radial:
-    """A covariance k(s) where s = sum_j (u_j - v_j)^2 / scale_j^2; `profile` returns k and dk/ds."""
+    """A covariance k(s) where s = sum_j (u_j - v_j)^2 / scale_j^2; `profile` names what returns k and dk/ds."""
 
-    profile: Callable[[Matrix], tuple[Matrix, Matrix]]
+    profile: str
     scale: Float[Tensor, " dim"]
 
     @classmethod
     def of(cls, kernel: Kernel) -> Radial:
         """Return what a kernel of GPyTorch computes, as it is now. Raises ValueError for one that is not radial."""
         if isinstance(kernel, RBFKernel):
-            profile = squared_exponential
+            profile = "rbf"
         elif isinstance(kernel, MaternKernel) and kernel.nu == 2.5:
-            profile = matern
+            profile = "matern"
         else:
             raise ValueError(f"a radial covariance is an RBFKernel or a MaternKernel of 5/2; got {kernel}")
         return cls(profile, kernel.lengthscale.detach().reshape(-1).clone())
@@ -55,7 +56,7 @@ class Radial:
         """Return k of every pair of points of [0, 1]^dim, and dk/ds."""
         u, v = (u - 0.5) / self.scale, (v - 0.5) / self.scale
         squares = u.square().sum(dim=1)[:, None] + v.square().sum(dim=1)
-        return self.profile(squares.addmm_(u, v.T, alpha=-2.0).clamp_min_(0.0))
+        return PROFILES[self.profile](squares.addmm_(u, v.T, alpha=-2.0).clamp_min_(0.0))
 
     def dense(self, u: Float[Tensor, "row dim"], v: Float[Tensor, "column dim"]) -> Matrix:
         """Return k of every pair of points."""
@@ -71,32 +72,16 @@ class Radial:
 
         return value, pull
 
+    def within(self, u: Float[Tensor, "row dim"]) -> tuple[Matrix, Pull]:
+        """Return k of points with one another, and what pulls symmetric slopes by k back to slopes by length-scales.
 
-@dataclass(frozen=True)
-class Likelihood:
-    """The logarithm of a marginal likelihood, and its derivatives by length-scales and by the noise's variance."""
+        Of sum_ab M_ab (u_aj - u_bj)^2, with M = slopes times dk/ds, products of M with u are taken apart.
+        """
+        value, slope = self.between(u, u)
 
-    value: float
-    scale: Float[Tensor, " dim"]
-    noise: float
+        def pull(weights: Matrix) -> Float[Tensor, " dim"]:
+            moments, centred = weights * slope, u - 0.5
+            spread = moments.sum(dim=1) @ centred.square() - (centred * (moments @ centred)).sum(dim=0)
+            return -4.0 * spread / self.scale**3
 
-
-def marginal_likelihood(
-    kernel: Radial, noise: float, u: Float[Tensor, "point dim"], values: Float[Tensor, " point"]
-) -> Likelihood:
-    """Return how likely values at points are under a process with zero mean (Rasmussen & Williams 2006, section 5.4.1).
-
-    With W = alpha alpha^T - K^-1, alpha = K^-1 values, a derivative is tr(W dK) / 2 (eq. 5.9), and of the length-scales
-    sum_ab M_ab (u_aj - u_bj)^2 is taken apart into products of M = W dk/ds with u, M being symmetric.
-    """
-    covariance, slope = kernel.between(u, u)
-    covariance.diagonal().add_(noise)
-    lower = psd_safe_cholesky(covariance)
-    inverse = torch.cholesky_inverse(lower)
-    alpha = inverse @ values
-    value = -0.5 * (values @ alpha) - lower.diagonal().log().sum() - 0.5 * len(values) * math.log(2.0 * math.pi)
-    weights = torch.outer(alpha, alpha).sub_(inverse)
-    noise_slope = 0.5 * float(weights.diagonal().sum())
-    moments, centred = weights.mul_(slope), u - 0.5
-    spread = moments.sum(dim=1) @ centred.square() - (centred * (moments @ centred)).sum(dim=0)
-    return Likelihood(float(value), -2.0 * spread / kernel.scale**3, noise_slope)
+        return value, pull

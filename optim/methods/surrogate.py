@@ -2,36 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar, get_args, get_type_hints
+from typing import Any, Literal, get_args, get_type_hints
 
 import numpy as np
 import torch
 from botorch.models import SingleTaskGP
 from botorch.models.utils.gpytorch_modules import get_covar_module_with_dim_scaled_prior
-from botorch.optim.fit import fit_gpytorch_mll_scipy
 from gpytorch.means import ZeroMean
-from gpytorch.mlls import ExactMarginalLogLikelihood
 from gpytorch.models import ExactGP
 from numpy.typing import NDArray
-from torch import Tensor
 
 from ..base import Points
 from ..memory import FLOAT, SearchSize
 from ..options import MANY, MethodOptions, number
 from ..processes import compute_drawing
 from .bound import NEAR, SPREAD, LowerBound, exclusive, least_point, unit
+from .fit import GROWTH, fitted, with_parameters
 from .magnitude import tame
-from .radial import Radial, marginal_likelihood
+from .process import Covariance, Process
+from .radial import Radial
 
 Rows = NDArray[np.intp]
-Process = TypeVar("Process", bound=ExactGP)
 
 ARRAYS = 16  # of points x points: ten that a process makes (measured with BoTorch 0.16), and factors kept
-GROWTH = 1.1  # hyper-parameters are fitted anew when there are this many times more points than at the last fit
-FIT_STEPS = 30  # of L-BFGS, from where the last fit ended
-FIT_POINTS = 300  # points to fit them to, evenly spread over the run: each step's cost grows with their cube
+FIT_POINTS = 300  # points to fit hyper-parameters to, spread over the run: each step's cost grows with their cube
+LEAST_SPREAD = 1e-8  # of losses that are put in deviations from their average, as in BoTorch's `Standardize`
 WORTH = 100  # points of a process from which on handing it to another process is worth while
 
 
@@ -42,7 +39,8 @@ class SurrogateOptions(MethodOptions):
     `coefficient` is how many standard deviations the bound lies below the mean. `kernel` is squared-exponential or
     Matern-5/2, with a length-scale per parameter. Points are drawn at random until `initial` of them are known: fewer
     say nothing about length-scales, and the search would settle on what they suggest. `max_points` points are
-    modelled: of more, the half with the least losses, and as many of the others, spread evenly over the run.
+    modelled at most: of more, those with the least losses for one half and as many of the others, spread evenly over
+    the run, chosen anew whenever the process is full or its length-scales are fitted.
     """
 
     method = "bo"
@@ -73,7 +71,9 @@ class Surrogate:
         self.z: Points = np.empty((0, dim))
         self.loss: Points = np.empty(0)
         self._fitted = 0  # points at the last fit
-        self._hyper: dict[str, Points] = {}
+        self._hyper: dict[str, Points] = {}  # see `fit.fitted`
+        self._chosen: Rows = np.empty(0, np.intp)  # those modelled of the first `_seen` points; all later ones are, too
+        self._seen = 0
 
     @property
     def informed(self) -> bool:
@@ -87,12 +87,14 @@ class Surrogate:
 
     def state(self) -> dict[str, Any]:
         """Return what the process knows, as data."""
-        return {"z": self.z, "loss": self.loss, "fitted": self._fitted, "hyper": self._hyper}
+        learnt = {"fitted": self._fitted, "hyper": self._hyper, "chosen": self._chosen, "seen": self._seen}
+        return {"z": self.z, "loss": self.loss, **learnt}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Take back what `state` returned."""
         self.z, self.loss = state["z"].reshape(-1, self.z.shape[1]), state["loss"]
         self._fitted, self._hyper = int(state["fitted"]), dict(state["hyper"])
+        self._chosen, self._seen = state["chosen"], int(state["seen"])
 
     def minimise(self, random: np.random.Generator) -> Points:
         """Return where mean - coefficient * standard deviation is least, shape (dim,); a random point before."""
@@ -104,28 +106,53 @@ class Surrogate:
         self.restore(learnt)
         return least
 
-    def model(self) -> SingleTaskGP:
+    def process(self) -> Process:
         """Return the process over [0, 1]^dim given the points, its hyper-parameters fitted if that is due."""
         with exclusive():
-            count = len(self.loss)
-            if self._fitted == 0 or count >= GROWTH * self._fitted:
-                self._hyper = fitted(self._condition(_thin(np.arange(count), FIT_POINTS)))
-                self._fitted = count
-            return self._condition(select(self.loss, self.options.max_points)).eval()
+            rows = self._learn()
+            u, values = unit(self.z[rows]), torch.from_numpy(self._values(rows))
+            return Process(self._covariance(), float(self._hyper["noise"][0]), u, values, len(self._chosen))
 
-    @property
-    def first(self) -> int | None:
-        """How many of the points, the first, it was fitted to last; None where it no longer holds all of them."""
-        return self._fitted if len(self.loss) <= self.options.max_points else None
+    def model(self) -> SingleTaskGP:
+        """Return the same as BoTorch's model of the losses as they are."""
+        with exclusive():
+            return self._condition(self._learn()).eval()
+
+    def _learn(self) -> Rows:
+        """Fit hyper-parameters and choose points anew if that is due, and return which points are modelled."""
+        count = len(self.loss)
+        due = self._fitted == 0 or count >= GROWTH * self._fitted
+        if due:
+            self._hyper, self._fitted = fitted(self._to_fit()), count
+        most = self.options.max_points
+        if due or len(self._chosen) + count - self._seen > most:
+            room = most if count <= most else max(1, int(most / GROWTH))
+            self._chosen, self._seen = select(self.loss, room), count
+        return np.concatenate([self._chosen, np.arange(self._seen, count)])
+
+    def _to_fit(self) -> ExactGP:
+        """Return the model whose hyper-parameters are fitted."""
+        return self._condition(_thin(np.arange(len(self.loss)), FIT_POINTS))
+
+    def _covariance(self) -> Covariance:
+        return Radial(self.options.kernel, torch.from_numpy(self._hyper["scale"]))
+
+    def _values(self, rows: Rows) -> Points:
+        """Return a number for each row of the process: losses in deviations from their average, as BoTorch has them."""
+        loss = self._losses()[rows]
+        spread = float(loss.std(ddof=1)) if len(loss) > 1 else 0.0
+        return np.asarray((loss - loss.mean()) / (spread if spread >= LEAST_SPREAD else 1.0))
+
+    def _losses(self) -> Points:
+        finite = np.isfinite(self.loss)
+        return tame(np.where(finite, self.loss, self.loss[finite].max()))  # a failure counts as the worst so far
 
     def _condition(self, rows: Rows) -> SingleTaskGP:
-        """Return the process given some of the points, with the hyper-parameters of the last fit."""
-        finite = np.isfinite(self.loss)
-        loss = tame(np.where(finite, self.loss, self.loss[finite].max()))  # a failure counts as the worst so far
+        """Return BoTorch's model of some of the points, with the hyper-parameters of the last fit."""
         dim = self.z.shape[1]
         model = SingleTaskGP(
             unit(self.z[rows]),
-            torch.from_numpy(loss[rows])[:, None],
+            torch.from_numpy(self._losses()[rows])[:, None],
             mean_module=ZeroMean(),
             covar_module=get_covar_module_with_dim_scaled_prior(dim, use_rbf_kernel=self.options.kernel == "rbf"),
         )
@@ -135,7 +162,7 @@ class Surrogate:
 def _minimise(surrogate: Surrogate, random: np.random.Generator) -> tuple[Points, dict[str, Any]]:
     """Return where the bound of a surrogate is least, and what it knows then."""
     with exclusive():
-        bound = LowerBound(surrogate.model(), surrogate.options.coefficient, surrogate.first)
+        bound = LowerBound(surrogate.process(), surrogate.options.coefficient)
         return least_point(bound, surrogate.z, surrogate.loss, random), surrogate.state()
 
 
@@ -156,41 +183,3 @@ def select(loss: Points, count: int) -> Rows:
         return np.arange(len(loss))
     best, others = np.split(np.argsort(loss, kind="stable"), [count // 2])
     return np.sort(np.concatenate([best, _thin(np.sort(others), count - len(best))]))
-
-
-def fitted(model: ExactGP) -> dict[str, Points]:
-    """Return the parameters at which marginal likelihood times priors is largest, from where they are, by name."""
-    likelihood = ExactMarginalLogLikelihood(model.likelihood, model).train()
-    how: dict[str, Any] = {"closure": closure_of(likelihood)} if isinstance(model, SingleTaskGP) else {}
-    fit_gpytorch_mll_scipy(likelihood, dict(likelihood.named_parameters()), options={"maxiter": FIT_STEPS}, **how)
-    return {name: value.detach().numpy().copy() for name, value in model.named_parameters()}
-
-
-def closure_of(likelihood: ExactMarginalLogLikelihood) -> Callable[[], tuple[Tensor, list[Tensor]]]:
-    """Return what gives minus the logarithm of likelihood times priors, for each point, and its slopes by parameters.
-
-    It is what BoTorch's closure gives for a process without mean whose parameters are not transformed.
-    """
-    model = likelihood.model
-    u, values, parameters = model.train_inputs[0], model.train_targets, list(likelihood.parameters())
-
-    def closure() -> tuple[Tensor, list[Tensor]]:
-        kernel, noise = model.covar_module, model.likelihood.noise
-        with torch.no_grad():
-            found = marginal_likelihood(Radial.of(kernel), float(noise), u, values)
-        # what is linear in the parameters with these slopes has the likelihood's slopes
-        linear = (kernel.lengthscale.reshape(-1) * found.scale).sum() + (noise * found.noise).sum()
-        priors = sum(prior.log_prob(of(module)).sum() for _, module, prior, of, _ in model.named_priors())
-        slopes = torch.autograd.grad(-(linear + priors) / len(values), parameters)
-        return -(found.value + priors.detach()) / len(values), list(slopes)
-
-    return closure
-
-
-def with_parameters(model: Process, parameters: Mapping[str, Points]) -> Process:
-    """Return a process, those of its parameters that are named set to these."""
-    with torch.no_grad():
-        for name, value in model.named_parameters():
-            if name in parameters:
-                value.copy_(torch.from_numpy(parameters[name]))
-    return model

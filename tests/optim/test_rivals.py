@@ -5,6 +5,8 @@ import math
 import numpy as np
 import pytest
 import torch
+from botorch.optim.closures import get_loss_closure_with_grads
+from gpytorch.mlls import ExactMarginalLogLikelihood
 from scipy.optimize import Bounds, basinhopping, minimize
 
 from gradscape.landscapes.adapters import from_torch
@@ -16,6 +18,8 @@ from gradscape.optim.methods.bayes_gradient import BOGradient, GradientProcess, 
 from gradscape.optim.methods.bound import LowerBound
 from gradscape.optim.methods.cmaes import CMAES
 from gradscape.optim.methods.cmaes_gradient import CMAESGradient
+from gradscape.optim.methods.fit import closure_of
+from gradscape.optim.methods.process import Process, covariance_of
 from gradscape.optim.methods.quasi_newton import LBFGSB, BasinHopping
 from gradscape.optim.methods.surrogate import Surrogate, SurrogateOptions
 from gradscape.optim.methods.turbo import TuRBO, TuRBOOptions, region
@@ -240,14 +244,36 @@ def test_the_process_of_losses_and_slopes_is_that_of_the_closed_form():
     inverse, cross = np.linalg.inv(k(u, u) + noise * np.eye(21)), k(new, u)[::3]
     mean = cross @ inverse @ standardised(loss, grad).ravel()
     deviation = np.sqrt(1.0 - np.einsum("ij,jk,ik->i", cross, inverse, cross))
-    for first in (None, 4):  # at once, or going on from four points
-        bound, points = LowerBound(model.eval(), 2.0, first), torch.from_numpy(new)
+    covariance, values = covariance_of(model.covar_module), model.train_targets.reshape(-1)
+    for first in (7, 4):  # at once, or going on from four points
+        process = Process(covariance, noise, torch.from_numpy(u), values, first)
+        bound, points = LowerBound(process, 2.0), torch.from_numpy(new)
         value, slope = bound.with_slope(points)
         np.testing.assert_allclose(value, mean - 2.0 * deviation, rtol=1e-8)
         np.testing.assert_allclose(bound(points), value)
         step = 1e-5 * torch.eye(2, dtype=torch.float64)
         differences = [(bound(points + one) - bound(points - one)) / 2e-5 for one in step]
         np.testing.assert_allclose(slope, torch.stack(differences, dim=1), rtol=1e-5, atol=1e-6)
+
+
+def test_the_covariance_of_slopes_and_the_likelihood_are_those_of_gpytorch():
+    random = np.random.default_rng(2)
+    u, loss, grad = random.uniform(size=(9, 3)), random.normal(size=9), random.normal(size=(9, 3))
+    model = GradientProcess(torch.from_numpy(u), torch.from_numpy(standardised(loss, grad)))
+    model.covar_module.lengthscale = torch.tensor([0.3, 0.7, 1.9])
+    other = torch.from_numpy(random.uniform(size=(4, 3)))
+    covariance = covariance_of(model.covar_module)
+    for one, two in ((torch.from_numpy(u), other), (other, other)):
+        wanted = model.covar_module(one, two).to_dense().detach()
+        torch.testing.assert_close(covariance.dense(one, two), wanted)
+        torch.testing.assert_close(covariance.across(one, two)[0], wanted[::4])
+    likelihood = ExactMarginalLogLikelihood(model.likelihood, model).train()
+    parameters = {name: one for name, one in likelihood.named_parameters() if one.requires_grad}
+    wanted, slopes = get_loss_closure_with_grads(likelihood, parameters)()
+    value, found = closure_of(likelihood)()
+    torch.testing.assert_close(value, wanted.detach(), rtol=1e-9, atol=1e-9)
+    for one, two in zip(found, slopes, strict=True):
+        torch.testing.assert_close(one, two, rtol=1e-6, atol=1e-8)
 
 
 def test_slopes_tell_the_process_more_than_losses_alone():
