@@ -54,7 +54,7 @@ class Solver:
     ) -> None:
         self.ball, self.dt, self.steps, self.device = ball, dt, steps, device
         self.types = precision(name)
-        self.kernel = step_kernel(name, contacts)
+        self.kernel = flight_kernel(name, contacts)
         load([self.kernel], device)
         self.data = _constants(ball, dt, name)
         shape, vec3 = (steps + 1, capacity), self.types.vec3
@@ -67,9 +67,7 @@ class Solver:
         batch = len(velocity)
         to_torch(self.x)[0, :batch] = start.to(self.types.torch)
         to_torch(self.v)[0, :batch] = velocity.to(self.types.torch)
-        for step in range(self.steps):
-            inputs = [step, self.data, *self.state]
-            wp.launch(self.kernel, batch, inputs, device=self.device, record_tape=False)
+        wp.launch(self.kernel, batch, [self.steps, self.data, *self.state], device=self.device, record_tape=False)
         return to_torch(self.x)[:, :batch]
 
     def gradient(self, adj_x: torch.Tensor) -> torch.Tensor:
@@ -80,8 +78,7 @@ class Solver:
         to_torch(self.adjoint[0])[-1, :batch] = adj_x.to(self.types.torch)
         settings: dict[str, Any] = {"device": self.device, "adjoint": True, "record_tape": False}
         settings["adj_inputs"] = [None, type(self.data)(), *self.adjoint]
-        for step in reversed(range(self.steps)):
-            wp.launch(self.kernel, batch, [step, self.data, *self.state], **settings)
+        wp.launch(self.kernel, batch, [self.steps, self.data, *self.state], **settings)
         return to_torch(self.adjoint[1])[0, :batch].clone()
 
 
@@ -147,8 +144,12 @@ def ground(name: str) -> Ground:
 
 @cache
 @no_type_check
-def step_kernel(name: str, contacts: str) -> Any:
-    """Return the kernel of one semi-implicit Euler step, in which the ball may meet the ground as `contacts` says."""
+def flight_kernel(name: str, contacts: str) -> Any:
+    """Return the kernel of a flight in semi-implicit Euler steps; a ball meets the ground as `contacts` says.
+
+    One thread takes a flight through all its steps, since a launch costs more than a step. Nothing is carried from step
+    to step but by the arrays: variables that a loop carries would be lost to its derivatives.
+    """
     types, module = precision(name), f"gradscape.rigid.{contacts}.{name}"
     real, vec3, Vecs = types.real, types.vec3, wp.array2d[types.vec3]
     Data, fly, rub = ground(name)
@@ -174,20 +175,21 @@ def step_kernel(name: str, contacts: str) -> Any:
         return speed + dt * force, roll + (dt * data.turning) * f_t
 
     @wp.kernel(module=module)
-    def advance(step: int, data: Data, x: Vecs, v: Vecs, roll: Vecs):
+    def advance(steps: int, data: Data, x: Vecs, v: Vecs, roll: Vecs):
         e = wp.tid()
-        here, speed, turn = x[step, e], v[step, e], roll[step, e]
-        c = here[1] - data.radius
-        if c < real(0.0):
-            after, turned = push(data, data.dt, c, speed, turn)
-            v[step + 1, e] = after
-            roll[step + 1, e] = turned
-            x[step + 1, e] = here + data.dt * after
-        else:
-            flown = speed + data.dt * fly(data, speed)
-            v[step + 1, e] = flown
-            roll[step + 1, e] = turn
-            x[step + 1, e] = here + data.dt * flown
+        for step in range(steps):
+            here, speed, turn = x[step, e], v[step, e], roll[step, e]
+            c = here[1] - data.radius
+            if c < real(0.0):
+                after, turned = push(data, data.dt, c, speed, turn)
+                v[step + 1, e] = after
+                roll[step + 1, e] = turned
+                x[step + 1, e] = here + data.dt * after
+            else:
+                flown = speed + data.dt * fly(data, speed)
+                v[step + 1, e] = flown
+                roll[step + 1, e] = turn
+                x[step + 1, e] = here + data.dt * flown
 
     @wp.func(module=module)
     def time_to_touch(data: Data, c: real, v_n: real, a: real) -> real:
@@ -202,23 +204,24 @@ def step_kernel(name: str, contacts: str) -> Any:
         return (root + v_n) / (real(-2.0) * a)
 
     @wp.kernel(module=module)
-    def advance_to_touch(step: int, data: Data, x: Vecs, v: Vecs, roll: Vecs):
+    def advance_to_touch(steps: int, data: Data, x: Vecs, v: Vecs, roll: Vecs):
         e = wp.tid()
-        here, speed, turn = x[step, e], v[step, e], roll[step, e]
-        c = here[1] - data.radius
-        a = fly(data, speed)
-        t = time_to_touch(data, c, speed[1], a[1])
-        met = speed + t * a
-        there = here + t * met
-        left = data.dt - t
-        if left > real(0.0):
-            after, turned = push(data, left, wp.min(c, real(0.0)), met, turn)
-            v[step + 1, e] = after
-            roll[step + 1, e] = turned
-            x[step + 1, e] = there + left * after
-        else:
-            v[step + 1, e] = met
-            roll[step + 1, e] = turn
-            x[step + 1, e] = there
+        for step in range(steps):
+            here, speed, turn = x[step, e], v[step, e], roll[step, e]
+            c = here[1] - data.radius
+            a = fly(data, speed)
+            t = time_to_touch(data, c, speed[1], a[1])
+            met = speed + t * a
+            there = here + t * met
+            left = data.dt - t
+            if left > real(0.0):
+                after, turned = push(data, left, wp.min(c, real(0.0)), met, turn)
+                v[step + 1, e] = after
+                roll[step + 1, e] = turned
+                x[step + 1, e] = there + left * after
+            else:
+                v[step + 1, e] = met
+                roll[step + 1, e] = turn
+                x[step + 1, e] = there
 
     return advance_to_touch if contacts == "touch" else advance
