@@ -134,6 +134,7 @@ class SemiLocal:
                 "CMA_rankmu": 0,
                 "CMA_active": False,
                 "CMA_diagonal_decoding": 0,
+                "CMA_mirrors": 0,  # which the library draws of populations below six
                 "AdaptSigma": PathLength,
                 "randn": Normal(random),
                 "seed": np.nan,  # leave numpy's own generator alone

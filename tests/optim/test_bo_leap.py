@@ -67,6 +67,15 @@ def test_a_population_is_drawn_around_the_leapt_point():
     np.testing.assert_allclose(np.cov(drawn.T), expected, atol=0.25 * expected.max())
 
 
+def test_no_point_of_a_small_population_mirrors_another():
+    local = SemiLocal(np.zeros(3), BOLeapOptions(population=5, best=2), np.random.default_rng(0))
+    for _ in range(3):
+        x = local.draw()
+        directions = (x - local.es.mean) / np.linalg.norm(x - local.es.mean, axis=1, keepdims=True)
+        assert (directions @ directions.T).min() > -0.999
+        local.tell(x, (x**2).sum(axis=1))
+
+
 def test_a_local_step_is_a_population_the_mean_of_its_best_five_and_a_descent_from_there():
     table = search(RIPPLES, BOLeap(SPACE, seed=1), budget=120, gradient_cost=2.0).dataset()
     x, loss, kind = (table[name].to_numpy() for name in ("x", "loss", "kind"))
