@@ -77,6 +77,14 @@ class Process:
             _factors.popitem(last=False)
         return found
 
+    @torch.no_grad()
+    def posterior(self, u: PointsTensor) -> tuple[Float[Tensor, " point"], Matrix]:
+        """Return mean and covariance of the values at points, given what is known, of points with one row each."""
+        factor, cross = self.factor(), self.covariance.dense(u, self.u)
+        white = factor.whiten(cross)
+        weights = factor.solve_whitened(factor.whiten(self.values[None]))[0]
+        return cross @ weights, self.covariance.dense(u, u).addmm_(white, white.T, alpha=-1.0)
+
 
 @dataclass(frozen=True)
 class Factor:

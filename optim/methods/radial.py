@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from gpytorch.kernels import Kernel, MaternKernel, RBFKernel
@@ -18,25 +19,51 @@ Matrix = Float[Tensor, "row column"]
 Pull = Callable[[Matrix], Tensor]
 
 
-def squared_exponential(squares: Matrix) -> tuple[Matrix, Matrix]:
-    """Return exp(-s / 2) of squared distances s, and its derivative by s."""
-    value = torch.exp(-0.5 * squares)
-    return value, -0.5 * value
+class Profile(Protocol):
+    """A covariance k as a function of the squared distance s, shape (row, column)."""
+
+    def value(self, squares: Matrix) -> Matrix:
+        """Return k, written over s: matrices of thousands of points are to be made once."""
+
+    def both(self, squares: Matrix) -> tuple[Matrix, Matrix]:
+        """Return k and dk/ds."""
 
 
-def matern(squares: Matrix) -> tuple[Matrix, Matrix]:
-    """Return the Matern-5/2 covariance of squared distances s, and its derivative by s."""
-    root = torch.sqrt(5.0 * squares)  # Rasmussen & Williams 2006, eq. 4.17
-    decay = torch.exp(-root)
-    return (1.0 + root + 5.0 / 3.0 * squares) * decay, -5.0 / 6.0 * (1.0 + root) * decay
+class SquaredExponential:
+    """exp(-s / 2)."""
+
+    def value(self, squares: Matrix) -> Matrix:
+        """Return k, written over s."""
+        return squares.mul_(-0.5).exp_()
+
+    def both(self, squares: Matrix) -> tuple[Matrix, Matrix]:
+        """Return k and dk/ds."""
+        value = self.value(squares)
+        return value, -0.5 * value
 
 
-PROFILES = {"rbf": squared_exponential, "matern": matern}
+class Matern:
+    """Matern's of smoothness 5/2 (Rasmussen & Williams 2006, eq. 4.17)."""
+
+    def value(self, squares: Matrix) -> Matrix:
+        """Return k, written over s."""
+        root = squares.mul_(5.0).sqrt_()
+        polynomial = root.square().div_(3.0).add_(root).add_(1.0)
+        return polynomial.mul_(root.neg_().exp_())
+
+    def both(self, squares: Matrix) -> tuple[Matrix, Matrix]:
+        """Return k and dk/ds."""
+        root = torch.sqrt(5.0 * squares)
+        decay = torch.exp(-root)
+        return (1.0 + root + 5.0 / 3.0 * squares) * decay, -5.0 / 6.0 * (1.0 + root) * decay
+
+
+PROFILES: dict[str, Profile] = {"rbf": SquaredExponential(), "matern": Matern()}
 
 
 @dataclass(frozen=True)
 class Radial:
-    """A covariance k(s) where s = sum_j (u_j - v_j)^2 / scale_j^2; `profile` names what returns k and dk/ds."""
+    """A covariance k(s) where s = sum_j (u_j - v_j)^2 / scale_j^2; `profile` is the name of k."""
 
     profile: str
     scale: Float[Tensor, " dim"]
@@ -54,13 +81,16 @@ class Radial:
 
     def between(self, u: Float[Tensor, "row dim"], v: Float[Tensor, "column dim"]) -> tuple[Matrix, Matrix]:
         """Return k of every pair of points of [0, 1]^dim, and dk/ds."""
-        u, v = (u - 0.5) / self.scale, (v - 0.5) / self.scale
-        squares = u.square().sum(dim=1)[:, None] + v.square().sum(dim=1)
-        return PROFILES[self.profile](squares.addmm_(u, v.T, alpha=-2.0).clamp_min_(0.0))
+        return PROFILES[self.profile].both(self._squares(u, v))
 
     def dense(self, u: Float[Tensor, "row dim"], v: Float[Tensor, "column dim"]) -> Matrix:
         """Return k of every pair of points."""
-        return self.between(u, v)[0]
+        return PROFILES[self.profile].value(self._squares(u, v))
+
+    def _squares(self, u: Float[Tensor, "row dim"], v: Float[Tensor, "column dim"]) -> Matrix:
+        u, v = (u - 0.5) / self.scale, (v - 0.5) / self.scale
+        squares = u.square().sum(dim=1)[:, None] + v.square().sum(dim=1)
+        return squares.addmm_(u, v.T, alpha=-2.0).clamp_min_(0.0)
 
     def across(self, u: Float[Tensor, "row dim"], v: Float[Tensor, "column dim"]) -> tuple[Matrix, Pull]:
         """Return k, and what pulls a function's slopes by k, shape (row, column), back to its slopes by `u`."""

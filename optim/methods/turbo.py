@@ -124,16 +124,13 @@ def _sample(
     surrogate: Surrogate, options: TuRBOOptions, length: float, random: np.random.Generator
 ) -> tuple[Points, dict[str, Any]]:
     """Return a batch of points of the region, and what the process knows then."""
-    with exclusive(), torch.no_grad():
-        with torch.enable_grad():
-            model = surrogate.model()
-        scales = model.covar_module.lengthscale.detach().squeeze(0).numpy()
-        count = candidates_of(options.candidates, surrogate.z.shape[1])
+    with exclusive():
+        process = surrogate.process()
+        scales, count = process.covariance.scale.numpy(), candidates_of(options.candidates, surrogate.z.shape[1])
         candidates = torch.from_numpy(region(surrogate, scales, length, count, random))
-        posterior: Any = model.posterior(candidates)
-        mean, covariance = posterior.mean[:, 0].numpy(), posterior.distribution.covariance_matrix
+        mean, covariance = process.posterior(candidates)
         root = psd_safe_cholesky(covariance).numpy()
-        samples = mean[:, None] + root @ random.standard_normal((len(mean), options.batch_size))
+        samples = mean.numpy()[:, None] + root @ random.standard_normal((count, options.batch_size))
     chosen = candidates.numpy()[samples.argmin(axis=0)]
     return 2.0 * chosen - 1.0, surrogate.state()
 

@@ -84,6 +84,18 @@ def test_the_bound_and_its_slopes_are_those_of_botorch(kernel, first):
 
 
 @pytest.mark.parametrize("kernel", ["rbf", "matern"])
+def test_the_posterior_is_that_of_botorch(kernel):
+    surrogate = informed(kernel=kernel)
+    model = surrogate.model()
+    points = torch.rand(20, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    mean, covariance = surrogate.process().posterior(points)
+    wanted, scale = model.posterior(points), model.outcome_transform
+    torch.testing.assert_close(scale.untransform(mean[:, None])[0], wanted.mean.detach(), rtol=1e-9, atol=1e-9)
+    covariance = covariance * scale.stdvs[0] ** 2
+    torch.testing.assert_close(covariance, wanted.distribution.covariance_matrix.detach(), rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("kernel", ["rbf", "matern"])
 def test_fits_climb_the_likelihood_that_botorch_has(kernel):
     model = informed(kernel=kernel).model()
     likelihood = ExactMarginalLogLikelihood(model.likelihood, model).train()
