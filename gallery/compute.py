@@ -20,6 +20,7 @@ from .companions import CompanionPart
 from .episodes import EpisodePart
 from .figures import Figure
 from .league import LeaguePart
+from .league_slices import LeagueSlicePart
 from .measures import ReportPart, TradeoffPart
 from .parts import FigurePart, SearchPart, SlicePart, SweepPart
 
@@ -33,6 +34,7 @@ PARTS: dict[str, type[FigurePart]] = {
     "reports": ReportPart,
     "tradeoffs": TradeoffPart,
     "league": LeaguePart,
+    "league-slices": LeagueSlicePart,
 }
 IF_NAMED = {"league"}  # parts that take so long that they are made where they are asked for, and not with all others
 

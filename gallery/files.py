@@ -125,3 +125,24 @@ class LeagueFiles:
     def there(self) -> bool:
         """Say whether all are there."""
         return all(one.is_file() for one in (self.record, self.picture, self.dark, self.runs))
+
+
+@dataclass(frozen=True)
+class LeagueSliceFiles:
+    """Name the files of the slice through the best point of a league's race: its folder, record and pictures."""
+
+    folder: Path
+    record: Path
+    picture: Path
+    dark: Path  # the picture for a dark page
+
+    @classmethod
+    def of(cls, root: Path, env: str) -> LeagueSliceFiles:
+        """Return where that of an environment is, in the gallery's data or in its site."""
+        folder = root / LEAGUE / env
+        picture = folder / "medians.png"
+        return cls(folder, folder / "medians.json", picture, folder / dark_name(picture.name))
+
+    def there(self) -> bool:
+        """Say whether all are there."""
+        return all(one.is_file() for one in (self.record, self.picture, self.dark)) and (self.folder / STORE).is_dir()
