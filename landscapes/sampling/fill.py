@@ -20,7 +20,7 @@ from ..space import as_whole
 from ..storage.disk import full, is_full
 from ..storage.store import SliceStore
 from ..storage.tiles import Tile
-from .distribution import FilledTile, ReadBack, Site, WorkersLostError, distribute, equal_batches, workers_of
+from .distribution import FilledTile, ReadBack, Site, WorkersLostError, distribute
 from .memory import MemoryBound
 
 
@@ -123,10 +123,9 @@ def _fill(
     site: Site, pending: Sequence[Tile], batch: int, executor: Executor | None
 ) -> Generator[FilledTile, None, None]:
     if executor is None:
-        for tiles in _batches(site.store, batch, set(pending)):
-            yield from site.fill(tiles)
+        yield from site.fill(site.store.tiles(), batch, pending)
     elif pending:
-        yield from distribute(site, equal_batches(site.store, pending, batch, workers_of(executor)), executor)
+        yield from distribute(site, pending, batch, executor)
 
 
 def _warn_of_damage(store: SliceStore, pending: Sequence[Tile]) -> None:
@@ -154,16 +153,3 @@ def resumable(store: SliceStore, counts: Counter[Status]) -> Iterator[None]:
 def _check_store(store: SliceStore, objective: Objective, plane: Plane, *, grad: bool) -> None:
     wanted = {"plane": plane.record(), "parameters": list(objective.space.names), "gradients": grad}
     check_identity(store.path, wanted=wanted, found={name: store.identity[name] for name in wanted})
-
-
-def _batches(store: SliceStore, batch: int, pending: set[Tile]) -> Iterator[list[Tile]]:
-    """Group all tiles the same way however many are pending, so that a resumed run repeats the same batches."""
-    group: list[Tile] = []
-    size = 0
-    for tile in store.tiles():
-        group.append(tile)
-        size += store.count(tile)
-        if size >= batch:
-            yield [member for member in group if member in pending]
-            group, size = [], 0
-    yield [member for member in group if member in pending]
