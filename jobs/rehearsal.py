@@ -141,7 +141,7 @@ def store_replica(replica: Replica, store: SliceStore) -> Stored:
             raise _Enough
 
     with contextlib.suppress(_Enough):
-        sample(replica, store.plane, store, grad=store.grad, progress=follow)
+        sample(replica, store.plane, store, gradients=int(store.grad), progress=follow)
     after = room_of(store.place or path)
     size, files = (
         round(old + (new - old) * total / done)

@@ -68,9 +68,7 @@ class Site:
         """Return the site as it is in this process."""
         return self
 
-    def fill(
-        self, tiles: Sequence[Tile], batch: int, pending: Collection[Tile] | None = None
-    ) -> Iterator[FilledTile]:
+    def fill(self, tiles: Sequence[Tile], batch: int, pending: Collection[Tile] | None = None) -> Iterator[FilledTile]:
         """Evaluate tiles in batches of so many points, and write them one by one; by default all are pending."""
         pending, finished = set(tiles if pending is None else pending), self.store.ascending
         for tile, found in evaluate_tiles(self.objective, self.store, tiles, batch, pending):

@@ -70,7 +70,7 @@ def kept(dataset: xr.Dataset, every: int) -> np.ndarray:
 @pytest.mark.parametrize("every", [2, 5])
 def test_gradients_are_those_of_the_whole_slice_where_they_are(plane: Plane, every: int, tmp_path: Path) -> None:
     whole, counted = sample(Counted(), plane), Counted()
-    job = SliceJob.of(counted, plane, command="", out=tmp_path / "cut", every=every)
+    job = SliceJob.of(counted, plane, command="", out=tmp_path / "cut", gradients=every)
     job.run()
     found = open_slice(tmp_path / "cut")
     inside = kept(whole, every)
@@ -80,7 +80,7 @@ def test_gradients_are_those_of_the_whole_slice_where_they_are(plane: Plane, eve
     np.testing.assert_array_equal(found["grad"].to_numpy()[inside], whole["grad"].to_numpy()[inside])
     assert found.identical(open_slice(tmp_path / "cut"))
     with ThreadPoolExecutor(2) as threads:
-        job = SliceJob.of(Counted(), plane, command="", out=tmp_path / "threads", every=every, executor=threads)
+        job = SliceJob.of(Counted(), plane, command="", out=tmp_path / "threads", gradients=every, executor=threads)
         job.run()
     apart = open_slice(tmp_path / "threads")
     for name in ("loss", "grad", "status"):
@@ -89,15 +89,15 @@ def test_gradients_are_those_of_the_whole_slice_where_they_are(plane: Plane, eve
 
 def test_no_more_gradients_are_asked_for_than_are_kept() -> None:
     counted = Counted()
-    sample(counted, PLANE, every=4)
+    sample(counted, PLANE, gradients=4)
     assert counted.gradients == 5 * 6  # of 18 and 21 samples
     assert counted.losses == 18 * 21 - counted.gradients
 
 
 def test_one_that_was_stopped_goes_on_to_the_same_bits(tmp_path: Path) -> None:
-    SliceJob.of(Counted(), PLANE, command="", out=tmp_path / "whole", every=3).run()
+    SliceJob.of(Counted(), PLANE, command="", out=tmp_path / "whole", gradients=3).run()
     for _ in range(100):
-        job = SliceJob.of(Counted(150), PLANE, command="", out=tmp_path / "cut", every=3)
+        job = SliceJob.of(Counted(150), PLANE, command="", out=tmp_path / "cut", gradients=3)
         try:
             job.run()
         except KeyboardInterrupt:
@@ -115,7 +115,7 @@ SQUARE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=64)  # its fi
 @pytest.mark.parametrize(("every", "batch"), [(2, 24), (3, 16), (4, 33)])
 def test_batches_of_gradients_and_of_losses_are_full_but_the_last(plane: Plane, every: int, batch: int) -> None:
     counted = Counted(batch=batch)
-    found = sample(counted, plane, every=every)
+    found = sample(counted, plane, gradients=every)
     number = int(kept(found, every).sum())
     for grad, points in ((True, number), (False, found["loss"].size - number)):
         full = full_batch(plane, every, batch, grad=grad)
@@ -133,7 +133,9 @@ def full_batch(plane: Plane, every: int, batch: int, *, grad: bool) -> int:
 
 def test_no_more_than_a_batch_of_either_kind_is_evaluated_ahead() -> None:
     counted, ahead = Counted(batch=32), list[int]()
-    sample(counted, SQUARE, every=3, progress=lambda now: ahead.append(counted.gradients + counted.losses - now.done))
+    sample(
+        counted, SQUARE, gradients=3, progress=lambda now: ahead.append(counted.gradients + counted.losses - now.done)
+    )
     kinds = [full_batch(SQUARE, 3, 32, grad=grad) for grad in (True, False)]
     assert 32 < max(ahead) < sum(kinds)
     assert ahead[-1] == 0
@@ -143,8 +145,8 @@ def test_no_more_than_a_batch_of_either_kind_is_evaluated_ahead() -> None:
 def test_gradients_that_do_not_fit_into_memory_are_halved_to_the_same_bits() -> None:
     small = Counted(batch=64, room=40)
     with pytest.warns(RuntimeWarning, match="counted ran out of memory at 64 points; going on with 32"):
-        found = sample(small, SQUARE, every=3)
-    wanted = sample(Counted(), SQUARE, every=3)
+        found = sample(small, SQUARE, gradients=3)
+    wanted = sample(Counted(), SQUARE, gradients=3)
     assert {len(one) for one in small.batches[True][:-1]} == {32}
     for name in ("loss", "grad", "status"):
         np.testing.assert_array_equal(found[name], wanted[name])
@@ -179,7 +181,7 @@ def test_workers_get_groups_of_tiles_whose_gradients_fill_a_batch(workers: int) 
 def test_workers_ask_for_few_batches_of_gradients(tmp_path: Path) -> None:
     counted = Counted(batch=32)
     with ThreadPoolExecutor(2) as threads:
-        sample(counted, SQUARE, every=3, executor=threads)
+        sample(counted, SQUARE, gradients=3, executor=threads)
     assert counted.gradients == 22 * 22
     assert len(counted.batches[True]) < 2 * 22 * 22 / 32  # of tiles there are 64
 
@@ -201,10 +203,10 @@ def test_a_gradient_that_is_lacking_where_it_belongs_is_a_tile_that_was_torn(tmp
 
 
 def test_other_gradients_are_another_slice(tmp_path: Path) -> None:
-    job = SliceJob.of(Counted(), PLANE, command="", out=tmp_path, every=3)
+    job = SliceJob.of(Counted(), PLANE, command="", out=tmp_path, gradients=3)
     job.run()
     with pytest.raises(ValueError, match="gradients_every: wanted 4, found 3"):
-        SliceJob.of(Counted(), PLANE, command="", out=tmp_path, every=4)
+        SliceJob.of(Counted(), PLANE, command="", out=tmp_path, gradients=4)
     with pytest.raises(ValueError, match="gradients_every: wanted none, found 3"):
         SliceJob.of(Counted(), PLANE, command="", out=tmp_path)
 
@@ -241,13 +243,13 @@ def waves(x: Tensor) -> Tensor:
 
 def both_of(every: int) -> Iterator[xr.Dataset]:
     plane = Plane.through(SPACE, SPACE.center, (0, 1), resolution=41)
-    return (sample(from_torch(waves, SPACE), plane, **how) for how in ({}, {"every": every}))
+    return (sample(from_torch(waves, SPACE), plane, **how) for how in ({}, {"gradients": every}))
 
 
 def test_what_is_finer_than_the_samples_is_looked_for_as_without_gradients() -> None:
     plane, objective = Plane.through(SPACE, SPACE.center, (0, 1), resolution=41), from_torch(waves, SPACE)
     _, strided = both_of(4)
-    assert find_unresolved(objective, strided) == find_unresolved(objective, sample(objective, plane, grad=False))
+    assert find_unresolved(objective, strided) == find_unresolved(objective, sample(objective, plane, gradients=0))
 
 
 def test_twice_the_resolution_is_measured_as_with_all_gradients() -> None:
