@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -52,11 +52,15 @@ Draw = Callable[..., "Figure"]  # draw(dataset, width=None): a slice for a scree
 
 @dataclass(frozen=True)
 class SliceCost:
-    """Say what is left of a slice to compute: episodes, seconds they should take, bytes of memory."""
+    """Say what is left of a slice to compute: episodes, seconds they should take, bytes of memory.
+
+    `each` has the seconds of an episode with a gradient, True, and of one without, as far as there are such ones here.
+    """
 
     episodes: int
     seconds: float
     memory: int
+    each: Mapping[bool, float] = field(default_factory=dict)
 
     def less(self, done: int) -> SliceCost:
         """Return what is left where so many of the episodes are done."""
@@ -347,9 +351,10 @@ def cost_of(objective: Objective, store: SliceStore) -> SliceCost:
     batch = first_points(store, pending, getattr(objective, "preferred_batch", 1))
     sloped = sum(int(store.sloped(tile).sum()) for tile in pending)
     counts = {True: sloped, False: left - sloped}
-    seconds = sum(n * seconds_per_episode(objective, batch, grad=grad) for grad, n in counts.items() if n)
+    each = {grad: seconds_per_episode(objective, batch, grad=grad) for grad, n in counts.items() if n}
+    seconds = sum(counts[grad] * one for grad, one in each.items())
     arrays = need_of(store.shape, store.plane.dim, grad=store.grad)
-    return SliceCost(left, seconds, peak_memory() + round(arrays.memory))
+    return SliceCost(left, seconds, peak_memory() + round(arrays.memory), each)
 
 
 def _cost_there(site: Site | RemoteSite) -> SliceCost:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -41,6 +43,11 @@ def check_gradients(gradients: int, plane: Plane, *, refined: bool) -> int:
             f"{gradients}; {min(plane.resolution) - 1} would fit, or take a higher resolution"
         )
     return gradients
+
+
+def count_gradients(resolution: Sequence[int], gradients: int) -> int:
+    """Return how many samples of a slice have a gradient: those at every so many along each axis, 0 for none."""
+    return math.prod(-(-points // gradients) for points in resolution) if gradients else 0
 
 
 def with_gradients(dataset: xr.Dataset) -> xr.Dataset:

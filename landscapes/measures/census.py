@@ -18,6 +18,7 @@ from torch import Tensor
 
 from ..directions import orthonormal
 from ..identity import plane_of
+from ..lattice import count_gradients
 from ..objective import Objective
 from ..plane import Plane
 from ..sampling.fill import sample
@@ -112,7 +113,7 @@ class CensusDesign:
     @property
     def samples(self) -> tuple[int, int]:
         """How many samples of a slice are without a gradient, and how many have one."""
-        having = (-(-self.resolution // self.gradients)) ** 2
+        having = count_gradients((self.resolution, self.resolution), self.gradients)
         return self.resolution**2 - having, having
 
     @property
