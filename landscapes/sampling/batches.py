@@ -59,16 +59,16 @@ class Batches:
         No more is evaluated ahead than the batch that a tile's last point is in.
         """
         batches, dim = self.points(), self.store.plane.dim
-        ahead = Evaluation.empty(dim, grad=self.grad)
+        ahead, start = Evaluation.empty(dim, grad=self.grad), 0
         for tile in self.tiles:
             if tile not in self.pending:
                 continue
             count = len(self._of(tile))
-            while len(ahead.loss) < count:
-                found = self.objective.evaluate(next(batches), grad=self.grad)
-                ahead = Evaluation.join([ahead, found], dim=dim, grad=self.grad)
-            yield ahead.rows(slice(count))
-            ahead = ahead.rows(slice(count, None))
+            while len(ahead.loss) < start + count:
+                parts = [ahead.rows(slice(start, None)), self.objective.evaluate(next(batches), grad=self.grad)]
+                ahead, start = Evaluation.join(parts, dim=dim, grad=self.grad), 0
+            yield ahead.rows(slice(start, start + count))
+            start += count
 
     def points(self) -> Iterator[Float[Tensor, "batch dim"]]:
         """Yield the points of one batch after another."""

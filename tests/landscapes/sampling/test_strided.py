@@ -21,6 +21,7 @@ from gradscape.landscapes.measures.twice import Twice, at_twice
 from gradscape.landscapes.measures.unresolved import find_unresolved
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.sampling.distribution import equal_groups
+from gradscape.landscapes.sampling.fill import Progress
 from gradscape.landscapes.storage.store import SliceStore, open_slice
 
 from ...command import Said
@@ -184,6 +185,23 @@ def test_workers_ask_for_few_batches_of_gradients(tmp_path: Path) -> None:
         sample(counted, SQUARE, gradients=3, executor=threads)
     assert counted.gradients == 22 * 22
     assert len(counted.batches[True]) < 2 * 22 * 22 / 32  # of tiles there are 64
+
+
+def test_a_slice_that_another_process_finishes_meanwhile_is_left_as_it_is(tmp_path: Path) -> None:
+    plane = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(300, 40))  # of two chunks once it is finished
+    path, counted = tmp_path / "s.zarr", Counted(batch=32)
+    store = strided_store(path, plane)
+
+    def finish(now: Progress) -> None:
+        if now.done and not (path / "zarr.json").exists():
+            sample(Counted(), plane, strided_store(path, plane))
+
+    found = sample(counted, plane, store, progress=finish)
+    assert store.ascending
+    assert counted.losses + counted.gradients < plane.resolution[0] * plane.resolution[1] / 2
+    wanted = sample(Counted(), plane, gradients=3)
+    for name in ("loss", "grad", "status"):
+        np.testing.assert_array_equal(found[name], wanted[name])
 
 
 def strided_store(path: Path, plane: Plane = PLANE) -> SliceStore:
