@@ -188,7 +188,7 @@ def test_workers_ask_for_few_batches_of_gradients(tmp_path: Path) -> None:
 
 
 def test_a_slice_that_another_process_finishes_meanwhile_is_left_as_it_is(tmp_path: Path) -> None:
-    plane = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(300, 40))  # of two chunks once it is finished
+    plane = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(600, 17))  # of three chunks once it is finished
     path, counted = tmp_path / "s.zarr", Counted(batch=32)
     store = strided_store(path, plane)
 
