@@ -62,7 +62,7 @@ def slice_(
     """
     how: dict[str, Any] = {"resolution": resolution, "through": through}
     how |= {"refine": refine, "budget": budget, "along": along, "policy": policy}
-    how["gradients"] = 0 if no_gradients else gradients
+    how |= {"gradients": 0 if no_gradients else gradients}
     _sample(scene, dims, extent, print_, out, **how, as_json=json_, force=force, scheduler=scheduler)
 
 

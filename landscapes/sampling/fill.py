@@ -70,10 +70,11 @@ def sample(
     `conclude` is called with the slice when it is complete, and returns attributes of it that are kept, too. Of one
     that was finished before it is not called.
 
-    Raises StoreMismatchError where the store was made by other settings, TooLargeError where the slice does not fit
-    into memory, DiskFullError and WorkersLostError where filling ended early, which say what is kept, and MemoryError
-    where a single point is too much for the device.
+    Raises ValueError where `gradients` or `batch` is no whole number, StoreMismatchError where the store was made by
+    other settings, TooLargeError where the slice does not fit into memory, DiskFullError and WorkersLostError where
+    filling ended early, which say what is kept, and MemoryError where a single point is too much for the device.
     """
+    gradients = as_whole(int(gradients) if isinstance(gradients, bool) else gradients, "gradients")
     if store is None:
         about = describe(objective)
         about["identity"] = with_stride(about["identity"], gradients)

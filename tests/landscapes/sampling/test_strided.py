@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -93,6 +94,12 @@ def test_no_more_gradients_are_asked_for_than_are_kept() -> None:
     sample(counted, PLANE, gradients=4)
     assert counted.gradients == 5 * 6  # of 18 and 21 samples
     assert counted.losses == 18 * 21 - counted.gradients
+
+
+@pytest.mark.parametrize("gradients", [-1, 2.5])
+def test_gradients_are_at_every_whole_number_of_samples(gradients: Any) -> None:
+    with pytest.raises(ValueError, match=f"gradients is a whole number of at least 0; got {gradients}"):
+        sample(Counted(), PLANE, gradients=gradients)
 
 
 def test_one_that_was_stopped_goes_on_to_the_same_bits(tmp_path: Path) -> None:
