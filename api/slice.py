@@ -77,12 +77,11 @@ def slice(
     fine, folder = Refinement.of(refine, budget), Path(out) if out is not None else None
     in_memory = out is None and policy is None and not is_environment(objective)
     stride = as_whole(int(gradients) if isinstance(gradients, bool) else gradients, "gradients")
-    slopes: dict[str, Any] = {"grad": stride > 0, "every": stride or 1}
-    begun: dict[str, Any] = {"out": folder, **slopes, "refinement": fine}
+    begun: dict[str, Any] = {"out": folder, "gradients": stride, "refinement": fine}
     where: dict[str, Any] = {"through": through, "extent": extent, "resolution": resolution}
     plane = cut(objective, dims, along, **where, kept=None if force or in_memory else begun)
     if in_memory:
-        return _sample_in_memory(within_box(objective) if along else objective, plane, fine, watch, **slopes)
+        return _sample_in_memory(within_box(objective) if along else objective, plane, fine, watch, stride)
     from ..jobs.slice import SliceJob
 
     how = {"refine": refine, "budget": budget, "policy": policy}
@@ -112,24 +111,24 @@ def _open(path: Path, remake: Callable[[], Objective] | None) -> Slice:
 
 
 def _sample_in_memory(
-    objective: Objective, plane: Plane, refinement: Refinement | None, watch: Watch, *, grad: bool, every: int
+    objective: Objective, plane: Plane, refinement: Refinement | None, watch: Watch, gradients: int
 ) -> Slice:
     from ..jobs.slice_summary import look_between
-    from ..landscapes.lattice import check_stride
+    from ..landscapes.lattice import check_gradients
     from ..landscapes.sampling.fill import describe, sample
     from ..landscapes.sampling.refine import refine
     from ..landscapes.slice import Slice
     from ..landscapes.storage.store import SliceStore
 
-    every = check_stride(every, plane, refined=refinement is not None) if grad else 1
+    gradients = check_gradients(gradients, plane, refined=refinement is not None)
     with watch.progress(math.prod(plane.resolution), "evaluations") as advance:
         how: dict[str, Any] = {
             "progress": lambda now: advance(now.done),
             "conclude": lambda whole: look_between(objective, whole),
         }
         if refinement is None:
-            dataset = sample(objective, plane, grad=grad, every=every, **how)
+            dataset = sample(objective, plane, gradients=gradients, **how)
         else:
-            store = SliceStore.in_memory(plane, objective.space, **describe(objective), grad=grad)
+            store = SliceStore.in_memory(plane, objective.space, **describe(objective), grad=gradients > 0)
             dataset = refine(objective, plane, store, refinement, **how)
     return Slice(dataset, None, lambda: objective)

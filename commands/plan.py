@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..jobs.scene import SceneSpec
-from .arguments import Along, Extent, Json, NoGradients, SomeDims, Through, read_extent, takes_scene
+from .arguments import Along, Extent, Gradients, Json, NoGradients, SomeDims, Through, read_extent, takes_scene
 from .plan_race import print_race_plan
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ def plan(
     ] = None,
     through: Through = "center",
     extent: Extent = None,
+    gradients: Gradients = 1,
     no_gradients: NoGradients = False,
     methods: Annotated[
         list[str] | None,
@@ -70,17 +71,18 @@ def plan(
     from .terminal import Bars, command_line, print_json
 
     bars, scene = Bars(), replace(scene, name=what)
-    cut = bool(dims or along or over or extent or resolution or no_gradients or through != "center")
+    wanted = 0 if no_gradients else gradients
+    cut = bool(dims or along or over or extent or resolution or wanted != 1 or through != "center")
     if methods or seeds or budget or option:
         print_race_plan(scene, methods or [], option or [], seeds, budget, workers, began=began, cut=cut, as_json=json_)
         return
     workers = workers or 1
     if what.endswith(".toml"):
-        _refuse_more(bool(over or extent or scene.options or along or through != "center"))
+        _refuse_more(bool(over or extent or scene.options or along or wanted > 1 or through != "center"))
         jobs = _figure_jobs(what, resolution, scene, grad=not no_gradients)
         _print_figures(list(_figures(jobs, bars, began, workers)), as_json=json_)
         return
-    where: dict[str, Any] = {"through": through, "extent": read_extent(extent), "grad": not no_gradients}
+    where: dict[str, Any] = {"through": through, "extent": read_extent(extent), "gradients": wanted}
     first = dims if dims or along else ["0", "1"]
     job = PlanJob(scene, first, resolution or RESOLUTION, **where, over=over, frames=frames, along=along)
     found = job.run(bars, began=began)
@@ -93,7 +95,9 @@ def plan(
 def _refuse_more(said: bool) -> None:
     """Raise ValueError where more is said of figures than they say themselves."""
     if said:
-        raise ValueError("figures say what they are; leave out --over, --along, --extent, --through and --set")
+        raise ValueError(
+            "figures say what they are; leave out --over, --along, --extent, --through, --gradients and --set"
+        )
 
 
 def _figure_jobs(path: str, resolution: int | None, scene: SceneSpec, *, grad: bool) -> list[tuple[Figure, PlanJob]]:
@@ -109,7 +113,8 @@ def _figure_jobs(path: str, resolution: int | None, scene: SceneSpec, *, grad: b
         wanted = scene.fidelity or figure.fidelity
         known = wanted if wanted in environment_class(figure.env).fidelities else None
         of = SceneSpec(figure.env, known, device=scene.device, options=figure.options)
-        jobs.append((figure, PlanJob(of, figure.dims, resolution or figure.resolution, figure.through, grad=grad)))
+        points, gradients = resolution or figure.resolution, figure.gradients if grad else 0
+        jobs.append((figure, PlanJob(of, figure.dims, points, figure.through, gradients=gradients)))
     return jobs
 
 
@@ -135,7 +140,8 @@ def _figures(
 def _kind(job: PlanJob) -> str:
     import json
 
-    return json.dumps([job.scene.name, job.scene.options, job.scene.fidelity, job.resolution, len(job.dims or ())])
+    scene = [job.scene.name, job.scene.options, job.scene.fidelity]
+    return json.dumps([*scene, job.resolution, job.gradients, len(job.dims or ())])
 
 
 def _print(found: Forecast, workers: int) -> None:
@@ -160,7 +166,8 @@ def _rows(plan: Plan, workers: int) -> Iterator[tuple[str, str, str]]:
     from ..landscapes.capacity import size
     from ..landscapes.cost import duration
 
-    yield "episodes", str(plan.episodes), f"in {plan.batches} batches"
+    some = f", {plan.gradients} of them with gradients" if 0 < plan.gradients < plan.episodes else ""
+    yield "episodes", str(plan.episodes), f"in {plan.batches} batches{some}"
     parts = [f"{name} {duration(seconds)}" for name, seconds in plan.seconds().items()]
     yield "time", duration(plan.wall(workers)), ", ".join(parts)
     if workers > 1:

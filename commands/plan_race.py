@@ -36,7 +36,8 @@ def print_race_plan(
         raise ValueError("--seeds, --budget and --option are of a race; name its methods with --methods, or all")
     if cut:
         raise ValueError(
-            "a race has no plane; leave out --dims, --along, --over, --resolution, --through, --extent, --no-gradients"
+            "a race has no plane; leave out --dims, --along, --over, --resolution, --through, --extent, --gradients, "
+            "--no-gradients"
         )
     if str(scene.name).endswith(".toml"):
         raise ValueError(f"a race is of one environment; got the list of figures {scene.name} and --methods")

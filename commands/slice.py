@@ -60,8 +60,9 @@ def slice_(
 
     Example: landscape slice fluid --dims 6 8 --resolution 24
     """
-    how: dict[str, Any] = {"resolution": resolution, "through": through, "grad": not no_gradients}
-    how |= {"refine": refine, "budget": budget, "along": along, "policy": policy, "every": gradients}
+    how: dict[str, Any] = {"resolution": resolution, "through": through}
+    how |= {"refine": refine, "budget": budget, "along": along, "policy": policy}
+    how |= {"gradients": 0 if no_gradients else gradients}
     _sample(scene, dims, extent, print_, out, **how, as_json=json_, force=force, scheduler=scheduler)
 
 
@@ -85,7 +86,7 @@ def bounce(
     """
     if axis not in ("x", "y", "z"):
         raise ValueError(f"bounce varies the velocity along axis x, y or z; got {axis!r}")
-    how: dict[str, Any] = {"resolution": resolution, "through": through, "grad": True}
+    how: dict[str, Any] = {"resolution": resolution, "through": through}
     _sample(scene, (f"velocity {axis}",), extent, print_, out, **how, as_json=json_, force=force)
 
 
@@ -98,10 +99,9 @@ def _sample(
     *,
     resolution: int,
     through: str,
-    grad: bool,
     as_json: bool,
     force: bool,
-    every: int = 1,
+    gradients: int = 1,
     scheduler: str | None = None,
     refine: str | None = None,
     budget: int | None = None,
@@ -123,14 +123,13 @@ def _sample(
     where: dict[str, Any] = {"extent": read_extent(extent), "resolution": resolution}
     how: dict[str, Any] = {
         "command": command_line(),
-        "grad": grad and policy is None,
-        "every": every,
+        "gradients": gradients if policy is None else 0,
         "force": force,
         "prints": prints or [],
     }
     how["refinement"] = Refinement.of(read_share(refine, "--refine"), budget)
     folders = {point: folder_for(Path(out), point, points) if out else None for point in points}
-    kept = {name: how[name] for name in ("grad", "every", "refinement")}
+    kept = {name: how[name] for name in ("gradients", "refinement")}
     planes = {  # all of them, or none is sampled
         point: cut(subject, dims, along, through=point, **where, kept=None if force else {**kept, "out": folder})
         for point, folder in folders.items()

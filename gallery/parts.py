@@ -144,7 +144,7 @@ class SlicePart(FigurePart):
         return SliceJob.of(
             env,
             self.figure.plane(env),
-            every=self.figure.gradients,
+            gradients=self.figure.gradients,
             command=self.figure.command(self.device),
             out=self.folder,
             # nothing is lost of a store made by other code or for another device

@@ -195,7 +195,7 @@ def _measure(one: Entrant, resolution: int, device: str) -> dict[str, NDArray[An
     about |= {"labels": plane.labels, "loss_unit": env.loss_unit}
     if report["checks"][0]["outcome"] == FAIL:
         return {"about": np.array(json.dumps(about)), "loss": np.empty((0, 0))}
-    dataset = sample(env, plane, grad=True)
+    dataset = sample(env, plane)
     sides = (plane.upper - plane.lower).numpy()
     slope = plane.slope(torch.from_numpy(dataset["grad"].transpose("v", "u", "dim").to_numpy())).numpy() * sides
     axes = {name: dataset[name].to_numpy() for name in ("u", "v")}

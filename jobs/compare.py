@@ -118,7 +118,7 @@ class CompareJob:
     def _sample(self, objective: Objective, watch: Watch) -> xr.Dataset:
         """Sample the objective where the first slice is sampled; return its slice."""
         boxed = bool(self.slice.identity.get("boxed"))
-        how: dict[str, Any] = {"grad": "grad" in self.slice.data, "boxed": boxed, "force": self.force}
+        how: dict[str, Any] = {"gradients": int("grad" in self.slice.data), "boxed": boxed, "force": self.force}
         job = SliceJob.of(objective, self.slice.plane, command=self.command, root=self.folder, **how)
         summary = job.run(watch)
         watch.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")

@@ -178,7 +178,7 @@ class OverlayJob:
         assert self.cut is not None  # as `run` has seen
         plane = self.cut.plane(plane_of(self.slice.data), self.runs)
         env = self._objective()
-        how: dict[str, Any] = {"grad": "grad" in self.slice.data, "boxed": self.cut.principal}
+        how: dict[str, Any] = {"gradients": int("grad" in self.slice.data), "boxed": self.cut.principal}
         job = SliceJob.of(env, plane, command=self.command, root=self.folder, **how)
         summary = job.run(watch)
         watch.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")

@@ -12,6 +12,8 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from ..landscapes.capacity import TooLargeError
+from ..landscapes.identity import with_stride
+from ..landscapes.lattice import check_gradients, count_gradients
 from .motion import SMOOTHING, Motion, need_of
 from .scene import SceneSpec
 from .scene import provenance as provenance_of
@@ -38,7 +40,7 @@ class Plan:
     `start` is what passes until the first episode that counts. So many `losses`, at most, are evaluated between the
     samples of a slice, each taken to cost an episode. `memory` is of the host, `gpu` of the device. `disk` is
     what results take, `filling` what the tiles of a slice take until it is finished. `rate` says where the seconds of
-    an episode are from.
+    an episode are from. Of the `episodes` so many `gradients` are computed, too.
     """
 
     episodes: int
@@ -53,6 +55,7 @@ class Plan:
     filling: Room
     rate: str = HERE
     losses: int = 0
+    gradients: int = 0
 
     @property
     def between(self) -> float:
@@ -76,7 +79,8 @@ class Plan:
     def record(self, workers: int) -> dict[str, Any]:
         """Return all of it as plain JSON."""
         return {
-            **{"episodes": self.episodes, "batches": self.batches, "workers": workers, "wall": self.wall(workers)},
+            **{"episodes": self.episodes, "gradients": self.gradients, "batches": self.batches},
+            **{"workers": workers, "wall": self.wall(workers)},
             **{"seconds": self.seconds(), "device_hours": self.device_hours, "rate": self.rate},
             "memory": {"host": self.memory, "device": self.gpu},
             "disk": {**asdict(self.disk), "filling": asdict(self.filling)},
@@ -116,7 +120,9 @@ class Forecast:
 class PlanJob:
     """A slice of a scene, or a sweep `over` something in so many `frames`, to foretell; nothing of it is kept.
 
-    What lies off the box, of one `along` directions, is taken to cost an episode like the rest.
+    Losses are at all samples of a slice, gradients at every so many along each axis, `gradients`, 0 for none; of a
+    sweep they are at all or none. What lies off the box, of one `along` directions, is taken to cost an episode like
+    the rest.
     """
 
     scene: SceneSpec
@@ -124,7 +130,7 @@ class PlanJob:
     resolution: int
     through: str = "center"
     extent: float | tuple[float, float] | None = None
-    grad: bool = True
+    gradients: int = 1
     over: str | None = None
     frames: int = 1
     along: str | None = None
@@ -134,7 +140,7 @@ class PlanJob:
 
         `began` is when its command would have begun, on the clock of `time.perf_counter`; now, by default. For a CUDA
         device that is not here, what `landscape tradeoff` kept of one counts. Raises ValueError for what the scene does
-        not have, and where nothing is known of the device that is asked for.
+        not have, for gradients that are too far apart, and where nothing is known of the device that is asked for.
         """
         from .cut import cut
 
@@ -142,6 +148,7 @@ class PlanJob:
         env, device = make_here(self.scene)
         how: dict[str, Any] = {"extent": self.extent, "resolution": self.resolution}
         plane = cut(env, self.dims, self.along, through=self.through, **how)
+        self._check(plane)
         with (watch or Watch()).busy(f"{env.name}: rehearsing {env.fidelity.name} episodes, tiles and pictures"):
             found = self._rehearse(env, plane, began)
         return Forecast(
@@ -154,14 +161,22 @@ class PlanJob:
             over=self.over,
             frames=self.frames if self.over else 1,
             too_large=self._too_large(plane),
-            plan=_elsewhere(found, env, device, grad=self.grad),
+            plan=_elsewhere(found, env, device),
         )
 
+    def _check(self, plane: Plane) -> None:
+        check_gradients(self.gradients, plane, refined=False)
+        if self.over is not None and self.gradients > 1:
+            raise ValueError(
+                f"a sweep has gradients at all samples or at none; got gradients at every {self.gradients} samples, so "
+                "leave out --gradients or --over"
+            )
+
     def _rehearse(self, env: Environment, plane: Plane, began: float) -> Plan:
-        how: dict[str, Any] = {"grad": self.grad, "began": began}
         with TemporaryDirectory() as folder:
             if self.over is None:
-                return plan_slice(env, plane, Path(folder), **how)
+                return plan_slice(env, plane, Path(folder), gradients=self.gradients, began=began)
+            how: dict[str, Any] = {"grad": self.gradients > 0, "began": began}
             return plan_sweep(env, plane, Path(folder), self.over, self.frames, **how)
 
     def _too_large(self, plane: Plane) -> str | None:
@@ -171,9 +186,9 @@ class PlanJob:
 
         try:
             if self.over is None:
-                refuse_slice(plane, Path(), grad=self.grad)
+                refuse_slice(plane, Path(), grad=self.gradients > 0)
             else:
-                refuse_sweep(plane, self.frames, Path(), grad=self.grad, over=self.over)
+                refuse_sweep(plane, self.frames, Path(), grad=self.gradients > 0, over=self.over)
         except TooLargeError as error:
             return str(error)
         return None
@@ -195,7 +210,7 @@ def make_here(scene: SceneSpec) -> tuple[Environment, str]:
     return env, env.device
 
 
-def _elsewhere(found: Plan, env: Environment, device: str, *, grad: bool) -> Plan:
+def _elsewhere(found: Plan, env: Environment, device: str) -> Plan:
     """Return a plan with the rate of a device that is not here, as `landscape tradeoff` measured it there."""
     if device == env.device:
         return found
@@ -203,48 +218,47 @@ def _elsewhere(found: Plan, env: Environment, device: str, *, grad: bool) -> Pla
 
     variant, path = find_variant(env, device)
     seconds = variant.comparison.seconds
-    each = seconds.with_gradient if grad else seconds.forward
+    each = {True: seconds.with_gradient, False: seconds.forward}
+    counts = {True: found.gradients, False: found.episodes - found.gradients}
     return replace(
         found,
-        simulating=found.episodes * each,
-        batches=-(-found.episodes // max(1, variant.comparison.batch)),
+        simulating=sum(n * each[grad] for grad, n in counts.items() if n),
+        batches=sum(-(-n // max(1, variant.comparison.batch)) for n in counts.values()),
         gpu=variant.memory or 0,
         rate=f"kept by `landscape tradeoff` in {path}; writing and drawing {found.rate}",
     )
 
 
-def plan_slice(env: Environment, plane: Plane, folder: Path, *, grad: bool, began: float) -> Plan:
-    """Plan a slice whose command would have begun at `began` on `time.perf_counter`'s clock.
+def plan_slice(env: Environment, plane: Plane, folder: Path, *, gradients: int, began: float) -> Plan:
+    """Plan a slice with gradients at every so many samples along each axis, 0 for none.
 
-    Of a large one a smaller one is rehearsed.
+    Its command would have begun at `began` on `time.perf_counter`'s clock. Of a large one a smaller one is rehearsed.
     """
     from ..landscapes.measures.unresolved import probes
     from .rehearsal import Replica, Room, count_pictures, store_replica, time_drawing
     from .slice import SliceJob, peak_memory
 
-    little = _little(plane)
+    little, grad = _little(plane), gradients > 0
     grown = Growth.of(little, plane, grad=grad)
     job = SliceJob.open(
         env, little, folder, picture_of(env, little),
-        identity=env.identity(), provenance=provenance_of(env, ""), grad=grad,
+        identity=with_stride(env.identity(), gradients), provenance=provenance_of(env, ""), grad=grad,
     )  # fmt: skip
     cost = job.cost()
     start, memory = time.perf_counter() - began, cost.memory - peak_memory() + grown.memory
     replica = Replica.of(env, job.store, cost.seconds / cost.episodes)
     kept = store_replica(replica, job.store)
     loading, once = time_drawing(lambda: job._save(kept.dataset))
-    episodes, simulating, writing = (
-        math.prod(plane.resolution),
-        grown.points * cost.seconds,
-        grown.points * kept.seconds,
-    )
-    batches = -(-episodes // env.preferred_batch)
+    episodes, having = math.prod(plane.resolution), count_gradients(plane.resolution, gradients)
+    counts = {True: having, False: episodes - having}
+    simulating, writing = sum(counts[one] * each for one, each in cost.each.items()), grown.points * kept.seconds
+    batches = sum(-(-n // env.preferred_batch) for n in counts.values())
     count = count_pictures(grown.levels, batches, simulating + writing, once)
     extra = Room(SUMMARY + sum(file.stat().st_size for file in folder.iterdir() if file.is_file()), 2)
     return Plan(
         episodes, batches, start, simulating, writing, loading + count * once, memory + peak_memory(), _gpu(env),
         grown.finished_room(kept, 1, extra), grown.filling_room(kept), _rate(little, plane),
-        probes(episodes, grad=grad),
+        probes(episodes, grad=gradients == 1), having,
     )  # fmt: skip
 
 
@@ -280,7 +294,7 @@ def plan_sweep(
         count * whole, count * -(-whole // env.preferred_batch), start, seconds * count * whole / job.total,
         count * grown.points * kept.seconds, drawing, round(memory + held) + peak_memory(), _gpu(env),
         grown.finished_room(kept, count, Room(films + SUMMARY + 250 * frames, 5)), grown.filling_room(kept),
-        _rate(little, plane),
+        _rate(little, plane), gradients=grad * count * whole,
     )  # fmt: skip
 
 

@@ -68,7 +68,7 @@ class Replica:
         return repeated
 
     def dataset(self, store: SliceStore) -> xr.Dataset:
-        """Return a slice of the shape of `store` without a gap."""
+        """Return a slice of the shape of `store` without a gap, with gradients where the store has them."""
         blank = store.dataset()
         grid = np.meshgrid(*(blank[name].to_numpy() for name in store.dims), indexing="ij")[::-1]
         nodes = torch.from_numpy(np.stack([axis.ravel() for axis in grid], axis=1))
@@ -79,6 +79,9 @@ class Replica:
             for name, values in filled.items():
                 flat = values.reshape(len(nodes), -1)
                 flat[rows] = getattr(said, str(name)).reshape(-1, flat.shape[1])
+        for axis in range(blank["loss"].ndim if store.grad else 0):
+            without = np.arange(blank["loss"].shape[axis]) % store.every > 0
+            filled["grad"].swapaxes(0, axis)[without] = np.nan
         return blank.copy(data=filled)
 
     def _repeat(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
@@ -141,7 +144,7 @@ def store_replica(replica: Replica, store: SliceStore) -> Stored:
             raise _Enough
 
     with contextlib.suppress(_Enough):
-        sample(replica, store.plane, store, grad=store.grad, progress=follow)
+        sample(replica, store.plane, store, gradients=int(store.grad), progress=follow)
     after = room_of(store.place or path)
     size, files = (
         round(old + (new - old) * total / done)

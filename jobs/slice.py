@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -21,7 +21,7 @@ from ..landscapes.adapters import within_box
 from ..landscapes.capacity import size
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.identity import with_stride
-from ..landscapes.lattice import check_stride
+from ..landscapes.lattice import check_gradients
 from ..landscapes.measures.unresolved import probes, stored_unresolved
 from ..landscapes.objective import Objective, Status
 from ..landscapes.plane import Plane
@@ -52,11 +52,15 @@ Draw = Callable[..., "Figure"]  # draw(dataset, width=None): a slice for a scree
 
 @dataclass(frozen=True)
 class SliceCost:
-    """Say what is left of a slice to compute: episodes, seconds they should take, bytes of memory."""
+    """Say what is left of a slice to compute: episodes, seconds they should take, bytes of memory.
+
+    `each` has the seconds of an episode with a gradient, True, and of one without, as far as there are such ones here.
+    """
 
     episodes: int
     seconds: float
     memory: int
+    each: Mapping[bool, float] = field(default_factory=dict)
 
     def less(self, done: int) -> SliceCost:
         """Return what is left where so many of the episodes are done."""
@@ -127,8 +131,7 @@ class SliceJob:
         command: str,
         out: Path | None = None,
         root: Path = ROOT,
-        grad: bool = True,
-        every: int = 1,
+        gradients: int = 1,
         force: bool = False,
         boxed: bool = False,
         cut: Mapping[str, Any] | None = None,
@@ -140,16 +143,16 @@ class SliceJob:
 
         That folder is under `root`.
 
-        Gradients are at `every` so many samples along each axis, losses at all. `boxed` leaves out what lies beyond the
-        parameters' bounds. With a `cut`, how it was cut along directions, it is boxed; of one that was begun,
-        `kept_plane` has the plane. With an `executor` its workers compute. Raises ValueError where gradients cannot be
-        so far apart, and as `open` does.
+        Losses are at all samples, gradients at every so many along each axis, `gradients`, 0 for none. `boxed` leaves
+        out what lies beyond the parameters' bounds. With a `cut`, how it was cut along directions, it is boxed; of one
+        that was begun, `kept_plane` has the plane. With an `executor` its workers compute. Raises ValueError where
+        gradients cannot be so far apart, and as `open` does.
         """
         boxed = boxed or cut is not None
-        every = check_stride(every, plane, refined=refinement is not None) if grad else 1
-        identity = with_stride(identity_of(objective), every)
+        gradients = check_gradients(gradients, plane, refined=refinement is not None)
+        identity = with_stride(identity_of(objective), gradients)
         identity |= ({"boxed": True} if boxed else {}) | ({"cut": dict(cut)} if cut else {})
-        out = out or default_folder(identity, plane.resolution, plane, grad, root, refinement)
+        out = out or default_folder(identity, plane.resolution, plane, gradients > 0, root, refinement)
         return cls.open(
             within_box(objective) if boxed else objective,
             plane,
@@ -158,7 +161,7 @@ class SliceJob:
             identity=identity,
             provenance=provenance(objective, command),
             command=command,
-            grad=grad,
+            grad=gradients > 0,
             force=force,
             executor=executor,
             remake=None if boxed else recipe(objective),
@@ -245,11 +248,10 @@ class SliceJob:
                 advance(dataset["status"].size, "looking between them")
                 return look_between(evaluator(self.objective, self.store, self.executor, self.remake), dataset)
 
-            how: dict[str, Any] = {"grad": self.store.grad, "executor": self.executor, "made": self.remake}
+            how: dict[str, Any] = {"executor": self.executor, "made": self.remake}
             how |= {"progress": follow, "conclude": conclude}
             if self.refinement is None:
-                return sample(self.objective, self.plane, self.store, **how), computed
-            del how["grad"]  # as the store has it
+                return sample(self.objective, self.plane, self.store, gradients=int(self.store.grad), **how), computed
             how |= {"refinement": self.refinement, "pieces": pieces_in(self.folder)}
             return refine(self.objective, self.plane, self.store, **how), computed
 
@@ -349,9 +351,10 @@ def cost_of(objective: Objective, store: SliceStore) -> SliceCost:
     batch = first_points(store, pending, getattr(objective, "preferred_batch", 1))
     sloped = sum(int(store.sloped(tile).sum()) for tile in pending)
     counts = {True: sloped, False: left - sloped}
-    seconds = sum(n * seconds_per_episode(objective, batch, grad=grad) for grad, n in counts.items() if n)
+    each = {grad: seconds_per_episode(objective, batch, grad=grad) for grad, n in counts.items() if n}
+    seconds = sum(counts[grad] * one for grad, one in each.items())
     arrays = need_of(store.shape, store.plane.dim, grad=store.grad)
-    return SliceCost(left, seconds, peak_memory() + round(arrays.memory))
+    return SliceCost(left, seconds, peak_memory() + round(arrays.memory), each)
 
 
 def _cost_there(site: Site | RemoteSite) -> SliceCost:

@@ -54,16 +54,15 @@ def kept_plane(
     *,
     out: Path | None = None,
     root: Path = ROOT,
-    grad: bool = True,
-    every: int = 1,
+    gradients: int = 1,
     refinement: Refinement | None = None,
 ) -> Plane | None:
     """Return the plane of a slice that was begun with the same cut along directions, None where there is none.
 
     It goes on along these: others may come out a little different each time, on a GPU, and some take many episodes.
     """
-    identity = with_stride(identity_of(objective), every) | {"boxed": True, "cut": dict(cut)}
-    path = (out or default_folder(identity, resolution, None, grad, root, refinement)) / STORE
+    identity = with_stride(identity_of(objective), gradients) | {"boxed": True, "cut": dict(cut)}
+    path = (out or default_folder(identity, resolution, None, gradients > 0, root, refinement)) / STORE
     if not is_slice(path):
         return None
     kept = SliceStore.open(path).identity

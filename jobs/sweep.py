@@ -236,7 +236,7 @@ class SweepJob:
 
     def _sample(self, number: int, count: _Count) -> xr.Dataset:
         (objective, made), store = self._sampled(number), self.stores[number]
-        how: dict[str, Any] = {"grad": store.grad, "executor": self.executor, "made": made}
+        how: dict[str, Any] = {"gradients": int(store.grad), "executor": self.executor, "made": made}
         dataset = sample(objective, self.motion.planes[number], store, progress=count.follow, **how)
         count.add(dataset)
         return dataset

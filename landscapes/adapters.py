@@ -111,7 +111,7 @@ class _TorchObjective:
         if gradient is None:
             raise ValueError(
                 f"{self.name} returned losses that carry no gradient; compute them from x with torch operations, "
-                "or sample with grad=False (--no-gradients)"
+                "or sample with gradients=0 (--no-gradients)"
             )
         return gradient
 
@@ -148,7 +148,7 @@ class _NumpyObjective:
         if self.differences is None:
             raise ValueError(
                 f"{self.name} returned losses without gradients; return (losses, gradients), pass differences=1e-4 "
-                "to from_numpy, or sample with grad=False (--no-gradients)"
+                "to from_numpy, or sample with gradients=0 (--no-gradients)"
             )
         lower, upper = self.space.lower, self.space.upper
         slopes = []

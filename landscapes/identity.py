@@ -52,9 +52,12 @@ def full_identity(identity: Mapping[str, Any], plane: Plane, space: ParameterSpa
     return plain_json({**identity, **own}, "a slice's identity")
 
 
-def with_stride(identity: Mapping[str, Any], every: int) -> dict[str, Any]:
-    """Add to a slice's settings that it has gradients at every so many samples along each axis, losses at all."""
-    return {**identity, EVERY: every} if every > 1 else dict(identity)
+def with_stride(identity: Mapping[str, Any], gradients: int) -> dict[str, Any]:
+    """Add to a slice's settings that it has gradients at every so many samples along each axis, where that says more.
+
+    Whether it has any at all is said by its store.
+    """
+    return {**identity, EVERY: gradients} if gradients > 1 else dict(identity)
 
 
 def gradient_stride(identity: Mapping[str, Any]) -> int:

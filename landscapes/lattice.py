@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,24 +25,29 @@ def has_all_gradients(dataset: xr.Dataset) -> bool:
     return "grad" in dataset and gradient_stride(stored_identity(dataset)) == 1
 
 
-def check_stride(every: int, plane: Plane, *, refined: bool) -> int:
-    """Return at every how many samples along each axis a slice shall have gradients.
+def check_gradients(gradients: int, plane: Plane, *, refined: bool) -> int:
+    """Return at every how many samples along each axis a slice shall have gradients, 0 for none.
 
     Raises ValueError where it then has fewer than two along an axis, or is refined, which takes gradients at all.
     """
-    every = as_whole(every, "gradients", least=1)
-    if every > 1 and refined:
+    gradients = as_whole(gradients, "gradients")
+    if gradients > 1 and refined:
         raise ValueError(
-            f"a slice is refined by the gradients of all its samples; got gradients at every {every} samples, so leave "
-            "out one of the two"
+            f"a slice is refined by the gradients of all its samples; got gradients at every {gradients} samples, so "
+            "leave out one of the two"
         )
-    if every >= min(plane.resolution):
+    if gradients >= min(plane.resolution):
         shape = " x ".join(map(str, plane.resolution))
         raise ValueError(
             f"a slice has gradients at two samples along each axis or more; got {shape} samples and gradients at every "
-            f"{every}; {min(plane.resolution) - 1} would fit, or take a higher resolution"
+            f"{gradients}; {min(plane.resolution) - 1} would fit, or take a higher resolution"
         )
-    return every
+    return gradients
+
+
+def count_gradients(resolution: Sequence[int], gradients: int) -> int:
+    """Return how many samples of a slice have a gradient: those at every so many along each axis, 0 for none."""
+    return math.prod(-(-points // gradients) for points in resolution) if gradients else 0
 
 
 def with_gradients(dataset: xr.Dataset) -> xr.Dataset:

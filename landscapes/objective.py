@@ -212,7 +212,7 @@ def _check_codes(status: object) -> Tensor:
 def _require_gradient(grad: Tensor | None, who: str) -> Tensor:
     if grad is None:
         raise ValueError(
-            f"{who} was asked for gradients and returned none; sample with grad=False (--no-gradients), "
+            f"{who} was asked for gradients and returned none; sample with gradients=0 (--no-gradients), "
             "or search with a method that needs none"
         )
     return grad

@@ -21,7 +21,11 @@ from .processes import Ended, alone, landscape
 HUGE = 10**15
 ROOM = 2 << 30  # bytes that a command may take beyond what it is loaded with
 COUNTS = {"seed", "top", "workers"}  # whole numbers that allocate nothing
-OF_A_GRID = [(("slice",), "budget"), (("census",), "gradients")]  # nor does one that is held to the points of a grid
+OF_A_GRID = [  # nor does one that is held to the points of a grid
+    (("slice",), "budget"),
+    (("census",), "gradients"),
+    (("plan",), "gradients"),
+]
 SUBJECTS = {"ENV": "ackley", "SLICE": "cut", "RUN": "run", "[SLICE|ENV]": "cut", "ENV|FIGURES.toml": "branin"}
 OF_A_RACE = [(("plan",), "seeds"), (("plan",), "budget")]  # those of a plan that are not of a slice
 NEEDED = {"--dims": "0 1", "--over": "smoothing", "--method": "random", "--axis": "x", "--plane": "pca"}

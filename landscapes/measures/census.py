@@ -18,8 +18,10 @@ from torch import Tensor
 
 from ..directions import orthonormal
 from ..identity import plane_of
-from ..objective import Objective, evaluate
+from ..lattice import count_gradients
+from ..objective import Objective
 from ..plane import Plane
+from ..sampling.fill import sample
 from ..space import ParameterSpace
 from ..statistics import Estimate
 from .classify import Verdict, classify
@@ -111,7 +113,7 @@ class CensusDesign:
     @property
     def samples(self) -> tuple[int, int]:
         """How many samples of a slice are without a gradient, and how many have one."""
-        having = (-(-self.resolution // self.gradients)) ** 2
+        having = count_gradients((self.resolution, self.resolution), self.gradients)
         return self.resolution**2 - having, having
 
     @property
@@ -157,33 +159,20 @@ def survey(objective: Objective, plane: Plane, *, deviation: float, seed: int, g
     the losses of all. Jumps are looked for in at most `STEEP` pairs of samples.
     """
     counted = _Counted(objective)
-    whole = sample(counted, plane, gradients=gradients)
+    whole = sample_cut(counted, plane, gradients=gradients)
     found, verdict = _measure(counted, whole, deviation, seed, jumps=True)
     halved, _ = _measure(counted, thin_out(whole), deviation, seed, jumps=False)
     loss = whole["loss"].to_numpy()
     return SurveyedSlice(loss, found, halved, verdict.words, counted.asked)
 
 
-def sample(objective: Objective, plane: Plane, *, gradients: int = 1) -> xr.Dataset:
-    """Evaluate a plane of an objective, in batches that it prefers; points outside its box are left out, as NaN.
+def sample_cut(objective: Objective, plane: Plane, *, gradients: int = 1) -> xr.Dataset:
+    """Return losses and gradients of a slice, NaN where a sample has none; nothing else is said of it than its plane.
 
-    Gradients are NaN but at every so many samples along each axis, `gradients`. Raises ValueError where the objective
-    has none.
+    Gradients are at every so many samples along each axis, `gradients`. Raises what `sample` does.
     """
-    grid = plane.grid()
-    loss, grad = torch.full(grid.shape[:2], torch.nan).double(), torch.full_like(grid, torch.nan)
-    having = torch.zeros(grid.shape[:2], dtype=torch.bool)
-    having[::gradients, ::gradients] = True
-    batch = getattr(objective, "preferred_batch", len(loss) ** 2)
-    for chosen in (having, ~having) if gradients > 1 else (having,):
-        parts = [evaluate(objective, part, grad=chosen is having) for part in torch.split(grid[chosen], batch)]
-        if chosen is having and parts[0].grad is None:
-            raise ValueError("a census needs gradients, which this objective does not have")
-        for part, where in zip(parts, torch.split(chosen.nonzero(), batch), strict=True):
-            loss[*where.T] = part.loss
-            if part.grad is not None:
-                grad[*where.T] = part.grad
-    return _dataset(plane, loss.numpy(), grad.numpy())
+    found = sample(objective, plane, gradients=gradients)
+    return _dataset(plane, found["loss"].to_numpy(), found["grad"].to_numpy())
 
 
 def thin_out(whole: xr.Dataset) -> xr.Dataset:

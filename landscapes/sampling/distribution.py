@@ -11,16 +11,15 @@ import pickle
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
 import cloudpickle
-import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
@@ -31,6 +30,7 @@ from ..objective import Evaluation, Objective, Status, name_of
 from ..storage.paths import place_of
 from ..storage.store import SliceStore
 from ..storage.tiles import Tile
+from .batches import evaluate_tiles
 from .memory import MemoryBound, free_memory
 
 T = TypeVar("T")
@@ -68,29 +68,14 @@ class Site:
         """Return the site as it is in this process."""
         return self
 
-    def fill(self, tiles: Sequence[Tile]) -> Iterator[FilledTile]:
-        """Evaluate tiles in one batch, and write them one by one."""
-        if not tiles:
-            return
-        parts = [self.store.points(tile) for tile in tiles]
-        evaluation = self._evaluate(tiles, torch.cat(parts))
-        notes = self.objective.take_notes()
-        start = 0
-        for tile, part in zip(tiles, parts, strict=True):
-            rows = evaluation.rows(slice(start, start := start + len(part)))
-            self.store.write(tile, rows)
-            yield FilledTile(tile, Counter(map(Status, rows.status.tolist())), notes)
-            notes = ()
-
-    def _evaluate(self, tiles: Sequence[Tile], x: Float[Tensor, "batch dim"]) -> Evaluation:
-        """Evaluate the points of tiles, some with a gradient and the others without; those have a gradient of NaN."""
-        if self.store.every == 1:
-            return self.objective.evaluate(x, grad=self.store.grad)
-        having = torch.from_numpy(np.concatenate([self.store.sloped(tile) for tile in tiles]))
-        both = [self.objective.evaluate(x[rows], grad=grad) for grad, rows in ((True, having), (False, ~having))]
-        order = torch.cat([having.nonzero(), (~having).nonzero()])[:, 0].argsort()
-        both[1] = replace(both[1], grad=torch.full_like(x[~having], torch.nan))
-        return Evaluation.join(both, dim=x.shape[1], grad=True).rows(order)
+    def fill(self, tiles: Sequence[Tile], batch: int, pending: Collection[Tile] | None = None) -> Iterator[FilledTile]:
+        """Evaluate tiles in batches of so many points, and write them one by one; by default all are pending."""
+        pending, finished = set(tiles if pending is None else pending), self.store.ascending
+        for tile, found in evaluate_tiles(self.objective, self.store, tiles, batch, pending):
+            self.store.write(tile, found)
+            yield FilledTile(tile, Counter(map(Status, found.status.tolist())), self.objective.take_notes())
+            if self.store.ascending != finished:  # by another process, and has other tiles since
+                return
 
     def __reduce__(self) -> tuple[Any, ...]:
         who = name_of(self.objective)
@@ -126,12 +111,12 @@ class RemoteSite:
         check_identity(store.path, wanted=self.identity, found=store.identity)
         return Site(make_objective(self.recipe), store)
 
-    def fill(self, tiles: Sequence[Tile]) -> Iterator[FilledTile]:
+    def fill(self, tiles: Sequence[Tile], batch: int) -> Iterator[FilledTile]:
         """Do what `Site.fill` does, but for tiles that a worker finished before it died."""
         site = self.here()
         found = {tile: site.store.statuses(tile) for tile in tiles}
         yield from (FilledTile(tile, statuses) for tile, statuses in found.items() if statuses)
-        yield from site.fill([tile for tile, statuses in found.items() if not statuses])
+        yield from site.fill(tiles, batch, {tile for tile, statuses in found.items() if not statuses})
 
 
 @dataclass(frozen=True)
@@ -167,14 +152,17 @@ def make_objective(recipe: bytes) -> MemoryBound:
         return _objectives[recipe]
 
 
-def equal_batches(store: SliceStore, tiles: Sequence[Tile], batch: int, workers: int) -> list[list[Tile]]:
-    """Group tiles, in their order, so that every worker gets as many batches, equal and of at most `batch` points.
+def equal_groups(store: SliceStore, tiles: Sequence[Tile], batch: int, workers: int) -> list[list[Tile]]:
+    """Group tiles, in their order, so that every worker gets as many groups, equal and of at most `batch` points.
 
-    Where tiles are coarse they are equal to within one, which may exceed `batch`.
+    Where gradients are at every few samples alone, groups are larger: of at most so many points with a gradient, and of
+    as many points in all as have so many where they are evenly spread. Where tiles are coarse groups are equal to
+    within one, which may exceed that.
     """
-    sizes = [store.count(tile) for tile in tiles]
+    share = store.every ** len(store.shape)  # of so many samples one has a gradient
+    sizes = [max(store.count(tile), share * int(store.sloped(tile).sum())) for tile in tiles]
     total = sum(sizes)
-    count = min(len(tiles), workers * math.ceil(total / (batch * workers)))
+    count = min(len(tiles), workers * math.ceil(total / (share * batch * workers)))
     groups: list[list[Tile]] = [[] for _ in range(count)]
     before = 0
     for tile, size in zip(tiles, sizes, strict=True):
@@ -251,9 +239,10 @@ def workers_of(executor: Executor) -> int:
     return int(getattr(executor, "_max_workers", 1))
 
 
-def distribute(site: Site, groups: Sequence[Sequence[Tile]], executor: Executor) -> Iterator[FilledTile]:
-    """Let an executor's workers fill batches of tiles, and yield each tile when its batch is done."""
-    yield from chain.from_iterable(run_tasks(executor, _fill, [(site, group) for group in groups]))
+def distribute(site: Site, tiles: Sequence[Tile], batch: int, executor: Executor) -> Iterator[FilledTile]:
+    """Let an executor's workers fill tiles, group by group, and yield each tile when its group is done."""
+    groups = equal_groups(site.store, tiles, batch, workers_of(executor))
+    yield from chain.from_iterable(run_tasks(executor, _fill, [(site, group, batch) for group in groups]))
 
 
 def run_tasks(executor: Executor, work: Callable[..., T], tasks: Iterable[Sequence[Any]]) -> Iterator[T]:
@@ -300,5 +289,5 @@ def _evaluate(
     return number, site.here().objective.evaluate(x, grad=grad)
 
 
-def _fill(site: Site | RemoteSite, tiles: Sequence[Tile]) -> list[FilledTile]:
-    return list(site.fill(tiles))
+def _fill(site: Site | RemoteSite, tiles: Sequence[Tile], batch: int) -> list[FilledTile]:
+    return list(site.fill(tiles, batch))

@@ -20,7 +20,7 @@ from ..space import as_whole
 from ..storage.disk import full, is_full
 from ..storage.store import SliceStore
 from ..storage.tiles import Tile
-from .distribution import FilledTile, ReadBack, Site, WorkersLostError, distribute, equal_batches, workers_of
+from .distribution import FilledTile, ReadBack, Site, WorkersLostError, distribute
 from .memory import MemoryBound
 
 
@@ -46,8 +46,7 @@ def sample(
     plane: Plane,
     store: SliceStore | None = None,
     *,
-    grad: bool = True,
-    every: int = 1,
+    gradients: int = 1,
     batch: int | None = None,
     progress: Callable[[Progress], None] | None = None,
     executor: Executor | None = None,
@@ -56,11 +55,13 @@ def sample(
 ) -> xr.Dataset:
     """Evaluate an objective on a plane and return the slice; what `store` holds already is not evaluated again.
 
-    Without a store the slice lives in memory. Gradients are at `every` so many samples along each axis, losses at all;
-    of a store it says so itself. `batch` is the number of points per evaluation, rounded up to whole tiles (default:
-    the objective's `preferred_batch`, else one tile); `progress` is called once at the start and after every tile. Stop
-    it at any instant: the same call goes on, and the result is bit for bit that of an uninterrupted one, given an
-    objective whose rows do not depend on their batch. A batch that does not fit into memory is halved.
+    Without a store the slice lives in memory. Losses are at all samples, gradients at every so many along each axis,
+    `gradients`, 0 for none; how far apart they are in a store it says itself. `batch` is the number of points per
+    evaluation, rounded up to whole tiles (default: the objective's `preferred_batch`, else one tile); where some
+    samples have no gradient, there are batches of those that have one and batches of the others, as `Batches` says.
+    `progress` is called once at the start and after every tile. Stop it at any instant: the same call goes on, and the
+    result is bit for bit that of an uninterrupted one, given an objective whose rows do not depend on their batch. A
+    batch that does not fit into memory is halved.
 
     With an `executor` its workers evaluate batches and write them to the store, which processes must see at the same
     path. Threads share the objective; in a process `made`, a function that can be pickled, makes it once, or else it is
@@ -69,27 +70,28 @@ def sample(
     `conclude` is called with the slice when it is complete, and returns attributes of it that are kept, too. Of one
     that was finished before it is not called.
 
-    Raises StoreMismatchError where the store was made by other settings, TooLargeError where the slice does not fit
-    into memory, DiskFullError and WorkersLostError where filling ended early, which say what is kept, and MemoryError
-    where a single point is too much for the device.
+    Raises ValueError where `gradients` or `batch` is no whole number, StoreMismatchError where the store was made by
+    other settings, TooLargeError where the slice does not fit into memory, DiskFullError and WorkersLostError where
+    filling ended early, which say what is kept, and MemoryError where a single point is too much for the device.
     """
+    gradients = as_whole(int(gradients) if isinstance(gradients, bool) else gradients, "gradients")
     if store is None:
         about = describe(objective)
-        about["identity"] = with_stride(about["identity"], every)
-        store = SliceStore.in_memory(plane, objective.space, **about, grad=grad)
-    _check_store(store, objective, plane, grad=grad)
+        about["identity"] = with_stride(about["identity"], gradients)
+        store = SliceStore.in_memory(plane, objective.space, **about, grad=gradients > 0)
+    _check_store(store, objective, plane, grad=gradients > 0)
     batch = as_whole(getattr(objective, "preferred_batch", 1) if batch is None else batch, "sample's batch", least=1)
     status = store.status()
     counts: Counter[Status] = Counter({kind: int((status == kind).sum()) for kind in Status if kind != Status.MISSING})
     resumed, pending = counts.total(), store.pending(status)
     left = Counter(tile.level for tile in pending)  # tiles, by level
-    every = 1 + store.tiles()[-1].level
-    levels = min(left, default=every)
+    all_levels = 1 + store.tiles()[-1].level
+    levels = min(left, default=all_levels)
     _warn_of_damage(store, pending)
 
     def report() -> None:
         nonlocal levels
-        before, levels = levels, min(left, default=every)
+        before, levels = levels, min(left, default=all_levels)
         if progress is not None:
             progress(Progress(counts.total(), status.size, resumed, dict(counts), levels, levels > before))
 
@@ -123,10 +125,9 @@ def _fill(
     site: Site, pending: Sequence[Tile], batch: int, executor: Executor | None
 ) -> Generator[FilledTile, None, None]:
     if executor is None:
-        for tiles in _batches(site.store, batch, set(pending)):
-            yield from site.fill(tiles)
+        yield from site.fill(site.store.tiles(), batch, pending)
     elif pending:
-        yield from distribute(site, equal_batches(site.store, pending, batch, workers_of(executor)), executor)
+        yield from distribute(site, pending, batch, executor)
 
 
 def _warn_of_damage(store: SliceStore, pending: Sequence[Tile]) -> None:
@@ -154,16 +155,3 @@ def resumable(store: SliceStore, counts: Counter[Status]) -> Iterator[None]:
 def _check_store(store: SliceStore, objective: Objective, plane: Plane, *, grad: bool) -> None:
     wanted = {"plane": plane.record(), "parameters": list(objective.space.names), "gradients": grad}
     check_identity(store.path, wanted=wanted, found={name: store.identity[name] for name in wanted})
-
-
-def _batches(store: SliceStore, batch: int, pending: set[Tile]) -> Iterator[list[Tile]]:
-    """Group all tiles the same way however many are pending, so that a resumed run repeats the same batches."""
-    group: list[Tile] = []
-    size = 0
-    for tile in store.tiles():
-        group.append(tile)
-        size += store.count(tile)
-        if size >= batch:
-            yield [member for member in group if member in pending]
-            group, size = [], 0
-    yield [member for member in group if member in pending]

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import xarray as xr
 
 import gradscape
@@ -17,6 +18,7 @@ from gradscape.jobs.tolerance import keep
 from gradscape.landscapes.draw.figures import page, sweep
 from gradscape.landscapes.measures.fidelity import Bootstrap, Comparison, GradientError, LossError, Seconds
 from gradscape.landscapes.measures.tradeoff import MeasuredVariant, Tradeoff
+from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.storage.arrays import need_of
 from gradscape.landscapes.storage.store import SliceStore
 
@@ -93,6 +95,32 @@ def test_the_parts_of_a_plan_add_up_to_what_the_job_takes(
     assert filling["files"] == pytest.approx(max(one.files for one in tiles), rel=0.02)
 
 
+def test_few_gradients_are_planned_at_their_own_rate(
+    run: Callable[..., Said], tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    evaluate = Environment.evaluate
+
+    def slower(env: Environment, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
+        clock.sleep(2 * EPISODE * len(x) * grad)
+        return evaluate(env, x, grad=grad)
+
+    monkeypatch.setattr(Environment, "evaluate", slower)
+    job = ["cartpole", "--dims", "0", "1", "--resolution", "32", "--gradients", "5", "--fidelity", "draft"]
+    planned = plan(run, tmp_path, *job)
+    done = json.loads(run("slice", *job, "--out", "made", "--json", cwd=tmp_path).stdout)
+    seconds, between = planned["seconds"], EPISODE * done["unresolved"]["episodes"]
+    assert (planned["episodes"], planned["gradients"]) == (32 * 32, 7 * 7)
+    assert seconds["simulating"] == pytest.approx(EPISODE * (32 * 32 + 2 * 7 * 7))
+    parts = seconds["simulating"] + seconds["writing"] + seconds["drawing"]
+    assert parts + between == pytest.approx(done["seconds"], abs=PICTURE)
+    assert between <= seconds["between"]
+    room, dense = room_of(tmp_path / "made"), plan(run, tmp_path, *job[:6], *job[8:])
+    assert planned["disk"]["bytes"] == pytest.approx(room.bytes, rel=0.5)
+    assert planned["disk"]["bytes"] < dense["disk"]["bytes"] / 5
+    assert dense["gradients"] == dense["episodes"]
+    assert plan(run, tmp_path, *job[:6], "--no-gradients")["gradients"] == 0
+
+
 def test_a_plan_needs_the_memory_that_is_held_and_that_of_the_slice_to_come(
     run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -127,12 +155,15 @@ def test_a_larger_job_is_planned_by_a_smaller_one(
     monkeypatch.setattr("gradscape.jobs.plan.MOST_POINTS", 32)
     scaled = plan(run, tmp_path, *said)
     assert scaled["rate"] == "measured here, now, on 32 x 32 points"
-    for name in ("episodes", "batches", "too_large"):
+    for name in ("episodes", "gradients", "batches", "too_large"):
         assert scaled[name] == whole[name]
     assert scaled["seconds"]["simulating"] == pytest.approx(whole["seconds"]["simulating"])
     assert scaled["disk"]["files"] == whole["disk"]["files"]
     for filled in ("bytes", "files"):
         assert scaled["disk"]["filling"][filled] == pytest.approx(whole["disk"]["filling"][filled], rel=0.6)
+    few = plan(run, tmp_path, *said, "--gradients", "5")
+    assert (few["gradients"], few["batches"]) == (13 * 13, 11 + 246)  # of 16, not as many times those of 32 x 32
+    assert few["seconds"]["simulating"] == pytest.approx(whole["seconds"]["simulating"])
 
 
 def test_a_plan_leaves_nothing_behind_and_workers_share_what_can_be_shared(
@@ -161,6 +192,14 @@ def test_figures_are_planned_by_kind_and_added_up(run: Callable[..., Said], tmp_
     assert {one.name for one in tmp_path.iterdir()} == {"f.toml"}
 
 
+def test_a_figure_with_few_gradients_is_planned_with_as_many(run: Callable[..., Said], tmp_path: Path) -> None:
+    figure = '[[figure]]\nid = "{}"\nenv = "bounce"\ndims = [0, 1]\nthrough = "example:aim"\ngradients = {}\n'
+    (tmp_path / "f.toml").write_text(figure.format("all", 1) + figure.format("few", 4))
+    how = ["f.toml", "--resolution", "16", "--fidelity", "draft"]
+    assert [one["gradients"] for one in plan(run, tmp_path, *how)["figures"]] == [256, 16]
+    assert [one["gradients"] for one in plan(run, tmp_path, *how, "--no-gradients")["figures"]] == [0, 0]
+
+
 def test_a_device_that_is_not_here_has_the_rate_that_tradeoff_kept(
     run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -183,6 +222,8 @@ def test_a_device_that_is_not_here_has_the_rate_that_tradeoff_kept(
     assert found["device"] == "cuda"
     assert (found["seconds"]["simulating"], found["batches"]) == (16 * 2.5, 2)
     assert str(path) in found["rate"]
+    few = json.loads(run(*command, "--gradients", "3", "--json", cwd=tmp_path).stdout)
+    assert (few["seconds"]["simulating"], few["batches"]) == (4 * 2.5 + 12 * 1.0, 1 + 2)
 
 
 @pytest.mark.parametrize(
@@ -191,6 +232,10 @@ def test_a_device_that_is_not_here_has_the_rate_that_tradeoff_kept(
         (["bonce"], "did you mean bounce?"),
         (["none.toml"], "no list of figures at none.toml"),
         (["figures.toml", "--over", "2"], "leave out --over"),
+        (["figures.toml", "--gradients", "2"], "--gradients and --set"),
+        (["bounce", "--over", "2", "--gradients", "2"], "leave out --gradients or --over"),
+        (["bounce", "--resolution", "8", "--gradients", "8"], "got 8 x 8 samples and gradients at every 8"),
+        (["bounce", "--gradients", "2", "--methods", "random"], "a race has no plane; leave out --dims"),
         (["bounce", "--over", "horizon", "--set", "horizon=0.5"], "leave out --set horizon"),
         (["bounce", "--dims", "0", "9"], "numbered 0 to 2; got 9"),
         (["bounce", "--workers", "0"], "--workers"),

@@ -16,7 +16,7 @@ SPACE = ParameterSpace.box(["x", "y"], -1.0, 1.0)
 def shown(function, dims=(0, 1), at=(0.0, 0.0), resolution=9) -> list[Node]:  # type: ignore[no-untyped-def]
     through = torch.tensor(at).double()
     plane = Plane.through(SPACE, through, dims, resolution=resolution)
-    return choose_nodes(sample(from_numpy(function, SPACE), plane, grad=False), through)
+    return choose_nodes(sample(from_numpy(function, SPACE), plane, gradients=0), through)
 
 
 def test_nodes_are_the_extremes_the_median_and_the_slices_own_point() -> None:

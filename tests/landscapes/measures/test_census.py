@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from gradscape.landscapes.measures.census import MEASURES, CensusDesign, survey, thin_out
-from gradscape.landscapes.measures.census import sample as sample_plane
+from gradscape.landscapes.adapters import from_torch
+from gradscape.landscapes.measures.census import MEASURES, CensusDesign, sample_cut, survey, thin_out
 from gradscape.landscapes.measures.census_statistics import bootstrap, divide, spread, word_shares
-from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.objective import Evaluation, evaluate
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.space import ParameterSpace
 
@@ -66,14 +66,31 @@ def test_random_directions_are_orthonormal_in_widths_of_the_box_and_nothing_is_a
     assert bowl.asked == sum(one.episodes for one in found)
 
 
+@pytest.mark.parametrize("along", ["pairs", "random"])
+@pytest.mark.parametrize("gradients", [1, 2, 3])
+def test_a_slice_holds_the_bits_of_its_points_evaluated_in_a_row(along: str, gradients: int) -> None:
+    objective = from_torch(lambda x: (7 * x).sin().prod(dim=1) + x.exp().sum(dim=1), BOX)
+    design = CensusDesign.draw(BOX, 4, along=along, resolution=19, seed=0, gradients=gradients)
+    plane = design.plane(1, 1)
+    found, grid = sample_cut(objective, plane, gradients=gradients), plane.grid()
+    wanted = evaluate(objective, grid.reshape(-1, 5), grad=True)
+    assert wanted.grad is not None
+    slopes = torch.full_like(grid, torch.nan)
+    slopes[::gradients, ::gradients] = wanted.grad.reshape(grid.shape)[::gradients, ::gradients]
+    assert found["loss"].to_numpy().tobytes() == wanted.loss.numpy().tobytes()
+    np.testing.assert_array_equal(found["grad"], slopes)
+    assert bool(wanted.loss.isnan().any()) == (along == "random")  # beyond the box
+    assert bool(found["grad"].notnull().any())
+
+
 def test_every_second_sample_is_what_half_the_resolution_would_sample() -> None:
     plane = Plane.through(BOX, BOX.center, (0, 3), resolution=9)
-    thin = thin_out(sample_plane(Bowl(), plane))
-    wanted = sample_plane(Bowl(), Plane.through(BOX, BOX.center, (0, 3), resolution=5))
+    thin = thin_out(sample_cut(Bowl(), plane))
+    wanted = sample_cut(Bowl(), Plane.through(BOX, BOX.center, (0, 3), resolution=5))
     np.testing.assert_allclose(thin["loss"], wanted["loss"])
     np.testing.assert_allclose(thin["grad"], wanted["grad"])
-    even = thin_out(sample_plane(Bowl(), Plane.through(BOX, BOX.center, (0, 3), resolution=8)))
-    np.testing.assert_allclose(even["loss"], sample_plane(Bowl(), Plane.through(BOX, BOX.center, (0, 3), resolution=8))["loss"][::2, ::2])  # fmt: skip # noqa: E501
+    even = thin_out(sample_cut(Bowl(), Plane.through(BOX, BOX.center, (0, 3), resolution=8)))
+    np.testing.assert_allclose(even["loss"], sample_cut(Bowl(), Plane.through(BOX, BOX.center, (0, 3), resolution=8))["loss"][::2, ::2])  # fmt: skip # noqa: E501
 
 
 def test_a_bowls_slices_are_very_smooth_with_good_gradients() -> None:

@@ -24,7 +24,7 @@ Function = Callable[[torch.Tensor], torch.Tensor]
 def cut(function: Function, *, dims=("x", "y"), resolution: int = 21, space=SPACE, extent=None, grad=True, at=None):
     point = SPACE.center if at is None else torch.tensor(at).double()
     plane = Plane.through(space, point, dims, resolution=resolution, extent=extent)
-    return sample(from_torch(lambda x: function(x.T), space), plane, grad=grad)
+    return sample(from_torch(lambda x: function(x.T), space), plane, gradients=int(grad))
 
 
 def bowl(x: torch.Tensor) -> torch.Tensor:

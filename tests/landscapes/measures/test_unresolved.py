@@ -53,7 +53,7 @@ def cut(
 ) -> tuple[Objective, xr.Dataset]:
     objective = from_torch(function, SPACE)
     plane = Plane.through(SPACE, torch.zeros(2), dims, resolution=points)
-    return objective, sample(objective, plane, grad=grad)
+    return objective, sample(objective, plane, gradients=int(grad))
 
 
 def look(

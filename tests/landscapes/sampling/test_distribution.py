@@ -21,7 +21,7 @@ from gradscape.landscapes.identity import StoreError
 from gradscape.landscapes.objective import Objective
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling import distribution as spread
-from gradscape.landscapes.sampling.distribution import Site, WorkersLostError, equal_batches
+from gradscape.landscapes.sampling.distribution import Site, WorkersLostError, equal_groups
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.sampling.memory import MemoryBound
 from gradscape.landscapes.space import ParameterSpace
@@ -208,21 +208,21 @@ def test_a_worker_of_another_store_or_without_the_file_system_says_so(tmp_path):
     remote = make(*arguments)
     (tmp_path / "s.filling.zarr").rename(tmp_path / "elsewhere.zarr")
     with pytest.raises(StoreError, match=r"a worker finds no .*file system that they share"):
-        list(remote.fill(store.tiles()))
+        list(remote.fill(store.tiles(), 16))
     SliceStore.create(tmp_path / "s.zarr", PLANE, SPACE, identity={"objective": "hill"})
     with pytest.raises(StoreError, match="objective: wanted 'wave', found 'hill'"):
-        list(remote.fill(store.tiles()))
+        list(remote.fill(store.tiles(), 16))
 
 
 def test_a_batch_that_was_half_done_by_a_worker_that_died_is_not_done_again(tmp_path):
     store = store_at(tmp_path / "s.zarr")
     first = store.tiles()[0]
-    list(Site(MemoryBound(from_torch(wave, SPACE)), store).fill([first]))
+    list(Site(MemoryBound(from_torch(wave, SPACE)), store).fill([first], 16))
     make, arguments = Site(MemoryBound(from_torch(broken_in_a_corner, SPACE)), store).__reduce__()
     remote = make(*arguments)
-    assert [filled.tile for filled in remote.fill([first])] == [first]  # found: evaluated it would break
+    assert [filled.tile for filled in remote.fill([first], 16)] == [first]  # found: evaluated it would break
     with pytest.raises(RuntimeError, match="broken cable"):
-        list(remote.fill(store.tiles()))
+        list(remote.fill(store.tiles(), 16))
 
 
 @pytest.fixture
@@ -262,18 +262,18 @@ def test_a_worker_keeps_a_store_open_until_another_lies_there(tmp_path):
     site = Site(MemoryBound(from_torch(wave, SPACE)), store_at(tmp_path / "s.zarr"), lambda: from_torch(wave, SPACE))
     remote = pickle.loads(pickle.dumps(site))
     tiles = site.store.tiles()
-    assert list(remote.fill(tiles[:1]))
+    assert list(remote.fill(tiles[:1], 16))
     assert remote.here().store is remote.here().store
     shutil.rmtree(site.store.place)
     again = store_at(site.store.path)
-    assert list(remote.fill(tiles[:1]))
+    assert list(remote.fill(tiles[:1], 16))
     assert again.statuses(tiles[0])
 
 
 @given(batch=st.integers(1, 400), workers=st.integers(1, 9))
 def test_batches_are_equal_and_as_many_for_every_worker(batch, workers):
     store = SliceStore.in_memory(Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=32), SPACE)
-    groups = equal_batches(store, store.tiles(), batch, workers)
+    groups = equal_groups(store, store.tiles(), batch, workers)
     assert [tile for group in groups for tile in group] == store.tiles()
     sizes = [sum(map(store.count, group)) for group in groups]
     assert len(groups) == 64 or len(groups) % workers == 0

@@ -153,7 +153,7 @@ def test_without_gradients_none_is_asked_for_and_none_stored(tmp_path):
             assert not grad
             return super().evaluate(x, grad=grad)
 
-    assert "grad" not in sample(Blind(), PLANE, store_at(tmp_path / "s.zarr", grad=False), grad=False)
+    assert "grad" not in sample(Blind(), PLANE, store_at(tmp_path / "s.zarr", grad=False), gradients=0)
     with pytest.raises(StoreError, match="gradients: wanted True, found False"):
         sample(Wave(), PLANE, store_at(tmp_path / "s.zarr", grad=False))
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ from gradscape.landscapes.measures.ruggedness import ruggedness
 from gradscape.landscapes.measures.twice import Twice, at_twice
 from gradscape.landscapes.measures.unresolved import find_unresolved
 from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.sampling.distribution import equal_groups
+from gradscape.landscapes.sampling.fill import Progress
 from gradscape.landscapes.storage.store import SliceStore, open_slice
 
 from ...command import Said
@@ -30,17 +33,24 @@ LINE = Plane.through(SPACE, SPACE.center, ["y"], resolution=30)
 
 
 class Counted:
-    """A wave that is not finite in a corner; it counts losses and gradients, and stops after so many points."""
+    """A wave that is not finite in a corner; it counts losses and gradients, and stops after so many points.
+
+    `batches` holds the points of every call, by whether gradients were asked for.
+    """
 
     space, name = SPACE, "counted"
 
-    def __init__(self, stop_after: int | None = None) -> None:
+    def __init__(self, stop_after: int | None = None, batch: int = 1, room: int | None = None) -> None:
         self.gradients = self.losses = 0
-        self.stop_after = stop_after
+        self.stop_after, self.preferred_batch, self.room = stop_after, batch, room
+        self.batches: dict[bool, list[list[tuple[float, ...]]]] = {True: [], False: []}
 
     def evaluate(self, x: Tensor, *, grad: bool = True) -> Evaluation:
         if self.stop_after is not None and self.losses + self.gradients >= self.stop_after:
             raise KeyboardInterrupt
+        if grad and self.room is not None and len(x) > self.room:
+            raise MemoryError
+        self.batches[grad].append(list(map(tuple, x.tolist())))
         self.gradients += len(x) * grad
         self.losses += len(x) * (not grad)
         loss = (3 * x).sin().sum(dim=1)
@@ -62,7 +72,7 @@ def kept(dataset: xr.Dataset, every: int) -> np.ndarray:
 @pytest.mark.parametrize("every", [2, 5])
 def test_gradients_are_those_of_the_whole_slice_where_they_are(plane: Plane, every: int, tmp_path: Path) -> None:
     whole, counted = sample(Counted(), plane), Counted()
-    job = SliceJob.of(counted, plane, command="", out=tmp_path / "cut", every=every)
+    job = SliceJob.of(counted, plane, command="", out=tmp_path / "cut", gradients=every)
     job.run()
     found = open_slice(tmp_path / "cut")
     inside = kept(whole, every)
@@ -72,7 +82,7 @@ def test_gradients_are_those_of_the_whole_slice_where_they_are(plane: Plane, eve
     np.testing.assert_array_equal(found["grad"].to_numpy()[inside], whole["grad"].to_numpy()[inside])
     assert found.identical(open_slice(tmp_path / "cut"))
     with ThreadPoolExecutor(2) as threads:
-        job = SliceJob.of(Counted(), plane, command="", out=tmp_path / "threads", every=every, executor=threads)
+        job = SliceJob.of(Counted(), plane, command="", out=tmp_path / "threads", gradients=every, executor=threads)
         job.run()
     apart = open_slice(tmp_path / "threads")
     for name in ("loss", "grad", "status"):
@@ -81,15 +91,21 @@ def test_gradients_are_those_of_the_whole_slice_where_they_are(plane: Plane, eve
 
 def test_no_more_gradients_are_asked_for_than_are_kept() -> None:
     counted = Counted()
-    sample(counted, PLANE, every=4)
+    sample(counted, PLANE, gradients=4)
     assert counted.gradients == 5 * 6  # of 18 and 21 samples
     assert counted.losses == 18 * 21 - counted.gradients
 
 
+@pytest.mark.parametrize("gradients", [-1, 2.5])
+def test_gradients_are_at_every_whole_number_of_samples(gradients: Any) -> None:
+    with pytest.raises(ValueError, match=f"gradients is a whole number of at least 0; got {gradients}"):
+        sample(Counted(), PLANE, gradients=gradients)
+
+
 def test_one_that_was_stopped_goes_on_to_the_same_bits(tmp_path: Path) -> None:
-    SliceJob.of(Counted(), PLANE, command="", out=tmp_path / "whole", every=3).run()
+    SliceJob.of(Counted(), PLANE, command="", out=tmp_path / "whole", gradients=3).run()
     for _ in range(100):
-        job = SliceJob.of(Counted(150), PLANE, command="", out=tmp_path / "cut", every=3)
+        job = SliceJob.of(Counted(150), PLANE, command="", out=tmp_path / "cut", gradients=3)
         try:
             job.run()
         except KeyboardInterrupt:
@@ -100,8 +116,103 @@ def test_one_that_was_stopped_goes_on_to_the_same_bits(tmp_path: Path) -> None:
         np.testing.assert_array_equal(one[name], other[name])
 
 
-def strided_store(path: Path) -> SliceStore:
-    return SliceStore.create(path, PLANE, SPACE, identity={"objective": "wave", "gradients_every": 3})
+SQUARE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=64)  # its first tiles have all of the gradients
+
+
+@pytest.mark.parametrize("plane", [PLANE, SQUARE, LINE], ids=["plane", "square", "line"])
+@pytest.mark.parametrize(("every", "batch"), [(2, 24), (3, 16), (4, 33)])
+def test_batches_of_gradients_and_of_losses_are_full_but_the_last(plane: Plane, every: int, batch: int) -> None:
+    counted = Counted(batch=batch)
+    found = sample(counted, plane, gradients=every)
+    number = int(kept(found, every).sum())
+    for grad, points in ((True, number), (False, found["loss"].size - number)):
+        full = full_batch(plane, every, batch, grad=grad)
+        sizes = list(map(len, counted.batches[grad]))
+        assert full % batch == 0
+        assert sizes == [full] * (points // full) + [points % full] * (points % full > 0)
+
+
+def full_batch(plane: Plane, every: int, batch: int, *, grad: bool) -> int:
+    """As many points as the batch, or the least multiple of it that those of any tile fit into."""
+    store = SliceStore.in_memory(plane, SPACE, identity={"gradients_every": every})
+    most = max(int((store.sloped(tile) == grad).sum()) for tile in store.tiles())
+    return next(size for size in range(batch, 10**6, batch) if size >= most)
+
+
+def test_no_more_than_a_batch_of_either_kind_is_evaluated_ahead() -> None:
+    counted, ahead = Counted(batch=32), list[int]()
+    sample(
+        counted, SQUARE, gradients=3, progress=lambda now: ahead.append(counted.gradients + counted.losses - now.done)
+    )
+    kinds = [full_batch(SQUARE, 3, 32, grad=grad) for grad in (True, False)]
+    assert 32 < max(ahead) < sum(kinds)
+    assert ahead[-1] == 0
+    assert len(ahead) == 65  # at the start and after each tile
+
+
+def test_gradients_that_do_not_fit_into_memory_are_halved_to_the_same_bits() -> None:
+    small = Counted(batch=64, room=40)
+    with pytest.warns(RuntimeWarning, match="counted ran out of memory at 64 points; going on with 32"):
+        found = sample(small, SQUARE, gradients=3)
+    wanted = sample(Counted(), SQUARE, gradients=3)
+    assert {len(one) for one in small.batches[True][:-1]} == {32}
+    for name in ("loss", "grad", "status"):
+        np.testing.assert_array_equal(found[name], wanted[name])
+
+
+def test_a_run_that_goes_on_repeats_the_batches(tmp_path: Path) -> None:
+    whole, stopped, last = Counted(batch=32), Counted(2000, batch=32), Counted(batch=32)
+    sample(whole, SQUARE, strided_store(tmp_path / "whole.zarr", SQUARE))
+    with pytest.raises(KeyboardInterrupt):
+        sample(stopped, SQUARE, strided_store(tmp_path / "cut.zarr", SQUARE))
+    sample(last, SQUARE, strided_store(tmp_path / "cut.zarr", SQUARE))
+    for grad in (True, False):
+        mine, theirs = last.batches[grad], whole.batches[grad]
+        assert 3 < len(mine) < len(theirs)
+        assert mine[1:] == theirs[1 - len(mine) :]
+        assert set(mine[0]) < set(theirs[-len(mine)])
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_workers_get_groups_of_tiles_whose_gradients_fill_a_batch(workers: int) -> None:
+    plane = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=90)
+    store = SliceStore.in_memory(plane, SPACE, identity={"gradients_every": 3})
+    groups = equal_groups(store, store.tiles(), 32, workers)
+    having = [sum(int(store.sloped(tile).sum()) for tile in group) for group in groups]
+    most = max(int(store.sloped(tile).sum()) for tile in store.tiles())
+    assert [tile for group in groups for tile in group] == store.tiles()
+    assert len(groups) % workers == 0
+    assert max(having) < 32 + most
+    assert sum(having) / len(having) > 32 / 2
+
+
+def test_workers_ask_for_few_batches_of_gradients(tmp_path: Path) -> None:
+    counted = Counted(batch=32)
+    with ThreadPoolExecutor(2) as threads:
+        sample(counted, SQUARE, gradients=3, executor=threads)
+    assert counted.gradients == 22 * 22
+    assert len(counted.batches[True]) < 2 * 22 * 22 / 32  # of tiles there are 64
+
+
+def test_a_slice_that_another_process_finishes_meanwhile_is_left_as_it_is(tmp_path: Path) -> None:
+    plane = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(600, 17))  # of three chunks once it is finished
+    path, counted = tmp_path / "s.zarr", Counted(batch=32)
+    store = strided_store(path, plane)
+
+    def finish(now: Progress) -> None:
+        if now.done and not (path / "zarr.json").exists():
+            sample(Counted(), plane, strided_store(path, plane))
+
+    found = sample(counted, plane, store, progress=finish)
+    assert store.ascending
+    assert counted.losses + counted.gradients < plane.resolution[0] * plane.resolution[1] / 2
+    wanted = sample(Counted(), plane, gradients=3)
+    for name in ("loss", "grad", "status"):
+        np.testing.assert_array_equal(found[name], wanted[name])
+
+
+def strided_store(path: Path, plane: Plane = PLANE) -> SliceStore:
+    return SliceStore.open_or_create(path, plane, SPACE, identity={"objective": "wave", "gradients_every": 3})
 
 
 @pytest.mark.parametrize("sloped", [True, False])
@@ -117,10 +228,10 @@ def test_a_gradient_that_is_lacking_where_it_belongs_is_a_tile_that_was_torn(tmp
 
 
 def test_other_gradients_are_another_slice(tmp_path: Path) -> None:
-    job = SliceJob.of(Counted(), PLANE, command="", out=tmp_path, every=3)
+    job = SliceJob.of(Counted(), PLANE, command="", out=tmp_path, gradients=3)
     job.run()
     with pytest.raises(ValueError, match="gradients_every: wanted 4, found 3"):
-        SliceJob.of(Counted(), PLANE, command="", out=tmp_path, every=4)
+        SliceJob.of(Counted(), PLANE, command="", out=tmp_path, gradients=4)
     with pytest.raises(ValueError, match="gradients_every: wanted none, found 3"):
         SliceJob.of(Counted(), PLANE, command="", out=tmp_path)
 
@@ -157,13 +268,13 @@ def waves(x: Tensor) -> Tensor:
 
 def both_of(every: int) -> Iterator[xr.Dataset]:
     plane = Plane.through(SPACE, SPACE.center, (0, 1), resolution=41)
-    return (sample(from_torch(waves, SPACE), plane, **how) for how in ({}, {"every": every}))
+    return (sample(from_torch(waves, SPACE), plane, **how) for how in ({}, {"gradients": every}))
 
 
 def test_what_is_finer_than_the_samples_is_looked_for_as_without_gradients() -> None:
     plane, objective = Plane.through(SPACE, SPACE.center, (0, 1), resolution=41), from_torch(waves, SPACE)
     _, strided = both_of(4)
-    assert find_unresolved(objective, strided) == find_unresolved(objective, sample(objective, plane, grad=False))
+    assert find_unresolved(objective, strided) == find_unresolved(objective, sample(objective, plane, gradients=0))
 
 
 def test_twice_the_resolution_is_measured_as_with_all_gradients() -> None:

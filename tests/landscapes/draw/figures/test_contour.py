@@ -224,7 +224,7 @@ def test_a_slice_where_everything_failed_is_still_a_picture(tmp_path, grad):
             nan = torch.full((len(x),), torch.nan).double()
             return Evaluation.from_results(nan, nan[:, None].expand(-1, 3) if grad else None)
 
-    figure = landscape_figure(sample(Broken(), plane(4, 4), grad=grad))
+    figure = landscape_figure(sample(Broken(), plane(4, 4), gradients=int(grad)))
     page.save(figure, tmp_path / "broken.png")
     assert "not finite: 16 of 16" in legend_of(figure)
     assert sum("lift" in axes.get_ylabel() for axes in figure.axes) == (2 if grad else 1)

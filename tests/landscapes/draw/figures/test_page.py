@@ -105,7 +105,7 @@ CHOSEN = {"draft": MIXED["rungs"][-1]["name"], "standard": MIXED["rungs"][10]["n
 FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
     "landscape_figure": [
         lambda width: landscape_figure(PLANE, width=width),
-        lambda width: landscape_figure(dated(sample(Bowl(), plane(9, 9), grad=False)), width=width),
+        lambda width: landscape_figure(dated(sample(Bowl(), plane(9, 9), gradients=0)), width=width),
     ],
     "profile_figure": [lambda width: profile_figure(LONG, events={"bounces": BOUNCES}, width=width)],
     "run_figure": [

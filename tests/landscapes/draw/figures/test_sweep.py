@@ -145,7 +145,7 @@ def test_smoothing_keeps_a_constant_and_averages_no_value_that_is_not_there() ->
 
 def test_smoothing_is_a_gaussian_of_that_share_of_each_side() -> None:
     wide = Plane.through(SPACE, SPACE.center, ("a", "b"), resolution=(41, 61), extent=((-1.0, -3.0), (1.0, 3.0)))
-    dataset = sample(Bowl(), wide, grad=False)
+    dataset = sample(Bowl(), wide, gradients=0)
     u, v = np.meshgrid(dataset["u"], dataset["v"])
     ok = np.full(u.shape, Status.OK, dataset["status"].dtype)
     dataset = dataset.assign(loss=dataset["loss"].copy(data=u**2 + v**2), status=dataset["status"].copy(data=ok))
