@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 
 from ..landscapes.objective import Status
 from ..landscapes.storage.files import replacing
+from ..landscapes.storage.layout import flags
 from ..landscapes.storage.records import reading
+from ..optim.base import Kind
 from ..optim.curves import best_so_far
 from ..optim.race import Race
 from ..optim.runs.arrays import FORWARD_EQUIVALENTS
@@ -123,8 +125,8 @@ def _table(
         "x": (("evaluation", "dim"), x),
         "grad": (("evaluation", "dim"), np.full_like(x, np.nan)),
         "loss": ("evaluation", loss.astype(float)),
-        "kind": ("evaluation", kind.astype(np.int8)),
-        "status": ("evaluation", known.astype(np.int8)),
+        "kind": ("evaluation", kind.astype(np.int8), flags(Kind)),
+        "status": ("evaluation", known.astype(np.int8), flags(Status)),
         "episodes": ("evaluation", np.arange(1, len(loss) + 1)),
     }
     coords = {name: ("dim", list(values)) for name, values in about["names"].items()}

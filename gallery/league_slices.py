@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from ..jobs.folder import SUMMARY
 from ..jobs.scene import SceneSpec
 from ..jobs.watch import Watch
 from ..landscapes.storage.records import read_json, write_record
@@ -74,7 +75,8 @@ class LeagueSlicePart(FigurePart):
         files.record.unlink(missing_ok=True)  # which says that the others are whole
         how: dict[str, Any] = {"command": self.label(), "out": files.folder, "force": True}
         outcome = SliceJob.of(env, self._plane(env, standings), gradients=0, executor=self.executor, **how).run(watch)
-        (files.folder / PICTURE).unlink()  # the map is drawn with the runs
+        for left in (PICTURE, SUMMARY):  # the map is drawn with the runs, and its page says the rest
+            (files.folder / left).unlink()
         runs = [improved(table) for table in KeptRuns.read(LeagueFiles.of(self.root, env.name).runs).medians.values()]
         dataset = open_slice(files.folder / STORE)
         save_both(overlay_figure(dataset, overlay(dataset, runs)), files.picture)
@@ -112,6 +114,9 @@ class LeagueSlicePart(FigurePart):
 
 def improved(table: xr.Dataset) -> xr.Dataset:
     """Return the episodes of a run that lowered its least loss: the others would cover the map."""
+    from ..landscapes.draw.figures.overlay import IMPROVEMENTS_OF
+
     loss = table["loss"].to_numpy()
     before = np.fmin.accumulate(np.append(np.inf, loss[:-1]))
-    return table.isel(evaluation=np.flatnonzero(loss < before))
+    rows = np.flatnonzero(loss < before)
+    return table.isel(evaluation=rows).assign_attrs({IMPROVEMENTS_OF: len(loss)})

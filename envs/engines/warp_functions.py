@@ -98,7 +98,7 @@ class WarpObjective(FunctionObjective):
         if not tape.launches:
             raise ValueError(
                 f"{self.name} launched no kernel, so its tape is empty; launch kernels that read its points and write "
-                "its losses, or sample with grad=False (--no-gradients)"
+                "its losses, or sample with gradients=0 (--no-gradients)"
             )
         if not losses.requires_grad:
             raise ValueError(f"{self.name} returned losses that carry no gradient; make them with requires_grad=True")

@@ -26,6 +26,7 @@ Runs = Sequence[xr.Dataset]
 PITCH = 5.4  # room of a panel on a screen [inch]
 HEADING = "Marker size: distance from the plane; colour: the loss the point truly had"
 FEW = 24  # most improvements that are numbered, over all runs
+IMPROVEMENTS_OF = "improvements_of"  # attribute of a run of which only improvements are laid: its episodes
 CROWD = 4  # runs from which on the lines that join them are thinner
 
 
@@ -149,10 +150,15 @@ def _number_improvements(ax: Axes, runs: Runs, plane: Plane) -> None:
     rows = [improvements(run)[::-1] for run in runs]
     turns = range(max(map(len, rows), default=0))
     picked = [(number, own[turn]) for turn in turns for number, own in enumerate(rows) if turn < len(own)][:FEW]
-    names = [labels.Name(str(row + 1), tuple(places[number][row])) for number, row in picked]
+    names = [labels.Name(str(_episode(runs[number], row)), tuple(places[number][row])) for number, row in picked]
     clear = np.concatenate([place[own] for place, own in zip(places, rows, strict=True)])
     size = page.sheet_of(ax).small
     labels.place(ax, names, clear, size=size, gaps=(0.7 * size,), gid="episode")
+
+
+def _episode(run: xr.Dataset, row: int) -> int:
+    """Return which episode of its run a row is: where only improvements are laid, not the next after the last."""
+    return int(run["episodes"][row]) if "episodes" in run else row + 1
 
 
 def _draw_against(ax: Axes, dataset: xr.Dataset, runs: Runs, reach: float) -> None:
@@ -276,4 +282,7 @@ def _count(runs: Runs) -> int:
 
 
 def _describe_runs(runs: Runs) -> str:
-    return f"{len(runs)} run{'s' if len(runs) != 1 else ''}, {_count(runs)} episodes"
+    said = f"{len(runs)} run{'s' if len(runs) != 1 else ''}, "
+    if runs and all(run.attrs.get(IMPROVEMENTS_OF) for run in runs):
+        return f"{said}{_count(runs)} improvements in {sum(run.attrs[IMPROVEMENTS_OF] for run in runs)} episodes"
+    return f"{said}{_count(runs)} episodes"
