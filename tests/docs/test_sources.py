@@ -72,6 +72,9 @@ def test_the_citation_is_of_this_project() -> None:
         str(one.last_names[0]) for one in entry.persons["author"]
     ]
     assert (paper["title"], str(paper["year"])) == (entry.fields["title"], entry.fields["year"])
+    assert paper["conference"]["name"] == entry.fields["booktitle"]
+    assert (paper["collection-title"], str(paper["volume"])) == (entry.fields["series"], entry.fields["volume"])
+    assert paper["url"].removeprefix("https://arxiv.org/abs/") == entry.fields["note"].removeprefix("arXiv:")
 
 
 def test_the_changelog_begins_with_this_version() -> None:
