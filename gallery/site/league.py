@@ -5,17 +5,19 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ...landscapes.storage.records import write_record
+from ...landscapes.plain import text
+from ...landscapes.storage.records import read_json, reading, write_record
+from ...landscapes.storage.store import open_slice
 from ...optim.claims import ClaimFinding, ClaimVerdict
 from ...optim.league import League, OverallRank, SceneStandings, Standing
-from ..files import LEAGUE, LEAGUE_PICTURE, LEAGUE_RECORD, LeagueFiles
+from ..files import LEAGUE, LEAGUE_PICTURE, LEAGUE_RECORD, REMAKE, STORE, LeagueFiles, LeagueSliceFiles
 from ..league import read_league, save_both
 from ..paper import Paper
-from .downloads import save_table
+from .downloads import save_slice, save_table
 
 LEAGUE_TABLE = "league.csv"
 VERDICTS = {
@@ -69,15 +71,19 @@ class Verdict:
 
 @dataclass(frozen=True)
 class LeaguePage:
-    """All that the page says: ranks, verdicts on claims, why others are none, and the races themselves."""
+    """All that the page says: ranks, verdicts on claims, why others are none, and the races themselves.
+
+    `slices` says by scene which command samples the slice through its best point, of those that have one.
+    """
 
     league: League
     rows: Sequence[RankRow]
     verdicts: Sequence[Verdict]
     silences: Sequence[tuple[str, str]]
+    slices: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, league: League, paper: Paper) -> LeaguePage:
+    def of(cls, league: League, paper: Paper, slices: Mapping[str, str]) -> LeaguePage:
         """Return what is to be said of a league beside the paper."""
         count = len(league.methods)
         rows = [_row(scene, league.methods, count) for scene in league.scenes]
@@ -87,7 +93,7 @@ class LeaguePage:
             Verdict(scene.env, scene.fidelity, one) for scene, claims in found for one in scene.findings(claims)
         ]
         silences = [(scene.env, claims.silence) for scene, claims in found if claims.silence]
-        return cls(league, [*rows, overall], verdicts, silences)
+        return cls(league, [*rows, overall], verdicts, silences, slices)
 
     @property
     def counts(self) -> str:
@@ -135,7 +141,22 @@ def place_league(data: Path, out: Path, paper: Paper) -> LeaguePage | None:
     save_table([_rank(one) for one in league.overall], folder / LEAGUE_TABLE)
     for scene in league.scenes:
         save_table([_came_off(scene, one) for one in scene.standings], folder / f"{scene.env}.csv")
-    return LeaguePage.of(league, paper)
+    slices = {one.env: place_slice(data, out, one.env) for one in league.scenes}
+    return LeaguePage.of(league, paper, {env: command for env, command in slices.items() if command})
+
+
+def place_slice(data: Path, out: Path, env: str) -> str | None:
+    """Put the slice through a scene's best point into the site, and return its command; None where there is none."""
+    source, target = (LeagueSliceFiles.of(root, env) for root in (data, out))
+    if not source.there():
+        return None
+    with reading(source.record, REMAKE.format("league-slices")):
+        command = text(read_json(source.record)["command"])
+    target.folder.mkdir()
+    for name in ("picture", "dark"):
+        shutil.copyfile(getattr(source, name), getattr(target, name))
+    save_slice(open_slice(source.folder / STORE), source.folder / STORE, target.folder)
+    return command
 
 
 def _row(scene: SceneStandings, methods: Sequence[str], count: int) -> RankRow:

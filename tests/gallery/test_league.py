@@ -12,16 +12,19 @@ from gradscape.envs.registry import make
 from gradscape.gallery import league as gallery_league
 from gradscape.gallery.compute import PARTS
 from gradscape.gallery.figures import Figure
+from gradscape.gallery.files import LeagueSliceFiles
 from gradscape.gallery.league import LeaguePart, read_league, read_standings
 from gradscape.gallery.league_runs import PLACES, KeptRun, KeptRuns
+from gradscape.gallery.league_slices import improved
 from gradscape.jobs import known
 from gradscape.jobs.race import RaceJob
 from gradscape.jobs.scene import point_of
 from gradscape.jobs.watch import Watch
 from gradscape.landscapes.adapters import from_numpy
-from gradscape.landscapes.identity import DamagedError
+from gradscape.landscapes.identity import DamagedError, plane_of, stored_identity
 from gradscape.landscapes.overlay import best_point
 from gradscape.landscapes.space import ParameterSpace
+from gradscape.landscapes.storage.store import open_slice
 from gradscape.optim.race import Race
 from gradscape.optim.runs.run import Run
 from gradscape.optim.search import search
@@ -35,7 +38,8 @@ FIGURES = [
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    monkeypatch.setattr("gradscape.gallery.figures.read_figures", lambda: list(FIGURES))
+    for place in ("figures", "league_slices"):
+        monkeypatch.setattr(f"gradscape.gallery.{place}.read_figures", lambda: list(FIGURES))
     for name, value in (("METHODS", ("random", "descents")), ("BUDGET", 12), ("SEEDS", 3)):
         monkeypatch.setattr(gallery_league, name, value)
     monkeypatch.chdir(tmp_path)
@@ -198,6 +202,44 @@ def test_a_better_run_is_preferred_to_the_gallery_s(small: Path, monkeypatch: py
     for loss, expected in ((1e9, own), (-1e9, torch.zeros(2, dtype=torch.float64))):
         monkeypatch.setattr(known, "best_of_league", lambda env, loss=loss: (torch.zeros(2, dtype=torch.float64), loss))
         assert torch.equal(point_of(env, "best"), expected)
+
+
+def test_median_runs_are_laid_over_the_slice_through_the_best_point(
+    small: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def slices(*only: str) -> str:
+        asked = ["gallery", "compute", "--part", "league-slices", "--device", "cpu", "--data", str(small), *only]
+        with pytest.raises(SystemExit) as left:
+            main(asked)
+        assert not left.value.code
+        return capsys.readouterr().err
+
+    assert "league-slices: 3 of 3 are there already" in slices()  # no league, no slice
+    assert compute(small, "--only", "branin") == 0
+    capsys.readouterr()
+    assert "league-slices: 1 of 3 are there already" in slices()
+    standings, files = read_standings(small / "league/branin.json"), LeagueSliceFiles.of(small, "branin")
+    assert {path.name for path in files.folder.iterdir()} == {
+        "slice.zarr", "medians.json", "medians.png", "medians-dark.png"
+    }  # fmt: skip
+    dataset = open_slice(files.folder / "slice.zarr")
+    assert standings.best is not None
+    plane, best = plane_of(dataset), torch.tensor(standings.best.x, dtype=torch.float64)
+    assert float(plane.distance(best[None])) < 1e-9
+    assert stored_identity(dataset)["fidelity"] == standings.fidelity
+    assert "3 of 3 are there already" in slices()
+    for run in KeptRuns.read(small / "league/branin.npz").medians.values():
+        some = improved(run)
+        assert (np.diff(some["loss"]) < 0).all()
+        assert float(some["loss"][-1]) == float(run["loss"].min())
+        assert some["episodes"][0] == 1
+    (small / "league/branin.json").unlink()  # another league has another best point
+    assert compute(small, "--only", "branin") == 0
+    record = json.loads(files.record.read_text())
+    record["key"]["best"][0] += 1
+    files.record.write_text(json.dumps(record))
+    capsys.readouterr()
+    assert "league-slices: 1 of 3 are there already" in slices()
 
 
 def test_the_league_is_a_part_that_figures_share() -> None:

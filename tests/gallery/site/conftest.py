@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from gradscape.gallery.figures import Figure
-from gradscape.gallery.files import RUN_SUFFIX, RUNS, LeagueFiles
+from gradscape.gallery.files import RUN_SUFFIX, RUNS, LeagueFiles, LeagueSliceFiles
 from gradscape.gallery.paper import PaperCaption
 from gradscape.gallery.runs import save_run
 from gradscape.gallery.site.build import build_site
@@ -173,6 +173,12 @@ def league(folder: Path) -> None:
         write_record(files.record, scene_standings(env, left_out).record())
         picture(files.picture)
         picture(files.dark)
+    sliced = LeagueSliceFiles.of(folder, "fluid")
+    keep(FIGURES[1], sliced.folder.parent)
+    (sliced.folder.parent / FIGURES[1].id).rename(sliced.folder)
+    picture(sliced.picture)
+    picture(sliced.dark)
+    write_record(sliced.record, {"key": {}, "command": "landscape slice fluid --dims 0 1 --through best"})
 
 
 def census(folder: Path) -> None:

@@ -140,9 +140,14 @@ def test_the_league_holds_claims_against_pairs_and_says_what_did_not_run(site: P
     assert "bounce: The paper compares no optimisers here" in page
     assert "Without turbo: turbo is &lt;not&gt; here" in page
     assert 'href="league.html"' in (site / "index.html").read_text()
-    assert {path.name for path in (site / "league").iterdir()} == {
+    assert {path.name for path in (site / "league").iterdir() if path.is_file()} == {
         f"{name}{kind}" for name in ("league", "fluid", "bounce") for kind in (".json", ".csv", ".png", "-dark.png")
     }
+    assert page.count("Where the searches went") == 1  # of two scenes, one of which has a slice
+    assert "landscape slice fluid --dims 0 1 --through best" in page
+    assert {path.name for path in (site / "league/fluid").iterdir()} == {
+        "medians.png", "medians-dark.png", "slice.csv", "slice.zarr.zip"
+    }  # fmt: skip
 
 
 def test_ranks_are_legible_on_their_colours(site: Path) -> None:
