@@ -112,10 +112,7 @@ def test_the_help_names_every_part(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_an_unknown_part_is_refused(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert compute(small, "--part", "films") == 2
-    assert (
-        "--part takes slices, companions, sweeps, episodes, searches, reports, tradeoffs, league; got films"
-        in " ".join(capsys.readouterr().err.split())
-    )
+    assert f"--part takes {', '.join(PARTS)}; got films" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_figure_through_another_point_is_not_there(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
