@@ -19,7 +19,8 @@ def compute(
         list[str] | None,
         typer.Option(
             help="slices, companions (the same cut through other points), sweeps, episodes, searches, reports, "
-            "tradeoffs, league or league-slices; may be repeated. By default all of them but the league, which takes longest."
+            "tradeoffs, league or league-slices; may be repeated. By default all of them but the league, which takes "
+            "longest."
         ),
     ] = None,
     fidelity: Fidelity = None,
