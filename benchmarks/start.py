@@ -2,7 +2,7 @@
 
     python benchmarks/start.py [pinball-2] [--repetitions 5] [--against OTHER/src]
 
-One command, `landscape slice ENV --dims 0 1`, is run again and again, each time in a process and a folder of its own, on
+One command, `landscape slice ENV --dims 0 1`, is run again and again, each time in a process and a folder of its own on
 caches that a first time has filled. Its parts are shares of the command's own time: what Python spends on importing, by
 package; making kernels ready; simulating; drawing. Drawing and the rest are without what they import.
 
@@ -82,7 +82,9 @@ def run(words: list[str], source: Path, *how: str) -> Spent:
     environment = os.environ | {"PYTHONPATH": str(source)}
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        done = subprocess.run([sys.executable, *how, *words], cwd=folder, env=environment, capture_output=True, text=True)
+        done = subprocess.run(
+            [sys.executable, *how, *words], cwd=folder, env=environment, capture_output=True, text=True
+        )
     clock, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode:
         raise RuntimeError(f"the command failed with {source}: {done.stderr[-2000:]}")
