@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import re
 import subprocess
 import sys
@@ -100,12 +101,12 @@ def test_of_torch_a_slice_imports_what_torch_imports_itself(sliced: set[str]) ->
 
 
 def test_what_a_command_imports_is_not_looked_through_for_garbage(monkeypatch: pytest.MonkeyPatch) -> None:
-    import gc
-
     before, seen = gc.get_threshold(), list[int]()
     monkeypatch.setattr("gradscape.cli.main", lambda: seen.append(gc.get_threshold()[0]))
     try:
         command.main()
+        assert gc.get_freeze_count() > 0
     finally:
         gc.set_threshold(*before)
+        gc.unfreeze()
     assert seen == [command.YOUNG] > [before[0]]

@@ -12,10 +12,14 @@ def main() -> Any:
     """Run the command in a process of its own.
 
     Of what it imports nothing is garbage, and to look through half a million objects again and again takes a fifth of
-    the time of importing them. Where memory is short it is collected by name.
+    the time of importing them, and a second at the end, when the system takes all memory back anyway. Where memory is
+    short garbage is collected by name.
     """
     gc.set_threshold(YOUNG)
-    return cli.main()
+    try:
+        return cli.main()
+    finally:
+        gc.freeze()
 
 
 if __name__ == "__main__":
