@@ -22,7 +22,7 @@ from ..landscapes.objective import Evaluation
 from ..landscapes.options import NoOptions, read_options
 from ..landscapes.sampling.memory import free_memory
 from ..landscapes.space import ParameterSpace, as_tensor
-from .batching import Pool, map_parts
+from .batching import Pool, cores, map_parts
 from .code import code_digest
 from .engines import find_engine
 from .engines.engine import Engine
@@ -221,6 +221,7 @@ class Environment(abc.ABC):
     @final
     def prepare(self) -> None:
         """Compile the kernels, or fetch them from the cache, so that the first evaluation is as quick as the next."""
+        self._compile_ahead()
         if self._solvers is not None:
             with self._solvers.lend():
                 pass
@@ -249,7 +250,7 @@ class Environment(abc.ABC):
     @property
     def threads(self) -> int:
         """Number of threads a batch is spread over: on a CPU, if the engine's solvers run beside each other."""
-        return _cores() if self._solvers is not None and self.device == "cpu" and self.capabilities.concurrent else 1
+        return cores() if self._solvers is not None and self.device == "cpu" and self.capabilities.concurrent else 1
 
     @property
     def capabilities(self) -> Engine:
@@ -292,6 +293,9 @@ class Environment(abc.ABC):
     def _setup(self) -> None:  # noqa: B027 -- a scene that shares nothing needs none
         """Prepare what all evaluations share; sets `space` unless the class does."""
 
+    def _compile_ahead(self) -> None:  # noqa: B027 -- a solver compiles what it needs, but one part after the other
+        """Compile all kernels beside each other."""
+
     def _prepare(self) -> None:  # noqa: B027 -- nothing, for most scenes
         """Make what else a first evaluation would make."""
 
@@ -314,7 +318,7 @@ class Environment(abc.ABC):
     def _limit_rows(self, capacity: int) -> int:
         """Return the rows a solver takes where one that runs beside others takes `capacity`."""
         alone = self.device == "cpu" and not self.capabilities.concurrent
-        return min(self._max_rows, capacity * (_cores() if alone else 1))
+        return min(self._max_rows, capacity * (cores() if alone else 1))
 
     def _refuse_broken_steps(self) -> None:
         dt, nearest = self.fidelity.dt, self.nearest_dt(self.fidelity.dt)
@@ -392,9 +396,3 @@ def _cuda() -> bool:
     from .engines.runtime import cuda_available
 
     return cuda_available()
-
-
-def _cores() -> int:
-    from .engines.runtime import cores
-
-    return cores()

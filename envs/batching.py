@@ -16,6 +16,13 @@ Part = TypeVar("Part")
 Result = TypeVar("Result")
 
 
+def cores() -> int:
+    """Count the cores this process may use."""
+    from .engines import runtime
+
+    return runtime.cores()
+
+
 class Pool(Generic[T]):
     """Lend objects that serve one thread at a time, making a new one where none is idle; with `most` of them, wait."""
 

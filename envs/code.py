@@ -22,9 +22,10 @@ COMPUTES_LOSSES = False  # of this file too
 HERE = Path(__file__).resolve().parent
 # Hooks of a scene that no loss depends on.
 DESCRIBING = frozenset({"about", "episode", "events", "memory", "work", "_energy", "_observe"})
+COMPILING = frozenset({"_compile_ahead"})  # earlier than it would be, and the same
 DRAWING = frozenset({"_parts", "_surroundings", "_body_names", "_view", "_watch", "_length_scale"})
 SETTINGS = frozenset({"fidelities", "model_parts"})  # records say which they are of
-NO_LOSS = DESCRIBING | DRAWING | SETTINGS
+NO_LOSS = DESCRIBING | DRAWING | COMPILING | SETTINGS
 
 
 @cache

@@ -26,7 +26,7 @@ from ..landscapes.sampling.fill import Progress, sample
 from ..landscapes.space import ParameterSpace
 from ..landscapes.storage.arrays import write_finished
 from ..landscapes.storage.store import SliceStore
-from .slice import first_points, pause_after
+from .slice import SOON, first_points, pause_after
 
 WRITING = 2.0  # seconds that a rehearsal goes on writing tiles
 SEEN = 1.0  # seconds for the evaluations that are repeated
@@ -168,7 +168,8 @@ def time_drawing(draw: Callable[[], object]) -> tuple[float, float]:
 
 def count_pictures(levels: int, batches: int, seconds: float, once: float) -> int:
     """Return how often `SliceJob.run` should draw: at the end, and of so many coarse pictures before some."""
-    return 1 + min(levels, batches, 1 + int(seconds / (pause_after(once) + once)))
+    before = 1 + int((seconds - SOON) / (pause_after(once) + once)) if seconds > SOON else 0
+    return 1 + min(levels, batches, before)
 
 
 def room_of(path: Path) -> Room:

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 
 STORE, PICTURE, REFINING = SLICE.store, SLICE.picture, "slice.refining"
 PAUSE, DRAWING = 10.0, 0.1  # between pictures of an unfinished slice: least seconds, and most of the time for them
+SOON = 3.0  # seconds until the first of them: of a slice that is finished by then it would be seen by nobody
 Draw = Callable[..., "Figure"]  # draw(dataset, width=None): a slice for a screen, or for a page so wide [mm]
 
 
@@ -231,7 +232,7 @@ class SliceJob:
 
     def _sample(self, watch: Watch) -> tuple[xr.Dataset, int]:
         """Sample what is missing; return the slice, and how many episodes were computed."""
-        drawn, pause, computed = -PAUSE, PAUSE, 0
+        drawn, pause, computed = time.monotonic(), SOON, 0
         with watch.progress(math.prod(self.plane.resolution)) as advance:
 
             def follow(now: Progress) -> None:
@@ -351,7 +352,7 @@ def cost_of(objective: Objective, store: SliceStore) -> SliceCost:
     batch = first_points(store, pending, getattr(objective, "preferred_batch", 1))
     sloped = sum(int(store.sloped(tile).sum()) for tile in pending)
     counts = {True: sloped, False: left - sloped}
-    each = {grad: seconds_per_episode(objective, batch, grad=grad) for grad, n in counts.items() if n}
+    each = {grad: seconds_per_episode(objective, batch, grad=grad, count=n) for grad, n in counts.items() if n}
     seconds = sum(counts[grad] * one for grad, one in each.items())
     arrays = need_of(store.shape, store.plane.dim, grad=store.grad)
     return SliceCost(left, seconds, peak_memory() + round(arrays.memory), each)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 
@@ -43,13 +44,16 @@ def episode_cost(objective: Objective, *, grad: bool = True) -> EpisodeCost:
     return EpisodeCost(best[False], best[True])
 
 
-def seconds_per_episode(objective: Objective, points: Float[Tensor, "batch dim"], *, grad: bool) -> float:
+def seconds_per_episode(
+    objective: Objective, points: Float[Tensor, "batch dim"], *, grad: bool, count: float = math.inf
+) -> float:
     """Measure what an episode costs where many are computed, at points such as those that will be [s].
 
-    As many points as there are threads are timed, again (a first time is longer), then more until they take long. A GPU
-    takes a whole batch at once: of one point most would be launches; so does an engine with `whole_batches`, to which
-    one point costs as much. Where its memory does not hold the batch, parts of it are timed, as they will be computed;
-    raises MemoryError where it does not hold one point.
+    As many points as there are threads are timed, again (a first time is longer), then more until they take long, or
+    until all that are to be, `count` of them, would not: what is over at once needs no better estimate. A GPU takes a
+    whole batch at once: of one point most would be launches; so does an engine with `whole_batches`, to which one point
+    costs as much. Where its memory does not hold the batch, parts of it are timed, as they will be computed; raises
+    MemoryError where it does not hold one point.
     """
     bound = MemoryBound(objective)
     whole = getattr(objective, "device", "cpu") == "cuda" or getattr(objective, "whole_batches", False)
@@ -57,8 +61,8 @@ def seconds_per_episode(objective: Objective, points: Float[Tensor, "batch dim"]
     seconds = measure_seconds(bound, points[:rows], grad=grad)
     if seconds < WARM_UP:
         seconds = measure_seconds(bound, points[:rows], grad=grad)
-    while seconds < ENOUGH and rows < len(points):
-        rows = min(4 * rows, len(points))
+    while seconds < ENOUGH <= seconds / rows * count and rows < len(points):
+        rows = min(round(max(4.0, ENOUGH / max(seconds, 1e-9)) * rows), len(points))  # they take no longer than enough
         seconds = measure_seconds(bound, points[:rows], grad=grad)
     return seconds / rows
 

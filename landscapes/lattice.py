@@ -85,11 +85,11 @@ def lift_between(plane: Plane, places: NDArray[np.float64]) -> torch.Tensor:
 
 def own_cells(dataset: xr.Dataset) -> xr.Dataset:
     """Return a slice as it is drawn: where it was not sampled it has loss and status of the nearest sample."""
-    from scipy.ndimage import distance_transform_edt
-
     lacking = dataset["status"].to_numpy() == Status.INTERPOLATED if "status" in dataset else np.zeros(0, bool)
     if not lacking.any():
         return dataset
+    from scipy.ndimage import distance_transform_edt
+
     nearest = tuple(distance_transform_edt(lacking, return_distances=False, return_indices=True))
     return dataset.assign({name: dataset[name].copy(data=dataset[name].to_numpy()[nearest]) for name in DRAWN})
 

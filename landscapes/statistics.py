@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import stats
+from numpy.typing import ArrayLike, NDArray
 
 from .plain import finite, or_nan
 
@@ -44,6 +43,34 @@ class Estimate:
         return cls(or_nan(record["value"]), or_nan(record["low"]), or_nan(record["high"]))
 
 
+@dataclass(frozen=True)
+class Line:
+    """Hold a line fitted to points by least squares, and the standard error of its slope, 0 for two points."""
+
+    slope: float
+    intercept: float
+    standard_error: float
+
+
+def fit_line(x: ArrayLike, y: ArrayLike) -> Line:
+    """Fit y = slope x + intercept to two or more points. Raises ValueError where all of x are the same."""
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    if len(np.unique(x)) < 2:
+        raise ValueError(f"a line is fitted to points at two or more x; got {len(x)} at {np.unique(x).tolist()}")
+    (variance, covariance), (_, spread) = np.cov(x, y, bias=True)
+    slope = covariance / variance
+    correlation = min(1.0, abs(covariance) / np.sqrt(variance * spread)) if spread > 0 else 1.0
+    left = (1 - correlation**2) * spread / variance / (len(x) - 2) if len(x) > 2 else 0.0
+    return Line(float(slope), float(y.mean() - slope * x.mean()), math.sqrt(left))
+
+
+def student(freedom: ArrayLike, level: float = (1 + CONFIDENCE) / 2) -> Any:
+    """Return the quantile of Student's distribution at a level, by default the upper end of a 95 % interval."""
+    from scipy.special import stdtrit  # scipy.stats, which has it too, takes four times as long to import
+
+    return stdtrit(freedom, level)
+
+
 def jackknife(
     statistic: Callable[[Values], float], samples: Values, *, least: float = -np.inf, most: float = np.inf
 ) -> Estimate:
@@ -63,7 +90,7 @@ def jackknife(
     if len(known) < 2 or not math.isfinite(value):
         return Estimate(value, math.nan, math.nan)
     deviation = math.sqrt((len(known) - 1) * float(np.mean((known - known.mean()) ** 2)))
-    reach = deviation * float(stats.t.ppf((1 + CONFIDENCE) / 2, len(known) - 1))
+    reach = deviation * float(student(len(known) - 1))
     return Estimate(value, max(least, value - reach), min(most, value + reach))
 
 
@@ -71,8 +98,12 @@ def share(hits: int, tries: int) -> Estimate:
     """Return a share with its exact binomial interval (Clopper & Pearson 1934)."""
     if not tries:
         return Estimate(math.nan, math.nan, math.nan)
-    interval = stats.binomtest(hits, tries).proportion_ci(CONFIDENCE)
-    return Estimate(hits / tries, float(interval.low), float(interval.high))
+    from scipy.special import betaincinv
+
+    tail = (1 - CONFIDENCE) / 2
+    low = float(betaincinv(hits, tries - hits + 1, tail)) if hits else 0.0
+    high = float(betaincinv(hits + 1, tries - hits, 1 - tail)) if hits < tries else 1.0
+    return Estimate(hits / tries, low, high)
 
 
 def mean(values: Values, *, least: float = -np.inf, most: float = np.inf) -> Estimate:
@@ -83,5 +114,5 @@ def mean(values: Values, *, least: float = -np.inf, most: float = np.inf) -> Est
     value = float(known.mean())
     if len(known) == 1:
         return Estimate(value, math.nan, math.nan)
-    reach = float(stats.sem(known) * stats.t.ppf((1 + CONFIDENCE) / 2, len(known) - 1))
+    reach = float(known.std(ddof=1)) / math.sqrt(len(known)) * float(student(len(known) - 1))
     return Estimate(value, max(least, value - reach), min(most, value + reach))

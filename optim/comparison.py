@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import mannwhitneyu
 
 from .bootstrap import Array, percentiles, weights
 from .curves import Tables, final_losses
@@ -105,6 +104,8 @@ def rank_test(a: Array, b: Array) -> float:
 
     It is 1 where all losses are the same.
     """
+    from scipy.stats import mannwhitneyu
+
     a, b = _placed(a), _placed(b)
     both = np.concatenate([a, b])
     distinct = len(np.unique(both))

@@ -86,7 +86,11 @@ def _draw(
 
 
 def _begin() -> None:
-    """Prepare a process: one thread, deaf to an interrupt, which the first process answers, and gone with that one."""
+    """Prepare a process: one thread, deaf to an interrupt, which the first process answers, and gone with that one.
+
+    Linear algebra of scipy, not loaded yet, would wait for threads of its own at every step of L-BFGS.
+    """
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
     import torch
 
     torch.set_num_threads(1)

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.stats import rankdata
 
 from .bootstrap import Array, interval
 from .comparison import Difference, Superiority, differences, superiorities
@@ -94,6 +93,8 @@ class RaceStatistics:
 
 def ranks(tables: Tables) -> list[Rank]:
     """Return how every method came off, the best mean rank first; within a seed, runs without success are last."""
+    from scipy.stats import rankdata
+
     final = final_losses(tables)
     comparable = np.where(np.isfinite(final), final, np.inf)
     places = rankdata(comparable, method="average", axis=0)

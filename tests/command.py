@@ -49,11 +49,12 @@ def make(folder: Path, *commands: str) -> Path:
     return folder
 
 
-def modules(arguments: list[str]) -> set[str]:
-    """Return what the command imports."""
+def modules(*commands: list[str], missing: tuple[str, ...] = ()) -> set[str]:
+    """Return what commands import, one after the other in a process where some packages are missing."""
     code = (
-        "import sys\nfrom gradscape.cli import main\n"
-        f"try: main({arguments})\nexcept SystemExit: pass\nprint('MODULES', *sys.modules, file=sys.stderr)"
+        f"import sys\nsys.modules.update(dict.fromkeys({missing}))\nfrom gradscape.cli import main\n"
+        f"for words in {commands}:\n    try: main(words)\n    except SystemExit as left: assert not left.code, words\n"
+        "print('MODULES', *(name for name in sys.modules if sys.modules[name]), file=sys.stderr)"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return set(said.stderr.split("MODULES")[1].split())

@@ -14,6 +14,7 @@ import warp as wp
 wp.config.log_level = wp.LOG_ERROR  # no banner
 
 COMPUTES_LOSSES = False  # for `code`
+MANY = ".engines.mpm."  # where solvers are whose kernels are of many modules
 
 
 def _start() -> None:
@@ -87,9 +88,18 @@ def to_torch(array: wp.array) -> torch.Tensor:
 
 
 def load(kernels: Iterable[Any], device: str) -> None:
-    """Compile kernels, or fetch them from the cache, before threads launch them."""
-    modules = list({kernel.module: None for kernel in kernels})
-    wp.force_load(device, modules, max_workers=cores())
+    """Compile kernels beside each other, or fetch them from the cache, before threads launch them.
+
+    To read Warp's headers takes two seconds of any module. The compiler can keep what it has read for the next module
+    of the same thread, but that takes a second more: it pays where a solver is of many.
+    """
+    modules = {kernel.module: kernel.func.__module__ for kernel in kernels}
+    before = wp.config.use_precompiled_headers
+    wp.config.use_precompiled_headers = any(MANY in where for where in modules.values())
+    try:
+        wp.force_load(device, list(modules), max_workers=cores())
+    finally:
+        wp.config.use_precompiled_headers = before
 
 
 def fill_struct(data: Any, record: Any) -> Any:

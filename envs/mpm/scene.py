@@ -116,6 +116,11 @@ class MpmScene(Environment):  # noqa: D101 -- `about` prints the docstrings of a
         make = partial(self._make_stage, self._engine("mpm").Solver, self.model, self._stop, settings)
         self._solvers = Pool(make, most=self._solvers_at_most)
 
+    def _compile_ahead(self) -> None:
+        compile_all = getattr(self._engine("mpm"), "compile_all", None)  # an engine may compile as it goes
+        if compile_all is not None:
+            compile_all(self.model, self.device, deterministic=self.deterministic)
+
     def _loss_steps(self) -> Sequence[int]:
         """Return the control steps before which losses are taken, the episode's end being one."""
         return (self.model.steps,)

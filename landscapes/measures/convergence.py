@@ -15,7 +15,6 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from ..plain import finite
 from ..statistics import CONFIDENCE
@@ -94,6 +93,8 @@ def solve_order(widths: Sequence[float], coarse: float, fine: float) -> float:
 
     NaN where a difference is not positive; negative where differences grow.
     """
+    from scipy.optimize import brentq
+
     if not (coarse > 0 and fine > 0 and math.isfinite(coarse) and math.isfinite(fine)):
         return math.nan
     first, second = math.log(widths[0] / widths[1]), math.log(widths[1] / widths[2])

@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import linregress
 
 from ..plain import finite, number, optional
-from ..statistics import mean
+from ..statistics import fit_line, mean
 from .fidelity import Bootstrap
 
 Array = NDArray[np.float64]
@@ -64,7 +63,7 @@ def measure_growth(time: Array, distance: Array, *, extent: float) -> Growth:
     factor = float(distance[-1] / distance[known[0]])
     if len(chosen) < FEWEST:
         return Growth(math.nan, whole, factor, bool(large.size))
-    rate = float(linregress(time[chosen], np.log(distance[chosen])).slope)
+    rate = fit_line(time[chosen], np.log(distance[chosen])).slope
     return Growth(rate, whole, factor, bool(large.size))
 
 

@@ -11,12 +11,11 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from scipy.stats import linregress, rankdata
 from torch import Tensor
 
 from ..objective import Evaluation, Objective, Status, evaluate
 from ..plain import finite, number, optional
-from ..statistics import CONFIDENCE
+from ..statistics import CONFIDENCE, fit_line
 
 REPETITION = 4.0  # least seconds that repetitions of a quick batch take, each way
 LARGEST = 60.0  # most seconds that a batch larger than the study's points may take
@@ -261,6 +260,8 @@ def gradient_error(grad: Array, reference: Array) -> tuple[Array, Array]:
 
 def spearman(a: Array, b: Array) -> Array:
     """Return Spearman's rank correlation along the last axis, NaN where one side has a single value."""
+    from scipy.stats import rankdata
+
     ranks = [rankdata(side, axis=-1) for side in (a, b)]
     ranks = [rank - rank.mean(axis=-1, keepdims=True) for rank in ranks]
     with np.errstate(invalid="ignore"):
@@ -295,8 +296,8 @@ def convergence_order(
     pairs = [(step, off) for step, off in zip(dt, error, strict=True) if np.isfinite(off) and off > 0]
     if len(pairs) < 3:
         return None
-    fit = linregress(*np.log(pairs).T)
-    return ConvergenceOrder(tuple(names), float(fit.slope), float(fit.stderr))
+    fit = fit_line(*np.log(pairs).T)
+    return ConvergenceOrder(tuple(names), fit.slope, fit.standard_error)
 
 
 def cheapest(rows: Sequence[Mapping[str, Any]], tolerance: float, *, relative: bool) -> Mapping[str, Any] | None:

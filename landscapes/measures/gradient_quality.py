@@ -13,14 +13,13 @@ import numpy as np
 import torch
 import xarray as xr
 from jaxtyping import Float
-from scipy import stats
 from torch import Tensor
 
 from ..identity import plane_of
 from ..objective import Objective, evaluate
 from ..plain import finite
 from ..plane import Plane
-from ..statistics import Values, mean, share
+from ..statistics import Values, mean, share, student
 from .records import ScaleRecord, WidthRecord
 from .ruggedness import box_slopes
 
@@ -164,7 +163,7 @@ def smoothed_slopes(
 def find_bias(found: xr.Dataset) -> xr.DataArray:
     """Say at which points first order is biased along an axis, by more than a little and than chance would have it."""
     level = 1 - CHANCE / 2 / found.sizes["axis"]
-    sure = xr.apply_ufunc(lambda count: stats.t.ppf(level, np.maximum(count - 1, 1)), found["count"])
+    sure = xr.apply_ufunc(lambda count: student(np.maximum(count - 1, 1), level), found["count"])
     flags: xr.DataArray = (abs(found["bias"]) > sure * found["bias_error"]).any("axis") & (
         disagreement(found) > NOTABLE_BIAS
     )

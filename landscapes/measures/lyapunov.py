@@ -12,10 +12,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import linregress
 
 from ..plain import number, or_nan, plain
-from ..statistics import Estimate, Values, mean
+from ..statistics import Estimate, Values, fit_line, mean
 
 FEWEST = 4  # horizons that a rate is fitted to
 MUCH = 0.5  # share of the points whose gradients must be known at all horizons
@@ -99,5 +98,5 @@ def measure_growth(time: Values, norm: Values) -> GradientGrowth:
 
 def _fit(axis: Values, values: Values) -> tuple[float, float]:
     """Return the slope of a line through values, and the standard deviation of what it leaves."""
-    found = linregress(axis, values)
-    return float(found.slope), float(np.std(values - found.intercept - found.slope * axis))
+    found = fit_line(axis, values)
+    return found.slope, float(np.std(values - found.intercept - found.slope * axis))

@@ -16,13 +16,10 @@ import numpy as np
 import torch
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import fft
-from scipy.spatial.distance import pdist
-from scipy.stats import linregress
 
 from ..identity import plane_of
 from ..plain import plain
-from ..statistics import Estimate, Values, jackknife
+from ..statistics import Estimate, Values, fit_line, jackknife
 from .records import LossesRecord
 
 FLAT_SLOPE = 1e-3  # a slope below it is effectively zero [ranges of the losses per side of the box]
@@ -142,7 +139,7 @@ def holder_exponent(loss: Values, axis: int, floor: float) -> float:
         if apart > floor:
             known.append((math.log(lag), math.log(apart)))
         lag *= 2
-    return float(linregress(*zip(*known, strict=True)).slope) if len(known) >= LAGS else math.nan
+    return fit_line(*zip(*known, strict=True)).slope if len(known) >= LAGS else math.nan
 
 
 def total_variation(loss: Values, axis: int) -> float:
@@ -202,6 +199,9 @@ def mean_distance(places: NDArray[np.intp], shape: tuple[int, ...]) -> float:
     Of many there are more pairs than memory holds, but few steps that samples can be apart: how many pairs are each is
     the autocorrelation of where the samples are, by the Fourier transform, rounded to the whole numbers it is made of.
     """
+    from scipy import fft
+    from scipy.spatial.distance import pdist
+
     if len(places) <= PAIRED:
         return float(pdist(places / _sides(shape)).mean())
     there = np.zeros(shape)

@@ -95,8 +95,17 @@ def unit(z: Points) -> Float[Tensor, "count dim"]:
 
 @contextmanager
 def exclusive() -> Iterator[None]:
-    """Keep other threads out, and quiet what is no news: iteration limits reached, jitter added to a covariance."""
+    """Keep other threads out, let torch use one core, and quiet what is no news: iteration limits, jitter added.
+
+    Sums have other last bits with another number of cores, which differs from machine to machine and from a race's
+    processes to the first one.
+    """
     with ONE_AT_A_TIME, warnings.catch_warnings():
         for category in (BotorchWarning, NumericalWarning, GPInputWarning):
             warnings.simplefilter("ignore", category)
-        yield
+        cores = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(cores)

@@ -129,8 +129,8 @@ def _sample(
         scales, count = process.covariance.scale.numpy(), candidates_of(options.candidates, surrogate.z.shape[1])
         candidates = torch.from_numpy(region(surrogate, scales, length, count, random))
         mean, covariance = process.posterior(candidates)
-        root = psd_safe_cholesky(covariance).numpy()
-        samples = mean.numpy()[:, None] + root @ random.standard_normal((count, options.batch_size))
+        drawn = torch.from_numpy(random.standard_normal((count, options.batch_size)))
+        samples = (mean[:, None] + psd_safe_cholesky(covariance) @ drawn).numpy()
     chosen = candidates.numpy()[samples.argmin(axis=0)]
     return 2.0 * chosen - 1.0, surrogate.state()
 

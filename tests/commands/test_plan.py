@@ -13,7 +13,7 @@ import xarray as xr
 import gradscape
 from gradscape.envs.base import Environment
 from gradscape.jobs.rehearsal import Replica, count_pictures, room_of, time_drawing
-from gradscape.jobs.slice import pause_after
+from gradscape.jobs.slice import SOON, pause_after
 from gradscape.jobs.tolerance import keep
 from gradscape.landscapes.draw.figures import page, sweep
 from gradscape.landscapes.measures.fidelity import Bootstrap, Comparison, GradientError, LossError, Seconds
@@ -138,8 +138,21 @@ def test_pictures_come_with_finer_levels_batches_and_a_pause_between_them() -> N
     space = gradscape.ParameterSpace.box(["a", "b"], -1.0, 1.0)
     store = SliceStore.in_memory(gradscape.Plane.through(space, space.center, ("a", "b"), resolution=64), space)
     most = 1 + store.tiles()[-1].level
-    cases = ((99, 1e6, 1.0), (99, 0.0, 1.0), (99, 44.0, 1.0), (3, 44.0, 1.0))
-    assert [count_pictures(most - 1, *now) for now in cases] == [most, 2, 6, 4]
+    soon = SOON + 44.0
+    cases = ((99, 1e6, 1.0), (99, SOON, 1.0), (99, SOON + 1.0, 1.0), (99, soon, 1.0), (3, soon, 1.0))
+    assert [count_pictures(most - 1, *now) for now in cases] == [most, 1, 2, 6, 4]
+
+
+@pytest.mark.parametrize(("resolution", "coarse"), [(4, False), (32, True)])
+def test_a_slice_that_is_over_at_once_is_drawn_when_it_is_finished_alone(
+    run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, resolution: int, coarse: bool
+) -> None:
+    drawn, save = list[Path](), page.save
+    monkeypatch.setattr(page, "save", lambda figure, path: (drawn.append(path), save(figure, path)))
+    words = ["bounce", "--dims", "0", "1", "--fidelity", "draft", "--resolution", str(resolution)]
+    assert run("slice", *words, "--out", "made", cwd=tmp_path).returncode == 0
+    assert EPISODE * 4**2 < SOON < EPISODE * 32**2
+    assert (len(drawn) > 1) == coarse
 
 
 def test_no_more_than_a_tenth_of_the_time_goes_into_pictures_of_what_is_unfinished() -> None:

@@ -6,6 +6,8 @@ import sys
 import textwrap
 
 import numpy as np
+import pytest
+import torch
 
 from gradscape.optim.methods.surrogate import WORTH, Surrogate, SurrogateOptions
 from gradscape.optim.processes import compute, processes
@@ -18,7 +20,10 @@ def informed() -> Surrogate:
     return surrogate
 
 
-def test_a_process_computes_the_same_bits_and_what_it_has_learnt_comes_back() -> None:
+@pytest.mark.parametrize("cores", [1, 2])
+def test_a_process_computes_the_same_bits_and_what_it_has_learnt_comes_back(cores: int) -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(cores)
     here, there = informed(), informed()
     random = [np.random.default_rng(3) for _ in range(2)]
     wanted = [here.minimise(random[0]) for _ in range(2)]
@@ -31,6 +36,21 @@ def test_a_process_computes_the_same_bits_and_what_it_has_learnt_comes_back() ->
     assert all(np.array_equal(one["hyper"][name], other["hyper"][name]) for name in one["hyper"])
     assert random[0].bit_generator.state == random[1].bit_generator.state
     assert compute(os.getpid) == os.getpid()
+    assert torch.get_num_threads() == cores
+    torch.set_num_threads(before)
+
+
+def threads() -> set[int]:
+    """Return how many threads the libraries use that searches for the least bound call."""
+    import botorch.optim.batched_lbfgs_b  # noqa: F401 -- which has scipy's loaded
+    import threadpoolctl
+
+    return {int(one["num_threads"]) for one in threadpoolctl.threadpool_info()}
+
+
+def test_a_process_has_one_thread() -> None:
+    with processes(2):
+        assert compute(threads) == {1}
 
 
 def test_processes_end_with_the_first() -> None:

@@ -26,6 +26,7 @@ from ..launches import Launches
 from ..runtime import free_memory, load, to_torch
 from .checkpoints import Allocator, Frame, Tape
 from .grid import velocity_kernel
+from .kernels import compile_all as compile_all
 from .model import BOX_MARGIN, EMPTY, Box, Model, nodes_around
 from .order import Order, Sorter
 from .smoothing import Smoother

@@ -1,0 +1,35 @@
+"""All kernels of a model at once: compiled beside each other, where a solver's parts ask for theirs one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from ..runtime import load
+from .grid import velocity_kernel
+from .model import Model
+from .order import sorting_kernels
+from .smoothing import smoothing_kernels
+from .transfers import transfers
+
+COMPUTES_LOSSES = False  # for `code`: what is compiled here, a solver would compile itself
+
+
+def compile_all(model: Model, device: str, *, deterministic: bool = False) -> None:
+    """Compile what a solver of the model launches, forward and backward, or fetch it from the cache."""
+    load(kernels(model, deterministic=deterministic), device)
+
+
+def kernels(model: Model, *, deterministic: bool = False) -> Iterator[Any]:
+    """Yield a kernel or more of each module, those first that take longest to compile."""
+    name = model.precision
+    yield transfers(name, deterministic=deterministic).p2g
+    if any(body.material.smoothing for body in model.bodies):
+        yield smoothing_kernels(name, deterministic=deterministic).spread
+    yield velocity_kernel(name, *model.boundary.function(name), deterministic=deterministic)
+    for body in model.bodies:
+        yield from body.material.kernels(name)
+    sorting = sorting_kernels(name)
+    yield sorting.label
+    for body in model.bodies:
+        yield from sorting.states[body.material.state(name)]

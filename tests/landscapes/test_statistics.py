@@ -1,0 +1,64 @@
+"""Quantiles, intervals and fitted lines, against scipy.stats, which the package does without where a command begins."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from gradscape.landscapes.statistics import fit_line, jackknife, mean, share, student
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 3, 15, 40, 1000])
+@pytest.mark.parametrize("level", [0.6, 0.975, 0.9999])
+def test_students_quantile_is_that_of_scipy(freedom, level):
+    assert float(student(freedom, level)) == stats.t.ppf(level, freedom)
+    assert float(student(freedom)) == stats.t.ppf(0.975, freedom)
+
+
+@pytest.mark.parametrize(("hits", "tries"), [(0, 1), (1, 1), (0, 17), (3, 17), (17, 17), (1, 1000), (499, 1000)])
+def test_the_interval_of_a_share_is_that_of_clopper_and_pearson(hits, tries):
+    found, wanted = share(hits, tries), stats.binomtest(hits, tries).proportion_ci(0.95)
+    assert (found.low, found.high) == pytest.approx((wanted.low, wanted.high), rel=1e-9, abs=1e-12)
+    if 0 < hits < tries:  # what the interval is: either end would leave 2.5 % for what was seen and beyond
+        assert stats.binom.sf(hits - 1, tries, found.low) == pytest.approx(0.025, rel=1e-9)
+        assert stats.binom.cdf(hits, tries, found.high) == pytest.approx(0.025, rel=1e-9)
+
+
+def test_nothing_tried_has_no_share():
+    assert np.isnan([share(0, 0).value, share(0, 0).low, share(0, 0).high]).all()
+
+
+def test_the_interval_of_a_mean_is_students():
+    values = RNG.normal(size=9)
+    found = mean(np.append(values, np.nan))
+    wanted = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
+    assert (found.low, found.high) == pytest.approx((wanted.low, wanted.high), rel=1e-12)
+
+
+def test_the_jackknife_of_a_mean_over_blocks_is_the_interval_of_the_blocks_means():
+    samples = np.repeat(RNG.normal(size=16), 3)  # a line whose 16 blocks are each of one value
+    found, wanted = jackknife(lambda at: float(np.nanmean(at)), samples), mean(samples[::3])
+    assert (found.value, found.low, found.high) == pytest.approx((wanted.value, wanted.low, wanted.high))
+
+
+@pytest.mark.parametrize("count", [2, 3, 20])
+@pytest.mark.parametrize("noise", [0.0, 1e-3, 1.0])
+def test_a_fitted_line_is_that_of_scipy(count, noise):
+    x = RNG.uniform(-3.0, 5.0, count)
+    y = 2.0 - 0.7 * x + noise * RNG.normal(size=count)
+    found, wanted = fit_line(x, y), stats.linregress(x, y)
+    assert (found.slope, found.intercept) == (wanted.slope, wanted.intercept)
+    assert found.standard_error == pytest.approx(wanted.stderr, rel=1e-9, abs=1e-9)
+
+
+def test_a_line_through_equal_values_is_level_and_exact():
+    found = fit_line([0.0, 1.0, 2.0], [0.1, 0.1, 0.1])
+    assert (found.slope, found.intercept, found.standard_error) == pytest.approx((0.0, 0.1, 0.0), abs=1e-15)
+
+
+def test_a_line_through_one_x_is_refused_with_it():
+    with pytest.raises(ValueError, match=r"at two or more x; got 3 at \[0\.1\]"):
+        fit_line([0.1, 0.1, 0.1], [1.0, 2.0, 3.0])

@@ -1,0 +1,112 @@
+"""The start of a command: which packages it imports, walked over all that the project depends on."""
+
+from __future__ import annotations
+
+import gc
+import re
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import packages_distributions
+from pathlib import Path
+from pkgutil import iter_modules
+
+import pytest
+import scipy
+
+from gradscape import __main__ as command
+
+from .command import modules, verbs
+
+PROJECT = tomllib.loads((Path(__file__).parent.parent / "pyproject.toml").read_text())["project"]
+TOLD = {"typer", "rich"}  # a command's words, and its tables
+SLICED = TOLD | {"numpy", "torch", "jaxtyping", "xarray", "pandas", "pyarrow", "zarr", "scipy", "matplotlib"}
+BROUGHT = {"torchgen", "mpl_toolkits", "cloudpickle"}  # by torch, matplotlib and pyarrow
+BOWL = """
+from gradscape import Environment, Fidelity, ParameterSpace
+
+
+class Bowl(Environment):
+    name = "bowl"
+    devices = ("cpu",)
+    fidelities = {"exact": Fidelity("exact", 0.0, "float64")}
+    space = ParameterSpace.box(["a", "b"], -1.0, 1.0)
+
+    def _evaluate(self, x, *, grad):
+        from gradscape import Evaluation
+
+        return Evaluation.from_results(x.square().sum(dim=1), 2 * x if grad else None)
+"""
+
+
+def depended() -> set[str]:
+    """Return the names under which all that the project depends on is imported, extras and all."""
+    asked = [*PROJECT["dependencies"], *(one for extra in PROJECT["optional-dependencies"].values() for one in extra)]
+    wanted = {re.split(r"[<>=;\[ ]", one)[0].lower().replace("_", "-") for one in asked} - {"gradscape"}
+    return {
+        name
+        for name, owners in packages_distributions().items()
+        if not name.startswith("_") and {owner.lower().replace("_", "-") for owner in owners} & wanted
+    }
+
+
+def packages(loaded: set[str]) -> set[str]:
+    """Return what of that is loaded."""
+    return {name.partition(".")[0] for name in loaded} & depended()
+
+
+@pytest.fixture(scope="module")
+def sliced(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
+    """Return what a slice of somebody's function imports, its picture drawn, where Dask is not installed.
+
+    Where it is, xarray imports it, and half of scipy with it.
+    """
+    folder = tmp_path_factory.mktemp("sliced")
+    (folder / "bowl.py").write_text(BOWL)
+    words = ["slice", f"{folder}/bowl.py:Bowl", "--dims", "0", "1", "--resolution", "12", "--out", f"{folder}/cut"]
+    loaded = modules(words, missing=("dask",))
+    assert (folder / "cut/landscape.png").exists()
+    return loaded
+
+
+def test_what_the_project_depends_on_is_found_by_the_names_it_is_imported_by() -> None:
+    assert depended() >= SLICED | {"warp", "skimage", "botorch", "stable_baselines3", "distributed"}
+
+
+def test_no_help_imports_more_than_what_reads_the_command() -> None:
+    each = [[*name.split(), "--help"] for name in verbs()]
+    assert len(each) > 20
+    assert packages(modules(["--help"], *each)) == {"typer"}
+
+
+@pytest.mark.parametrize("verb", ["envs", "methods"])
+def test_lists_import_nothing_that_computes(verb: str) -> None:
+    assert packages(modules([verb])) == TOLD
+
+
+def test_a_slice_of_a_function_imports_no_engine_and_nothing_that_measures_or_searches(sliced: set[str]) -> None:
+    assert packages(sliced) - BROUGHT == SLICED
+
+
+def test_of_scipy_a_slice_imports_what_has_the_quantiles_alone(sliced: set[str]) -> None:
+    public = {f"scipy.{one.name}" for one in iter_modules(scipy.__path__) if not one.name.startswith("_")}
+    assert len(public) > 15
+    assert sliced & public == {"scipy.special", "scipy.version"}
+
+
+def test_of_torch_a_slice_imports_what_torch_imports_itself(sliced: set[str]) -> None:
+    code = "import sys, torch; print(*sys.modules)"
+    alone = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert {name for name in sliced if name.startswith("torch.")} <= set(alone)
+
+
+def test_what_a_command_imports_is_not_looked_through_for_garbage(monkeypatch: pytest.MonkeyPatch) -> None:
+    before, seen = gc.get_threshold(), list[int]()
+    monkeypatch.setattr("gradscape.cli.main", lambda: seen.append(gc.get_threshold()[0]))
+    try:
+        command.main()
+        assert gc.get_freeze_count() > 0
+    finally:
+        gc.set_threshold(*before)
+        gc.unfreeze()
+    assert seen == [command.YOUNG] > [before[0]]
