@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import torch
@@ -26,12 +26,16 @@ class MeetingEnded(Exception):  # noqa: N818 -- no error: it ends those who stil
 
 @dataclass(eq=False)
 class _Question:
-    """What a member asks, and what it gets: an answer, and its share of the seconds that the batch took."""
+    """What a member asks, and what it gets: an answer, and its share of the seconds that the batch took.
+
+    Each member waits for its own question to be `settled`: one condition for all would wake all at every question.
+    """
 
     key: Key
     x: Float[Tensor, "count dim"]
     answer: Any = None
     seconds: float = 0.0
+    settled: threading.Event = field(default_factory=threading.Event)
 
 
 class Meeting:
@@ -51,7 +55,7 @@ class Meeting:
         self._questions: dict[int, _Question] = {}
         self._own = threading.local()  # of each thread: its number, and how long it has waited for others [s]
         self._ended = False
-        self._changed = threading.Condition()
+        self._changed = threading.Condition()  # on which the thread that serves waits
 
     def __getattr__(self, name: str) -> Any:
         """Return what else the objective says of itself, such as how many decisions an episode has."""
@@ -72,6 +76,7 @@ class Meeting:
         with self._changed:
             self._ended = True
             self._changed.notify_all()
+            self._settle()
 
     def clock(self) -> float:
         """Return a time [s] that passes while the calling thread works, and by its share of what a batch takes."""
@@ -100,10 +105,16 @@ class Meeting:
                 for key in sorted({one.key for one in self._questions.values()}):
                     self._answer(key)
                 with self._changed:
-                    self._questions.clear()
-                    self._changed.notify_all()
+                    self._settle()
         finally:
             self.end()
+
+    def _settle(self) -> None:
+        """Let go all who wait; the lock is held."""
+        settled = list(self._questions.values())
+        self._questions.clear()
+        for question in settled:
+            question.settled.set()
 
     def _wait_for_all(self) -> bool:
         """Wait until every member asks; say whether there is anyone to answer."""
@@ -129,8 +140,9 @@ class Meeting:
             if self._ended:
                 raise MeetingEnded
             self._questions[self._own.number] = question
-            self._changed.notify_all()
-            self._changed.wait_for(lambda: self._ended or self._questions.get(self._own.number) is not question)
+            if len(self._questions) == self._present:
+                self._changed.notify_all()
+        question.settled.wait()
         if question.answer is None:
             raise MeetingEnded
         self._own.waited += time.perf_counter() - began - question.seconds
