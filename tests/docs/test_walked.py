@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import inspect
-import json
 import re
 import shutil
 from dataclasses import replace
@@ -24,6 +23,7 @@ from gradscape.envs.registry import BUILTIN, environment_class
 from gradscape.gallery.figures import read_figures
 from gradscape.gallery.files import DATA
 from gradscape.gallery.paper import read_paper
+from gradscape.landscapes.storage.records import read_json, write_record
 from gradscape.optim.claims import ClaimVerdict
 from gradscape.optim.league import League
 
@@ -135,9 +135,9 @@ def test_a_slice_is_judged_by_which_of_the_paper_s_words_were_measured(
     figure = next(one for one in read_figures() if one.id == REPORTED)
     folder = tmp_path / figure.id
     folder.mkdir()
-    record = json.loads((DATA / figure.id / "report.json").read_text())
+    record = read_json(DATA / figure.id / "report.json")
     words = [{"word": f"word {number}", "measured": hit} for number, hit in enumerate(hits)]
-    (folder / "report.json").write_text(json.dumps(record | {"paper": {"words": words, "where": "nowhere"}}))
+    write_record(folder / "report.json", record | {"paper": {"words": words, "where": "nowhere"}})
     one = KeptFigure(figure, tmp_path)
     assert reproduction.verdict_of(one) == verdict
     page = reproduction.pages(replace(Kept.read(tmp_path / "none"), figures=[one]), tmp_path)["reproduction.md"]
