@@ -112,7 +112,8 @@ def test_few_gradients_are_planned_at_their_own_rate(
     assert (planned["episodes"], planned["gradients"]) == (32 * 32, 7 * 7)
     assert seconds["simulating"] == pytest.approx(EPISODE * (32 * 32 + 2 * 7 * 7))
     parts = seconds["simulating"] + seconds["writing"] + seconds["drawing"]
-    assert parts + between == pytest.approx(done["seconds"], abs=PICTURE)
+    late = 2 * PICTURE  # batches of gradients go on from level to level, so that two pictures are not due any more
+    assert parts + between == pytest.approx(done["seconds"], abs=late)
     assert between <= seconds["between"]
     room, dense = room_of(tmp_path / "made"), plan(run, tmp_path, *job[:6], *job[8:])
     assert planned["disk"]["bytes"] == pytest.approx(room.bytes, rel=0.5)

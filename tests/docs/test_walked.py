@@ -177,7 +177,7 @@ def test_every_picture_of_the_pages_says_what_made_it() -> None:
     assert pictures == set(re.findall(r"^\| `([\w-]+\.png)` \|", text, flags=re.MULTILINE))
     for row in (line for line in text.splitlines() if ".png`" in line):
         assert re.search(r"\| \[[\w-]+\]\(\.\./", row), f"no page shows {row}"
-        verb = re.search(r"`landscape (\w+)", row)
+        verb = re.search(r"`landscape (gallery \w+|\w+)", row)
         assert (verb and verb[1] in VERBS) or "`python -m benchmarks." in row
 
 
