@@ -114,8 +114,8 @@ def _search_in_memory(
     objective: Objective, optimizer: Optimizer, budget: int, out: str | Path | None, watch: Watch
 ) -> Run:
     """Search an objective of which nothing says what decides its numbers, so that no run of it can be continued."""
-    from ..jobs.search import one_torch_thread
     from ..landscapes.objective import name_of
+    from ..landscapes.threads import one_torch_thread
     from ..optim.search import search
 
     if out is not None:

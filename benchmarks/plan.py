@@ -104,7 +104,7 @@ def race_ratios(folder: Path) -> dict[str, float]:
     from gradscape.jobs.plan_race import RacePlanJob
     from gradscape.jobs.race import RaceJob
     from gradscape.jobs.scene import SceneSpec
-    from gradscape.jobs.search import one_torch_thread
+    from gradscape.landscapes.threads import one_torch_thread
     from gradscape.optim.processes import processes
     from gradscape.optim.race import race
 

@@ -23,8 +23,9 @@ from rich.table import Table
 
 from gradscape.envs.base import Environment
 from gradscape.envs.registry import make
-from gradscape.jobs.search import make_optimizer, one_torch_thread
+from gradscape.jobs.search import make_optimizer
 from gradscape.landscapes.storage.records import write_record
+from gradscape.landscapes.threads import one_torch_thread
 from gradscape.optim.bootstrap import interval
 from gradscape.optim.comparison import difference
 from gradscape.optim.processes import processes

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..envs.batching import cores
 from ..jobs.league import Fixture, LeagueJob
 from ..jobs.scene import SceneSpec
 from ..jobs.watch import Watch
@@ -58,16 +59,12 @@ class LeaguePart(FigurePart):
 
     def make(self, watch: Watch) -> str:
         """Race, or go on with it, and keep what is needed of it."""
-        from ..landscapes.draw.film import lighten
-
         race, left_out = self._job.run_race(self._fixture, watch)
         found = SceneStandings.of(race, left_out=left_out, command=self.label())
         files = self._files
         make_folder(files.record.parent)
         files.record.unlink(missing_ok=True)  # which says that the others are whole
-        save_both(race.plot(), files.picture)
-        for picture in (files.picture, files.dark):
-            lighten(picture)
+        keep_both(race.plot(), files.picture)
         KeptRuns.of(race).write(files.runs)
         write_record(files.record, found.record())
         return (
@@ -85,7 +82,7 @@ class LeaguePart(FigurePart):
     @property
     def _job(self) -> LeagueJob:
         how = {"budget": BUDGET, "seeds": SEEDS, "command": self.label()}
-        return LeagueJob.of([self._own_scene], METHODS, **how, workers=_cores(), executor=self.executor)  # type: ignore[arg-type] # each of its kind
+        return LeagueJob.of([self._own_scene], METHODS, **how, workers=cores(), executor=self.executor)  # type: ignore[arg-type] # each of its kind
 
     @property
     def _own_scene(self) -> SceneSpec:
@@ -110,6 +107,15 @@ def read_league(root: Path) -> League | None:
     return League(scenes, {}, "landscape gallery compute --part league")
 
 
+def keep_both(picture: Picture, path: Path) -> None:
+    """Do what `save_both` does, in as few bytes as show no less: they go into the repository."""
+    from ..landscapes.draw.film import lighten
+
+    save_both(picture, path)
+    for file in (path, path.with_name(dark_name(path.name))):
+        lighten(file)
+
+
 def save_both(picture: Picture, path: Path) -> None:
     """Write a picture, and the same for a dark page beside it."""
     from ..landscapes.draw.figures.dark import darken
@@ -119,9 +125,3 @@ def save_both(picture: Picture, path: Path) -> None:
     save(picture, path)
     darken(picture)
     save(picture, dark)
-
-
-def _cores() -> int:
-    from ..envs.engines.runtime import cores
-
-    return cores()

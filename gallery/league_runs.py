@@ -18,6 +18,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..landscapes.objective import Status
+from ..landscapes.overlay import lowered
 from ..landscapes.storage.files import replacing
 from ..landscapes.storage.layout import flags
 from ..landscapes.storage.records import reading
@@ -54,7 +55,7 @@ class KeptRun:
         data = run.data.isel(evaluation=slice(budget))
         loss, x = data["loss"].to_numpy(), data["x"].to_numpy()
         best = best_so_far(loss)
-        rows = np.flatnonzero(np.isfinite(best) & ~(best >= np.append(np.inf, best[:-1])))
+        rows = lowered(best)
         spent = data[FORWARD_EQUIVALENTS].to_numpy()
         last = x[rows[-1]] if len(rows) else np.full(x.shape[1], np.nan)
         return cls(run.method, run.seed, rows + 1, spent[rows], loss[rows], len(loss), float(spent[-1]), last)

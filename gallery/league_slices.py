@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 
 from ..jobs.folder import SUMMARY
 from ..jobs.scene import SceneSpec
 from ..jobs.watch import Watch
+from ..landscapes.overlay import lowered, overlay
 from ..landscapes.storage.records import read_json, write_record
+from ..optim.curves import best_so_far
 from ..optim.league import SceneStandings
 from .figures import read_figures
 from .files import PICTURE, STORE, LeagueFiles, LeagueSliceFiles
-from .league import read_standings, save_both
+from .league import keep_both, read_standings
 from .league_runs import KeptRuns
 from .parts import FigurePart, seconds_of_one
 from .records import read_if_sound
@@ -65,8 +66,6 @@ class LeagueSlicePart(FigurePart):
         """Sample the slice, lay the median runs over it, and draw both."""
         from ..jobs.slice import SliceJob
         from ..landscapes.draw.figures.overlay import overlay_figure
-        from ..landscapes.draw.film import lighten
-        from ..landscapes.overlay import overlay
         from ..landscapes.storage.store import open_slice
 
         standings, files = self._standings(), self._files
@@ -79,9 +78,7 @@ class LeagueSlicePart(FigurePart):
             (files.folder / left).unlink()
         runs = [improved(table) for table in KeptRuns.read(LeagueFiles.of(self.root, env.name).runs).medians.values()]
         dataset = open_slice(files.folder / STORE)
-        save_both(overlay_figure(dataset, overlay(dataset, runs)), files.picture)
-        for picture in (files.picture, files.dark):
-            lighten(picture)
+        keep_both(overlay_figure(dataset, overlay(dataset, runs)), files.picture)
         write_record(files.record, {"key": self._key(standings), "command": self.label(), "device": env.device})
         return outcome.outcome()
 
@@ -117,6 +114,4 @@ def improved(table: xr.Dataset) -> xr.Dataset:
     from ..landscapes.draw.figures.overlay import IMPROVEMENTS_OF
 
     loss = table["loss"].to_numpy()
-    before = np.fmin.accumulate(np.append(np.inf, loss[:-1]))
-    rows = np.flatnonzero(loss < before)
-    return table.isel(evaluation=rows).assign_attrs({IMPROVEMENTS_OF: len(loss)})
+    return table.isel(evaluation=lowered(best_so_far(loss))).assign_attrs({IMPROVEMENTS_OF: len(loss)})

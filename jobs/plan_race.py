@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.space import as_whole
+from ..landscapes.threads import one_torch_thread
 from ..optim.memory import SearchSize, run_need
 from ..optim.race import ABREAST
 from ..optim.registry import optimizer_class
@@ -19,7 +20,7 @@ from ..optim.rehearsal import BLOCK, Rehearsal, rehearse
 from .methods import able_methods, check_methods, require_room
 from .plan import HERE, make_here
 from .scene import SceneSpec
-from .search import make_optimizer, one_torch_thread
+from .search import make_optimizer
 from .slice import peak_memory
 from .watch import Watch
 

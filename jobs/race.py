@@ -17,6 +17,7 @@ from ..landscapes.sampling.distribution import run_tasks, workers_of
 from ..landscapes.space import as_whole
 from ..landscapes.storage.files import clear, tidy, visible_files, write_json
 from ..landscapes.storage.ownership import refuse_others
+from ..landscapes.threads import one_torch_thread
 from ..optim.claims import Claims, check_claims
 from ..optim.processes import processes
 from ..optim.race import Competitor, Race, name_seeds, race
@@ -27,7 +28,7 @@ from .folder import RACE, RACE_FIGURES, ROOT, RUN_STORE, folder_named
 from .methods import able_methods, check_methods, require_room
 from .race_summary import RaceSummary
 from .scene import provenance
-from .search import make_optimizer, one_torch_thread, open_run_store
+from .search import make_optimizer, open_run_store
 from .watch import PREPARING, Watch, resumable
 from .workers import recipe
 

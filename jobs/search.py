@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
-
-import torch
 
 from ..landscapes.cost import duration, episode_cost
 from ..landscapes.objective import Objective, Status
 from ..landscapes.space import as_whole
 from ..landscapes.storage.files import clear, tidy, write_json
+from ..landscapes.threads import one_torch_thread
 from ..optim.base import Kind
 from ..optim.memory import SearchSize, require_method, require_runs
 from ..optim.registry import code_digest, optimizer_class
@@ -215,20 +213,6 @@ class SearchJob:
             command=self.command,
             files=files,
         )
-
-
-@contextmanager
-def one_torch_thread() -> Iterator[None]:
-    """Let a method's numbers depend on its seed alone: how a model rounds depends on how many threads share its sums.
-
-    Models of a thousand points gain little by a second one, and wait long for it where other work runs.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 @one_torch_thread()

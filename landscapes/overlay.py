@@ -76,7 +76,11 @@ def run_name(table: xr.Dataset, between: str = ", seed ") -> str:
 
 def improvements(run: xr.Dataset) -> NDArray[np.intp]:
     """Return the rows of a run laid over a slice that lowered its least loss so far, in the order of evaluation."""
-    best = run["best"].to_numpy()
+    return lowered(run["best"].to_numpy())
+
+
+def lowered(best: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return where the least loss so far has fallen, NaN standing for none yet."""
     before = np.append(np.inf, best[:-1])
     return np.flatnonzero(np.isfinite(best) & ~(best >= before))
 

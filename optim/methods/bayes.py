@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 
 from ..base import Kind, Optimizer, Points, Proposal
 from ..memory import SearchSize
+from ..options import MethodOptions
 from .descent import Descent, DescentOptions
 from .surrogate import Surrogate, SurrogateOptions, surrogate_memory
 
@@ -22,7 +23,8 @@ class BO(Optimizer):
     """
 
     name = "bo"
-    Options = SurrogateOptions
+    Options: ClassVar[type[MethodOptions]] = SurrogateOptions
+    surrogate: Surrogate
 
     @classmethod
     def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
@@ -34,7 +36,7 @@ class BO(Optimizer):
 
     def _ask(self) -> Proposal:
         kind = Kind.ACQUISITION if self.surrogate.informed else Kind.RANDOM
-        return Proposal(torch.from_numpy(self.surrogate.minimise(self.random)[None]), kind)
+        return Proposal(torch.from_numpy(self.surrogate.minimise(self.random)[None]), kind, grad=self.needs_grad)
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
         self.surrogate.add(z, loss)

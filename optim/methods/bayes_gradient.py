@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,9 +18,10 @@ from gpytorch.models import ExactGP
 from jaxtyping import Float
 from torch import Tensor
 
-from ..base import Kind, Optimizer, Points, Proposal
+from ..base import Points
 from ..memory import FLOAT, SearchSize
 from ..options import MANY, MethodOptions, number
+from .bayes import BO
 from .bound import NEAR, SPREAD, unit
 from .fit import with_parameters
 from .sloped import Sloped
@@ -45,7 +46,7 @@ class BOGradientOptions(MethodOptions):
     initial: int = number(10, 2, MANY)
 
 
-class BOGradient(Optimizer):
+class BOGradient(BO):
     """Evaluate where the lower confidence bound of a process over losses and gradients is least.
 
     The process has GPyTorch's squared-exponential covariance of a function and its slopes (`RBFKernelGrad`). A point
@@ -56,7 +57,8 @@ class BOGradient(Optimizer):
     """
 
     name = "bo-gradient"
-    Options: ClassVar[type[BOGradientOptions]] = BOGradientOptions
+    Options = BOGradientOptions
+    surrogate: SlopeSurrogate
     needs_grad = True
 
     @classmethod
@@ -72,22 +74,12 @@ class BOGradient(Optimizer):
             )
         self.surrogate = SlopeSurrogate(self.space.dim, self.options, points)
 
-    def _ask(self) -> Proposal:
-        kind = Kind.ACQUISITION if self.surrogate.informed else Kind.RANDOM
-        return Proposal(torch.from_numpy(self.surrogate.minimise(self.random)[None]), kind, grad=True)
-
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
         assert grad is not None  # as asked
         self.surrogate.learn(z, loss, grad)
 
     def _inform(self, z: Points, loss: Points, grad: Points | None) -> None:
         self._tell(z, loss, grad)
-
-    def _state(self) -> dict[str, Any]:
-        return {"surrogate": self.surrogate.state()}
-
-    def _restore(self, own: Mapping[str, Any]) -> None:
-        self.surrogate.restore(own["surrogate"])
 
 
 class SlopeSurrogate(Surrogate):

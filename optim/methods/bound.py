@@ -17,6 +17,7 @@ from jaxtyping import Float
 from linear_operator.utils.warnings import NumericalWarning
 from torch import Tensor
 
+from ...landscapes.threads import one_torch_thread
 from ..base import Points
 from .process import Process
 from .radial import Matrix
@@ -41,7 +42,7 @@ class LowerBound:
         self.coefficient = coefficient
         self.covariance, self.known = process.covariance, process.u
         self.factor = process.factor()
-        self.weights = self.factor.solve_whitened(self.factor.whiten(process.values[None]))[0]
+        self.weights = self.factor.weights(process.values)
 
     @torch.no_grad()
     def __call__(self, u: Float[Tensor, "count dim"]) -> Float[Tensor, " count"]:
@@ -95,17 +96,8 @@ def unit(z: Points) -> Float[Tensor, "count dim"]:
 
 @contextmanager
 def exclusive() -> Iterator[None]:
-    """Keep other threads out, let torch use one core, and quiet what is no news: iteration limits, jitter added.
-
-    Sums have other last bits with another number of cores, which differs from machine to machine and from a race's
-    processes to the first one.
-    """
-    with ONE_AT_A_TIME, warnings.catch_warnings():
+    """Keep other threads out, let torch use one core, and quiet what is no news: iteration limits, jitter added."""
+    with ONE_AT_A_TIME, one_torch_thread(), warnings.catch_warnings():
         for category in (BotorchWarning, NumericalWarning, GPInputWarning):
             warnings.simplefilter("ignore", category)
-        cores = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
-            yield
-        finally:
-            torch.set_num_threads(cores)
+        yield

@@ -82,8 +82,7 @@ class Process:
         """Return mean and covariance of the values at points, given what is known, of points with one row each."""
         factor, cross = self.factor(), self.covariance.dense(u, self.u)
         white = factor.whiten(cross)
-        weights = factor.solve_whitened(factor.whiten(self.values[None]))[0]
-        return cross @ weights, self.covariance.dense(u, u).addmm_(white, white.T, alpha=-1.0)
+        return cross @ factor.weights(self.values), self.covariance.dense(u, u).addmm_(white, white.T, alpha=-1.0)
 
 
 @dataclass(frozen=True)
@@ -121,6 +120,10 @@ class Factor:
             return first.T
         last = _solve(self.own, rows[:, count:].T - self.across @ first)
         return torch.cat([first, last]).T
+
+    def weights(self, values: Float[Tensor, " row"]) -> Float[Tensor, " row"]:
+        """Return the inverse covariance times a number for each row: what covariances make means with."""
+        return self.solve_whitened(self.whiten(values[None]))[0]
 
     def solve_whitened(self, rows: Matrix) -> Matrix:
         """Return L^-T times the transpose of rows, transposed: of whitened rows, the inverse covariance times rows."""

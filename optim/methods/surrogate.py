@@ -113,11 +113,6 @@ class Surrogate:
             u, values = unit(self.z[rows]), torch.from_numpy(self._values(rows))
             return Process(self._covariance(), float(self._hyper["noise"][0]), u, values, len(self._chosen))
 
-    def model(self) -> SingleTaskGP:
-        """Return the same as BoTorch's model of the losses as they are."""
-        with exclusive():
-            return self._condition(self._learn()).eval()
-
     def _learn(self) -> Rows:
         """Fit hyper-parameters and choose points anew if that is due, and return which points are modelled."""
         count = len(self.loss)

@@ -1,9 +1,13 @@
-"""What becomes of an optimiser that is written and read."""
+"""What becomes of an optimiser that is written and read, and BoTorch's model of what one knows."""
 
 from typing import TypeVar
 
+from botorch.models import SingleTaskGP
+
 from gradscape.landscapes.objective import Objective
 from gradscape.optim.base import Optimizer
+from gradscape.optim.methods.bound import exclusive
+from gradscape.optim.methods.surrogate import Surrogate
 from gradscape.optim.runs.state import decode, encode
 
 T = TypeVar("T", bound=Optimizer)
@@ -12,3 +16,9 @@ T = TypeVar("T", bound=Optimizer)
 def restored(optimizer: T, objective: Objective) -> T:
     """Return the optimiser that is read from what is written of this one."""
     return type(optimizer).from_state(objective, decode(encode(optimizer.state())))
+
+
+def model_of(surrogate: Surrogate) -> SingleTaskGP:
+    """Return BoTorch's model of what a surrogate's process is of, its hyper-parameters fitted if that is due."""
+    with exclusive():
+        return surrogate._condition(surrogate._learn()).eval()

@@ -12,7 +12,7 @@ from gradscape.optim.methods.bayes import BO, BODescents, BODescentsOptions
 from gradscape.optim.methods.random import RandomSearch
 from gradscape.optim.search import search
 
-from .states import restored
+from .states import model_of, restored
 
 SPACE = ParameterSpace.box(("x", "y"), -2.0, 4.0, "m")
 BOWL = from_torch(lambda x: ((x - 1.5) ** 2).sum(dim=1) + (3 * x).cos().prod(dim=1), SPACE)
@@ -58,7 +58,7 @@ def test_bo_evaluates_where_the_bound_of_all_it_knows_is_least_and_the_first_ten
     assert table["slope"].isnull().all()
     found = SPACE.to_unit(optimizer.ask().x)
     grid = torch.cartesian_prod(*2 * [torch.linspace(0.0, 1.0, 101, dtype=torch.float64)])
-    bound = UpperConfidenceBound(optimizer.surrogate.model(), beta=1.0, maximize=False)
+    bound = UpperConfidenceBound(model_of(optimizer.surrogate), beta=1.0, maximize=False)
     with torch.no_grad():
         assert bound(found[:, None]) >= bound(grid[:, None]).max() - 1e-6
 

@@ -18,6 +18,8 @@ from gradscape.optim.methods.radial import Radial
 from gradscape.optim.methods.surrogate import Surrogate, SurrogateOptions
 from gradscape.optim.runs.state import decode, encode
 
+from .states import model_of
+
 
 def waves(z: np.ndarray) -> np.ndarray:
     return 30.0 + 5.0 * np.sin(4.0 * z).sum(axis=1) + 8.0 * (z**2).sum(axis=1)
@@ -37,7 +39,7 @@ def test_the_bounds_argmin_agrees_with_a_dense_grid(count, kernel):
     axis = torch.linspace(0.0, 1.0, 201, dtype=torch.float64)
     grid = torch.cartesian_prod(axis, axis)
     found = torch.from_numpy(surrogate.minimise(np.random.default_rng(0)) + 1.0)[None] / 2.0
-    bound = UpperConfidenceBound(surrogate.model(), beta=1.0, maximize=False)
+    bound = UpperConfidenceBound(model_of(surrogate), beta=1.0, maximize=False)
     with torch.no_grad():
         values, value = -bound(grid[:, None]), -bound(found[:, None])
     assert value <= values.min() + 1e-6 * (values.max() - values.min())
@@ -46,7 +48,7 @@ def test_the_bounds_argmin_agrees_with_a_dense_grid(count, kernel):
 
 def test_the_process_is_the_posterior_of_a_zero_mean_with_squared_exponential_covariance():
     surrogate = informed()
-    model = surrogate.model()
+    model = model_of(surrogate)
     u, new = (surrogate.z + 1.0) / 2.0, np.random.default_rng(2).uniform(size=(5, 2))
     mean, spread = surrogate.loss.mean(), surrogate.loss.std(ddof=1)
     scale = model.covar_module.lengthscale.detach().numpy()
@@ -72,7 +74,7 @@ def going_on(surrogate: Surrogate, first: int) -> Process:
 @pytest.mark.parametrize("kernel", ["rbf", "matern"])
 def test_the_bound_and_its_slopes_are_those_of_botorch(kernel, first):
     surrogate = informed(kernel=kernel)
-    model = surrogate.model()
+    model = model_of(surrogate)
     points = torch.rand(7, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64).requires_grad_()
     wanted = -UpperConfidenceBound(model, beta=2.5**2, maximize=False)(points[:, None])
     (slopes,) = torch.autograd.grad(wanted.sum(), points)
@@ -86,7 +88,7 @@ def test_the_bound_and_its_slopes_are_those_of_botorch(kernel, first):
 @pytest.mark.parametrize("kernel", ["rbf", "matern"])
 def test_the_posterior_is_that_of_botorch(kernel):
     surrogate = informed(kernel=kernel)
-    model = surrogate.model()
+    model = model_of(surrogate)
     points = torch.rand(20, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     mean, covariance = surrogate.process().posterior(points)
     wanted, scale = model.posterior(points), model.outcome_transform
@@ -97,7 +99,7 @@ def test_the_posterior_is_that_of_botorch(kernel):
 
 @pytest.mark.parametrize("kernel", ["rbf", "matern"])
 def test_fits_climb_the_likelihood_that_botorch_has(kernel):
-    model = informed(kernel=kernel).model()
+    model = model_of(informed(kernel=kernel))
     likelihood = ExactMarginalLogLikelihood(model.likelihood, model).train()
     parameters = dict(likelihood.named_parameters())
     for factor in (1.0, 1.7):  # where the last fit ended, and elsewhere
@@ -139,7 +141,7 @@ def test_fitting_raises_the_likelihood_that_a_parameter_without_effect_is_ignore
     surrogate = Surrogate(2, SurrogateOptions())
     z = np.random.default_rng(1).uniform(-1.0, 1.0, (60, 2))
     surrogate.add(z, np.sin(5.0 * z[:, 0]))
-    used, unused = surrogate.model().covar_module.lengthscale.detach().flatten().tolist()
+    used, unused = model_of(surrogate).covar_module.lengthscale.detach().flatten().tolist()
     assert unused > 10.0 * used
 
 
@@ -174,9 +176,9 @@ def test_points_are_drawn_at_random_until_there_are_enough_and_one_has_a_loss():
 
 
 def test_every_point_is_modelled_up_to_the_most_and_the_best_half_and_a_spread_past_it():
-    assert len(informed(50, max_points=50).model().train_targets) == 50
+    assert len(model_of(informed(50, max_points=50)).train_targets) == 50
     surrogate = informed(100, max_points=20)
-    kept = set(map(tuple, 2.0 * surrogate.model().train_inputs[0].numpy() - 1.0))
+    kept = set(map(tuple, 2.0 * model_of(surrogate).train_inputs[0].numpy() - 1.0))
     order = np.argsort(surrogate.loss)
     assert len(kept) == int(20 / GROWTH)  # with room for those to come
 
@@ -190,18 +192,18 @@ def test_every_point_is_modelled_up_to_the_most_and_the_best_half_and_a_spread_p
 
 def test_hyper_parameters_are_kept_until_the_data_have_grown_by_a_tenth():
     surrogate = informed(40)
-    before = surrogate.model().covar_module.lengthscale.tolist()
+    before = model_of(surrogate).covar_module.lengthscale.tolist()
     z = np.random.default_rng(9).uniform(-1.0, 1.0, (4, 2))
     surrogate.add(z[:3], 100.0 * waves(z[:3]))
-    assert surrogate.model().covar_module.lengthscale.tolist() == before
+    assert model_of(surrogate).covar_module.lengthscale.tolist() == before
     surrogate.add(z[3:], 100.0 * waves(z[3:]))
     assert len(surrogate.loss) >= GROWTH * 40
-    assert surrogate.model().covar_module.lengthscale.tolist() != before
+    assert model_of(surrogate).covar_module.lengthscale.tolist() != before
 
 
 def test_its_state_is_whole_and_it_leaves_no_trace_in_global_generators_or_warning_filters():
     surrogate = informed(43)
-    surrogate.model()
+    model_of(surrogate)
     before = torch.get_rng_state(), np.random.get_state()[1].copy(), list(warnings.filters)
     copy = Surrogate(2, surrogate.options)
     copy.restore(decode(encode(surrogate.state())))
@@ -260,7 +262,7 @@ def test_factors_of_other_processes_are_told_apart():
 
 def test_a_full_process_makes_room_and_keeps_every_point_that_comes_until_it_is_full_again():
     surrogate = informed(40, max_points=44)
-    surrogate.model()
+    model_of(surrogate)
     random, fits = np.random.default_rng(3), []
     for _ in range(30):
         z = random.uniform(-1.0, 1.0, (1, 2))

@@ -25,12 +25,13 @@ from typing import Any, no_type_check
 import numpy as np
 import torch
 
+from ....landscapes.threads import one_torch_thread
 from ..mpm.model import EMPTY, Model
 from ..mpm.smoothing import smooth_volume_ratios
 from ..runtime import precision
 from .boundaries import boundary_contact
 from .materials import kernels, types
-from .runtime import one_torch_thread, start, ti
+from .runtime import start, ti
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,8 +2,7 @@
 
 import os
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import redirect_stdout
 from functools import cache
 from io import StringIO
 from typing import Any
@@ -17,7 +16,7 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)  # it asks locale for what Python 3.15 will not have
     import taichi as ti  # type: ignore[import-untyped]
 
-__all__ = ["one_torch_thread", "real", "start", "ti"]
+__all__ = ["real", "start", "ti"]
 
 _started: list[str] = []  # the device
 
@@ -46,17 +45,6 @@ def real(name: str) -> Any:
     if name not in types:
         raise ValueError(f"precision must be float32 or float64; got {name!r}")
     return types[name]
-
-
-@contextmanager
-def one_torch_thread() -> Iterator[None]:
-    """Keep torch to one thread: its others busily wait for work on the cores that Taichi needs, and triple times."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _init(device: str) -> None:
