@@ -1,18 +1,19 @@
-"""Write the table of what many slices of every scene are like, from the censuses that the gallery keeps.
+"""Write the tables of what many slices of every scene are like, from the censuses that the gallery keeps.
 
     python -m benchmarks.censuses [--check]
 
-The table in docs/measures.md has a row for each scene: how many slices were measured, in which share of them losses
-move by less than a hundredth of what they do in all, which share each word of the classification fits, with its
-interval, and the paper's words with their shares. It is of the records by `landscape census ENV --fidelity standard` in
-gallery/data/census; a scene that has none, or has changed since, is said to be so. With --check nothing is written:
-exit code 1 says that the page differs, or that a scene is not measured.
+README.md has the shares alone. The table in docs/measures.md has a row for each scene: how many slices were measured,
+in which share of them losses move by less than a hundredth of what they do in all, which share each word of the
+classification fits, with its interval, and the paper's words with their shares. It is of the records by `landscape
+census ENV --fidelity standard` in gallery/data/census; a scene that has none, or has changed since, is said to be so.
+With --check nothing is written:
+exit code 1 says that a page differs, or that a scene is not measured.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,11 +23,20 @@ from gradscape.gallery.paper import read_paper
 from gradscape.landscapes.statistics import Estimate
 from gradscape.landscapes.storage.records import read_json
 
-from .pages import DATA, DOCS, MISSING, UNMEASURED, is_present, scenes, settle_measured
+from .pages import DATA, DOCS, MISSING, ROOT, UNMEASURED, is_present, scenes, settle_measured
 
 PAGE, NAME = DOCS / "measures.md", "censuses"
+README = ROOT / "README.md"
 FAINT = 0.01  # of the range of the losses of all slices
 HEAD = ("environment", "slices", "faint", "measured: share of the slices (95 % interval)", "the paper's words")
+SHORT = {  # the columns of README: what a slice may be, and the words that say so
+    "very smooth": ("very smooth",),
+    "smooth with local minima": ("smooth with local minima",),
+    "rugged": ("rugged", "extremely rugged"),
+    "with jumps": ("discontinuous",),
+    "gradients good": ("gradients good",),
+}
+SHORT_HEAD = ("environment", *SHORT, "the paper says")
 
 
 @dataclass(frozen=True)
@@ -81,10 +91,24 @@ def rows(found: Mapping[str, Shares | str]) -> Iterator[list[str]]:
         yield [f"`{name}`", str(one.slices), f"{100 * one.faint:.0f} %", measured, ", ".join(map(one.say, said))]
 
 
+def short_rows(found: Mapping[str, Shares | str]) -> Iterator[list[str]]:
+    """Return a row of README for each scene: percentages of its slices, of words of which none has two of a column."""
+    paper = read_paper().words
+    for name, one in found.items():
+        said = ", ".join(paper[name].words) if name in paper else ""
+        shares = [one] if isinstance(one, str) else [_percent(one, words) for words in SHORT.values()]
+        yield [f"`{name}`", *shares, *[""] * (len(SHORT) - len(shares)), said]
+
+
+def _percent(shares: Shares, words: Sequence[str]) -> str:
+    return f"{100 * sum(shares.words[word].value for word in words):.0f} %"
+
+
 def main() -> int:
-    """Write the page, or say what is not so."""
+    """Write both pages, or say what is not so."""
     found = censuses()
-    return settle_measured(__doc__ or "", found, HEAD, rows(found), PAGE, NAME)
+    tables = ((HEAD, rows(found), PAGE), (SHORT_HEAD, short_rows(found), README))
+    return max(settle_measured(__doc__ or "", found, head, lines, page, NAME) for head, lines, page in tables)
 
 
 if __name__ == "__main__":

@@ -50,7 +50,8 @@ def written(page: Path, name: str) -> str:
 
 def write(text: str, page: Path, name: str) -> None:
     """Put a table into a page, in the place of the one of this name."""
-    page.write_text(page.read_text().replace(written(page, name), text))
+    before, after = (f"<!-- {name} -->\n\n", f"\n<!-- /{name} -->")
+    page.write_text(page.read_text().replace(before + written(page, name) + after, before + text + after))
 
 
 def settle_measured(

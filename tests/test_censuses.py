@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from benchmarks import censuses
-from benchmarks.censuses import HEAD, NAME, PAGE, Shares, rows
+from benchmarks.censuses import HEAD, NAME, PAGE, README, SHORT, SHORT_HEAD, Shares, rows, short_rows
 from benchmarks.pages import DATA, MISSING, UNMEASURED, written
 
 from gradscape.envs.registry import entries, environment_class
@@ -11,9 +11,16 @@ from gradscape.jobs.report_tables import markdown
 from gradscape.landscapes.storage.records import read_json, write_record
 
 
-def test_the_page_holds_the_censuses() -> None:
-    wanted = markdown(HEAD, list(rows(censuses.censuses())))
-    assert written(PAGE, NAME) == wanted, "`python -m benchmarks.censuses` writes the page"
+def test_the_pages_hold_the_censuses() -> None:
+    found = censuses.censuses()
+    for page, head, lines in ((PAGE, HEAD, rows(found)), (README, SHORT_HEAD, short_rows(found))):
+        assert written(page, NAME) == markdown(head, list(lines)), "`python -m benchmarks.censuses` writes the page"
+
+
+def test_shares_of_a_column_count_no_slice_twice() -> None:
+    for path in sorted((DATA / "census").glob("*.json")):
+        for words in SHORT.values():
+            assert all(len(set(words) & set(one["words"])) < 2 for one in read_json(path)["slices"])
 
 
 def test_every_scene_of_ours_has_a_row() -> None:
