@@ -58,7 +58,7 @@ class Solver:
     ) -> None:
         self.chain, self.dt, self.hold, self.steps, self.device = chain, dt, hold, controls * hold, device
         self.types = precision(name)
-        self.kernel = step_kernel(name)
+        self.kernel = motion_kernel(name)
         load([self.kernel], device)
         self.constants = [self.types.mat33(*chain.inertia), self.types.vec3(*chain.beta), chain.gravity, chain.damping]
         shape, vec3, vec4 = (self.steps + 1, capacity), self.types.vec3, self.types.vec4
@@ -75,8 +75,7 @@ class Solver:
         to_torch(self.phi)[0, :batch] = phi.to(self.types.torch)
         to_torch(self.p)[0, :batch] = p.to(self.types.torch)
         to_torch(self.control)[:, :batch] = controls.transpose(0, 1).to(self.types.torch)
-        for step in range(self.steps):
-            wp.launch(self.kernel, batch, self._inputs(step), device=self.device, record_tape=False)
+        wp.launch(self.kernel, batch, self._inputs, device=self.device, record_tape=False)
         return to_torch(self.phi)[:, :batch]
 
     def energy(self, batch: int, phi: torch.Tensor) -> torch.Tensor:
@@ -95,22 +94,24 @@ class Solver:
         for adjoint in (self.adj_phi, self.adj_p, self.adj_control):
             adjoint.zero_()
         to_torch(self.adj_phi)[-1, :batch] = adj_phi.to(self.types.torch)
-        for step in reversed(range(self.steps)):
-            inputs = self._inputs(step)
-            adjoints = [None] * (len(inputs) - 3) + [self.adj_control, self.adj_phi, self.adj_p]
-            wp.launch(
-                self.kernel, batch, inputs, adj_inputs=adjoints, device=self.device, adjoint=True, record_tape=False
-            )
+        settings: dict[str, Any] = {"device": self.device, "adjoint": True, "record_tape": False}
+        settings["adj_inputs"] = [None] * (len(self._inputs) - 3) + [self.adj_control, self.adj_phi, self.adj_p]
+        wp.launch(self.kernel, batch, self._inputs, **settings)
         return to_torch(self.adj_control)[:, :batch].transpose(0, 1).clone()
 
-    def _inputs(self, step: int) -> list[Any]:
-        return [step, step // self.hold, self.dt, *self.constants, self.control, self.phi, self.p]
+    @property
+    def _inputs(self) -> list[Any]:
+        return [self.steps, self.hold, self.dt, *self.constants, self.control, self.phi, self.p]
 
 
 @cache
 @no_type_check
-def step_kernel(name: str) -> Any:
-    """Return the kernel of one step of the classical Runge-Kutta method."""
+def motion_kernel(name: str) -> Any:
+    """Return the kernel of a motion by the classical Runge-Kutta method.
+
+    One thread takes a motion through all its steps, since a launch costs more than a step. Nothing is carried from step
+    to step but by the arrays: variables that a loop carries would be lost to its derivatives.
+    """
     types, module = precision(name), f"gradscape.chain.{name}"
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
 
@@ -141,8 +142,8 @@ def step_kernel(name: str) -> Any:
 
     @wp.kernel(module=module)
     def advance(
-        step: int,
-        k: int,
+        steps: int,
+        hold: int,
         dt: real,
         C: mat33,
         beta: vec3,
@@ -153,21 +154,22 @@ def step_kernel(name: str) -> Any:
         p: wp.array2d[vec3],
     ):
         e = wp.tid()
-        control, phi0, p0 = controls[k, e], phi[step, e], p[step, e]
-        u, half = control[0], real(0.5) * dt
-        v1 = velocity(C, beta, u, phi0, p0)
-        f1 = force(C, beta, gravity, damping, control, phi0, v1)
-        phi2 = phi0 + half * v1
-        v2 = velocity(C, beta, u, phi2, p0 + half * f1)
-        f2 = force(C, beta, gravity, damping, control, phi2, v2)
-        phi3 = phi0 + half * v2
-        v3 = velocity(C, beta, u, phi3, p0 + half * f2)
-        f3 = force(C, beta, gravity, damping, control, phi3, v3)
-        phi4 = phi0 + dt * v3
-        v4 = velocity(C, beta, u, phi4, p0 + dt * f3)
-        f4 = force(C, beta, gravity, damping, control, phi4, v4)
-        sixth = dt / real(6.0)
-        phi[step + 1, e] = phi0 + sixth * (v1 + real(2.0) * (v2 + v3) + v4)
-        p[step + 1, e] = p0 + sixth * (f1 + real(2.0) * (f2 + f3) + f4)
+        for step in range(steps):
+            control, phi0, p0 = controls[step // hold, e], phi[step, e], p[step, e]
+            u, half = control[0], real(0.5) * dt
+            v1 = velocity(C, beta, u, phi0, p0)
+            f1 = force(C, beta, gravity, damping, control, phi0, v1)
+            phi2 = phi0 + half * v1
+            v2 = velocity(C, beta, u, phi2, p0 + half * f1)
+            f2 = force(C, beta, gravity, damping, control, phi2, v2)
+            phi3 = phi0 + half * v2
+            v3 = velocity(C, beta, u, phi3, p0 + half * f2)
+            f3 = force(C, beta, gravity, damping, control, phi3, v3)
+            phi4 = phi0 + dt * v3
+            v4 = velocity(C, beta, u, phi4, p0 + dt * f3)
+            f4 = force(C, beta, gravity, damping, control, phi4, v4)
+            sixth = dt / real(6.0)
+            phi[step + 1, e] = phi0 + sixth * (v1 + real(2.0) * (v2 + v3) + v4)
+            p[step + 1, e] = p0 + sixth * (f1 + real(2.0) * (f2 + f3) + f4)
 
     return advance
