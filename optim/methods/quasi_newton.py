@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass
+from queue import SimpleQueue
+from threading import Thread
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,20 +19,42 @@ from ..memory import FLOAT, SearchSize
 from ..options import MANY, MethodOptions, number
 
 MEMORY = 10  # pairs of steps and gradients that the Hessian is made of, as scipy's default has it
+THREAD = "L-BFGS-B"  # what threads are called in which scipy minimises
 INTERVAL, TARGET, FACTOR = 50, 0.5, 0.9  # of hops, of those accepted, of a hop's length: scipy's defaults
 
 
-class _Unknown(Exception):  # noqa: N818 -- no error: it ends a minimisation that has come to where nothing is known
-    def __init__(self, z: Points) -> None:
-        self.z = z
+class _EndedError(Exception):
+    """Ends a minimisation that nobody wants any more."""
+
+
+def _minimise(start: Points, evaluations: int, asked: SimpleQueue[Any], values: SimpleQueue[Any]) -> None:
+    """Minimise from `start`: put each point into `asked` and wait in `values` for its loss and gradient, None to end.
+
+    What scipy returns or raises is asked last.
+    """
+
+    def at(z: Points) -> tuple[float, Points]:
+        asked.put(z.copy())
+        if (known := values.get()) is None:
+            raise _EndedError
+        found: tuple[float, Points] = known
+        return found
+
+    how = {"maxcor": MEMORY, "maxfun": evaluations}
+    try:
+        asked.put(minimize(at, start, jac=True, method="L-BFGS-B", bounds=[(-1.0, 1.0)] * len(start), options=how))
+    except _EndedError:
+        pass
+    except Exception as error:
+        asked.put(error)
 
 
 class LocalSearch:
     """Minimise by scipy's L-BFGS-B from `start`, in the scaled box: `at` is the point it asks for next, until `done`.
 
-    scipy calls a function and waits for its value. So it is called anew for each point with the values that are known
-    by then, all of which it asks for again in the same order, and is ended where it asks for the first that is not.
-    `failed` says that it ended as scipy does not call a success.
+    scipy calls a function and waits for its value, so it runs in a thread of its own, which is told the values. Where a
+    search is restored there is no such thread: a new one is told all that were known, for which it asks again in the
+    same order. `failed` says that it ended as scipy does not call a success.
     """
 
     def __init__(self, start: Points, evaluations: int) -> None:
@@ -39,39 +64,40 @@ class LocalSearch:
         self.grad: list[Points] = []
         self.at, self.best, self.best_loss = self.start, self.start, math.inf
         self.done = self.failed = False
+        self._thread: tuple[SimpleQueue[Any], SimpleQueue[Any]] | None = None
 
     def tell(self, loss: float, grad: Points) -> None:
         """Take in the loss and the gradient, shape (dim,), of the point asked for."""
         self.z.append(self.at)
         self.loss.append(loss)
         self.grad.append(grad)
-        known = iter(zip(self.loss, self.grad, strict=True))
-
-        def at(z: Points) -> tuple[float, Points]:
-            try:
-                return next(known)
-            except StopIteration:
-                raise _Unknown(z.copy()) from None
-
-        try:
-            found = minimize(
-                at,
-                self.start,
-                jac=True,
-                method="L-BFGS-B",
-                bounds=[(-1.0, 1.0)] * len(self.start),
-                options={"maxcor": MEMORY, "maxfun": self.evaluations},
-            )
-        except _Unknown as unknown:
-            self.at = unknown.z
+        asked, values = self._thread or self._begin()
+        values.put((loss, grad.copy()))
+        found = asked.get()
+        if isinstance(found, Exception):
+            raise found
+        if isinstance(found, np.ndarray):
+            self.at = found
         else:
             self.done, self.failed = True, not found.success
             self.best, self.best_loss = np.asarray(found.x), float(found.fun)
 
+    def _begin(self) -> tuple[SimpleQueue[Any], SimpleQueue[Any]]:
+        """Start a thread, and bring it to where it waits for the last value."""
+        self._thread = asked, values = SimpleQueue[Any](), SimpleQueue[Any]()
+        Thread(target=_minimise, args=(self.start, self.evaluations, asked, values), name=THREAD, daemon=True).start()
+        weakref.finalize(self, values.put, None)
+        asked.get()
+        for known in zip(self.loss[:-1], self.grad[:-1], strict=True):
+            values.put((known[0], known[1].copy()))
+            asked.get()
+        return asked, values
+
     def state(self) -> dict[str, Any]:
         """Return where the search stands, as data."""
         dim = len(self.start)
-        return vars(self) | {
+        kept = {name: value for name, value in vars(self).items() if name != "_thread"}
+        return kept | {
             "z": np.array(self.z).reshape(-1, dim),
             "loss": np.array(self.loss),
             "grad": np.array(self.grad).reshape(-1, dim),
@@ -81,7 +107,7 @@ class LocalSearch:
     def from_state(cls, state: Mapping[str, Any]) -> LocalSearch:
         """Return the search that had this state."""
         search = cls(state["start"], int(state["evaluations"]))
-        for name in vars(search):
+        for name in vars(search).keys() - {"_thread"}:
             value = state[name]
             setattr(search, name, list(value) if name in ("z", "grad") else value)
         search.loss = [float(loss) for loss in state["loss"]]
