@@ -13,6 +13,7 @@ import sysconfig
 import tarfile
 import tomllib
 import zipfile
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
@@ -38,7 +39,7 @@ gallery list
 gallery build
 """.strip().splitlines()
 DRIVER = """
-import json, sys, traceback
+import importlib, json, pkgutil, sys, traceback
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
 from gradscape.cli import main
@@ -53,10 +54,7 @@ for line in json.load(sys.stdin):
         said[line] = [left.code or 0, out.getvalue()]
     except BaseException:
         said[line] = ["raised", out.getvalue() + traceback.format_exc()]
-print(json.dumps(said))
-"""
-WALK = """
-import importlib, json, pkgutil, gradscape
+import gradscape
 names = [module.name for module in pkgutil.walk_packages(gradscape.__path__, "gradscape.")]
 missing = {}
 for name in names:
@@ -64,7 +62,7 @@ for name in names:
         importlib.import_module(name)
     except ModuleNotFoundError as error:
         missing[name] = error.name
-print(json.dumps([gradscape.__file__, names, missing]))
+print(json.dumps({"said": said, "home": gradscape.__path__[0], "names": names, "missing": missing}))
 """
 
 
@@ -127,6 +125,34 @@ def python(built: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> 
     return found
 
 
+@dataclass(frozen=True)
+class Tried:
+    """What commands said in a folder, one after the other, and then which modules import in the same process.
+
+    `changed`: files that the package has gained or lost meanwhile.
+    """
+
+    folder: Path
+    said: dict[str, tuple[int | str, str]]
+    home: str
+    names: list[str]
+    missing: dict[str, str]
+    changed: list[Path]
+
+
+@pytest.fixture(scope="module")
+def tried(python: Path, tmp_path_factory: pytest.TempPathFactory) -> Tried:
+    folder = tmp_path_factory.mktemp("tried")
+    (site,) = (python.parent.parent / "lib").glob("python*/site-packages/gradscape")
+
+    def files() -> set[Path]:
+        return {file for file in site.rglob("*") if "__pycache__" not in file.parts}
+
+    before = files()
+    out = ran(python, "-c", DRIVER, cwd=folder, input=json.dumps(TRIED)).splitlines()[-1]
+    return Tried(folder, **json.loads(out), changed=sorted(before ^ files()))
+
+
 def names_of(archive: Path) -> set[str]:
     """Return the files of an sdist or a wheel, as paths in the package."""
     if archive.suffix == ".whl":
@@ -165,28 +191,25 @@ def test_what_is_sent_is_small_for_all_that_the_figures_weigh(built: dict[str, P
     assert max(sdist.stat().st_size, built["wheel"].stat().st_size) < LARGEST
 
 
-def test_every_module_imports_where_it_is_installed(built: dict[str, Path], python: Path, tmp_path: Path) -> None:
+def test_every_module_imports_where_it_is_installed(built: dict[str, Path], python: Path, tried: Tried) -> None:
     """But for those that need a package of an extra, where the wheel is installed without."""
-    home, names, missing = json.loads(ran(python, "-c", WALK, cwd=tmp_path))
-    assert Path(home).is_relative_to(python.parent.parent)
+    assert Path(tried.home).is_relative_to(python.parent.parent)
     files = {name for name in names_of(built["wheel"]) if name.endswith(".py")}
     modules = {"gradscape." + name.removesuffix(".py").replace("/", ".").removesuffix(".__init__") for name in files}
-    assert {*names, "gradscape.__init__"} == modules
+    assert {*tried.names, "gradscape.__init__"} == modules
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     wanted = [re.split("[^a-z0-9-]", one)[0] for one in extras["rl"] + extras["distributed"]]
     optional = {one.replace("-", "_") for one in (*wanted, *chain(*EXTRAS.values()))}
-    assert set(missing.values()) <= optional
+    assert set(tried.missing.values()) <= optional
 
 
-def test_the_command_works_there_and_leaves_its_results_where_one_stands(python: Path, tmp_path: Path) -> None:
-    site = Path(ran(python, "-c", "import gradscape; print(gradscape.__path__[0])", cwd=tmp_path).strip())
-    before = sorted(file for file in site.rglob("*") if "__pycache__" not in file.parts)
-    assert ran(python.parent / "landscape", "--help", cwd=tmp_path).startswith("Usage: landscape")
-    said = json.loads(ran(python, "-c", DRIVER, cwd=tmp_path, input=json.dumps(TRIED)).splitlines()[-1])
+def test_the_command_works_there_and_leaves_its_results_where_one_stands(python: Path, tried: Tried) -> None:
+    said, folder = tried.said, tried.folder
+    assert ran(python.parent / "landscape", "--help", cwd=folder).startswith("Usage: landscape")
     assert {line: code for line, (code, _) in said.items()} == dict.fromkeys(TRIED, 0), said
     assert "the quickest of" in said[next(line for line in TRIED if "--tolerance" in line)][1]
-    assert (tmp_path / "rastrigin/landscape.png").exists()
-    assert (tmp_path / "out/gallery-data/bounce-y/slice.zarr").exists()
+    assert (folder / "rastrigin/landscape.png").exists()
+    assert (folder / "out/gallery-data/bounce-y/slice.zarr").exists()
     assert "figures in out/gallery-data" in said["gallery list"][1]
-    assert (tmp_path / "out/gallery/bounce-y/index.html").exists()
-    assert sorted(file for file in site.rglob("*") if "__pycache__" not in file.parts) == before
+    assert (folder / "out/gallery/bounce-y/index.html").exists()
+    assert tried.changed == []

@@ -89,9 +89,10 @@ def test_taichi_refuses_to_be_deterministic():
 
 @pytest.mark.parametrize(("name", "known"), [("fluid", "scoop"), ("assembly", "demonstration")])
 def test_drafts_agree_as_far_as_float32_does(name, known):
-    """Losses within 1e-3 and gradients within 1e-2 (here 7e-5 and 1e-4 at most)."""
-    ours, theirs = (make(name, device="cpu", engine=engine) for engine in ("warp", "taichi"))
+    """Over two fifths of an episode, when tools are at work: losses within 1e-4 and gradients within 1e-3."""
+    ours, theirs = (make(name, device="cpu", engine=engine, horizon=0.4) for engine in ("warp", "taichi"))
     x = ours.example(known)[None]
     one, two = ours.evaluate(x), theirs.evaluate(x)
-    torch.testing.assert_close(two.loss, one.loss, rtol=1e-3, atol=0.0)
-    assert (two.grad - one.grad).norm() < 1e-2 * one.grad.norm()
+    assert one.grad.norm() > 0.01
+    torch.testing.assert_close(two.loss, one.loss, rtol=1e-4, atol=0.0)
+    assert (two.grad - one.grad).norm() < 1e-3 * one.grad.norm()

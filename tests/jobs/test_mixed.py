@@ -4,6 +4,7 @@ import itertools
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -22,7 +23,7 @@ from gradscape.jobs.variants import Variant
 from gradscape.landscapes import cost
 from gradscape.landscapes.measures import fidelity
 from gradscape.landscapes.measures.choice import CLAIMS, Shortfall
-from gradscape.landscapes.measures.fidelity import Sample, compare
+from gradscape.landscapes.measures.fidelity import Comparison, Sample, compare
 from gradscape.landscapes.measures.mixed import MixedTradeoff
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.space import ParameterSpace
@@ -97,19 +98,27 @@ def sample(env: Environment, x: Tensor) -> Sample:
     return Sample(found.loss.numpy(), found.grad.numpy(), found.status.numpy(), 1.0, 1.0, 1)
 
 
+@cache
+def every_notch(stable: float, options: tuple[tuple[str, float], ...]) -> list[tuple[int, int, Comparison]]:
+    """Return (steps per second, cells, comparison) of all notches that there are: what tests of a claim share."""
+    assert Trading.stable == stable
+    x, own = Trading.space.sobol(POINTS, seed=0), dict(options)
+    reference = sample(Trading(fidelity="reference", **own), x)
+    found = []
+    for count, fine in itertools.product((7, 10, 15, 22, 33, 50, 75, 110, 170), (4, 6, 8, 10, 12, 16, 20, 24, 32)):
+        one = Fidelity("one", dt=1 / count, resolution=fine)
+        found.append((count, fine, compare(sample(Trading(fidelity=one, **own), x), reference, seed=0)))
+    return found
+
+
 def optimum(claim: str, *, chaotic: bool = False, **options: float) -> tuple[float, int]:
     """Return steps per second and cells of the least work that keeps a claim, of all notches that there are."""
     (promise,) = (one for one in CLAIMS if one.name == claim)
-    x = Trading.space.sobol(POINTS, seed=0)
-    reference = sample(Trading(fidelity="reference", **options), x)
-    steps = (7, 10, 15, 22, 33, 50, 75, 110, 170)
-    cells = (4, 6, 8, 10, 12, 16, 20, 24, 32)
-    able = []
-    for count, fine in itertools.product(steps, cells):
-        one = Fidelity("one", dt=1 / count, resolution=fine)
-        found = compare(sample(Trading(fidelity=one, **options), x), reference, seed=0)
-        if Shortfall.of(found, promise, chaotic=chaotic).kept:
-            able.append((count * fine**2, count, fine))
+    able = [
+        (count * fine**2, count, fine)
+        for count, fine, found in every_notch(Trading.stable, tuple(sorted(options.items())))
+        if Shortfall.of(found, promise, chaotic=chaotic).kept
+    ]
     return min(able)[1:]
 
 

@@ -130,3 +130,18 @@ def test_it_is_sliced_like_any_other(tmp_path):
     )
     np.testing.assert_allclose(cut.data.loss, wanted.data.loss, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(cut.data.grad, wanted.data.grad, rtol=1e-12, atol=1e-12)
+
+
+def test_what_was_traced_in_one_precision_is_forgotten_before_the_other():
+    """Also what an inner function of JAX's own keeps, which does not know of the objective that called it."""
+    traced = []
+
+    @jax.jit
+    def inner(x):
+        traced.append(str(x.dtype))
+        return x.sum()
+
+    for precision in ("float64", "float64", "float32", "float64"):
+        found = gs.from_jax(inner, SPACE, precision=precision).evaluate(X[:1], grad=False)
+        torch.testing.assert_close(found.loss, X[:1].sum(dim=1), rtol=1e-6, atol=0)
+    assert traced == ["float64", "float32", "float64"]
