@@ -37,8 +37,8 @@ class Flight:
 
     Position `x`, velocity `v`, `spin` (counterclockwise) and the time `rest` left in the step are differentiable;
     `step`, `impacts` (events at once), `support` (surface that carries the ball, or FREE), `pick` (surface that is met
-    or another event, FREE or DONE) and `hits` (impacts faster than crawling) are whole numbers; `when` is the time of
-    the event [s], as it was found.
+    or another event, FREE or, of a row's last state, DONE) and `hits` (impacts faster than crawling) are whole numbers;
+    `when` is the time of the event [s], as it was found.
     """
 
     NUMBERS = ("x", "v", "spin", "rest")
@@ -79,7 +79,7 @@ class Solver:
         self.angle, self.adj_angle = (
             wp.zeros((capacity, len(board.pivots)), dtype=self.types.real, device=device) for _ in range(2)
         )
-        self.iterations = wp.zeros(capacity, dtype=wp.int32, device=device)
+        self.iterations = wp.zeros(capacity, dtype=wp.int32, device=device)  # that rows have taken
         self.flight = Flight(2 * steps + SPARE, capacity, name, device)
         self.adjoint: Flight | None = None
 
@@ -108,7 +108,7 @@ class Solver:
         """Return what the adjoint of the last positions, shape (batch, 2), is for the beginning of the latest run."""
         batch = len(adj_x)
         adjoint = self._clear_adjoint(batch)
-        adjoint.tensor("x")[self.taken, self._rows(len(self.taken))] = adj_x.to(adjoint.tensor("x"))
+        adjoint.tensor("x")[self.taken, self._rows(batch)] = adj_x.to(adjoint.tensor("x"))
         settings: dict[str, Any] = {"device": self.device, "adjoint": True, "record_tape": False}
         nothing = [None] * len(Flight.COUNTS)
         settings["adj_inputs"] = [None, type(self.data)(), self.adj_angle, *adjoint.arrays(), *nothing]
