@@ -18,7 +18,7 @@ from ..landscapes.space import ParameterSpace
 from .base import Environment, Episode, Fidelity, MaterialRange, ModelPart, Work
 from .batching import Pool
 from .engines.balls.board import INERTIA, RIGID, Board
-from .engines.balls.impacts import ASK, Solver
+from .engines.balls.impacts import SPARE, Solver
 from .options import EpisodeOptions
 
 WIDTH, HEIGHT = 8.0, 10.0  # the board [m]
@@ -107,7 +107,7 @@ class Pinball(Environment):
 
     def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
-        iterations = 2 * self.steps + ASK
+        iterations = 2 * self.steps + SPARE
         return iterations * ((2 * 6 + 1) * (8 if self.fidelity.precision == "float64" else 4) + 5 * 4)
 
     def work(self) -> Work:

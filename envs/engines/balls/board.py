@@ -52,13 +52,6 @@ def constants(board: Board, *, dt: float, steps: int, name: str, device: str) ->
     return data
 
 
-class Kernels(NamedTuple):
-    """What makes one iteration: `find` says what is met, `move` is differentiated."""
-
-    find: Any
-    move: Any
-
-
 class Surfaces(NamedTuple):
     """What both contact rules ask of geometry and friction, and the struct `Data` of their constants."""
 

@@ -6,7 +6,8 @@ from typing import no_type_check
 import warp as wp
 
 from ..runtime import precision
-from .board import DONE, FREE, Kernels, surfaces
+from .board import FREE, surfaces
+from .episodes import Kernels, episode_kernels
 from .rolling import ARC, rolling
 from .roots import roots
 
@@ -149,9 +150,10 @@ def impact_kernels(name: str) -> Kernels:
                     soonest = t
         return soonest, first
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.func(module=module)
     def find(
         i: int,
+        e: int,
         data: Data,
         angle: Reals,
         x: Vecs,
@@ -165,10 +167,6 @@ def impact_kernels(name: str) -> Kernels:
         hits: Ints,
         when: Reals,
     ):
-        e = wp.tid()
-        if step[i, e] >= data.steps:
-            pick[i, e] = DONE
-            return
         here, carrier, span = x[i, e], support[i, e], rest[i, e]
         pick[i, e] = FREE
         when[i, e] = span
@@ -289,9 +287,10 @@ def impact_kernels(name: str) -> Kernels:
             return surface
         return FREE
 
-    @wp.kernel(module=module)
+    @wp.func(module=module)
     def move(
         i: int,
+        e: int,
         data: Data,
         angle: Reals,
         x: Vecs,
@@ -305,11 +304,8 @@ def impact_kernels(name: str) -> Kernels:
         hits: Ints,
         when: Reals,
     ):
-        e = wp.tid()
         surface, carrier = pick[i, e], support[i, e]
         step[i + 1, e] = step[i, e]
-        if surface == DONE:
-            return
         span, found = rest[i, e], when[i, e]
         hits[i + 1, e] = hits[i, e]
         impacts[i + 1, e] = 0
@@ -365,4 +361,4 @@ def impact_kernels(name: str) -> Kernels:
             else:
                 impacts[i + 1, e] = impacts[i, e] + 1
 
-    return Kernels(find, move)
+    return episode_kernels(module, name, find, move)

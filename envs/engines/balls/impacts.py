@@ -2,8 +2,9 @@
 
 Between impacts the ball flies a parabola, and where a face carries it, its path is one too: `roots` says when it meets
 what. A step only bounds how far one looks ahead. One iteration takes a row to its next event, or to the end of its
-step: `find` says what comes first and when, `move` goes there. Only `move` is differentiated, its adjoint running
-through the iterations in reverse; it corrects the time by a step of Newton's, whose derivative is the time's own.
+step: `find` says what comes first and when, `move` goes there. One launch takes every row through all its iterations.
+Only `move` is differentiated, its adjoint running through them in reverse; it corrects the time by a step of Newton's,
+whose derivative is the time's own.
 """
 
 from dataclasses import dataclass
@@ -13,12 +14,12 @@ import torch
 import warp as wp
 
 from ..runtime import load, precision, to_torch
-from .board import DONE, FREE, Board, constants
+from .board import FREE, Board, constants
 from .events import JAM as JAM
 from .events import impact_kernels
 from .overlaps import step_kernels
 
-ASK = 32  # iterations between two questions whether all rows are done
+SPARE = 32  # iterations for which there is room at first, beyond two a step
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +37,8 @@ class Flight:
 
     Position `x`, velocity `v`, `spin` (counterclockwise) and the time `rest` left in the step are differentiable;
     `step`, `impacts` (events at once), `support` (surface that carries the ball, or FREE), `pick` (surface that is met
-    or another event, FREE or DONE) and `hits` (impacts faster than crawling) are whole numbers; `when` is the time of
-    the event [s], as it was found.
+    or another event, FREE or, of a row's last state, DONE) and `hits` (impacts faster than crawling) are whole numbers;
+    `when` is the time of the event [s], as it was found.
     """
 
     NUMBERS = ("x", "v", "spin", "rest")
@@ -78,7 +79,8 @@ class Solver:
         self.angle, self.adj_angle = (
             wp.zeros((capacity, len(board.pivots)), dtype=self.types.real, device=device) for _ in range(2)
         )
-        self.flight = Flight(2 * steps + ASK, capacity, name, device)
+        self.iterations = wp.zeros(capacity, dtype=wp.int32, device=device)  # that rows have taken
+        self.flight = Flight(2 * steps + SPARE, capacity, name, device)
         self.adjoint: Flight | None = None
 
     def run(
@@ -99,25 +101,24 @@ class Solver:
         for field in (*Flight.NUMBERS, *Flight.COUNTS):
             row = self.flight.tensor(field)[0, :batch]
             row[:] = torch.as_tensor(first.get(field, 0), dtype=torch.float64).to(row)
-        self.taken = self._advance(batch)
+        self.taken = self._follow(batch)
         return self.at_end("x")
 
     def gradient(self, adj_x: torch.Tensor) -> Slopes:
         """Return what the adjoint of the last positions, shape (batch, 2), is for the beginning of the latest run."""
         batch = len(adj_x)
-        adjoint = self._clear_adjoint()
-        adjoint.tensor("x")[self.taken, self._rows()] = adj_x.to(adjoint.tensor("x"))
+        adjoint = self._clear_adjoint(batch)
+        adjoint.tensor("x")[self.taken, self._rows(batch)] = adj_x.to(adjoint.tensor("x"))
         settings: dict[str, Any] = {"device": self.device, "adjoint": True, "record_tape": False}
         nothing = [None] * len(Flight.COUNTS)
         settings["adj_inputs"] = [None, type(self.data)(), self.adj_angle, *adjoint.arrays(), *nothing]
-        for i in reversed(range(int(self.taken.max()))):
-            wp.launch(self.kernels.move, batch, self._inputs(i), **settings)
+        wp.launch(self.kernels.retrace, batch, self._inputs(), **settings)
         first = {name: adjoint.tensor(field)[0, :batch].clone() for name, field in _SLOPES.items()}
         return Slopes(to_torch(self.adj_angle)[:batch].clone(), **first)
 
     def at_end(self, field: str) -> torch.Tensor:
         """Return one field of the latest run's last states, shape (batch, ...)."""
-        return self.flight.tensor(field)[self.taken, self._rows()]
+        return self.flight.tensor(field)[self.taken, self._rows(len(self.taken))]
 
     def at_steps(self, field: str, row: int) -> torch.Tensor:
         """Return one field of a row of the latest run at the ends of steps, shape (step + 1, ...)."""
@@ -126,38 +127,37 @@ class Solver:
         ends = torch.cat([step.new_ones(1), step.diff()]) > 0
         return self.flight.tensor(field)[: last + 1, row][ends]
 
-    def _advance(self, batch: int) -> torch.Tensor:
-        """Iterate until all rows are done; return how many iterations each took."""
-        i = 0
-        while bool((self.flight.tensor("step")[i, :batch] < self.steps).any()):
-            if i + ASK >= self.flight.length:
-                self._double_length()
-            for k in range(i, i + ASK):
-                for kernel in self.kernels:
-                    wp.launch(kernel, batch, self._inputs(k), device=self.device, record_tape=False)
-            i += ASK
-        taken: torch.Tensor = (self.flight.tensor("pick")[:i, :batch] != DONE).sum(dim=0)
-        return taken
+    def _follow(self, batch: int) -> torch.Tensor:
+        """Launch until all rows are done, with more room where it has not been enough; return each row's iterations."""
+        self.iterations.zero_()
+        taken = to_torch(self.iterations)[:batch]
+        while True:
+            inputs = [self.flight.length - 1, *self._inputs()]
+            wp.launch(self.kernels.follow, batch, inputs, device=self.device, record_tape=False)
+            counts = taken.long()
+            if bool((self.flight.tensor("step")[counts, self._rows(batch)] >= self.steps).all()):
+                return counts
+            self._double_length()
 
     def _double_length(self) -> None:
         old, self.flight = self.flight, Flight(2 * self.flight.length, self.capacity, self.name, self.device)
         for field in (*Flight.NUMBERS, *Flight.COUNTS):
             self.flight.tensor(field)[: old.length] = old.tensor(field)
 
-    def _clear_adjoint(self) -> Flight:
+    def _clear_adjoint(self, batch: int) -> Flight:
         if self.adjoint is None or self.adjoint.length != self.flight.length:
             self.adjoint = Flight(self.flight.length, self.capacity, self.name, self.device, counts=False)
         used = int(self.taken.max()) + 1
         for field in Flight.NUMBERS:
-            self.adjoint.tensor(field)[:used] = 0
+            self.adjoint.tensor(field)[:used, :batch] = 0
         self.adj_angle.zero_()
         return self.adjoint
 
-    def _inputs(self, i: int) -> list[Any]:
-        return [i, self.data, self.angle, *self.flight.arrays()]
+    def _inputs(self) -> list[Any]:
+        return [self.iterations, self.data, self.angle, *self.flight.arrays()]
 
-    def _rows(self) -> torch.Tensor:
-        return torch.arange(len(self.taken), device=self.taken.device)
+    def _rows(self, batch: int) -> torch.Tensor:
+        return torch.arange(batch, device=self.flight.tensor("step").device)
 
 
 _SLOPES = {"start": "x", "velocity": "v", "spin": "spin"}

@@ -10,7 +10,8 @@ from typing import no_type_check
 import warp as wp
 
 from ..runtime import precision
-from .board import DONE, FREE, Kernels, surfaces
+from .board import FREE, surfaces
+from .episodes import Kernels, episode_kernels
 
 
 @cache
@@ -23,9 +24,10 @@ def step_kernels(name: str) -> Kernels:
     module = f"gradscape.overlaps.{name}"
     Data, along, _, outward, distance, nearest, _, rebound, deflect = surfaces(name)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.func(module=module)
     def find(
         i: int,
+        e: int,
         data: Data,
         angle: Reals,
         x: Vecs,
@@ -40,10 +42,6 @@ def step_kernels(name: str) -> Kernels:
         when: Reals,
     ):
         """Find the surface that is overlapped most, of those that are approached."""
-        e = wp.tid()
-        if step[i, e] >= data.steps:
-            pick[i, e] = DONE
-            return
         here = x[i, e]
         w = v[i, e] - vec2(real(0.0), data.gravity * data.dt)
         bars = data.pivot.shape[0]
@@ -61,9 +59,10 @@ def step_kernels(name: str) -> Kernels:
                 first = surface
         pick[i, e] = first
 
-    @wp.kernel(module=module)
+    @wp.func(module=module)
     def move(
         i: int,
+        e: int,
         data: Data,
         angle: Reals,
         x: Vecs,
@@ -77,11 +76,7 @@ def step_kernels(name: str) -> Kernels:
         hits: Ints,
         when: Reals,
     ):
-        e = wp.tid()
         surface = pick[i, e]
-        step[i + 1, e] = step[i, e]
-        if surface == DONE:
-            return
         here, turn = x[i, e], real(spin[i, e])
         w = v[i, e] - vec2(real(0.0), data.gravity * data.dt)
         hits[i + 1, e] = hits[i, e]
@@ -96,4 +91,4 @@ def step_kernels(name: str) -> Kernels:
         spin[i + 1, e] = turn
         step[i + 1, e] = step[i, e] + 1
 
-    return Kernels(find, move)
+    return episode_kernels(module, name, find, move)
