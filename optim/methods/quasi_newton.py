@@ -67,7 +67,7 @@ class LocalSearch:
         self._thread: tuple[SimpleQueue[Any], SimpleQueue[Any]] | None = None
 
     def tell(self, loss: float, grad: Points) -> None:
-        """Take in the loss and the gradient, shape (dim,), of the point asked for."""
+        """Take in the loss and the gradient, shape (dim,), of the point asked for; raises whatever scipy raises."""
         self.z.append(self.at)
         self.loss.append(loss)
         self.grad.append(grad)
