@@ -6,8 +6,7 @@ README.md has the shares alone. The table in docs/measures.md has a row for each
 in which share of them losses move by less than a hundredth of what they do in all, which share each word of the
 classification fits, with its interval, and the paper's words with their shares. It is of the records by `landscape
 census ENV --fidelity standard` in gallery/data/census; a scene that has none, or has changed since, is said to be so.
-With --check nothing is written:
-exit code 1 says that a page differs, or that a scene is not measured.
+With --check nothing is written: exit code 1 says that a page differs, or that a scene is not measured.
 """
 
 from __future__ import annotations
@@ -80,9 +79,8 @@ def censuses(data: Path = DATA) -> dict[str, Shares | str]:
 
 def rows(found: Mapping[str, Shares | str]) -> Iterator[list[str]]:
     """Return a row for each scene."""
-    paper = read_paper().words
     for name, one in found.items():
-        said = paper[name].words if name in paper else ()
+        said = _paper_words(name)
         if isinstance(one, str):
             yield [f"`{name}`", "", "", one, ", ".join(said)]
             continue
@@ -92,15 +90,20 @@ def rows(found: Mapping[str, Shares | str]) -> Iterator[list[str]]:
 
 
 def short_rows(found: Mapping[str, Shares | str]) -> Iterator[list[str]]:
-    """Return a row of README for each scene: percentages of its slices, of words of which none has two of a column."""
-    paper = read_paper().words
+    """Return a row of README for each scene: which percentage of its slices fits each column."""
+    nothing = [""] * (len(SHORT) - 1)
     for name, one in found.items():
-        said = ", ".join(paper[name].words) if name in paper else ""
-        shares = [one] if isinstance(one, str) else [_percent(one, words) for words in SHORT.values()]
-        yield [f"`{name}`", *shares, *[""] * (len(SHORT) - len(shares)), said]
+        shares = [one, *nothing] if isinstance(one, str) else [_percent(one, words) for words in SHORT.values()]
+        yield [f"`{name}`", *shares, ", ".join(_paper_words(name))]
+
+
+def _paper_words(scene: str) -> Sequence[str]:
+    words = read_paper().words
+    return words[scene].words if scene in words else ()
 
 
 def _percent(shares: Shares, words: Sequence[str]) -> str:
+    """Add the shares of words of which a slice has one at most."""
     return f"{100 * sum(shares.words[word].value for word in words):.0f} %"
 
 

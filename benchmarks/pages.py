@@ -44,14 +44,21 @@ def is_present(scene: str, code: str, engine: str = "warp") -> bool:
 
 def written(page: Path, name: str) -> str:
     """Return the table of a name that a page holds; raises ValueError where it has no such marks, or two of them."""
-    (found,) = re.findall(rf"<!-- {name} -->\n\n(.*?)\n<!-- /{name} -->", page.read_text(), flags=re.DOTALL)
-    return str(found)
+    text = page.read_text()
+    return text[_place(text, name)]
 
 
-def write(text: str, page: Path, name: str) -> None:
-    """Put a table into a page, in the place of the one of this name."""
-    before, after = (f"<!-- {name} -->\n\n", f"\n<!-- /{name} -->")
-    page.write_text(page.read_text().replace(before + written(page, name) + after, before + text + after))
+def write(table: str, page: Path, name: str) -> None:
+    """Put a table into a page, in the place of the one of this name; raises ValueError as `written` does."""
+    text = page.read_text()
+    place = _place(text, name)
+    page.write_text(text[: place.start] + table + text[place.stop :])
+
+
+def _place(text: str, name: str) -> slice:
+    """Return where between its marks a table stands."""
+    (found,) = re.finditer(rf"<!-- {name} -->\n\n(.*?)\n<!-- /{name} -->", text, flags=re.DOTALL)
+    return slice(*found.span(1))
 
 
 def settle_measured(

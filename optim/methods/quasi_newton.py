@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from queue import SimpleQueue
 from threading import Thread
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 import torch
@@ -22,12 +22,14 @@ MEMORY = 10  # pairs of steps and gradients that the Hessian is made of, as scip
 THREAD = "L-BFGS-B"  # what threads are called in which scipy minimises
 INTERVAL, TARGET, FACTOR = 50, 0.5, 0.9  # of hops, of those accepted, of a hop's length: scipy's defaults
 
+Values: TypeAlias = "SimpleQueue[tuple[float, Points] | None]"  # losses with gradients, at last None
+
 
 class _EndedError(Exception):
     """Ends a minimisation that nobody wants any more."""
 
 
-def _minimise(start: Points, evaluations: int, asked: SimpleQueue[Any], values: SimpleQueue[Any]) -> None:
+def _minimise(start: Points, evaluations: int, asked: SimpleQueue[Any], values: Values) -> None:
     """Minimise from `start`: put each point into `asked` and wait in `values` for its loss and gradient, None to end.
 
     What scipy returns or raises is asked last.
@@ -37,8 +39,7 @@ def _minimise(start: Points, evaluations: int, asked: SimpleQueue[Any], values: 
         asked.put(z.copy())
         if (known := values.get()) is None:
             raise _EndedError
-        found: tuple[float, Points] = known
-        return found
+        return known
 
     how = {"maxcor": MEMORY, "maxfun": evaluations}
     try:
@@ -64,7 +65,7 @@ class LocalSearch:
         self.grad: list[Points] = []
         self.at, self.best, self.best_loss = self.start, self.start, math.inf
         self.done = self.failed = False
-        self._thread: tuple[SimpleQueue[Any], SimpleQueue[Any]] | None = None
+        self._thread: tuple[SimpleQueue[Any], Values] | None = None
 
     def tell(self, loss: float, grad: Points) -> None:
         """Take in the loss and the gradient, shape (dim,), of the point asked for; raises whatever scipy raises."""
@@ -82,32 +83,36 @@ class LocalSearch:
             self.done, self.failed = True, not found.success
             self.best, self.best_loss = np.asarray(found.x), float(found.fun)
 
-    def _begin(self) -> tuple[SimpleQueue[Any], SimpleQueue[Any]]:
+    def _begin(self) -> tuple[SimpleQueue[Any], Values]:
         """Start a thread, and bring it to where it waits for the last value."""
-        self._thread = asked, values = SimpleQueue[Any](), SimpleQueue[Any]()
+        asked: SimpleQueue[Any] = SimpleQueue()
+        values: Values = SimpleQueue()
+        self._thread = asked, values
         Thread(target=_minimise, args=(self.start, self.evaluations, asked, values), name=THREAD, daemon=True).start()
         weakref.finalize(self, values.put, None)
         asked.get()
-        for known in zip(self.loss[:-1], self.grad[:-1], strict=True):
-            values.put((known[0], known[1].copy()))
+        for loss, grad in zip(self.loss[:-1], self.grad[:-1], strict=True):
+            values.put((loss, grad.copy()))
             asked.get()
         return asked, values
 
     def state(self) -> dict[str, Any]:
         """Return where the search stands, as data."""
         dim = len(self.start)
-        kept = {name: value for name, value in vars(self).items() if name != "_thread"}
-        return kept | {
+        return self._kept() | {
             "z": np.array(self.z).reshape(-1, dim),
             "loss": np.array(self.loss),
             "grad": np.array(self.grad).reshape(-1, dim),
         }
 
+    def _kept(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_thread"}
+
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> LocalSearch:
         """Return the search that had this state."""
         search = cls(state["start"], int(state["evaluations"]))
-        for name in vars(search).keys() - {"_thread"}:
+        for name in search._kept():
             value = state[name]
             setattr(search, name, list(value) if name in ("z", "grad") else value)
         search.loss = [float(loss) for loss in state["loss"]]
