@@ -293,7 +293,7 @@ def test_more_parameters_than_slopes_can_be_modelled_of_are_refused():
         BOGradient(space)
 
 
-def test_a_localthat_is_dropped_leaves_no_thread() -> None:
+def test_a_search_that_is_dropped_leaves_no_thread() -> None:
     before = set(threading.enumerate())
     local = LocalSearch(np.array([0.3, -0.8]), 100)
     local.tell(1.0, np.array([0.5, 0.2]))

@@ -17,7 +17,7 @@ from gradscape.landscapes.draw.figures import dark
 
 from .conftest import FIGURES
 
-EVERY = 79  # of the damages that are thought of, since each takes a site; with 1 all of them are done
+EVERY = 37  # of the damages that are thought of, since each takes a site; with 1 all of them are done
 
 
 @pytest.fixture
