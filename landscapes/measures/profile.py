@@ -83,8 +83,11 @@ def effort(rank: int, points: int, shape: Sequence[int] = ()) -> tuple[int, int]
     places = points**2
     losses = NOISE_POINTS * (2 + 2 * REPEATS) + PAIRS_PER_POINT * points * 14
     losses += places * rank * 2 * len(gradients.SCALES)
-    between = (probes(math.prod(shape), grad=True), episodes_at_twice(shape)) if shape else (0, 0)
-    return losses + between[0], places * (1 + 2 * PAIRS * len(gradients.WIDTHS)) + between[1]
+    slopes = places * (1 + 2 * PAIRS * len(gradients.WIDTHS))
+    if shape:
+        anew = episodes_at_twice(shape)
+        losses, slopes = losses + probes(math.prod(shape), grad=True) + anew[0], slopes + anew[1]
+    return losses, slopes
 
 
 def need_of(rank: int, dim: int, points: int) -> Need:

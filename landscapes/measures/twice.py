@@ -3,7 +3,8 @@
 The cells are drawn in blocks, two along each axis, which are sampled anew half a step apart. What can be measured
 within a block is measured there twice, of all samples and of the slice's own alone. The mean of the difference is added
 to what the whole slice shows (a difference estimator), with Student's interval. A turn is seen there where two
-successive steps turn back. How many minima and jumps there are is no such measure: what is known of these stays.
+successive steps turn back. Gradients are taken of a block's inner samples alone: those on its border have no difference across to
+be compared with. How many minima and jumps there are is no such measure: what is known of these stays.
 """
 
 from __future__ import annotations
@@ -57,9 +58,10 @@ class Twice:
         }
 
 
-def episodes_at_twice(shape: Sequence[int]) -> int:
-    """Return how many gradients, at most, are evaluated for a slice of such a shape."""
-    return _drawn(shape) * int(SIDE ** len(shape) - 3 ** len(shape))
+def episodes_at_twice(shape: Sequence[int]) -> tuple[int, int]:
+    """Return how many losses and how many gradients, at most, are evaluated for a slice of such a shape."""
+    inner, border = _places(len(shape), every=True)
+    return _drawn(shape) * len(border), _drawn(shape) * len(inner)
 
 
 def at_twice(
@@ -128,16 +130,25 @@ def _sample(
     own = tuple([slice(None, None, 2)] * rank)
     for number, block in enumerate(drawn):
         losses[number][own], slopes[number][own] = loss[_part(block, 3)], slope[_part(block, 3)]
-    between = (np.indices([SIDE] * rank) % 2).any(axis=0)
-    new = np.argwhere(between if has_all_gradients(dataset) else np.ones_like(between))
-    places = (drawn[:, None, :] + new / 2).reshape(-1, rank)
-    answer = evaluate(objective, lift_between(plane, places), grad=True)
-    at = tuple([slice(None), *new.T])
-    losses[at] = answer.loss.numpy().reshape(len(drawn), -1)
-    assert answer.grad is not None  # as it was asked for
-    sides = (plane.upper - plane.lower).numpy()
-    slopes[at] = (plane.slope(answer.grad).numpy() * sides)[:, ::-1].reshape(len(drawn), -1, rank)
-    return losses, slopes, len(places)
+    sides, episodes = (plane.upper - plane.lower).numpy(), 0
+    for new, grad in zip(_places(rank, every=not has_all_gradients(dataset)), (True, False), strict=True):
+        places = (drawn[:, None, :] + new / 2).reshape(-1, rank)
+        answer = evaluate(objective, lift_between(plane, places), grad=grad)
+        at, episodes = tuple([slice(None), *new.T]), episodes + len(places)
+        losses[at] = answer.loss.numpy().reshape(len(drawn), -1)
+        if answer.grad is not None:
+            slopes[at] = (plane.slope(answer.grad).numpy() * sides)[:, ::-1].reshape(len(drawn), -1, rank)
+    return losses, slopes, episodes
+
+
+def _places(rank: int, *, every: bool) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the places of a block, in half steps, of new gradients and of new losses alone.
+
+    Gradients are within it, at `every` place there or only at those that are not the slice's own; losses on its border.
+    """
+    at = np.indices([SIDE] * rank)
+    new, inner = (at % 2).any(axis=0), ((at > 0) & (at < SIDE - 1)).all(axis=0)
+    return np.argwhere(inner & (new | every)), np.argwhere(~inner & new)
 
 
 def _measure(
@@ -160,7 +171,7 @@ def _measure(
     ]
     average, uphill = likeness(cosine)
     level = float((np.max(apart, axis=0) <= floor).mean())
-    flat = float((np.linalg.norm(slope, axis=-1) <= FLAT_SLOPE * whole).mean())
+    flat = float((np.linalg.norm(slope[inner], axis=-1) <= FLAT_SLOPE * whole).mean())
     return [float(np.concatenate(turned).mean()), level, flat, average, uphill]
 
 
