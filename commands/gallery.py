@@ -62,6 +62,7 @@ def list_(data: Data = None, json_: Json = False) -> None:
     Example: landscape gallery list
     """
     import json
+    from dataclasses import asdict
 
     from ..gallery.figures import read_figures
     from ..gallery.files import data_folder
@@ -71,7 +72,8 @@ def list_(data: Data = None, json_: Json = False) -> None:
     root = data_folder(data)
     states = [(figure, SlicePart(figure, root, "cpu").state()) for figure in read_figures()]
     if json_:
-        print(json.dumps([{"id": figure.id, "points": of.points, "done": of.done} for figure, of in states]))
+        known = [(figure.id, asdict(state)) for figure, state in states]
+        print(json.dumps([{"id": name, **state} for name, state in known]))
         return
     listed = table("figure", "paper", "environment", "dims", "through", "data", title=f"figures in {root}")
     for figure, state in states:
@@ -82,6 +84,11 @@ def list_(data: Data = None, json_: Json = False) -> None:
     Console(soft_wrap=True).print(
         f"{len(states) - missing} there, {missing} missing; `landscape gallery compute` samples what is missing"
     )
+    if old := [figure.id for figure, state in states if state.changed]:
+        Console(soft_wrap=True).print(
+            f"{len(old)} were sampled with other settings than their fidelity has now; "
+            f"to sample one anew, delete its folder in {root}"
+        )
 
 
 def build(data: Data = None, out: Site = "out/gallery") -> None:

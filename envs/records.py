@@ -25,6 +25,10 @@ class Fidelity:
     sampling: float = 2.0
     particles: int = 0
 
+    def changes_from(self, known: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+        """Return the settings that are others than a record has of this fidelity: what it has, and what they are."""
+        return {name: (value, getattr(self, name)) for name, value in known.items() if value != getattr(self, name)}
+
 
 @dataclass(frozen=True)
 class Work:

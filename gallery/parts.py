@@ -34,10 +34,14 @@ METHODS, BUDGET, SEED = ("random", "cma-es", "descents", "bo", "bo-leap"), 100, 
 
 @dataclass(frozen=True)
 class State:
-    """How much of a slice is sampled: `done` of `points`, or None where the data is another slice's."""
+    """How much of a slice is sampled: `done` of `points`, or None where the data is another slice's.
+
+    `changed` names the settings of its fidelity that were others when it was sampled.
+    """
 
     points: int
     done: int | None
+    changed: str = ""
 
     @property
     def finished(self) -> bool:
@@ -46,7 +50,7 @@ class State:
 
     def __str__(self) -> str:
         if self.finished:
-            return "there"
+            return f"there, of another {self.changed}" if self.changed else "there"
         if self.done is None:
             return "other settings"
         return f"{self.done} of {self.points} points" if self.done else "missing"
@@ -122,7 +126,8 @@ class SlicePart(FigurePart):
             return State(points, 0)
         stored = SliceStore.open(store)
         same = _same(self.figure, stored.identity) and _through(stored.provenance) == self.figure.through
-        return State(points, int((stored.status() > 0).sum()) if same else None)
+        changed = ", ".join(changes_since(stored.identity)) if same else ""
+        return State(points, int((stored.status() > 0).sum()) if same else None, changed)
 
     def seconds_each(self) -> float:
         """Time a point."""
@@ -258,6 +263,12 @@ def _same(figure: Figure, identity: Mapping[str, Any]) -> bool:
     options = {name: identity["options"].get(name) for name in figure.options}
     same &= gradient_stride(identity) == figure.gradients
     return bool(same and options == figure.options and plane["resolution"] == [figure.resolution] * len(dims))
+
+
+def changes_since(identity: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Return the settings of a slice's fidelity that are others now than when it was sampled: both values."""
+    now = environment_class(identity["objective"]).fidelities.get(identity["fidelity"])
+    return now.changes_from(identity["settings"]) if now is not None and "settings" in identity else {}
 
 
 def _through(provenance: Mapping[str, Any]) -> str:

@@ -50,9 +50,9 @@ def _sentences(record: dict[str, Any], env: Environment) -> Iterator[str]:
     of = f"{known['engine']} on {known['device']}, {record['points']} points, {record['provenance']['created']}"
     if known["code"] != (code := _code(env, known["engine"])):
         of += f", of another version of the code, {known['code']}, this is {code}"
-    now = asdict(env.fidelities[record["fidelity"]]) if record["fidelity"] in env.fidelities else known["settings"]
-    if others := [f"{name} {value}" for name, value in known["settings"].items() if value != now[name]]:
-        of += f", when {record['fidelity']} had {', '.join(others)}"
+    now = env.fidelities.get(record["fidelity"])
+    if now is not None and (others := now.changes_from(known["settings"])):
+        of += f", when {record['fidelity']} had {', '.join(f'{name} {value}' for name, (value, _) in others.items())}"
     for limit in record["limits"]:
         if limit["knob"] == "dt":
             right = _accuracy(record, limit)

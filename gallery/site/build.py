@@ -49,6 +49,7 @@ from ..files import (
     dark_name,
 )
 from ..paper import read_paper
+from ..parts import changes_since
 from .card import place_card
 from .downloads import save_slice, save_table
 from .front import Front
@@ -269,6 +270,7 @@ def _entry(figure: Figure, dataset: xr.Dataset, source: Path) -> FigureEntry:
         episodes=[],
         sweep=read_sweep(source),
         companions=read_companions(source),
+        changed=changes_since(identity),
         runs=[],
         measures=read_measures(source),
         report=read_report(source),

@@ -272,7 +272,10 @@ class ModelEntry:
 
 @dataclass(frozen=True)
 class FigureEntry:
-    """A slice of the gallery, and all that its page shows."""
+    """A slice of the gallery, and all that its page shows.
+
+    `changed` holds the settings of its fidelity that changed since it was sampled: what they were, and what they are.
+    """
 
     id: str
     env: str
@@ -294,6 +297,7 @@ class FigureEntry:
     episodes: Sequence[EpisodeEntry]
     sweep: SweepRecord | None
     companions: Sequence[Companion]
+    changed: Mapping[str, Sequence[Any]]
     runs: Sequence[Search]
     measures: Mapping[str, str | float]
     report: ReportEntry | None

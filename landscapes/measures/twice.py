@@ -3,8 +3,8 @@
 The cells are drawn in blocks, two along each axis, which are sampled anew half a step apart. What can be measured
 within a block is measured there twice, of all samples and of the slice's own alone. The mean of the difference is added
 to what the whole slice shows (a difference estimator), with Student's interval. A turn is seen there where two
-successive steps turn back. Gradients are taken of a block's inner samples alone: those on its border have no difference across to
-be compared with. How many minima and jumps there are is no such measure: what is known of these stays.
+successive steps turn back. Gradients are taken of a block's inner samples alone: those on its border have no difference
+across to be compared with. How many minima and jumps there are is no such measure: what is known of these stays.
 """
 
 from __future__ import annotations

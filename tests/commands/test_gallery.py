@@ -134,6 +134,23 @@ def test_list_says_what_is_there_missing_and_other(data: Path, capsys: pytest.Ca
     assert gallery_parts.SlicePart(replace(FIGURES[2], resolution=6), data, "cpu").state().done is None
 
 
+def test_a_slice_of_other_settings_than_now_is_said_to_be_so(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    coarser = {name: replace(one, resolution=one.resolution + 7) for name, one in Branin.fidelities.items()}
+    monkeypatch.setattr(Branin, "fidelities", coarser)
+    capsys.readouterr()
+    assert gallery("list", "--data", str(data), "--json") == 0
+    changed = {one["id"]: one["changed"] for one in json.loads(capsys.readouterr().out)}
+    assert changed == {"bounce-y": "", "bounce-x-y": "", "branin": "resolution"}
+    assert gallery("list", "--data", str(data)) == 0
+    assert "1 were sampled with other settings" in capsys.readouterr().out
+    assert gallery("build", "--data", str(data), "--out", str(tmp_path / "site")) == 0
+    pages = {name: (tmp_path / "site" / name / "index.html").read_text() for name in ("bounce-y", "branin")}
+    assert "resolution 0, now 7. Sampled now it may look different." in pages["branin"]
+    assert "Of an earlier scene" not in pages["bounce-y"]
+
+
 def test_build_refuses_an_empty_folder_of_data_and_foreign_files(listed: None, data: Path, tmp_path: Path) -> None:
     assert gallery("build", "--data", str(tmp_path / "none"), "--out", str(tmp_path / "site")) == 2
     (tmp_path / "mine").mkdir()

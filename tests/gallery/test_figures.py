@@ -25,7 +25,7 @@ def test_a_figure_names_what_its_environment_has(figure) -> None:  # type: ignor
     env = make(figure.env, fidelity=figure.fidelity, device="cpu", **figure.options)
     assert point(env, figure.through).shape == (env.space.dim,)
     assert len({env.space.index(dim) for dim in figure.dims}) == len(figure.dims)
-    planes = {(48, 1), (256, 4)}  # samples along each axis, and at every how many of them a gradient is
+    planes = {(48, 1), (96, 2), (256, 4)}  # samples along each axis, and at every how many of them a gradient is
     assert (figure.resolution, figure.gradients) in ({(512, 1)} if len(figure.dims) == 1 else planes)
 
 
