@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 from ..jobs.cut import cut, describe_cut
 from ..jobs.scene import SceneSpec
+from ..landscapes.space import as_whole
 from .progress import default_watch
 from .scene import SceneKeywords, environment, say_call, say_cut
 
@@ -29,7 +30,7 @@ def sweep(
     resolution: int = 16,
     through: str | Float[Tensor, " dim"] = "center",
     extent: float | tuple[float, float] | None = None,
-    gradients: bool = True,
+    gradients: bool | int = True,
     out: str | Path | None = None,
     force: bool = False,
     **keywords: Unpack[SceneKeywords],
@@ -40,7 +41,7 @@ def sweep(
     Along directions, which `along` names instead of `dims` as for `slice`, a parameter is moved at the point that the
     slices go through, and what lies off the box is left out. The samples and the films lie in the folder `out`, by
     default one under out/ named after the sweep: the same call goes on there where it stopped. The rest is that of
-    `slice`.
+    `slice`. Of smoothed losses there are no gradients.
 
     Raises ValueError for what the scene does not have or cannot be swept, where nothing is to move, and where the
     folder holds something else or another sweep, which `force` replaces; Stopped where it is interrupted.
@@ -52,6 +53,7 @@ def sweep(
     plane = cut(env, dims, along, through=through, extent=extent, resolution=resolution)
     from ..jobs.sweep import SweepJob
 
+    stride = as_whole(int(gradients) if isinstance(gradients, bool) else gradients, "gradients")
     said: dict[str, Any] = {"over": over, "frames": frames, "resolution": resolution}
     said |= say_cut(along, through, extent, gradients=gradients)
     settings: dict[str, Any] = {
@@ -59,6 +61,6 @@ def sweep(
         "out": Path(out) if out is not None else None,
         "cut": describe_cut(along, through, extent),
     }
-    job = SweepJob.of(env, plane, over, frames, grad=gradients, force=force, **settings)
+    job = SweepJob.of(env, plane, over, frames, gradients=stride, force=force, **settings)
     job.run(watch)
     return job.sample()

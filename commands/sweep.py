@@ -12,6 +12,7 @@ from ..jobs.scene import SceneSpec
 from .arguments import (
     Along,
     Extent,
+    Gradients,
     Json,
     NoGradients,
     Resolution,
@@ -36,6 +37,7 @@ def sweep(
     resolution: Resolution = 16,
     through: Through = "center",
     extent: Extent = None,
+    gradients: Gradients = 1,
     no_gradients: NoGradients = False,
     scheduler: Scheduler = None,
     out: Annotated[
@@ -61,7 +63,7 @@ def sweep(
     env, folder = scene.make(bars), Path(out) if out else None
     where: dict[str, Any] = {"through": through, "extent": read_extent(extent)}
     plane = cut(env, dims, along, **where, resolution=resolution)
-    how: dict[str, Any] = {"command": command_line(), "grad": not no_gradients, "force": force}
+    how: dict[str, Any] = {"command": command_line(), "gradients": 0 if no_gradients else gradients, "force": force}
     how["cut"] = describe_cut(along, **where)
     with bars.busy(f"opening {frames} slices"):
         job = SweepJob.of(env, plane, over, frames, out=folder, **how)

@@ -197,9 +197,10 @@ class SweepPart(FigurePart):
 
         env, over = self._scene(DRAFT).make(), self.figure.over
         motion = Motion.of(env, self.figure.plane(env, COARSE), over, FRAMES)
-        grad = over != SMOOTHING
-        folder = sweep_folder(env, motion, over, grad=grad)
-        return replace(SweepJob.open(env, motion, folder, command=self.label(), grad=grad), executor=self.executor)
+        gradients = int(over != SMOOTHING)
+        folder = sweep_folder(env, motion, over, gradients=gradients)
+        job = SweepJob.open(env, motion, folder, command=self.label(), gradients=gradients)
+        return replace(job, executor=self.executor)
 
 
 class SearchPart(FigurePart):

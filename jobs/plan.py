@@ -148,7 +148,7 @@ class PlanJob:
         env, device = make_here(self.scene)
         how: dict[str, Any] = {"extent": self.extent, "resolution": self.resolution}
         plane = cut(env, self.dims, self.along, through=self.through, **how)
-        self._check(plane)
+        check_gradients(self.gradients, plane, refined=False)
         with (watch or Watch()).busy(f"{env.name}: rehearsing {env.fidelity.name} episodes, tiles and pictures"):
             found = self._rehearse(env, plane, began)
         return Forecast(
@@ -164,19 +164,11 @@ class PlanJob:
             plan=_elsewhere(found, env, device),
         )
 
-    def _check(self, plane: Plane) -> None:
-        check_gradients(self.gradients, plane, refined=False)
-        if self.over is not None and self.gradients > 1:
-            raise ValueError(
-                f"a sweep has gradients at all samples or at none; got gradients at every {self.gradients} samples, so "
-                "leave out --gradients or --over"
-            )
-
     def _rehearse(self, env: Environment, plane: Plane, began: float) -> Plan:
         with TemporaryDirectory() as folder:
             if self.over is None:
                 return plan_slice(env, plane, Path(folder), gradients=self.gradients, began=began)
-            how: dict[str, Any] = {"grad": self.gradients > 0, "began": began}
+            how: dict[str, Any] = {"gradients": self.gradients, "began": began}
             return plan_sweep(env, plane, Path(folder), self.over, self.frames, **how)
 
     def _too_large(self, plane: Plane) -> str | None:
@@ -269,14 +261,15 @@ def plan_sweep(
     over: str,
     frames: int,
     *,
-    grad: bool,
+    gradients: int,
     began: float,
 ) -> Plan:
     """Plan a sweep; of a long one fewer frames are rehearsed, and of large slices smaller ones."""
-    little, grad = _little(plane), grad and over != SMOOTHING
-    grown, whole = Growth.of(little, plane, grad=grad), math.prod(plane.resolution)
+    little, gradients = _little(plane), 0 if over == SMOOTHING else gradients
+    grad, whole, having = gradients > 0, math.prod(plane.resolution), count_gradients(plane.resolution, gradients)
+    grown = Growth.of(little, plane, grad=grad)
     motion = Motion.of(env, little, over, min(frames, MOST_FRAMES))
-    job = SweepJob.open(env, motion, folder, command="", grad=grad)
+    job = SweepJob.open(env, motion, folder, command="", gradients=gradients)
     cost = job.cost()
     seconds, memory = cost.seconds, cost.memory
     start, last = time.perf_counter() - began, len(job.stores) - 1
@@ -291,10 +284,11 @@ def plan_sweep(
     held = need_of(plane.resolution, plane.dim, frames, grad=grad, over=over).memory
     held -= need_of(little.resolution, plane.dim, 0, grad=grad, over=over).memory
     return Plan(
-        count * whole, count * -(-whole // env.preferred_batch), start, seconds * count * whole / job.total,
+        count * whole, count * sum(-(-n // env.preferred_batch) for n in (having, whole - having)), start,
+        seconds * count * whole / job.total,
         count * grown.points * kept.seconds, drawing, round(memory + held) + peak_memory(), _gpu(env),
         grown.finished_room(kept, count, Room(films + SUMMARY + 250 * frames, 5)), grown.filling_room(kept),
-        _rate(little, plane), gradients=grad * count * whole,
+        _rate(little, plane), gradients=count * having,
     )  # fmt: skip
 
 

@@ -215,9 +215,7 @@ class SliceJob:
             if self.refinement and cost.episodes:
                 cost = cost.less(int((self._so_far()["status"] > 0).sum()))
         total, whole = math.prod(self.plane.resolution), self.store.grad and self.store.every == 1
-        kind = "episodes with gradients" if whole else "episodes"
-        if self.store.every > 1:
-            kind = f"episodes (gradients at every {self.store.every} samples along each axis)"
+        kind = kind_of(self.store)
         watch.note(" · ".join([env, str(about.get("fidelity")), str(about.get("device")), str(self.folder)]))
         if not cost.episodes:
             watch.note(f"all {total} {kind} are there already")
@@ -289,6 +287,13 @@ class SliceJob:
             files=files,
             barrier=barrier_of(dataset),
         )
+
+
+def kind_of(store: SliceStore) -> str:
+    """Say what is computed for a slice: episodes, and at which samples with gradients."""
+    if store.every > 1:
+        return f"episodes (gradients at every {store.every} samples along each axis)"
+    return "episodes with gradients" if store.grad else "episodes"
 
 
 def picture_of(objective: Objective, plane: Plane) -> Draw:

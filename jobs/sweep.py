@@ -19,6 +19,8 @@ import xarray as xr
 from ..landscapes.adapters import within_box
 from ..landscapes.capacity import size
 from ..landscapes.cost import duration
+from ..landscapes.identity import with_stride
+from ..landscapes.lattice import check_gradients
 from ..landscapes.objective import Objective, Status
 from ..landscapes.plain import plain_name
 from ..landscapes.sampling.fill import Progress, sample
@@ -29,7 +31,7 @@ from ..landscapes.storage.store import SliceStore
 from .folder import ROOT, SWEEP, folder_named
 from .motion import HORIZON, SMOOTHING, Motion, refuse_too_large
 from .scene import provenance
-from .slice import SliceCost, estimate_cost
+from .slice import SliceCost, estimate_cost, kind_of
 from .slice_place import MOST
 from .slice_summary import count_statuses, flat_points, range_of, say_range
 from .watch import PREPARING, Advance, Watch, resumable
@@ -71,6 +73,7 @@ class SweepSummary:
     options: dict[str, Any] | None
     resolution: list[int]
     gradients: bool
+    gradients_every: int
     episodes: int
     resumed: int
     seconds: float
@@ -113,25 +116,24 @@ class SweepJob:
         folder: Path,
         *,
         command: str,
-        grad: bool = True,
+        gradients: int = 1,
         force: bool = False,
         cut: Mapping[str, Any] | None = None,
     ) -> SweepJob:
         """Go on with the sweep in `folder`, or begin it there; `force` begins anew where another one is.
 
-        With a `cut`, how it was cut along directions, it is boxed. Raises ValueError where the folder holds something
+        Gradients are at every so many samples along each axis, `gradients`, 0 for none. With a `cut`, how it was cut along directions, it is boxed. Raises ValueError where the folder holds something
         else, StoreMismatchError where it holds another sweep.
         """
         check_folder(folder)
         if force:
             _clear(folder)
-        how: dict[str, Any] = {"grad": grad, "provenance": provenance(env, command)}
+        how: dict[str, Any] = {"grad": gradients > 0, "provenance": provenance(env, command)}
         oblique: dict[str, Any] = {"boxed": True, "cut": dict(cut)} if cut else {}
+        made = [with_stride(motion.env_at(number).identity(), gradients) for number in range(len(motion.stores))]
         stores = tuple(
-            SliceStore.open_or_create(
-                folder / name, plane, env.space, identity=motion.env_at(number).identity() | oblique, **how
-            )
-            for number, (name, plane) in enumerate(zip(motion.stores, motion.planes, strict=True))
+            SliceStore.open_or_create(folder / name, plane, env.space, identity=identity | oblique, **how)
+            for name, plane, identity in zip(motion.stores, motion.planes, made, strict=True)
         )
         return cls(env, motion, folder, stores, command, boxed=bool(cut))
 
@@ -145,26 +147,26 @@ class SweepJob:
         *,
         command: str,
         out: Path | None = None,
-        grad: bool = True,
+        gradients: int = 1,
         force: bool = False,
         cut: Mapping[str, Any] | None = None,
     ) -> SweepJob:
         """Open the sweep of an environment in `out`, by default a folder named after it under out/.
 
-        With a `cut` it is boxed, and one that was begun goes on along its own directions: on a GPU they come out a
-        little different each time. Raises ValueError for what cannot be swept, TooLargeError for what has no room here,
-        and as `open` does.
+        Of smoothed losses there are no gradients. With a `cut` it is boxed, and one that was begun goes on along its
+        own directions: on a GPU they come out a little different each time. Raises ValueError for what cannot be swept
+        and where gradients cannot be so far apart, TooLargeError for what has no room here, and as `open` does.
         """
         if plane.rank != 2 or frames < 2:
             dims = ", ".join(plane.names)
             raise ValueError(f"a sweep has two dims and two frames or more; got {dims} and {frames} frames")
-        grad = grad and over != SMOOTHING  # of smoothed losses there are no gradients to show
-        refuse_too_large(plane, frames, out or ROOT, grad=grad, over=over)
+        gradients = 0 if over == SMOOTHING else check_gradients(gradients, plane, refined=False)
+        refuse_too_large(plane, frames, out or ROOT, grad=gradients > 0, over=over)
         motion = Motion.of(env, plane, over, frames)
-        folder = out or sweep_folder(env, motion, over, grad=grad, cut=cut)
+        folder = out or sweep_folder(env, motion, over, gradients=gradients, cut=cut)
         if cut and not force:
             motion = Motion.of(env, _along_kept(folder / motion.stores[0], plane, cut), over, frames)
-        return cls.open(env, motion, folder, command=command, grad=grad, force=force, cut=cut)
+        return cls.open(env, motion, folder, command=command, gradients=gradients, force=force, cut=cut)
 
     @cached_property
     def total(self) -> int:
@@ -216,13 +218,9 @@ class SweepJob:
         """Say how much of it is on disk."""
         return f"{self.done()} of {self.total} points are kept in {self.folder}"
 
-    @property
-    def _grad(self) -> bool:
-        return self.stores[0].grad
-
     def _announce(self, watch: Watch) -> None:
         """Say what is left to compute and what that costs."""
-        left, env, kind = self.total - self.done(), self.env, "episodes with gradients" if self._grad else "episodes"
+        left, env, kind = self.total - self.done(), self.env, kind_of(self.stores[0])
         watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {self.folder}")
         if not left:
             watch.note(f"all {self.total} {kind} of {len(self.stores)} slices are there already")
@@ -265,7 +263,8 @@ class SweepJob:
             device=first.identity["device"],
             options=first.identity["options"],
             resolution=list(first.plane.resolution),
-            gradients=self._grad,
+            gradients=first.grad,
+            gradients_every=first.every,
             episodes=self.total - resumed,
             resumed=resumed,
             seconds=round(seconds, 3),
@@ -300,7 +299,7 @@ class _Count:
 
 
 def sweep_folder(
-    env: Environment, motion: Motion, over: int | str, *, grad: bool = True, cut: Mapping[str, Any] | None = None
+    env: Environment, motion: Motion, over: int | str, *, gradients: int = 1, cut: Mapping[str, Any] | None = None
 ) -> Path:
     """Return a folder of its own for every different sweep, the same for the same one."""
     planes = [plane.record() for plane in motion.planes]
@@ -312,7 +311,7 @@ def sweep_folder(
     else:  # directions may differ by rounding
         axes, where = [plain_name(cut["along"])[:MOST]], [dict(cut), points]
     parts = ["sweep", env.name, *axes, "over", what, env.fidelity.name, points]
-    return folder_named(parts, [env.identity(), *where, motion.values, grad])
+    return folder_named(parts, [with_stride(env.identity(), gradients), *where, motion.values, gradients > 0])
 
 
 def _along_kept(path: Path, plane: Plane, cut: Mapping[str, Any]) -> Plane:

@@ -30,6 +30,9 @@ JOBS = {
     "flip": ["flip", "--dims", "0", "1", "--resolution", "14", "--fidelity", "draft"],
     "along": ["bounce", "--along", "random:1", "--extent", "0.2", "--resolution", "32", "--fidelity", "draft"],
     "sweep": ["bounce", "--dims", "0", "1", "--over", "2", "--frames", "4", "--resolution", "16"],
+    "sweep of few gradients": [
+        *("bounce", "--dims", "0", "1", "--over", "2", "--frames", "3", "--resolution", "16", "--gradients", "3"),
+    ],
 }
 EPISODE, TILE, PICTURE = 0.05, 0.035, 0.5  # seconds that it takes to simulate, write and draw one
 
@@ -69,7 +72,7 @@ def plan(run: Callable[..., Said], cwd: Path, *arguments: str) -> dict[str, Any]
 def test_the_parts_of_a_plan_add_up_to_what_the_job_takes(
     run: Callable[..., Said], tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    planned, verb = plan(run, tmp_path, *JOBS[name]), "sweep" if name == "sweep" else "slice"
+    planned, verb = plan(run, tmp_path, *JOBS[name]), name.split(" ")[0] if name.startswith("sweep") else "slice"
     finish, tiles, before = SliceStore.finish, [], clock.slept.count(TILE)
 
     def finished(store: SliceStore, dataset: xr.Dataset) -> None:
@@ -247,7 +250,7 @@ def test_a_device_that_is_not_here_has_the_rate_that_tradeoff_kept(
         (["none.toml"], "no list of figures at none.toml"),
         (["figures.toml", "--over", "2"], "leave out --over"),
         (["figures.toml", "--gradients", "2"], "--gradients and --set"),
-        (["bounce", "--over", "2", "--gradients", "2"], "leave out --gradients or --over"),
+        (["bounce", "--over", "2", "--resolution", "8", "--gradients", "8"], "gradients at every 8"),
         (["bounce", "--resolution", "8", "--gradients", "8"], "got 8 x 8 samples and gradients at every 8"),
         (["bounce", "--gradients", "2", "--methods", "random"], "a race has no plane; leave out --dims"),
         (["bounce", "--over", "horizon", "--set", "horizon=0.5"], "leave out --set horizon"),

@@ -70,6 +70,22 @@ def test_each_frame_is_the_slice_at_its_value(run: Command, tmp_path: Path) -> N
     assert "75 episodes with gradients of 3 slices to compute: about" in done.stderr
 
 
+def test_gradients_may_be_at_some_of_the_samples(run: Command, tmp_path: Path) -> None:
+    every = run(SWEEP.replace("moved", "every"))
+    some = run(f"{SWEEP} --gradients 2 --json")
+    assert (every.returncode, some.returncode) == (0, 0), some.stderr
+    assert "75 episodes (gradients at every 2 samples along each axis) of 3 slices to compute" in some.stderr
+    assert json.loads(some.stdout)["gradients_every"] == 2
+    for number in range(3):
+        dense, strided = (open_slice(f"{name}/frames/{number:03d}.zarr") for name in ("every", "moved"))
+        np.testing.assert_array_equal(strided["loss"], dense["loss"])
+        np.testing.assert_array_equal(strided["grad"][::2, ::2], dense["grad"][::2, ::2])
+        assert int(strided["grad"].notnull().all("dim").sum()) == 9
+    again = run(SWEEP)
+    assert again.returncode == 2
+    assert "gradients" in again.stderr
+
+
 def test_nothing_is_computed_twice(run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run(SWEEP)
     first = [open_slice(f"moved/frames/{number:03d}.zarr") for number in range(3)]
