@@ -15,7 +15,6 @@ from torch import Tensor
 
 from ..landscapes.objective import Evaluation, Objective, name_of
 from ..landscapes.sampling.memory import MemoryBound
-from .processes import tell_when_away
 
 Key = tuple[str, int]  # what is asked, and of which kind
 T = TypeVar("T")
@@ -44,19 +43,16 @@ class Meeting:
 
     Once all `members` wait, the thread that calls `serve` answers them: it evaluates the points of all who want the
     same in one batch, in the order of the members' numbers, given an objective whose rows do not depend on their batch.
-    So the objective itself is only ever used by that thread. On a CPU, which gains little by full batches, it does not
-    wait for members whose processes compute (`processes.compute`): it would do nothing meanwhile. A member says by
-    `seat` who it is, and leaves when it has ended.
+    So the objective itself is only ever used by that thread. A member says by `seat` who it is, and leaves when it has
+    ended.
     """
 
     def __init__(self, objective: Objective, members: int) -> None:
         self.objective = objective
         self.space, self.name = objective.space, name_of(objective)
         self._bound = MemoryBound(objective)
-        self._present, self._away = members, 0  # away are those who wait for a process of theirs
-        self._hurried = getattr(objective, "device", "cpu") == "cpu"
+        self._present = members
         self._questions: dict[int, _Question] = {}
-        self._heard: dict[int, _Question] = {}  # those that are being answered
         self._own = threading.local()  # of each thread: its number, and how long it has waited for others [s]
         self._ended = False
         self._changed = threading.Condition()  # on which the thread that serves waits
@@ -68,7 +64,6 @@ class Meeting:
     def seat(self, number: int) -> None:
         """Give the thread that calls this its number, by which points are ordered in a batch."""
         self._own.number, self._own.waited = number, 0.0
-        tell_when_away(self._go_away)
 
     def leave(self) -> None:
         """Take the thread that calls this out of the meeting: nobody waits for it any more."""
@@ -81,8 +76,6 @@ class Meeting:
         with self._changed:
             self._ended = True
             self._changed.notify_all()
-            self._heard |= self._questions
-            self._questions.clear()
             self._settle()
 
     def clock(self) -> float:
@@ -108,8 +101,8 @@ class Meeting:
         What the objective raises ends it, and an interrupt does, too.
         """
         try:
-            while self._hear():
-                for key in sorted({one.key for one in self._heard.values()}):
+            while self._wait_for_all():
+                for key in sorted({one.key for one in self._questions.values()}):
                     self._answer(key)
                 with self._changed:
                     self._settle()
@@ -118,34 +111,19 @@ class Meeting:
 
     def _settle(self) -> None:
         """Let go all who wait; the lock is held."""
-        settled = list(self._heard.values())
-        self._heard.clear()
+        settled = list(self._questions.values())
+        self._questions.clear()
         for question in settled:
             question.settled.set()
 
-    def _hear(self) -> bool:
-        """Wait until every member asks, or those whom nobody waits for; say whether there is anyone to answer."""
+    def _wait_for_all(self) -> bool:
+        """Wait until every member asks; say whether there is anyone to answer."""
         with self._changed:
-            self._changed.wait_for(lambda: self._ended or self._all_ask())
-            if self._ended or not self._present:
-                return False
-            self._heard |= self._questions
-            self._questions.clear()
-            return True
-
-    def _all_ask(self) -> bool:
-        asking = len(self._questions)
-        return asking == self._present or (self._hurried and 0 < asking == self._present - self._away)
-
-    def _go_away(self, step: int) -> None:
-        """Count a member that waits for a process, or, by -1, one that goes on."""
-        with self._changed:
-            self._away += step
-            if self._all_ask():
-                self._changed.notify_all()
+            self._changed.wait_for(lambda: self._ended or len(self._questions) == self._present)
+            return not self._ended and self._present > 0
 
     def _answer(self, key: Key) -> None:
-        asked = [self._heard[number] for number in sorted(self._heard) if self._heard[number].key == key]
+        asked = [self._questions[number] for number in sorted(self._questions) if self._questions[number].key == key]
         x, began = torch.cat([one.x for one in asked]), time.perf_counter()
         what, kind = key
         simulated: Any = self._bound if what == "evaluate" else self.objective
@@ -162,7 +140,7 @@ class Meeting:
             if self._ended:
                 raise MeetingEnded
             self._questions[self._own.number] = question
-            if self._all_ask():
+            if len(self._questions) == self._present:
                 self._changed.notify_all()
         question.settled.wait()
         if question.answer is None:

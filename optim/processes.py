@@ -20,7 +20,7 @@ Result = TypeVar("Result")
 
 _pools: list[ProcessPoolExecutor] = []  # of one process each
 _turns = itertools.count()  # of threads that compute for the first time
-_seat = threading.local()  # of each thread: its turn, and whom to tell that it is away
+_seat = threading.local()  # of each thread: its turn
 _seconds = 0.0  # see `seconds_computed`
 
 
@@ -51,27 +51,11 @@ def compute(function: Callable[..., Result], *arguments: Any) -> Result:
     """Return what a function of a module returns, computed by a process if there are any, and here otherwise."""
     global _seconds
     if _pools:
-        with _away():
-            return _pool().submit(function, *arguments).result()
+        return _pool().submit(function, *arguments).result()
     began = time.perf_counter()
     result = function(*arguments)
     _seconds += time.perf_counter() - began
     return result
-
-
-def tell_when_away(tell: Callable[[int], None]) -> None:
-    """Have `tell` told 1 when the thread that calls this waits for a process from now on, and -1 when it goes on."""
-    _seat.tell = tell
-
-
-@contextmanager
-def _away() -> Iterator[None]:
-    tell: Callable[[int], None] = getattr(_seat, "tell", lambda step: None)
-    tell(1)
-    try:
-        yield
-    finally:
-        tell(-1)
 
 
 def _pool() -> ProcessPoolExecutor:

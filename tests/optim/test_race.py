@@ -173,7 +173,7 @@ def test_an_interrupt_while_methods_compute_ends_them(monkeypatch):
         self.end()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gradscape.optim.meeting.Meeting._hear", interrupted)
+    monkeypatch.setattr("gradscape.optim.meeting.Meeting._wait_for_all", interrupted)
     with pytest.raises(KeyboardInterrupt):
         race(objective, entries, budget=BUDGET, gradient_cost=2.0)
     assert objective.asked == 0
