@@ -27,7 +27,8 @@ class Fidelity:
 
     def changes_from(self, known: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
         """Return the settings that are others than a record has of this fidelity: what it has, and what they are."""
-        return {name: (value, getattr(self, name)) for name, value in known.items() if value != getattr(self, name)}
+        now = vars(self)
+        return {name: (value, now.get(name)) for name, value in known.items() if value != now.get(name)}
 
 
 @dataclass(frozen=True)

@@ -122,8 +122,9 @@ class SweepJob:
     ) -> SweepJob:
         """Go on with the sweep in `folder`, or begin it there; `force` begins anew where another one is.
 
-        Gradients are at every so many samples along each axis, `gradients`, 0 for none. With a `cut`, how it was cut along directions, it is boxed. Raises ValueError where the folder holds something
-        else, StoreMismatchError where it holds another sweep.
+        Gradients are at every so many samples along each axis, `gradients`, 0 for none. With a `cut`, how it was cut
+        along directions, it is boxed. Raises ValueError where the folder holds something else, StoreMismatchError where
+        it holds another sweep.
         """
         check_folder(folder)
         if force:
