@@ -161,7 +161,8 @@ class SweepJob:
         if plane.rank != 2 or frames < 2:
             dims = ", ".join(plane.names)
             raise ValueError(f"a sweep has two dims and two frames or more; got {dims} and {frames} frames")
-        gradients = 0 if over == SMOOTHING else check_gradients(gradients, plane, refined=False)
+        gradients = check_gradients(gradients, plane, refined=False)
+        gradients = 0 if over == SMOOTHING else gradients
         refuse_too_large(plane, frames, out or ROOT, grad=gradients > 0, over=over)
         motion = Motion.of(env, plane, over, frames)
         folder = out or sweep_folder(env, motion, over, gradients=gradients, cut=cut)
