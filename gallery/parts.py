@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..envs.registry import environment_class
+from ..envs.registry import entries, environment_class
 from ..jobs.watch import Watch
 from ..landscapes.identity import gradient_stride
 from .figures import Figure
@@ -267,9 +267,14 @@ def _same(figure: Figure, identity: Mapping[str, Any]) -> bool:
 
 
 def changes_since(identity: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Return the settings of a slice's fidelity that are others now than when it was sampled: both values."""
+    """Return the settings of a slice's fidelity that are others now than when it was sampled: both values.
+
+    There are none that are known of a scene that is not registered here, or of a fidelity that it has no more.
+    """
+    if identity["objective"] not in entries() or "settings" not in identity:
+        return {}
     now = environment_class(identity["objective"]).fidelities.get(identity["fidelity"])
-    return now.changes_from(identity["settings"]) if now is not None and "settings" in identity else {}
+    return now.changes_from(identity["settings"]) if now is not None else {}
 
 
 def _through(provenance: Mapping[str, Any]) -> str:
