@@ -86,7 +86,7 @@ def list_(data: Data = None, json_: Json = False) -> None:
     )
     if old := [figure.id for figure, state in states if state.changed]:
         Console(soft_wrap=True).print(
-            f"{len(old)} were sampled with other settings than their fidelity has now; "
+            f"{len(old)} are older: they were sampled with other settings than their fidelity has now; "
             f"to sample one anew, delete its folder in {root}"
         )
 

@@ -50,7 +50,7 @@ class State:
 
     def __str__(self) -> str:
         if self.finished:
-            return f"there, of another {self.changed}" if self.changed else "there"
+            return "older" if self.changed else "there"
         if self.done is None:
             return "other settings"
         return f"{self.done} of {self.points} points" if self.done else "missing"

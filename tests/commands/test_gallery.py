@@ -144,7 +144,7 @@ def test_a_slice_of_other_settings_than_now_is_said_to_be_so(
     changed = {one["id"]: one["changed"] for one in json.loads(capsys.readouterr().out)}
     assert changed == {"bounce-y": "", "bounce-x-y": "", "branin": "resolution"}
     assert gallery("list", "--data", str(data)) == 0
-    assert "1 were sampled with other settings" in capsys.readouterr().out
+    assert "1 are older: they were sampled with other settings" in capsys.readouterr().out
     assert gallery("build", "--data", str(data), "--out", str(tmp_path / "site")) == 0
     pages = {name: (tmp_path / "site" / name / "index.html").read_text() for name in ("bounce-y", "branin")}
     assert "resolution 0, now 7. Sampled now it may look different." in pages["branin"]
