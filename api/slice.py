@@ -12,7 +12,7 @@ from ..jobs.scene import SceneSpec, environment_of, with_policy
 from ..jobs.watch import Watch
 from ..landscapes.adapters import within_box
 from ..landscapes.objective import name_of
-from ..landscapes.space import as_whole
+from ..landscapes.space import as_stride
 from .progress import default_watch
 from .scene import SceneKeywords, is_environment, objective_of, say_call, say_cut
 
@@ -76,7 +76,7 @@ def slice(
 
     fine, folder = Refinement.of(refine, budget), Path(out) if out is not None else None
     in_memory = out is None and policy is None and not is_environment(objective)
-    stride = as_whole(int(gradients) if isinstance(gradients, bool) else gradients, "gradients")
+    stride = as_stride(gradients)
     begun: dict[str, Any] = {"out": folder, "gradients": stride, "refinement": fine}
     where: dict[str, Any] = {"through": through, "extent": extent, "resolution": resolution}
     plane = cut(objective, dims, along, **where, kept=None if force or in_memory else begun)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 from ..jobs.cut import cut, describe_cut
 from ..jobs.scene import SceneSpec
-from ..landscapes.space import as_whole
 from .progress import default_watch
 from .scene import SceneKeywords, environment, say_call, say_cut
 
@@ -53,7 +52,6 @@ def sweep(
     plane = cut(env, dims, along, through=through, extent=extent, resolution=resolution)
     from ..jobs.sweep import SweepJob
 
-    stride = as_whole(int(gradients) if isinstance(gradients, bool) else gradients, "gradients")
     said: dict[str, Any] = {"over": over, "frames": frames, "resolution": resolution}
     said |= say_cut(along, through, extent, gradients=gradients)
     settings: dict[str, Any] = {
@@ -61,6 +59,6 @@ def sweep(
         "out": Path(out) if out is not None else None,
         "cut": describe_cut(along, through, extent),
     }
-    job = SweepJob.of(env, plane, over, frames, gradients=stride, force=force, **settings)
+    job = SweepJob.of(env, plane, over, frames, gradients=gradients, force=force, **settings)
     job.run(watch)
     return job.sample()

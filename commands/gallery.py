@@ -72,8 +72,7 @@ def list_(data: Data = None, json_: Json = False) -> None:
     root = data_folder(data)
     states = [(figure, SlicePart(figure, root, "cpu").state()) for figure in read_figures()]
     if json_:
-        known = [(figure.id, asdict(state)) for figure, state in states]
-        print(json.dumps([{"id": name, **state} for name, state in known]))
+        print(json.dumps([{"id": figure.id, **asdict(state)} for figure, state in states]))
         return
     listed = table("figure", "paper", "environment", "dims", "through", "data", title=f"figures in {root}")
     for figure, state in states:
@@ -84,9 +83,9 @@ def list_(data: Data = None, json_: Json = False) -> None:
     Console(soft_wrap=True).print(
         f"{len(states) - missing} there, {missing} missing; `landscape gallery compute` samples what is missing"
     )
-    if old := [figure.id for figure, state in states if state.changed]:
+    if older := sum(bool(state.changed) for _, state in states):
         Console(soft_wrap=True).print(
-            f"{len(old)} are older: they were sampled with other settings than their fidelity has now; "
+            f"{older} are older: they were sampled with other settings than their fidelity has now; "
             f"to sample one anew, delete its folder in {root}"
         )
 

@@ -192,14 +192,10 @@ class SweepPart(FigurePart):
         return SweepRecord(self.figure.over, DRAFT, FRAMES, [COARSE, COARSE], label, low, high, command)
 
     def _open(self) -> SweepJob:
-        from ..jobs.motion import SMOOTHING, Motion
-        from ..jobs.sweep import SweepJob, sweep_folder
+        from ..jobs.sweep import SweepJob
 
-        env, over = self._scene(DRAFT).make(), self.figure.over
-        motion = Motion.of(env, self.figure.plane(env, COARSE), over, FRAMES)
-        gradients = int(over != SMOOTHING)
-        folder = sweep_folder(env, motion, over, gradients=gradients)
-        job = SweepJob.open(env, motion, folder, command=self.label(), gradients=gradients)
+        env = self._scene(DRAFT).make()
+        job = SweepJob.of(env, self.figure.plane(env, COARSE), self.figure.over, FRAMES, command=self.label())
         return replace(job, executor=self.executor)
 
 
@@ -271,10 +267,10 @@ def changes_since(identity: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
 
     There are none that are known of a scene that is not registered here, or of a fidelity that it has no more.
     """
-    if identity["objective"] not in entries() or "settings" not in identity:
+    if (name := identity["objective"]) not in entries():
         return {}
-    now = environment_class(identity["objective"]).fidelities.get(identity["fidelity"])
-    return now.changes_from(identity["settings"]) if now is not None else {}
+    now = environment_class(name).fidelities.get(identity["fidelity"])
+    return now.changes_from(identity.get("settings", {})) if now is not None else {}
 
 
 def _through(provenance: Mapping[str, Any]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -215,10 +215,15 @@ def _elsewhere(found: Plan, env: Environment, device: str) -> Plan:
     return replace(
         found,
         simulating=sum(n * each[grad] for grad, n in counts.items() if n),
-        batches=sum(-(-n // max(1, variant.comparison.batch)) for n in counts.values()),
+        batches=_count_batches(counts.values(), max(1, variant.comparison.batch)),
         gpu=variant.memory or 0,
         rate=f"kept by `landscape tradeoff` in {path}; writing and drawing {found.rate}",
     )
+
+
+def _count_batches(counts: Iterable[int], size: int) -> int:
+    """Count the batches of points with gradients and of those without, which are evaluated apart."""
+    return sum(-(-count // size) for count in counts)
 
 
 def plan_slice(env: Environment, plane: Plane, folder: Path, *, gradients: int, began: float) -> Plan:
@@ -244,7 +249,7 @@ def plan_slice(env: Environment, plane: Plane, folder: Path, *, gradients: int, 
     episodes, having = math.prod(plane.resolution), count_gradients(plane.resolution, gradients)
     counts = {True: having, False: episodes - having}
     simulating, writing = sum(counts[one] * each for one, each in cost.each.items()), grown.points * kept.seconds
-    batches = sum(-(-n // env.preferred_batch) for n in counts.values())
+    batches = _count_batches(counts.values(), env.preferred_batch)
     count = count_pictures(grown.levels, batches, simulating + writing, once)
     extra = Room(SUMMARY + sum(file.stat().st_size for file in folder.iterdir() if file.is_file()), 2)
     return Plan(
@@ -284,7 +289,7 @@ def plan_sweep(
     held = need_of(plane.resolution, plane.dim, frames, grad=grad, over=over).memory
     held -= need_of(little.resolution, plane.dim, 0, grad=grad, over=over).memory
     return Plan(
-        count * whole, count * sum(-(-n // env.preferred_batch) for n in (having, whole - having)), start,
+        count * whole, count * _count_batches((having, whole - having), env.preferred_batch), start,
         seconds * count * whole / job.total,
         count * grown.points * kept.seconds, drawing, round(memory + held) + peak_memory(), _gpu(env),
         grown.finished_room(kept, count, Room(films + SUMMARY + 250 * frames, 5)), grown.filling_room(kept),

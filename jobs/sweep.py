@@ -148,7 +148,7 @@ class SweepJob:
         *,
         command: str,
         out: Path | None = None,
-        gradients: int = 1,
+        gradients: bool | int = 1,
         force: bool = False,
         cut: Mapping[str, Any] | None = None,
     ) -> SweepJob:

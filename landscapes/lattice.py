@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .identity import gradient_stride, plane_of, stored_identity
 from .objective import Status
 from .plane import Plane
-from .space import as_whole
+from .space import as_stride
 
 DRAWN = ("loss", "status")
 
@@ -25,12 +25,12 @@ def has_all_gradients(dataset: xr.Dataset) -> bool:
     return "grad" in dataset and gradient_stride(stored_identity(dataset)) == 1
 
 
-def check_gradients(gradients: int, plane: Plane, *, refined: bool) -> int:
+def check_gradients(gradients: bool | int, plane: Plane, *, refined: bool) -> int:
     """Return at every how many samples along each axis a slice shall have gradients, 0 for none.
 
     Raises ValueError where it then has fewer than two along an axis, or is refined, which takes gradients at all.
     """
-    gradients = as_whole(gradients, "gradients")
+    gradients = as_stride(gradients)
     if gradients > 1 and refined:
         raise ValueError(
             f"a slice is refined by the gradients of all its samples; got gradients at every {gradients} samples, so "

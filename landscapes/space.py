@@ -142,6 +142,11 @@ def as_whole(value: object, what: str, *, least: int = 0) -> int:
     return number
 
 
+def as_stride(gradients: bool | int) -> int:
+    """Return at every how many samples gradients are: 0 for none, 1 for all. Raises ValueError for no whole number."""
+    return as_whole(int(gradients) if isinstance(gradients, bool) else gradients, "gradients")
+
+
 def tensor_of(x: object, who: str) -> Float[Tensor, "*shape"]:
     """Return a tensor as it is, and one of any other numbers."""
     return x if isinstance(x, Tensor) else as_tensor(x, who)

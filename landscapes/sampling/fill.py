@@ -16,7 +16,7 @@ import xarray as xr
 from ..identity import check_identity, with_stride
 from ..objective import Objective, Status, name_of
 from ..plane import Plane
-from ..space import as_whole
+from ..space import as_stride, as_whole
 from ..storage.disk import full, is_full
 from ..storage.store import SliceStore
 from ..storage.tiles import Tile
@@ -74,7 +74,7 @@ def sample(
     other settings, TooLargeError where the slice does not fit into memory, DiskFullError and WorkersLostError where
     filling ended early, which say what is kept, and MemoryError where a single point is too much for the device.
     """
-    gradients = as_whole(int(gradients) if isinstance(gradients, bool) else gradients, "gradients")
+    gradients = as_stride(gradients)
     if store is None:
         about = describe(objective)
         about["identity"] = with_stride(about["identity"], gradients)

@@ -72,7 +72,7 @@ def plan(run: Callable[..., Said], cwd: Path, *arguments: str) -> dict[str, Any]
 def test_the_parts_of_a_plan_add_up_to_what_the_job_takes(
     run: Callable[..., Said], tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    planned, verb = plan(run, tmp_path, *JOBS[name]), name.split(" ")[0] if name.startswith("sweep") else "slice"
+    planned, verb = plan(run, tmp_path, *JOBS[name]), "sweep" if name.startswith("sweep") else "slice"
     finish, tiles, before = SliceStore.finish, [], clock.slept.count(TILE)
 
     def finished(store: SliceStore, dataset: xr.Dataset) -> None:
