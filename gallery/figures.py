@@ -77,10 +77,13 @@ class Figure:
         lines = ["import gradscape as gs", "", f"s = gs.slice({self.env!r}, {self.dims!r}, {said})"]
         return "\n".join([*lines, "s.plot()", "print(s.report().words)"])
 
-    def sweep_command(self, *, frames: int, resolution: int, fidelity: str, device: str) -> str:
-        """Return the command that makes its sweep."""
+    def sweep_command(self, *, frames: int, resolution: int, gradients: int, fidelity: str, device: str) -> str:
+        """Return the command that makes its sweep; of smoothed losses there are no gradients."""
+        from ..jobs.motion import SMOOTHING
+
         axes = ["--dims", *map(str, self.dims), "--over", self.over, "--frames", str(frames)]
         how = ["--resolution", str(resolution), "--fidelity", fidelity, "--through", self.through]
+        how += ["--gradients", str(gradients)] if self.over != SMOOTHING else []
         return shlex.join(["landscape", "sweep", self.env, *axes, *how, *self._set, "--device", device])
 
     def search_command(self, method: str, *, budget: int, seed: int, fidelity: str, device: str) -> str:

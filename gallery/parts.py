@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ..jobs.sweep import SweepJob
 
 DRAFT = "draft"  # fidelity of sweeps and searches, of which there are many episodes; of functions their only one
-FRAMES, COARSE = 12, 24  # of a sweep: frames, and points along each axis
+FRAMES, COARSE, APART = 12, 48, 4  # of a sweep: frames, points along each axis, and how far apart its gradients are
 DPI, LOSS = 80, 28  # of its film
 METHODS, BUDGET, SEED = ("random", "cma-es", "descents", "bo", "bo-leap"), 100, 0
 
@@ -163,7 +163,8 @@ class SweepPart(FigurePart):
 
     def label(self) -> str:
         """Return the command that makes it."""
-        return self.figure.sweep_command(frames=FRAMES, resolution=COARSE, fidelity=DRAFT, device=self.device)
+        how = {"frames": FRAMES, "resolution": COARSE, "gradients": APART}
+        return self.figure.sweep_command(**how, fidelity=DRAFT, device=self.device)
 
     def count_left(self) -> int:
         """Return 1 where there is no film of these settings yet."""
@@ -195,7 +196,8 @@ class SweepPart(FigurePart):
         from ..jobs.sweep import SweepJob
 
         env = self._scene(DRAFT).make()
-        job = SweepJob.of(env, self.figure.plane(env, COARSE), self.figure.over, FRAMES, command=self.label())
+        plane, over = self.figure.plane(env, COARSE), self.figure.over
+        job = SweepJob.of(env, plane, over, FRAMES, gradients=APART, command=self.label())
         return replace(job, executor=self.executor)
 
 
