@@ -1,8 +1,8 @@
-"""The runs of a race as the gallery keeps them, in one small file: improvements of all, one run of each method whole.
+"""The runs of a race as the gallery keeps them, in one small file: the improvements of each, and where some lie.
 
 Of every run there are the episodes that lowered its least loss, what it had cost by then, and its best point in full.
-Of the median run of each method, by final loss, there are all points, too, each parameter as one of 65 536 places in
-its box, which is finer than any picture. Gradients are not kept.
+Of the median run of each method, by final loss, there are the points of these episodes, too, each parameter as one of
+65 536 places in its box, which is finer than any picture. Gradients are not kept.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..landscapes.objective import Status
-from ..landscapes.overlay import lowered
+from ..landscapes.overlay import IMPROVEMENTS_OF, lowered
 from ..landscapes.storage.files import replacing
 from ..landscapes.storage.layout import flags
 from ..landscapes.storage.records import reading
@@ -63,9 +63,9 @@ class KeptRun:
 
 @dataclass(frozen=True, eq=False)
 class KeptRuns:
-    """What is kept of a race: every run's improvements, and the median run of each method as a table of all its points.
+    """What is kept of a race: every run's improvements, and those of the median run of each method with their points.
 
-    A table has the columns of a run but for seconds, with gradients of NaN.
+    The latter are tables with the columns of a run but for seconds, with gradients of NaN.
     """
 
     runs: Sequence[KeptRun]
@@ -91,19 +91,21 @@ class KeptRuns:
 
 
 def _median(members: Sequence[Run], budget: int) -> xr.Dataset:
-    """Return the run of median final loss, of two the better, with points as exact as they are kept."""
+    """Return the improvements of the run of median final loss, of two the better, with points as exact as kept."""
     final = np.array([best_so_far(run.data["loss"].to_numpy()[:budget])[-1] for run in members])
     order = np.argsort(np.where(np.isfinite(final), final, np.inf), kind="stable")
     data = members[order[(len(members) - 1) // 2]].data.isel(evaluation=slice(budget))
-    attrs = data.attrs
-    places = _places(data["x"].to_numpy(), np.array(attrs["lower"]), np.array(attrs["upper"]))
+    rows = lowered(best_so_far(data["loss"].to_numpy()))
+    about = _about(data.assign_attrs({IMPROVEMENTS_OF: data.sizes["evaluation"]}))
+    data = data.isel(evaluation=rows)
+    places = _places(data["x"].to_numpy(), np.array(about["lower"]), np.array(about["upper"]))
     loss = data["loss"].to_numpy().astype(np.float32)
-    return _table(places, loss, data["kind"].to_numpy(), data["status"].to_numpy(), _about(data))
+    return _table(places, loss, data["kind"].to_numpy(), rows + 1, about)
 
 
 def _about(data: xr.Dataset) -> dict[str, Any]:
     """Return what a table says of itself, as JSON has it."""
-    wanted = ("env", "method", "seed", "budget", "fidelity", "loss_unit", "identity", "provenance")
+    wanted = ("env", "method", "seed", "budget", "fidelity", "loss_unit", "identity", "provenance", IMPROVEMENTS_OF)
     attrs = {name: data.attrs[name] for name in wanted}
     box = {name: np.asarray(data.attrs[name], float).tolist() for name in ("lower", "upper")}
     named = {name: [str(one) for one in data[name].to_numpy()] for name in ("dim", "unit")}
@@ -116,19 +118,18 @@ def _places(x: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[n
 
 
 def _table(
-    places: NDArray[np.uint16], loss: NDArray[Any], kind: NDArray[Any], status: NDArray[Any], about: Mapping[str, Any]
+    places: NDArray[np.uint16], loss: NDArray[Any], kind: NDArray[Any], episode: NDArray[Any], about: Mapping[str, Any]
 ) -> xr.Dataset:
-    """Return a run's table from what is kept of it."""
+    """Return the table of a run's improvements from what is kept of them."""
     lower, upper = np.array(about["lower"]), np.array(about["upper"])
     x = lower + places / PLACES * (upper - lower)
-    known = np.where(np.isin(status, list(Status)), status, Status.ERROR)
     columns = {
         "x": (("evaluation", "dim"), x),
         "grad": (("evaluation", "dim"), np.full_like(x, np.nan)),
         "loss": ("evaluation", loss.astype(float)),
         "kind": ("evaluation", kind.astype(np.int8), flags(Kind)),
-        "status": ("evaluation", known.astype(np.int8), flags(Status)),
-        "episodes": ("evaluation", np.arange(1, len(loss) + 1)),
+        "status": ("evaluation", np.full(len(loss), Status.OK, np.int8), flags(Status)),
+        "episodes": ("evaluation", episode),
     }
     coords = {name: ("dim", list(values)) for name, values in about["names"].items()}
     attrs = {name: value for name, value in about.items() if name != "names"}
@@ -169,14 +170,14 @@ def _packed_medians(medians: Mapping[str, xr.Dataset]) -> dict[str, Any]:
         box = (np.array(table.attrs[name]) for name in ("lower", "upper"))
         found[f"places {method}"] = _places(table["x"].to_numpy(), *box)
         found[f"losses {method}"] = table["loss"].to_numpy().astype(np.float32)
-        found[f"kind {method}"], found[f"status {method}"] = table["kind"].to_numpy(), table["status"].to_numpy()
+        found[f"kind {method}"], found[f"episode {method}"] = table["kind"].to_numpy(), table["episodes"].to_numpy()
         found[f"about {method}"] = np.array(json.dumps(_about(table)))
     return found
 
 
 def _unpacked_medians(arrays: Mapping[str, NDArray[Any]]) -> Iterator[tuple[str, xr.Dataset]]:
     for method in dict.fromkeys(map(str, arrays["method"])):
-        places, losses, kind, status, about = (
-            arrays[f"{name} {method}"] for name in ("places", "losses", "kind", "status", "about")
+        places, losses, kind, episode, about = (
+            arrays[f"{name} {method}"] for name in ("places", "losses", "kind", "episode", "about")
         )
-        yield method, _table(places, losses, kind, status, json.loads(str(about)))
+        yield method, _table(places, losses, kind, episode, json.loads(str(about)))

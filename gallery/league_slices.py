@@ -9,9 +9,8 @@ import torch
 from ..jobs.folder import SUMMARY
 from ..jobs.scene import SceneSpec
 from ..jobs.watch import Watch
-from ..landscapes.overlay import lowered, overlay
+from ..landscapes.overlay import overlay
 from ..landscapes.storage.records import read_json, write_record
-from ..optim.curves import best_so_far
 from ..optim.league import SceneStandings
 from .figures import read_figures
 from .files import PICTURE, STORE, LeagueFiles, LeagueSliceFiles
@@ -21,8 +20,6 @@ from .parts import FigurePart, seconds_of_one
 from .records import read_if_sound
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from ..envs.base import Environment
     from ..landscapes.plane import Plane
 
@@ -30,10 +27,10 @@ RESOLUTION = 48  # points along each axis
 
 
 class LeagueSlicePart(FigurePart):
-    """Losses around the best point of the league in the figure's environment, and the median runs over them.
+    """Losses around the best point of the league in the figure's environment, and median runs over them.
 
-    They are at the league's own fidelity, along the dims of the environment's first figure. Figures of an environment
-    share it. There is none where no league is kept.
+    Of the runs their improvements are laid. Losses are at the league's own fidelity, along the dims of the environment's
+    first figure. Figures of an environment share it. There is none where no league is kept.
     """
 
     @property
@@ -76,7 +73,7 @@ class LeagueSlicePart(FigurePart):
         outcome = SliceJob.of(env, self._plane(env, standings), gradients=0, executor=self.executor, **how).run(watch)
         for left in (PICTURE, SUMMARY):  # the map is drawn with the runs, and its page says the rest
             (files.folder / left).unlink()
-        runs = [improved(table) for table in KeptRuns.read(LeagueFiles.of(self.root, env.name).runs).medians.values()]
+        runs = list(KeptRuns.read(LeagueFiles.of(self.root, env.name).runs).medians.values())
         dataset = open_slice(files.folder / STORE)
         keep_both(overlay_figure(dataset, overlay(dataset, runs)), files.picture)
         write_record(files.record, {"key": self._key(standings), "command": self.label(), "device": env.device})
@@ -107,11 +104,3 @@ class LeagueSlicePart(FigurePart):
 
     def _standings(self) -> SceneStandings | None:
         return read_if_sound(read_standings, LeagueFiles.of(self.root, self.figure.env).record)
-
-
-def improved(table: xr.Dataset) -> xr.Dataset:
-    """Return the episodes of a run that lowered its least loss: the others would cover the map."""
-    from ..landscapes.draw.figures.overlay import IMPROVEMENTS_OF
-
-    loss = table["loss"].to_numpy()
-    return table.isel(evaluation=lowered(best_so_far(loss))).assign_attrs({IMPROVEMENTS_OF: len(loss)})

@@ -17,6 +17,7 @@ from .identity import plane_of
 from .lattice import own_cells
 from .plane import Plane
 
+IMPROVEMENTS_OF = "improvements_of"  # attribute of a run of which only improvements are laid: how many episodes it has
 RECENT = 64  # how many evaluations ago an iterate's predecessor is looked for
 PARALLEL = 1e-12  # most by which the cosine between a step and the negative gradient may differ from 1
 

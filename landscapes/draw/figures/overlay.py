@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...identity import plane_of
 from ...objective import Status
-from ...overlay import improvements, run_name
+from ...overlay import IMPROVEMENTS_OF, improvements, run_name
 from ...plane import Plane
 from .. import style
 from . import contour, labels, page, panel
@@ -26,7 +26,6 @@ Runs = Sequence[xr.Dataset]
 PITCH = 5.4  # room of a panel on a screen [inch]
 HEADING = "Marker size: distance from the plane; colour: the loss the point truly had"
 FEW = 24  # most improvements that are numbered, over all runs
-IMPROVEMENTS_OF = "improvements_of"  # attribute of a run of which only improvements are laid: its episodes
 CROWD = 4  # runs from which on the lines that join them are thinner
 
 
