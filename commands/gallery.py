@@ -33,10 +33,9 @@ def compute(
 
     The folder of the data then holds a folder for each figure: slice.zarr at the figure's fidelity, companions.json of
     the same cut through other points, episode-*.mp4 at some of its nodes, sweep.mp4 at draft fidelity, report.json and
-    measures.json. In runs/ are searches at draft fidelity, in tradeoff/ the accuracy of each environment against its
-    time, in league/ races of nine methods at the figures' fidelity. Stop it at any moment: the same command goes on
-    where it stopped. A figure that fails does not stop the
-    others.
+    measures.json. In runs/ are searches at the figures' fidelity, in tradeoff/ the accuracy of each environment against
+    its time, in league/ races of nine methods at the figures' fidelity. Stop it at any moment: the same command goes on
+    where it stopped. A figure that fails does not stop the others.
 
     Example: landscape gallery compute --only fluid --part slices --device cuda
     """

@@ -86,10 +86,10 @@ class Figure:
         how += ["--gradients", str(gradients)] if self.over != SMOOTHING else []
         return shlex.join(["landscape", "sweep", self.env, *axes, *how, *self._set, "--device", device])
 
-    def search_command(self, method: str, *, budget: int, seed: int, fidelity: str, device: str) -> str:
-        """Return the command that searches its environment."""
-        how = ["--method", method, "--budget", str(budget), "--seed", str(seed), "--fidelity", fidelity]
-        return shlex.join(["landscape", "optimize", self.env, *how, *self._set, "--device", device])
+    def race_command(self, methods: Sequence[str], *, budget: int, device: str) -> str:
+        """Return the command that searches its environment by several methods."""
+        how = ["--methods", ",".join(methods), "--budget", str(budget), "--seeds", "1", "--fidelity", self.fidelity]
+        return shlex.join(["landscape", "race", self.env, *how, *self._set, "--device", device])
 
     @property
     def _set(self) -> list[str]:

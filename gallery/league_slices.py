@@ -29,8 +29,8 @@ RESOLUTION = 48  # points along each axis
 class LeagueSlicePart(FigurePart):
     """Losses around the best point of the league in the figure's environment, and median runs over them.
 
-    Of the runs their improvements are laid. Losses are at the league's own fidelity, along the dims of the environment's
-    first figure. Figures of an environment share it. There is none where no league is kept.
+    Of the runs their improvements are laid. Losses are at the league's own fidelity, along the dims of the first of the
+    environment's figures, which share it. There is none where no league is kept.
     """
 
     @property

@@ -19,17 +19,15 @@ from .records import SweepRecord, read_if_sound
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    import xarray as xr
-
     from ..envs.base import Environment
     from ..jobs.scene import SceneSpec
     from ..jobs.slice import SliceJob
     from ..jobs.sweep import SweepJob
 
-DRAFT = "draft"  # fidelity of sweeps and searches, of which there are many episodes; of functions their only one
+DRAFT = "draft"  # fidelity of sweeps, of which there are many episodes; of functions their only one
 FRAMES, COARSE, APART = 12, 48, 4  # of a sweep: frames, points along each axis, and how far apart its gradients are
 DPI, LOSS = 80, 28  # of its film
-METHODS, BUDGET, SEED = ("random", "cma-es", "descents", "bo", "bo-leap"), 100, 0
+METHODS, BUDGET = ("random", "cma-es", "descents", "bo", "bo-leap"), 100  # of searches
 
 
 @dataclass(frozen=True)
@@ -202,7 +200,7 @@ class SweepPart(FigurePart):
 
 
 class SearchPart(FigurePart):
-    """A run of each method in the figure's environment, which its other figures share."""
+    """A run of each method in the figure's environment at its fidelity, which its other figures share."""
 
     @property
     def shared(self) -> str:
@@ -210,48 +208,51 @@ class SearchPart(FigurePart):
         return self._where.name
 
     def label(self) -> str:
-        """Name methods, budget and scene."""
-        return f"{', '.join(METHODS)}: {BUDGET} episodes each in {self._where.name}"
+        """Return the command that races them."""
+        return self.figure.race_command(METHODS, budget=BUDGET, device=self.device)
 
     def count_left(self) -> int:
-        """Count the runs not made."""
+        """Count the runs not made at this fidelity."""
         return len(self._missing())
 
     def seconds_each(self) -> float:
-        """Time a run by one of its episodes; what a method takes itself comes on top."""
-        return BUDGET * 2 * seconds_of_one(self._scene(DRAFT).make())
+        """Share what simulating all of them in lockstep takes; what methods take themselves comes on top."""
+        from ..jobs.race import lockstep_seconds
+        from ..optim.registry import optimizer_class
+
+        env = self._scene().make()
+        asking = sum(optimizer_class(method).needs_grad for method in METHODS)
+        left = {0: BUDGET * (len(METHODS) - asking), 1: BUDGET * asking}
+        return lockstep_seconds(env, left, len(METHODS)) / len(METHODS)
 
     def make(self, watch: Watch) -> str:
-        """Run every method that has not run."""
+        """Race the methods, in a folder under out/, and keep the runs that are missing."""
+        from ..jobs.race import RaceJob
         from .runs import save_run
 
-        env = self._scene(DRAFT).make()
+        job = RaceJob.of(self._scene().make(), METHODS, budget=BUDGET, seeds=1, command=self.label(), watch=watch)
+        runs = replace(job, executor=self.executor).run(watch).race.runs
         for method in self._missing():
-            save_run(self._search(env, method, watch), self._file(method))
+            save_run(runs[method][0].data, self._file(method))
         return f"{len(METHODS)} runs of {BUDGET} episodes"
-
-    def _search(self, env: Environment, method: str, watch: Watch) -> xr.Dataset:
-        """Run a method, in a folder of its own under out/, and return the run's table."""
-        from ..jobs.search import SearchJob, make_optimizer
-
-        command = self.figure.search_command(
-            method, budget=BUDGET, seed=SEED, fidelity=env.fidelity.name, device=self.device
-        )
-        job = SearchJob.of(env, make_optimizer(method, env, seed=SEED), budget=BUDGET, command=command)
-        job.run(watch)
-        return job.store.dataset()
 
     @property
     def _where(self) -> Path:
         return self.root / RUNS / "-".join([self.figure.env, *map(str, self.figure.options.values())])
 
     def _file(self, method: str) -> Path:
-        return self._where / f"{method}-{SEED}{RUN_SUFFIX}"
+        return self._where / f"{method}-0{RUN_SUFFIX}"
 
     def _missing(self) -> list[str]:
+        """Return the methods of which no run at the figure's fidelity is kept, or at any where that has no name."""
         from .runs import open_run
 
-        return [method for method in METHODS if read_if_sound(open_run, self._file(method)) is None]
+        fidelity = self._scene().fidelity
+        runs = {method: read_if_sound(open_run, self._file(method)) for method in METHODS}
+        return [
+            method for method, run in runs.items()
+            if run is None or (fidelity is not None and run.attrs["fidelity"] != fidelity)
+        ]  # fmt: skip
 
 
 def _same(figure: Figure, identity: Mapping[str, Any]) -> bool:

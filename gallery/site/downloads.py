@@ -16,8 +16,6 @@ from ...landscapes.export import frame
 from ...landscapes.identity import plane_of
 from ..files import CSV, ZARR
 
-DIGITS = 7  # of a number of single precision
-
 
 def save_slice(dataset: xr.Dataset, store: Path, folder: Path) -> list[str]:
     """Write a slice as CSV and, as it lies in its finished store, as zarr in one file; return their names.
@@ -28,7 +26,8 @@ def save_slice(dataset: xr.Dataset, store: Path, folder: Path) -> list[str]:
     table = frame(dataset.drop_vars("grad", errors="ignore"))
     for name, column in _slopes(dataset).items():
         table[name] = column
-    table.to_csv(folder / CSV, index=False, float_format=f"%.{DIGITS}g")
+    exact = table.select_dtypes(float).columns  # digits of single precision say all there is
+    table.astype(dict.fromkeys(exact, np.float32)).to_csv(folder / CSV, index=False)
     if not store.is_dir():
         return [CSV]
     with ZipFile(folder / ZARR, "w", ZIP_STORED) as packed:  # chunks are compressed already

@@ -59,10 +59,10 @@ class Studio:
 
 
 def _start(places: Sequence[tuple[Path, Path]]) -> list[subprocess.Popen[bytes]]:
-    """Start processes that draw the slices, all but one of the cores; none where there is one."""
+    """Start processes that draw the slices, as many as there are cores; none where there is one."""
     from ...envs.engines.runtime import cores
 
-    count = min(cores() - 1, MOST)
+    count = min(cores(), MOST) if cores() > 1 else 0
     shares = [[str(path) for place in places[k::count] for path in place] for k in range(count)]
     command = [sys.executable, "-m", __name__]
     return [subprocess.Popen([*command, *share], stdout=subprocess.PIPE) for share in shares]

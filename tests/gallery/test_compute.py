@@ -28,7 +28,7 @@ FIGURES = [
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """Let all there is to make be little, and steps of time long."""
     monkeypatch.setattr("gradscape.gallery.figures.read_figures", lambda: list(FIGURES))
-    for name, value in (("FRAMES", 2), ("COARSE", 4), ("DPI", 40), ("METHODS", ("random", "cma-es")), ("BUDGET", 9)):
+    for name, value in (("FRAMES", 2), ("COARSE", 5), ("DPI", 40), ("METHODS", ("random", "cma-es")), ("BUDGET", 9)):
         monkeypatch.setattr(gallery_parts, name, value)
     monkeypatch.setattr(gallery_companions, "RESOLUTION", 4)
     for name, value in (("HEIGHT", 60), ("LONGEST", 2)):

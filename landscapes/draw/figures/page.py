@@ -49,7 +49,7 @@ class Picture(Figure):
     def _repr_png_(self) -> bytes:
         """Return the picture as a notebook shows it."""
         with io.BytesIO() as raw:
-            self.savefig(raw, format="png", dpi=style.DPI)
+            _write_png(self, raw)
             return raw.getvalue()
 
 
@@ -190,9 +190,24 @@ def save(figure: Figure, path: str | Path) -> None:
     kind = path.suffix.lower().removeprefix(".")
     if kind not in DATED:
         raise ValueError(f"a picture is saved as .png, .pdf or .svg; got {path.name!r}")
-    how: dict[str, Any] = {"format": kind, "dpi": style.DPI if kind == "png" else style.PRINT_DPI}
     with replacing(path) as partial, _settings, rc_context(EMBEDDED):
-        figure.savefig(partial, metadata=DATED[kind], **how)
+        if kind == "png":
+            _write_png(figure, partial)
+        else:
+            figure.savefig(partial, metadata=DATED[kind], format=kind, dpi=style.PRINT_DPI)
+
+
+def _write_png(figure: Figure, file: str | Path | io.BytesIO) -> None:
+    """Write a figure as PNG, drawn once: `savefig` draws one with a layout twice."""
+    canvas, dpi = figure.canvas, figure.get_dpi()
+    if not isinstance(canvas, FigureCanvasAgg):
+        figure.savefig(file, format="png", dpi=style.DPI)
+        return
+    figure.set_dpi(style.DPI)
+    try:
+        canvas.print_png(file)  # type: ignore[no-untyped-call]
+    finally:
+        figure.set_dpi(dpi)
 
 
 def save_prints(draw: Callable[[float], Figure], path: Path, widths: Sequence[float]) -> list[str]:
