@@ -53,9 +53,10 @@ def overlay(
     Points that another program evaluated are a CSV or Parquet file or a pandas table, with a column for each parameter,
     called as it is, and one called loss, which is missing where an evaluation failed; or an Optuna study; or an
     experiment of Ax, or its client.
-    The slice is cut anew `through` the best point of all runs (best) or of one run's folder, and along the runs' two
-    principal directions with `plane` pca, with `resolution` points along each axis, on `device`. The files lie in the
-    folder `out`, by default one under out/ named after the overlay.
+    The slice is cut anew `through` the best point of all runs (best) or of one run's folder, or any other point that
+    `gradscape.slice` goes through by its name, and along the runs' two principal directions with `plane` pca, with
+    `resolution` points along each axis, on `device`. The files lie in the folder `out`, by default one under out/ named
+    after the overlay.
 
     Raises ValueError for runs of other landscapes than the slice's, for a slice of a line, where there is no slice or
     run, where a table lacks a column, and where the folder holds something else; Stopped where it is interrupted.

@@ -26,7 +26,11 @@ def overlay(
     ] = None,
     print_: Print = None,
     through: Annotated[
-        str | None, typer.Option(help="Cut anew through the best point of all runs (best) or of one run's folder.")
+        str | None,
+        typer.Option(
+            help="Cut anew through a point: the best of all these runs (best) or of one run's folder, or any that "
+            "`landscape slice --through` takes."
+        ),
     ] = None,
     plane: Annotated[str | None, typer.Option(help="Cut anew along the runs' two principal directions: pca.")] = None,
     resolution: Annotated[

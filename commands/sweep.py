@@ -54,21 +54,23 @@ def sweep(
 
     Example: landscape sweep fluid --dims 6 8 --over 7 --frames 12
     """
-    from ..jobs.cut import cut, describe_cut
+    from ..jobs.cut import cut, describe_cut, folder_for, split_points
     from ..jobs.sweep import SweepJob
     from ..jobs.workers import workers
     from .terminal import Bars, command_line, print_json
 
     bars = Bars()
-    env, folder = scene.make(bars), Path(out) if out else None
-    where: dict[str, Any] = {"through": through, "extent": read_extent(extent)}
-    plane = cut(env, dims, along, **where, resolution=resolution)
+    env, points, ends = scene.make(bars), split_points(through), read_extent(extent)
     how: dict[str, Any] = {"command": command_line(), "gradients": 0 if no_gradients else gradients, "force": force}
-    how["cut"] = describe_cut(along, **where)
-    with bars.busy(f"opening {frames} slices"):
-        job = SweepJob.of(env, plane, over, frames, out=folder, **how)
+    planes = {point: cut(env, dims, along, through=point, extent=ends, resolution=resolution) for point in points}
+    said = list[dict[str, Any]]()
     with workers(scheduler, env.device) as executor:
-        summary = replace(job, executor=executor).run(bars)
-    bars.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
+        for point, plane in planes.items():
+            named, folder = describe_cut(along, point, ends), folder_for(Path(out), point, points) if out else None
+            with bars.busy(f"opening {frames} slices"):
+                job = SweepJob.of(env, plane, over, frames, out=folder, cut=named, **how)
+            summary = replace(job, executor=executor).run(bars)
+            bars.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
+            said.append({**asdict(summary), "folder": str(job.folder)})
     if json_:
-        print_json(asdict(summary), folder=str(job.folder))
+        print_json(said[0] if len(said) == 1 else {"sweeps": said})

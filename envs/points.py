@@ -12,7 +12,10 @@ from torch import Tensor
 
 from .base import Environment
 
-FORMS = "center, random:SEED, example:NAME, best:RUN or a file with its parameters (.json, .npy, .csv, .parquet, text)"
+FORMS = (
+    "center, random:SEED, example:NAME, best, best:RUN, a file with its parameters (.json, .npy, text), or a row of a "
+    "table, TABLE.csv:ROW"
+)
 
 
 def point(environment: Environment, text: str) -> Float[Tensor, " dim"]:
@@ -29,7 +32,7 @@ def point(environment: Environment, text: str) -> Float[Tensor, " dim"]:
         return environment.example(value)
     path = Path(text)
     if not path.is_file():
-        raise ValueError(f"{environment.name} can be cut through {FORMS}; got {text!r}, which is no file")
+        raise ValueError(f"{environment.name} can be cut through {FORMS}; got {text!r}, which is none of these")
     return _read(environment, path)
 
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ..landscapes.plane import Plane
     from ..landscapes.space import ParameterSpace
 
+WORDS = ("center", "example", "random", "best")  # that names of points begin with
 HALF, LEAST = 0.5, 1e-3  # of a width of the box: how far a slice reaches at least, and what is no width for one
 SPREAD = 1 / 8  # the same by the root of how many parameters there are: each moves by that share of its width
 
@@ -39,6 +40,8 @@ def cut(
     `kept` says where a slice may have been begun, as for `kept_plane`: it goes on along its own directions. Raises
     ValueError where both or neither are given, and as `plane_through` and `plane_along` do.
     """
+    if not isinstance(through, str) and any(isinstance(one, str) for one in through):
+        raise ValueError(f"a slice goes through one point here; got {len(through)} names, so ask for each by itself")
     if (dims is None or len(dims) == 0) == (along is None):
         raise ValueError("a slice takes --dims, one or two parameters, or --along, directions; give one of them")
     if along is None:
@@ -81,6 +84,8 @@ def plane_along(
     if kind == "pca":
         from ..landscapes.overlay import principal_plane
 
+        if not value:
+            raise ValueError("--along pca:RUN takes the folder of a run or of a race; got no folder")
         return principal_plane(runs_in(objective, value), resolution=(resolution, resolution))
     point = named_point(objective, through) if isinstance(through, str) else through
     if kind == "random" and value.isdecimal():
@@ -128,7 +133,7 @@ def describe_cut(
 
 def split_points(through: str) -> list[str]:
     """Return the points in A,B,..., each once; a file is one, whatever its name."""
-    return [through] if Path(through).is_file() else list(dict.fromkeys(through.split(",")))
+    return [through] if Path(through).is_file() else list(dict.fromkeys(filter(None, through.split(",")))) or [through]
 
 
 def folder_for(out: Path, point: str, points: Sequence[str]) -> Path:
@@ -145,10 +150,15 @@ def joined_points(along: str) -> list[str]:
 
 
 def points_in(text: str) -> list[str]:
-    """Return the names of points in A:B or A:B:C; example:, random:, best: and TABLE.csv:ROW take what follows them."""
+    """Return the names of points in A:B or A:B:C; example:, random:, best: and TABLE.csv:ROW take what follows them.
+
+    After `best` that is the folder of a run, unless it is the word that another point begins with.
+    """
     parts, names = text.split(":"), list[str]()
     while parts:
         name = parts.pop(0)
-        row = name.lower().endswith(SUFFIXES) and bool(parts) and parts[0].isdecimal()
-        names.append(f"{name}:{parts.pop(0)}" if (name in ("example", "random", "best") or row) and parts else name)
+        after = parts[0] if parts else ""
+        row = name.lower().endswith(SUFFIXES) and after.isdecimal()
+        takes = name in ("example", "random") or row or (name == "best" and after not in WORDS)
+        names.append(f"{name}:{parts.pop(0)}" if takes and parts else name)
     return names

@@ -18,12 +18,14 @@ from ..landscapes.slice import Slice
 from ..landscapes.storage.files import tidy, visible_files
 from ..landscapes.storage.paths import slice_exists
 from ..landscapes.storage.store import open_slice
-from .folder import OVERLAY, ROOT, SLICE_STORE, folder_named, run_tables
-from .scene import environment_of
+from .folder import OVERLAY, ROOT, SLICE_STORE, folder_named
+from .scene import environment_of, named_point
 from .slice import SliceJob
 from .watch import Watch, resumable
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from ..landscapes.draw.figures.page import Picture
 
 
@@ -36,8 +38,9 @@ MUST, SHOULD = ("objective", "options"), ("fidelity", "settings", "engine", "cod
 class Cut:
     """Say how a slice is cut anew: through a point of runs, along their principal directions, with other resolution.
 
-    `through` is the best point of all runs (best) or of one run's folder, `principal` takes the runs' two principal
-    directions instead of the slice's own, and `resolution` is by default the slice's.
+    `through` is the best point of all runs (best) or of one run's folder, or any other that a slice can go through;
+    `principal` takes the runs' two principal directions instead of the slice's own, and `resolution` is by default the
+    slice's.
     """
 
     through: str | None = None
@@ -55,21 +58,23 @@ class Cut:
             return None
         return cls(through, plane is not None, resolution)
 
-    def plane(self, present: Plane, tables: Sequence[xr.Dataset]) -> Plane:
+    def plane(self, present: Plane, tables: Sequence[xr.Dataset], objective: Objective) -> Plane:
         """Return the plane of the new slice: parallel to the one that is present, or the runs' principal one.
 
-        Raises ValueError where the run it goes through searched another number of parameters.
+        Raises ValueError where there is no such point of the objective to go through.
         """
         shape = (self.resolution,) * present.rank if self.resolution else present.resolution
-        point = None
-        if self.through:
-            point, _ = best_point(tables if self.through == BEST else run_tables([self.through]))
-            if len(point) != present.dim:
-                raise ValueError(f"{self.through} searched {len(point)} parameters; the slice has {present.dim}")
+        point = self._point(tables, objective) if self.through else None
         if self.principal:
             return principal_plane(tables, resolution=shape, through=point)
         assert point is not None  # as one of the two is asked for
         return replace(present.shift_to(point), resolution=shape)
+
+    def _point(self, tables: Sequence[xr.Dataset], objective: Objective) -> Tensor:
+        assert self.through is not None  # or nothing asks for it
+        if self.through == BEST:
+            return best_point(tables)[0]
+        return named_point(objective, f"{BEST}:{self.through}" if Path(self.through).is_dir() else self.through)
 
 
 @dataclass(frozen=True)
@@ -176,8 +181,8 @@ class OverlayJob:
     def _sample(self, watch: Watch) -> Slice:
         """Sample the slice that is cut anew."""
         assert self.cut is not None  # as `run` has seen
-        plane = self.cut.plane(plane_of(self.slice.data), self.runs)
         env = self._objective()
+        plane = self.cut.plane(plane_of(self.slice.data), self.runs, env)
         how: dict[str, Any] = {"gradients": int("grad" in self.slice.data), "boxed": self.cut.principal}
         job = SliceJob.of(env, plane, command=self.command, root=self.folder, **how)
         summary = job.run(watch)

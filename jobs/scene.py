@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -137,14 +137,17 @@ def environment_of(dataset: xr.Dataset, device: str) -> Environment:
 def point_of(env: Environment, text: str) -> Tensor:
     """Return the parameters that `text` names: a point, as `envs.points` has it, or best:RUN, the best of a run.
 
-    Without a run it is the best of all that are known: those under out/, and the one that the gallery's league found.
-    Raises ValueError where there is no such point, or where the run searched another environment.
+    Without a run it is the best of all that are known of an environment of the same options: those under out/, and the
+    one that the gallery's league found. Raises ValueError where there is no such point, or where the run searched
+    another environment.
     """
-    kind, _, run = text.partition(":")
+    kind, colon, run = text.partition(":")
     if kind != "best":
         from ..envs.points import point
 
         return point(env, text)
+    if colon and not run:
+        raise ValueError("best:RUN takes the folder of a run, and best alone the best of all; got 'best:'")
     from ..landscapes.overlay import best_point
 
     if run:
@@ -160,18 +163,27 @@ def point_of(env: Environment, text: str) -> Tensor:
 
 
 def _known_runs(env: Environment, *, needed: bool) -> list[xr.Dataset]:
-    """Return all runs of an environment under the default folder. Raises ValueError for none, if it is `needed`."""
+    """Return all runs of an environment with these options under the default folder.
+
+    Raises ValueError for none, if it is `needed`.
+    """
+    from ..landscapes.identity import stored_identity
+    from ..landscapes.plain import plain_json
     from .folder import LEAGUE, ROOT
 
+    ours = plain_json(asdict(env.options), "options")
     found = list[Any]()
     races = ROOT.glob(f"{LEAGUE.kind}-*/*")  # of leagues, one folder deeper than others
     for folder in sorted(path for path in (*ROOT.glob("*"), *races) if path.is_dir()):
         try:
-            found += runs_in(env, str(folder))
+            runs = runs_in(env, str(folder))
         except ValueError:
             continue  # no run, or one of another environment
+        found += [run for run in runs if stored_identity(run).get("options") == ours]
     if needed and not found:
-        raise ValueError(f"no run of {env.name} is known under {ROOT}/; `landscape optimize {env.name}` makes one")
+        raise ValueError(
+            f"no run of {env.name} with these options is known under {ROOT}/; `landscape optimize {env.name}` makes one"
+        )
     return found
 
 

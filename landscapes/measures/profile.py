@@ -170,8 +170,8 @@ def named_measures(record: ProfileRecord) -> dict[str, str]:
         "Neighbours with a jump between them": _shares(jumps["share"]),
         "Jumps explained by an event": _shares(jumps["explained_by_events"]),
         "Correlation length, of the box": ", ".join(map(_shares, losses["correlation_length"])),
-        "Hölder exponent": ", ".join(map(_number, losses.get("holder", []))),
-        "Total variation, in ranges": ", ".join(map(_number, losses["total_variation"])),
+        "Hölder exponent": _along_axes(losses.get("holder", [])),
+        "Total variation, in ranges": _along_axes(losses["total_variation"]),
         "Information content": _number(losses["information"]),
         "Dispersion of the best 5 %": _number(losses["dispersion"]),
         "Fitness-distance correlation": _number(losses["fitness_distance"]),
@@ -191,6 +191,12 @@ def named_measures(record: ProfileRecord) -> dict[str, str]:
 
 def _shares(estimate: EstimateRecord | None) -> str:
     return _with_interval(estimate, _percent)
+
+
+def _along_axes(values: Sequence[EstimateRecord | None]) -> str:
+    """Say a number for each axis, a dash where one is not known, nothing where none is."""
+    said = list(map(_number, values))
+    return ", ".join(one or "\N{EN DASH}" for one in said) if any(said) else ""
 
 
 def _number(estimate: EstimateRecord | None) -> str:

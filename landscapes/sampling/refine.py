@@ -68,7 +68,10 @@ class Refinement:
         _, axes = coarsest_lattice(plane.resolution)
         least = math.prod(map(len, axes))
         if self.budget is not None and self.budget < least:
-            raise ValueError(f"a slice of this resolution begins with {least} points; got a budget of {self.budget}")
+            raise ValueError(
+                f"a slice of this resolution begins with {least} points; got a budget of {self.budget}: take that many "
+                "or more, or a finer resolution, of which a smaller share is enough to begin with"
+            )
 
     def shares(self) -> Iterator[float]:
         """Yield the shares of the range to go through, ever smaller."""

@@ -12,6 +12,7 @@ import torch
 
 import gradscape
 from gradscape.cli import main
+from gradscape.jobs.scene import named_point
 from gradscape.landscapes.identity import plane_of
 from gradscape.landscapes.overlay import best_point, overlay
 from gradscape.landscapes.storage.store import open_slice
@@ -91,6 +92,16 @@ def test_a_slice_cut_through_the_best_point_shows_its_loss(run: Callable[..., Sa
     assert "all 36 episodes with gradients are there already" in again.stderr
 
 
+@pytest.mark.parametrize("point", ["random:2", "center", "best:race/descents-0", "race/descents-0", "example:aim"])
+def test_a_slice_is_cut_anew_through_any_point_that_has_a_name(run: Callable[..., Said], point: str) -> None:
+    done = run(f"overlay cut race --through {point} --resolution 3 --out over --device cpu")
+    assert done.returncode == 0, done.stderr
+    (folder,) = (path for path in Path("over").iterdir() if path.is_dir())
+    env = gradscape.make("bounce", device="cpu")
+    x = named_point(env, f"best:{point}" if point == "race/descents-0" else point)
+    assert float(plane_of(open_slice(folder / "slice.zarr")).distance(x)) < 1e-12
+
+
 def test_a_principal_plane_lies_nearer_to_the_run_than_the_slice_did(run: Callable[..., Said]) -> None:
     done = run("overlay cut race/cma-es-0 --plane pca --resolution 4 --out over --device cpu")
     assert done.returncode == 0, done.stderr
@@ -131,7 +142,7 @@ def test_another_fidelity_is_drawn_with_a_warning(run: Callable[..., Said]) -> N
         ("overlay race race", "is no slice store"),
         ("overlay cut race --plane tsne", "--plane takes pca, the runs' principal plane; got 'tsne'"),
         ("overlay cut race --resolution 4", "give --through or --plane too"),
-        ("overlay cut race --through nowhere", "there is no run at"),
+        ("overlay cut race --through nowhere", "got 'nowhere', which is none of these"),
         ("overlay cut race --out cut", "cut holds other files"),
     ],
 )

@@ -47,6 +47,18 @@ def names(folder: Path) -> list[str]:
     return sorted(file.name for file in folder.iterdir())
 
 
+def test_through_several_points_there_is_a_sweep_for_each(run: Command, tmp_path: Path) -> None:
+    words = "sweep bounce --dims 0 1 --over horizon --frames 2 --resolution 3 --through center,random:1 --device cpu"
+    done = run(f"{words} --out moved --json")
+    assert done.returncode == 0, done.stderr
+    assert [one["folder"] for one in json.loads(done.stdout)["sweeps"]] == ["moved/center", "moved/random-1"]
+    space = gradscape.make("bounce", device="cpu").space
+    for folder, point in (("center", space.center), ("random-1", space.uniform(1, seed=1)[0])):
+        assert names(tmp_path / "moved" / folder) == FILES
+        frame = plane_of(open_slice(tmp_path / "moved" / folder / "frames/000.zarr"))
+        torch.testing.assert_close(frame.origin[2], point[2])
+
+
 def test_each_frame_is_the_slice_at_its_value(run: Command, tmp_path: Path) -> None:
     done = run(f"{SWEEP} --json")
     assert done.returncode == 0, done.stderr

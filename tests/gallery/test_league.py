@@ -181,7 +181,7 @@ def test_the_best_point_of_the_gallery_is_known_to_slices(
     small: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     env = make("branin", device="cpu")
-    with pytest.raises(ValueError, match="no run of branin is known"):
+    with pytest.raises(ValueError, match="no run of branin with these options is known"):
         point_of(env, "best")
     LeaguePart(FIGURES[0], small, "cpu").make(Watch())
     found = read_standings(small / "league/branin.json").best

@@ -9,6 +9,7 @@ import torch
 
 import gradscape as gs
 from gradscape.jobs.cut import joined_points, plane_along
+from gradscape.jobs.scene import point_of
 from gradscape.landscapes.objective import Status
 from gradscape.landscapes.plane import Plane
 
@@ -41,6 +42,8 @@ class Wells(gs.Environment):
         ("center:example:aim", ["center", "example:aim"]),
         ("random:1:random:2:center", ["random:1", "random:2", "center"]),
         ("best:run:p.json", ["best:run", "p.json"]),
+        ("best:center", ["best", "center"]),
+        ("best:random:4:best:run", ["best", "random:4", "best:run"]),
         ("random:3", []),
         ("hessian", []),
         ("gradient", []),
@@ -132,6 +135,20 @@ def test_verbs_take_such_slices(run, tmp_path):
         assert done.returncode == 0, (command, done.stderr)
 
 
+def test_the_best_point_known_is_of_the_same_options(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("gradscape.jobs.known.best_of_league", lambda env: None)
+    envs = [gs.make("bounce", device="cpu", target_x=x) for x in (2.0, 3.0)]
+    runs = [gs.optimize(env, "random", budget=12) for env in envs]
+    for env, run in zip(envs, runs, strict=True):
+        np.testing.assert_array_equal(point_of(env, "best"), run.best.x)
+
+
+def test_a_list_of_names_is_refused_where_a_slice_goes_through_one_point():
+    with pytest.raises(ValueError, match="goes through one point here; got 2 names"):
+        gs.slice("bounce", (0, 1), through=["center", "random:1"])
+
+
 def test_through_several_points_there_is_a_slice_for_each(run, tmp_path):
     words = ["slice", "bounce", "--dims", "0", "1", "--through", "center,random:1,center", "--resolution", "2"]
     done = run(*words, "--json", cwd=tmp_path)
@@ -159,9 +176,12 @@ def test_through_several_points_there_is_a_slice_for_each(run, tmp_path):
         (["--along", "center:random:1", "--through", "random:2"], "says where it goes; leave out --through"),
         (["--along", "center:center"], "not zero and not parallel"),
         (["--along", "pca:nothing"], "nothing"),
+        (["--along", "pca"], "--along pca:RUN takes the folder of a run"),
+        (["--dims", "0", "--through", "best:"], "best:RUN takes the folder of a run"),
+        (["--dims", "0", "--through", "random:x"], "got 'random:x', which is none of these"),
         (
             ["--along", "hessian", "--through", "best"],
-            "no run of bounce is known under out/; `landscape optimize",
+            "no run of bounce with these options is known under out/; `landscape optimize",
         ),
     ],
 )
