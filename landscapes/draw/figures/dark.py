@@ -80,13 +80,9 @@ def invert_greys(colours: Colours) -> Colours:
 
 def save_dark(source: Path, target: Path) -> None:
     """Write a picture that is there as PNG for a dark page: where a colour meets the paper, the paper is taken out."""
-    with Image.open(source) as picture:
-        pixels = np.asarray(picture.convert("RGB"), dtype=np.uint32)
-    packed, place = np.unique((pixels << (16, 8, 0)).sum(axis=-1, dtype=np.uint32), return_inverse=True)
-    light = (packed[:, None] >> (16, 8, 0) & 255) / 255  # a picture has far fewer colours than pixels
+    light, place = _colours_of(source)
     level, chroma = light.mean(axis=-1), np.ptp(light, axis=-1)
     paper, pale = (level > PAPER) & (chroma < PALE_GREY[0]), (level > PALE) & (chroma > PALE_GREY[0])
-    place = place.reshape(pixels.shape[:2])
     edge = binary_dilation(paper[place], iterations=NEIGHBOURHOOD) & pale[place]
     ground = to_rgba_array(style.NIGHT)[0, :3]
     dark = _as_bytes(invert_greys(light))[place]
@@ -95,6 +91,16 @@ def save_dark(source: Path, target: Path) -> None:
     _keep_ground(few, paper[place], _as_bytes(ground))
     with replacing(target) as partial:
         few.save(partial, "PNG")
+
+
+def _colours_of(source: Path) -> tuple[Colours, NDArray[np.integer[Any]]]:
+    """Return a picture's colours, shape (colour, 3), far fewer than pixels, and which one each pixel has."""
+    with Image.open(source) as picture:
+        if picture.mode == "P":
+            return np.array(picture.getpalette()).reshape(-1, 3) / 255, np.asarray(picture)
+        pixels = np.asarray(picture.convert("RGB"), dtype=np.uint32)
+    packed, place = np.unique((pixels << (16, 8, 0)).sum(axis=-1, dtype=np.uint32), return_inverse=True)
+    return (packed[:, None] >> (16, 8, 0) & 255) / 255, place.reshape(pixels.shape[:2])
 
 
 def _keep_ground(few: Image.Image, paper: NDArray[np.bool_], ground: NDArray[np.uint8]) -> None:
