@@ -167,7 +167,7 @@ def small() -> None:
     tradeoff.REPETITION = tradeoff.LARGEST = 0.002
     cost.MOMENT = cost.ENOUGH = cost.WARM_UP = 0.0
     gallery_parts.METHODS, gallery_parts.BUDGET = ("random",), 8
-    gallery_parts.FRAMES, gallery_parts.COARSE = 2, 4
+    gallery_parts.FRAMES, gallery_parts.COARSE = 2, 5
     gallery_episodes.LONGEST, gallery_episodes.HEIGHT = 2, 48
     gallery_measures.TRADEOFF_POINTS, gallery_measures.REPORT_POINTS = 2, 2
     gallery_measures.TURNED = ["precision"]

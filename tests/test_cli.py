@@ -103,7 +103,7 @@ def test_a_folder_of_other_files_is_left_alone(run: Callable[..., Said], tmp_pat
         (["slice", "branin", "--dims", "0", "1", "--device", "tpu"], "got device 'tpu'"),
         (
             ["slice", "branin", "--dims", "0", "1", "--through", "nowhere"],
-            "center, random:SEED, example:NAME, best:RUN or a file",
+            "center, random:SEED, example:NAME, best, best:RUN, a file",
         ),
         (["slice", "branin", "--dims", "0", "1", "--through", "example:x"], "branin has no example 'x'"),
         (["slice", "branin", "--dims", "0", "1", "--extent", "wide"], "got 'wide'"),
