@@ -19,6 +19,8 @@ from .records import SweepRecord, read_if_sound
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
+    import xarray as xr
+
     from ..envs.base import Environment
     from ..jobs.scene import SceneSpec
     from ..jobs.slice import SliceJob
@@ -244,15 +246,21 @@ class SearchPart(FigurePart):
         return self._where / f"{method}-0{RUN_SUFFIX}"
 
     def _missing(self) -> list[str]:
-        """Return the methods of which no run at the figure's fidelity is kept, or at any where that has no name."""
+        """Return the methods without a run that is at the figure's fidelity and over its slice's parameters."""
+        from ..landscapes.identity import stored_identity
+        from ..landscapes.storage.paths import is_slice
+        from ..landscapes.storage.store import SliceStore
         from .runs import open_run
 
-        fidelity = self._scene().fidelity
-        runs = {method: read_if_sound(open_run, self._file(method)) for method in METHODS}
-        return [
-            method for method, run in runs.items()
-            if run is None or (fidelity is not None and run.attrs["fidelity"] != fidelity)
-        ]  # fmt: skip
+        fidelity, store = self._scene().fidelity, self.folder / STORE
+        over = SliceStore.open(store).identity["parameters"] if is_slice(store) else None
+
+        def fits(run: xr.Dataset | None) -> bool:
+            if run is None or fidelity not in (None, run.attrs["fidelity"]):
+                return False
+            return over in (None, stored_identity(run)["parameters"])
+
+        return [method for method in METHODS if not fits(read_if_sound(open_run, self._file(method)))]
 
 
 def _same(figure: Figure, identity: Mapping[str, Any]) -> bool:

@@ -16,6 +16,7 @@ from gradscape.gallery import parts as gallery_parts
 from gradscape.gallery.compute import IF_NAMED, PARTS
 from gradscape.gallery.figures import Figure
 from gradscape.gallery.paper import PaperCaption
+from gradscape.gallery.runs import open_run, save_run
 
 FIGURES = [
     Figure("ball", "bounce", (0, 1), PaperCaption("It jumps."), through="example:aim", resolution=8, fidelity="draft"),
@@ -90,6 +91,20 @@ def test_everything_is_made_once(small: Path, capsys: pytest.CaptureFixture[str]
     assert all(f"{part}: 3 of 3 are there already" in said for part in PARTS if part not in IF_NAMED)
     assert not any(f"{part}:" in said for part in IF_NAMED)
     assert not (small / "league").exists()
+
+
+def test_a_run_at_another_fidelity_or_over_other_parameters_is_none(small: Path) -> None:
+    part = gallery_parts.SearchPart(FIGURES[0], small, "cpu")
+    assert compute(small, "--only", "ball", "--part", "slices", "--part", "searches") == 0
+    assert part.there()
+    assert replace(part, figure=replace(part.figure, fidelity="standard")).count_left() == 2
+    file = small / "runs/bounce/random-0.zarr.zip"
+    run = open_run(file)
+    identity = json.loads(run.attrs["identity"])
+    renamed = [[f"{name} then", unit] for name, unit in zip(run["dim"].values, run["unit"].values, strict=True)]
+    assert identity["parameters"]
+    save_run(run.assign_attrs(identity=json.dumps({**identity, "parameters": renamed})), file)
+    assert part.count_left() == 1
 
 
 def test_films_of_other_nodes_go_when_the_slice_changes(small: Path) -> None:
