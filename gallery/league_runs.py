@@ -94,13 +94,12 @@ def _median(members: Sequence[Run], budget: int) -> xr.Dataset:
     """Return the improvements of the run of median final loss, of two the better, with points as exact as kept."""
     final = np.array([best_so_far(run.data["loss"].to_numpy()[:budget])[-1] for run in members])
     order = np.argsort(np.where(np.isfinite(final), final, np.inf), kind="stable")
-    data = members[order[(len(members) - 1) // 2]].data.isel(evaluation=slice(budget))
-    rows = lowered(best_so_far(data["loss"].to_numpy()))
-    about = _about(data.assign_attrs({IMPROVEMENTS_OF: data.sizes["evaluation"]}))
-    data = data.isel(evaluation=rows)
-    places = _places(data["x"].to_numpy(), np.array(about["lower"]), np.array(about["upper"]))
+    whole = members[order[(len(members) - 1) // 2]].data.isel(evaluation=slice(budget))
+    rows = lowered(best_so_far(whole["loss"].to_numpy()))
+    data = whole.isel(evaluation=rows).assign_attrs({IMPROVEMENTS_OF: whole.sizes["evaluation"]})
+    places = _places(data["x"].to_numpy(), *(np.array(data.attrs[name]) for name in ("lower", "upper")))
     loss = data["loss"].to_numpy().astype(np.float32)
-    return _table(places, loss, data["kind"].to_numpy(), rows + 1, about)
+    return _table(places, loss, data["kind"].to_numpy(), rows + 1, _about(data))
 
 
 def _about(data: xr.Dataset) -> dict[str, Any]:

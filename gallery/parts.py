@@ -246,21 +246,21 @@ class SearchPart(FigurePart):
         return self._where / f"{method}-0{RUN_SUFFIX}"
 
     def _missing(self) -> list[str]:
-        """Return the methods without a run that is at the figure's fidelity and over its slice's parameters."""
+        """Return the methods without a run at the figure's fidelity that its slice's page would show."""
         from ..landscapes.identity import stored_identity
         from ..landscapes.storage.paths import is_slice
         from ..landscapes.storage.store import SliceStore
-        from .runs import open_run
+        from .runs import open_run, searched
 
         fidelity, store = self._scene().fidelity, self.folder / STORE
-        over = SliceStore.open(store).identity["parameters"] if is_slice(store) else None
+        cut = SliceStore.open(store).identity if is_slice(store) else None
 
-        def fits(run: xr.Dataset | None) -> bool:
-            if run is None or fidelity not in (None, run.attrs["fidelity"]):
-                return False
-            return over in (None, stored_identity(run)["parameters"])
+        def fits(run: xr.Dataset) -> bool:
+            own = cut is None or searched(stored_identity(run), cut)
+            return own and fidelity in (None, run.attrs["fidelity"])
 
-        return [method for method in METHODS if not fits(read_if_sound(open_run, self._file(method)))]
+        runs = {method: read_if_sound(open_run, self._file(method)) for method in METHODS}
+        return [method for method, run in runs.items() if run is None or not fits(run)]
 
 
 def _same(figure: Figure, identity: Mapping[str, Any]) -> bool:

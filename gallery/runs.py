@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -38,3 +39,11 @@ def open_run(path: Path) -> xr.Dataset:
         if lost := COLUMNS.keys() - table.variables.keys():
             raise ValueError(f"it lacks {', '.join(sorted(lost))}")
     return table
+
+
+def searched(run: Mapping[str, Any], slice_: Mapping[str, Any]) -> bool:
+    """Whether a run searched a slice's scene; an option that one of them was made without does not tell them apart."""
+    ours, theirs = run.get("options", {}), slice_.get("options", {})
+    shared = set(ours) & set(theirs)
+    same = run["objective"] == slice_["objective"] and run["parameters"] == slice_["parameters"]
+    return same and all(ours[name] == theirs[name] for name in shared)

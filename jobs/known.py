@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -30,10 +31,14 @@ def best_of_league(env: Environment) -> tuple[Tensor, float] | None:
         return None
     with reading(path, "delete it, and `landscape gallery compute --part league` makes it anew"):
         found = SceneStandings.of_record(read_json(path))
-    same = found.identity.get("options") == plain_json(asdict(env.options), "options")
-    if found.best is None or not same or len(found.best.x) != env.space.dim:
+    if found.best is None or not has_options(found.identity, env) or len(found.best.x) != env.space.dim:
         return None
     return torch.tensor(found.best.x, dtype=torch.float64), found.best.loss
+
+
+def has_options(identity: Mapping[str, Any], env: Environment) -> bool:
+    """Say whether what has this identity was made with the environment's options."""
+    return bool(identity.get("options") == plain_json(asdict(env.options), "options"))
 
 
 def league_file(env: str) -> Path:

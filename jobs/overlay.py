@@ -18,7 +18,7 @@ from ..landscapes.slice import Slice
 from ..landscapes.storage.files import tidy, visible_files
 from ..landscapes.storage.paths import slice_exists
 from ..landscapes.storage.store import open_slice
-from .folder import OVERLAY, ROOT, SLICE_STORE, folder_named
+from .folder import OVERLAY, ROOT, SLICE_STORE, folder_named, run_tables
 from .scene import environment_of, named_point
 from .slice import SliceJob
 from .watch import Watch, resumable
@@ -61,20 +61,25 @@ class Cut:
     def plane(self, present: Plane, tables: Sequence[xr.Dataset], objective: Objective) -> Plane:
         """Return the plane of the new slice: parallel to the one that is present, or the runs' principal one.
 
-        Raises ValueError where there is no such point of the objective to go through.
+        Raises ValueError where there is no such point of the objective to go through, and where the run it goes through
+        searched another number of parameters.
         """
         shape = (self.resolution,) * present.rank if self.resolution else present.resolution
-        point = self._point(tables, objective) if self.through else None
+        point = None
+        if self.through:
+            point = self._point(self.through, tables, objective)
+            if len(point) != present.dim:
+                raise ValueError(f"{self.through} searched {len(point)} parameters; the slice has {present.dim}")
         if self.principal:
             return principal_plane(tables, resolution=shape, through=point)
         assert point is not None  # as one of the two is asked for
         return replace(present.shift_to(point), resolution=shape)
 
-    def _point(self, tables: Sequence[xr.Dataset], objective: Objective) -> Tensor:
-        assert self.through is not None  # or nothing asks for it
-        if self.through == BEST:
+    @staticmethod
+    def _point(through: str, tables: Sequence[xr.Dataset], objective: Objective) -> Tensor:
+        if through == BEST:
             return best_point(tables)[0]
-        return named_point(objective, f"{BEST}:{self.through}" if Path(self.through).is_dir() else self.through)
+        return best_point(run_tables([through]))[0] if Path(through).is_dir() else named_point(objective, through)
 
 
 @dataclass(frozen=True)

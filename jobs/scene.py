@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -168,10 +168,9 @@ def _known_runs(env: Environment, *, needed: bool) -> list[xr.Dataset]:
     Raises ValueError for none, if it is `needed`.
     """
     from ..landscapes.identity import stored_identity
-    from ..landscapes.plain import plain_json
     from .folder import LEAGUE, ROOT
+    from .known import has_options
 
-    ours = plain_json(asdict(env.options), "options")
     found = list[Any]()
     races = ROOT.glob(f"{LEAGUE.kind}-*/*")  # of leagues, one folder deeper than others
     for folder in sorted(path for path in (*ROOT.glob("*"), *races) if path.is_dir()):
@@ -179,7 +178,7 @@ def _known_runs(env: Environment, *, needed: bool) -> list[xr.Dataset]:
             runs = runs_in(env, str(folder))
         except ValueError:
             continue  # no run, or one of another environment
-        found += [run for run in runs if stored_identity(run).get("options") == ours]
+        found += [run for run in runs if has_options(stored_identity(run), env)]
     if needed and not found:
         raise ValueError(
             f"no run of {env.name} with these options is known under {ROOT}/; `landscape optimize {env.name}` makes one"

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -14,7 +13,7 @@ from ...landscapes.identity import stored_identity, stored_provenance
 from ...landscapes.objective import Status
 from ...landscapes.overlay import improvements, lay
 from ..files import RUN_SUFFIX, RUNS
-from ..runs import open_run
+from ..runs import open_run, searched
 from .manifest import Trajectory
 from .page_data import round_off
 
@@ -29,21 +28,13 @@ def lay_runs(dataset: xr.Dataset, tables: Sequence[xr.Dataset]) -> list[Trajecto
     """Lay the runs of a slice's environment and options over it, the least loss first."""
     from ...landscapes.draw.figures.overlay import farthest_distance
 
-    own = [table for table in tables if _same(stored_identity(table), stored_identity(dataset))]
+    own = [table for table in tables if searched(stored_identity(table), stored_identity(dataset))]
     runs = [lay(dataset, table, f"{table.attrs['method']}, seed {table.attrs['seed']}") for table in own]
     reach = farthest_distance(runs)
     points = sum(run.sizes["evaluation"] for run in runs)
     top = math.inf if "v" in dataset.dims else float(dataset["loss"].max())  # of what a line's map shows
     laid = [_trajectory(run, reach, points, top) for run in runs]
     return sorted(laid, key=lambda run: math.inf if run.best is None else run.best)
-
-
-def _same(run: Mapping[str, Any], slice_: Mapping[str, Any]) -> bool:
-    """Whether a run searched a slice's scene; an option that one of them was made without does not tell them apart."""
-    ours, theirs = run.get("options", {}), slice_.get("options", {})
-    shared = set(ours) & set(theirs)
-    same = run["objective"] == slice_["objective"] and run["parameters"] == slice_["parameters"]
-    return same and all(ours[name] == theirs[name] for name in shared)
 
 
 def _trajectory(run: xr.Dataset, reach: float, points: int, top: float) -> Trajectory:

@@ -143,6 +143,8 @@ def test_another_fidelity_is_drawn_with_a_warning(run: Callable[..., Said]) -> N
         ("overlay cut race --plane tsne", "--plane takes pca, the runs' principal plane; got 'tsne'"),
         ("overlay cut race --resolution 4", "give --through or --plane too"),
         ("overlay cut race --through nowhere", "got 'nowhere', which is none of these"),
+        ("overlay cut race --through small", "small searched 2 parameters; the slice has 3"),
+        ("overlay cut race --through best:small", "small holds no runs of bounce alone"),
         ("overlay cut race --out cut", "cut holds other files"),
     ],
 )
