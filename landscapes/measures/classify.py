@@ -71,7 +71,7 @@ def judge(found: Ruggedness, jumps: Jumps | None, average: float, uphill: float)
     if jumps is not None and len(jumps.height):
         share = jumps.share
         reasons.pop(VERY_SMOOTH, None)
-        reasons[DISCONTINUOUS] = f"{len(jumps.height)} jumps found, between {share.value:.1%} of neighbouring samples"
+        reasons[DISCONTINUOUS] = f"jumps found: {len(jumps.height)}, between {share.value:.1%} of neighbouring samples"
     return Verdict(reasons | _gradients(found, average, uphill))
 
 

@@ -31,7 +31,7 @@ Picture = NDArray[np.uint8]
 HEIGHT = 600  # of a frame [pixel]
 STRIP, STRIP_DPI = 0.4, 100  # height of what is over a film [inch], and how fine it is
 BAR = 0.25  # most of a frame's width that its scale takes
-LIKELY = (0.5, 1.6)  # narrowest and widest frame, its width per height
+LIKELY = (0.8, 1.6)  # narrowest and widest frame, its width per height
 AWAY_DISTANCE = 2.0  # from where on a target's surface is away from a body's particles, in their distances
 LONGEST, RATE = 100, 25  # most frames of a film, and how many of them a second
 EXTENT, CELLS = 3.0, 192  # of the ground in halves of the view's diagonal; of its shadow along each side
@@ -165,16 +165,17 @@ def _stage(view: View, shot: Shot) -> Iterator[pv.Plotter]:
 
 
 def _write_scale(plotter: pv.Plotter, shot: Shot) -> None:
-    """Write how long the scale's bar is, over its place at the lower right."""
+    """Write how long the scale's bar is, over its place at the lower right; it may be the wider of the two."""
     right, lift = materials.INSET
-    over = (shot.size[0] - right - round(shot.bar * shot.metre), lift + 2 * materials.THICK)
-    _stamp(plotter, f"{style.number(shot.bar)} m", "scale", over)
+    over = (shot.size[0] - right, lift + 2 * materials.THICK)
+    _stamp(plotter, f"{style.number(shot.bar)} m", "scale", over).justification_horizontal = "right"
 
 
-def _stamp(plotter: pv.Plotter, said: str, name: str, position: tuple[int, int]) -> None:
-    """Write on a picture, on a ground that lets little through."""
+def _stamp(plotter: pv.Plotter, said: str, name: str, position: tuple[int, int]) -> pv.TextProperty:
+    """Write on a picture, on a ground that lets little through, and return how it is written."""
     actor = plotter.add_text(said, name=name, position=position, **materials.STAMP)
     actor.prop.background_color, actor.prop.background_opacity = materials.BACKGROUND, materials.VEIL
+    return actor.prop
 
 
 def _draw_bar(picture: Picture, shot: Shot) -> None:
