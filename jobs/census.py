@@ -7,7 +7,6 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import cloudpickle
@@ -24,13 +23,9 @@ from .watch import PREPARING, Watch, resumable
 from .workers import recipe
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
-    from torch import Tensor
-
     from ..envs.base import Environment
     from ..landscapes.measures.census import CensusDesign, SurveyedSlice
     from ..landscapes.measures.census_record import Census
-    from ..landscapes.objective import Evaluation, Objective
     from ..landscapes.plane import Plane
     from ..landscapes.storage.checkpoint import Checkpoint
 
@@ -270,11 +265,8 @@ def _survey(env: Any, group: Sequence[tuple[str, Plane]], how: Mapping[str, Any]
     from ..landscapes.measures.census import survey
     from ..optim.meeting import Meeting, work_abreast
 
-    turn = Lock()  # measuring is for one thread at a time
-
     def work(piece: str, plane: Plane, meeting: Meeting) -> Piece:
-        with turn:
-            return piece, survey(_InTurn(meeting, turn), plane, **how).arrays()
+        return piece, survey(meeting, plane, **how).arrays()
 
     return work_abreast(env, [partial(work, *one) for one in group])
 
@@ -282,20 +274,3 @@ def _survey(env: Any, group: Sequence[tuple[str, Plane]], how: Mapping[str, Any]
 def _survey_there(there: bytes, group: Sequence[tuple[str, Plane]], how: Mapping[str, Any]) -> list[Piece]:
     """Survey slices on a worker, which keeps the environment that it has made."""
     return _survey(make_objective(there).objective, group, how)
-
-
-class _InTurn:
-    """An objective whose askers let others work while they wait for an answer."""
-
-    def __init__(self, objective: Objective, turn: Lock) -> None:
-        self._objective, self._turn = objective, turn
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._objective, name)
-
-    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
-        self._turn.release()
-        try:
-            return self._objective.evaluate(x, grad=grad)
-        finally:
-            self._turn.acquire()

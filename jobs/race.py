@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from ..optim.base import Optimizer
 
 PICTURE = RACE.picture
+WORTH = 100  # episodes left of a run; processes are not started for fewer
 Options = Mapping[str, Mapping[str, Any]]  # method -> name -> value, which may be text
 
 
@@ -152,7 +153,8 @@ class RaceJob:
             if self.executor:
                 self._distribute(self.executor, ratio, follow)
                 return
-            with processes(self.workers):
+            most = max(map(self._count_left, self.competitors))
+            with processes(self.workers if most > WORTH else 1):
                 race(self.env, self.competitors, budget=self.budget, gradient_cost=ratio, progress=follow)
 
     def _distribute(

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ..landscapes.objective import Evaluation, Objective, name_of
 from ..landscapes.sampling.memory import MemoryBound
+from .turns import Turns, aside
 
 Key = tuple[str, int]  # what is asked, and of which kind
 T = TypeVar("T")
@@ -44,7 +45,7 @@ class Meeting:
     Once all `members` wait, the thread that calls `serve` answers them: it evaluates the points of all who want the
     same in one batch, in the order of the members' numbers, given an objective whose rows do not depend on their batch.
     So the objective itself is only ever used by that thread. A member says by `seat` who it is, and leaves when it has
-    ended.
+    ended. Between its questions it works while the others wait.
     """
 
     def __init__(self, objective: Objective, members: int) -> None:
@@ -53,7 +54,8 @@ class Meeting:
         self._bound = MemoryBound(objective)
         self._present = members
         self._questions: dict[int, _Question] = {}
-        self._own = threading.local()  # of each thread: its number, and how long it has waited for others [s]
+        self._own = threading.local()  # of each thread: its number, and how long it has waited for answers [s]
+        self._turns = Turns()
         self._ended = False
         self._changed = threading.Condition()  # on which the thread that serves waits
 
@@ -62,11 +64,13 @@ class Meeting:
         return getattr(self.objective, name)
 
     def seat(self, number: int) -> None:
-        """Give the thread that calls this its number, by which points are ordered in a batch."""
+        """Give the thread that calls this its number, by which points are ordered in a batch, and its first turn."""
         self._own.number, self._own.waited = number, 0.0
+        self._turns.take()
 
     def leave(self) -> None:
         """Take the thread that calls this out of the meeting: nobody waits for it any more."""
+        self._turns.give()
         with self._changed:
             self._present -= 1
             self._changed.notify_all()
@@ -80,7 +84,7 @@ class Meeting:
 
     def clock(self) -> float:
         """Return a time [s] that passes while the calling thread works, and by its share of what a batch takes."""
-        return time.perf_counter() - float(self._own.waited)
+        return time.perf_counter() - float(self._own.waited) - self._turns.waited
 
     def prepare(self) -> None:
         """Do nothing: the thread that serves has prepared the objective."""
@@ -142,10 +146,11 @@ class Meeting:
             self._questions[self._own.number] = question
             if len(self._questions) == self._present:
                 self._changed.notify_all()
-        question.settled.wait()
+        with aside():
+            question.settled.wait()
+            self._own.waited += time.perf_counter() - began - question.seconds
         if question.answer is None:
             raise MeetingEnded
-        self._own.waited += time.perf_counter() - began - question.seconds
         return question.answer
 
 

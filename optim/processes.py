@@ -13,6 +13,8 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from .turns import aside
+
 if TYPE_CHECKING:
     import numpy as np
 
@@ -51,7 +53,9 @@ def compute(function: Callable[..., Result], *arguments: Any) -> Result:
     """Return what a function of a module returns, computed by a process if there are any, and here otherwise."""
     global _seconds
     if _pools:
-        return _pool().submit(function, *arguments).result()
+        found = _pool().submit(function, *arguments)
+        with aside():
+            return found.result()
     began = time.perf_counter()
     result = function(*arguments)
     _seconds += time.perf_counter() - began

@@ -29,7 +29,6 @@ Rows = NDArray[np.intp]
 ARRAYS = 16  # of points x points: ten that a process makes (measured with BoTorch 0.16), and factors kept
 FIT_POINTS = 300  # points to fit hyper-parameters to, spread over the run: each step's cost grows with their cube
 LEAST_SPREAD = 1e-8  # of losses that are put in deviations from their average, as in BoTorch's `Standardize`
-WORTH = 100  # points of a process from which on handing it to another process is worth while
 
 
 @dataclass(frozen=True)
@@ -100,8 +99,6 @@ class Surrogate:
         """Return where mean - coefficient * standard deviation is least, shape (dim,); a random point before."""
         if not self.informed:
             return np.asarray(random.uniform(-1.0, 1.0, self.z.shape[1]))
-        if len(self.loss) < WORTH:
-            return _minimise(self, random)[0]
         least, learnt = compute_drawing(random, _minimise, self)
         self.restore(learnt)
         return least

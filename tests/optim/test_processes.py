@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from gradscape.optim.methods.surrogate import WORTH, Surrogate, SurrogateOptions
+from gradscape.optim.methods.surrogate import Surrogate, SurrogateOptions
 from gradscape.optim.processes import compute, processes
+
+KNOWN = 30
 
 
 def informed() -> Surrogate:
     surrogate = Surrogate(2, SurrogateOptions())
-    z = np.random.default_rng(1).uniform(-1.0, 1.0, (WORTH, 2))
+    z = np.random.default_rng(1).uniform(-1.0, 1.0, (KNOWN, 2))
     surrogate.add(z, np.sin(5.0 * z).sum(axis=1))
     return surrogate
 
@@ -32,7 +34,7 @@ def test_a_process_computes_the_same_bits_and_what_it_has_learnt_comes_back(core
         found = [there.minimise(random[1]) for _ in range(2)]
     np.testing.assert_array_equal(found, wanted)
     one, other = (surrogate.state() for surrogate in (here, there))
-    assert one["fitted"] == other["fitted"] == WORTH
+    assert one["fitted"] == other["fitted"] == KNOWN
     assert all(np.array_equal(one["hyper"][name], other["hyper"][name]) for name in one["hyper"])
     assert random[0].bit_generator.state == random[1].bit_generator.state
     assert compute(os.getpid) == os.getpid()

@@ -152,6 +152,7 @@ def test_seconds_are_a_runs_own_and_its_share_of_each_batch():
     clock = SimpleNamespace(perf_counter=lambda: now[0])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gradscape.optim.meeting.time", clock)
+        patch.setattr("gradscape.optim.turns.time", clock)
         entries = field()
         race(Slow(), entries, budget=BUDGET, gradient_cost=2.0)
     for entry in entries:
