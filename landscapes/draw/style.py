@@ -97,7 +97,7 @@ FAILED_MARK: dict[str, Any] = {"marker": "x", "s": 18.0, "linewidths": 0.9, "col
 BORDER: dict[str, Any] = {"s": 20.0, "facecolors": "none", "linewidths": 0.8, "zorder": 3.2, "clip_on": False}
 
 _MAP: dict[str, Any] = {"origin": "lower", "aspect": "auto", "interpolation": "nearest", "rasterized": True}
-COSINE: dict[str, Any] = _MAP | {"cmap": colormaps["RdBu"], "vmin": -1.0, "vmax": 1.0}  # of a gradient and a slope
+COSINE: dict[str, Any] = {"cmap": colormaps["RdBu"], "vmin": -1.0, "vmax": 1.0}  # of a gradient and a slope
 DIFFERENCE_MAP: Colormap = colormaps["PuOr_r"]  # of two losses: orange where the second is higher
 DISAGREEMENT: dict[str, Any] = _MAP | {"cmap": colormaps["cividis"], "vmin": 0.0, "vmax": 1.0}  # of two estimates
 NO_SLOPE: dict[str, Any] = {"facecolor": "#dcdcdc", "linewidth": 0.0}  # no slope above the noise

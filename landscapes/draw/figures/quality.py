@@ -15,7 +15,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from ...identity import plane_of
+from ...identity import gradient_stride, plane_of, stored_identity
+from ...lattice import with_gradients
 from ...measures.gradient_quality import disagreement, find_bias, scale_table
 from ...measures.ruggedness import box_slopes
 from .. import style
@@ -84,9 +85,11 @@ def _signs(sheet: style.Sheet, dataset: xr.Dataset) -> list[Artist]:
 
 
 def _cosine_map(ax: Axes, dataset: xr.Dataset, found: xr.Dataset, *, last: bool) -> None:
-    plane, cosine = plane_of(dataset), found["cosine"].to_numpy()
+    """Draw the cosines with differences over one scale, each as wide as those that have a gradient are apart."""
+    plane, some, every = plane_of(dataset), with_gradients(dataset), gradient_stride(stored_identity(dataset))
+    cosine = found["cosine"].to_numpy()[::every, ::every]
     ax.set_facecolor(style.NO_SLOPE["facecolor"])
-    drawn = ax.imshow(np.ma.masked_invalid(cosine), extent=_extent(dataset), **style.COSINE)
+    drawn = ax.pcolormesh(*contour.cell_edges(some), np.ma.masked_invalid(cosine), rasterized=True, **style.COSINE)
     contour.frame(ax, dataset, plane)
     panel.name_axes(ax, plane.labels[0])
     seen = cosine[np.isfinite(cosine)]
@@ -198,8 +201,3 @@ def _slope_label(dataset: xr.Dataset) -> str:
 
 def _percent(share: xr.DataArray) -> str:
     return f"{style.number(100 * float(share), '.2g')}\N{NO-BREAK SPACE}%"
-
-
-def _extent(dataset: xr.Dataset) -> tuple[float, float, float, float]:
-    low, high = (end.tolist() for end in plane_of(dataset).cell_bounds())
-    return low[0], high[0], low[1], high[1]

@@ -10,8 +10,10 @@ from gradscape.landscapes.draw import style
 from gradscape.landscapes.draw.figures.labels import Name, place
 from gradscape.landscapes.draw.figures.page import Picture
 from gradscape.landscapes.draw.figures.quality import quality_figure
+from gradscape.landscapes.sampling.fill import sample
 
-from .test_page import PLANE, quality
+from .test_contour import Bowl, plane
+from .test_page import PLANE, dated, quality
 
 
 @pytest.mark.parametrize(
@@ -47,6 +49,22 @@ def test_a_mean_that_rounds_to_zero_is_written_without_a_sign_and_titles_keep_ap
         row.sort(key=lambda box: box.x0)
         for left, right in itertools.pairwise(row):
             assert right.x0 - left.x1 > 0.02 * figure.bbox.width  # room enough to tell them apart
+
+
+def test_cosines_are_as_wide_as_gradients_are_apart() -> None:
+    """Grey says that there is no slope above the noise, and not that there is no gradient."""
+    every = 4
+    figure = quality_figure(*quality(dated(sample(Bowl(), plane(33, 33), gradients=every))))
+    maps = [ax for ax in figure.axes if "differences over" in ax.get_title()]
+    assert len(maps) == 3
+    mesh = maps[0].collections[0]
+    shown = np.ma.getmaskarray(mesh.get_array())
+    assert shown.shape == (9, 9)
+    assert not shown[1:5, 1:-1].any()  # above, episodes fail
+    low, high = maps[0].get_xlim()
+    edges = np.asarray(mesh.get_coordinates())[0, :, 0]
+    assert (edges[0], edges[-1]) == pytest.approx((low, high))
+    assert np.diff(edges)[1:-1] == pytest.approx(every * (high - low) / 33)
 
 
 def panel(*, side: float = 4.0):
