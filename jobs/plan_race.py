@@ -14,6 +14,7 @@ from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.space import as_whole
 from ..landscapes.threads import one_torch_thread
 from ..optim.memory import SearchSize, run_need
+from ..optim.processes import worth_starting
 from ..optim.race import ABREAST
 from ..optim.registry import optimizer_class
 from ..optim.rehearsal import BLOCK, Rehearsal, rehearse
@@ -215,6 +216,7 @@ def plan_race(
 
     `makers` make each method. Raises ValueError where nothing is known of a `device` other than the environment's.
     """
+    workers = worth_starting(workers, max((max(runs, default=0) for runs in left.values()), default=0))
     with TemporaryDirectory() as folder:
         rehearsed = {}
         for method, make in makers.items():

@@ -19,7 +19,7 @@ from ..landscapes.storage.files import clear, tidy, visible_files, write_json
 from ..landscapes.storage.ownership import refuse_others
 from ..landscapes.threads import one_torch_thread
 from ..optim.claims import Claims, check_claims
-from ..optim.processes import processes
+from ..optim.processes import processes, worth_starting
 from ..optim.race import Competitor, Race, name_seeds, race
 from ..optim.registry import optimizer_class
 from ..optim.runs.store import RunStore
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from ..optim.base import Optimizer
 
 PICTURE = RACE.picture
-WORTH = 100  # episodes left of a run; processes are not started for fewer
 Options = Mapping[str, Mapping[str, Any]]  # method -> name -> value, which may be text
 
 
@@ -154,7 +153,7 @@ class RaceJob:
                 self._distribute(self.executor, ratio, follow)
                 return
             most = max(map(self._count_left, self.competitors))
-            with processes(self.workers if most > WORTH else 1):
+            with processes(worth_starting(self.workers, most)):
                 race(self.env, self.competitors, budget=self.budget, gradient_cost=ratio, progress=follow)
 
     def _distribute(

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
+WORTH = 100  # episodes left of a run; processes are not started for fewer
+
 _pools: list[ProcessPoolExecutor] = []  # of one process each
 _turns = itertools.count()  # of threads that compute for the first time
 _seat = threading.local()  # of each thread: its turn
@@ -47,6 +49,11 @@ def processes(count: int) -> Iterator[None]:
             pool.shutdown(wait=False, cancel_futures=True)
         for pool in pools:
             pool.shutdown()
+
+
+def worth_starting(count: int, episodes: int) -> int:
+    """Return how many of `count` processes are worth starting for runs that have so many episodes left at most."""
+    return count if episodes > WORTH else 1
 
 
 def compute(function: Callable[..., Result], *arguments: Any) -> Result:

@@ -132,9 +132,8 @@ def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None)
     quiver = ax.quiver(
         u[seen], v[seen], steps[seen, 0], steps[seen, 1], logarithm[at][seen],
         cmap=style.SLOPE_MAP, norm=scale.norm, pivot="mid", angles="xy", scale_units="xy", scale=1.0, **style.ARROW,
+        clip_on=False, in_layout=False,  # one at the border reaches half its length beyond it
     )  # fmt: skip
-    quiver.set_clip_on(False)  # one at the border reaches half its length beyond it
-    quiver.set_in_layout(False)
     bar = panel.colour_bar(ax, quiver, label, scale)
     bar.ax.set_visible(bool(seen.any()))  # hidden rather than left out, so that both panels keep their width
     if not flat.any():
