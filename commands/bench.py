@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from ..jobs.bench import BatchRate, Bench, KernelTable
+    from ..jobs.roofline import Roof
     from .terminal import Console
 
 
@@ -26,6 +27,9 @@ def bench(
         typer.Option(min=1, help="Episodes at once; may be repeated. By default 1 and what the environment prefers."),
     ] = None,
     seconds: Annotated[float, typer.Option(min=0.0, help="How long to time each batch size, about.")] = 10.0,
+    roofline: Annotated[
+        bool, typer.Option(help="Hold each kernel against what the device moves and calculates at best, as measured.")
+    ] = False,
     json_: Json = False,
 ) -> None:
     """Measure episodes per second, forward and with gradient, and what they are spent on; nothing is written.
@@ -41,7 +45,8 @@ def bench(
     from ..jobs.bench import BenchJob
     from .terminal import Bars, Console, command_line, print_json
 
-    job = BenchJob.of(scene, against=against, batches=sorted(set(batch or [])), seconds=seconds)
+    how = {"against": against, "batches": sorted(set(batch or [])), "seconds": seconds, "roofline": roofline}
+    job = BenchJob.of(scene, **how)
     found = job.run(Bars())
     if json_:
         print_json(found.record(), command=command_line())
@@ -61,6 +66,9 @@ def show(found: Bench, console: Console) -> None:
             console.print(f"batch {rate.batch}, {rate.engine}: {rate.failed} episodes failed", highlight=False)
     if found.kernels and found.kernels["forward"].kernels:
         console.print(_kernels(*found.kernels.values()))
+        if found.roof is not None:
+            console.print(_roofline(found.kernels["with_gradient"], found.roof))
+            console.print(_against(found.kernels["with_gradient"], found.roof), highlight=False)
     if one := found.adapter:
         console.print(
             f"a batch of {one.batch}: {one.forward:.1%} of the time is not the engine's own program, "
@@ -117,6 +125,29 @@ def _kernels(forward: KernelTable, sloped: KernelTable) -> Table:
     cells = [_format_time(left, left / way.seconds) for left, way in zip(rest, (forward, sloped), strict=True)]
     shown.add_row("outside kernels", *cells[0], *cells[1])
     return shown
+
+
+def _roofline(sloped: KernelTable, roof: Roof) -> Table:
+    """Return what kernels had to move and to calculate as a table, slowest first, and what that is of the roof."""
+    from .terminal import table
+
+    shown = table("kernel, with gradient", "GB/s", "Gflop/s", "of the roof", "limit")
+    for row in sloped.kernels:
+        moved, flops, of_roof = row.bytes or 0, row.flops or 0.0, row.of_roof or 0.0
+        memory = moved / roof.bytes_per_second >= flops / roof.flops_per_second
+        rates = [f"{amount / row.seconds / 1e9:,.3g}" for amount in (moved, flops)]
+        shown.add_row(row.name, *rates, f"{of_roof:.1%}", "memory" if memory else "flops")
+    return shown
+
+
+def _against(sloped: KernelTable, roof: Roof) -> str:
+    """Return in a line what the roof is, and what share of their time all kernels would take there."""
+    spent = sum(row.seconds for row in sloped.kernels)
+    least = sum(row.seconds * (row.of_roof or 0.0) for row in sloped.kernels)
+    return (
+        f"the roof, measured: {roof.bytes_per_second / 1e9:,.3g} GB/s, {roof.flops_per_second / 1e9:,.3g} Gflop/s; "
+        f"at it all kernels would take {least / spent:.1%} of their time"
+    )
 
 
 def _format_time(seconds: float, share: float) -> tuple[str, str]:

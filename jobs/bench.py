@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..envs.base import Environment, Work
 from ..envs.engines import find_engine
-from ..envs.engines.profiling import count_compiled_modules, time_kernels
+from ..envs.engines.profiling import count_compiled_modules, count_demands, time_kernels
 from ..envs.engines.runtime import cores, device_names, free_memory
 from ..landscapes.capacity import Need, require
 from ..landscapes.cost import duration
@@ -25,6 +25,7 @@ from ..landscapes.objective import Evaluation, Status
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.fill import sample
 from ..landscapes.storage.store import SliceStore
+from .roofline import Roof, measure_roof
 from .scene import SceneSpec
 from .watch import Watch
 
@@ -87,12 +88,19 @@ class BatchRate:
 
 @dataclass(frozen=True)
 class KernelSeconds:
-    """Say how often a kernel was launched, the seconds it took altogether, and their share of the time that passed."""
+    """Say how often a kernel was launched, the seconds it took altogether, and their share of the time that passed.
+
+    With a roofline, also the `bytes` it had to move and its operations [flop] at least, and what share of its time
+    these take at the roof; None without.
+    """
 
     name: str
     calls: int
     seconds: float
     share: float
+    bytes: int | None = None
+    flops: float | None = None
+    of_roof: float | None = None
 
 
 @dataclass(frozen=True)
@@ -139,7 +147,8 @@ class Bench:
     """Hold what was measured of an environment; fields are called as `landscape bench --json` has them.
 
     `start` is by engine, `kernels` by way (forward, with_gradient), None of other engines than Warp. Ratios are of the
-    largest batch, None without another engine. `adapter` is None of engines whose programs are our own.
+    largest batch, None without another engine. `adapter` is None of engines whose programs are our own, `roof` where it
+    was not asked for.
     """
 
     env: str
@@ -159,6 +168,7 @@ class Bench:
     kernels: dict[str, KernelTable] | None
     sampler: SamplerShare
     adapter: AdapterShare | None = None
+    roof: Roof | None = None
 
     def record(self) -> dict[str, Any]:
         """Return it as plain JSON."""
@@ -170,7 +180,7 @@ class BenchJob:
     """An environment to measure on an engine, in turn with another one if `against` names it.
 
     `make` returns the environment for an engine. Each of `batches` (1 and the preferred one by default) is timed for
-    about so many `seconds`.
+    about so many `seconds`. With `roofline`, kernels are held against what the device can do at best.
     """
 
     make: Callable[[str], Environment]
@@ -178,6 +188,7 @@ class BenchJob:
     against: str | None = None
     batches: Sequence[int] = ()
     seconds: float = 10.0
+    roofline: bool = False
 
     @classmethod
     def of(cls, scene: SceneSpec, **how: Any) -> BenchJob:
@@ -196,6 +207,7 @@ class BenchJob:
         """
         watch = watch or Watch()
         with watch.busy("preparing") as say:
+            roof = self._measure_roof(say) if self.roofline else None
             envs, starts = _start_engines(self.make, self.engine, self.against, say)
             env = envs[self.engine]
             for batch in self.batches:
@@ -207,7 +219,7 @@ class BenchJob:
                 say(f"timing batches of {batch}")
                 rates += _time_batch(envs, _points(env, batch), self.seconds)
             say("timing kernels")
-            kernels = _time_kernels(env) if find_engine(self.engine).profiled else None
+            kernels = _time_kernels(env, roof) if find_engine(self.engine).profiled else None
             adapter = _time_adapter(env, self.seconds)
             say("timing the sampler")
             own = [rate.with_gradient.episodes_per_second for rate in rates if rate.engine == self.engine]
@@ -231,7 +243,16 @@ class BenchJob:
             kernels=kernels,
             sampler=sampler,
             adapter=adapter,
+            roof=roof,
         )
+
+    def _measure_roof(self, follow: Callable[[str], None]) -> Roof:
+        """Measure the device before an engine takes its memory."""
+        if not find_engine(self.engine).profiled:
+            raise ValueError(f"--roofline reads Warp's kernels, of which {self.engine} has none; name another engine")
+        env = self.make(self.engine)
+        follow(f"measuring what {env.device} does at best")
+        return measure_roof(env.device, env.fidelity.precision)
 
 
 def _need(env: Environment, batch: int) -> Need:
@@ -332,7 +353,7 @@ def _time_adapter(env: Environment, seconds: float) -> AdapterShare | None:
     return AdapterShare(len(points), **shares)
 
 
-def _time_kernels(env: Environment) -> dict[str, KernelTable]:
+def _time_kernels(env: Environment, roof: Roof | None) -> dict[str, KernelTable]:
     """Return the time by kernel, forward and with gradient, of the rows that one solver takes at once.
 
     They run on one thread: what several launch at a time adds up to more than the time that passes.
@@ -346,8 +367,24 @@ def _time_kernels(env: Environment) -> dict[str, KernelTable]:
             env._simulate(points, grad=grad)
             wall = time.perf_counter() - began
         slowest = sorted(times.items(), key=lambda item: -item[1].seconds)
-        rows = (KernelSeconds(name, one.calls, one.seconds, one.seconds / wall) for name, one in slowest)
+        rows = [KernelSeconds(name, one.calls, one.seconds, one.seconds / wall) for name, one in slowest]
+        if roof is not None:
+            rows = _hold_against(roof, rows, env, points, grad=grad)
         found[way] = KernelTable(len(points), wall, tuple(rows))
+    return found
+
+
+def _hold_against(
+    roof: Roof, rows: Sequence[KernelSeconds], env: Environment, points: Tensor, *, grad: bool
+) -> list[KernelSeconds]:
+    """Simulate once more, and say what the kernels had to do."""
+    with count_demands() as demands:
+        env._simulate(points, grad=grad)
+    found = []
+    for row in rows:
+        moved, flops = demands[row.name]
+        of_roof = roof.seconds(moved, flops) / row.seconds
+        found.append(replace(row, bytes=moved, flops=flops, of_roof=of_roof))
     return found
 
 
