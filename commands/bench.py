@@ -13,7 +13,8 @@ from .arguments import Json, takes_scene
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from ..jobs.bench import BatchRate, Bench, KernelTable
+    from ..jobs.bench import BatchRate, Bench
+    from ..jobs.kernel_times import KernelTable
     from ..jobs.roofline import Roof
     from .terminal import Console
 

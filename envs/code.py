@@ -4,12 +4,16 @@ It is taken of the scene's own file and of every file of this folder that it imp
 comments, docstrings and import lines. Other scenes, the other engine, and what no loss depends on do not count: a file
 that says `COMPUTES_LOSSES = False`, and the hooks by which scenes are drawn and described. Nor do settings count that a
 record holds beside the digest: fidelities, and by which options parts of the model are left out.
+
+Code that was measured to compute the same numbers as older code, to the last bit, has the digest of that:
+`python -m benchmarks.same_numbers` writes `same_numbers.json`.
 """
 
 from __future__ import annotations
 
 import ast
 import hashlib
+import json
 from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
@@ -20,6 +24,7 @@ from .engines import find_engine
 COMPUTES_LOSSES = False  # of this file too
 
 HERE = Path(__file__).resolve().parent
+SAME_NUMBERS = HERE / "same_numbers.json"
 # Hooks of a scene that no loss depends on.
 DESCRIBING = frozenset({"about", "episode", "events", "memory", "work", "_energy", "_observe"})
 COMPILING = frozenset({"_compile_ahead"})  # earlier than it would be, and the same
@@ -30,7 +35,23 @@ NO_LOSS = DESCRIBING | DRAWING | COMPILING | SETTINGS
 
 @cache
 def code_digest(kind: type, engine: str = "warp") -> str:
-    """Return a digest of the code that the numbers of an environment's class come from, on an engine."""
+    """Return a digest of the code that the numbers of an environment's class come from, on an engine.
+
+    It is that of the oldest code that computes the same numbers, as far as that was measured.
+    """
+    own = own_digest(kind, engine)
+    return _numbers_of().get(own, own)
+
+
+@cache
+def _numbers_of() -> dict[str, str]:
+    """Return digests of older code by those of code that computes the same numbers."""
+    return {new: str(one["numbers_of"]) for new, one in json.loads(SAME_NUMBERS.read_text()).items()}
+
+
+@cache
+def own_digest(kind: type, engine: str = "warp") -> str:
+    """Return a digest of the code itself, whatever older code computed the same numbers."""
     family = kind.own_classes() if hasattr(kind, "own_classes") else (kind,)
     own = dict.fromkeys(file for one in family if (file := file_of(one)))
     ours = [file for file in own if file.is_relative_to(HERE)]

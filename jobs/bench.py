@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..envs.base import Environment, Work
 from ..envs.engines import find_engine
-from ..envs.engines.profiling import count_compiled_modules, count_demands, time_kernels
+from ..envs.engines.profiling import count_compiled_modules
 from ..envs.engines.runtime import cores, device_names, free_memory
 from ..landscapes.capacity import Need, require
 from ..landscapes.cost import duration
@@ -25,12 +25,12 @@ from ..landscapes.objective import Evaluation, Status
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.fill import sample
 from ..landscapes.storage.store import SliceStore
+from .kernel_times import WAYS, KernelTable, tabulate_kernels
 from .roofline import Roof, measure_roof
 from .scene import SceneSpec
 from .watch import Watch
 
 K = TypeVar("K")
-WAYS = {"forward": False, "with_gradient": True}
 LEAST = 2  # repetitions of everything, whatever they take
 ADAPTED = 256  # episodes that an engine's own program is timed for
 SMALL = 64  # points along each axis of the sampler's slice, at most
@@ -84,32 +84,6 @@ class BatchRate:
     def record(self) -> dict[str, Any]:
         """Return it as plain JSON, which has ratios only where there are any."""
         return {name: value for name, value in asdict(self).items() if value is not None}
-
-
-@dataclass(frozen=True)
-class KernelSeconds:
-    """Say how often a kernel was launched, the seconds it took altogether, and their share of the time that passed.
-
-    With a roofline, also the `bytes` it had to move and its operations [flop] at least, and what share of its time
-    these take at the roof; None without.
-    """
-
-    name: str
-    calls: int
-    seconds: float
-    share: float
-    bytes: int | None = None
-    flops: float | None = None
-    of_roof: float | None = None
-
-
-@dataclass(frozen=True)
-class KernelTable:
-    """Hold the kernels of one batch, slowest first, which took so many `seconds` altogether."""
-
-    batch: int
-    seconds: float
-    kernels: tuple[KernelSeconds, ...]
 
 
 @dataclass(frozen=True)
@@ -219,7 +193,8 @@ class BenchJob:
                 say(f"timing batches of {batch}")
                 rates += _time_batch(envs, _points(env, batch), self.seconds)
             say("timing kernels")
-            kernels = _time_kernels(env, roof) if find_engine(self.engine).profiled else None
+            rows = _points(env, env._rows_per_part(env.preferred_batch))
+            kernels = tabulate_kernels(env, rows, roof) if find_engine(self.engine).profiled else None
             adapter = _time_adapter(env, self.seconds)
             say("timing the sampler")
             own = [rate.with_gradient.episodes_per_second for rate in rates if rate.engine == self.engine]
@@ -351,41 +326,6 @@ def _time_adapter(env: Environment, seconds: float) -> AdapterShare | None:
         times = alternate(calls, seconds)
         shares[way] = max(0.0, 1 - min(times["engine"]) / min(times["ours"]))
     return AdapterShare(len(points), **shares)
-
-
-def _time_kernels(env: Environment, roof: Roof | None) -> dict[str, KernelTable]:
-    """Return the time by kernel, forward and with gradient, of the rows that one solver takes at once.
-
-    They run on one thread: what several launch at a time adds up to more than the time that passes.
-    """
-    points = _points(env, env._rows_per_part(env.preferred_batch))
-    env._simulate(points, grad=True)
-    found = {}
-    for way, grad in WAYS.items():
-        with time_kernels(env.device) as times:
-            began = time.perf_counter()
-            env._simulate(points, grad=grad)
-            wall = time.perf_counter() - began
-        slowest = sorted(times.items(), key=lambda item: -item[1].seconds)
-        rows = [KernelSeconds(name, one.calls, one.seconds, one.seconds / wall) for name, one in slowest]
-        if roof is not None:
-            rows = _hold_against(roof, rows, env, points, grad=grad)
-        found[way] = KernelTable(len(points), wall, tuple(rows))
-    return found
-
-
-def _hold_against(
-    roof: Roof, rows: Sequence[KernelSeconds], env: Environment, points: Tensor, *, grad: bool
-) -> list[KernelSeconds]:
-    """Simulate once more, and say what the kernels had to do."""
-    with count_demands() as demands:
-        env._simulate(points, grad=grad)
-    found = []
-    for row in rows:
-        moved, flops = demands[row.name]
-        of_roof = roof.seconds(moved, flops) / row.seconds
-        found.append(replace(row, bytes=moved, flops=flops, of_roof=of_roof))
-    return found
 
 
 class _Clocked:

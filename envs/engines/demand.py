@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
+from .runtime import has_rows
+
 COMPUTES_LOSSES = False
 
 ASSIGNED = re.compile(r"(?:var_(\w+) = )?(wp::)?(\w+)(?:<[^()]*>)?\((.*)\);")
@@ -54,8 +56,12 @@ def demand(
 ) -> Demand:
     """Return what a launch has to do over `dim` threads, given its arguments, and their adjoints if it is `backward`.
 
-    `dim` begins with the environments, as arrays of two axes and more do.
+    `dim` begins with the environments, as arrays of two axes and more do. A kernel in C++ whose threads have whole rows
+    says which one does the same by Warp's functions, `plain`.
     """
+    if has_rows(kernel):
+        labels = [argument.label for argument in kernel.adj.args]
+        kernel, dim = kernel.plain, (dim[0], arguments[labels.index(kernel.elements)].shape[1])
     code = _read(kernel)
     labels = [argument.label for argument in kernel.adj.args]
     moved = 0

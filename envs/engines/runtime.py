@@ -55,6 +55,19 @@ def precision(name: str) -> Precision:
     return Precision(name, real, vector(3, real), vector(4, real), matrix((3, 3), real), dtype)
 
 
+def take_rows(kernel: Any, plain: Any, array: str) -> None:
+    """Note that a thread of a kernel has the row of an environment, for each element of which `plain` has a thread.
+
+    `array` names an argument that has as many elements.
+    """
+    kernel.plain, kernel.elements = plain, array
+
+
+def has_rows(kernel: Any) -> bool:
+    """Say whether a thread of a kernel has the row of an environment."""
+    return hasattr(kernel, "plain")
+
+
 def determinism(deterministic: bool) -> wp.DeterministicMode:
     """Return what a module of kernels is told: whether its atomic adds must come in the same order every time."""
     return wp.DeterministicMode.RUN_TO_RUN if deterministic else wp.DeterministicMode.NOT_GUARANTEED

@@ -67,7 +67,7 @@ def files_of(name: str, engine: str = "", folder: Path = code.HERE) -> set[str]:
 
 # What scenes import, or lies beside them, and computes no loss: it says so itself.
 SILENT = {"base.py", "batching.py", "code.py", "registry.py", "observation.py", "outlines.py", "engines/runtime.py"}
-SILENT |= {"installed.py", "records.py", "mpm/plasticine_look.py", "engines/mpm/kernels.py"}
+SILENT |= {"installed.py", "records.py", "mpm/plasticine_look.py", "engines/mpm/kernels.py", "engines/demand.py"}
 # What no scene imports.
 ELSEWHERE = {"importing.py", "points.py", "engines/profiling.py", "engines/engine.py", "engines/warp.py"}
 ELSEWHERE |= {"engines/warp_functions.py"}  # what it makes of a function is no scene

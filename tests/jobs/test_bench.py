@@ -151,7 +151,7 @@ def timed(request, monkeypatch):
     """Return kernels' times by the way of a ball's flight; on a CPU every look at the clock takes a second."""
     if request.param == "cpu":
         clock = Clock(tick=1.0)
-        for module in ("jobs.bench", "envs.engines.profiling"):
+        for module in ("jobs.bench", "jobs.kernel_times", "envs.engines.profiling"):
             monkeypatch.setattr(f"gradscape.{module}.time", clock)
         monkeypatch.setattr(Bounce, "threads", 1)  # a solver takes fewer rows than are worth evaluating at once
     job = BenchJob(lambda engine: Bounce(device=request.param, engine=engine), "warp", batches=[1], seconds=0.0)
@@ -240,7 +240,7 @@ def test_a_roofline_says_what_kernels_take_at_the_roof(monkeypatch):
     record = job.run().record()
     assert record["roof"] == {"bytes_per_second": 1e9, "flops_per_second": 2e9}
     rows = [row for way in record["kernels"].values() for row in way["kernels"]]
-    assert {"transfers.p2g", "transfers.adjoint_p2g"} <= {row["name"] for row in rows}
+    assert {"transfers_in_rows.p2g", "transfers_in_rows.adjoint_p2g"} <= {row["name"] for row in rows}
     for row in rows:
         assert row["bytes"] > 0
         assert row["of_roof"] == pytest.approx(max(row["bytes"] / 1e9, row["flops"] / 2e9) / row["seconds"])

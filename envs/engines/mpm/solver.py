@@ -23,7 +23,7 @@ import torch
 import warp as wp
 
 from ..launches import Launches
-from ..runtime import free_memory, load, to_torch
+from ..runtime import free_memory, has_rows, load, to_torch
 from .checkpoints import Allocator, Frame, Tape
 from .grid import velocity_kernel
 from .kernels import compile_all as compile_all
@@ -31,7 +31,7 @@ from .model import BOX_MARGIN, EMPTY, Box, Model, nodes_around
 from .order import Order, Sorter
 from .smoothing import Smoother
 from .stencil import lattice
-from .transfers import transfers
+from .transfers_cpu import transfers_on
 
 CROWD = 8_000  # particles that hide what a launch costs on one core
 BUSY, FULL_CARD = 400_000, 1_000_000  # particles that keep a GPU busy; more than which gain nothing
@@ -77,11 +77,11 @@ class Solver:
         self.stop = stop or threading.Event()
         self.allocator = Allocator(model, capacity, device)
         self.types = self.allocator.types
-        self.kernels = transfers(model.precision, deterministic=deterministic)
+        self.kernels = transfers_on(device, model.precision, deterministic=deterministic)
         boundary = model.boundary.function(model.precision)
         self.velocity = velocity_kernel(model.precision, *boundary, deterministic=deterministic)
         self.boundary = model.boundary.data(model.precision, device)
-        self.materials = [body.material.kernels(model.precision) for body in model.bodies]
+        self.materials = [body.material.kernels(model.precision, rows=device == "cpu") for body in model.bodies]
         transferring = [self.kernels.p2g, self.kernels.g2p, self.kernels.adjoint_p2g, self.kernels.adjoint_g2p]
         load([*transferring, self.velocity, *chain.from_iterable(self.materials)], device)
         self.first = np.concatenate([[0], np.cumsum([len(body.x) for body in model.bodies])]).tolist()
@@ -289,8 +289,8 @@ class Solver:
         return len(self.model.bodies[b].x)
 
     def launch(self, kernel: Any, size: int, batch: int, inputs: list[Any], **how: Any) -> None:
-        """Launch a kernel over [environment, element]."""
-        self.launches.launch(kernel, (batch, size), inputs, **how)
+        """Launch a kernel over [environment, element], or over environments where it takes their rows."""
+        self.launches.launch(kernel, (batch, 1 if has_rows(kernel) else size), inputs, **how)
 
     def by_lane(self, paths: wp.array) -> torch.Tensor:
         """View paths as [environment, lane, step, slot, axis]."""

@@ -212,4 +212,5 @@ def transfers(name: str, *, deterministic: bool = False) -> SimpleNamespace:
                     add(adj_grid_v, e, row + k, vec4(w * q[0], w * q[1], w * q[2], real(0.0)), run, 3)
         adj_x[e, p] = adj_x_new[e, p] + lattice.inv_dx * (slope - wp.transpose(c) * s0)
 
-    return SimpleNamespace(clear=clear, p2g=p2g, g2p=g2p, adjoint_p2g=adjoint_p2g, adjoint_g2p=adjoint_g2p)
+    kernels = {"clear": clear, "p2g": p2g, "g2p": g2p, "adjoint_p2g": adjoint_p2g, "adjoint_g2p": adjoint_g2p}
+    return SimpleNamespace(**kernels)

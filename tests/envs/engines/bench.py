@@ -4,7 +4,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from gradscape.envs.engines.runtime import precision, to_torch
+from gradscape.envs.engines.runtime import has_rows, precision, to_torch
 
 SCALE, MASS, VOLUME, DT = -0.7, 0.2, 0.3, 1e-3
 NAMES = ["float32", "float64"]
@@ -68,7 +68,8 @@ class MaterialBench:
         each = [wp.array(np.full((1, count), value), dtype=self.types.real) for value in (MASS, VOLUME)]
         results = [self._array(torch.zeros_like(like)) for like in wanted]
         inputs = [0, dt, SCALE, *self.material.constants(), *each, *map(self._array, given), *results]
-        wp.launch(self.kernels[which], (1, count), inputs, record_tape=False)
+        kernel = self.kernels[which]
+        wp.launch(kernel, (1, 1 if has_rows(kernel) else count), inputs, record_tape=False)
         return tuple(to_torch(array)[0].double().clone() for array in results)
 
     def _array(self, values):

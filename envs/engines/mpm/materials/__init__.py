@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ...runtime import precision
-from . import elastic, fluid, plasticine
+from . import elastic, fluid, plasticine, plasticine_cpu
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Fluid:
         """Return J at which the fluid bears `pressure` [Pa], counted on its reference volume."""
         return np.asarray(np.exp(-pressure / self.bulk))  # K log J = -pressure
 
-    def kernels(self, name: str) -> tuple[Any, Any]:
-        """Return (update, adjoint) for one precision."""
+    def kernels(self, name: str, *, rows: bool = False) -> tuple[Any, Any]:
+        """Return (update, adjoint) for one precision; there are none whose threads have rows."""
         update, adjoint = fluid.kernels(name)
         return update, adjoint
 
@@ -97,8 +97,8 @@ class Elastic(_Solid):
         modulus = density * speed**2  # lam + 2 mu
         return cls(density, modulus * (1.0 + poisson) * (1.0 - 2.0 * poisson) / (1.0 - poisson), poisson)
 
-    def kernels(self, name: str) -> tuple[Any, Any]:
-        """Return (update, adjoint) for one precision."""
+    def kernels(self, name: str, *, rows: bool = False) -> tuple[Any, Any]:
+        """Return (update, adjoint) for one precision; there are none whose threads have rows."""
         update, adjoint = elastic.kernels(name)
         return update, adjoint
 
@@ -113,9 +113,10 @@ class Plasticine(_Solid):
 
     yield_stress: float
 
-    def kernels(self, name: str) -> tuple[Any, Any]:
-        """Return (update, adjoint) for one precision."""
-        update, adjoint = plasticine.kernels(name)
+    def kernels(self, name: str, *, rows: bool = False) -> tuple[Any, Any]:
+        """Return (update, adjoint) for one precision; in float32 there are some whose threads have `rows`."""
+        in_rows = rows and name == "float32"
+        update, adjoint = plasticine_cpu.kernels_in_rows() if in_rows else plasticine.kernels(name)
         return update, adjoint
 
     def constants(self) -> tuple[float, ...]:

@@ -8,7 +8,8 @@ import torch
 import warp as wp
 
 from gradscape.envs.engines.mpm.transfers import lattice, transfers
-from gradscape.envs.engines.runtime import precision, to_torch
+from gradscape.envs.engines.mpm.transfers_cpu import transfers_in_rows, transfers_on
+from gradscape.envs.engines.runtime import has_rows, precision, to_torch
 
 ORIGIN, DX, NODES, DT = (-0.3, 0.2, 1.1), 0.05, (9, 8, 10), 2e-3
 BATCH, COUNT = 2, 40
@@ -206,3 +207,44 @@ def test_a_particle_near_the_edge_of_the_grid_is_reported():
     new = [bench.zeros(COUNT, 3), bench.zeros(COUNT, 3), bench.zeros(COUNT, 3, 3)]
     bench.launch(bench.kernels.g2p, [bench.lattice, DT, bench.array(x), bench.array(AT_NODES), *new, escaped])
     assert to_torch(escaped).tolist() == [0, 1]
+
+
+def outside(x):
+    """Take some particles out of the grid, where they are clamped to its border."""
+    moved = x.clone()
+    moved[0, :4] += torch.tensor([[0.9, 0, 0], [-0.9, 0, 0], [0, 0.9, -0.9], [0, 0, 0.0]])
+    return moved
+
+
+@pytest.mark.parametrize("x", [X, outside(X)], ids=["within", "some without"])
+def test_rows_of_a_cpu_have_the_same_bits(x):
+    """Four numbers at a time give what Warp's own code gives, a kernel and a particle at a time."""
+    bench, rows = Bench("float32"), transfers_in_rows()
+    place = [bench.lattice, bench.array(M), bench.array(x), bench.array(V), bench.array(A)]
+    moved = [bench.lattice, DT, bench.array(x), bench.array(AT_NODES)]
+    adjoints = [bench.array(draw(BATCH, COUNT, *tail, seed=7)) for tail in ((3,), (3,), (3, 3))]
+    free = bench.array(draw(BATCH, CELLS, 4, seed=8))
+
+    def zeros(*names):
+        tails = {"node": (CELLS, 4), "vector": (COUNT, 3), "matrix": (COUNT, 3, 3)}
+        return [bench.zeros(tails[name][0], *tails[name][1:]) for name in names]
+
+    calls = {
+        "p2g": (place, lambda: zeros("node")),
+        "g2p": (moved, lambda: [*zeros("vector", "vector", "matrix"), wp.zeros(BATCH, dtype=wp.int32)]),
+        "adjoint_p2g": ([*place, free], lambda: [bench.array(V), *zeros("vector", "matrix")]),
+        "adjoint_g2p": ([*moved, *adjoints], lambda: zeros("node", "vector")),
+    }
+    for name, (inputs, make) in calls.items():
+        wanted, found = make(), make()
+        wp.launch(getattr(bench.kernels, name), (BATCH, COUNT), [*inputs, *wanted], record_tape=False)
+        wp.launch(getattr(rows, name), (BATCH, 1), [*inputs, *found], record_tape=False)
+        for one, other in zip(wanted, found, strict=True):
+            assert (one.numpy() == other.numpy()).all(), name
+            assert one.numpy().any() or name == "g2p", name
+
+
+def test_only_a_cpu_in_single_precision_has_rows():
+    assert has_rows(transfers_on("cpu", "float32").p2g)
+    assert not has_rows(transfers_on("cpu", "float64").p2g)
+    assert transfers_on("cuda", "float32", deterministic=True) is transfers("float32", deterministic=True)

@@ -1,0 +1,149 @@
+"""Say of which scenes this checkout computes the same numbers as an older one, to the last bit, and keep that.
+
+    git worktree add OLD COMMIT
+    python -m benchmarks.same_numbers OLD [--scene fluid] [--write]
+
+A change of an engine changes the digest of its scenes' code (`envs.code`), and every record of theirs then counts as of
+other code. Where the change makes them quicker and nothing else, `--write` says so in `envs/same_numbers.json`, and the
+records stay what they are. A scene's numbers are the same where
+
+- losses, gradients and what failed are, bit for bit, at some points on a CPU: at draft in two batches, at standard one;
+- what runs on CUDA is compiled to the same PTX, kernel by kernel, which needs no GPU.
+
+A scene that differs in either is left out, and the exit code is 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ARCHITECTURE = 90  # of the GPU that is compiled for
+POINTS = {"draft": 4, "standard": 1}
+KEPT = Path(__file__).resolve().parent.parent / "envs" / "same_numbers.json"
+
+
+def main() -> None:
+    """Compare two checkouts."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("old", type=Path, help="the older checkout")
+    parser.add_argument("--scene", action="append", help="by default every scene whose digest has changed")
+    parser.add_argument("--write", action="store_true", help="keep what is the same")
+    parser.add_argument("--measure", action="store_true", help="only measure the checkout that is imported")
+    asked = parser.parse_args()
+    if asked.measure:
+        print(json.dumps(measure(asked.scene or [])))
+        return
+    before, now = (ask(root, []) for root in (asked.old, Path.cwd()))
+    changed = [name for name, one in now.items() if name in before and one["code"] != before[name]["code"]]
+    scenes = asked.scene or changed
+    same, differ = [], False
+    for scene in scenes:
+        theirs, ours = (ask(root, [scene])[scene] for root in (asked.old, Path.cwd()))
+        held = [part for part in ours if part not in ("code", "known")]
+        parts = [part for part in held if ours[part] != theirs.get(part)]
+        said = f"differs in {', '.join(parts)}" if parts else f"the same in {', '.join(held)}"
+        print(f"{scene}: {said}", flush=True)
+        differ |= bool(parts)
+        same += [] if parts else [(scene, ours["code"], theirs["known"])]
+    if asked.write:
+        keep(same)
+    sys.exit(int(differ))
+
+
+def ask(root: Path, scenes: list[str]) -> dict[str, dict[str, str]]:
+    """Measure a checkout in a process of its own, which imports it and this file."""
+    command = [sys.executable, __file__, str(root), "--measure"]
+    for scene in scenes:
+        command += ["--scene", scene]
+    where = {**os.environ, "PYTHONPATH": str(root.resolve() / "src")}
+    done = subprocess.run(command, env=where, cwd=root, check=True, stdout=subprocess.PIPE, text=True)
+    found: dict[str, dict[str, str]] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+def measure(scenes: list[str]) -> dict[str, dict[str, str]]:
+    """Return digests of the code, the numbers and the compiled kernels of scenes; without any, of the code of all."""
+    from gradscape.envs import code
+    from gradscape.envs.registry import entries, environment_class
+
+    found = {}
+    for scene in scenes or entries():
+        kind = environment_class(scene)
+        own = getattr(code, "own_digest", code.code_digest)
+        found[scene] = {"code": own(kind, kind.engines[0]), "known": code.code_digest(kind, kind.engines[0])}
+        if scenes:
+            found[scene] |= numbers(scene) | compiled(scene)
+    return found
+
+
+def numbers(scene: str) -> dict[str, str]:
+    """Return a digest of what a scene computes on a CPU at some points, by fidelity."""
+    from gradscape.envs.registry import environment_class, make
+
+    found = {}
+    for fidelity, count in POINTS.items():
+        if fidelity in environment_class(scene).fidelities:
+            env = make(scene, fidelity=fidelity, device="cpu")
+            x = env.space.sobol(count, seed=0)
+            batches = [x, x[:1]] if count > 1 else [x]
+            results = [env.evaluate(batch) for batch in batches]
+            tensors = [tensor for one in results for tensor in (one.loss, one.grad, one.status)]
+            found[fidelity] = hash_of(tensor.detach().cpu().contiguous().numpy().tobytes() for tensor in tensors)
+    return found
+
+
+def compiled(scene: str) -> dict[str, str]:
+    """Return a digest of what each module of a scene's kernels is compiled to for CUDA."""
+    import warp as wp
+
+    from gradscape.envs.engines.mpm.kernels import kernels
+    from gradscape.envs.registry import make
+
+    model = getattr(make(scene, fidelity="standard", device="cpu"), "model", None)
+    if model is None:
+        return {}
+    try:
+        launched = list(kernels(model, "cuda"))
+    except TypeError:  # of a checkout in which all devices have the same
+        launched = list(kernels(model))  # type: ignore[call-arg]
+    modules = {kernel.module.name: kernel.module for kernel in launched}
+    with tempfile.TemporaryDirectory() as folder:
+        return {
+            re.sub(r"_[0-9a-f]{8}$", "", name): hash_of(
+                re.sub(rb"_[0-9a-f]{8}\b|_[0-9a-f]{8}(?=_)|//.*", b"", path.read_bytes())
+                for path in wp.compile_aot_module(module, arch=ARCHITECTURE, module_dir=folder, use_ptx=True)
+                if path.suffix == ".ptx"
+            )
+            for name, module in modules.items()
+        }
+
+
+def hash_of(pieces: object) -> str:
+    """Return a digest of bytes."""
+    digest = hashlib.sha256()
+    for piece in pieces:  # type: ignore[attr-defined]
+        digest.update(piece)
+    return digest.hexdigest()[:16]
+
+
+def keep(same: list[tuple[str, str, str]]) -> None:
+    """Write down for each scene that its code computes what an older one did."""
+    kept = json.loads(KEPT.read_text()) if KEPT.exists() else {}
+    for scene, code, known in same:
+        if code != known:
+            kept[code] = {"scene": scene, "numbers_of": known}
+    KEPT.write_text(
+        json.dumps(dict(sorted(kept.items(), key=lambda item: (item[1]["scene"], item[0]))), indent=1) + "\n"
+    )
+
+
+if __name__ == "__main__":
+    main()
