@@ -151,7 +151,7 @@ def test_an_adjoint_where_three_singular_values_coincide_is_that_of_a_swelling_b
 
 
 def test_rows_of_a_cpu_have_the_same_bits():
-    """Eight particles at a time give what one at a time gives, undeformed, yielding, flat, thin and turned inside out."""
+    """Eight particles at a time give what one gives: undeformed, yielding, flat, thin and turned inside out."""
     sizes = torch.tensor([0.0, 1e-3, 0.05, 0.3, 1.5]).repeat(25)[:, None, None]
     odd = [torch.diag(torch.tensor(one)) for one in ([0.0, 0, 0], [1.0, 1, 0], [2.0, 1, -1], [1.0, 0, 0])]
     F = torch.cat([torch.stack(odd).double(), IDENTITY + sizes * draw(125, 3, 3, seed=30)])
