@@ -1,4 +1,4 @@
-"""Singular value decomposition of eight matrices at a time, for a CPU in float32: C++ with the bits of `decomposition`."""
+"""Singular value decomposition, eight matrices at a time on a CPU in float32: C++ with the bits of `decomposition`."""
 
 from .decomposition import ROUND_OFF, SWEEPS, TINY
 
