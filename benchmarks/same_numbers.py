@@ -10,7 +10,7 @@ records stay what they are. A scene's numbers are the same where
 - losses, gradients and what failed are, bit for bit, at some points on a CPU: at draft in two batches, at standard one;
 - what runs on CUDA is compiled to the same PTX, kernel by kernel, which needs no GPU.
 
-A scene that differs in either is left out, and the exit code is 1.
+A scene that differs in either is left out, with those that share its code, and the exit code is 1.
 """
 
 from __future__ import annotations
@@ -44,18 +44,22 @@ def main() -> None:
     before, now = (ask(root, []) for root in (asked.old, Path.cwd()))
     changed = [name for name, one in now.items() if name in before and one["code"] != before[name]["code"]]
     scenes = asked.scene or changed
-    same, differ = [], False
-    for scene in scenes:
-        theirs, ours = (ask(root, [scene])[scene] for root in (asked.old, Path.cwd()))
-        held = [part for part in ours if part not in ("code", "known")]
-        parts = [part for part in held if ours[part] != theirs.get(part)]
-        said = f"differs in {', '.join(parts)}" if parts else f"the same in {', '.join(held)}"
-        print(f"{scene}: {said}", flush=True)
-        differ |= bool(parts)
-        same += [] if parts else [(scene, ours["code"], theirs["known"])]
+    same = [scene for scene in scenes if is_same(scene, asked.old)]
     if asked.write:
-        keep(same)
-    sys.exit(int(differ))
+        codes = {now[scene]["code"] for scene in same}
+        families = {code: sorted(name for name in changed if now[name]["code"] == code) for code in codes}
+        keep({code: (names, before[names[0]]["known"]) for code, names in families.items() if set(names) <= set(same)})
+    sys.exit(int(same != scenes))
+
+
+def is_same(scene: str, old: Path) -> bool:
+    """Say whether both checkouts compute the same numbers, and print what was compared."""
+    theirs, ours = (ask(root, [scene])[scene] for root in (old, Path.cwd()))
+    held = [part for part in ours if part not in ("code", "known")]
+    differ = [part for part in held if ours[part] != theirs.get(part)]
+    said = f"differs in {', '.join(differ)}" if differ else f"the same in {', '.join(held)}"
+    print(f"{scene}: {said}", flush=True)
+    return not differ
 
 
 def ask(root: Path, scenes: list[str]) -> dict[str, dict[str, str]]:
@@ -134,15 +138,12 @@ def hash_of(pieces: object) -> str:
     return digest.hexdigest()[:16]
 
 
-def keep(same: list[tuple[str, str, str]]) -> None:
-    """Write down for each scene that its code computes what an older one did."""
-    kept = json.loads(KEPT.read_text()) if KEPT.exists() else {}
-    for scene, code, known in same:
-        if code != known:
-            kept[code] = {"scene": scene, "numbers_of": known}
-    KEPT.write_text(
-        json.dumps(dict(sorted(kept.items(), key=lambda item: (item[1]["scene"], item[0]))), indent=1) + "\n"
-    )
+def keep(same: dict[str, tuple[list[str], str]]) -> None:
+    """Write down of codes which scenes are theirs, and the oldest code that computes the same numbers."""
+    scenes = {scene for names, _ in same.values() for scene in names}
+    kept = {code: one for code, one in json.loads(KEPT.read_text()).items() if not scenes & set(one["scenes"])}
+    kept |= {code: {"numbers_of": known, "scenes": names} for code, (names, known) in same.items()}
+    KEPT.write_text(json.dumps(dict(sorted(kept.items(), key=lambda item: item[1]["scenes"])), indent=1) + "\n")
 
 
 if __name__ == "__main__":

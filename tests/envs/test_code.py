@@ -1,6 +1,7 @@
 """The digest of a scene's code: what changes it, and what does not."""
 
 import importlib
+import json
 import shutil
 from pathlib import Path
 
@@ -51,6 +52,27 @@ def test_a_foreign_class_has_the_digest_of_its_code_and_not_of_its_words(
 def test_a_class_of_a_notebook_has_a_digest() -> None:
     made = type("Made", (Environment,), {"__module__": "__main__"})
     assert len(code_digest(made)) == 12
+
+
+def test_code_that_computes_the_same_numbers_has_the_digest_of_older_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    kind = environment_class("bounce")
+    own = code.own_digest(kind)
+    monkeypatch.setattr(code, "_numbers_of", lambda: {own: "older"})
+    assert code_digest.__wrapped__(kind) == "older"
+    monkeypatch.setattr(code, "_numbers_of", lambda: {"another": "older"})
+    assert code_digest.__wrapped__(kind) == own
+
+
+def test_what_computes_the_same_numbers_is_said_once_of_a_scene_and_names_the_oldest() -> None:
+    kept = json.loads(code.SAME_NUMBERS.read_text())
+    digests = {name: code.own_digest(environment_class(name)) for name in SCENES}
+    for digest, one in kept.items():
+        theirs = sorted(name for name in SCENES if digests[name] == digest)
+        assert theirs == one["scenes"], (
+            f"{digest} is not their code: run benchmarks.same_numbers, or delete what it says"
+        )
+        assert {code_digest(environment_class(name)) for name in theirs} == {one["numbers_of"]}
+        assert one["numbers_of"] not in kept
 
 
 @pytest.fixture
