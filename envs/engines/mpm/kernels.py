@@ -9,7 +9,7 @@ from ..runtime import load
 from .grid import velocity_kernel
 from .model import Model
 from .order import sorting_kernels
-from .smoothing import smoothing_kernels
+from .smoothing_cpu import smoothing_on
 from .transfers_cpu import transfers_on
 
 COMPUTES_LOSSES = False  # for `code`: what is compiled here, a solver would compile itself
@@ -25,7 +25,7 @@ def kernels(model: Model, device: str, *, deterministic: bool = False) -> Iterat
     name = model.precision
     yield transfers_on(device, name, deterministic=deterministic).p2g
     if any(body.material.smoothing for body in model.bodies):
-        yield smoothing_kernels(name, deterministic=deterministic).spread
+        yield smoothing_on(device, name, deterministic=deterministic).spread
     yield velocity_kernel(name, *model.boundary.function(name), deterministic=deterministic)
     for body in model.bodies:
         yield from body.material.kernels(name, rows=device == "cpu")

@@ -16,7 +16,7 @@ from .transfers import transfers
 
 # Of particle p: the node where its stencil begins, where it is from there [cells], its weights and their slopes. `V4`
 # are three numbers of a particle and one that is zero, or four of a node; nodes lie one after another, z fastest.
-PRELUDE = """
+STENCIL = """
     typedef float V4 __attribute__((vector_size(16), aligned(4)));
     const float inv_dx = grid.inv_dx, dx = 1.0f / grid.inv_dx;
     const int ny = grid.ny, nz = grid.nz;
@@ -42,10 +42,16 @@ PRELUDE = """
         a[3] = x[1]; a[4] = y[1]; a[5] = z[1];
         a[6] = x[2]; a[7] = y[2]; a[8] = z[2];
     };
-    const float* X = (const float*)&wp::index(x, e, 0);
 """
+PRELUDE = (
+    STENCIL
+    + """
+    const float* X = (const float*)&wp::index(x, e, 0);
+    const int count = x.shape[1];
+"""
+)
 EACH = """
-    for (int p = 0; p < x.shape[1]; ++p) {
+    for (int p = 0; p < count; ++p) {
         const float s[3] = {
             (X[3 * p] - grid.origin[0]) * inv_dx,
             (X[3 * p + 1] - grid.origin[1]) * inv_dx,
