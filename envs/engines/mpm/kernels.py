@@ -25,7 +25,9 @@ def kernels(model: Model, device: str, *, deterministic: bool = False) -> Iterat
     name = model.precision
     yield transfers_on(device, name, deterministic=deterministic).p2g
     if any(body.material.smoothing for body in model.bodies):
-        yield smoothing_on(device, name, deterministic=deterministic).spread
+        smoothing = smoothing_on(device, name, deterministic=deterministic)
+        yield smoothing.spread
+        yield smoothing.clear  # of another module where the others take rows
     yield velocity_kernel(name, *model.boundary.function(name), deterministic=deterministic)
     for body in model.bodies:
         yield from body.material.kernels(name, rows=device == "cpu")
