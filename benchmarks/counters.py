@@ -20,7 +20,8 @@ from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from gradscape.envs.engines.profiling import count_demands, suspend_graphs, time_kernels
+from gradscape.envs.engines.launches import suspend_graphs
+from gradscape.envs.engines.profiling import count_demands, kernel_name, time_kernels
 from gradscape.envs.registry import make
 
 TIME = "gpu__time_duration.sum"
@@ -35,7 +36,7 @@ SHARES = {
 }
 REGISTERS = "launch__registers_per_thread"
 METRICS = (TIME, *MEMORY, CACHE, *SHARES.values(), REGISTERS)
-WARP = re.compile(r"(?P<key>\w+?)(_[0-9a-f]{8})?_cuda_kernel_(?P<way>forward|backward)")
+WARP = re.compile(r"(?P<key>\w+)_cuda_kernel_(?P<way>forward|backward)")
 
 
 @dataclass
@@ -56,7 +57,7 @@ def read_counters(lines: Iterable[str]) -> dict[str, Counted]:
     for row in csv.DictReader(line for line in lines if line.startswith('"')):
         found = WARP.fullmatch(row["Kernel Name"])
         if found:
-            name = found["key"].replace("__locals__", ".") + (" backward" if found["way"] == "backward" else "")
+            name = kernel_name(found["key"], backward=found["way"] == "backward")
             launches[name, row["ID"]][row["Metric Name"]] = float(row["Metric Value"].replace(",", ""))
     counted: dict[str, Counted] = {}
     for (name, _), metrics in launches.items():

@@ -23,6 +23,7 @@ import re
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 ARCHITECTURE = 90  # of the GPU that is compiled for
@@ -130,10 +131,10 @@ def compiled(scene: str) -> dict[str, str]:
         }
 
 
-def hash_of(pieces: object) -> str:
+def hash_of(pieces: Iterable[bytes]) -> str:
     """Return a digest of bytes."""
     digest = hashlib.sha256()
-    for piece in pieces:  # type: ignore[attr-defined]
+    for piece in pieces:
         digest.update(piece)
     return digest.hexdigest()[:16]
 

@@ -193,8 +193,9 @@ class BenchJob:
                 say(f"timing batches of {batch}")
                 rates += _time_batch(envs, _points(env, batch), self.seconds)
             say("timing kernels")
-            rows = _points(env, env._rows_per_part(env.preferred_batch))
-            kernels = tabulate_kernels(env, rows, roof) if find_engine(self.engine).profiled else None
+            kernels = None
+            if find_engine(self.engine).profiled:
+                kernels = tabulate_kernels(env, _points(env, env._rows_per_part(env.preferred_batch)), roof)
             adapter = _time_adapter(env, self.seconds)
             say("timing the sampler")
             own = [rate.with_gradient.episodes_per_second for rate in rates if rate.engine == self.engine]

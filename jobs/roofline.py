@@ -11,6 +11,9 @@ from dataclasses import dataclass
 
 import torch
 
+from ..landscapes.sampling.memory import free_memory
+from ..landscapes.threads import one_torch_thread
+
 COPIED = {"cpu": 2**28, "cuda": 2**32}  # bytes of an array that no cache holds
 SIDE = {"cpu": 2**11, "cuda": 2**13}  # of a square matrix
 REPEATED = 5
@@ -33,20 +36,23 @@ class Roof:
 
 def measure_roof(device: str, precision: str) -> Roof:
     """Measure a device's roof by copying an array and by multiplying two matrices of a precision, the best of some."""
-    kind, threads = getattr(torch, precision), torch.get_num_threads()
-    if device == "cpu":
-        torch.set_num_threads(1)
-    try:
-        source = torch.ones(COPIED[device], dtype=torch.uint8, device=device)
-        copy, matrix = torch.empty_like(source), torch.ones(SIDE[device], SIDE[device], dtype=kind, device=device)
-        moving = _least_seconds(lambda: copy.copy_(source), device)
-        multiplying = _least_seconds(lambda: matrix @ matrix, device)
-    finally:
-        torch.set_num_threads(threads)
-        if device == "cuda":
-            source = copy = matrix = torch.empty(0)
-            torch.cuda.empty_cache()
-    return Roof(2.0 * COPIED[device] / moving, 2.0 * SIDE[device] ** 3 / multiplying)
+    with one_torch_thread():
+        roof = Roof(_copy(device), _multiply(device, getattr(torch, precision)))
+    free_memory()
+    return roof
+
+
+def _copy(device: str) -> float:
+    """Return the bytes that are read and written in a second."""
+    source = torch.ones(COPIED[device], dtype=torch.uint8, device=device)
+    copy = torch.empty_like(source)
+    return 2.0 * COPIED[device] / _least_seconds(lambda: copy.copy_(source), device)
+
+
+def _multiply(device: str, kind: torch.dtype) -> float:
+    """Return the products and sums that are done in a second."""
+    matrix = torch.ones(SIDE[device], SIDE[device], dtype=kind, device=device)
+    return 2.0 * SIDE[device] ** 3 / _least_seconds(lambda: matrix @ matrix, device)
 
 
 def _least_seconds(call: Callable[[], object], device: str) -> float:

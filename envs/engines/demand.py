@@ -59,11 +59,10 @@ def demand(
     `dim` begins with the environments, as arrays of two axes and more do. A kernel in C++ whose threads have whole rows
     says which one does the same by Warp's functions, `plain`.
     """
+    labels = [argument.label for argument in kernel.adj.args]
     if has_rows(kernel):
-        labels = [argument.label for argument in kernel.adj.args]
         kernel, dim = kernel.plain, (dim[0], arguments[labels.index(kernel.elements)].shape[1])
     code = _read(kernel)
-    labels = [argument.label for argument in kernel.adj.args]
     moved = 0
     for label, array in zip(labels, arguments, strict=True):
         if isinstance(array, wp.array):
@@ -93,10 +92,8 @@ def _read(kernel: Any) -> _Code:
     options = kernel.module.resolve_options(wp.config) | {"output_arch": None}
     builder = ModuleBuilder(kernel.module, options)
     functions = {function.native_func: function for function in builder.functions}
-    built = next(
-        one for one in builder.kernels if one.hash == kernel.hash
-    )  # of several that are alike, Warp builds one
-    return _read_adjoint(built.adj, functions)
+    alike = next(one for one in builder.kernels if one.hash == kernel.hash)  # Warp builds one of several
+    return _read_adjoint(alike.adj, functions)
 
 
 def _read_adjoint(adj: Any, functions: Mapping[str, Any]) -> _Code:
@@ -124,8 +121,8 @@ def _read_adjoint(adj: Any, functions: Mapping[str, Any]) -> _Code:
             if first in parameters and (name in WRITES or name.startswith("atomic")):
                 writes.add(first)
             flops += _operations(name, types.get(target), [types.get(label) for label in taken])
-    met = (reads | writes) & parameters
-    return _Code(frozenset(reads & met), frozenset(writes & met), flops, walks or (loops and bool(met)))
+    reads, writes = reads & parameters, writes & parameters
+    return _Code(frozenset(reads), frozenset(writes), flops, walks or (loops and bool(reads | writes)))
 
 
 def _read_function(function: Any, functions: Mapping[str, Any]) -> _Code:

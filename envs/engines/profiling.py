@@ -71,7 +71,7 @@ class _Launch:
 
     @property
     def name(self) -> str:
-        return _kernel_name(self.kernel.key, backward=self.backward)
+        return kernel_name(self.kernel.key, backward=self.backward)
 
     def demand(self) -> Demand:
         kept = self.command()
@@ -125,10 +125,10 @@ def _time_on_cuda(times: dict[str, KernelTime]) -> Iterator[None]:
     finally:
         for run in wp.timing_end():
             way, _, name = run.name.partition(" kernel ")
-            key = re.sub(r"_[0-9a-f]{8}$", "", name)  # without the hash of its code
-            times[_kernel_name(key, backward=way == "backward")].add(run.elapsed / 1e3)
+            times[kernel_name(name, backward=way == "backward")].add(run.elapsed / 1e3)
 
 
-def _kernel_name(key: str, *, backward: bool) -> str:
-    """Return a kernel's name after that of the function that makes it."""
-    return key.replace("__locals__", ".") + (" backward" if backward else "")
+def kernel_name(key: str, *, backward: bool) -> str:
+    """Return a kernel's name after that of the function that makes it, without the hash of its code."""
+    plain = re.sub(r"_[0-9a-f]{8}$", "", key)
+    return plain.replace("__locals__", ".") + (" backward" if backward else "")
