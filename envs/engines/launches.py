@@ -27,14 +27,14 @@ class _Call:
 class _Sequence:
     """Launches in their order, as they were made for a box of nodes.
 
-    `located` are those whose first argument says where that lies, `on_nodes` those that run over its nodes in so many
-    environments.
+    `located` are those whose first argument says where that lies, `sized` those that run over something of it in so
+    many environments, as their function says.
     """
 
     box: Box
     launches: list[Any] = field(default_factory=list)
     located: list[Any] = field(default_factory=list)
-    on_nodes: list[tuple[Any, int]] = field(default_factory=list)
+    sized: list[tuple[Any, int, Callable[[Box], int]]] = field(default_factory=list)
 
     def run(self) -> None:
         for command in self.launches:
@@ -45,8 +45,8 @@ class _Sequence:
         if box != self.box:
             for command in self.located:
                 command.set_param_at_index(0, lattice)
-            for command, batch in self.on_nodes:
-                command.set_dim((batch, box.cells))
+            for command, batch, size in self.sized:
+                command.set_dim((batch, size(box)))
             self.box = box
 
 
@@ -82,15 +82,21 @@ class Launches:
             self._run_graph((key, box), known)
 
     def launch(
-        self, kernel: Any, dim: tuple[int, int], inputs: list[Any], *, nodes: bool = False, **adjoint: Any
+        self,
+        kernel: Any,
+        dim: tuple[int, int],
+        inputs: list[Any],
+        *,
+        size: Callable[[Box], int] | None = None,
+        **adjoint: Any,
     ) -> None:
-        """Launch a kernel as part of the work under way; `nodes` says that it runs over those of the box."""
+        """Launch a kernel as part of the work under way; `size` says over how much of a box it runs."""
         how: dict[str, Any] = {"record_tape": False, "record_cmd": True, "block_dim": BLOCK}
         command = wp.launch(kernel, dim, inputs, device=self.device, **how, **adjoint)
         if inputs[0] is self._lattice:
             self._recording.located.append(command)
-        if nodes:
-            self._recording.on_nodes.append((command, dim[0]))
+        if size is not None:
+            self._recording.sized.append((command, dim[0], size))
         self._recording.launches.append(command)
         command.launch()
 

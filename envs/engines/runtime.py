@@ -68,11 +68,6 @@ def has_rows(kernel: Any) -> bool:
     return hasattr(kernel, "plain")
 
 
-def determinism(deterministic: bool) -> wp.DeterministicMode:
-    """Return what a module of kernels is told: whether its atomic adds must come in the same order every time."""
-    return wp.DeterministicMode.RUN_TO_RUN if deterministic else wp.DeterministicMode.NOT_GUARANTEED
-
-
 def cuda_available() -> bool:
     """Say whether Warp can drive a CUDA device here."""
     return bool(wp.is_cuda_available())

@@ -112,14 +112,13 @@ class MpmScene(Environment):  # noqa: D101 -- `about` prints the docstrings of a
         self.model = self._model()
         self._capacity = self._limit_rows(capacity(self.model, self.device))
         settings: dict[str, Any] = {"capacity": self._capacity, "device": self.device}
-        settings |= {"deterministic": True} if self.deterministic else {}
         make = partial(self._make_stage, self._engine("mpm").Solver, self.model, self._stop, settings)
         self._solvers = Pool(make, most=self._solvers_at_most)
 
     def _compile_ahead(self) -> None:
         compile_all = getattr(self._engine("mpm"), "compile_all", None)  # an engine may compile as it goes
         if compile_all is not None:
-            compile_all(self.model, self.device, deterministic=self.deterministic)
+            compile_all(self.model, self.device)
 
     def _loss_steps(self) -> Sequence[int]:
         """Return the control steps before which losses are taken, the episode's end being one."""

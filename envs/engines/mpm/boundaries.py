@@ -1,11 +1,10 @@
 """What grid velocities meet: moving tools and walls.
 
-A boundary is a Warp function (its data, node position, velocity, environment, tools, the same tools once more, control
-step, fraction of it, 1 over its span) -> velocity. `tools` [environment, control step, slot] holds positions [m] at the
-ends of control steps; in between a tool moves at constant velocity. `still` are the same places without an adjoint:
-with them a node finds out whether a tool is near. If all nodes asked `tools`, all would add their zeros to its adjoint,
-one after the other. Sizes and frictions are data, so that scenes with the same kind of
-boundary share its compiled kernel.
+A boundary is a Warp function (its data, node position, velocity, environment, lane, tools, sums, control step, fraction
+of it, 1 over its span) -> velocity. `tools` [environment, control step, slot] holds positions [m] at the ends of
+control steps; in between a tool moves at constant velocity. A node looks whether a tool is near without an adjoint, and
+reads where it is with one that is summed exactly (`exact`), in the `sums` of its `lane`. Sizes and frictions are data,
+so that scenes with the same kind of boundary share its compiled kernel.
 """
 
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from typing import Any, ClassVar, Protocol, no_type_check
 import warp as wp
 
 from ..runtime import fill_struct, precision
+from .exact import tool_readers
 from .sdf import bowl, rod
 
 
@@ -95,8 +95,9 @@ def _open(name: str) -> tuple[Any, Any]:
         p: vec3,
         v: vec3,
         e: int,
+        lane: int,
         tools: wp.array3d[vec3],
-        still: wp.array3d[vec3],
+        sums: wp.array2d[wp.int64],
         step: int,
         fraction: real,
         rate: real,
@@ -113,6 +114,7 @@ def _ladle_in_tank(name: str) -> tuple[Any, Any]:
     real, vec3, vec4 = types.real, types.vec3, types.vec4
     module = f"gradscape.boundaries.{name}"
     bowl_distance, rod_distance = bowl(name), rod(name)
+    read, look = tool_readers(name).read, tool_readers(name).look
 
     @partial(wp.struct, module=module)
     class Scene:
@@ -128,10 +130,25 @@ def _ladle_in_tank(name: str) -> tuple[Any, Any]:
         slip: real
 
     @wp.func(module=module)
-    def between(tools: wp.array3d[vec3], e: int, step: int, fraction: real) -> vec3:
+    def look_between(tools: wp.array3d[vec3], e: int, step: int, fraction: real) -> vec3:
+        """Return where the ladle is, without an adjoint."""
+        start = look(tools, e, step, 0, 0)
+        return start + fraction * (look(tools, e, step, 1, 0) - start)
+
+    @wp.func(module=module)
+    def between(
+        tools: wp.array3d[vec3], sums: wp.array2d[wp.int64], e: int, lane: int, step: int, fraction: real
+    ) -> vec3:
         """Return where the ladle is."""
-        start = tools[e, step, 0]
-        return start + fraction * (tools[e, step + 1, 0] - start)
+        start = read(tools, sums, e, lane, step, 0, 0)
+        return start + fraction * (read(tools, sums, e, lane, step, 1, 0) - start)
+
+    @wp.func(module=module)
+    def velocity(
+        tools: wp.array3d[vec3], sums: wp.array2d[wp.int64], e: int, lane: int, step: int, rate: real
+    ) -> vec3:
+        """Return how the ladle moves."""
+        return rate * (read(tools, sums, e, lane, step, 1, 0) - read(tools, sums, e, lane, step, 0, 0))
 
     @wp.func(module=module)
     def slide(v: vec3, body: vec3, hit: vec4, band: real, friction: real) -> vec3:
@@ -162,23 +179,24 @@ def _ladle_in_tank(name: str) -> tuple[Any, Any]:
         p: vec3,
         v: vec3,
         e: int,
+        lane: int,
         tools: wp.array3d[vec3],
-        still: wp.array3d[vec3],
+        sums: wp.array2d[wp.int64],
         step: int,
         fraction: real,
         rate: real,
     ) -> vec3:
         beside = scene.half_thickness + scene.band
         near = scene.radius + beside
-        local = p - between(still, e, step, fraction)
+        local = p - look_between(tools, e, step, fraction)
         if wp.abs(local[2]) < near and wp.abs(local[0]) < near and wp.abs(local[1]) < near:
-            hit = bowl_distance(p - between(tools, e, step, fraction), scene.radius, scene.half_thickness)
-            v = slide(v, rate * (tools[e, step + 1, 0] - tools[e, step, 0]), hit, scene.band, scene.friction)
+            hit = bowl_distance(p - between(tools, sums, e, lane, step, fraction), scene.radius, scene.half_thickness)
+            v = slide(v, velocity(tools, sums, e, lane, step, rate), hit, scene.band, scene.friction)
         handle = scene.height > real(0.0)
         if handle and wp.abs(local[2]) < beside and wp.abs(local[0] + scene.radius) < beside:
-            foot = p - between(tools, e, step, fraction) + vec3(scene.radius, real(0.0), real(0.0))
+            foot = p - between(tools, sums, e, lane, step, fraction) + vec3(scene.radius, real(0.0), real(0.0))
             hit = rod_distance(foot, scene.height, scene.half_thickness)
-            v = slide(v, rate * (tools[e, step + 1, 0] - tools[e, step, 0]), hit, scene.band, scene.friction)
+            v = slide(v, velocity(tools, sums, e, lane, step, rate), hit, scene.band, scene.friction)
         edge = scene.half_width - real(1e-6)  # a wall's own nodes belong to it
         if wp.abs(p[0]) > edge or wp.abs(p[2]) > edge or p[1] < real(1e-6):
             v = along_wall(p, v, edge, scene.slip)

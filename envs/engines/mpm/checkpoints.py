@@ -6,6 +6,8 @@ from typing import Any
 import warp as wp
 
 from ..runtime import precision
+from .cells import Lists, segments
+from .exact import LANES, SUMS
 from .model import Box, Model, place_grid
 
 
@@ -32,10 +34,10 @@ class Grid:
 
 
 class Allocator:
-    """Allocate arrays of zeros for up to `capacity` environments of a model."""
+    """Allocate arrays of zeros for up to `capacity` environments of a model, those of `columns` or without."""
 
-    def __init__(self, model: Model, capacity: int, device: str) -> None:
-        self.model, self.capacity, self.device = model, capacity, device
+    def __init__(self, model: Model, capacity: int, device: str, *, columns: bool = False) -> None:
+        self.model, self.capacity, self.device, self.columns = model, capacity, device, columns
         self.types = precision(model.precision)
 
     def array(self, dtype: Any, size: int) -> wp.array:
@@ -65,10 +67,22 @@ class Allocator:
         """Return zeros for A, [environment, particle]."""
         return self.array(self.types.mat33, self.model.particles)
 
-    def paths(self, lanes: int) -> wp.array:
-        """Return zeros [environment and lane, step, slot]."""
-        shape = self.capacity * lanes, self.model.steps + 1, self.model.boundary.slots
+    def lists(self, segments: int) -> Lists:
+        """Return lists of no particles."""
+        first, end = (self.array(wp.int32, segments) for _ in range(2))
+        return Lists(self.array(wp.int32, self.model.particles), first, end)
+
+    def paths(self) -> wp.array:
+        """Return zeros [environment, step, slot]."""
+        shape = self.capacity, self.model.steps + 1, self.model.boundary.slots
         return wp.zeros(shape, dtype=self.types.vec3, device=self.device)
+
+    def sums(self) -> wp.array:
+        """Return the sums that the adjoint of the tools is made of on a GPU, [environment and lane, sum]."""
+        if self.device == "cpu":
+            return wp.zeros((1, 1), dtype=wp.int64)
+        count = 2 * self.model.boundary.slots * 3 * SUMS[self.model.precision]
+        return wp.zeros((self.capacity * LANES, count), dtype=wp.int64, device=self.device)
 
 
 class Tape:
@@ -81,6 +95,7 @@ class Tape:
         self.smoothed = allocator.smoothed()
         self.A = [allocator.affine_momentum() for _ in range(model.substeps)]
         self.grids = [allocator.grid(cells) for _ in range(model.substeps)]
+        self.lists = [allocator.lists(1) for _ in range(model.substeps)] if allocator.columns else []
         self.lattice = place_grid(model)
         self._allocator = allocator
 
@@ -89,15 +104,17 @@ class Tape:
         """What its arrays take."""
         grids = [array for grid in self.grids for array in (grid.m, grid.v)]
         frames = [array for frame in self.frames for array in frame.arrays()]
-        return sum(array.capacity for array in (*frames, *self.smoothed.values(), *self.A, *grids))
+        lists = [array for one in self.lists for array in (one.order, one.first, one.end)]
+        return sum(array.capacity for array in (*frames, *self.smoothed.values(), *self.A, *grids, *lists))
 
-    def growth(self, cells: int) -> int:
-        """Return the bytes that grids of so many nodes take beyond those that are there, 0 where these suffice."""
-        if self._cells >= cells:
-            return 0
-        more = self._room(cells) - self._cells
-        size = int(wp.types.type_size_in_bytes(self._allocator.types.vec4))
-        return 2 * len(self.grids) * self._allocator.capacity * more * size
+    def growth(self, box: Box) -> int:
+        """Return the bytes that a box of nodes takes beyond those that are there, 0 where these suffice."""
+        size, growth = int(wp.types.type_size_in_bytes(self._allocator.types.vec4)), 0
+        if self._cells < box.cells:
+            growth += 2 * size * (self._room(box.cells) - self._cells)
+        if self.lists and self._segments < segments(box):
+            growth += 2 * 4 * (segments(box) * 5 // 4 - self._segments)
+        return growth * len(self.grids) * self._allocator.capacity
 
     def start(self, checkpoint: Frame) -> Frame:
         """Return the frame that the control step starts from: the checkpoint, with the states that are smoothed."""
@@ -110,12 +127,19 @@ class Tape:
             for substep in range(len(self.grids)):
                 self.grids[substep] = self._allocator.grid(0)  # the old one goes first
                 self.grids[substep] = self._allocator.grid(self._room(box.cells))
+        if self.lists and self._segments < segments(box):
+            self.lists = [self._allocator.lists(segments(box) * 5 // 4) for _ in self.lists]
         self.step, self.lattice = step, place_grid(self._allocator.model, box)
 
     @property
     def _cells(self) -> int:
         """How many nodes all its grids have room for."""
         return min(int(grid.v.shape[1]) for grid in self.grids)
+
+    @property
+    def _segments(self) -> int:
+        """How many segments all its lists have room for."""
+        return min(int(lists.end.shape[1]) for lists in self.lists)
 
     def _room(self, cells: int) -> int:
         """Return how many nodes to make room for where so many are needed."""

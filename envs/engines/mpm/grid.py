@@ -5,7 +5,8 @@ from typing import Any, no_type_check
 
 import warp as wp
 
-from ..runtime import determinism, precision
+from ..runtime import precision
+from .exact import LANES
 from .stencil import lattice
 
 # A node is read once, so that its adjoint can be set, where Warp would add to it atomically.
@@ -14,7 +15,7 @@ READ, ADJOINT_READ = "return wp::index(grid, e, i);", "wp::index(adj_grid, e, i)
 
 @cache
 @no_type_check
-def velocity_kernel(name: str, boundary_velocity: Any, Data: Any, *, deterministic: bool = False) -> Any:
+def velocity_kernel(name: str, boundary_velocity: Any, Data: Any) -> Any:
     """Return the kernel that turns a node's momentum into its velocity after gravity and boundary."""
     types = precision(name)
     real, vec3, vec4 = types.real, types.vec3, types.vec4
@@ -23,19 +24,18 @@ def velocity_kernel(name: str, boundary_velocity: Any, Data: Any, *, determinist
     @wp.func_native(READ, adj_snippet=ADJOINT_READ)
     def read(grid: wp.array2d[vec4], e: int, i: int) -> vec4: ...
 
-    @wp.kernel(module="unique", module_options={"deterministic": determinism(deterministic)})
+    @wp.kernel(module="unique")
     def velocity(
         lattice: Lattice,
         boundary: Data,
         dt: real,
         gravity: real,
         empty: real,
-        lanes: int,
         step: int,
         fraction: real,
         rate: real,
         tools: wp.array3d[vec3],
-        still: wp.array3d[vec3],
+        sums: wp.array2d[wp.int64],
         grid_m: wp.array2d[vec4],
         grid_v: wp.array2d[vec4],
     ):
@@ -48,7 +48,7 @@ def velocity_kernel(name: str, boundary_velocity: Any, Data: Any, *, determinist
             node = vec3(real(i / (lattice.nz * lattice.ny) + first[0]), real(j + first[1]), real(k + first[2]))
             p = lattice.origin + node * (real(1.0) / lattice.inv_dx)
             v = vec3(g[0], g[1], g[2]) / g[3] - vec3(real(0.0), dt * gravity, real(0.0))
-            v = boundary_velocity(boundary, p, v, e * lanes + i % lanes, tools, still, step, fraction, rate)
+            v = boundary_velocity(boundary, p, v, e, i % LANES, tools, sums, step, fraction, rate)
             grid_v[e, i] = vec4(v[0], v[1], v[2], real(0.0))
         else:
             grid_v[e, i] = vec4()

@@ -6,32 +6,48 @@ from collections.abc import Iterator
 from typing import Any
 
 from ..runtime import load
+from .cells import cell_kernels
+from .columns import column_kernels
+from .exact import settle_kernel
 from .grid import velocity_kernel
 from .model import Model
 from .order import sorting_kernels
-from .smoothing_cpu import smoothing_on
-from .transfers_cpu import transfers_on
+from .smoothing_columns import smoothing_columns
+from .smoothing_cpu import smoothing_on_cpu
+from .smoothing_kernels import smoothing_kernels
+from .transfers import transfers
+from .transfers_cpu import transfers_on_cpu
 
 COMPUTES_LOSSES = False  # for `code`: what is compiled here, a solver would compile itself
 
 
-def compile_all(model: Model, device: str, *, deterministic: bool = False) -> None:
+def compile_all(model: Model, device: str) -> None:
     """Compile what a solver of the model launches, forward and backward, or fetch it from the cache."""
-    load(kernels(model, device, deterministic=deterministic), device)
+    load(kernels(model, device), device)
 
 
-def kernels(model: Model, device: str, *, deterministic: bool = False) -> Iterator[Any]:
+def kernels(model: Model, device: str) -> Iterator[Any]:
     """Yield a kernel or more of each module, those first that take longest to compile."""
     name = model.precision
-    yield transfers_on(device, name, deterministic=deterministic).p2g
-    if any(body.material.smoothing for body in model.bodies):
-        smoothing = smoothing_on(device, name, deterministic=deterministic)
-        yield smoothing.spread
-        yield smoothing.clear  # of another module where the others take rows
-    yield velocity_kernel(name, *model.boundary.function(name), deterministic=deterministic)
+    yield from (_of_cpu if device == "cpu" else _of_gpu)(name, any(body.material.smoothing for body in model.bodies))
+    yield velocity_kernel(name, *model.boundary.function(name))
     for body in model.bodies:
         yield from body.material.kernels(name, rows=device == "cpu")
     sorting = sorting_kernels(name)
     yield sorting.label
     for body in model.bodies:
         yield from sorting.states[body.material.state(name)]
+
+
+def _of_cpu(name: str, smooth: bool) -> Iterator[Any]:
+    yield transfers_on_cpu(name).p2g
+    if smooth:
+        yield smoothing_on_cpu(name).spread
+        yield smoothing_on_cpu(name).clear  # of another module where the others take rows
+
+
+def _of_gpu(name: str, smooth: bool) -> Iterator[Any]:
+    yield from (transfers(name, scattering=False).g2p, column_kernels(name).p2g, cell_kernels(name).label)
+    yield settle_kernel(name)
+    if smooth:
+        yield from (smoothing_kernels(name, scattering=False).collect, smoothing_columns(name).spread)

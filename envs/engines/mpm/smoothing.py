@@ -18,17 +18,20 @@ from torch import Tensor
 
 from ..runtime import precision
 from .model import Model
-from .smoothing_cpu import smoothing_on
+from .scatter import nodes
+from .smoothing_columns import smoothing_columns
+from .smoothing_cpu import smoothing_on_cpu
+from .smoothing_kernels import smoothing_kernels
 
 
 class Smoother:
     """Smooth one body's volume ratios before a control step, and bring adjoints back."""
 
-    def __init__(self, solver: Any, body: int, *, deterministic: bool) -> None:
+    def __init__(self, solver: Any, body: int) -> None:
         model, material = solver.model, solver.model.bodies[body].material
         self.body, self.first, self.size = body, solver.first[body], solver.size(body)
         self.slope, self.share = hydrostatic_slope(model, body), material.smoothing
-        self.kernels = smoothing_on(solver.device, model.precision, deterministic=deterministic)
+        self.kernels = self._kernels(model.precision)
         types = precision(model.precision)
         self.amount, self.weight, self.adj_mean = (solver.allocator.array(types.real, model.cells) for _ in range(3))
 
@@ -43,24 +46,56 @@ class Smoother:
     def run_back(self, solver: Any, step: int, batch: int, adjoint: Any) -> None:
         """Turn the adjoint of the tape's first state into that of the checkpoint's, and add to that of x."""
         self._spread(solver, step, batch)
+        self._collect_back(solver, step, batch, adjoint)
         tape, checkpoint = solver.tape(step), solver.checkpoints[step]
-        x, J, adj_J = checkpoint.x, checkpoint.S[self.body], adjoint.S[self.body]
-        nodes = solver.boxes[step].cells
-        solver.launch(self.kernels.clear, nodes, batch, [self.adj_mean], nodes=True)
-        inputs = [tape.lattice, self.first, self.share, x, tape.smoothed[self.body], self.amount, self.weight]
-        inputs += [adj_J, adjoint.x, self.adj_mean]
-        solver.launch(self.kernels.adjoint_collect, self.size, batch, inputs)
-        inputs = [tape.lattice, self.first, self.slope, self.share, solver.orders[step].volume, x, J]
-        inputs += [self.amount, self.weight, self.adj_mean, adj_J, adjoint.x]
+        inputs = [tape.lattice, self.first, self.slope, self.share, solver.orders[step].volume, checkpoint.x]
+        inputs += [checkpoint.S[self.body], self.amount, self.weight, self.adj_mean, adjoint.S[self.body], adjoint.x]
         solver.launch(self.kernels.adjoint_spread, self.size, batch, inputs)
 
+    def _kernels(self, name: str) -> Any:
+        return smoothing_on_cpu(name)
+
     def _spread(self, solver: Any, step: int, batch: int) -> None:
-        nodes = solver.boxes[step].cells
+        """Fill `amount` and `weight`."""
         for values in (self.amount, self.weight):
-            solver.launch(self.kernels.clear, nodes, batch, [values], nodes=True)
+            solver.launch_on_box(self.kernels.clear, nodes, step, batch, [values])
         x, J = solver.checkpoints[step].x, solver.checkpoints[step].S[self.body]
         inputs = [solver.tape(step).lattice, self.first, self.slope, solver.orders[step].volume, x, J]
         solver.launch(self.kernels.spread, self.size, batch, [*inputs, self.amount, self.weight])
+
+    def _collect_back(self, solver: Any, step: int, batch: int, adjoint: Any) -> None:
+        """Fill `adj_mean`, turn the adjoint of J' into that of its logarithm, and add to that of x."""
+        solver.launch_on_box(self.kernels.clear, nodes, step, batch, [self.adj_mean])
+        self._launch_adjoint_collect(solver, step, batch, adjoint)
+
+    def _launch_adjoint_collect(self, solver: Any, step: int, batch: int, adjoint: Any) -> None:
+        tape = solver.tape(step)
+        inputs = [tape.lattice, self.first, self.share, solver.checkpoints[step].x, tape.smoothed[self.body]]
+        inputs += [self.amount, self.weight, adjoint.S[self.body], adjoint.x, self.adj_mean]
+        solver.launch(self.kernels.adjoint_collect, self.size, batch, inputs)
+
+
+class ColumnSmoother(Smoother):
+    """Do the same with sums by columns of cells, after the lists of the control step's first substep."""
+
+    def __init__(self, solver: Any, body: int) -> None:
+        super().__init__(solver, body)
+        self.columns = smoothing_columns(solver.model.precision)
+
+    def _kernels(self, name: str) -> Any:
+        return smoothing_kernels(name, scattering=False)
+
+    def _spread(self, solver: Any, step: int, batch: int) -> None:
+        x, J = solver.checkpoints[step].x, solver.checkpoints[step].S[self.body]
+        inputs = [self.first, self.slope, solver.orders[step].volume, x, J]
+        solver.scatter.walk(self.columns.spread, step, 0, batch, inputs)
+        solver.scatter.add_up(self.columns.add_up, step, 0, batch, [self.amount, self.weight])
+
+    def _collect_back(self, solver: Any, step: int, batch: int, adjoint: Any) -> None:
+        self._launch_adjoint_collect(solver, step, batch, adjoint)
+        inputs = [self.first, self.share, solver.checkpoints[step].x, adjoint.S[self.body]]
+        solver.scatter.walk(self.columns.spread_adjoint, step, 0, batch, inputs)
+        solver.scatter.add_up(self.columns.add_up_adjoint, step, 0, batch, [self.adj_mean])
 
 
 def hydrostatic_slope(model: Model, body: int) -> float:

@@ -256,14 +256,13 @@ def smoothing_in_rows() -> SimpleNamespace:
         "adjoint_collect": adjoint_collect,
         "adjoint_spread": adjoint_spread,
     }
-    plain = smoothing_kernels("float32", deterministic=False)
+    plain = smoothing_kernels("float32")
     for key, kernel in kernels.items():
         take_rows(kernel, getattr(plain, key), "J_new" if key == "adjoint_collect" else "J")
     return SimpleNamespace(**kernels, clear=plain.clear)
 
 
-def smoothing_on(device: str, name: str, *, deterministic: bool = False) -> Any:
-    """Return the smoothing kernels of a device in one precision."""
-    if device == "cpu" and name == "float32":
-        return smoothing_in_rows()
-    return smoothing_kernels(name, deterministic=deterministic)
+def smoothing_on_cpu(name: str) -> SimpleNamespace:
+    """Return the smoothing kernels of one precision that are quickest on a CPU."""
+    kernels: SimpleNamespace = smoothing_in_rows() if name == "float32" else smoothing_kernels(name)
+    return kernels

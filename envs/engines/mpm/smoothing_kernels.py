@@ -6,18 +6,20 @@ from typing import no_type_check
 
 import warp as wp
 
-from ..runtime import determinism, precision
+from ..runtime import precision
 from .stencil import lattice, stencil
 
 
 @cache
 @no_type_check
-def smoothing_kernels(name: str, *, deterministic: bool = False) -> SimpleNamespace:
-    """Return the kernels `clear, spread, collect, adjoint_collect, adjoint_spread` of one precision."""
+def smoothing_kernels(name: str, *, scattering: bool = True) -> SimpleNamespace:
+    """Return the kernels `clear, spread, collect, adjoint_collect, adjoint_spread` of one precision.
+
+    Unless `scattering`, `adjoint_collect` does not add to the nodes: `smoothing_columns` has kernels that do.
+    """
     types = precision(name)
     real, vec3 = types.real, types.vec3
-    module = f"gradscape.smoothing.{name}{'.deterministic' if deterministic else ''}"
-    wp.set_module_options({"deterministic": determinism(deterministic)}, module)
+    module = f"gradscape.smoothing.{name}{'' if scattering else '.gathers'}"
     Lattice, spline = lattice(name), stencil(name)
     base_node, weights, weight_slopes = spline.base_node, spline.weights, spline.weight_slopes
 
@@ -25,6 +27,11 @@ def smoothing_kernels(name: str, *, deterministic: bool = False) -> SimpleNamesp
     def inverse(weight: real):
         # A particle in the middle of a cell gives the farthest of its nodes nothing, and others may not meet these.
         return wp.where(weight > real(0.0), real(1.0) / weight, real(0.0))
+
+    def add(values: wp.array2d[real], e: int, i: int, value: real):
+        wp.atomic_add(values, e, i, value)
+
+    add = wp.func(add, module=module) if scattering else wp.func_native("")(add)
 
     @wp.kernel(module=module, enable_backward=False)
     def clear(values: wp.array2d[real]):
@@ -56,8 +63,8 @@ def smoothing_kernels(name: str, *, deterministic: bool = False) -> SimpleNamesp
                 row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
                 for k in range(3):
                     w = wx[i] * wy[j] * wz[k] * volume[e, q]
-                    wp.atomic_add(amount, e, row + k, w * beyond)
-                    wp.atomic_add(weight, e, row + k, w)
+                    add(amount, e, row + k, w * beyond)
+                    add(weight, e, row + k, w)
 
     @wp.kernel(module=module, enable_backward=False)
     def collect(
@@ -118,7 +125,7 @@ def smoothing_kernels(name: str, *, deterministic: bool = False) -> SimpleNamesp
                 for k in range(3):
                     mean = amount[e, row + k] * inverse(weight[e, row + k])
                     steep += mean * vec3(dx_[i] * wy[j] * wz[k], wx[i] * dy_[j] * wz[k], wx[i] * wy[j] * dz_[k])
-                    wp.atomic_add(adj_mean, e, row + k, wx[i] * wy[j] * wz[k] * share * g)
+                    add(adj_mean, e, row + k, wx[i] * wy[j] * wz[k] * share * g)
         adj_x[e, q] = adj_x[e, q] + (share * g * lattice.inv_dx) * steep
         adj_J[e, p] = g
 

@@ -25,13 +25,16 @@ import warp as wp
 from ..launches import Launches
 from ..runtime import free_memory, has_rows, load, to_torch
 from .checkpoints import Allocator, Frame, Tape
+from .exact import settle_kernel
 from .grid import velocity_kernel
 from .kernels import compile_all as compile_all
 from .model import BOX_MARGIN, EMPTY, Box, Model, nodes_around
 from .order import Order, Sorter
-from .smoothing import Smoother
+from .scatter import ByColumns, InPlace, Scatter, nodes
+from .smoothing import ColumnSmoother, Smoother
 from .stencil import lattice
-from .transfers_cpu import transfers_on
+from .transfers import transfers
+from .transfers_cpu import transfers_on_cpu
 
 CROWD = 8_000  # particles that hide what a launch costs on one core
 BUSY, FULL_CARD = 400_000, 1_000_000  # particles that keep a GPU busy; more than which gain nothing
@@ -39,7 +42,6 @@ WHOLE_EPISODE = 192e6  # bytes up to which a CPU stores an episode whole
 LAUNCHES = 200_000  # particles up to which launches cost a GPU more than what they launch
 SPARE = 0.85  # part of a GPU's free memory that control steps are kept in
 GRAIN = 4  # nodes to which the boxes of so few are rounded, so that the same ones come again
-LANES = 32  # copies of the tools on a GPU, so that fewer nodes wait for each other to add to the same adjoint
 
 
 def capacity(model: Model, device: str) -> int:
@@ -60,8 +62,8 @@ def memory(model: Model, device: str) -> int:
 class Solver:
     """Run up to `capacity` environments of one model at once, and differentiate where their control steps end.
 
-    Setting `stop` ends a run within a control step, with InterruptedError. `deterministic` makes a GPU's sums come in
-    the same order every time; on a CPU they do.
+    Setting `stop` ends a run within a control step, with InterruptedError. Every sum has one order, which depends on
+    an environment's own particles only: on a GPU, or where `columns` says so, by columns of cells (`scatter`).
     """
 
     def __init__(
@@ -71,23 +73,23 @@ class Solver:
         capacity: int,
         device: str,
         stop: threading.Event | None = None,
-        deterministic: bool = False,
+        columns: bool | None = None,
     ) -> None:
         self.model, self.capacity, self.device = model, capacity, device
         self.stop = stop or threading.Event()
-        self.allocator = Allocator(model, capacity, device)
+        columns = device != "cpu" if columns is None else columns
+        self.allocator = Allocator(model, capacity, device, columns=columns)
         self.types = self.allocator.types
-        self.kernels = transfers_on(device, model.precision, deterministic=deterministic)
-        boundary = model.boundary.function(model.precision)
-        self.velocity = velocity_kernel(model.precision, *boundary, deterministic=deterministic)
+        self.kernels = transfers(model.precision, scattering=False) if columns else transfers_on_cpu(model.precision)
+        self.velocity = velocity_kernel(model.precision, *model.boundary.function(model.precision))
         self.boundary = model.boundary.data(model.precision, device)
         self.materials = [body.material.kernels(model.precision, rows=device == "cpu") for body in model.bodies]
-        transferring = [self.kernels.p2g, self.kernels.g2p, self.kernels.adjoint_p2g, self.kernels.adjoint_g2p]
-        load([*transferring, self.velocity, *chain.from_iterable(self.materials)], device)
+        load([*vars(self.kernels).values(), self.velocity, *chain.from_iterable(self.materials)], device)
         self.first = np.concatenate([[0], np.cumsum([len(body.x) for body in model.bodies])]).tolist()
         self.empty = EMPTY * float(model.mass.min())
+        self.scatter: Scatter = ByColumns(self) if columns else InPlace(self)
         smooth = [b for b, body in enumerate(model.bodies) if body.material.smoothing]
-        self.smoothers = [Smoother(self, b, deterministic=deterministic) for b in smooth]
+        self.smoothers = [(ColumnSmoother if columns else Smoother)(self, b) for b in smooth]
         self.boxes = [Box((0, 0, 0), model.nodes)] * model.steps
         self.margins = [BOX_MARGIN] * model.steps  # cells around the particles, as each step has needed so far
         self.checkpoints = [self.allocator.frame() for _ in range(model.steps + 1)]
@@ -98,8 +100,8 @@ class Solver:
         whole = device == "cpu" and memory(model, device) > model.bytes_per_environment(1)
         self.tapes = [Tape(self.allocator) for _ in range(model.steps if whole else 1)]
         self.spare_used = device == "cpu"  # whether spare memory has been put to use
-        self.lanes = 1 if device == "cpu" else LANES
-        self.tools = self.allocator.paths(self.lanes)
+        self.tools = self.allocator.paths()
+        self.sums = self.allocator.sums()
         self.left_box, self.escaped = (wp.zeros(capacity, dtype=wp.int32, device=device) for _ in range(2))
         self.adjoint: _Adjoint | None = None
         self._start()
@@ -108,7 +110,7 @@ class Solver:
         """Simulate with the boundary's `tools`, shape (batch, step + 1, slot, 3); return x at their end [m]."""
         batch, steps = len(tools), tools.shape[1] - 1
         self.escaped.zero_()
-        self.by_lane(self.tools)[:batch, :, : steps + 1] = tools[:, None].to(self.types.torch)
+        to_torch(self.tools)[:batch, : steps + 1] = tools.to(self.types.torch)
         corners = self.model.corners
         for step in range(steps):
             corners = self._advance_on_box(step, batch, *corners)
@@ -191,7 +193,7 @@ class Solver:
         """Make room for a control step, at the cost of others where memory runs out."""
         while len(self.tapes) > 1 and not self._fits(step):
             self._drop_tapes()
-        if self.tape(step).growth(self.boxes[step].cells):
+        if self.tape(step).growth(self.boxes[step]) + self.scatter.make_room(self.boxes[step]):
             self.launches.clear()
         try:
             self.tape(step).make_room(step, self.boxes[step])
@@ -208,7 +210,7 @@ class Solver:
         """
         if self.device == "cpu":
             return True
-        growth = self.tape(step).growth(self.boxes[step].cells)
+        growth = self.tape(step).growth(self.boxes[step])
         return not growth or growth <= free_memory() // 2
 
     def _drop_tapes(self) -> None:
@@ -224,9 +226,10 @@ class Solver:
 
     def _substeps(self, step: int, batch: int) -> None:
         tape, frames = self.tape(step), self.frames(step)
-        for smoother in self.smoothers:
-            smoother.run(self, step, batch)
         for s in range(self.model.substeps):
+            self.scatter.list_particles(step, s, frames[s], batch)
+            for smoother in self.smoothers if s == 0 else ():
+                smoother.run(self, step, batch)
             self._update(step, frames[s], frames[s + 1], tape.A[s], batch)
             self._fill_grid(frames[s], step, s, batch)
             self._move_particles(frames[s], frames[s + 1], step, s, batch)
@@ -237,21 +240,8 @@ class Solver:
 
     def _fill_grid(self, frame: Frame, step: int, substep: int, batch: int) -> None:
         """Fill the substep's grid: momentum and mass from particles, then velocity."""
-        tape = self.tape(step)
-        self.clear(tape.grids[substep].m, step, batch)
-        particles = [self.orders[step].mass, frame.x, frame.v, tape.A[substep]]
-        inputs = [tape.lattice, *particles, tape.grids[substep].m]
-        self.launch(self.kernels.p2g, self.model.particles, batch, inputs)
-        inputs = self.velocity_inputs(step, substep)
-        self.launch(self.velocity, self.boxes[step].cells, batch, inputs, nodes=True)
-
-    def clear(self, grid: wp.array, step: int, batch: int) -> None:
-        """Zero what a control step uses of a grid."""
-        if self.device == "cpu":  # where numpy is quicker, and torch would spread it over threads that others want
-            values = grid.numpy()[:batch]
-            self.launches.call(lambda: values[:, : self.boxes[step].cells].fill(0.0))
-        else:
-            self.launch(self.kernels.clear, self.boxes[step].cells, batch, [grid], nodes=True)
+        self.scatter.p2g(step, substep, frame, batch)
+        self.launch_on_box(self.velocity, nodes, step, batch, self.velocity_inputs(step, substep))
 
     def _move_particles(self, frame: Frame, new: Frame, step: int, substep: int, batch: int) -> None:
         tape = self.tape(step)
@@ -269,7 +259,7 @@ class Solver:
     def velocity_inputs(self, step: int, substep: int) -> list[Any]:
         """Return the arguments of the grid's velocity kernel."""
         model, tape = self.model, self.tape(step)
-        time = [self.lanes, step, substep / model.substeps, 1.0 / (model.substeps * model.dt)]
+        time = [step, substep / model.substeps, 1.0 / (model.substeps * model.dt)]
         grid = tape.grids[substep]
         return [
             tape.lattice,
@@ -279,7 +269,7 @@ class Solver:
             self.empty,
             *time,
             self.tools,
-            self.tools,
+            self.sums,
             grid.m,
             grid.v,
         ]
@@ -288,14 +278,15 @@ class Solver:
         """Return the number of particles of body b."""
         return len(self.model.bodies[b].x)
 
-    def launch(self, kernel: Any, size: int, batch: int, inputs: list[Any], **how: Any) -> None:
+    def launch(self, kernel: Any, size: int, batch: int, inputs: list[Any]) -> None:
         """Launch a kernel over [environment, element], or over environments where it takes their rows."""
-        self.launches.launch(kernel, (batch, 1 if has_rows(kernel) else size), inputs, **how)
+        self.launches.launch(kernel, (batch, 1 if has_rows(kernel) else size), inputs)
 
-    def by_lane(self, paths: wp.array) -> torch.Tensor:
-        """View paths as [environment, lane, step, slot, axis]."""
-        view = to_torch(paths)
-        return view.view(self.capacity, self.lanes, *view.shape[1:])
+    def launch_on_box(
+        self, kernel: Any, size: Callable[[Box], int], step: int, batch: int, inputs: list[Any], **how: Any
+    ) -> None:
+        """Launch a kernel over [environment, whatever `size` counts of a control step's box]."""
+        self.launches.launch(kernel, (batch, size(self.boxes[step])), inputs, size=size, **how)
 
     def _start(self) -> None:
         first = self.checkpoints[0]
@@ -312,7 +303,9 @@ class _Adjoint:
         self.new, self.old = solver.allocator.frame(), solver.allocator.frame()
         self.A = solver.allocator.affine_momentum()
         self.grid = solver.allocator.grid(max(box.cells for box in solver.boxes))
-        self.tools = solver.allocator.paths(solver.lanes)
+        self.tools = solver.allocator.paths()
+        self.settle = settle_kernel(solver.model.precision)
+        load([self.settle], solver.device)
         self.structs = (
             lattice(solver.model.precision)(),
             type(solver.boundary)(),
@@ -332,8 +325,7 @@ class _Adjoint:
             if solver.tape(step).step != step:
                 solver._advance(step, batch)
             self._retreat(step, batch)
-        by_lane: torch.Tensor = solver.by_lane(self.tools)[:batch]
-        return by_lane.sum(dim=1)
+        return to_torch(self.tools)[:batch].clone()
 
     def _retreat(self, step: int, batch: int) -> None:
         solver = self.solver
@@ -349,27 +341,22 @@ class _Adjoint:
         solver = self.solver
         tape, frames = solver.tape(step), solver.frames(step)
         for s in reversed(range(solver.model.substeps)):
-            solver.clear(self.grid.v, step, batch)
-            self._adjoint_g2p(frames[s], tape, s, batch)
+            solver.scatter.adjoint_g2p(step, s, frames[s], self.new, self.grid.v, self.old.x, batch)
             self._adjoint_velocity(step, s, batch)
             self._adjoint_p2g(step, frames[s], tape, s, batch)
             self._adjoint_update(step, frames[s], batch)
             self.new, self.old = self.old, self.new
         for smoother in solver.smoothers:
             smoother.run_back(solver, step, batch, self.new)
-
-    def _adjoint_g2p(self, frame: Frame, tape: Tape, substep: int, batch: int) -> None:
-        solver = self.solver
-        inputs = [tape.lattice, solver.model.dt, frame.x, tape.grids[substep].v]
-        inputs += [self.new.x, self.new.v, self.new.C, self.grid.v, self.old.x]
-        solver.launch(solver.kernels.adjoint_g2p, solver.model.particles, batch, inputs)
+        if solver.device != "cpu":  # where nodes add to the adjoint itself
+            solver.launch(self.settle, 2 * solver.model.boundary.slots, batch, [step, solver.sums, self.tools])
 
     def _adjoint_velocity(self, step: int, substep: int, batch: int) -> None:
         solver = self.solver
         inputs = solver.velocity_inputs(step, substep)
         adjoints = [*self.structs, *[None] * (len(inputs) - 6), self.tools, None, self.grid.m, self.grid.v]
         how = {"adj_inputs": adjoints, "adj_outputs": [], "adjoint": True}
-        solver.launch(solver.velocity, solver.boxes[step].cells, batch, inputs, nodes=True, **how)
+        solver.launch_on_box(solver.velocity, nodes, step, batch, inputs, **how)
 
     def _adjoint_p2g(self, step: int, frame: Frame, tape: Tape, substep: int, batch: int) -> None:
         solver = self.solver

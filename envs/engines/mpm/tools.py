@@ -25,6 +25,7 @@ import numpy as np
 import warp as wp
 
 from ..runtime import precision
+from .exact import tool_readers
 from .sdf import capsule, cylinder, sphere, torus
 
 FAINTEST = 0.1  # exp(-softness d) at which a tool's shell ends
@@ -113,6 +114,7 @@ def _tools_in_room(name: str, count: int) -> tuple[Any, Any]:
     real, vec3, vec4 = types.real, types.vec3, types.vec4
     module = f"gradscape.tools.{name}.{count}"
     ball, stick, ring, post = sphere(name), capsule(name), torus(name), cylinder(name)
+    read, look = tool_readers(name).read, tool_readers(name).look
     up = wp.constant(vec3(0.0, 1.0, 0.0))
 
     @partial(wp.struct, module=module)
@@ -173,27 +175,28 @@ def _tools_in_room(name: str, count: int) -> tuple[Any, Any]:
         p: vec3,
         v: vec3,
         e: int,
+        lane: int,
         tools: wp.array3d[vec3],
-        still: wp.array3d[vec3],
+        sums: wp.array2d[wp.int64],
         step: int,
         fraction: real,
         rate: real,
     ) -> vec3:
         slot = scene.slot[j]
-        place = still[e, step, slot]
-        gap = p - (place + fraction * (still[e, step + 1, slot] - place))
+        place = look(tools, e, step, 0, slot)
+        gap = p - (place + fraction * (look(tools, e, step, 1, slot) - place))
         if wp.dot(gap, gap) > scene.reach[j] * scene.reach[j]:
             return v
         kind = scene.kind[j]
         shape = scene.shape[j]
-        start = tools[e, step, slot]
-        change = tools[e, step + 1, slot] - start
+        start = read(tools, sums, e, lane, step, 0, slot)
+        change = read(tools, sums, e, lane, step, 1, slot) - start
         local = p - (start + fraction * change)
         body = rate * change
         axis = up
         if kind == Kind.ROLLER:
-            angles = tools[e, step, slot + 1]
-            turn = tools[e, step + 1, slot + 1] - angles
+            angles = read(tools, sums, e, lane, step, 0, slot + 1)
+            turn = read(tools, sums, e, lane, step, 1, slot + 1) - angles
             yaw = angles[1] + fraction * turn[1]
             axis = vec3(wp.sin(yaw), real(0.0), wp.cos(yaw))
             body += wp.cross(rate * (turn[0] * axis + turn[1] * up), local)
@@ -213,14 +216,15 @@ def _tools_in_room(name: str, count: int) -> tuple[Any, Any]:
         p: vec3,
         v: vec3,
         e: int,
+        lane: int,
         tools: wp.array3d[vec3],
-        still: wp.array3d[vec3],
+        sums: wp.array2d[wp.int64],
         step: int,
         fraction: real,
         rate: real,
     ) -> vec3:
         for j in range(wp.static(count)):  # unrolled: a loop that AD replays would lose v
-            v = apply_tool(scene, j, p, v, e, tools, still, step, fraction, rate)
+            v = apply_tool(scene, j, p, v, e, lane, tools, sums, step, fraction, rate)
         if p[1] <= scene.floor:
             v = apply_floor(v, scene.floor_friction)
         vx, vy, vz = v[0], v[1], v[2]

@@ -2,7 +2,7 @@
 
 Notation of Hu et al. 2018 (MLS-MPM): particle position x [m], velocity v [m/s], affine velocity C [1/s], affine
 momentum A [kg/s]; node i holds momentum and mass (grid_m), or velocity (grid_v). Arrays are [environment, particle] and
-[environment, node]; a node's flat index runs z fastest. Grid values are 4-vectors, so that a GPU can add one at a time.
+[environment, node]; a node's flat index runs z fastest.
 
 The adjoints are written out because they cost half of what reverse-mode AD of the 27-node stencil costs; the tests hold
 them against it.
@@ -14,22 +14,22 @@ from typing import no_type_check
 
 import warp as wp
 
-from ..runtime import determinism, precision
-from .aggregation import aggregation
+from ..runtime import precision
 from .stencil import lattice, stencil
 
 
 @cache
 @no_type_check
-def transfers(name: str, *, deterministic: bool = False) -> SimpleNamespace:
-    """Return the transfer kernels `clear, p2g, g2p, adjoint_p2g, adjoint_g2p` of one precision."""
+def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
+    """Return the transfer kernels `p2g, g2p, adjoint_p2g, adjoint_g2p` of one precision.
+
+    Unless `scattering`, `adjoint_g2p` does not add to the grid: `columns` does on a GPU, and p2g is there instead.
+    """
     types = precision(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
-    module = f"gradscape.transfers.{name}{'.deterministic' if deterministic else ''}"
-    wp.set_module_options({"deterministic": determinism(deterministic)}, module)
+    module = f"gradscape.transfers.{name}{'' if scattering else '.gathers'}"
     Lattice, spline = lattice(name), stencil(name)
     base_node, weights, weight_slopes = spline.base_node, spline.weights, spline.weight_slopes
-    find_run, add = aggregation(name, module, native=name == "float32" and not deterministic)
     offset = wp.constant(vec3(0.0, 1.0, 2.0))  # real(i) on an unrolled index breaks the code generator in float64
 
     @wp.func(module=module)
@@ -40,10 +40,10 @@ def transfers(name: str, *, deterministic: bool = False) -> SimpleNamespace:
     def head(g: vec4):
         return vec3(g[0], g[1], g[2])
 
-    @wp.kernel(module=module, enable_backward=False)
-    def clear(grid: wp.array2d[vec4]):
-        e, i = wp.tid()
-        grid[e, i] = vec4()
+    def add(grid: wp.array2d[vec4], e: int, i: int, value: vec4):
+        wp.atomic_add(grid, e, i, value)
+
+    add = wp.func(add, module=module) if scattering else wp.func_native("")(add)
 
     @wp.kernel(module=module, enable_backward=False)
     def p2g(
@@ -65,7 +65,6 @@ def transfers(name: str, *, deterministic: bool = False) -> SimpleNamespace:
         a = A[e, p] * (real(1.0) / lattice.inv_dx)
         ax, ay, az = column(a, 0), column(a, 1), column(a, 2)
         q0 = m * v[e, p] - a * f
-        run = find_run(e, (corner[0] * lattice.ny + corner[1]) * lattice.nz + corner[2])
         for i in range(3):
             for j in range(3):
                 row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
@@ -74,7 +73,7 @@ def transfers(name: str, *, deterministic: bool = False) -> SimpleNamespace:
                 for k in range(3):
                     w = wij * wz[k]
                     q = w * (qij + offset[k] * az)
-                    add(grid_m, e, row + k, vec4(q[0], q[1], q[2], w * m), run, 4)
+                    add(grid_m, e, row + k, vec4(q[0], q[1], q[2], w * m))
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint_p2g(
@@ -194,7 +193,6 @@ def transfers(name: str, *, deterministic: bool = False) -> SimpleNamespace:
         q0 = adj_v_new[e, p] + dt * adj_x_new[e, p] - c * f
         slope = vec3()
         s0 = vec3()
-        run = find_run(e, (corner[0] * lattice.ny + corner[1]) * lattice.nz + corner[2])
         for i in range(3):
             for j in range(3):
                 row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
@@ -209,8 +207,8 @@ def transfers(name: str, *, deterministic: bool = False) -> SimpleNamespace:
                     sigma = wp.dot(q, vi)
                     s0 += w * vi
                     slope += sigma * vec3(gx * wz[k], gy * wz[k], wij * dz_[k])
-                    add(adj_grid_v, e, row + k, vec4(w * q[0], w * q[1], w * q[2], real(0.0)), run, 3)
+                    add(adj_grid_v, e, row + k, vec4(w * q[0], w * q[1], w * q[2], real(0.0)))
         adj_x[e, p] = adj_x_new[e, p] + lattice.inv_dx * (slope - wp.transpose(c) * s0)
 
-    kernels = {"clear": clear, "p2g": p2g, "g2p": g2p, "adjoint_p2g": adjoint_p2g, "adjoint_g2p": adjoint_g2p}
+    kernels = {"p2g": p2g, "g2p": g2p, "adjoint_p2g": adjoint_p2g, "adjoint_g2p": adjoint_g2p}
     return SimpleNamespace(**kernels)

@@ -235,11 +235,10 @@ ADJOINT_G2P = (
 )
 
 
-def transfers_on(device: str, name: str, *, deterministic: bool = False) -> Any:
-    """Return the transfer kernels of a device in one precision; on a CPU every sum comes in the same order anyway."""
-    if device == "cpu" and name == "float32":
-        return transfers_in_rows()
-    return transfers(name, deterministic=deterministic)
+def transfers_on_cpu(name: str) -> SimpleNamespace:
+    """Return the transfer kernels of one precision that are quickest on a CPU."""
+    kernels: SimpleNamespace = transfers_in_rows() if name == "float32" else transfers(name)
+    return kernels
 
 
 @cache

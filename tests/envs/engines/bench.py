@@ -95,14 +95,14 @@ class BoundaryBench:
             data: Data,
             p: wp.array[vec3],
             tools: wp.array3d[vec3],
-            still: wp.array3d[vec3],
+            sums: wp.array2d[wp.int64],
             fraction: real,
             rate: real,
             v: wp.array[vec3],
             out: wp.array[vec3],
         ):
             i = wp.tid()
-            out[i] = contact(data, p[i], v[i], 0, tools, still, 0, fraction, rate)
+            out[i] = contact(data, p[i], v[i], 0, 0, tools, sums, 0, fraction, rate)
 
         self.kernel = apply
 
@@ -122,7 +122,7 @@ class BoundaryBench:
 
     def _inputs(self, p, v, tools, fraction):
         at, places, before, after = (self._array(t) for t in (p.expand_as(v), tools[None], v, torch.zeros_like(v)))
-        return [self.data, at, places, places, fraction, self.rate, before, after]
+        return [self.data, at, places, wp.zeros((1, 1), dtype=wp.int64), fraction, self.rate, before, after]
 
     def _array(self, values):
         return wp.array(values.contiguous().numpy(), dtype=self.types.vec3, copy=True)

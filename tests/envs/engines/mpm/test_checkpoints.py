@@ -18,12 +18,13 @@ from .bodies import free_model, kneaded, kneading, over_time, solved, stirred, w
 GPU = pytest.mark.skipif(not cuda_available(), reason="no CUDA device")
 
 
-def test_results_do_not_depend_on_what_else_is_in_the_batch():
+@pytest.mark.parametrize("columns", [False, True])
+def test_results_do_not_depend_on_what_else_is_in_the_batch(columns):
     """The others lie elsewhere and stray farther, so that another part of the grid is worked on."""
     model, paths = kneading()
     adj_x = weights(model, 3, 3)
-    lone = kneaded(model, paths[:1], {model.steps: adj_x[:1]})
-    solver = Solver(model, capacity=3, device="cpu")
+    lone = kneaded(model, paths[:1], {model.steps: adj_x[:1]}, columns=columns)
+    solver = Solver(model, capacity=3, device="cpu", columns=columns)
     to_torch(solver.checkpoints[0].x)[1:] += torch.tensor([[[0.25, 0.1, 0.05]], [[-0.2, 0.2, -0.1]]])
     end, gradient = solver.run(paths), solver.gradient({model.steps: adj_x})
     assert all(box.cells < more.cells for box, more in zip(lone[0].boxes, solver.boxes, strict=True))
@@ -32,13 +33,14 @@ def test_results_do_not_depend_on_what_else_is_in_the_batch():
     assert gradient[0].abs().max() > 0
 
 
-def test_the_whole_grid_and_its_parts_give_the_same_bits(monkeypatch):
+@pytest.mark.parametrize("columns", [False, True])
+def test_the_whole_grid_and_its_parts_give_the_same_bits(monkeypatch, columns):
     model, paths = kneading()
     adj_x = {model.steps: weights(model, 3, 4)}
-    cropped = kneaded(model, paths, adj_x)
+    cropped = kneaded(model, paths, adj_x, columns=columns)
     assert all(box.cells < model.cells / 2 for box in cropped[0].boxes)
     monkeypatch.setattr(mpm, "BOX_MARGIN", 1000)
-    whole = kneaded(model, paths, adj_x)
+    whole = kneaded(model, paths, adj_x, columns=columns)
     assert whole[0].boxes == [Box((0, 0, 0), model.nodes)] * model.steps
     assert torch.equal(whole[1], cropped[1])
     assert torch.equal(whole[2], cropped[2])
@@ -70,17 +72,18 @@ def test_the_grid_grows_where_a_particle_leaves_its_part(monkeypatch, speed):
         assert torch.equal(over_time(cropped, name), over_time(whole, name))
 
 
-def test_a_tape_grows_by_the_bytes_it_says():
+@pytest.mark.parametrize("columns", [False, True])
+def test_a_tape_grows_by_the_bytes_it_says(columns):
     model, paths = kneading()
-    solver = Solver(model, capacity=len(paths), device="cpu")
+    solver = Solver(model, capacity=len(paths), device="cpu", columns=columns)
     solver.boxes[0] = nodes_around(model, *model.corners, mpm.BOX_MARGIN)
     tape = Tape(solver.allocator)
     for margin in (0, 3):  # the second time it has something to lose
         box = solver.boxes[0] = nodes_around(model, *model.corners, mpm.BOX_MARGIN + margin)
-        before, growth = tape.bytes, tape.growth(box.cells)
+        before, growth = tape.bytes, tape.growth(box)
         tape.make_room(0, box)
         assert tape.bytes - before == growth > 0
-    assert tape.growth(box.cells) == 0
+    assert tape.growth(box) == 0
 
 
 @pytest.mark.parametrize("warned", [True, False])
