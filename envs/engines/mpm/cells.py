@@ -2,13 +2,14 @@
 
 Between control steps particles lie in memory by body and cell (`order`), but they move on in between. So each substep
 lists its particles by cell, and those of a cell as they lie in memory. SEGMENT cells along z, from a multiple of
-SEGMENT on, make a segment, whose particles come one after the other in the list.
+SEGMENT on, make a segment, whose particles come one after the other in the list. Where in the list a segment is,
+chance may decide: nothing depends on it.
 """
 
 from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import warp as wp
 
@@ -18,17 +19,36 @@ from .stencil import lattice, stencil
 
 SEGMENT = 8  # cells
 
+# Neighbours in memory are mostly of one cell: on a GPU one of them counts for all of a warp.
+TAKE_NUMBER = """
+#if defined(__CUDA_ARCH__)
+    const unsigned alike = __match_any_sync(__activemask(), (unsigned long long)&wp::index(counts, e, cell));
+    const int lane = threadIdx.x & 31, leader = __ffs(alike) - 1;
+    int number = 0;
+    if (lane == leader) number = atomicAdd(&wp::index(counts, e, cell), __popc(alike));
+    return __shfl_sync(alike, number, leader) + __popc(alike & ((1u << lane) - 1u));
+#else
+    return wp::index(counts, e, cell)++;
+#endif
+"""
+
 
 @dataclass(frozen=True, eq=False)
 class Lists:
-    """The particles by cell: `order` [environment, place], and where a segment's begin and end there.
+    """The particles by cell: `order` [environment, place], and the places of segments, [environment, segment].
 
-    `first` and `end` are [environment, segment]; both are 0 where a segment has none.
+    A segment's particles are at places `first` to `end`; `span` holds which planes of nodes they touch, counted from
+    the segment's first: the lowest, and 16 times the one beyond the highest; 0 where it has no particles.
     """
 
     order: wp.array
     first: wp.array
     end: wp.array
+    span: wp.array
+
+    def segments(self) -> list[wp.array]:
+        """Return the arrays of segments."""
+        return [self.first, self.end, self.span]
 
 
 def segments(box: Box) -> int:
@@ -39,89 +59,97 @@ def segments(box: Box) -> int:
 
 @cache
 @no_type_check
-def cell_functions(name: str) -> SimpleNamespace:
-    """Return the functions `depth, column` of one precision.
-
-    depth(lattice) is the number of segments along z, column(lattice, i, j) that of the first segment of a column.
-    """
-    Lattice, module = lattice(name), f"gradscape.cells.{name}"
-
-    @wp.func(module=module)
-    def depth(lattice: Lattice):
-        return (lattice.first[2] + lattice.nz - 1) / SEGMENT - lattice.first[2] / SEGMENT + 1
-
-    @wp.func(module=module)
-    def column(lattice: Lattice, i: int, j: int):
-        return (i * lattice.ny + j) * depth(lattice)
-
-    return SimpleNamespace(depth=depth, column=column)
-
-
-@cache
-@no_type_check
 def cell_kernels(name: str) -> SimpleNamespace:
-    """Return the kernels `label, forget, list_cells` of one precision."""
+    """Return the kernels `count, place_segments, place, tidy` of one precision, which make lists in this order."""
     types = precision(name)
     real, vec3 = types.real, types.vec3
-    Lattice, base_node, functions = lattice(name), stencil(name).base_node, cell_functions(name)
-    depth, column, module = functions.depth, functions.column, f"gradscape.cells.{name}"
+    Lattice, base_node, module = lattice(name), stencil(name).base_node, f"gradscape.cells.{name}"
+
+    @wp.func_native(TAKE_NUMBER)
+    def take_number(counts: wp.array2d[wp.int32], e: int, cell: int) -> int: ...
 
     @wp.kernel(module=module, enable_backward=False)
-    def label(lattice: Lattice, x: wp.array2d[vec3], keys: wp.array[wp.int32], places: wp.array[wp.int32]):
-        """Give each particle a key by environment and cell."""
-        e, p = wp.tid()
-        base = base_node((x[e, p] - lattice.origin) * lattice.inv_dx, lattice)
-        first = column(lattice, base[0] - lattice.first[0], base[1] - lattice.first[1])
-        segment = first + base[2] / SEGMENT - lattice.first[2] / SEGMENT
-        segment += e * lattice.nx * lattice.ny * depth(lattice)
-        at = e * x.shape[1] + p
-        keys[at] = segment * SEGMENT + base[2] % SEGMENT
-        places[at] = p
-
-    @wp.kernel(module=module, enable_backward=False)
-    def forget(lattice: Lattice, first: wp.array2d[wp.int32], end: wp.array2d[wp.int32]):
-        e, s = wp.tid()
-        first[e, s] = 0
-        end[e, s] = 0
-
-    @wp.kernel(module=module, enable_backward=False)
-    def list_cells(
+    def count(
         lattice: Lattice,
-        keys: wp.array[wp.int32],
-        places: wp.array[wp.int32],
-        order: wp.array2d[wp.int32],
+        x: wp.array2d[vec3],
+        cells: wp.array2d[wp.int32],
+        numbers: wp.array2d[wp.int32],
+        counts: wp.array2d[wp.int32],
+        used: wp.array[wp.int32],
+    ):
+        """Tell each particle its cell, and its number there in the order of arrival."""
+        e, p = wp.tid()
+        if p == 0:
+            used[e] = 0
+        base = base_node((x[e, p] - lattice.origin) * lattice.inv_dx, lattice)
+        bottom = lattice.first[2] / SEGMENT
+        depth = (lattice.first[2] + lattice.nz - 1) / SEGMENT - bottom + 1
+        column = (base[0] - lattice.first[0]) * lattice.ny + base[1] - lattice.first[1]
+        cell = (column * depth - bottom) * SEGMENT + base[2]
+        cells[e, p] = cell
+        numbers[e, p] = take_number(counts, e, cell)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def place_segments(
+        lattice: Lattice,
+        counts: wp.array2d[wp.int32],
+        used: wp.array[wp.int32],
+        starts: wp.array2d[wp.int32],
         first: wp.array2d[wp.int32],
         end: wp.array2d[wp.int32],
+        span: wp.array2d[wp.int32],
     ):
-        """Take the particles' order, and find where each segment begins and ends in it."""
+        """Give each segment its places in the list, and each of its cells; count from 0 again."""
+        e, s = wp.tid()
+        total, low, high = int(0), int(0), int(0)
+        for k in range(SEGMENT):
+            here = counts[e, s * SEGMENT + k]
+            if here > 0:
+                if total == 0:
+                    low = k
+                high = k + 3
+            total += here
+        at = int(0)
+        if total > 0:
+            at = wp.atomic_add(used, e, total)
+        first[e, s] = at
+        end[e, s] = at + total
+        span[e, s] = low + 16 * high
+        for k in range(SEGMENT):
+            starts[e, s * SEGMENT + k] = at
+            at += counts[e, s * SEGMENT + k]
+            counts[e, s * SEGMENT + k] = 0
+
+    @wp.kernel(module=module, enable_backward=False)
+    def place(
+        cells: wp.array2d[wp.int32],
+        numbers: wp.array2d[wp.int32],
+        starts: wp.array2d[wp.int32],
+        arrived: wp.array2d[wp.int32],
+    ):
+        """List particles by cell, those of a cell as they arrived."""
         e, p = wp.tid()
-        count = order.shape[1]
-        at = e * count + p
-        order[e, p] = places[at]
-        here = keys[at] / SEGMENT
-        segment = here - e * lattice.nx * lattice.ny * depth(lattice)
-        before, after = int(-1), int(-1)
-        if p > 0:
-            before = keys[at - 1] / SEGMENT
-        if p < count - 1:
-            after = keys[at + 1] / SEGMENT
-        if before != here:
-            first[e, segment] = p
-        if after != here:
-            end[e, segment] = p + 1
+        arrived[e, starts[e, cells[e, p]] + numbers[e, p]] = p
 
-    return SimpleNamespace(label=label, forget=forget, list_cells=list_cells)
+    @wp.kernel(module=module, enable_backward=False)
+    def tidy(
+        cells: wp.array2d[wp.int32],
+        starts: wp.array2d[wp.int32],
+        arrived: wp.array2d[wp.int32],
+        end: wp.array2d[wp.int32],
+        order: wp.array2d[wp.int32],
+    ):
+        """List them by cell, those of a cell as they lie in memory."""
+        e, p = wp.tid()
+        cell = cells[e, p]
+        start = starts[e, cell]
+        stop = end[e, cell / SEGMENT]
+        if cell % SEGMENT < SEGMENT - 1:
+            stop = starts[e, cell + 1]
+        before = int(0)
+        for i in range(start, stop):
+            if arrived[e, i] < p:
+                before += 1
+        order[e, start + before] = p
 
-
-class Lister:
-    """List the particles of up to `capacity` environments by cell."""
-
-    def __init__(self, name: str, particles: int, capacity: int, device: str) -> None:
-        self.kernels, self.particles, self.device = cell_kernels(name), particles, device
-        room = 2 * capacity * particles
-        self.keys, self.places = (wp.zeros(room, dtype=wp.int32, device=device) for _ in range(2))
-
-    def sort(self, box: Box, batch: int) -> None:
-        """Bring keys and places into the order of keys; those that are equal stay as they are."""
-        bits = (batch * segments(box) * SEGMENT).bit_length()
-        wp.utils.radix_sort_pairs(self.keys, self.places, batch * self.particles, 0, bits)
+    return SimpleNamespace(count=count, place_segments=place_segments, place=place, tidy=tidy)

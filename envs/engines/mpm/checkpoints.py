@@ -69,8 +69,7 @@ class Allocator:
 
     def lists(self, segments: int) -> Lists:
         """Return lists of no particles."""
-        first, end = (self.array(wp.int32, segments) for _ in range(2))
-        return Lists(self.array(wp.int32, self.model.particles), first, end)
+        return Lists(self.array(wp.int32, self.model.particles), *(self.array(wp.int32, segments) for _ in range(3)))
 
     def paths(self) -> wp.array:
         """Return zeros [environment, step, slot]."""
@@ -104,7 +103,7 @@ class Tape:
         """What its arrays take."""
         grids = [array for grid in self.grids for array in (grid.m, grid.v)]
         frames = [array for frame in self.frames for array in frame.arrays()]
-        lists = [array for one in self.lists for array in (one.order, one.first, one.end)]
+        lists = [array for one in self.lists for array in (one.order, *one.segments())]
         return sum(array.capacity for array in (*frames, *self.smoothed.values(), *self.A, *grids, *lists))
 
     def growth(self, box: Box) -> int:
@@ -113,7 +112,7 @@ class Tape:
         if self._cells < box.cells:
             growth += 2 * size * (self._room(box.cells) - self._cells)
         if self.lists and self._segments < segments(box):
-            growth += 2 * 4 * (segments(box) * 5 // 4 - self._segments)
+            growth += 3 * 4 * (segments(box) * 5 // 4 - self._segments)
         return growth * len(self.grids) * self._allocator.capacity
 
     def start(self, checkpoint: Frame) -> Frame:

@@ -1,10 +1,11 @@
 """Scatters without atomic adds, for a GPU: a warp walks a column of cells, and nodes add up what columns give them.
 
-Particles are listed by cell (`cells`). A warp, 32 threads, takes the particles of SEGMENT cells along z one after the
-other; 27 of its lanes hold the sums of the 27 nodes around the present cell, and where the next cell begins, the lowest
-nine are written down and the others move on by one. A segment so leaves 9 rows of SEGMENT + 2 numbers of four parts,
-and each node then adds up those of the nine columns that it is part of. Every sum has one order, which depends on
-nothing but an environment's own particles: neither on its place in a batch, nor on the box of nodes, nor on chance.
+Particles are listed by cell (`cells`). A warp, 32 threads, takes the particles of SEGMENT cells along z, one cell after
+the other, three particles at a time: nine lanes each, one for a row of three nodes along z, which hold the sums of the
+27 nodes around the present cell. Where the next cell begins, the lowest nine are added up over the three and written
+down, and the others become lower by one. A segment so leaves 9 rows of up to SEGMENT + 2 numbers of four parts, and
+each node then adds up those of the nine columns that it is part of. Every sum has one order, which depends on nothing
+but an environment's own particles: neither on its place in a batch, nor on the box of nodes, nor on chance.
 """
 
 from functools import cache
@@ -15,23 +16,39 @@ import warp as wp
 
 from ..launches import BLOCK
 from ..runtime import precision
-from .cells import SEGMENT, cell_functions
+from .cells import SEGMENT
 from .stencil import lattice, stencil
 
+WARP = 32  # threads that walk a segment together on a GPU; on a CPU one does
 PLANES = SEGMENT + 2  # of nodes that the cells of a segment touch
 PARTS = 9 * PLANES  # numbers of four parts that a segment leaves
 
+FOUR = "struct alignas(16) Four { REAL a, b, c, d; };"
+EMIT = """
+        {
+            const Four sum{
+                low.a + __shfl_down_sync(all, low.a, 9) + __shfl_down_sync(all, low.a, 18),
+                low.b + __shfl_down_sync(all, low.b, 9) + __shfl_down_sync(all, low.b, 18),
+                low.c + __shfl_down_sync(all, low.c, 9) + __shfl_down_sync(all, low.c, 18),
+                low.d + __shfl_down_sync(all, low.d, 9) + __shfl_down_sync(all, low.d, 18)};
+            if (lane < 9) *(Four *)&wp::index(parts, e, at + lane * PLANES + now) = sum;
+            low = middle, middle = high, high = Four{};
+        }
+"""
 OPEN = """
+    wp::vec_t<13, REAL> state;
+    state[12] = REAL(span & 15);
 #if !defined(__CUDA_ARCH__)
     for (int i = 0; i < PARTS; ++i) wp::index(parts, e, at + i) = wp::vec_t<4, REAL>();
 #endif
+    return state;
 """
 WALK = """
 #if defined(__CUDA_ARCH__)
-    struct __align__(16) Four { REAL a, b, c, d; };
-    __shared__ Four stage[WARPS][32][5];
+    FOUR
+    __shared__ Four stage[WARPS][WARP][5];
     const unsigned all = 0xffffffffu;
-    const int lane = threadIdx.x & 31;
+    const int lane = threadIdx.x & 31, group = lane / 9, i = lane % 9 / 3, j = lane % 3;
     Four (*rows)[5] = stage[threadIdx.x >> 5];
     __syncwarp();
     rows[lane][0] = Four{q[0], q[1], q[2], mass};
@@ -39,35 +56,38 @@ WALK = """
     rows[lane][2] = Four{a.data[0][1], a.data[1][1], a.data[2][1], f[1]};
     rows[lane][3] = Four{a.data[0][2], a.data[1][2], a.data[2][2], f[2]};
     __syncwarp();
-    const int i = lane / 9, j = lane / 3 % 3, k = lane % 3;
-    const bool used = lane < 27;
-    const REAL oi = REAL(i), oj = REAL(j), ok = REAL(k), half = REAL(0.5);
-    const REAL ui = i == 1 ? REAL(0.75) : REAL(0.0), si = !used ? REAL(0.0) : i == 1 ? REAL(-1.0) : half;
-    const REAL uj = j == 1 ? REAL(0.75) : REAL(0.0), sj = j == 1 ? REAL(-1.0) : half;
-    const REAL uk = k == 1 ? REAL(0.75) : REAL(0.0), sk = k == 1 ? REAL(-1.0) : half;
-    const REAL mi = REAL(1.5) - half * oi, mj = REAL(1.5) - half * oj, mk = REAL(1.5) - half * ok;
-    REAL s0 = state[0], s1 = state[1], s2 = state[2], s3 = state[3];
-    int now = (int)state[4];
-    for (int t = 0; t < count; ++t) {
-        for (const int next = __shfl_sync(all, cell, t); now < next; ++now) {
-            if (used && k == 0)
-                wp::index(parts, e, at + lane / 3 * PLANES + now) = wp::vec_t<4, REAL>(s0, s1, s2, s3);
-            s0 = __shfl_down_sync(all, s0, 1);
-            s1 = __shfl_down_sync(all, s1, 1);
-            s2 = __shfl_down_sync(all, s2, 1);
-            s3 = __shfl_down_sync(all, s3, 1);
-            if (k == 2) s0 = s1 = s2 = s3 = REAL(0.0);
+    const REAL oi = REAL(i), oj = REAL(j), half = REAL(0.5), one = REAL(1.0), three = REAL(0.75);
+    const REAL ui = i == 1 ? three : REAL(0.0), si = i == 1 ? -one : half, mi = REAL(1.5) - half * oi;
+    const REAL uj = j == 1 ? three : REAL(0.0), sj = j == 1 ? -one : half, mj = REAL(1.5) - half * oj;
+    Four low{state[0], state[1], state[2], state[3]};
+    Four middle{state[4], state[5], state[6], state[7]};
+    Four high{state[8], state[9], state[10], state[11]};
+    int now = (int)state[12];
+    const int before = __shfl_up_sync(all, cell, 1);
+    const unsigned heads = __ballot_sync(all, lane < count && (lane == 0 || cell != before));
+    for (int first = 0; first < count;) {
+        const unsigned later = heads >> first >> 1;
+        const int last = later ? first + __ffs(later) : count;
+        for (const int here = __shfl_sync(all, cell, first); now < here; ++now) EMIT
+        for (int t = group < 3 ? first + group : last; t < last; t += 3) {
+            const Four b = rows[t][0], x = rows[t][1], y = rows[t][2], z = rows[t][3];
+            const REAL tx = x.d - mi, ty = y.d - mj, u = z.d - REAL(1.5), v = z.d - one, w = z.d - half;
+            const REAL wij = (ui + si * tx * tx) * (uj + sj * ty * ty);
+            const REAL w0 = wij * (half * u * u), w1 = wij * (three - v * v), w2 = wij * (half * w * w);
+            REAL qa = b.a + oi * x.a + oj * y.a, qb = b.b + oi * x.b + oj * y.b, qc = b.c + oi * x.c + oj * y.c;
+            low.a += w0 * qa, low.b += w0 * qb, low.c += w0 * qc, low.d += w0 * b.d;
+            qa += z.a, qb += z.b, qc += z.c;
+            middle.a += w1 * qa, middle.b += w1 * qb, middle.c += w1 * qc, middle.d += w1 * b.d;
+            qa += z.a, qb += z.b, qc += z.c;
+            high.a += w2 * qa, high.b += w2 * qb, high.c += w2 * qc, high.d += w2 * b.d;
         }
-        const Four b = rows[t][0], x = rows[t][1], y = rows[t][2], z = rows[t][3];
-        const REAL tx = x.d - mi, ty = y.d - mj, tz = z.d - mk;
-        const REAL w = (ui + si * tx * tx) * (uj + sj * ty * ty) * (uk + sk * tz * tz);
-        s0 += w * (b.a + oi * x.a + oj * y.a + ok * z.a);
-        s1 += w * (b.b + oi * x.b + oj * y.b + ok * z.b);
-        s2 += w * (b.c + oi * x.c + oj * y.c + ok * z.c);
-        s3 += w * b.d;
+        first = last;
     }
-    wp::vec_t<5, REAL> left;
-    left[0] = s0, left[1] = s1, left[2] = s2, left[3] = s3, left[4] = REAL(now);
+    wp::vec_t<13, REAL> left;
+    left[0] = low.a, left[1] = low.b, left[2] = low.c, left[3] = low.d;
+    left[4] = middle.a, left[5] = middle.b, left[6] = middle.c, left[7] = middle.d;
+    left[8] = high.a, left[9] = high.b, left[10] = high.c, left[11] = high.d;
+    left[12] = REAL(now);
     return left;
 #else
     REAL w[3][3];
@@ -82,8 +102,10 @@ WALK = """
             for (int k = 0; k < 3; ++k) {
                 const REAL weight = w[0][i] * w[1][j] * w[2][k];
                 wp::vec_t<4, REAL> &sum = wp::index(parts, e, at + (3 * i + j) * PLANES + cell + k);
-                for (int d = 0; d < 3; ++d)
-                    sum[d] += weight * (q[d] + REAL(i) * a.data[d][0] + REAL(j) * a.data[d][1] + REAL(k) * a.data[d][2]);
+                for (int d = 0; d < 3; ++d) {
+                    const REAL move = REAL(i) * a.data[d][0] + REAL(j) * a.data[d][1] + REAL(k) * a.data[d][2];
+                    sum[d] += weight * (q[d] + move);
+                }
                 sum[3] += weight * mass;
             }
     return state;
@@ -91,20 +113,54 @@ WALK = """
 """
 CLOSE = """
 #if defined(__CUDA_ARCH__)
+    FOUR
     const unsigned all = 0xffffffffu;
-    const int lane = threadIdx.x & 31, k = lane % 3;
-    REAL s0 = state[0], s1 = state[1], s2 = state[2], s3 = state[3];
-    for (int now = (int)state[4]; now < PLANES; ++now) {
-        if (lane < 27 && k == 0)
-            wp::index(parts, e, at + lane / 3 * PLANES + now) = wp::vec_t<4, REAL>(s0, s1, s2, s3);
-        s0 = __shfl_down_sync(all, s0, 1);
-        s1 = __shfl_down_sync(all, s1, 1);
-        s2 = __shfl_down_sync(all, s2, 1);
-        s3 = __shfl_down_sync(all, s3, 1);
-        if (k == 2) s0 = s1 = s2 = s3 = REAL(0.0);
-    }
+    const int lane = threadIdx.x & 31;
+    Four low{state[0], state[1], state[2], state[3]};
+    Four middle{state[4], state[5], state[6], state[7]};
+    Four high{state[8], state[9], state[10], state[11]};
+    for (int now = (int)state[12]; now < span >> 4; ++now) EMIT
 #endif
 """
+ADD_UP = """
+    FOUR
+    const int nz = grid.nz, ny = grid.ny, z = grid.first[2] + i % nz, y = i / nz % ny, x = i / nz / ny;
+    const int bottom = grid.first[2] / SEGMENT, depth = (grid.first[2] + nz - 1) / SEGMENT - bottom + 1;
+    const int segment = z / SEGMENT - bottom, plane = z % SEGMENT;
+    const bool both = plane < 2 && segment > 0;
+    const int *row = &wp::index(spans, e, 0);
+    const Four *given = (const Four *)&wp::index(parts, e, 0);
+    int lower[9], upper[9];
+#pragma unroll
+    for (int c = 0; c < 9; ++c) {
+        const bool there = x >= c / 3 && y >= c % 3;
+        const int here = ((x - c / 3) * ny + y - c % 3) * depth + segment;
+        lower[c] = there && both ? row[here - 1] : 0;
+        upper[c] = there ? row[here] : 0;
+    }
+    Four sums[2] = {};
+#pragma unroll
+    for (int c = 0; c < 9; ++c) {
+        const int here = ((x - c / 3) * ny + y - c % 3) * depth + segment, at = plane + SEGMENT;
+        const Four none{};
+        const bool low = at >= (lower[c] & 15) && at < lower[c] >> 4;
+        const bool high = plane >= (upper[c] & 15) && plane < upper[c] >> 4;
+        const Four a = low ? given[(here - 1) * PARTS + c * PLANES + at] : none;
+        const Four b = high ? given[here * PARTS + c * PLANES + plane] : none;
+        sums[0].a += a.a, sums[0].b += a.b, sums[0].c += a.c, sums[0].d += a.d;
+        sums[1].a += b.a, sums[1].b += b.b, sums[1].c += b.c, sums[1].d += b.d;
+    }
+    return wp::vec_t<4, REAL>(
+        sums[0].a + sums[1].a, sums[0].b + sums[1].b, sums[0].c + sums[1].c, sums[0].d + sums[1].d);
+"""
+
+
+def fill(code: str, name: str) -> str:
+    """Put what a precision decides, and other constants, into C++."""
+    words = {"EMIT": EMIT, "FOUR": FOUR, "PLANES": PLANES, "PARTS": PARTS, "SEGMENT": SEGMENT, "REAL": f"wp::{name}"}
+    for word, value in {**words, "WARPS": BLOCK // WARP, "WARP": WARP}.items():
+        code = code.replace(word, str(value))
+    return code
 
 
 @cache
@@ -119,18 +175,12 @@ def walker(name: str) -> SimpleNamespace:
     """
     types = precision(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
-    State = wp.types.vector(5, real)
-    constants = {"PLANES": str(PLANES), "PARTS": str(PARTS), "WARPS": str(BLOCK // 32), "REAL": f"wp::{name}"}
+    State = wp.types.vector(13, real)
 
-    def fill(code: str) -> str:
-        for word, value in constants.items():
-            code = code.replace(word, value)
-        return code
+    @wp.func_native(fill(OPEN, name))
+    def open_segment(parts: wp.array2d[vec4], e: int, at: int, span: int) -> State: ...
 
-    @wp.func_native(fill(OPEN))
-    def open_segment(parts: wp.array2d[vec4], e: int, at: int): ...
-
-    @wp.func_native(fill(WALK))
+    @wp.func_native(fill(WALK, name))
     def walk(
         parts: wp.array2d[vec4],
         e: int,
@@ -144,33 +194,47 @@ def walker(name: str) -> SimpleNamespace:
         state: State,
     ) -> State: ...
 
-    @wp.func_native(fill(CLOSE))
-    def close_segment(parts: wp.array2d[vec4], e: int, at: int, state: State): ...
+    @wp.func_native(fill(CLOSE, name))
+    def close_segment(parts: wp.array2d[vec4], e: int, at: int, span: int, state: State): ...
 
     return SimpleNamespace(open=open_segment, walk=walk, close=close_segment, State=State)
 
 
 @cache
 @no_type_check
-def column_kernels(name: str) -> SimpleNamespace:
-    """Return the kernels `p2g, adjoint_g2p, add_up` of one precision, and the function `add_up_node`.
+def node_sum(name: str):
+    """Return the function (lattice, spans, parts, e, i) that adds up what the parts say of node i, in one order."""
+    Lattice, vec4 = lattice(name), precision(name).vec4
+
+    @wp.func_native(fill(ADD_UP, name))
+    def add_up_node(
+        grid: Lattice, spans: wp.array2d[wp.int32], parts: wp.array2d[vec4], e: int, i: int
+    ) -> vec4: ...
+
+    return add_up_node
+
+
+@cache
+@no_type_check
+def column_kernels(name: str, lanes: int) -> SimpleNamespace:
+    """Return the kernels `p2g, adjoint_g2p, add_up` of one precision for warps of so many `lanes`.
 
     The first two are the scatters of `transfers`, over [environment, segment and lane]; `add_up`, over [environment,
     node], takes their parts to the nodes.
     """
     types = precision(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
-    Lattice, base_node, functions, steps = lattice(name), stencil(name).base_node, cell_functions(name), walker(name)
-    column, module = functions.column, f"gradscape.columns.{name}"
-    open_segment, walk, close_segment, State = steps.open, steps.walk, steps.close, steps.State
+    Lattice, base_node, steps = lattice(name), stencil(name).base_node, walker(name)
+    add_up_node, module = node_sum(name), f"gradscape.columns.{name}.{lanes}"
+    open_segment, walk, close_segment = steps.open, steps.walk, steps.close
 
     @wp.kernel(module=module, enable_backward=False)
     def p2g(
         lattice: Lattice,
-        lanes: int,
         order: wp.array2d[wp.int32],
         first: wp.array2d[wp.int32],
         end: wp.array2d[wp.int32],
+        spans: wp.array2d[wp.int32],
         mass: wp.array2d[real],
         x: wp.array2d[vec3],
         v: wp.array2d[vec3],
@@ -179,13 +243,13 @@ def column_kernels(name: str) -> SimpleNamespace:
     ):
         """Scatter momentum m v + A (x_i - x) and mass."""
         e, t = wp.tid()
-        last = end[e, t / lanes]
-        if last == 0:
+        segment = t / lanes
+        span = spans[e, segment]
+        if span == 0:
             return
-        at = t / lanes * PARTS
-        open_segment(parts, e, at)
-        state = State()
-        for i in range(first[e, t / lanes], last, lanes):
+        at, last = segment * PARTS, end[e, segment]
+        state = open_segment(parts, e, at, span)
+        for i in range(first[e, segment], last, lanes):
             p = order[e, wp.min(i + t % lanes, last - 1)]
             s = (x[e, p] - lattice.origin) * lattice.inv_dx
             base = base_node(s, lattice)
@@ -194,15 +258,15 @@ def column_kernels(name: str) -> SimpleNamespace:
             a = A[e, p] * (real(1.0) / lattice.inv_dx)
             q = m * v[e, p] - a * f
             state = walk(parts, e, at, wp.min(lanes, last - i), base[2] % SEGMENT, f, m, q, a, state)
-        close_segment(parts, e, at, state)
+        close_segment(parts, e, at, span, state)
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint_g2p(
         lattice: Lattice,
-        lanes: int,
         order: wp.array2d[wp.int32],
         first: wp.array2d[wp.int32],
         end: wp.array2d[wp.int32],
+        spans: wp.array2d[wp.int32],
         dt: real,
         x: wp.array2d[vec3],
         adj_x_new: wp.array2d[vec3],
@@ -212,13 +276,13 @@ def column_kernels(name: str) -> SimpleNamespace:
     ):
         """Scatter the adjoints of the velocities that g2p gathered."""
         e, t = wp.tid()
-        last = end[e, t / lanes]
-        if last == 0:
+        segment = t / lanes
+        span = spans[e, segment]
+        if span == 0:
             return
-        at = t / lanes * PARTS
-        open_segment(parts, e, at)
-        state = State()
-        for i in range(first[e, t / lanes], last, lanes):
+        at, last = segment * PARTS, end[e, segment]
+        state = open_segment(parts, e, at, span)
+        for i in range(first[e, segment], last, lanes):
             p = order[e, wp.min(i + t % lanes, last - 1)]
             s = (x[e, p] - lattice.origin) * lattice.inv_dx
             base = base_node(s, lattice)
@@ -226,31 +290,11 @@ def column_kernels(name: str) -> SimpleNamespace:
             c = (real(4.0) * lattice.inv_dx) * adj_C_new[e, p]
             q = adj_v_new[e, p] + dt * adj_x_new[e, p] - c * f
             state = walk(parts, e, at, wp.min(lanes, last - i), base[2] % SEGMENT, f, real(0.0), q, c, state)
-        close_segment(parts, e, at, state)
-
-    @wp.func(module=module)
-    def add_up_node(lattice: Lattice, end: wp.array2d[wp.int32], parts: wp.array2d[vec4], e: int, i: int) -> vec4:
-        """Return what the parts say of a node, in one order of columns and segments."""
-        x = i / (lattice.nz * lattice.ny)
-        y = (i / lattice.nz) % lattice.ny
-        z = lattice.first[2] + i % lattice.nz
-        segment, plane = z / SEGMENT - lattice.first[2] / SEGMENT, z % SEGMENT
-        total = vec4()
-        for a in range(3):
-            for b in range(3):
-                if x >= a and y >= b:
-                    here = column(lattice, x - a, y - b) + segment
-                    row = (3 * a + b) * PLANES + plane
-                    if plane < 2 and segment > 0:
-                        if end[e, here - 1] > 0:
-                            total += parts[e, (here - 1) * PARTS + row + SEGMENT]
-                    if end[e, here] > 0:
-                        total += parts[e, here * PARTS + row]
-        return total
+        close_segment(parts, e, at, span, state)
 
     @wp.kernel(module=module, enable_backward=False)
-    def add_up(lattice: Lattice, end: wp.array2d[wp.int32], parts: wp.array2d[vec4], grid: wp.array2d[vec4]):
+    def add_up(lattice: Lattice, spans: wp.array2d[wp.int32], parts: wp.array2d[vec4], grid: wp.array2d[vec4]):
         e, i = wp.tid()
-        grid[e, i] = add_up_node(lattice, end, parts, e, i)
+        grid[e, i] = add_up_node(lattice, spans, parts, e, i)
 
-    return SimpleNamespace(p2g=p2g, adjoint_g2p=adjoint_g2p, add_up=add_up, add_up_node=add_up_node)
+    return SimpleNamespace(p2g=p2g, adjoint_g2p=adjoint_g2p, add_up=add_up)

@@ -91,10 +91,10 @@ def tool_readers(name: str) -> SimpleNamespace:
 def settle_kernel(name: str):
     """Return the kernel that takes the sums of a control step to the adjoint of tools, and clears them.
 
-    It runs over [environment, slot at the step's start or end].
+    It runs over [environment, axis of a slot at the step's start or end].
     """
     types, count = precision(name), SUMS[name]
-    real, vec3 = types.real, types.vec3
+    real = types.real
 
     @wp.func_native(WEIGH.replace("BITS", str(BITS)).replace("LOWEST", str(LOWEST[name])))
     def weigh(sum: wp.int64, range: int) -> wp.float64: ...
@@ -103,24 +103,21 @@ def settle_kernel(name: str):
     def no_number() -> wp.float64: ...
 
     @wp.kernel(module=f"gradscape.exact.{name}", enable_backward=False)
-    def settle(step: int, sums: wp.array2d[wp.int64], adj_tools: wp.array3d[vec3]):
+    def settle(step: int, sums: wp.array2d[wp.int64], adj_tools: wp.array4d[real]):
         e, place = wp.tid()
+        value = wp.float64(0.0)
+        for i in range(count):
+            at = place * count + count - 1 - i
+            total = wp.int64(0)
+            for lane in range(LANES):
+                total += sums[e * LANES + lane, at]
+                sums[e * LANES + lane, at] = wp.int64(0)
+            if i == 0 and total > wp.int64(0):
+                value = no_number()
+            elif i > 0:
+                value += weigh(total, count - 1 - i)
         slots = adj_tools.shape[2]
-        change = vec3()
-        for axis in range(3):
-            value = wp.float64(0.0)
-            for i in range(count):
-                at = (place * 3 + axis) * count + count - 1 - i
-                total = wp.int64(0)
-                for lane in range(LANES):
-                    total += sums[e * LANES + lane, at]
-                    sums[e * LANES + lane, at] = wp.int64(0)
-                if i == 0 and total > wp.int64(0):
-                    value = no_number()
-                elif i > 0:
-                    value += weigh(total, count - 1 - i)
-            change[axis] = real(value)
-        step_after, slot = step + place / slots, place % slots
-        adj_tools[e, step_after, slot] = adj_tools[e, step_after, slot] + change
+        at_step, slot, axis = step + place / (3 * slots), place / 3 % slots, place % 3
+        adj_tools[e, at_step, slot, axis] = adj_tools[e, at_step, slot, axis] + real(value)
 
     return settle

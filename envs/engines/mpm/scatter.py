@@ -8,12 +8,10 @@ from typing import Any, Protocol
 import warp as wp
 
 from ..runtime import load
-from .cells import Lister, Lists, segments
+from .cells import SEGMENT, Lists, cell_kernels, segments
 from .checkpoints import Frame
-from .columns import PARTS, column_kernels
+from .columns import PARTS, WARP, column_kernels
 from .model import Box
-
-LANES = 32  # threads that walk a segment together on a GPU
 
 
 class Scatter(Protocol):
@@ -72,33 +70,36 @@ class ByColumns:
     """Warps walk columns of cells, and nodes add up what columns give them: one order of sums, whatever the batch."""
 
     def __init__(self, solver: Any) -> None:
-        model, device = solver.model, solver.device
+        model, device, allocator = solver.model, solver.device, solver.allocator
         self.solver = weakref.proxy(solver)
-        self.lister = Lister(model.precision, model.particles, solver.capacity, device)
-        self.kernels = column_kernels(model.precision)
-        load([self.kernels.p2g, self.lister.kernels.label], device)
-        self.lanes = 1 if device == "cpu" else LANES
-        self.parts = self._room(1)
+        self.lanes = 1 if device == "cpu" else WARP
+        self.kernels = column_kernels(model.precision, self.lanes)
+        self.listing = cell_kernels(model.precision)
+        load([self.kernels.p2g, self.listing.count], device)
+        self.cells, self.numbers, self.arrived = (allocator.array(wp.int32, model.particles) for _ in range(3))
+        self.used: wp.array = wp.zeros(solver.capacity, dtype=wp.int32, device=device)
+        self._allocate(1)
 
     def make_room(self, box: Box) -> bool:
         """Make room for a box of nodes, and say whether arrays were replaced."""
-        wanted = segments(box) * PARTS
-        if wanted <= self.parts.shape[1]:
+        wanted = segments(box)
+        if wanted * PARTS <= self.parts.shape[1]:
             return False
-        self.parts = self._room(0)  # the old one goes first
-        self.parts = self._room(wanted * 5 // 4)
+        self._allocate(0)  # the old ones go first
+        self._allocate(wanted * 5 // 4)
         return True
 
     def list_particles(self, step: int, substep: int, frame: Frame, batch: int) -> None:
         """Find out where particles are, before a substep."""
-        solver, tape, lister = self.solver, self.solver.tape(step), self.lister
+        solver, tape, kernels = self.solver, self.solver.tape(step), self.listing
         lists: Lists = tape.lists[substep]
         count = solver.model.particles
-        solver.launch(lister.kernels.label, count, batch, [tape.lattice, frame.x, lister.keys, lister.places])
-        solver.launches.call(lambda: lister.sort(solver.boxes[step], batch))
-        solver.launch_on_box(lister.kernels.forget, segments, step, batch, [tape.lattice, lists.first, lists.end])
-        inputs = [tape.lattice, lister.keys, lister.places, lists.order, lists.first, lists.end]
-        solver.launch(lister.kernels.list_cells, count, batch, inputs)
+        inputs = [tape.lattice, frame.x, self.cells, self.numbers, self.counts, self.used]
+        solver.launch(kernels.count, count, batch, inputs)
+        inputs = [tape.lattice, self.counts, self.used, self.starts, *lists.segments()]
+        solver.launch_on_box(kernels.place_segments, segments, step, batch, inputs)
+        solver.launch(kernels.place, count, batch, [self.cells, self.numbers, self.starts, self.arrived])
+        solver.launch(kernels.tidy, count, batch, [self.cells, self.starts, self.arrived, lists.end, lists.order])
 
     def p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
         """Fill the substep's grid with momentum and mass."""
@@ -120,21 +121,23 @@ class ByColumns:
         """Launch a kernel that leaves parts of sums at nodes, after the substep's lists."""
         tape = self.solver.tape(step)
         lists: Lists = tape.lists[substep]
-        given = [tape.lattice, self.lanes, lists.order, lists.first, lists.end, *inputs, self.parts]
+        given = [tape.lattice, lists.order, *lists.segments(), *inputs, self.parts]
         self.solver.launch_on_box(kernel, self._threads, step, batch, given)
 
     def add_up(self, kernel: Any, step: int, substep: int, batch: int, grids: list[wp.array]) -> None:
         """Launch a kernel that adds up the parts at nodes."""
         tape = self.solver.tape(step)
-        inputs = [tape.lattice, tape.lists[substep].end, self.parts, *grids]
+        inputs = [tape.lattice, tape.lists[substep].span, self.parts, *grids]
         self.solver.launch_on_box(kernel, nodes, step, batch, inputs)
 
     def _threads(self, box: Box) -> int:
         return segments(box) * self.lanes
 
-    def _room(self, parts: int) -> wp.array:
-        array: wp.array = self.solver.allocator.array(self.solver.types.vec4, parts)
-        return array
+    def _allocate(self, count: int) -> None:
+        """Allocate what so many segments take."""
+        allocator = self.solver.allocator
+        self.parts: wp.array = allocator.array(allocator.types.vec4, count * PARTS)
+        self.counts, self.starts = (allocator.array(wp.int32, count * SEGMENT) for _ in range(2))
 
 
 def nodes(box: Box) -> int:

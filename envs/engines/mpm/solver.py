@@ -304,6 +304,7 @@ class _Adjoint:
         self.A = solver.allocator.affine_momentum()
         self.grid = solver.allocator.grid(max(box.cells for box in solver.boxes))
         self.tools = solver.allocator.paths()
+        self.tools_by_axis: wp.array = wp.from_torch(to_torch(self.tools), requires_grad=False)
         self.settle = settle_kernel(solver.model.precision)
         load([self.settle], solver.device)
         self.structs = (
@@ -349,7 +350,7 @@ class _Adjoint:
         for smoother in solver.smoothers:
             smoother.run_back(solver, step, batch, self.new)
         if solver.device != "cpu":  # where nodes add to the adjoint itself
-            solver.launch(self.settle, 2 * solver.model.boundary.slots, batch, [step, solver.sums, self.tools])
+            solver.launch(self.settle, 6 * solver.model.boundary.slots, batch, [step, solver.sums, self.tools_by_axis])
 
     def _adjoint_velocity(self, step: int, substep: int, batch: int) -> None:
         solver = self.solver

@@ -1,10 +1,12 @@
 """Sums by columns of cells, as a GPU makes them, against those in place; here each warp's work is done by one thread."""
 
+from itertools import groupby
+
 import pytest
 import torch
 import warp as wp
 
-from gradscape.envs.engines.mpm.cells import SEGMENT, Lister, segments
+from gradscape.envs.engines.mpm.cells import SEGMENT, cell_kernels, segments
 from gradscape.envs.engines.mpm.model import Box, place_grid
 from gradscape.envs.engines.runtime import to_torch
 
@@ -41,29 +43,30 @@ def test_particles_are_listed_by_cell_and_then_as_they_lie(first):
     box = Box((0, 0, first), (*model.nodes[:2], model.nodes[2] - first))
     x = torch.rand((2, 500, 3), generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 0.4 - 0.2
     x[:, :, 1] += 0.4
-    lister = Lister("float64", 500, 2, "cpu")
-    order, begins, ends = list_by_hand(lister, model, box, x)
-    s = (x - torch.tensor(model.origin)) / model.dx
-    cell = (s - 0.5).floor().long()
-    for row in range(2):
-        keys = [(*cell[row, p, :2].tolist(), int(cell[row, p, 2]), p) for p in range(500)]
-        assert order[row].tolist() == [key[-1] for key in sorted(keys)]
-        full = (ends[row] > 0).nonzero()[:, 0]
-        assert len(full) == len({(i, j, k // SEGMENT) for i, j, k, _ in keys})
-        assert begins[row, full].tolist() == [0, *ends[row, full][:-1].tolist()]
-        for segment in full.tolist():
-            members = order[row, begins[row, segment] : ends[row, segment]].tolist()
-            assert len({(i, j, k // SEGMENT) for i, j, k in cell[row, members].tolist()}) == 1
+    cell = ((x - torch.tensor(model.origin)) / model.dx - 0.5).floor().long()
+    for _ in range(2):  # the second time it begins where the first has ended
+        order, begins, ends, spans = listed(model, box, x)
+        for row in range(2):
+            keys = sorted((i, j, k // SEGMENT, k % SEGMENT, p) for p, (i, j, k) in enumerate(cell[row].tolist()))
+            wanted = {where: list(group) for where, group in groupby(keys, key=lambda key: key[:3])}
+            full = (spans[row] > 0).nonzero()[:, 0].tolist()
+            found = [order[row, begins[row, s] : ends[row, s]].tolist() for s in full]
+            assert found == [[key[-1] for key in group] for group in wanted.values()]
+            touched = [(group[0][3], group[-1][3] + 3) for group in wanted.values()]
+            assert [(int(spans[row, s]) % 16, int(spans[row, s]) // 16) for s in full] == touched
 
 
-def list_by_hand(lister, model, box, x):
-    """Return the order of particles, and the beginnings and ends of segments, all [row, *]."""
-    lattice, count = place_grid(model, box), segments(box)
+def listed(model, box, x):
+    """Return the order of particles, and the first, end, and span of segments, all [row, *]."""
+    kernels, lattice, (batch, count) = cell_kernels("float64"), place_grid(model, box), x.shape[:2]
     at = wp.array(x.numpy(), dtype=wp.vec3d)
-    order, first, end = (wp.zeros((len(x), size), dtype=wp.int32) for size in (x.shape[1], count, count))
-    wp.launch(lister.kernels.label, x.shape[:2], [lattice, at, lister.keys, lister.places])
-    lister.sort(box, len(x))
-    wp.launch(lister.kernels.forget, (len(x), count), [lattice, first, end])
-    inputs = [lattice, lister.keys, lister.places, order, first, end]
-    wp.launch(lister.kernels.list_cells, x.shape[:2], inputs)
-    return to_torch(order).clone(), to_torch(first).clone(), to_torch(end).clone()
+    cells, numbers, arrived, order = (wp.zeros((batch, count), dtype=wp.int32) for _ in range(4))
+    counts, starts = (wp.zeros((batch, segments(box) * SEGMENT), dtype=wp.int32) for _ in range(2))
+    found = [wp.zeros((batch, segments(box)), dtype=wp.int32) for _ in range(3)]
+    used = wp.zeros(batch, dtype=wp.int32)
+    wp.launch(kernels.count, (batch, count), [lattice, at, cells, numbers, counts, used])
+    wp.launch(kernels.place_segments, (batch, segments(box)), [lattice, counts, used, starts, *found])
+    wp.launch(kernels.place, (batch, count), [cells, numbers, starts, arrived])
+    wp.launch(kernels.tidy, (batch, count), [cells, starts, arrived, found[1], order])
+    assert not to_torch(counts).any()
+    return [to_torch(array).clone() for array in (order, *found)]
