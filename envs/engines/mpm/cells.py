@@ -18,6 +18,7 @@ from .model import Box
 from .stencil import lattice, stencil
 
 SEGMENT = 8  # cells
+STARTS = SEGMENT + 1  # of the cells of a segment, and of what comes after it
 
 # Neighbours in memory are mostly of one cell: on a GPU one of them counts for all of a warp.
 TAKE_NUMBER = """
@@ -33,22 +34,57 @@ TAKE_NUMBER = """
 """
 
 
+TAKE_PLACES = """
+#if defined(__CUDA_ARCH__)
+    const unsigned all = 0xffffffffu;
+    const int lane = threadIdx.x & 31;
+    const unsigned full = __ballot_sync(all, total > 0);
+    int sum = total;
+    for (int step = 1; step < 32; step *= 2) {
+        const int other = __shfl_up_sync(all, sum, step);
+        if (lane >= step) sum += other;
+    }
+    int place = 0, segment = 0;
+    if (lane == 31 && full) {
+        place = atomicAdd(&wp::index(used, e, 0), sum);
+        segment = atomicAdd(&wp::index(used, e, 1), __popc(full));
+    }
+    place = __shfl_sync(all, place, 31) + sum - total;
+    segment = __shfl_sync(all, segment, 31) + __popc(full & ((1u << lane) - 1u));
+#else
+    const int place = wp::index(used, e, 0), segment = wp::index(used, e, 1);
+    wp::index(used, e, 0) += total;
+    wp::index(used, e, 1) += total > 0;
+#endif
+    return wp::vec_t<2, wp::int32>(place, segment);
+"""
+
+
 @dataclass(frozen=True, eq=False)
 class Lists:
-    """The particles by cell: `order` [environment, place], and the places of segments, [environment, segment].
+    """The particles by cell: `order` [environment, place], and its segments.
 
-    A segment's particles are at places `first` to `end`; `span` holds which planes of nodes they touch, counted from
-    the segment's first: the lowest, and 16 times the one beyond the highest; 0 where it has no particles.
+    Those with particles are `full` [environment] in number, and of each of them `which` says which one it is, and
+    `first` and `end` at which places its particles are, all [environment, segment with particles]. `span`
+    [environment, segment] holds which planes of nodes they touch, counted from the segment's first: the lowest, and
+    256 times the one beyond the highest; 0 where it has no particles.
     """
 
     order: wp.array
+    full: wp.array
+    which: wp.array
     first: wp.array
     end: wp.array
     span: wp.array
 
     def segments(self) -> list[wp.array]:
-        """Return the arrays of segments."""
-        return [self.first, self.end, self.span]
+        """Return all that tells about segments."""
+        return [self.full, self.which, self.first, self.end, self.span]
+
+
+def warps(box: Box) -> int:
+    """Return the number of threads, in whole warps, that a box's segments take one each."""
+    return -(-segments(box) // 32) * 32
 
 
 def segments(box: Box) -> int:
@@ -68,6 +104,9 @@ def cell_kernels(name: str) -> SimpleNamespace:
     @wp.func_native(TAKE_NUMBER)
     def take_number(counts: wp.array2d[wp.int32], e: int, cell: int) -> int: ...
 
+    @wp.func_native(TAKE_PLACES)
+    def take_places(used: wp.array2d[wp.int32], e: int, total: int) -> wp.vec2i: ...
+
     @wp.kernel(module=module, enable_backward=False)
     def count(
         lattice: Lattice,
@@ -75,12 +114,12 @@ def cell_kernels(name: str) -> SimpleNamespace:
         cells: wp.array2d[wp.int32],
         numbers: wp.array2d[wp.int32],
         counts: wp.array2d[wp.int32],
-        used: wp.array[wp.int32],
+        used: wp.array2d[wp.int32],
     ):
         """Tell each particle its cell, and its number there in the order of arrival."""
         e, p = wp.tid()
-        if p == 0:
-            used[e] = 0
+        if p < 2:
+            used[e, p] = 0
         base = base_node((x[e, p] - lattice.origin) * lattice.inv_dx, lattice)
         bottom = lattice.first[2] / SEGMENT
         depth = (lattice.first[2] + lattice.nz - 1) / SEGMENT - bottom + 1
@@ -93,63 +132,70 @@ def cell_kernels(name: str) -> SimpleNamespace:
     def place_segments(
         lattice: Lattice,
         counts: wp.array2d[wp.int32],
-        used: wp.array[wp.int32],
+        used: wp.array2d[wp.int32],
         starts: wp.array2d[wp.int32],
+        which: wp.array2d[wp.int32],
         first: wp.array2d[wp.int32],
         end: wp.array2d[wp.int32],
         span: wp.array2d[wp.int32],
     ):
         """Give each segment its places in the list, and each of its cells; count from 0 again."""
         e, s = wp.tid()
+        bottom = lattice.first[2] / SEGMENT
+        depth = (lattice.first[2] + lattice.nz - 1) / SEGMENT - bottom + 1
+        there = s < lattice.nx * lattice.ny * depth
         total, low, high = int(0), int(0), int(0)
-        for k in range(SEGMENT):
-            here = counts[e, s * SEGMENT + k]
-            if here > 0:
-                if total == 0:
-                    low = k
-                high = k + 3
-            total += here
-        at = int(0)
+        if there:
+            for k in range(SEGMENT):
+                here = counts[e, s * SEGMENT + k]
+                if here > 0:
+                    if total == 0:
+                        low = k
+                    high = k + 3
+                total += here
+            span[e, s] = low + 256 * high
+        taken = take_places(used, e, total)
         if total > 0:
-            at = wp.atomic_add(used, e, total)
-        first[e, s] = at
-        end[e, s] = at + total
-        span[e, s] = low + 16 * high
-        for k in range(SEGMENT):
-            starts[e, s * SEGMENT + k] = at
-            at += counts[e, s * SEGMENT + k]
-            counts[e, s * SEGMENT + k] = 0
+            at, segment = taken[0], taken[1]
+            which[e, segment] = s
+            first[e, segment] = at
+            end[e, segment] = at + total
+            for k in range(SEGMENT):
+                starts[e, s * STARTS + k] = at
+                at += counts[e, s * SEGMENT + k]
+                counts[e, s * SEGMENT + k] = 0
+            starts[e, s * STARTS + SEGMENT] = at
 
     @wp.kernel(module=module, enable_backward=False)
     def place(
         cells: wp.array2d[wp.int32],
         numbers: wp.array2d[wp.int32],
         starts: wp.array2d[wp.int32],
+        used: wp.array2d[wp.int32],
         arrived: wp.array2d[wp.int32],
+        full: wp.array[wp.int32],
     ):
         """List particles by cell, those of a cell as they arrived."""
         e, p = wp.tid()
-        arrived[e, starts[e, cells[e, p]] + numbers[e, p]] = p
+        if p == 0:
+            full[e] = used[e, 1]
+        cell = cells[e, p]
+        arrived[e, starts[e, cell + cell / SEGMENT] + numbers[e, p]] = p
 
     @wp.kernel(module=module, enable_backward=False)
     def tidy(
         cells: wp.array2d[wp.int32],
         starts: wp.array2d[wp.int32],
         arrived: wp.array2d[wp.int32],
-        end: wp.array2d[wp.int32],
         order: wp.array2d[wp.int32],
     ):
         """List them by cell, those of a cell as they lie in memory."""
         e, p = wp.tid()
-        cell = cells[e, p]
-        start = starts[e, cell]
-        stop = end[e, cell / SEGMENT]
-        if cell % SEGMENT < SEGMENT - 1:
-            stop = starts[e, cell + 1]
+        at = cells[e, p] + cells[e, p] / SEGMENT
         before = int(0)
-        for i in range(start, stop):
+        for i in range(starts[e, at], starts[e, at + 1]):
             if arrived[e, i] < p:
                 before += 1
-        order[e, start + before] = p
+        order[e, starts[e, at] + before] = p
 
     return SimpleNamespace(count=count, place_segments=place_segments, place=place, tidy=tidy)

@@ -69,7 +69,9 @@ class Allocator:
 
     def lists(self, segments: int) -> Lists:
         """Return lists of no particles."""
-        return Lists(self.array(wp.int32, self.model.particles), *(self.array(wp.int32, segments) for _ in range(3)))
+        full: wp.array = wp.zeros(self.capacity, dtype=wp.int32, device=self.device)
+        by_segment = (self.array(wp.int32, segments) for _ in range(4))
+        return Lists(self.array(wp.int32, self.model.particles), full, *by_segment)
 
     def paths(self) -> wp.array:
         """Return zeros [environment, step, slot]."""
@@ -112,7 +114,7 @@ class Tape:
         if self._cells < box.cells:
             growth += 2 * size * (self._room(box.cells) - self._cells)
         if self.lists and self._segments < segments(box):
-            growth += 3 * 4 * (segments(box) * 5 // 4 - self._segments)
+            growth += 4 * 4 * (segments(box) * 5 // 4 - self._segments)
         return growth * len(self.grids) * self._allocator.capacity
 
     def start(self, checkpoint: Frame) -> Frame:

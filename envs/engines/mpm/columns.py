@@ -1,13 +1,14 @@
-"""Scatters without atomic adds, for a GPU: a warp walks a column of cells, and nodes add up what columns give them.
+"""Scatters without atomic adds, for a GPU: threads walk columns of cells, and nodes add up what columns give them.
 
-Particles are listed by cell (`cells`). A warp, 32 threads, takes the particles of SEGMENT cells along z, one cell after
-the other, three particles at a time: nine lanes each, one for a row of three nodes along z, which hold the sums of the
-27 nodes around the present cell. Where the next cell begins, the lowest nine are added up over the three and written
-down, and the others become lower by one. A segment so leaves 9 rows of up to SEGMENT + 2 numbers of four parts, and
-each node then adds up those of the nine columns that it is part of. Every sum has one order, which depends on nothing
-but an environment's own particles: neither on its place in a batch, nor on the box of nodes, nor on chance.
+Particles are listed by cell (`cells`). Three lanes of a warp take the particles of SEGMENT cells along z, one after the
+other; each holds the sums of nine of the 27 nodes around the present cell, those of one x. Where the next cell begins,
+the lowest three are written down and the others become lower by one. A segment so leaves 9 rows of up to SEGMENT + 2
+numbers of four parts, and each node then adds up those of the nine columns that it is part of. Every sum has one order,
+which depends on nothing but an environment's own particles: neither on its place in a batch, nor on the box of nodes,
+nor on chance.
 """
 
+from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
 from typing import no_type_check
@@ -16,78 +17,101 @@ import warp as wp
 
 from ..launches import BLOCK
 from ..runtime import precision
-from .cells import SEGMENT
+from .cells import SEGMENT, segments
+from .model import Box
 from .stencil import lattice, stencil
 
-WARP = 32  # threads that walk a segment together on a GPU; on a CPU one does
 PLANES = SEGMENT + 2  # of nodes that the cells of a segment touch
 PARTS = 9 * PLANES  # numbers of four parts that a segment leaves
+
+
+@dataclass(frozen=True)
+class Team:
+    """How threads share segments: `groups` of them, a segment each, of `size` lanes, in a warp of so many `lanes`."""
+
+    lanes: int
+    groups: int
+    size: int
+
+    def threads(self, box: Box) -> int:
+        """Return how many threads a box of nodes takes."""
+        return -(-segments(box) // self.groups) * self.lanes
+
+
+TEAMS = {True: Team(32, 10, 3), False: Team(1, 1, 1)}  # by whether it is a GPU: on a CPU a thread has a segment
 
 FOUR = "struct alignas(16) Four { REAL a, b, c, d; };"
 EMIT = """
         {
-            const Four sum{
-                low.a + __shfl_down_sync(all, low.a, 9) + __shfl_down_sync(all, low.a, 18),
-                low.b + __shfl_down_sync(all, low.b, 9) + __shfl_down_sync(all, low.b, 18),
-                low.c + __shfl_down_sync(all, low.c, 9) + __shfl_down_sync(all, low.c, 18),
-                low.d + __shfl_down_sync(all, low.d, 9) + __shfl_down_sync(all, low.d, 18)};
-            if (lane < 9) *(Four *)&wp::index(parts, e, at + lane * PLANES + now) = sum;
-            low = middle, middle = high, high = Four{};
+#pragma unroll
+            for (int j = 0; j < 3; ++j) {
+                const int here = 12 * j;
+                *(Four *)&wp::index(parts, e, at + (3 * i + j) * PLANES + now) =
+                    Four{sums[here], sums[here + 1], sums[here + 2], sums[here + 3]};
+#pragma unroll
+                for (int k = 0; k < 8; ++k) sums[here + k] = sums[here + k + 4];
+#pragma unroll
+                for (int k = 8; k < 12; ++k) sums[here + k] = REAL(0.0);
+            }
         }
 """
 OPEN = """
-    wp::vec_t<13, REAL> state;
-    state[12] = REAL(span & 15);
 #if !defined(__CUDA_ARCH__)
     for (int i = 0; i < PARTS; ++i) wp::index(parts, e, at + i) = wp::vec_t<4, REAL>();
 #endif
+    wp::vec_t<37, REAL> state;
+    state[36] = REAL(span & 255);
     return state;
 """
 WALK = """
 #if defined(__CUDA_ARCH__)
     FOUR
-    __shared__ Four stage[WARPS][WARP][5];
-    const unsigned all = 0xffffffffu;
-    const int lane = threadIdx.x & 31, group = lane / 9, i = lane % 9 / 3, j = lane % 3;
+    __shared__ Four stage[WARPS][32][5];
+    const int lane = threadIdx.x & 31, i = lane % 3;
     Four (*rows)[5] = stage[threadIdx.x >> 5];
     __syncwarp();
     rows[lane][0] = Four{q[0], q[1], q[2], mass};
     rows[lane][1] = Four{a.data[0][0], a.data[1][0], a.data[2][0], f[0]};
     rows[lane][2] = Four{a.data[0][1], a.data[1][1], a.data[2][1], f[1]};
     rows[lane][3] = Four{a.data[0][2], a.data[1][2], a.data[2][2], f[2]};
+    rows[lane][4].a = REAL(cell);
     __syncwarp();
-    const REAL oi = REAL(i), oj = REAL(j), half = REAL(0.5), one = REAL(1.0), three = REAL(0.75);
-    const REAL ui = i == 1 ? three : REAL(0.0), si = i == 1 ? -one : half, mi = REAL(1.5) - half * oi;
-    const REAL uj = j == 1 ? three : REAL(0.0), sj = j == 1 ? -one : half, mj = REAL(1.5) - half * oj;
-    Four low{state[0], state[1], state[2], state[3]};
-    Four middle{state[4], state[5], state[6], state[7]};
-    Four high{state[8], state[9], state[10], state[11]};
-    int now = (int)state[12];
-    const int before = __shfl_up_sync(all, cell, 1);
-    const unsigned heads = __ballot_sync(all, lane < count && (lane == 0 || cell != before));
-    for (int first = 0; first < count;) {
-        const unsigned later = heads >> first >> 1;
-        const int last = later ? first + __ffs(later) : count;
-        for (const int here = __shfl_sync(all, cell, first); now < here; ++now) EMIT
-        for (int t = group < 3 ? first + group : last; t < last; t += 3) {
-            const Four b = rows[t][0], x = rows[t][1], y = rows[t][2], z = rows[t][3];
-            const REAL tx = x.d - mi, ty = y.d - mj, u = z.d - REAL(1.5), v = z.d - one, w = z.d - half;
-            const REAL wij = (ui + si * tx * tx) * (uj + sj * ty * ty);
-            const REAL w0 = wij * (half * u * u), w1 = wij * (three - v * v), w2 = wij * (half * w * w);
-            REAL qa = b.a + oi * x.a + oj * y.a, qb = b.b + oi * x.b + oj * y.b, qc = b.c + oi * x.c + oj * y.c;
-            low.a += w0 * qa, low.b += w0 * qb, low.c += w0 * qc, low.d += w0 * b.d;
-            qa += z.a, qb += z.b, qc += z.c;
-            middle.a += w1 * qa, middle.b += w1 * qb, middle.c += w1 * qc, middle.d += w1 * b.d;
-            qa += z.a, qb += z.b, qc += z.c;
-            high.a += w2 * qa, high.b += w2 * qb, high.c += w2 * qc, high.d += w2 * b.d;
+    const REAL oi = REAL(i), half = REAL(0.5), one = REAL(1.0), more = REAL(1.5), three = REAL(0.75);
+    const REAL ui = i == 1 ? three : REAL(0.0), si = i == 1 ? -one : half, mi = more - half * oi;
+    REAL sums[36];
+#pragma unroll
+    for (int k = 0; k < 36; ++k) sums[k] = state[k];
+    int now = (int)state[36];
+    for (int t = 0; t < count; ++t) {
+        const Four *row = rows[lane - i + t];
+        const Four b = row[0], x = row[1], y = row[2], z = row[3];
+        const int here = (int)row[4].a;
+        for (; now < here; ++now) EMIT
+        const REAL tx = x.d - mi, u = y.d - more, v = y.d - one, w = y.d - half;
+        const REAL wx = ui + si * tx * tx;
+        const REAL wy[3] = {wx * (half * u * u), wx * (three - v * v), wx * (half * w * w)};
+        const REAL tu = z.d - more, tv = z.d - one, tw = z.d - half;
+        const REAL wz[3] = {half * tu * tu, three - tv * tv, half * tw * tw};
+        REAL qa = b.a + oi * x.a, qb = b.b + oi * x.b, qc = b.c + oi * x.c;
+#pragma unroll
+        for (int j = 0; j < 3; ++j) {
+            REAL ra = qa, rb = qb, rc = qc;
+#pragma unroll
+            for (int k = 0; k < 3; ++k) {
+                const REAL weight = wy[j] * wz[k];
+                sums[12 * j + 4 * k] += weight * ra;
+                sums[12 * j + 4 * k + 1] += weight * rb;
+                sums[12 * j + 4 * k + 2] += weight * rc;
+                sums[12 * j + 4 * k + 3] += weight * b.d;
+                ra += z.a, rb += z.b, rc += z.c;
+            }
+            qa += y.a, qb += y.b, qc += y.c;
         }
-        first = last;
     }
-    wp::vec_t<13, REAL> left;
-    left[0] = low.a, left[1] = low.b, left[2] = low.c, left[3] = low.d;
-    left[4] = middle.a, left[5] = middle.b, left[6] = middle.c, left[7] = middle.d;
-    left[8] = high.a, left[9] = high.b, left[10] = high.c, left[11] = high.d;
-    left[12] = REAL(now);
+    wp::vec_t<37, REAL> left;
+#pragma unroll
+    for (int k = 0; k < 36; ++k) left[k] = sums[k];
+    left[36] = REAL(now);
     return left;
 #else
     REAL w[3][3];
@@ -114,12 +138,18 @@ WALK = """
 CLOSE = """
 #if defined(__CUDA_ARCH__)
     FOUR
-    const unsigned all = 0xffffffffu;
-    const int lane = threadIdx.x & 31;
-    Four low{state[0], state[1], state[2], state[3]};
-    Four middle{state[4], state[5], state[6], state[7]};
-    Four high{state[8], state[9], state[10], state[11]};
-    for (int now = (int)state[12]; now < span >> 4; ++now) EMIT
+    const int i = (threadIdx.x & 31) % 3;
+    REAL sums[36];
+#pragma unroll
+    for (int k = 0; k < 36; ++k) sums[k] = state[k];
+    for (int now = (int)state[36]; now < span >> 8; ++now) EMIT
+#endif
+"""
+MOST = """
+#if defined(__CUDA_ARCH__)
+    return __reduce_max_sync(0xffffffffu, count);
+#else
+    return count;
 #endif
 """
 ADD_UP = """
@@ -138,27 +168,26 @@ ADD_UP = """
         lower[c] = there && both ? row[here - 1] : 0;
         upper[c] = there ? row[here] : 0;
     }
-    Four sums[2] = {};
+    Four low{}, high{};
 #pragma unroll
     for (int c = 0; c < 9; ++c) {
         const int here = ((x - c / 3) * ny + y - c % 3) * depth + segment, at = plane + SEGMENT;
         const Four none{};
-        const bool low = at >= (lower[c] & 15) && at < lower[c] >> 4;
-        const bool high = plane >= (upper[c] & 15) && plane < upper[c] >> 4;
-        const Four a = low ? given[(here - 1) * PARTS + c * PLANES + at] : none;
-        const Four b = high ? given[here * PARTS + c * PLANES + plane] : none;
-        sums[0].a += a.a, sums[0].b += a.b, sums[0].c += a.c, sums[0].d += a.d;
-        sums[1].a += b.a, sums[1].b += b.b, sums[1].c += b.c, sums[1].d += b.d;
+        const bool is_low = at >= (lower[c] & 255) && at < lower[c] >> 8;
+        const bool is_high = plane >= (upper[c] & 255) && plane < upper[c] >> 8;
+        const Four a = is_low ? given[(here - 1) * PARTS + c * PLANES + at] : none;
+        const Four b = is_high ? given[here * PARTS + c * PLANES + plane] : none;
+        low.a += a.a, low.b += a.b, low.c += a.c, low.d += a.d;
+        high.a += b.a, high.b += b.b, high.c += b.c, high.d += b.d;
     }
-    return wp::vec_t<4, REAL>(
-        sums[0].a + sums[1].a, sums[0].b + sums[1].b, sums[0].c + sums[1].c, sums[0].d + sums[1].d);
+    return wp::vec_t<4, REAL>(low.a + high.a, low.b + high.b, low.c + high.c, low.d + high.d);
 """
 
 
 def fill(code: str, name: str) -> str:
     """Put what a precision decides, and other constants, into C++."""
     words = {"EMIT": EMIT, "FOUR": FOUR, "PLANES": PLANES, "PARTS": PARTS, "SEGMENT": SEGMENT, "REAL": f"wp::{name}"}
-    for word, value in {**words, "WARPS": BLOCK // WARP, "WARP": WARP}.items():
+    for word, value in {**words, "WARPS": BLOCK // 32}.items():
         code = code.replace(word, str(value))
     return code
 
@@ -166,16 +195,19 @@ def fill(code: str, name: str) -> str:
 @cache
 @no_type_check
 def walker(name: str) -> SimpleNamespace:
-    """Return the functions `open, walk, close` and the type `State` of one precision.
+    """Return the functions `most, open, walk, close` of one precision.
 
-    A warp's lanes call all three, together: `open` before their segment, whose parts begin at `at`, `close` after it.
-    `walk` adds the next `count` particles to the parts, of each of which a lane knows the cell in the segment, where it
-    is from its base node, `f`, its mass, and the q and a of what it gives node i: w_i (q + a i), and w_i mass. On a CPU
-    a thread has a warp's work, one particle at a time.
+    A warp's lanes call all of them, together: `most` for the greatest of their counts, `open` before their segment,
+    whose parts begin at `at`, `close` after it. `walk` adds the next `count` particles of each group to its parts. A
+    lane knows one of them: its cell in the segment, where it is from its base node, `f`, its mass, and the q and a of
+    what it gives node i, w_i (q + a i), and w_i mass.
     """
     types = precision(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
-    State = wp.types.vector(13, real)
+    State = wp.types.vector(37, real)
+
+    @wp.func_native(MOST)
+    def most(count: int) -> int: ...
 
     @wp.func_native(fill(OPEN, name))
     def open_segment(parts: wp.array2d[vec4], e: int, at: int, span: int) -> State: ...
@@ -197,7 +229,32 @@ def walker(name: str) -> SimpleNamespace:
     @wp.func_native(fill(CLOSE, name))
     def close_segment(parts: wp.array2d[vec4], e: int, at: int, span: int, state: State): ...
 
-    return SimpleNamespace(open=open_segment, walk=walk, close=close_segment, State=State)
+    return SimpleNamespace(most=most, open=open_segment, walk=walk, close=close_segment)
+
+
+@cache
+@no_type_check
+def segment_taker(team: Team):
+    """Return the function that says of a thread's segment (number, span, first place, count), none if it has none."""
+    lanes, groups, size = team.lanes, team.groups, team.size
+
+    @wp.func(module=f"gradscape.columns.{lanes}")
+    def take_segment(
+        e: int,
+        t: int,
+        full: int,
+        which: wp.array2d[wp.int32],
+        first: wp.array2d[wp.int32],
+        end: wp.array2d[wp.int32],
+        spans: wp.array2d[wp.int32],
+    ):
+        group = t % lanes / size
+        i = t / lanes * groups + group
+        if group >= groups or i >= full:
+            return wp.vec4i(0, 0, 0, 0)
+        return wp.vec4i(which[e, i], spans[e, which[e, i]], first[e, i], end[e, i] - first[e, i])
+
+    return take_segment
 
 
 @cache
@@ -216,22 +273,26 @@ def node_sum(name: str):
 
 @cache
 @no_type_check
-def column_kernels(name: str, lanes: int) -> SimpleNamespace:
-    """Return the kernels `p2g, adjoint_g2p, add_up` of one precision for warps of so many `lanes`.
+def column_kernels(name: str, team: Team) -> SimpleNamespace:
+    """Return the kernels `p2g, adjoint_g2p, add_up` of one precision for threads in a `team`.
 
-    The first two are the scatters of `transfers`, over [environment, segment and lane]; `add_up`, over [environment,
+    The first two are the scatters of `transfers`, over [environment, thread of the team]; `add_up`, over [environment,
     node], takes their parts to the nodes.
     """
     types = precision(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
     Lattice, base_node, steps = lattice(name), stencil(name).base_node, walker(name)
-    add_up_node, module = node_sum(name), f"gradscape.columns.{name}.{lanes}"
+    add_up_node, module = node_sum(name), f"gradscape.columns.{name}.{team.lanes}"
+    take_segment, most = segment_taker(team), steps.most
     open_segment, walk, close_segment = steps.open, steps.walk, steps.close
+    lanes, groups, size = team.lanes, team.groups, team.size
 
     @wp.kernel(module=module, enable_backward=False)
     def p2g(
         lattice: Lattice,
         order: wp.array2d[wp.int32],
+        full: wp.array[wp.int32],
+        which: wp.array2d[wp.int32],
         first: wp.array2d[wp.int32],
         end: wp.array2d[wp.int32],
         spans: wp.array2d[wp.int32],
@@ -243,27 +304,28 @@ def column_kernels(name: str, lanes: int) -> SimpleNamespace:
     ):
         """Scatter momentum m v + A (x_i - x) and mass."""
         e, t = wp.tid()
-        segment = t / lanes
-        span = spans[e, segment]
-        if span == 0:
+        if t / lanes * groups >= full[e]:
             return
-        at, last = segment * PARTS, end[e, segment]
+        mine = take_segment(e, t, full[e], which, first, end, spans)
+        at, span, begin, count = mine[0] * PARTS, mine[1], mine[2], mine[3]
         state = open_segment(parts, e, at, span)
-        for i in range(first[e, segment], last, lanes):
-            p = order[e, wp.min(i + t % lanes, last - 1)]
+        for i in range(0, most(count), size):
+            p = order[e, begin + wp.min(i + t % lanes % size, wp.max(count - 1, 0))]
             s = (x[e, p] - lattice.origin) * lattice.inv_dx
             base = base_node(s, lattice)
             f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
             m = mass[e, p]
             a = A[e, p] * (real(1.0) / lattice.inv_dx)
             q = m * v[e, p] - a * f
-            state = walk(parts, e, at, wp.min(lanes, last - i), base[2] % SEGMENT, f, m, q, a, state)
+            state = walk(parts, e, at, wp.min(size, count - i), base[2] % SEGMENT, f, m, q, a, state)
         close_segment(parts, e, at, span, state)
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint_g2p(
         lattice: Lattice,
         order: wp.array2d[wp.int32],
+        full: wp.array[wp.int32],
+        which: wp.array2d[wp.int32],
         first: wp.array2d[wp.int32],
         end: wp.array2d[wp.int32],
         spans: wp.array2d[wp.int32],
@@ -276,20 +338,19 @@ def column_kernels(name: str, lanes: int) -> SimpleNamespace:
     ):
         """Scatter the adjoints of the velocities that g2p gathered."""
         e, t = wp.tid()
-        segment = t / lanes
-        span = spans[e, segment]
-        if span == 0:
+        if t / lanes * groups >= full[e]:
             return
-        at, last = segment * PARTS, end[e, segment]
+        mine = take_segment(e, t, full[e], which, first, end, spans)
+        at, span, begin, count = mine[0] * PARTS, mine[1], mine[2], mine[3]
         state = open_segment(parts, e, at, span)
-        for i in range(first[e, segment], last, lanes):
-            p = order[e, wp.min(i + t % lanes, last - 1)]
+        for i in range(0, most(count), size):
+            p = order[e, begin + wp.min(i + t % lanes % size, wp.max(count - 1, 0))]
             s = (x[e, p] - lattice.origin) * lattice.inv_dx
             base = base_node(s, lattice)
             f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
             c = (real(4.0) * lattice.inv_dx) * adj_C_new[e, p]
             q = adj_v_new[e, p] + dt * adj_x_new[e, p] - c * f
-            state = walk(parts, e, at, wp.min(lanes, last - i), base[2] % SEGMENT, f, real(0.0), q, c, state)
+            state = walk(parts, e, at, wp.min(size, count - i), base[2] % SEGMENT, f, real(0.0), q, c, state)
         close_segment(parts, e, at, span, state)
 
     @wp.kernel(module=module, enable_backward=False)

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..runtime import load
 from .cells import cell_kernels
-from .columns import WARP, column_kernels
+from .columns import TEAMS, column_kernels
 from .exact import settle_kernel
 from .grid import velocity_kernel
 from .model import Model
@@ -47,7 +47,7 @@ def _of_cpu(name: str, smooth: bool) -> Iterator[Any]:
 
 
 def _of_gpu(name: str, smooth: bool) -> Iterator[Any]:
-    yield from (transfers(name, scattering=False).g2p, column_kernels(name, WARP).p2g, cell_kernels(name).count)
+    yield from (transfers(name, scattering=False).g2p, column_kernels(name, TEAMS[True]).p2g, cell_kernels(name).count)
     yield settle_kernel(name)
     if smooth:
-        yield from (smoothing_kernels(name, scattering=False).collect, smoothing_columns(name, WARP).spread)
+        yield from (smoothing_kernels(name, scattering=False).collect, smoothing_columns(name, TEAMS[True]).spread)

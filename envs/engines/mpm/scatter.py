@@ -8,9 +8,9 @@ from typing import Any, Protocol
 import warp as wp
 
 from ..runtime import load
-from .cells import SEGMENT, Lists, cell_kernels, segments
+from .cells import SEGMENT, STARTS, Lists, cell_kernels, segments, warps
 from .checkpoints import Frame
-from .columns import PARTS, WARP, column_kernels
+from .columns import PARTS, TEAMS, column_kernels
 from .model import Box
 
 
@@ -72,12 +72,12 @@ class ByColumns:
     def __init__(self, solver: Any) -> None:
         model, device, allocator = solver.model, solver.device, solver.allocator
         self.solver = weakref.proxy(solver)
-        self.lanes = 1 if device == "cpu" else WARP
-        self.kernels = column_kernels(model.precision, self.lanes)
+        self.team = TEAMS[device != "cpu"]
+        self.kernels = column_kernels(model.precision, self.team)
         self.listing = cell_kernels(model.precision)
         load([self.kernels.p2g, self.listing.count], device)
         self.cells, self.numbers, self.arrived = (allocator.array(wp.int32, model.particles) for _ in range(3))
-        self.used: wp.array = wp.zeros(solver.capacity, dtype=wp.int32, device=device)
+        self.used = allocator.array(wp.int32, 2)
         self._allocate(1)
 
     def make_room(self, box: Box) -> bool:
@@ -96,10 +96,11 @@ class ByColumns:
         count = solver.model.particles
         inputs = [tape.lattice, frame.x, self.cells, self.numbers, self.counts, self.used]
         solver.launch(kernels.count, count, batch, inputs)
-        inputs = [tape.lattice, self.counts, self.used, self.starts, *lists.segments()]
-        solver.launch_on_box(kernels.place_segments, segments, step, batch, inputs)
-        solver.launch(kernels.place, count, batch, [self.cells, self.numbers, self.starts, self.arrived])
-        solver.launch(kernels.tidy, count, batch, [self.cells, self.starts, self.arrived, lists.end, lists.order])
+        inputs = [tape.lattice, self.counts, self.used, self.starts, *lists.segments()[1:]]
+        solver.launch_on_box(kernels.place_segments, warps, step, batch, inputs)
+        inputs = [self.cells, self.numbers, self.starts, self.used, self.arrived, lists.full]
+        solver.launch(kernels.place, count, batch, inputs)
+        solver.launch(kernels.tidy, count, batch, [self.cells, self.starts, self.arrived, lists.order])
 
     def p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
         """Fill the substep's grid with momentum and mass."""
@@ -122,7 +123,7 @@ class ByColumns:
         tape = self.solver.tape(step)
         lists: Lists = tape.lists[substep]
         given = [tape.lattice, lists.order, *lists.segments(), *inputs, self.parts]
-        self.solver.launch_on_box(kernel, self._threads, step, batch, given)
+        self.solver.launch_on_box(kernel, self.team.threads, step, batch, given)
 
     def add_up(self, kernel: Any, step: int, substep: int, batch: int, grids: list[wp.array]) -> None:
         """Launch a kernel that adds up the parts at nodes."""
@@ -130,14 +131,11 @@ class ByColumns:
         inputs = [tape.lattice, tape.lists[substep].span, self.parts, *grids]
         self.solver.launch_on_box(kernel, nodes, step, batch, inputs)
 
-    def _threads(self, box: Box) -> int:
-        return segments(box) * self.lanes
-
     def _allocate(self, count: int) -> None:
         """Allocate what so many segments take."""
         allocator = self.solver.allocator
         self.parts: wp.array = allocator.array(allocator.types.vec4, count * PARTS)
-        self.counts, self.starts = (allocator.array(wp.int32, count * SEGMENT) for _ in range(2))
+        self.counts, self.starts = (allocator.array(wp.int32, count * size) for size in (SEGMENT, STARTS))
 
 
 def nodes(box: Box) -> int:

@@ -80,7 +80,7 @@ class ColumnSmoother(Smoother):
 
     def __init__(self, solver: Any, body: int) -> None:
         super().__init__(solver, body)
-        self.columns = smoothing_columns(solver.model.precision, solver.scatter.lanes)
+        self.columns = smoothing_columns(solver.model.precision, solver.scatter.team)
 
     def _kernels(self, name: str) -> Any:
         return smoothing_kernels(name, scattering=False)

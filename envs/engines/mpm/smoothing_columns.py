@@ -8,27 +8,31 @@ import warp as wp
 
 from ..runtime import precision
 from .cells import SEGMENT
-from .columns import PARTS, node_sum, walker
+from .columns import PARTS, Team, node_sum, segment_taker, walker
 from .stencil import lattice, stencil
 
 
 @cache
 @no_type_check
-def smoothing_columns(name: str, lanes: int) -> SimpleNamespace:
-    """Return the kernels `spread, add_up, spread_adjoint, add_up_adjoint` of one precision, for warps of `lanes`.
+def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
+    """Return the kernels `spread, add_up, spread_adjoint, add_up_adjoint` of one precision, for threads in a `team`.
 
     The body's particles are `size` from number `first` on; others in the same cells give nothing.
     """
     types = precision(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
     Lattice, base_node, steps = lattice(name), stencil(name).base_node, walker(name)
+    take_segment, most = segment_taker(team), steps.most
     open_segment, walk, close_segment = steps.open, steps.walk, steps.close
-    add_up_node, module = node_sum(name), f"gradscape.smoothing.{name}.columns.{lanes}"
+    lanes, groups, size = team.lanes, team.groups, team.size
+    add_up_node, module = node_sum(name), f"gradscape.smoothing.{name}.columns.{team.lanes}"
 
     @wp.kernel(module=module, enable_backward=False)
     def spread(
         lattice: Lattice,
         order: wp.array2d[wp.int32],
+        full: wp.array[wp.int32],
+        which: wp.array2d[wp.int32],
         first: wp.array2d[wp.int32],
         end: wp.array2d[wp.int32],
         spans: wp.array2d[wp.int32],
@@ -41,14 +45,13 @@ def smoothing_columns(name: str, lanes: int) -> SimpleNamespace:
     ):
         """Scatter V s and V."""
         e, t = wp.tid()
-        segment = t / lanes
-        span = spans[e, segment]
-        if span == 0:
+        if t / lanes * groups >= full[e]:
             return
-        at, last = segment * PARTS, end[e, segment]
+        mine = take_segment(e, t, full[e], which, first, end, spans)
+        at, span, begin, count = mine[0] * PARTS, mine[1], mine[2], mine[3]
         state = open_segment(parts, e, at, span)
-        for i in range(first[e, segment], last, lanes):
-            p = order[e, wp.min(i + t % lanes, last - 1)]
+        for i in range(0, most(count), size):
+            p = order[e, begin + wp.min(i + t % lanes % size, wp.max(count - 1, 0))]
             s = (x[e, p] - lattice.origin) * lattice.inv_dx
             base = base_node(s, lattice)
             f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
@@ -56,7 +59,7 @@ def smoothing_columns(name: str, lanes: int) -> SimpleNamespace:
             if p >= body and p < body + J.shape[1]:
                 V = volume[e, p]
                 q = vec3(V * (wp.log(J[e, p - body]) - slope * x[e, p][1]), V, real(0.0))
-            state = walk(parts, e, at, wp.min(lanes, last - i), base[2] % SEGMENT, f, real(0.0), q, mat33(), state)
+            state = walk(parts, e, at, wp.min(size, count - i), base[2] % SEGMENT, f, real(0.0), q, mat33(), state)
         close_segment(parts, e, at, span, state)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -76,6 +79,8 @@ def smoothing_columns(name: str, lanes: int) -> SimpleNamespace:
     def spread_adjoint(
         lattice: Lattice,
         order: wp.array2d[wp.int32],
+        full: wp.array[wp.int32],
+        which: wp.array2d[wp.int32],
         first: wp.array2d[wp.int32],
         end: wp.array2d[wp.int32],
         spans: wp.array2d[wp.int32],
@@ -87,21 +92,20 @@ def smoothing_columns(name: str, lanes: int) -> SimpleNamespace:
     ):
         """Scatter the adjoints of the nodes' means, from those of log J'."""
         e, t = wp.tid()
-        segment = t / lanes
-        span = spans[e, segment]
-        if span == 0:
+        if t / lanes * groups >= full[e]:
             return
-        at, last = segment * PARTS, end[e, segment]
+        mine = take_segment(e, t, full[e], which, first, end, spans)
+        at, span, begin, count = mine[0] * PARTS, mine[1], mine[2], mine[3]
         state = open_segment(parts, e, at, span)
-        for i in range(first[e, segment], last, lanes):
-            p = order[e, wp.min(i + t % lanes, last - 1)]
+        for i in range(0, most(count), size):
+            p = order[e, begin + wp.min(i + t % lanes % size, wp.max(count - 1, 0))]
             s = (x[e, p] - lattice.origin) * lattice.inv_dx
             base = base_node(s, lattice)
             f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
             q = vec3()
             if p >= body and p < body + adj_log.shape[1]:
                 q = vec3(share * adj_log[e, p - body], real(0.0), real(0.0))
-            state = walk(parts, e, at, wp.min(lanes, last - i), base[2] % SEGMENT, f, real(0.0), q, mat33(), state)
+            state = walk(parts, e, at, wp.min(size, count - i), base[2] % SEGMENT, f, real(0.0), q, mat33(), state)
         close_segment(parts, e, at, span, state)
 
     @wp.kernel(module=module, enable_backward=False)

@@ -6,7 +6,7 @@ import pytest
 import torch
 import warp as wp
 
-from gradscape.envs.engines.mpm.cells import SEGMENT, cell_kernels, segments
+from gradscape.envs.engines.mpm.cells import SEGMENT, STARTS, cell_kernels, segments, warps
 from gradscape.envs.engines.mpm.model import Box, place_grid
 from gradscape.envs.engines.runtime import to_torch
 
@@ -44,29 +44,34 @@ def test_particles_are_listed_by_cell_and_then_as_they_lie(first):
     x = torch.rand((2, 500, 3), generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 0.4 - 0.2
     x[:, :, 1] += 0.4
     cell = ((x - torch.tensor(model.origin)) / model.dx - 0.5).floor().long()
+    depth = segments(box) // (box.nodes[0] * box.nodes[1])
     for _ in range(2):  # the second time it begins where the first has ended
-        order, begins, ends, spans = listed(model, box, x)
+        order, full, which, begins, ends, spans = listed(model, box, x)
         for row in range(2):
             keys = sorted((i, j, k // SEGMENT, k % SEGMENT, p) for p, (i, j, k) in enumerate(cell[row].tolist()))
+            found = {}
+            for s, begin, end in zip(*(array[row, : full[row]].tolist() for array in (which, begins, ends))):
+                column, layer = divmod(s, depth)
+                place = *divmod(column, box.nodes[1]), layer + first // SEGMENT
+                found[place] = (order[row, begin:end].tolist(), divmod(int(spans[row, s]), 256))
             wanted = {where: list(group) for where, group in groupby(keys, key=lambda key: key[:3])}
-            full = (spans[row] > 0).nonzero()[:, 0].tolist()
-            found = [order[row, begins[row, s] : ends[row, s]].tolist() for s in full]
-            assert found == [[key[-1] for key in group] for group in wanted.values()]
-            touched = [(group[0][3], group[-1][3] + 3) for group in wanted.values()]
-            assert [(int(spans[row, s]) % 16, int(spans[row, s]) // 16) for s in full] == touched
+            assert found == {
+                where: ([key[-1] for key in group], (group[-1][3] + 3, group[0][3])) for where, group in wanted.items()
+            }
+            assert int((spans[row] > 0).sum()) == full[row]
 
 
 def listed(model, box, x):
-    """Return the order of particles, and the first, end, and span of segments, all [row, *]."""
+    """Return the order of particles, and the full, which, first, end, and span of segments, all [row, *]."""
     kernels, lattice, (batch, count) = cell_kernels("float64"), place_grid(model, box), x.shape[:2]
     at = wp.array(x.numpy(), dtype=wp.vec3d)
     cells, numbers, arrived, order = (wp.zeros((batch, count), dtype=wp.int32) for _ in range(4))
-    counts, starts = (wp.zeros((batch, segments(box) * SEGMENT), dtype=wp.int32) for _ in range(2))
-    found = [wp.zeros((batch, segments(box)), dtype=wp.int32) for _ in range(3)]
-    used = wp.zeros(batch, dtype=wp.int32)
+    counts, starts = (wp.zeros((batch, segments(box) * size), dtype=wp.int32) for size in (SEGMENT, STARTS))
+    found = [wp.zeros((batch, segments(box)), dtype=wp.int32) for _ in range(4)]
+    full, used = wp.zeros(batch, dtype=wp.int32), wp.zeros((batch, 2), dtype=wp.int32)
     wp.launch(kernels.count, (batch, count), [lattice, at, cells, numbers, counts, used])
-    wp.launch(kernels.place_segments, (batch, segments(box)), [lattice, counts, used, starts, *found])
-    wp.launch(kernels.place, (batch, count), [cells, numbers, starts, arrived])
-    wp.launch(kernels.tidy, (batch, count), [cells, starts, arrived, found[1], order])
+    wp.launch(kernels.place_segments, (batch, warps(box)), [lattice, counts, used, starts, *found])
+    wp.launch(kernels.place, (batch, count), [cells, numbers, starts, used, arrived, full])
+    wp.launch(kernels.tidy, (batch, count), [cells, starts, arrived, order])
     assert not to_torch(counts).any()
-    return [to_torch(array).clone() for array in (order, *found)]
+    return [to_torch(array).clone() for array in (order, full, *found)]
