@@ -107,7 +107,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
     @wp.func_native(TAKE_PLACES)
     def take_places(used: wp.array2d[wp.int32], e: int, total: int) -> wp.vec2i: ...
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def count(
         lattice: Lattice,
         x: wp.array2d[vec3],
@@ -128,7 +128,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
         cells[e, p] = cell
         numbers[e, p] = take_number(counts, e, cell)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def place_segments(
         lattice: Lattice,
         counts: wp.array2d[wp.int32],
@@ -166,7 +166,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
                 counts[e, s * SEGMENT + k] = 0
             starts[e, s * STARTS + SEGMENT] = at
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def place(
         cells: wp.array2d[wp.int32],
         numbers: wp.array2d[wp.int32],
@@ -182,7 +182,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
         cell = cells[e, p]
         arrived[e, starts[e, cell + cell / SEGMENT] + numbers[e, p]] = p
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def tidy(
         cells: wp.array2d[wp.int32],
         starts: wp.array2d[wp.int32],

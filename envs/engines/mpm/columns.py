@@ -1,8 +1,8 @@
 """Scatters without atomic adds, for a GPU: threads walk columns of cells, and nodes add up what columns give them.
 
-Particles are listed by cell (`cells`). Three lanes of a warp take the particles of SEGMENT cells along z, one after the
-other; each holds the sums of nine of the 27 nodes around the present cell, those of one x. Where the next cell begins,
-the lowest three are written down and the others become lower by one. A segment so leaves 9 rows of up to SEGMENT + 2
+Particles are listed by cell (`cells`). Nine lanes of a warp take the particles of SEGMENT cells along z, one after the
+other; each holds the sums of three of the 27 nodes around the present cell, a row along z. Where the next cell begins,
+the lowest nine are written down and the others become lower by one. A segment so leaves 9 rows of up to SEGMENT + 2
 numbers of four parts, and each node then adds up those of the nine columns that it is part of. Every sum has one order,
 which depends on nothing but an environment's own particles: neither on its place in a batch, nor on the box of nodes,
 nor on chance.
@@ -38,36 +38,28 @@ class Team:
         return -(-segments(box) // self.groups) * self.lanes
 
 
-TEAMS = {True: Team(32, 10, 3), False: Team(1, 1, 1)}  # by whether it is a GPU: on a CPU a thread has a segment
+TEAMS = {True: Team(32, 3, 9), False: Team(1, 1, 1)}  # by whether it is a GPU: on a CPU a thread has a segment
 
 FOUR = "struct alignas(16) Four { REAL a, b, c, d; };"
 EMIT = """
         {
-#pragma unroll
-            for (int j = 0; j < 3; ++j) {
-                const int here = 12 * j;
-                *(Four *)&wp::index(parts, e, at + (3 * i + j) * PLANES + now) =
-                    Four{sums[here], sums[here + 1], sums[here + 2], sums[here + 3]};
-#pragma unroll
-                for (int k = 0; k < 8; ++k) sums[here + k] = sums[here + k + 4];
-#pragma unroll
-                for (int k = 8; k < 12; ++k) sums[here + k] = REAL(0.0);
-            }
+            *(Four *)&wp::index(parts, e, at + row * PLANES + now) = low;
+            low = middle, middle = high, high = Four{};
         }
 """
 OPEN = """
 #if !defined(__CUDA_ARCH__)
     for (int i = 0; i < PARTS; ++i) wp::index(parts, e, at + i) = wp::vec_t<4, REAL>();
 #endif
-    wp::vec_t<37, REAL> state;
-    state[36] = REAL(span & 255);
+    wp::vec_t<13, REAL> state;
+    state[12] = REAL(span & 255);
     return state;
 """
 WALK = """
 #if defined(__CUDA_ARCH__)
     FOUR
     __shared__ Four stage[WARPS][32][5];
-    const int lane = threadIdx.x & 31, i = lane % 3;
+    const int lane = threadIdx.x & 31, row = lane % 9, i = row / 3, j = row % 3;
     Four (*rows)[5] = stage[threadIdx.x >> 5];
     __syncwarp();
     rows[lane][0] = Four{q[0], q[1], q[2], mass};
@@ -76,42 +68,33 @@ WALK = """
     rows[lane][3] = Four{a.data[0][2], a.data[1][2], a.data[2][2], f[2]};
     rows[lane][4].a = REAL(cell);
     __syncwarp();
-    const REAL oi = REAL(i), half = REAL(0.5), one = REAL(1.0), more = REAL(1.5), three = REAL(0.75);
+    const REAL oi = REAL(i), oj = REAL(j), half = REAL(0.5), one = REAL(1.0), more = REAL(1.5), three = REAL(0.75);
     const REAL ui = i == 1 ? three : REAL(0.0), si = i == 1 ? -one : half, mi = more - half * oi;
-    REAL sums[36];
-#pragma unroll
-    for (int k = 0; k < 36; ++k) sums[k] = state[k];
-    int now = (int)state[36];
+    const REAL uj = j == 1 ? three : REAL(0.0), sj = j == 1 ? -one : half, mj = more - half * oj;
+    Four low{state[0], state[1], state[2], state[3]};
+    Four middle{state[4], state[5], state[6], state[7]};
+    Four high{state[8], state[9], state[10], state[11]};
+    int now = (int)state[12];
     for (int t = 0; t < count; ++t) {
-        const Four *row = rows[lane - i + t];
-        const Four b = row[0], x = row[1], y = row[2], z = row[3];
-        const int here = (int)row[4].a;
+        const Four *given = rows[lane - row + t];
+        const Four b = given[0], x = given[1], y = given[2], z = given[3];
+        const int here = (int)given[4].a;
         for (; now < here; ++now) EMIT
-        const REAL tx = x.d - mi, u = y.d - more, v = y.d - one, w = y.d - half;
-        const REAL wx = ui + si * tx * tx;
-        const REAL wy[3] = {wx * (half * u * u), wx * (three - v * v), wx * (half * w * w)};
-        const REAL tu = z.d - more, tv = z.d - one, tw = z.d - half;
-        const REAL wz[3] = {half * tu * tu, three - tv * tv, half * tw * tw};
-        REAL qa = b.a + oi * x.a, qb = b.b + oi * x.b, qc = b.c + oi * x.c;
-#pragma unroll
-        for (int j = 0; j < 3; ++j) {
-            REAL ra = qa, rb = qb, rc = qc;
-#pragma unroll
-            for (int k = 0; k < 3; ++k) {
-                const REAL weight = wy[j] * wz[k];
-                sums[12 * j + 4 * k] += weight * ra;
-                sums[12 * j + 4 * k + 1] += weight * rb;
-                sums[12 * j + 4 * k + 2] += weight * rc;
-                sums[12 * j + 4 * k + 3] += weight * b.d;
-                ra += z.a, rb += z.b, rc += z.c;
-            }
-            qa += y.a, qb += y.b, qc += y.c;
-        }
+        const REAL tx = x.d - mi, ty = y.d - mj, u = z.d - more, v = z.d - one, w = z.d - half;
+        const REAL wij = (ui + si * tx * tx) * (uj + sj * ty * ty);
+        const REAL w0 = wij * (half * u * u), w1 = wij * (three - v * v), w2 = wij * (half * w * w);
+        REAL qa = b.a + oi * x.a + oj * y.a, qb = b.b + oi * x.b + oj * y.b, qc = b.c + oi * x.c + oj * y.c;
+        low.a += w0 * qa, low.b += w0 * qb, low.c += w0 * qc, low.d += w0 * b.d;
+        qa += z.a, qb += z.b, qc += z.c;
+        middle.a += w1 * qa, middle.b += w1 * qb, middle.c += w1 * qc, middle.d += w1 * b.d;
+        qa += z.a, qb += z.b, qc += z.c;
+        high.a += w2 * qa, high.b += w2 * qb, high.c += w2 * qc, high.d += w2 * b.d;
     }
-    wp::vec_t<37, REAL> left;
-#pragma unroll
-    for (int k = 0; k < 36; ++k) left[k] = sums[k];
-    left[36] = REAL(now);
+    wp::vec_t<13, REAL> left;
+    left[0] = low.a, left[1] = low.b, left[2] = low.c, left[3] = low.d;
+    left[4] = middle.a, left[5] = middle.b, left[6] = middle.c, left[7] = middle.d;
+    left[8] = high.a, left[9] = high.b, left[10] = high.c, left[11] = high.d;
+    left[12] = REAL(now);
     return left;
 #else
     REAL w[3][3];
@@ -138,11 +121,11 @@ WALK = """
 CLOSE = """
 #if defined(__CUDA_ARCH__)
     FOUR
-    const int i = (threadIdx.x & 31) % 3;
-    REAL sums[36];
-#pragma unroll
-    for (int k = 0; k < 36; ++k) sums[k] = state[k];
-    for (int now = (int)state[36]; now < span >> 8; ++now) EMIT
+    const int row = (threadIdx.x & 31) % 9;
+    Four low{state[0], state[1], state[2], state[3]};
+    Four middle{state[4], state[5], state[6], state[7]};
+    Four high{state[8], state[9], state[10], state[11]};
+    for (int now = (int)state[12]; now < span >> 8; ++now) EMIT
 #endif
 """
 MOST = """
@@ -204,7 +187,7 @@ def walker(name: str) -> SimpleNamespace:
     """
     types = precision(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
-    State = wp.types.vector(37, real)
+    State = wp.types.vector(13, real)
 
     @wp.func_native(MOST)
     def most(count: int) -> int: ...
@@ -287,7 +270,7 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
     open_segment, walk, close_segment = steps.open, steps.walk, steps.close
     lanes, groups, size = team.lanes, team.groups, team.size
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def p2g(
         lattice: Lattice,
         order: wp.array2d[wp.int32],
@@ -309,8 +292,10 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
         mine = take_segment(e, t, full[e], which, first, end, spans)
         at, span, begin, count = mine[0] * PARTS, mine[1], mine[2], mine[3]
         state = open_segment(parts, e, at, span)
+        following = order[e, begin + wp.min(t % lanes % size, wp.max(count - 1, 0))]
         for i in range(0, most(count), size):
-            p = order[e, begin + wp.min(i + t % lanes % size, wp.max(count - 1, 0))]
+            p = following
+            following = order[e, begin + wp.min(i + size + t % lanes % size, wp.max(count - 1, 0))]
             s = (x[e, p] - lattice.origin) * lattice.inv_dx
             base = base_node(s, lattice)
             f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
@@ -320,7 +305,7 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
             state = walk(parts, e, at, wp.min(size, count - i), base[2] % SEGMENT, f, m, q, a, state)
         close_segment(parts, e, at, span, state)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def adjoint_g2p(
         lattice: Lattice,
         order: wp.array2d[wp.int32],
@@ -343,8 +328,10 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
         mine = take_segment(e, t, full[e], which, first, end, spans)
         at, span, begin, count = mine[0] * PARTS, mine[1], mine[2], mine[3]
         state = open_segment(parts, e, at, span)
+        following = order[e, begin + wp.min(t % lanes % size, wp.max(count - 1, 0))]
         for i in range(0, most(count), size):
-            p = order[e, begin + wp.min(i + t % lanes % size, wp.max(count - 1, 0))]
+            p = following
+            following = order[e, begin + wp.min(i + size + t % lanes % size, wp.max(count - 1, 0))]
             s = (x[e, p] - lattice.origin) * lattice.inv_dx
             base = base_node(s, lattice)
             f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
@@ -353,7 +340,7 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
             state = walk(parts, e, at, wp.min(size, count - i), base[2] % SEGMENT, f, real(0.0), q, c, state)
         close_segment(parts, e, at, span, state)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def add_up(lattice: Lattice, spans: wp.array2d[wp.int32], parts: wp.array2d[vec4], grid: wp.array2d[vec4]):
         e, i = wp.tid()
         grid[e, i] = add_up_node(lattice, spans, parts, e, i)

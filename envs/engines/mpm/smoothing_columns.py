@@ -27,7 +27,7 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
     lanes, groups, size = team.lanes, team.groups, team.size
     add_up_node, module = node_sum(name), f"gradscape.smoothing.{name}.columns.{team.lanes}"
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def spread(
         lattice: Lattice,
         order: wp.array2d[wp.int32],
@@ -50,8 +50,10 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         mine = take_segment(e, t, full[e], which, first, end, spans)
         at, span, begin, count = mine[0] * PARTS, mine[1], mine[2], mine[3]
         state = open_segment(parts, e, at, span)
+        following = order[e, begin + wp.min(t % lanes % size, wp.max(count - 1, 0))]
         for i in range(0, most(count), size):
-            p = order[e, begin + wp.min(i + t % lanes % size, wp.max(count - 1, 0))]
+            p = following
+            following = order[e, begin + wp.min(i + size + t % lanes % size, wp.max(count - 1, 0))]
             s = (x[e, p] - lattice.origin) * lattice.inv_dx
             base = base_node(s, lattice)
             f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
@@ -62,7 +64,7 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
             state = walk(parts, e, at, wp.min(size, count - i), base[2] % SEGMENT, f, real(0.0), q, mat33(), state)
         close_segment(parts, e, at, span, state)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def add_up(
         lattice: Lattice,
         spans: wp.array2d[wp.int32],
@@ -75,7 +77,7 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         amount[e, i] = total[0]
         weight[e, i] = total[1]
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def spread_adjoint(
         lattice: Lattice,
         order: wp.array2d[wp.int32],
@@ -97,8 +99,10 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         mine = take_segment(e, t, full[e], which, first, end, spans)
         at, span, begin, count = mine[0] * PARTS, mine[1], mine[2], mine[3]
         state = open_segment(parts, e, at, span)
+        following = order[e, begin + wp.min(t % lanes % size, wp.max(count - 1, 0))]
         for i in range(0, most(count), size):
-            p = order[e, begin + wp.min(i + t % lanes % size, wp.max(count - 1, 0))]
+            p = following
+            following = order[e, begin + wp.min(i + size + t % lanes % size, wp.max(count - 1, 0))]
             s = (x[e, p] - lattice.origin) * lattice.inv_dx
             base = base_node(s, lattice)
             f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
@@ -108,7 +112,7 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
             state = walk(parts, e, at, wp.min(size, count - i), base[2] % SEGMENT, f, real(0.0), q, mat33(), state)
         close_segment(parts, e, at, span, state)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def add_up_adjoint(
         lattice: Lattice, spans: wp.array2d[wp.int32], parts: wp.array2d[vec4], adj_mean: wp.array2d[real]
     ):
