@@ -15,8 +15,7 @@ from typing import no_type_check
 
 import warp as wp
 
-from ..launches import BLOCK
-from ..runtime import precision
+from ..runtime import BLOCK, precision
 from .cells import SEGMENT, segments
 from .model import Box
 from .stencil import lattice, stencil
