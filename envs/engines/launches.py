@@ -12,9 +12,10 @@ from typing import Any, ClassVar
 import warp as wp
 
 from .mpm.model import Box
-from .runtime import BLOCK
 
 MAX_GRAPHS, MAX_SEQUENCES = 512, 1024  # that are stored; more are not worth their memory
+
+BLOCK = 128  # threads of a GPU that share registers; scatters and gathers like few
 
 
 @dataclass(frozen=True)

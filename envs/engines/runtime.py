@@ -14,7 +14,6 @@ import warp as wp
 wp.config.log_level = wp.LOG_ERROR  # no banner
 
 COMPUTES_LOSSES = False  # for `code`
-BLOCK = 128  # threads of a GPU that share registers and memory; scatters and gathers like few
 MANY = ".engines.mpm."  # where solvers are whose kernels are of many modules
 
 

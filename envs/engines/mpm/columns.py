@@ -15,7 +15,8 @@ from typing import no_type_check
 
 import warp as wp
 
-from ..runtime import BLOCK, precision
+from ..launches import BLOCK
+from ..runtime import precision
 from .cells import SEGMENT, segments
 from .model import Box
 from .stencil import lattice, stencil

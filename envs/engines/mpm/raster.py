@@ -7,7 +7,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from ..runtime import BLOCK, load, precision, to_torch
+from ..runtime import load, precision, to_torch
 from .model import Model, place_grid
 from .stencil import lattice, stencil
 from .transfers import transfers
@@ -87,7 +87,7 @@ class Raster:
             self.units.zero_()
             self._place(x)
             inputs = [self.lattice, self.mass, self.particles[0], 1.0 / self.unit, self.units]
-            wp.launch(self.count, (len(x), self.mass.shape[1]), inputs, device=self.device, record_tape=False, block_dim=BLOCK)
+            wp.launch(self.count, (len(x), self.mass.shape[1]), inputs, device=self.device, record_tape=False)
             return (to_torch(self.units)[: len(x)].double() * self.unit).to(x.dtype)
         self.grid.zero_()
         self._launch(self.kernels.p2g, x, [])
@@ -109,7 +109,7 @@ class Raster:
     def _launch(self, kernel: Any, x: torch.Tensor, adjoints: list[Any]) -> None:
         self._place(x)
         inputs = [self.lattice, self.mass, *self.particles, self.grid, *adjoints]
-        wp.launch(kernel, (len(x), self.mass.shape[1]), inputs, device=self.device, record_tape=False, block_dim=BLOCK)
+        wp.launch(kernel, (len(x), self.mass.shape[1]), inputs, device=self.device, record_tape=False)
 
 
 class _Spread(torch.autograd.Function):

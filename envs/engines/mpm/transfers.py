@@ -15,7 +15,6 @@ from typing import no_type_check
 import warp as wp
 
 from ..runtime import precision
-from .matrices import matrices
 from .stencil import lattice, stencil
 
 
@@ -30,7 +29,6 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
     module = f"gradscape.transfers.{name}{'' if scattering else '.gathers'}"
     Lattice, spline = lattice(name), stencil(name)
-    read, write = matrices(name).read, matrices(name).write
     base_node, weights, weight_slopes = spline.base_node, spline.weights, spline.weight_slopes
     offset = wp.constant(vec3(0.0, 1.0, 2.0))  # real(i) on an unrolled index breaks the code generator in float64
 
@@ -99,8 +97,7 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
         dx_, dy_, dz_ = weight_slopes(f[0]), weight_slopes(f[1]), weight_slopes(f[2])
         m = mass[e, p]
         dx = real(1.0) / lattice.inv_dx
-        affine = read(A, e, p)
-        a = affine * dx
+        a = A[e, p] * dx
         ax, ay, az = column(a, 0), column(a, 1), column(a, 2)
         q0 = m * v[e, p] - a * f
         h0 = vec3()
@@ -128,8 +125,8 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
                 hx += offset[i] * rij
                 hy += offset[j] * rij
         adj_v[e, p] = m * h0
-        write(adj_A, e, p, dx * wp.matrix_from_cols(hx - f[0] * h0, hy - f[1] * h0, hz - f[2] * h0))
-        adj_x[e, p] = adj_x[e, p] + lattice.inv_dx * slope - wp.transpose(affine) * h0
+        adj_A[e, p] = dx * wp.matrix_from_cols(hx - f[0] * h0, hy - f[1] * h0, hz - f[2] * h0)
+        adj_x[e, p] = adj_x[e, p] + lattice.inv_dx * slope - wp.transpose(A[e, p]) * h0
 
     @wp.kernel(module=module, enable_backward=False)
     def g2p(
@@ -166,8 +163,7 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
                 sy += offset[j] * rij
                 sz += r1 + real(2.0) * r2
         v_new[e, p] = s0
-        c = wp.matrix_from_cols(sx - f[0] * s0, sy - f[1] * s0, sz - f[2] * s0)
-        write(C_new, e, p, (real(4.0) * lattice.inv_dx) * c)
+        C_new[e, p] = (real(4.0) * lattice.inv_dx) * wp.matrix_from_cols(sx - f[0] * s0, sy - f[1] * s0, sz - f[2] * s0)
         x_new[e, p] = x[e, p] + dt * s0
         if wp.min(wp.min(f[0], f[1]), f[2]) < real(0.49) or wp.max(wp.max(f[0], f[1]), f[2]) > real(1.51):
             left_box[e] = 1
@@ -192,7 +188,7 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
         corner = base - lattice.first
         wx, wy, wz = weights(f[0]), weights(f[1]), weights(f[2])
         dx_, dy_, dz_ = weight_slopes(f[0]), weight_slopes(f[1]), weight_slopes(f[2])
-        c = (real(4.0) * lattice.inv_dx) * read(adj_C_new, e, p)
+        c = (real(4.0) * lattice.inv_dx) * adj_C_new[e, p]
         cx, cy, cz = column(c, 0), column(c, 1), column(c, 2)
         q0 = adj_v_new[e, p] + dt * adj_x_new[e, p] - c * f
         slope = vec3()

@@ -6,7 +6,6 @@ from typing import Any, no_type_check
 import warp as wp
 
 from ...runtime import precision
-from ..matrices import matrices
 
 
 @cache
@@ -15,7 +14,6 @@ def kernels(name: str) -> tuple[Any, Any]:
     """Return (update, adjoint): F' = (I + dt C) F, tau = mu (F' F'^T - I) + lam log(det F') I."""
     types = precision(name)
     real, mat33 = types.real, types.mat33
-    read, write = matrices(name).read, matrices(name).write
     module = f"gradscape.elastic.{name}"
 
     @wp.kernel(module=module, enable_backward=False)
@@ -33,12 +31,12 @@ def kernels(name: str) -> tuple[Any, Any]:
         A: wp.array2d[mat33],
     ):
         e, p = wp.tid()
-        c, f = read(C, e, first + p), read(F, e, p)
-        f = f + dt * c * f
+        c = C[e, first + p]
+        f = F[e, p] + dt * c * F[e, p]
         identity = wp.identity(n=3, dtype=real)
         tau = mu * (f * wp.transpose(f) - identity) + lam * wp.log(wp.determinant(f)) * identity
-        write(F_new, e, p, f)
-        write(A, e, first + p, scale * volume[e, first + p] * tau + mass[e, first + p] * c)
+        F_new[e, p] = f
+        A[e, first + p] = scale * volume[e, first + p] * tau + mass[e, first + p] * c
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint(
@@ -58,12 +56,11 @@ def kernels(name: str) -> tuple[Any, Any]:
     ):
         e, p = wp.tid()
         identity = wp.identity(n=3, dtype=real)
-        old, adj_a = read(F, e, p), read(adj_A, e, first + p)
-        advance = identity + dt * read(C, e, first + p)
-        f = advance * old
-        g = (scale * volume[e, first + p]) * adj_a  # the adjoint of tau
-        adj_f = read(adj_F_new, e, p) + mu * (g + wp.transpose(g)) * f + lam * wp.trace(g) * wp.transpose(wp.inverse(f))
-        write(adj_F, e, p, wp.transpose(advance) * adj_f)
-        write(adj_C, e, first + p, mass[e, first + p] * adj_a + dt * adj_f * wp.transpose(old))
+        advance = identity + dt * C[e, first + p]
+        f = advance * F[e, p]
+        g = (scale * volume[e, first + p]) * adj_A[e, first + p]  # the adjoint of tau
+        adj_f = adj_F_new[e, p] + mu * (g + wp.transpose(g)) * f + lam * wp.trace(g) * wp.transpose(wp.inverse(f))
+        adj_F[e, p] = wp.transpose(advance) * adj_f
+        adj_C[e, first + p] = mass[e, first + p] * adj_A[e, first + p] + dt * adj_f * wp.transpose(F[e, p])
 
     return update, adjoint

@@ -6,7 +6,6 @@ from typing import Any, no_type_check
 import warp as wp
 
 from ...runtime import precision
-from ..matrices import matrices
 
 TORN = 1.04  # volume ratio at which a fluid tears
 
@@ -17,7 +16,6 @@ def kernels(name: str) -> tuple[Any, Any]:
     """Return (update, adjoint): J' = min(exp(dt tr C) J, TORN), tau = K log J' I + J' mu (C + C^T - 2/3 tr C I)."""
     types = precision(name)
     real, mat33 = types.real, types.mat33
-    read, write = matrices(name).read, matrices(name).write
     module = f"gradscape.fluid.{name}"
 
     @wp.func(module=module)
@@ -39,11 +37,11 @@ def kernels(name: str) -> tuple[Any, Any]:
         A: wp.array2d[mat33],
     ):
         e, p = wp.tid()
-        c = read(C, e, first + p)
+        c = C[e, first + p]
         j = wp.min(wp.exp(dt * wp.trace(c)) * J[e, p], real(TORN))
         tau = bulk * wp.log(j) * wp.identity(n=3, dtype=real) + j * viscosity * shear(c)
         J_new[e, p] = j
-        write(A, e, first + p, scale * volume[e, first + p] * tau + mass[e, first + p] * c)
+        A[e, first + p] = scale * volume[e, first + p] * tau + mass[e, first + p] * c
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint(
@@ -62,15 +60,15 @@ def kernels(name: str) -> tuple[Any, Any]:
         adj_C: wp.array2d[mat33],
     ):
         e, p = wp.tid()
-        c, adj_a = read(C, e, first + p), read(adj_A, e, first + p)
+        c = C[e, first + p]
         growth = wp.exp(dt * wp.trace(c))
         j = wp.min(growth * J[e, p], real(TORN))
-        g = (scale * volume[e, first + p]) * adj_a  # the adjoint of tau
+        g = (scale * volume[e, first + p]) * adj_A[e, first + p]  # the adjoint of tau
         adj_j = adj_J_new[e, p] + bulk * wp.trace(g) / j + viscosity * wp.ddot(g, shear(c))
         if growth * J[e, p] > real(TORN):
             adj_j = real(0.0)
         adj_J[e, p] = growth * adj_j
         dilation = dt * j * adj_j * wp.identity(n=3, dtype=real)
-        write(adj_C, e, first + p, mass[e, first + p] * adj_a + j * viscosity * shear(g) + dilation)
+        adj_C[e, first + p] = mass[e, first + p] * adj_A[e, first + p] + j * viscosity * shear(g) + dilation
 
     return update, adjoint
