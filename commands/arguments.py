@@ -50,7 +50,7 @@ Tolerance = Annotated[
 ]
 Device = Annotated[str, typer.Option(help="auto, cpu or cuda; auto takes CUDA where it is.")]
 Deterministic = Annotated[
-    bool, typer.Option("--deterministic", help="Bitwise reproducible GPU results (about 10x slower).")
+    bool, typer.Option("--deterministic", help="Refuse an engine whose results on a GPU are not the same every time.")
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Random seed.")]
 Engine = Annotated[

@@ -45,8 +45,8 @@ class Environment(abc.ABC):
     are `space` and `_evaluate`. An environment is an `Objective`, and a torch function: `env(x)` returns losses, shape
     (batch,), that can be differentiated. `fidelity` is a name from `fidelities`, the first unless said otherwise, or a
     record of one's own; `device` is auto, cpu or cuda; `engine` is one of `engines`, the first unless said otherwise;
-    options are those of the class's `Options`. On a GPU two runs may differ by round-off, because atomic adds come in
-    any order, unless `deterministic` says otherwise.
+    options are those of the class's `Options`. Two runs give the same bits, on a CPU and on a GPU, alone or in a batch,
+    but for an engine that cannot promise that; `deterministic` refuses such an engine.
     """
 
     name: ClassVar[str]  # of a class that says none, its own in lower case

@@ -298,7 +298,8 @@ def make(
     """Make an environment by its registered name, by FILE.py:Class, or of a class.
 
     `fidelity` defaults to its cheapest, `engine` to its first; `device` is auto, cpu or cuda. Raises ValueError where
-    the environment does not exist, or has no such fidelity, device, engine or option.
+    the environment does not exist, or has no such fidelity, device, engine or option, or where the engine does not give
+    the same bits every time and they are to be `deterministic`.
     """
     kind = name if isinstance(name, type) else environment_class(name)
     settings: dict[str, Any] = {"fidelity": fidelity, "device": device, "engine": engine}

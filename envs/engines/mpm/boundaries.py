@@ -144,9 +144,7 @@ def _ladle_in_tank(name: str) -> tuple[Any, Any]:
         return start + fraction * (read(tools, sums, e, lane, step, 1, 0) - start)
 
     @wp.func(module=module)
-    def velocity(
-        tools: wp.array3d[vec3], sums: wp.array2d[wp.int64], e: int, lane: int, step: int, rate: real
-    ) -> vec3:
+    def velocity(tools: wp.array3d[vec3], sums: wp.array2d[wp.int64], e: int, lane: int, step: int, rate: real) -> vec3:
         """Return how the ladle moves."""
         return rate * (read(tools, sums, e, lane, step, 1, 0) - read(tools, sums, e, lane, step, 0, 0))
 

@@ -97,8 +97,7 @@ def segments(box: Box) -> int:
 @no_type_check
 def cell_kernels(name: str) -> SimpleNamespace:
     """Return the kernels `count, place_segments, place, tidy` of one precision, which make lists in this order."""
-    types = precision(name)
-    real, vec3 = types.real, types.vec3
+    vec3 = precision(name).vec3
     Lattice, base_node, module = lattice(name), stencil(name).base_node, f"gradscape.cells.{name}"
 
     @wp.func_native(TAKE_NUMBER)
@@ -144,7 +143,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
         bottom = lattice.first[2] / SEGMENT
         depth = (lattice.first[2] + lattice.nz - 1) / SEGMENT - bottom + 1
         there = s < lattice.nx * lattice.ny * depth
-        total, low, high = int(0), int(0), int(0)
+        total, low, high = wp.int32(0), wp.int32(0), wp.int32(0)
         if there:
             for k in range(SEGMENT):
                 here = counts[e, s * SEGMENT + k]
@@ -192,7 +191,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
         """List them by cell, those of a cell as they lie in memory."""
         e, p = wp.tid()
         at = cells[e, p] + cells[e, p] / SEGMENT
-        before = int(0)
+        before = wp.int32(0)
         for i in range(starts[e, at], starts[e, at + 1]):
             if arrived[e, i] < p:
                 before += 1

@@ -16,7 +16,7 @@ import warp as wp
 
 from ..runtime import precision
 
-LANES = 32  # copies of the sums, so that fewer nodes wait for each other to add to the same one
+LANES = 8  # copies of the sums, so that fewer nodes wait for each other to add to the same one
 BITS = 16
 SUMS = {"float32": 17, "float64": 130}  # ranges that hold all exponents, and the last: how many are no numbers
 

@@ -71,16 +71,21 @@ class Model:
         """Number of nodes of the grid."""
         return int(np.prod(self.nodes))
 
-    def bytes_per_environment(self, tapes: int) -> int:
+    def bytes_per_environment(self, tapes: int, *, columns: bool = False) -> int:
         """Return about what an environment takes of a solver that stores so many control steps whole, with adjoints.
 
-        Grids are counted as large as they are around the bodies at rest, and as large again.
+        Grids are counted as large as they are around the bodies at rest, and as large again. Sums by `columns` take 45
+        numbers a node, and lists of particles an integer a particle in each substep.
         """
         state = sum(len(body.x) * (1 if isinstance(body.material, Fluid) else 9) for body in self.bodies)
         frame = 15 * self.particles + state  # x, v, C and each material's own
-        grid = 8 * min(self.cells, nodes_around(self, *self.corners, BOX_MARGIN).cells * 2)
-        substep = frame + 9 * self.particles + grid
-        return self.real_bytes * ((self.steps + 3) * frame + (tapes * self.substeps + 1) * substep)
+        nodes = min(self.cells, nodes_around(self, *self.corners, BOX_MARGIN).cells * 2)
+        substep = frame + 9 * self.particles + 8 * nodes
+        numbers = (self.steps + 3) * frame + (tapes * self.substeps + 1) * substep
+        if not columns:
+            return self.real_bytes * numbers
+        integers = (tapes * self.substeps + 3) * (self.particles + nodes)
+        return self.real_bytes * (numbers + 45 * nodes) + 4 * integers
 
     @property
     def corners(self) -> tuple[torch.Tensor, torch.Tensor]:

@@ -48,15 +48,17 @@ def capacity(model: Model, device: str) -> int:
     """Return how many environments of a model a solver should take at once."""
     if device == "cpu":
         return max(1, min(4, CROWD // model.particles))  # few enough for the cache
-    free = free_memory() * 3 // 4
-    fitting, whole = free // memory(model, device), free // model.bytes_per_environment(model.steps)
-    return max(1, min(1024, FULL_CARD // model.particles, fitting, max(whole, BUSY // model.particles)))
+    free, whole = free_memory() * 3 // 4, model.bytes_per_environment(model.steps, columns=True)
+    fitting = free // memory(model, device)
+    return max(1, min(1024, FULL_CARD // model.particles, fitting, max(free // whole, BUSY // model.particles)))
 
 
 def memory(model: Model, device: str) -> int:
     """Return about how many bytes an environment takes; a GPU's spare memory is used beyond that."""
+    if device != "cpu":
+        return model.bytes_per_environment(1, columns=True)
     whole = model.bytes_per_environment(model.steps)
-    return whole if device == "cpu" and whole <= WHOLE_EPISODE else model.bytes_per_environment(1)
+    return whole if whole <= WHOLE_EPISODE else model.bytes_per_environment(1)
 
 
 class Solver:
@@ -228,8 +230,9 @@ class Solver:
         tape, frames = self.tape(step), self.frames(step)
         for s in range(self.model.substeps):
             self.scatter.list_particles(step, s, frames[s], batch)
-            for smoother in self.smoothers if s == 0 else ():
-                smoother.run(self, step, batch)
+            if s == 0:
+                for smoother in self.smoothers:
+                    smoother.run(self, step, batch)
             self._update(step, frames[s], frames[s + 1], tape.A[s], batch)
             self._fill_grid(frames[s], step, s, batch)
             self._move_particles(frames[s], frames[s + 1], step, s, batch)
@@ -304,9 +307,9 @@ class _Adjoint:
         self.A = solver.allocator.affine_momentum()
         self.grid = solver.allocator.grid(max(box.cells for box in solver.boxes))
         self.tools = solver.allocator.paths()
-        self.tools_by_axis: wp.array = wp.from_torch(to_torch(self.tools), requires_grad=False)
-        self.settle = settle_kernel(solver.model.precision)
-        load([self.settle], solver.device)
+        self.tools_by_axis: Any = wp.from_torch(to_torch(self.tools), requires_grad=False)
+        self.settle = settle_kernel(solver.model.precision)  # of a GPU, where nodes do not add to the adjoint itself
+        load([self.settle] if solver.device != "cpu" else [], solver.device)
         self.structs = (
             lattice(solver.model.precision)(),
             type(solver.boundary)(),
@@ -315,7 +318,7 @@ class _Adjoint:
     def run(self, adj_x: Mapping[int, torch.Tensor]) -> torch.Tensor:
         """Return the adjoint of the tools, shape (batch, step + 1, slot, 3)."""
         solver, batch = self.solver, len(next(iter(adj_x.values())))
-        for array in (*self.new.arrays(), self.tools):
+        for array in (*self.new.arrays(), self.tools, solver.sums):
             array.zero_()
         for step in reversed(range(max(adj_x))):
             if step + 1 in adj_x:
@@ -349,7 +352,7 @@ class _Adjoint:
             self.new, self.old = self.old, self.new
         for smoother in solver.smoothers:
             smoother.run_back(solver, step, batch, self.new)
-        if solver.device != "cpu":  # where nodes add to the adjoint itself
+        if solver.device != "cpu":
             solver.launch(self.settle, 6 * solver.model.boundary.slots, batch, [step, solver.sums, self.tools_by_axis])
 
     def _adjoint_velocity(self, step: int, substep: int, batch: int) -> None:

@@ -6,7 +6,7 @@ comes in the same order. Warp's own code for a CPU works on one number at a time
 
 from functools import cache
 from types import SimpleNamespace
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import warp as wp
 

@@ -1,4 +1,4 @@
-"""Sums by columns of cells, as a GPU makes them, against those in place; here each warp's work is done by one thread."""
+"""Sums by columns of cells, as a GPU makes them, against those in place; here a thread does the work of a warp."""
 
 from itertools import groupby
 
@@ -50,7 +50,9 @@ def test_particles_are_listed_by_cell_and_then_as_they_lie(first):
         for row in range(2):
             keys = sorted((i, j, k // SEGMENT, k % SEGMENT, p) for p, (i, j, k) in enumerate(cell[row].tolist()))
             found = {}
-            for s, begin, end in zip(*(array[row, : full[row]].tolist() for array in (which, begins, ends))):
+            for s, begin, end in zip(
+                *(array[row, : full[row]].tolist() for array in (which, begins, ends)), strict=True
+            ):
                 column, layer = divmod(s, depth)
                 place = *divmod(column, box.nodes[1]), layer + first // SEGMENT
                 found[place] = (order[row, begin:end].tolist(), divmod(int(spans[row, s]), 256))
