@@ -28,7 +28,7 @@ import numpy as np
 
 FACTOR, REPEATS = 2.0, 3
 LEAST = 1e-7  # a distance below which all are the same
-POINTS = {"draft": 32, "standard": 8}
+POINTS = {"draft": 32, "standard": 32}
 
 
 def main() -> None:
