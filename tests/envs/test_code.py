@@ -100,7 +100,7 @@ def home_of(name: str) -> str:
 
 
 def test_a_scene_has_the_files_that_it_computes_with_and_no_other_scene_s() -> None:
-    engine = {"solver.py", "transfers.py", "aggregation.py", "checkpoints.py", "materials/fluid.py"}
+    engine = {"solver.py", "transfers.py", "scatter.py", "columns.py", "checkpoints.py", "materials/fluid.py"}
     assert {"mpm/fluid.py", "mpm/scene.py", *(f"engines/mpm/{name}" for name in engine)} <= files_of("fluid")
     assert files_of("bounce") == {"bounce.py", "engines/balls/rigid.py", "options.py"}
     scenes, homes = {name: files_of(name) for name in SCENES}, {name: home_of(name) for name in SCENES}

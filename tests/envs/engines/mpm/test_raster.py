@@ -25,12 +25,22 @@ def node_positions():
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
 
 
-@pytest.fixture(scope="module")
-def raster():
+def make_raster(*, counting=None, name="float64", mass=MASS):
     x = places(1, seed=1)[0].numpy()
     body = Body(Elastic(1.0, 1.0, 0.3), x, np.ones(COUNT), np.ones(COUNT))
-    model = Model("float64", (body,), Open(), ORIGIN, DX, NODES, dt=1e-3, substeps=1, steps=1)
-    return Raster(model, MASS.numpy(), capacity=3, device="cpu")
+    model = Model(name, (body,), Open(), ORIGIN, DX, NODES, dt=1e-3, substeps=1, steps=1)
+    return Raster(model, mass.numpy(), capacity=3, device="cpu", counting=counting)
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["adding", "counting"])
+def raster(request):
+    return make_raster(counting=request.param)
+
+
+def test_masses_that_are_counted_do_not_depend_on_the_order_of_particles():
+    x, turned = places(3, seed=7), torch.randperm(COUNT, generator=torch.Generator().manual_seed(8))
+    one, other = (make_raster(counting=True, name="float32", mass=MASS[order]) for order in (range(COUNT), turned))
+    assert torch.equal(one(x), other(x[:, turned]))
 
 
 def test_nodes_hold_the_particles_mass_and_its_first_moment(raster):
