@@ -18,7 +18,7 @@ from ..runtime import precision
 
 LANES = 8  # copies of the sums, so that fewer nodes wait for each other to add to the same one
 BITS = 16
-SUMS = {"float32": 17, "float64": 130}  # ranges that hold all exponents, and the last: how many are no numbers
+SUMS = {"float32": 17, "float64": 132}  # ranges that hold all exponents, and the last: how many are no numbers
 
 ADD = {
     "float32": """

@@ -60,7 +60,8 @@ class Raster:
     ) -> None:
         types = precision(model.precision)
         self.counting = device != "cpu" if counting is None else counting
-        self.kernels, self.count = transfers(model.precision), count_kernel(model.precision)
+        self.kernels = transfers(model.precision, scattering=not self.counting)
+        self.count = count_kernel(model.precision)
         self.lattice, self.device = place_grid(model), device
         load([self.kernels.adjoint_p2g, *([self.count] if self.counting else [])], device)
         self.unit = float(mass.sum()) / WHOLE

@@ -94,6 +94,8 @@ class ByColumns:
         solver, tape, kernels = self.solver, self.solver.tape(step), self.listing
         lists: Lists = tape.lists[substep]
         count = solver.model.particles
+        if count == 1:
+            solver.launches.call(self.used.zero_)  # of which the kernel clears a number for each particle, up to two
         inputs = [tape.lattice, frame.x, self.cells, self.numbers, self.counts, self.used]
         solver.launch(kernels.count, count, batch, inputs)
         inputs = [tape.lattice, self.counts, self.used, self.starts, *lists.segments()[1:]]

@@ -1,5 +1,6 @@
 """Sums by columns of cells, as a GPU makes them, against those in place; here a thread does the work of a warp."""
 
+from dataclasses import replace
 from itertools import groupby
 
 import pytest
@@ -7,7 +8,7 @@ import torch
 import warp as wp
 
 from gradscape.envs.engines.mpm.cells import SEGMENT, STARTS, cell_kernels, segments, warps
-from gradscape.envs.engines.mpm.model import Box, place_grid
+from gradscape.envs.engines.mpm.model import Body, Box, place_grid
 from gradscape.envs.engines.runtime import to_torch
 
 from .bodies import kneaded, kneading, stirred, weights
@@ -24,6 +25,18 @@ def test_clay_under_tools_moves_as_in_place():
     assert_equal_but_for_rounding(got[1], wanted[1])
     assert_equal_but_for_rounding(got[2], wanted[2])
     assert wanted[2].abs().max() > 0
+
+
+def test_a_lone_particle_moves_as_in_place():
+    model, paths = kneading()
+    body = model.bodies[0]
+    lone = replace(model, bodies=(Body(body.material, body.x[:1], body.volume[:1], body.ratio[:1]),))
+    adj_x = {lone.steps: weights(lone, 3, 5)}
+    wanted, got = (kneaded(lone, paths, adj_x, columns=columns) for columns in (False, True))
+    again = got[0].run(paths)
+    assert_equal_but_for_rounding(got[1], wanted[1])
+    assert torch.equal(again, got[1])
+    assert_equal_but_for_rounding(got[2], wanted[2])
 
 
 def test_a_stirred_fluid_is_smoothed_and_moves_as_in_place():
