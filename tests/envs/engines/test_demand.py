@@ -3,6 +3,7 @@
 import warp as wp
 
 from gradscape.envs.engines.demand import Demand, demand
+from gradscape.envs.engines.mpm.columns import TEAMS, column_kernels
 from gradscape.envs.engines.mpm.transfers import transfers
 from gradscape.envs.engines.profiling import count_demands, time_kernels
 from gradscape.envs.mpm.fluid import Fluid
@@ -117,3 +118,15 @@ def test_every_kernel_that_is_timed_is_counted():
     assert all(one.bytes > 0 for one in demands.values())
     once = demands[p2g].bytes / times[p2g].calls
     assert once == 4 * (1 + 3 + 3 + 9 + 2 * 4) * 2 * env.model.particles
+
+
+def test_of_partial_sums_no_more_is_counted_than_is_told():
+    """As many are met as there are segments with particles, which no argument says; what is walked is counted whole."""
+    kernels, count = column_kernels("float32", TEAMS[True]), 40
+    segments = [wp.zeros(BATCH, dtype=wp.int32), *(wp.zeros((BATCH, 4), dtype=wp.int32) for _ in range(4))]
+    order = wp.zeros((BATCH, count), dtype=wp.int32)
+    particles = [wp.zeros((BATCH, count), dtype=kind) for kind in (wp.float32, wp.vec3, wp.vec3, wp.mat33)]
+    given = [kernels.p2g.adj.args[0].type(), order, *segments, *particles]
+    found = [demand(kernels.p2g, (BATCH, 64), [*given, wp.zeros((BATCH, room), dtype=wp.vec4)]) for room in (90, 9000)]
+    assert found[0] == found[1]
+    assert found[0].bytes == BATCH * (count * 4 * (1 + 1 + 3 + 3 + 9) + 4 * (1 + 4 * 4))
