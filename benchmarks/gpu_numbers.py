@@ -16,8 +16,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -40,11 +38,17 @@ def main() -> None:
     parser.add_argument("--measure", type=Path, help="only measure the checkout that is imported, into this folder")
     asked = parser.parse_args()
     if asked.measure:
-        measure(asked.scene or soft_scenes(), asked.measure)
+        print(json.dumps(measure(asked.scene, asked.measure)))
         return
+    from benchmarks.same_numbers import ask
+
+    scenes = asked.scene or soft_scenes()
     with tempfile.TemporaryDirectory() as folder:
         roots = {"old": asked.old.resolve(), "new": Path.cwd()}
-        codes = {which: ask(root, asked.scene or soft_scenes(), Path(folder) / which) for which, root in roots.items()}
+        codes = {
+            which: ask(root, scenes, script=Path(__file__), measure=[str(Path(folder) / which)])
+            for which, root in roots.items()
+        }
         found = {
             scene: {"old": codes["old"][scene], "new": code, "distances": compare(scene, Path(folder))}
             for scene, code in codes["new"].items()
@@ -68,19 +72,8 @@ def soft_scenes() -> list[str]:
     return [name for name in entries() if ".envs.mpm." in environment_class(name).__module__]
 
 
-def ask(root: Path, scenes: Sequence[str], folder: Path) -> dict[str, str]:
-    """Measure a checkout in a process of its own, which imports it and this file, and return the codes of scenes."""
-    command = [sys.executable, __file__, str(root), "--measure", str(folder)]
-    for scene in scenes:
-        command += ["--scene", scene]
-    where = {**os.environ, "PYTHONPATH": f"{root / 'src'}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
-    subprocess.run(command, env=where, cwd=root, check=True)
-    codes: dict[str, str] = json.loads((folder / "codes.json").read_text())
-    return codes
-
-
-def measure(scenes: Sequence[str], folder: Path) -> None:
-    """Write the losses and gradients of scenes, REPEATS times, and which code computed them."""
+def measure(scenes: Sequence[str], folder: Path) -> dict[str, str]:
+    """Write the losses and gradients of scenes, REPEATS times, and return which code computed them."""
     from gradscape.envs import code
     from gradscape.envs.registry import environment_class, make
 
@@ -98,7 +91,7 @@ def measure(scenes: Sequence[str], folder: Path) -> None:
             arrays |= {f"grad{i}": grad for i, grad in enumerate(grads)}
             np.savez(folder / f"{scene}-{fidelity}.npz", **arrays)
             del env
-    (folder / "codes.json").write_text(json.dumps(codes))
+    return codes
 
 
 def compare(scene: str, folder: Path) -> dict[str, tuple[float, float]]:

@@ -24,7 +24,7 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -71,14 +71,20 @@ def is_same(scene: str, old: Path, gpu: dict[str, Any]) -> bool:
     return not differ
 
 
-def ask(root: Path, scenes: list[str]) -> dict[str, dict[str, str]]:
-    """Measure a checkout in a process of its own, which imports it and this file."""
-    command = [sys.executable, __file__, str(root), "--measure"]
+def ask(
+    root: Path, scenes: Sequence[str], *, script: Path = Path(__file__), measure: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Return what a script prints that measures scenes of a checkout, in a process of its own, which imports that.
+
+    `measure` is what its option of this name takes.
+    """
+    command = [sys.executable, str(script), str(root), "--measure", *measure]
     for scene in scenes:
         command += ["--scene", scene]
-    where = {**os.environ, "PYTHONPATH": str(root.resolve() / "src")}
+    paths = os.pathsep.join(filter(None, [str(root.resolve() / "src"), os.environ.get("PYTHONPATH")]))
+    where = {**os.environ, "PYTHONPATH": paths}
     done = subprocess.run(command, env=where, cwd=root, check=True, stdout=subprocess.PIPE, text=True)
-    found: dict[str, dict[str, str]] = json.loads(done.stdout.splitlines()[-1])
+    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return found
 
 

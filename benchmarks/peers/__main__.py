@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from .environments import InstallError, interpreter
+from .protocol import add_options
 from .table import Pair, best, markdown
 
 ROOT = Path(__file__).parents[2]
@@ -126,10 +127,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         prog="python -m benchmarks.peers", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("peers", nargs="*", metavar="PEER", help=f"of {', '.join(PEERS)}; all by default")
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
-    parser.add_argument("--particles", type=int, default=1000, help="n^3 of a cube, or how many chains")
-    parser.add_argument("--substeps", type=int, default=64)
-    parser.add_argument("--repeat", type=int, default=3, help="calls of which the best is taken, in each round")
+    add_options(parser)
     parser.add_argument("--rounds", type=int, default=2, help="how often peer and ours take turns")
     parser.add_argument("--limit", type=float, default=1800.0, help="seconds that one process may take")
     parser.add_argument("--python", action="append", default=[], metavar="PEER=PATH", help="its interpreter")

@@ -112,13 +112,18 @@ def measure(simulation: Simulation, scene: Cube | Chain, repeat: int, memory: Me
     return found
 
 
-def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
-    """Return what a peer was asked for."""
-    parser = argparse.ArgumentParser(description="Measure one simulator; the last line is a JSON object.")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add what the driver is asked for and hands on to peers."""
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--particles", type=int, default=1000, help="n^3 of a cube, or how many chains")
     parser.add_argument("--substeps", type=int, default=64)
-    parser.add_argument("--repeat", type=int, default=3)
+    parser.add_argument("--repeat", type=int, default=3, help="calls of which the best is taken, in each round")
+
+
+def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """Return what a peer was asked for."""
+    parser = argparse.ArgumentParser(description="Measure one simulator; the last line is a JSON object.")
+    add_options(parser)
     parser.add_argument("--source", default=None, help="a file of the peer's that is not in a package")
     return parser.parse_args(arguments)
 
