@@ -1,9 +1,9 @@
 """What the kernels of a scene really move on a GPU, by its hardware counters, beside what they have to move at least.
 
-    python -m benchmarks.counters fluid [--set horizon=0.08] [--launches 300]
+    python -m benchmarks.counters fluid [--batch 1] [--set horizon=0.08] [--launches 300]
 
 Needs NVIDIA's Nsight Compute (`ncu`) and the right to read counters. It profiles the launches around the turn from
-forward to backward of episodes at standard, in batches as large as the scene likes. A kernel is run again for each of
+forward to backward of episodes at standard, in batches as large as the scene likes unless told. A kernel is run again for each of
 its counters, and what it wrote put back, which takes minutes where a scene fills the memory: shorten it. `landscape
 bench SCENE --roofline` has the times of whole episodes.
 """
@@ -68,26 +68,26 @@ def read_counters(lines: Iterable[str]) -> dict[str, Counted]:
     return counted
 
 
-def simulate(scene: str, options: list[str]) -> None:
+def simulate(scene: str, options: list[str], batch: int | None) -> None:
     """Simulate a batch with gradient, twice: the first compiles, and fills what is filled once."""
-    env, points = prepare(scene, options)
+    env, points = prepare(scene, options, batch)
     with suspend_graphs():
         for _ in range(2):
             env._simulate(points, grad=True)
 
 
-def prepare(scene: str, options: list[str]) -> tuple:
-    """Return the environment and the points of a batch of one solver."""
+def prepare(scene: str, options: list[str], batch: int | None) -> tuple:
+    """Return the environment and the points of a batch, at most what one solver takes."""
     env = make(scene, fidelity="standard", device="cuda", **dict(one.split("=", 1) for one in options))
-    return env, env.space.sobol(env._rows_per_part(env.preferred_batch), seed=0)
+    return env, env.space.sobol(env._rows_per_part(batch or env.preferred_batch), seed=0)
 
 
-def profile(scene: str, options: list[str], skip: int, launches: int) -> dict[str, Counted]:
+def profile(scene: str, options: list[str], batch: int, skip: int, launches: int) -> dict[str, Counted]:
     """Run a batch under Nsight Compute, and return what it counted of some launches."""
     command = ["ncu", "--target-processes", "all", "--metrics", ",".join(METRICS), "--csv"]
     command += ["--graph-profiling", "node", "--kernel-name", "regex:.*_cuda_kernel_(for|back)ward"]
     command += ["--launch-skip", str(skip), "--launch-count", str(launches)]
-    command += [sys.executable, "-m", "benchmarks.counters", scene, "--simulate"]
+    command += [sys.executable, "-m", "benchmarks.counters", scene, "--simulate", "--batch", str(batch)]
     for option in options:
         command += ["--set", option]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
@@ -98,15 +98,16 @@ def main() -> None:
     """Print a table of kernels."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene")
+    parser.add_argument("--batch", type=int, help="how many episodes at once, at most as many as one solver takes")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="an option of the scene")
     parser.add_argument("--launches", type=int, default=300, help="how many to profile")
     parser.add_argument("--simulate", action="store_true", help="only simulate, to be profiled")
     asked = parser.parse_args()
     if asked.simulate:
-        return simulate(asked.scene, asked.set)
+        return simulate(asked.scene, asked.set, asked.batch)
     if shutil.which("ncu") is None:
         sys.exit("ncu (NVIDIA Nsight Compute) was not found; install it, or read `landscape bench --roofline` alone")
-    env, points = prepare(asked.scene, asked.set)
+    env, points = prepare(asked.scene, asked.set, asked.batch)
     env._simulate(points, grad=True)
     with time_kernels("cuda") as there:
         env._simulate(points, grad=False)
@@ -115,7 +116,7 @@ def main() -> None:
     with count_demands() as demands:
         env._simulate(points, grad=True)
     forward, all_ = (sum(one.calls for one in found.values()) for found in (there, times))
-    counted = profile(asked.scene, asked.set, max(0, all_ + forward - asked.launches // 2), asked.launches)
+    counted = profile(asked.scene, asked.set, len(points), max(0, all_ + forward - asked.launches // 2), asked.launches)
     print(f"{asked.scene}, standard, batch {len(points)}, {' '.join(asked.set)}")
     heads = ("kernel", "launches", "µs", "has to move [MB]", "memory [MB]", "L2 [MB]", *SHARES, "registers")
     print("| " + " | ".join(heads) + " |\n" + "|---" * len(heads) + "|")

@@ -20,7 +20,20 @@ BLOCK = 128  # threads of a GPU that share registers; scatters and gathers like 
 
 @dataclass(frozen=True)
 class _Call:
-    launch: Callable[[], None]
+    work: Callable[[], None]
+
+    def launch(self, stream: Any = None) -> None:
+        self.work()
+
+
+class _Mark:
+    """Where launches go to a second stream, go on on the first, and the first waits for the second."""
+
+    def launch(self) -> None:
+        """Do nothing: outside of a graph all launches are on one stream."""
+
+
+FORK, BACK, JOIN = _Mark(), _Mark(), _Mark()
 
 
 @dataclass
@@ -39,6 +52,23 @@ class _Sequence:
     def run(self) -> None:
         for command in self.launches:
             command.launch()
+
+    def capture(self, device: str) -> Any:
+        """Return a graph of the launches."""
+        with wp.ScopedCapture(device=device) as captured:
+            stream = first = wp.get_stream(device)
+            second = wp.Stream(device)
+            for command in self.launches:
+                if command is FORK:
+                    second.wait_stream(first)
+                    stream = second
+                elif command is BACK:
+                    stream = first
+                elif command is JOIN:
+                    first.wait_stream(second)
+                else:
+                    command.launch(stream)
+        return captured.graph
 
     def move(self, box: Box, lattice: Any) -> None:
         """Make the launches run on another box."""
@@ -105,6 +135,17 @@ class Launches:
         self._recording.launches.append(_Call(work))
         work()
 
+    @contextmanager
+    def beside(self) -> Iterator[None]:
+        """Let a graph run what is launched within a with block beside what follows it, up to `join`."""
+        self._recording.launches.append(FORK)
+        yield
+        self._recording.launches.append(BACK)
+
+    def join(self) -> None:
+        """Let what follows wait for what was launched `beside`."""
+        self._recording.launches.append(JOIN)
+
     def clear(self) -> None:
         """Drop all that is stored."""
         self.sequences.clear()
@@ -120,9 +161,7 @@ class Launches:
             if len(self.graphs) == MAX_GRAPHS:
                 self.seen.clear()
                 self.graphs.clear()
-            with wp.ScopedCapture(device=self.device) as capture:
-                known.run()
-            self.graphs[key] = capture.graph
+            self.graphs[key] = known.capture(self.device)
         wp.capture_launch(self.graphs[key])
 
 

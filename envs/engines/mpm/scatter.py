@@ -115,7 +115,8 @@ class ByColumns:
         self, step: int, substep: int, frame: Frame, new: Frame, grid_v: wp.array, adj_x: wp.array, batch: int
     ) -> None:
         """Fill the adjoint of the grid's velocity, and set that of x, from those of the frame `new`."""
-        launch_adjoint_g2p(self.solver, step, substep, frame, new, grid_v, adj_x, batch)
+        with self.solver.launches.beside():
+            launch_adjoint_g2p(self.solver, step, substep, frame, new, grid_v, adj_x, batch)
         inputs = [self.solver.model.dt, frame.x, new.x, new.v, new.C]
         self.walk(self.kernels.adjoint_g2p, step, substep, batch, inputs)
         self.add_up(self.kernels.add_up, step, substep, batch, [grid_v])

@@ -229,11 +229,14 @@ class Solver:
     def _substeps(self, step: int, batch: int) -> None:
         tape, frames = self.tape(step), self.frames(step)
         for s in range(self.model.substeps):
-            self.scatter.list_particles(step, s, frames[s], batch)
-            if s == 0:
+            with self.launches.beside():
+                self.scatter.list_particles(step, s, frames[s], batch)
+            if s == 0 and self.smoothers:
+                self.launches.join()
                 for smoother in self.smoothers:
                     smoother.run(self, step, batch)
             self._update(step, frames[s], frames[s + 1], tape.A[s], batch)
+            self.launches.join()
             self._fill_grid(frames[s], step, s, batch)
             self._move_particles(frames[s], frames[s + 1], step, s, batch)
 
@@ -347,6 +350,7 @@ class _Adjoint:
         for s in reversed(range(solver.model.substeps)):
             solver.scatter.adjoint_g2p(step, s, frames[s], self.new, self.grid.v, self.old.x, batch)
             self._adjoint_velocity(step, s, batch)
+            solver.launches.join()
             self._adjoint_p2g(step, frames[s], tape, s, batch)
             self._adjoint_update(step, frames[s], batch)
             self.new, self.old = self.old, self.new

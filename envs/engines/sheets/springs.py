@@ -200,16 +200,29 @@ class Solver:
 
 
 def _network(sheet: Sheet, Network: Any, types: Any, device: str) -> Any:
-    """List every vertex's neighbours one after the other, those of vertex i from first[i] to first[i + 1]."""
+    """List every vertex's springs in the order of their other ends; behind the last of them are zeros."""
     ends = np.concatenate([sheet.pairs, sheet.pairs[:, ::-1]])
     order = np.lexsort((ends[:, 1], ends[:, 0]))
+    here, there = ends[order].T
+    count = np.bincount(here, minlength=len(sheet.x))
+    number = np.arange(len(here)) - np.repeat(np.cumsum(count) - count, count)
+    shape, place = (len(count), int(count.max(initial=1))), (here, number)
+    if device != "cpu":  # a thread has a vertex: what they read at once lies side by side
+        shape, place = shape[::-1], place[::-1]
+
+    def table(values: np.ndarray, dtype: torch.dtype) -> Any:
+        filled = torch.zeros(shape, dtype=dtype)
+        filled[place] = torch.from_numpy(values).to(dtype)
+        return wp.from_torch(filled.flatten().to(device))
+
     network = Network()
-    network.first = wp.array(np.searchsorted(ends[order, 0], np.arange(len(sheet.x) + 1)), dtype=int, device=device)
-    network.neighbor = wp.array(ends[order, 1], dtype=int, device=device)
-    network.rest = wp.array(np.tile(sheet.rest, 2)[order], dtype=types.real, device=device)
-    network.weight = wp.array(np.tile(sheet.weight, 2)[order], dtype=types.real, device=device)
-    network.plate = wp.array(np.tile(sheet.plates, 2)[order], dtype=types.real, device=device)
-    network.mass = wp.array(sheet.masses, dtype=types.real, device=device)
+    network.count = wp.array(count, dtype=int, device=device)
+    network.by_vertex, network.by_spring = (shape[1], 1) if device == "cpu" else (1, shape[1])
+    network.neighbor = table(there, torch.int32)
+    for name in ("rest", "weight", "plates"):
+        setattr(network, name, table(np.tile(getattr(sheet, name), 2)[order], types.torch))
+    masses = torch.from_numpy(sheet.masses.copy()).to(types.torch)
+    network.mass, network.inverse_mass = (wp.from_torch(value.to(device)) for value in (masses, 1.0 / masses))
     for name in ("damping", "drag", "gravity"):
         setattr(network, name, getattr(sheet, name))
     return network
@@ -225,19 +238,39 @@ def spring_kernels(name: str) -> SimpleNamespace:
 
     @partial(wp.struct, module=module)
     class Network:
-        """Springs as lists of each vertex's neighbours, and the scalars of Sheet."""
+        """Springs by vertex, and the scalars of Sheet.
 
-        first: wp.array[int]
+        Vertex i has `count` of them, the k-th at number i * `by_vertex` + k * `by_spring` of what follows.
+        """
+
+        count: wp.array[int]
+        by_vertex: int
+        by_spring: int
         neighbor: wp.array[int]
         rest: wp.array[real]
         weight: wp.array[real]
-        plate: wp.array[real]
+        plates: wp.array[real]
         mass: wp.array[real]
+        inverse_mass: wp.array[real]
         damping: real
         drag: real
         gravity: real
 
-    @wp.kernel(module=module, enable_backward=False)
+    # Warp looks of every index whether it counts from the end, and multiplies it by a stride in 64 bits. These arrays
+    # are read twelve times a vertex.
+    @wp.func_native("return values.data[i];")
+    def real_at(values: wp.array[real], i: int) -> real: ...
+
+    @wp.func_native("return values.data[i];")
+    def number_at(values: wp.array[int], i: int) -> int: ...
+
+    @wp.func_native("return values.data[i];")
+    def stiffness_at(values: wp.array2d[real], i: int) -> real: ...
+
+    @wp.func_native("return values.data[i];")
+    def vector_at(values: wp.array2d[vec3], i: int) -> vec3: ...
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def pull(
         network: Network,
         dt: real,
@@ -247,22 +280,26 @@ def spring_kernels(name: str) -> SimpleNamespace:
         pulled: wp.array2d[vec3],
     ):
         row, i = wp.tid()
-        x_i, v_i, s_i = x[row, i], v[row, i], stiffness[row, i]
+        first = row * x.shape[1]
+        x_i, v_i = vector_at(x, first + i), vector_at(v, first + i)
+        s_i = stiffness_at(stiffness, first + i)
         f = vec3()
-        for k in range(network.first[i], network.first[i + 1]):
-            j = network.neighbor[k]
-            d = x[row, j] - x_i
-            f += network.plate[k] * d
+        for k in range(network.count[i]):
+            at = i * network.by_vertex + k * network.by_spring
+            j = first + number_at(network.neighbor, at)
+            d = vector_at(x, j) - x_i
+            w = vector_at(v, j) - v_i
+            both = s_i + stiffness_at(stiffness, j)
+            weight, rest = real_at(network.weight, at), real_at(network.rest, at)
+            f += real_at(network.plates, at) * d
             length = wp.length(d)
-            if length > real(0.0):  # ends that coincide have no direction
-                n = (real(1.0) / length) * d
-                s = real(0.5) * (s_i + stiffness[row, j])
-                tension = s * (length - network.rest[k]) + network.damping * wp.dot(v[row, j] - v_i, n)
-                f += (network.weight[k] * tension) * n
+            n = wp.where(length > real(0.0), real(1.0) / length, real(0.0)) * d  # ends that coincide have no direction
+            tension = (real(0.5) * both) * (length - rest) + network.damping * wp.dot(w, n)
+            f += (weight * tension) * n
         a = f / network.mass[i] - network.drag * v_i - vec3(real(0.0), network.gravity, real(0.0))
         pulled[row, i] = v_i + dt * a
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def adjoint(
         network: Network,
         dt: real,
@@ -276,30 +313,35 @@ def spring_kernels(name: str) -> SimpleNamespace:
         adj_stiffness: wp.array2d[real],
     ):
         row, i = wp.tid()
-        x_i, v_i, s_i, adj_i = x[row, i], v[row, i], stiffness[row, i], adj_pulled[row, i]
-        mu_i = (real(1.0) / network.mass[i]) * adj_i
+        first = row * x.shape[1]
+        x_i, v_i = vector_at(x, first + i), vector_at(v, first + i)
+        s_i, adj_i = stiffness_at(stiffness, first + i), vector_at(adj_pulled, first + i)
+        mu_i = network.inverse_mass[i] * adj_i
         gx = vec3()
         gv = vec3()
         gs = real(0.0)
-        for k in range(network.first[i], network.first[i + 1]):
-            j = network.neighbor[k]
-            d = x[row, j] - x_i
-            difference = (real(1.0) / network.mass[j]) * adj_pulled[row, j] - mu_i
-            gx += network.plate[k] * difference
+        for k in range(network.count[i]):
+            at = i * network.by_vertex + k * network.by_spring
+            neighbor = number_at(network.neighbor, at)
+            j = first + neighbor
+            d = vector_at(x, j) - x_i
+            w = vector_at(v, j) - v_i
+            difference = real_at(network.inverse_mass, neighbor) * vector_at(adj_pulled, j) - mu_i
+            both = s_i + stiffness_at(stiffness, j)
+            weight, rest = real_at(network.weight, at), real_at(network.rest, at)
+            gx += real_at(network.plates, at) * difference
             length = wp.length(d)
-            if length > real(0.0):
-                inverse = real(1.0) / length
-                n = inverse * d
-                w = v[row, j] - v_i
-                mu = network.weight[k] * difference
-                s = real(0.5) * (s_i + stiffness[row, j])
-                along, rate = wp.dot(mu, n), wp.dot(w, n)
-                across = mu - along * n
-                tension = s * (length - network.rest[k]) + network.damping * rate
-                gx += (s * along) * n + (tension * inverse) * across
-                gx += (network.damping * along * inverse) * (w - rate * n)
-                gv += (network.damping * along) * n
-                gs -= real(0.5) * along * (length - network.rest[k])
+            inverse = wp.where(length > real(0.0), real(1.0) / length, real(0.0))
+            n = inverse * d
+            mu = weight * difference
+            s = real(0.5) * both
+            along, rate = wp.dot(mu, n), wp.dot(w, n)
+            across = mu - along * n
+            tension = s * (length - rest) + network.damping * rate
+            gx += (s * along) * n + (tension * inverse) * across
+            gx += (network.damping * along * inverse) * (w - rate * n)
+            gv += (network.damping * along) * n
+            gs -= real(0.5) * along * (length - rest)
         adj_x[row, i] = adj_here[row, i] + dt * gx
         adj_v[row, i] = (real(1.0) - dt * network.drag) * adj_i + dt * gv
         adj_stiffness[row, i] += dt * gs
