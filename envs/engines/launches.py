@@ -11,8 +11,6 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from .mpm.model import Box
-
 MAX_GRAPHS, MAX_SEQUENCES = 512, 1024  # that are stored; more are not worth their memory
 
 BLOCK = 128  # threads of a GPU that share registers; scatters and gathers like few
@@ -38,16 +36,15 @@ FORK, BACK, JOIN = _Mark(), _Mark(), _Mark()
 
 @dataclass
 class _Sequence:
-    """Launches in their order, as they were made for a box of nodes.
+    """Launches in their order, as they were made for one `extent`.
 
-    `located` are those whose first argument says where that lies, `sized` those that run over something of it in so
-    many environments, as their function says.
+    `located` are those whose first argument says where that lies, `sized` those whose dimensions a function of it says.
     """
 
-    box: Box
+    extent: Any
     launches: list[Any] = field(default_factory=list)
     located: list[Any] = field(default_factory=list)
-    sized: list[tuple[Any, int, Callable[[Box], int]]] = field(default_factory=list)
+    sized: list[tuple[Any, Callable[[Any], tuple[int, int]]]] = field(default_factory=list)
 
     def run(self) -> None:
         for command in self.launches:
@@ -70,21 +67,21 @@ class _Sequence:
                     command.launch(stream)
         return captured.graph
 
-    def move(self, box: Box, lattice: Any) -> None:
-        """Make the launches run on another box."""
-        if box != self.box:
+    def move(self, extent: Any, place: Any) -> None:
+        """Make the launches run over another extent."""
+        if extent != self.extent:
             for command in self.located:
-                command.set_param_at_index(0, lattice)
-            for command, batch, size in self.sized:
-                command.set_dim((batch, size(box)))
-            self.box = box
+                command.set_param_at_index(0, place)
+            for command, dim in self.sized:
+                command.set_dim(dim(extent))
+            self.extent = extent
 
 
 class Launches:
     """Run the launches of a piece of work: made when it first comes, stored from then on.
 
-    What is launched under one key must be the same every time, arrays and numbers: only the box of nodes may be
-    another. Where an array is replaced by another, `clear` must be called.
+    What is launched under one key must be the same every time, arrays and numbers: only the extent may be another, a
+    box of nodes or a number of rows. Where an array is replaced by another, `clear` must be called.
     """
 
     use_graphs: ClassVar[bool] = True
@@ -95,38 +92,38 @@ class Launches:
         self.seen: set[Hashable] = set()
         self.graphs: dict[Hashable, Any] = {}
 
-    def run(self, key: Hashable, box: Box, lattice: Any, work: Callable[[], None], *, small: bool) -> None:
-        """Do `work` on a box of nodes; where it is `small`, a GPU records it when it comes again on the same box."""
+    def run(
+        self, key: Hashable, extent: Hashable, work: Callable[[], None], *, place: Any = None, small: bool
+    ) -> None:
+        """Do `work` over an extent, and say to launches that ask for it by their first argument which `place` that is.
+
+        Where work is `small`, a GPU records it when it comes again over the same extent.
+        """
         known = self.sequences.get(key)
         if known is None:
             if len(self.sequences) == MAX_SEQUENCES:
                 self.clear()
-            self.sequences[key] = self._recording = _Sequence(box)
-            self._lattice = lattice
+            self.sequences[key] = self._recording = _Sequence(extent)
+            self._place = place
             work()
             return
-        known.move(box, lattice)
+        known.move(extent, place)
         if self.device == "cpu" or not small or not self.use_graphs:
             known.run()
         else:
-            self._run_graph((key, box), known)
+            self._run_graph((key, extent), known)
 
     def launch(
-        self,
-        kernel: Any,
-        dim: tuple[int, int],
-        inputs: list[Any],
-        *,
-        size: Callable[[Box], int] | None = None,
-        **adjoint: Any,
+        self, kernel: Any, dim: tuple[int, int] | Callable[[Any], tuple[int, int]], inputs: list[Any], **how: Any
     ) -> None:
-        """Launch a kernel as part of the work under way; `size` says over how much of a box it runs."""
-        how: dict[str, Any] = {"record_tape": False, "record_cmd": True, "block_dim": BLOCK}
-        command = wp.launch(kernel, dim, inputs, device=self.device, **how, **adjoint)
-        if inputs[0] is self._lattice:
+        """Launch a kernel as part of the work under way, with dimensions that may be a function of its extent."""
+        size = dim(self._recording.extent) if callable(dim) else dim
+        how |= {"record_tape": False, "record_cmd": True, "block_dim": BLOCK}
+        command = wp.launch(kernel, size, inputs, device=self.device, **how)
+        if self._place is not None and inputs[0] is self._place:
             self._recording.located.append(command)
-        if size is not None:
-            self._recording.sized.append((command, dim[0], size))
+        if callable(dim):
+            self._recording.sized.append((command, dim))
         self._recording.launches.append(command)
         command.launch()
 

@@ -172,6 +172,7 @@ class SheetScene(Environment):
     def _pull_back(self, solver: Solver, loss: Tensor, end: Tensor, drive: Drive, x: Tensor) -> Tensor:
         (adj_end,) = torch.autograd.grad(loss.sum(), end)
         driven = zip((drive.velocity, drive.stiffness, drive.poses), solver.gradient(adj_end), strict=True)
-        change = torch.stack([(part * adjoint.to(part)).sum() for part, adjoint in driven]).sum()
+        changes = [(part * adjoint.to(part)).sum() for part, adjoint in driven if part.requires_grad]
+        change = torch.stack(changes).sum()
         (slope,) = torch.autograd.grad(change, x)
         return slope

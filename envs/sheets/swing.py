@@ -159,7 +159,7 @@ class Swing(SheetScene):
         )
 
     def _rest_poses(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 3"]:
-        return x.new_zeros(len(x), self.steps + 1, 3)
+        return x.new_zeros(1, 1, 3).expand(len(x), self.steps + 1, 3)
 
     def _prepare(self) -> None:
         _ = self._target

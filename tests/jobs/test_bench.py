@@ -10,7 +10,6 @@ import warp as wp
 from gradscape.envs.base import Environment, Fidelity, Work
 from gradscape.envs.bounce import Bounce
 from gradscape.envs.engines.launches import Launches
-from gradscape.envs.engines.mpm.model import Box
 from gradscape.envs.engines.profiling import KernelTime, time_kernels
 from gradscape.envs.engines.runtime import cuda_available
 from gradscape.envs.mpm.fluid import Fluid
@@ -191,12 +190,11 @@ def test_kernels_are_launched_one_by_one_to_be_timed(monkeypatch):
     monkeypatch.setattr(wp, "timing_end", list)
     monkeypatch.setattr(wp, "capture_launch", lambda graph: launched.append(graph))
     launches, launched = Launches("cuda"), []
-    box = Box((0, 0, 0), (1, 1, 1))
-    launches.run("key", box, None, lambda: launches.call(lambda: launched.append("kernel")), small=True)
-    launches.seen, launches.graphs = {("key", box)}, {("key", box): "graph"}
+    launches.run("key", 1, lambda: launches.call(lambda: launched.append("kernel")), small=True)
+    launches.seen, launches.graphs = {("key", 1)}, {("key", 1): "graph"}
     with time_kernels("cuda"):
-        launches.run("key", box, None, launched.clear, small=True)
-    launches.run("key", box, None, launched.clear, small=True)
+        launches.run("key", 1, launched.clear, small=True)
+    launches.run("key", 1, launched.clear, small=True)
     assert launched == ["kernel", "kernel", "graph"]
 
 

@@ -1,7 +1,7 @@
 """What MLS-MPM stores of an episode: the particles of an instant, the grids of a substep, a control step whole."""
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import warp as wp
 
@@ -9,6 +9,8 @@ from ..runtime import precision
 from .cells import Lists, segments
 from .exact import LANES, SUMS
 from .model import Box, Model, place_grid
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,17 +88,30 @@ class Allocator:
         return wp.zeros((self.capacity * LANES, count), dtype=wp.int64, device=self.device)
 
 
-class Tape:
-    """Hold one control step whole: frames between its ends, A and grids of its substeps, and where the grids lie."""
+class Cycle(list[T]):
+    """A list that begins again behind its end."""
 
-    def __init__(self, allocator: Allocator, cells: int = 1) -> None:
+    def __getitem__(self, number: Any) -> Any:
+        """Return an element by a number that may be beyond the end."""
+        return super().__getitem__(number % len(self))
+
+
+class Tape:
+    """Hold one control step whole: frames between its ends, A and grids of its substeps, and where the grids lie.
+
+    Of a step in `pieces` it holds the frames between these, and the rest of one piece, whose room all of them share.
+    """
+
+    def __init__(self, allocator: Allocator, cells: int = 1, pieces: int = 1) -> None:
         model = allocator.model
         self.step = -1
-        self.frames = [allocator.frame() for _ in range(model.substeps - 1)]
+        held = model.piece(pieces)
+        inner = [allocator.frame() for _ in range(held - 1)]
+        self.frames = [inner[s % held - 1] if s % held else allocator.frame() for s in range(1, model.substeps)]
         self.smoothed = allocator.smoothed()
-        self.A = [allocator.affine_momentum() for _ in range(model.substeps)]
-        self.grids = [allocator.grid(cells) for _ in range(model.substeps)]
-        self.lists = [allocator.lists(1) for _ in range(model.substeps)] if allocator.columns else []
+        self.A: Cycle[wp.array] = Cycle(allocator.affine_momentum() for _ in range(held))
+        self.grids: Cycle[Grid] = Cycle(allocator.grid(cells) for _ in range(held))
+        self.lists: Cycle[Lists] = Cycle(allocator.lists(1) for _ in range(held if allocator.columns else 0))
         self.lattice = place_grid(model)
         self._allocator = allocator
 
@@ -104,7 +119,7 @@ class Tape:
     def bytes(self) -> int:
         """What its arrays take."""
         grids = [array for grid in self.grids for array in (grid.m, grid.v)]
-        frames = [array for frame in self.frames for array in frame.arrays()]
+        frames = [array for frame in set(self.frames) for array in frame.arrays()]
         lists = [array for one in self.lists for array in (one.order, *one.segments())]
         return sum(array.capacity for array in (*frames, *self.smoothed.values(), *self.A, *grids, *lists))
 
@@ -129,7 +144,7 @@ class Tape:
                 self.grids[substep] = self._allocator.grid(0)  # the old one goes first
                 self.grids[substep] = self._allocator.grid(self._room(box.cells))
         if self.lists and self._segments < segments(box):
-            self.lists = [self._allocator.lists(segments(box) * 5 // 4) for _ in self.lists]
+            self.lists = Cycle(self._allocator.lists(segments(box) * 5 // 4) for _ in self.lists)
         self.step, self.lattice = step, place_grid(self._allocator.model, box)
 
     @property

@@ -71,20 +71,26 @@ class Model:
         """Number of nodes of the grid."""
         return int(np.prod(self.nodes))
 
-    def bytes_per_environment(self, tapes: int, *, columns: bool = False) -> int:
+    def piece(self, pieces: int) -> int:
+        """Return how many substeps a piece has where a control step is in so many; the last one may have fewer."""
+        return -(-self.substeps // pieces)
+
+    def bytes_per_environment(self, tapes: int, *, columns: bool = False, pieces: int = 1) -> int:
         """Return about what an environment takes of a solver that stores so many control steps whole, with adjoints.
 
         Grids are counted as large as they are around the bodies at rest, and as large again. Sums by `columns` take 45
-        numbers a node, and lists of particles an integer a particle in each substep.
+        numbers a node, and lists of particles an integer a particle in each substep. Of a step in `pieces` one is
+        stored, and a frame for each of the others.
         """
         state = sum(len(body.x) * (1 if isinstance(body.material, Fluid) else 9) for body in self.bodies)
         frame = 15 * self.particles + state  # x, v, C and each material's own
         nodes = min(self.cells, nodes_around(self, *self.corners, BOX_MARGIN).cells * 2)
         substep = frame + 9 * self.particles + 8 * nodes
-        numbers = (self.steps + 3) * frame + (tapes * self.substeps + 1) * substep
+        stored = tapes * self.piece(pieces)
+        numbers = (self.steps + 3 + tapes * (pieces - 1)) * frame + (stored + 1) * substep
         if not columns:
             return self.real_bytes * numbers
-        integers = (tapes * self.substeps + 3) * (self.particles + nodes)
+        integers = (stored + 3) * (self.particles + nodes)
         return self.real_bytes * (numbers + 45 * nodes) + 4 * integers
 
     @property

@@ -8,8 +8,9 @@ One substep, state (x, v, C, S) of frame s to frame s + 1, S being each material
     g2p     v'   = sum w v_i, C' = 4/dx^2 sum w v_i (x_i - x)^T, x' = x + dt v'
 
 Particles are kept at the ends of control steps; as many of the last control steps as fit are kept whole, with A and
-grids of every substep (on a CPU all or one). The gradient recomputes the others, one at a time. Between control steps
-particles are sorted (`order`), and a fluid's volume ratios smoothed (`smoothing`).
+grids of every substep (on a CPU all or one). The gradient recomputes the others, one at a time, and a step that is too
+large to be kept whole in pieces. Between control steps particles are sorted (`order`), and a fluid's volume ratios
+smoothed (`smoothing`).
 """
 
 import threading
@@ -56,16 +57,27 @@ def capacity(model: Model, device: str) -> int:
 def memory(model: Model, device: str) -> int:
     """Return about how many bytes an environment takes; a GPU's spare memory is used beyond that."""
     if device != "cpu":
-        return model.bytes_per_environment(1, columns=True)
+        return model.bytes_per_environment(1, columns=True, pieces=pieces_that_fit(model, device))
     whole = model.bytes_per_environment(model.steps)
     return whole if whole <= WHOLE_EPISODE else model.bytes_per_environment(1)
+
+
+def pieces_that_fit(model: Model, device: str) -> int:
+    """Return into how many pieces a control step has to be cut so that one of them fits into memory."""
+    if device == "cpu":
+        return 1
+    free, count = free_memory() * 3 // 4, 1
+    while count < model.substeps and model.bytes_per_environment(1, columns=True, pieces=count) > free:
+        count += 1
+    return count
 
 
 class Solver:
     """Run up to `capacity` environments of one model at once, and differentiate where their control steps end.
 
     Setting `stop` ends a run within a control step, with InterruptedError. Every sum has one order, which depends on
-    an environment's own particles only: on a GPU, or where `columns` says so, by columns of cells (`scatter`).
+    an environment's own particles only: on a GPU, or where `columns` says so, by columns of cells (`scatter`). Of a control
+    step in `pieces` one is kept, by default the largest that fits; no bit depends on their number.
     """
 
     def __init__(
@@ -76,8 +88,10 @@ class Solver:
         device: str,
         stop: threading.Event | None = None,
         columns: bool | None = None,
+        pieces: int | None = None,
     ) -> None:
         self.model, self.capacity, self.device = model, capacity, device
+        self.pieces = pieces or pieces_that_fit(model, device)
         self.stop = stop or threading.Event()
         columns = device != "cpu" if columns is None else columns
         self.allocator = Allocator(model, capacity, device, columns=columns)
@@ -100,7 +114,7 @@ class Solver:
         self.sorter = Sorter(model, capacity, device)
         self.launches = Launches(device)
         whole = device == "cpu" and memory(model, device) > model.bytes_per_environment(1)
-        self.tapes = [Tape(self.allocator) for _ in range(model.steps if whole else 1)]
+        self.tapes = [Tape(self.allocator, pieces=self.pieces) for _ in range(model.steps if whole else 1)]
         self.spare_used = device == "cpu"  # whether spare memory has been put to use
         self.tools = self.allocator.paths()
         self.sums = self.allocator.sums()
@@ -125,7 +139,7 @@ class Solver:
         self.spare_used = True
         more = min(self.model.steps - 1, int(SPARE * free_memory()) // self.tapes[0].bytes)
         cells = self.tapes[0].grids[0].m.shape[1]
-        self.tapes += [Tape(self.allocator, cells) for _ in range(more)]
+        self.tapes += [Tape(self.allocator, cells, self.pieces) for _ in range(more)]
         self.tapes[0].step = -1  # it keeps other steps now
         self.launches.clear()
 
@@ -189,7 +203,8 @@ class Solver:
         if self.stop.is_set():
             raise InterruptedError("the simulation was stopped")
         self._make_room(step)
-        self.launch_again(("forward", step, batch), step, batch, lambda: self._substeps(step, batch))
+        substeps = range(self.model.substeps)
+        self.launch_again(("forward", step, batch), step, batch, lambda: self.substeps(step, batch, substeps))
 
     def _make_room(self, step: int) -> None:
         """Make room for a control step, at the cost of others where memory runs out."""
@@ -221,14 +236,16 @@ class Solver:
 
     def launch_again(self, key: tuple[Any, ...], step: int, batch: int, work: Callable[[], None]) -> None:
         """Do a control step's work, by the launches kept from the last time if there was one."""
-        self.launches.run(key, self.boxes[step], self.tape(step).lattice, work, small=self._small(batch))
+        place = self.tape(step).lattice
+        self.launches.run(key, self.boxes[step], work, place=place, small=self._small(batch))
 
     def _small(self, batch: int) -> bool:
         return batch * self.model.particles <= LAUNCHES
 
-    def _substeps(self, step: int, batch: int) -> None:
+    def substeps(self, step: int, batch: int, substeps: range) -> None:
+        """Launch substeps of a control step."""
         tape, frames = self.tape(step), self.frames(step)
-        for s in range(self.model.substeps):
+        for s in substeps:
             with self.launches.beside():
                 self.scatter.list_particles(step, s, frames[s], batch)
             if s == 0 and self.smoothers:
@@ -292,7 +309,7 @@ class Solver:
         self, kernel: Any, size: Callable[[Box], int], step: int, batch: int, inputs: list[Any], **how: Any
     ) -> None:
         """Launch a kernel over [environment, whatever `size` counts of a control step's box]."""
-        self.launches.launch(kernel, (batch, size(self.boxes[step])), inputs, size=size, **how)
+        self.launches.launch(kernel, lambda box: (batch, size(box)), inputs, **how)
 
     def _start(self) -> None:
         first = self.checkpoints[0]
@@ -343,21 +360,32 @@ class _Adjoint:
         key = "backward", step, batch, id(self.new)
         solver.launch_again(key, step, batch, lambda: self._substeps(step, batch))
         self.new, self.old = ends  # launches that are kept exchange nothing here
+        if solver.pieces > 1:
+            solver.tape(step).step = -1  # it holds the first piece now
 
     def _substeps(self, step: int, batch: int) -> None:
+        solver, count = self.solver, self.solver.model.substeps
+        length = solver.model.piece(solver.pieces)
+        for first in reversed(range(0, count, length)):
+            piece = range(first, min(first + length, count))
+            if piece.stop < count:
+                solver.substeps(step, batch, piece)
+            self._substeps_back(step, batch, piece)
+        for smoother in solver.smoothers:
+            smoother.run_back(solver, step, batch, self.new)
+        if solver.device != "cpu":
+            solver.launch(self.settle, 6 * solver.model.boundary.slots, batch, [step, solver.sums, self.tools_by_axis])
+
+    def _substeps_back(self, step: int, batch: int, substeps: range) -> None:
         solver = self.solver
         tape, frames = solver.tape(step), solver.frames(step)
-        for s in reversed(range(solver.model.substeps)):
+        for s in reversed(substeps):
             solver.scatter.adjoint_g2p(step, s, frames[s], self.new, self.grid.v, self.old.x, batch)
             self._adjoint_velocity(step, s, batch)
             solver.launches.join()
             self._adjoint_p2g(step, frames[s], tape, s, batch)
             self._adjoint_update(step, frames[s], batch)
             self.new, self.old = self.old, self.new
-        for smoother in solver.smoothers:
-            smoother.run_back(solver, step, batch, self.new)
-        if solver.device != "cpu":
-            solver.launch(self.settle, 6 * solver.model.boundary.slots, batch, [step, solver.sums, self.tools_by_axis])
 
     def _adjoint_velocity(self, step: int, substep: int, batch: int) -> None:
         solver = self.solver

@@ -293,18 +293,26 @@ def _stop_twice(name: str, rule: Rule) -> Any:
     return stop
 
 
+# An element is read once, so that its adjoint can be set, where Warp would add to it atomically.
+READ = "return wp::index(values, row, i);"
+ADJOINT_READ = "if (adj_values.data) wp::index(adj_values, row, i) = adj_ret;"
+
+
 @cache
 @no_type_check
 def contact_kernel(name: str, stop: Any, Data: Any) -> Any:
     """Return the kernel that lets a surface stop vertices, and moves them.
 
     Within a step the surface moves steadily from one pose to the next. `held` vertices stay where they are. Poses are
-    read by vertex, so that the adjoint of each vertex's own is a sum that no other thread adds to.
+    read by vertex. The adjoint sets those of poses, `x` and `pulled`, whatever they were, or leaves out what is None.
     """
     types = precision(name)
     real, vec3 = types.real, types.vec3
 
-    @wp.kernel(module=f"gradscape.contact.{stop.key}")
+    @wp.func_native(READ, adj_snippet=ADJOINT_READ)
+    def read(values: wp.array2d[vec3], row: int, i: int) -> vec3: ...
+
+    @wp.kernel(module=f"gradscape.contact.{stop.key}", grid_stride=False)
     def touch(
         dt: real,
         data: Data,
@@ -317,8 +325,8 @@ def contact_kernel(name: str, stop: Any, Data: Any) -> Any:
         v_next: wp.array2d[vec3],
     ):
         row, i = wp.tid()
-        p = x[row, i] + vec3()  # a value: what is read from an array is a reference, which cannot be assigned to
-        v = stop(data, p, pulled[row, i], pose[row, i], following[row, i], dt)
+        p = read(x, row, i)
+        v = stop(data, p, read(pulled, row, i), read(pose, row, i), read(following, row, i), dt)
         if held[i]:
             v = vec3(real(0.0), real(0.0), real(0.0))
         v_next[row, i] = v
@@ -348,7 +356,7 @@ def sum_kernels(name: str) -> tuple[Any, Any]:
 
     @wp.kernel(module=module, enable_backward=False)
     def add(by_part: wp.array2d[vec3], by_row: wp.array[vec3]):
-        row = wp.tid()
+        row, _ = wp.tid()
         total = vec3()
         for part in range(by_part.shape[1]):
             total += by_part[row, part]

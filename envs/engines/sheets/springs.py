@@ -7,6 +7,7 @@ the adjoint of the force on i, a pair that pulls i by f and j by -f adds -(mu_j 
 
 import math
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 from types import SimpleNamespace
@@ -16,8 +17,12 @@ import numpy as np
 import torch
 import warp as wp
 
+from ..launches import Launches
 from ..runtime import free_memory, load, precision, to_torch
 from .contact import Rule, Surface, contact_kernel, sum_kernels
+
+STRETCH = 50  # steps that are launched at once
+SMALL = 200_000  # vertices up to which launches cost a GPU more than what they launch
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +76,7 @@ class Solver:
 
     In each step springs, gravity and air change velocities; the surface takes what goes into it, by a `rule` of
     `contact`; then vertices move. The whole episode is kept. Sums have one order on every device. Setting `stop` ends
-    an episode within a step, with InterruptedError.
+    an episode within STRETCH steps, with InterruptedError.
     """
 
     def __init__(
@@ -96,6 +101,8 @@ class Solver:
         load([self.springs.pull, self.springs.adjoint, self.touch, *([self.gather] if surface.moves else [])], device)
         self.moves = surface.moves
         self.surface = surface.data(name)
+        self.no_adjoint = type(self.surface)()  # Warp wants a place for it
+        self.launches = Launches(device)
         self.network = _network(sheet, self.springs.Network, self.types, device)
         self.held: Any = wp.array(np.isin(np.arange(len(sheet.x)), sheet.held), dtype=wp.bool, device=device)
         self._allocate(capacity)
@@ -110,10 +117,10 @@ class Solver:
         to_torch(self.x[0])[:batch] = torch.from_numpy(self.sheet.x).to(self.x_all)
         to_torch(self.v[0])[:batch] = (velocity[:, None] * self._free()).to(self.x_all)
         to_torch(self.stiffness)[:batch] = stiffness.to(self.x_all)
-        to_torch(self.poses)[:, :batch] = 0.0 if poses is None else poses.transpose(0, 1).to(self.x_all)
-        for step in range(self.steps):
-            self._launch(self.springs.pull, batch, self._pull_inputs(step), [self.pulled[step]])
-            self._launch(self.touch, batch, self._touch_inputs(step), [self.x[step + 1], self.v[step + 1]])
+        if self.moves:
+            to_torch(self.poses)[:, :batch] = 0.0 if poses is None else poses.transpose(0, 1).to(self.x_all)
+        for first in range(0, self.steps, STRETCH):
+            self._run("forward", first, batch, self._step)
         return self.x_all[:, :batch]
 
     def gradient(self, adj_x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -122,12 +129,18 @@ class Solver:
         for array in (self.adj_v, self.adj_stiffness, self.adj_poses):
             array.zero_()
         to_torch(self.adj_x)[:batch] = adj_x.to(self.x_all)
-        for step in reversed(range(self.steps)):
-            self._step_back(step, batch)
-        stiffness, poses = to_torch(self.adj_stiffness)[:batch], to_torch(self.adj_poses)[:, :batch]
+        for first in reversed(range(0, self.steps, STRETCH)):
+            self._run("backward", first, batch, self._step_back)
         start = to_torch(self.adj_v)[:batch].cpu() * self._free().to(self.x_all.dtype)
         velocity = torch.stack([row.sum(dim=0) for row in start])  # by row: batched sums round as the batch is split
-        return velocity, stiffness.cpu().clone(), poses.cpu().transpose(0, 1).clone()
+        return velocity, to_torch(self.adj_stiffness)[:batch].cpu().clone(), self._read_adj_poses(batch)
+
+    def _read_adj_poses(self, batch: int) -> torch.Tensor:
+        """Return the adjoint of poses, shape (batch, step + 1, 3): zeros where the surface does not move."""
+        adjoint = to_torch(self.adj_poses)
+        if not self.moves:
+            return torch.zeros(1, dtype=adjoint.dtype).expand(batch, len(adjoint), 3)
+        return adjoint[:, :batch].cpu().transpose(0, 1).clone()
 
     def _allocate(self, capacity: int) -> None:
         count, frames = len(self.sheet.x), self.steps + 1
@@ -154,36 +167,33 @@ class Solver:
         free[list(self.sheet.held)] = 0.0
         return free
 
-    def _step_back(self, step: int, batch: int) -> None:
-        for array in (self.adj_here, self.adj_pulled, *self.adj_pose):
-            if array is not None:
-                array.zero_()
-        wp.launch(
-            self.touch,
-            (batch, len(self.sheet.x)),
-            self._touch_inputs(step),
-            [self.x[step + 1], self.v[step + 1]],
-            adj_inputs=[None, type(self.surface)(), None, *self.adj_pose, self.adj_here, self.adj_pulled],
-            adj_outputs=[self.adj_x, self.adj_v],
-            device=self.device,
-            adjoint=True,
-            record_tape=False,
-        )
+    def _run(self, way: str, first: int, batch: int, step: Callable[[int], None]) -> None:
+        """Launch a stretch of steps, in their order or, backward, in the reverse of it."""
+        if self.stop.is_set():
+            raise InterruptedError("the simulation was stopped")
+
+        def work() -> None:
+            steps = range(first, min(first + STRETCH, self.steps))
+            for number in steps if way == "forward" else reversed(steps):
+                step(number)
+
+        self.launches.run((way, first), batch, work, small=batch * len(self.sheet.x) <= SMALL)
+
+    def _step(self, step: int) -> None:
+        self._launch(self.springs.pull, [*self._pull_inputs(step), self.pulled[step]])
+        self._launch(self.touch, [*self._touch_inputs(step), self.x[step + 1], self.v[step + 1]])
+
+    def _step_back(self, step: int) -> None:
+        moved = [self.x[step + 1], self.v[step + 1]]
+        adjoints = [*self.adj_pose, self.adj_here, self.adj_pulled, self.adj_x, self.adj_v]
+        how = {"adj_inputs": [None, self.no_adjoint, None, *adjoints], "adjoint": True}
+        self._launch(self.touch, [*self._touch_inputs(step), *moved], **how)
         for frame, by_vertex in zip((step, step + 1), self.adj_pose, strict=True):
             if by_vertex is not None:
-                self._add_up(by_vertex, self.adj_poses[frame], batch)
-        seeds = [self.adj_here, self.adj_pulled]
-        self._launch(
-            self.springs.adjoint,
-            batch,
-            [*self._pull_inputs(step), *seeds],
-            [self.adj_x, self.adj_v, self.adj_stiffness],
-        )
-
-    def _add_up(self, by_vertex: Any, by_row: Any, batch: int) -> None:
-        size = (batch, self.adj_parts.shape[1])
-        wp.launch(self.gather, size, [by_vertex], [self.adj_parts], device=self.device, record_tape=False)
-        wp.launch(self.add, batch, [self.adj_parts], [by_row], device=self.device, record_tape=False)
+                self._launch(self.gather, [by_vertex, self.adj_parts], elements=self.adj_parts.shape[1])
+                self._launch(self.add, [self.adj_parts, self.adj_poses[frame]], elements=1)
+        changed = [self.adj_x, self.adj_v, self.adj_stiffness]
+        self._launch(self.springs.adjoint, [*self._pull_inputs(step), self.adj_here, self.adj_pulled, *changed])
 
     def _pull_inputs(self, step: int) -> list[Any]:
         return [self.network, self.dt, self.stiffness, self.x[step], self.v[step]]
@@ -192,11 +202,10 @@ class Solver:
         poses = self.pose[step], self.pose[step + 1]
         return [self.dt, self.surface, self.held, *poses, self.x[step], self.pulled[step]]
 
-    def _launch(self, kernel: Any, batch: int, inputs: list[Any], outputs: list[Any]) -> None:
-        if self.stop.is_set():
-            raise InterruptedError("the simulation was stopped")
-        size = (batch, len(self.sheet.x))
-        wp.launch(kernel, size, inputs, outputs, device=self.device, record_tape=False)
+    def _launch(self, kernel: Any, inputs: list[Any], *, elements: int | None = None, **how: Any) -> None:
+        """Launch a kernel over rows and vertices, or so many other elements."""
+        count = len(self.sheet.x) if elements is None else elements
+        self.launches.launch(kernel, lambda batch: (batch, count), inputs, **how)
 
 
 def _network(sheet: Sheet, Network: Any, types: Any, device: str) -> Any:

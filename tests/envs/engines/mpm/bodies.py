@@ -125,13 +125,13 @@ def weights(model, batch, seed):
     return torch.rand((batch, model.particles, 3), generator=generator, dtype=torch.float64) - 0.5
 
 
-def kneaded(model, paths, adj_x, *, columns=False):
+def kneaded(model, paths, adj_x, *, columns=False, pieces=1):
     """Return (solver, last x, gradient)."""
-    solver = Solver(model, capacity=len(paths), device="cpu", columns=columns)
+    solver = Solver(model, capacity=len(paths), device="cpu", columns=columns, pieces=pieces)
     return solver, solver.run(paths).clone(), solver.gradient(adj_x)
 
 
-def stirred(*, smoothing=0.0, columns=False):
+def stirred(*, smoothing=0.0, columns=False, pieces=1):
     """Return a solver of a coarse tank, and the path of a ladle that stirs it.
 
     Nodes lie nowhere on the bowl's mid-surface nor in the plane of its rim: there the normal jumps, or bends.
@@ -139,4 +139,4 @@ def stirred(*, smoothing=0.0, columns=False):
     model = tank(replace(SYRUP, smoothing=smoothing), 0.05, at_rest=True, steps=6)
     time = torch.linspace(0, 1, model.steps + 1, dtype=torch.float64)
     path = torch.stack([0.003 + 0.02 * time, 0.1141 - 0.05 * time, 0.007 + 0.01 * time], dim=-1)[None, :, None]
-    return Solver(model, capacity=2, device="cpu", columns=columns), path.expand(2, -1, -1, -1).contiguous()
+    return Solver(model, capacity=2, device="cpu", columns=columns, pieces=pieces), path.expand(2, -1, -1, -1).contiguous()

@@ -57,6 +57,42 @@ def test_an_episode_kept_whole_and_one_repeated_step_by_step_give_the_same_bits(
     assert torch.equal(kept[2], repeated[2])
 
 
+@pytest.mark.parametrize("columns", [False, True])
+@pytest.mark.parametrize("pieces", [2, 3, 100])
+def test_a_control_step_in_pieces_gives_the_same_bits(pieces, columns):
+    """The last piece has fewer substeps; a second gradient of the same episode is the first."""
+    model, paths = kneading()
+    assert model.substeps % model.piece(3) != 0
+    adj_x = {2: weights(model, 3, 5), model.steps: weights(model, 3, 6)}
+    whole = kneaded(model, paths, adj_x, columns=columns)
+    cut = kneaded(model, paths, adj_x, columns=columns, pieces=pieces)
+    assert cut[0].tapes[0].bytes < whole[0].tapes[0].bytes
+    assert torch.equal(cut[1], whole[1])
+    assert torch.equal(cut[2], whole[2])
+    assert torch.equal(cut[0].gradient(adj_x), whole[2])
+
+
+def test_a_smoothed_fluid_in_pieces_gives_the_same_bits():
+    found = []
+    for pieces in (1, 2):
+        solver, paths = stirred(smoothing=0.2, columns=True, pieces=pieces)
+        end = solver.run(paths).clone()
+        found.append((end, solver.gradient({solver.model.steps: weights(solver.model, 2, 7)})))
+    assert torch.equal(found[0][0], found[1][0])
+    assert torch.equal(found[0][1], found[1][1])
+    assert found[0][1].abs().max() > 0
+
+
+def test_a_control_step_is_cut_into_as_few_pieces_as_fit(monkeypatch):
+    model, _ = kneading()
+    sizes = [model.bytes_per_environment(1, columns=True, pieces=count) for count in (1, 2, 3)]
+    assert sizes == sorted(sizes, reverse=True)
+    for count, size in enumerate(sizes, start=1):
+        monkeypatch.setattr(mpm, "free_memory", lambda size=size: -(-size * 4 // 3))
+        assert mpm.pieces_that_fit(model, "cuda") == count
+    assert mpm.pieces_that_fit(model, "cpu") == 1
+
+
 @pytest.mark.parametrize("speed", [4.0, 18.0])  # [m/s], so 0.8 or 3.6 cells in a control step
 def test_the_grid_grows_where_a_particle_leaves_its_part(monkeypatch, speed):
     """One cell of margin is enough for the slow; the quick make it repeat the step on more, with the same bits."""
