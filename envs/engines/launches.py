@@ -105,13 +105,13 @@ class Launches:
                 self.clear()
             self.sequences[key] = self._recording = _Sequence(extent)
             self._place = place
+            self.seen.add((key, extent))
             work()
-            return
-        known.move(extent, place)
-        if self.device == "cpu" or not small or not self.use_graphs:
-            known.run()
+        elif small and self.use_graphs and self.device != "cpu":
+            self._run_graph((key, extent), known, place)
         else:
-            self._run_graph((key, extent), known)
+            known.move(extent, place)
+            known.run()
 
     def launch(
         self, kernel: Any, dim: tuple[int, int] | Callable[[Any], tuple[int, int]], inputs: list[Any], **how: Any
@@ -149,12 +149,13 @@ class Launches:
         self.seen.clear()
         self.graphs.clear()
 
-    def _run_graph(self, key: Hashable, known: _Sequence) -> None:
-        if key not in self.seen:
-            self.seen.add(key)
-            known.run()
-            return
+    def _run_graph(self, key: tuple[Hashable, Hashable], known: _Sequence, place: Any) -> None:
         if key not in self.graphs:
+            known.move(key[1], place)
+            if key not in self.seen:
+                self.seen.add(key)
+                known.run()
+                return
             if len(self.graphs) == MAX_GRAPHS:
                 self.seen.clear()
                 self.graphs.clear()

@@ -1,10 +1,10 @@
 """What a batch of MLS-MPM episodes shares: bodies, boundary, grid, time; and which of the grid's nodes matter when."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 import warp as wp
 
 from ..runtime import precision
@@ -94,10 +94,10 @@ class Model:
         return self.real_bytes * (numbers + 45 * nodes) + 4 * integers
 
     @property
-    def corners(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def corners(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and highest coordinates of particles at rest [m], each of shape (3,)."""
-        x = torch.from_numpy(np.concatenate([body.x for body in self.bodies]))
-        return x.amin(dim=0), x.amax(dim=0)
+        x = np.concatenate([body.x for body in self.bodies])
+        return x.min(axis=0), x.max(axis=0)
 
     @property
     def real_bytes(self) -> int:
@@ -129,18 +129,19 @@ def place_grid(model: Model, box: Box | None = None) -> Any:
     return placed
 
 
-def nodes_around(model: Model, low: torch.Tensor, high: torch.Tensor, margin: int, grain: int = 1) -> Box:
+def nodes_around(model: Model, low: np.ndarray, high: np.ndarray, margin: int, grain: int = 1) -> Box:
     """Return the nodes that particles between two corners [m], shape (3,), touch while none moves `margin` cells.
 
     It begins and ends at multiples of `grain`, or with the grid.
     """
-    if not bool((low + high).isfinite().all()):
+    if not np.isfinite([low, high]).all():
         return Box((0, 0, 0), model.nodes)
-    origin = torch.tensor(model.origin, dtype=torch.float64)
-    last = torch.tensor(model.nodes) - 1
     farthest = max(model.nodes)  # from the grid that matters; an exploded body may be beyond what an integer holds
-    first = ((low - origin) / model.dx - 0.5).floor().clamp(-farthest, farthest).int() - margin
-    end = ((high - origin) / model.dx + 1.5).floor().clamp(-farthest, farthest).int() + margin
-    first, end = first // grain * grain, -(-end // grain) * grain
-    first, end = first.clamp_min(0).minimum(last - 2), end.minimum(last)
-    return Box(tuple(first.tolist()), tuple((end - first).clamp_min(2).add(1).tolist()))
+    spans = []
+    for origin, count, lowest, highest in zip(model.origin, model.nodes, low.tolist(), high.tolist(), strict=True):
+        first = math.floor(min(max((lowest - origin) / model.dx - 0.5, -farthest), farthest)) - margin
+        end = math.floor(min(max((highest - origin) / model.dx + 1.5, -farthest), farthest)) + margin
+        first = min(max(first // grain * grain, 0), count - 3)
+        spans.append((first, max(min(-(-end // grain) * grain, count - 1) - first, 2) + 1))
+    firsts, counts = zip(*spans, strict=True)
+    return Box(firsts, counts)

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from ..launches import Launches
 from ..runtime import load, precision, to_torch
 from .model import Model, place_grid
 from .stencil import lattice
@@ -139,8 +140,8 @@ class Order:
 class Sorter:
     """Sort the particles of up to `capacity` environments between control steps, and bring adjoints back."""
 
-    def __init__(self, model: Model, capacity: int, device: str) -> None:
-        self.model, self.device, self.lattice = model, device, place_grid(model)
+    def __init__(self, model: Model, capacity: int, device: str, launches: Launches) -> None:
+        self.model, self.launches, self.lattice = model, launches, place_grid(model)
         sizes = [len(body.x) for body in model.bodies]
         self.body: wp.array = wp.array(np.repeat(np.arange(len(sizes), dtype=np.int32), sizes), device=device)
         room = 2 * capacity * model.particles
@@ -152,23 +153,20 @@ class Sorter:
         self.first = np.cumsum([0, *sizes])[:-1].tolist()
 
     def sort(self, old: Any, new: Any, before: Order, order: Order, batch: int) -> None:
-        """Fill `order` and the frame `new` from the frame `old`, which lies in the order of the step `before`."""
-        count = self.model.particles
+        """Launch what fills `order` and the frame `new` from the frame `old`, which lies in the order `before`."""
+        launch, count = self.launches.launch, self.model.particles
         inputs = [self.lattice, len(self.model.bodies), self.body, old.x, self.keys, self.places]
-        self._launch(self.kernels.label, count, batch, inputs)
-        wp.utils.radix_sort_pairs(self.keys, self.places, batch * count, 0, self.bits)
+        launch(self.kernels.label, (batch, count), inputs)
+        self.launches.call(lambda: wp.utils.radix_sort_pairs(self.keys, self.places, batch * count, 0, self.bits))
         theirs = [before.name, before.mass, before.volume, old.x, old.v, old.C]
         ours = [order.name, order.mass, order.volume, new.x, new.v, new.C]
-        self._launch(self.kernels.take, count, batch, [self.places, order.place, *theirs, *ours])
+        launch(self.kernels.take, (batch, count), [self.places, order.place, *theirs, *ours])
         for first, source, S in zip(self.first, old.S, new.S, strict=True):
-            self._launch(self.kernels.states[S.dtype][0], S.shape[1], batch, [first, order.place, source, S])
+            launch(self.kernels.states[S.dtype][0], (batch, S.shape[1]), [first, order.place, source, S])
 
     def unsort(self, new: Any, old: Any, order: Order, batch: int) -> None:
-        """Fill the frame `old`, in the order of the step before, from the frame `new`, in `order`."""
+        """Launch what fills the frame `old`, in the order of the step before, from the frame `new`, in `order`."""
         arrays = [new.x, new.v, new.C, old.x, old.v, old.C]
-        self._launch(self.kernels.give, self.model.particles, batch, [order.place, *arrays])
+        self.launches.launch(self.kernels.give, (batch, self.model.particles), [order.place, *arrays])
         for first, S, target in zip(self.first, new.S, old.S, strict=True):
-            self._launch(self.kernels.states[S.dtype][1], S.shape[1], batch, [first, order.place, S, target])
-
-    def _launch(self, kernel: Any, size: int, batch: int, inputs: list[Any]) -> None:
-        wp.launch(kernel, (batch, size), inputs, device=self.device, record_tape=False)
+            self.launches.launch(self.kernels.states[S.dtype][1], (batch, S.shape[1]), [first, order.place, S, target])

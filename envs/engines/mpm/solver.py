@@ -16,6 +16,7 @@ smoothed (`smoothing`).
 import threading
 import weakref
 from collections.abc import Callable, Mapping
+from functools import partial
 from itertools import chain
 from typing import Any
 
@@ -27,6 +28,7 @@ from ..launches import Launches
 from ..runtime import free_memory, has_rows, load, to_torch
 from .checkpoints import Allocator, Frame, Tape
 from .exact import settle_kernel
+from .extent import Extent
 from .grid import velocity_kernel
 from .kernels import compile_all as compile_all
 from .model import BOX_MARGIN, EMPTY, Box, Model, nodes_around
@@ -111,8 +113,9 @@ class Solver:
         self.checkpoints = [self.allocator.frame() for _ in range(model.steps + 1)]
         self.orders = [Order(model, capacity, device) for _ in self.checkpoints]
         self.end = self.allocator.frame()  # of a control step, before its particles are sorted
-        self.sorter = Sorter(model, capacity, device)
         self.launches = Launches(device)
+        self.sorter = Sorter(model, capacity, device, self.launches)
+        self.extent = Extent(self.allocator, self.launches)
         whole = device == "cpu" and memory(model, device) > model.bytes_per_environment(1)
         self.tapes = [Tape(self.allocator, pieces=self.pieces) for _ in range(model.steps if whole else 1)]
         self.spare_used = device == "cpu"  # whether spare memory has been put to use
@@ -172,8 +175,8 @@ class Solver:
         return self.tapes[step % len(self.tapes)]
 
     def _advance_on_box(
-        self, step: int, batch: int, low: torch.Tensor, high: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+        self, step: int, batch: int, low: np.ndarray, high: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Simulate a control step on the nodes around the particles, or on more where one leaves them.
 
         Take the corners between which they are at its beginning [m], shape (3,), and return those of its end.
@@ -182,29 +185,32 @@ class Solver:
         grain = GRAIN if self.device != "cpu" and self._small(batch) else 1
         while True:
             self.boxes[step] = nodes_around(self.model, low, high, self.margins[step], grain)
-            self.left_box.zero_()
             self._advance(step, batch)
-            *corners, left = self._read_extent(batch)
-            if self.boxes[step] == whole or not bool(left.any()):
+            self.extent.find(self.end.x, self.left_box, batch, small=self._small(batch))
+            self._sort(step, batch)  # which a GPU does while corners are read, whether or not the step holds
+            *corners, left = self.extent.read()
+            if self.boxes[step] == whole or not left:
                 break
             self.margins[step] *= 2
-        to_torch(self.escaped)[:batch] += to_torch(self.left_box)[:batch]
-        orders = self.orders[step], self.orders[step + 1]
-        self.sorter.sort(self.end, self.checkpoints[step + 1], *orders, batch)
+        if left:
+            to_torch(self.escaped)[:batch] += to_torch(self.left_box)[:batch]
         return corners[0], corners[1]
 
-    def _read_extent(self, batch: int) -> tuple[torch.Tensor, ...]:
-        """Return the corners of all particles [m] and whether one left its box, by one transfer."""
-        x, left = to_torch(self.end.x)[:batch], to_torch(self.left_box)[:batch]
-        seen = torch.cat([x.amin(dim=(0, 1)), x.amax(dim=(0, 1)), left.amax()[None].to(x)])
-        return torch.split(seen.double().cpu(), 3)
+    def _sort(self, step: int, batch: int) -> None:
+        """Bring the particles at a control step's end into the order of the next one."""
+        orders, after = (self.orders[step], self.orders[step + 1]), self.checkpoints[step + 1]
+        work = partial(self.sorter.sort, self.end, after, *orders, batch)
+        self.launches.run(("sort", step, batch), None, work, small=self._small(batch))
 
     def _advance(self, step: int, batch: int) -> None:
         if self.stop.is_set():
             raise InterruptedError("the simulation was stopped")
         self._make_room(step)
-        substeps = range(self.model.substeps)
-        self.launch_again(("forward", step, batch), step, batch, lambda: self.substeps(step, batch, substeps))
+        self.launch_again(("forward", step, batch), step, batch, lambda: self._launch_step(step, batch))
+
+    def _launch_step(self, step: int, batch: int) -> None:
+        self.launches.call(self.left_box.zero_)
+        self.substeps(step, batch, range(self.model.substeps))
 
     def _make_room(self, step: int) -> None:
         """Make room for a control step, at the cost of others where memory runs out."""
@@ -344,8 +350,6 @@ class _Adjoint:
             if step + 1 in adj_x:
                 x = to_torch(self.new.x)[:batch]
                 x += solver.orders[step + 1].from_model(adj_x[step + 1].to(x))
-            solver.sorter.unsort(self.new, self.old, solver.orders[step + 1], batch)
-            self.new, self.old = self.old, self.new
             if solver.tape(step).step != step:
                 solver._advance(step, batch)
             self._retreat(step, batch)
@@ -356,7 +360,7 @@ class _Adjoint:
         if self.grid.m.shape[1] < solver.boxes[step].cells:
             self.grid = solver.allocator.grid(solver.boxes[step].cells)
             solver.launches.clear()
-        ends = (self.old, self.new) if solver.model.substeps % 2 else (self.new, self.old)
+        ends = (self.new, self.old) if solver.model.substeps % 2 else (self.old, self.new)  # as often exchanged
         key = "backward", step, batch, id(self.new)
         solver.launch_again(key, step, batch, lambda: self._substeps(step, batch))
         self.new, self.old = ends  # launches that are kept exchange nothing here
@@ -365,6 +369,8 @@ class _Adjoint:
 
     def _substeps(self, step: int, batch: int) -> None:
         solver, count = self.solver, self.solver.model.substeps
+        solver.sorter.unsort(self.new, self.old, solver.orders[step + 1], batch)
+        self.new, self.old = self.old, self.new
         length = solver.model.piece(solver.pieces)
         for first in reversed(range(0, count, length)):
             piece = range(first, min(first + length, count))

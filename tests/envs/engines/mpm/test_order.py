@@ -4,6 +4,7 @@ import pytest
 import torch
 import warp as wp
 
+from gradscape.envs.engines.launches import Launches
 from gradscape.envs.engines.mpm.order import Order, Sorter
 from gradscape.envs.engines.mpm.solver import Solver
 from gradscape.envs.engines.runtime import to_torch
@@ -25,8 +26,9 @@ def sorted_once():
         view[:] = torch.rand(view.shape, generator=generator, dtype=view.dtype)
     room = model.dx * (torch.tensor(model.nodes) - 1)
     to_torch(old.x)[:] = torch.tensor(model.origin, dtype=torch.float64) + to_torch(old.x) * room
-    before, order, sorter = Order(model, BATCH, "cpu"), Order(model, BATCH, "cpu"), Sorter(model, BATCH, "cpu")
-    sorter.sort(old, new, before, order, BATCH)
+    before, order, launches = Order(model, BATCH, "cpu"), Order(model, BATCH, "cpu"), Launches("cpu")
+    sorter = Sorter(model, BATCH, "cpu", launches)
+    launches.run("sort", BATCH, lambda: sorter.sort(old, new, before, order, BATCH), small=False)
     return model, old, new, order, sorter
 
 
@@ -50,7 +52,7 @@ def test_everything_a_particle_has_goes_with_it_and_comes_back(sorted_once):
         assert torch.equal(order.to_model(to_torch(getattr(new, name))), to_torch(getattr(old, name)))
         assert torch.equal(order.from_model(to_torch(getattr(old, name))), to_torch(getattr(new, name)))
     again = type(old)(*(wp.zeros_like(array) for array in (old.x, old.v, old.C)), tuple(map(wp.zeros_like, old.S)))
-    sorter.unsort(new, again, order, BATCH)
+    sorter.launches.run("unsort", BATCH, lambda: sorter.unsort(new, again, order, BATCH), small=False)
     for back, array in zip(again.arrays(), old.arrays(), strict=True):
         assert torch.equal(to_torch(back), to_torch(array))
 
