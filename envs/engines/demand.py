@@ -62,7 +62,7 @@ def demand(
     """
     labels = [argument.label for argument in kernel.adj.args]
     if has_rows(kernel):
-        kernel, dim = kernel.plain, (dim[0], arguments[labels.index(kernel.elements)].shape[1])
+        kernel, dim = kernel.plain, (dim[0], _count(arguments[labels.index(kernel.elements)]))
     code = _read(kernel)
     moved = 0
     for label, array in zip(labels, arguments, strict=True):
@@ -74,6 +74,11 @@ def demand(
             ways = 2 * (label in code.reads) + (label in code.writes)
             moved += ways * _bytes_met(array, dim, whole=code.walks)
     return Demand(moved, code.flops * math.prod(dim) * (BACKWARD if backward else 1))
+
+
+def _count(elements: Any) -> int:
+    """Count the elements of an environment: those of an array's rows, or the nodes of a lattice."""
+    return int(elements.shape[1] if isinstance(elements, wp.array) else elements.nx * elements.ny * elements.nz)
 
 
 def _bytes_met(array: wp.array, dim: Sequence[int], *, whole: bool) -> int:

@@ -55,12 +55,12 @@ def precision(name: str) -> Precision:
     return Precision(name, real, vector(3, real), vector(4, real), matrix((3, 3), real), dtype)
 
 
-def take_rows(kernel: Any, plain: Any, array: str) -> None:
+def take_rows(kernel: Any, plain: Any, elements: str) -> None:
     """Note that a thread of a kernel has the row of an environment, for each element of which `plain` has a thread.
 
-    `array` names an argument that has as many elements.
+    `elements` names an argument that has as many elements: an array, or a lattice of nodes.
     """
-    kernel.plain, kernel.elements = plain, array
+    kernel.plain, kernel.elements = plain, elements
 
 
 def has_rows(kernel: Any) -> bool:

@@ -9,7 +9,7 @@ from ..runtime import load
 from .cells import cell_kernels
 from .columns import TEAMS, column_kernels
 from .exact import settle_kernel
-from .grid import velocity_kernel
+from .grid_cpu import velocity_on
 from .model import Model
 from .order import sorting_kernels
 from .smoothing_columns import smoothing_columns
@@ -30,7 +30,7 @@ def kernels(model: Model, device: str) -> Iterator[Any]:
     """Yield a kernel or more of each module, those first that take longest to compile."""
     name = model.precision
     yield from (_of_cpu if device == "cpu" else _of_gpu)(name, any(body.material.smoothing for body in model.bodies))
-    yield velocity_kernel(name, *model.boundary.function(name))
+    yield velocity_on(device, name, model.boundary)
     for body in model.bodies:
         yield from body.material.kernels(name, rows=device == "cpu")
     sorting = sorting_kernels(name)

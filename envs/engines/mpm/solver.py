@@ -29,7 +29,7 @@ from ..runtime import free_memory, has_rows, load, to_torch
 from .checkpoints import Allocator, Frame, Tape
 from .exact import settle_kernel
 from .extent import Extent
-from .grid import velocity_kernel
+from .grid_cpu import velocity_on
 from .kernels import compile_all as compile_all
 from .model import BOX_MARGIN, EMPTY, Box, Model, nodes_around
 from .order import Order, Sorter
@@ -99,7 +99,7 @@ class Solver:
         self.allocator = Allocator(model, capacity, device, columns=columns)
         self.types = self.allocator.types
         self.kernels = transfers(model.precision, scattering=False) if columns else transfers_on_cpu(model.precision)
-        self.velocity = velocity_kernel(model.precision, *model.boundary.function(model.precision))
+        self.velocity = velocity_on(device, model.precision, model.boundary)
         self.boundary = model.boundary.data(model.precision, device)
         self.materials = [body.material.kernels(model.precision, rows=device == "cpu") for body in model.bodies]
         load([*vars(self.kernels).values(), self.velocity, *chain.from_iterable(self.materials)], device)
@@ -121,6 +121,7 @@ class Solver:
         self.spare_used = device == "cpu"  # whether spare memory has been put to use
         self.tools = self.allocator.paths()
         self.sums = self.allocator.sums()
+        self.listed = [self.allocator.array(wp.int32, model.cells + 1)] if has_rows(self.velocity) else []
         self.left_box, self.escaped = (wp.zeros(capacity, dtype=wp.int32, device=device) for _ in range(2))
         self.adjoint: _Adjoint | None = None
         self._start()
@@ -301,6 +302,7 @@ class Solver:
             self.sums,
             grid.m,
             grid.v,
+            *self.listed,
         ]
 
     def size(self, b: int) -> int:
@@ -315,7 +317,7 @@ class Solver:
         self, kernel: Any, size: Callable[[Box], int], step: int, batch: int, inputs: list[Any], **how: Any
     ) -> None:
         """Launch a kernel over [environment, whatever `size` counts of a control step's box]."""
-        self.launches.launch(kernel, lambda box: (batch, size(box)), inputs, **how)
+        self.launches.launch(kernel, lambda box: (batch, 1 if has_rows(kernel) else size(box)), inputs, **how)
 
     def _start(self) -> None:
         first = self.checkpoints[0]
@@ -396,7 +398,8 @@ class _Adjoint:
     def _adjoint_velocity(self, step: int, substep: int, batch: int) -> None:
         solver = self.solver
         inputs = solver.velocity_inputs(step, substep)
-        adjoints = [*self.structs, *[None] * (len(inputs) - 6), self.tools, None, self.grid.m, self.grid.v]
+        given = [self.tools, None, self.grid.m, self.grid.v, *[None] * len(solver.listed)]
+        adjoints = [*self.structs, *[None] * (len(inputs) - 2 - len(given)), *given]
         how = {"adj_inputs": adjoints, "adj_outputs": [], "adjoint": True}
         solver.launch_on_box(solver.velocity, nodes, step, batch, inputs, **how)
 

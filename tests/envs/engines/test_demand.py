@@ -113,7 +113,7 @@ def test_every_kernel_that_is_timed_is_counted():
         env._simulate(points, grad=True)
     with count_demands() as demands:
         env._simulate(points, grad=True)
-    p2g, backward = "transfers_in_rows.p2g", "velocity_kernel.velocity backward"
+    p2g, backward = "transfers_in_rows.p2g", "velocity_in_rows.velocity backward"
     assert set(demands) == set(times) > {p2g, "transfers_in_rows.adjoint_g2p", backward}
     assert all(one.bytes > 0 for one in demands.values())
     once = demands[p2g].bytes / times[p2g].calls

@@ -1,0 +1,106 @@
+"""What happens at grid nodes: rows of a CPU against Warp's own code to the last bit, at walls, near tools, in boxes."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+import warp as wp
+
+from gradscape.envs.engines.mpm.boundaries import LadleInTank, Open
+from gradscape.envs.engines.mpm.grid import velocity_kernel
+from gradscape.envs.engines.mpm.grid_cpu import velocity_on
+from gradscape.envs.engines.mpm.stencil import lattice
+from gradscape.envs.engines.mpm.tools import STICKY, Kind, Tool, ToolsInRoom
+from gradscape.envs.engines.runtime import has_rows, precision
+
+from ..bench import draw
+
+BATCH, DX, ORIGIN, STEP = 3, 1 / 32, (-0.25, -0.0625, -0.25), 1
+TANK = LadleInTank(half_width=0.1875, lid=0.4, radius=0.07, half_thickness=0.01, height=0.25, band=0.02, friction=0.25)
+TOOLS = (
+    Tool(Kind.SPHERE, (0.04,), 0.5),
+    Tool(Kind.CAPSULE, (0.05, 0.03), 0.9),
+    Tool(Kind.TORUS, (0.06, 0.02), 0.0),
+    Tool(Kind.CYLINDER, (0.04, 0.03), 0.5),
+    Tool(Kind.ROLLER, (0.06, 0.03), 0.5),
+)
+ROOM = ToolsInRoom(TOOLS, (-0.1875, 0.0, -0.1875), (0.1875, 0.4, 0.1875), 0.03125, STICKY, 300.0)
+BOUNDARIES = {
+    "open": Open(),
+    "tank": TANK,
+    "tank that holds back": replace(TANK, slip=0.5),
+    "tank that sticks, ladle without handle": replace(TANK, slip=0.0, height=0.0),
+    "sticky floor": ROOM,
+    "rubbing floor": replace(ROOM, friction=0.3),
+    "slipping floor": replace(ROOM, friction=0.0, tools=TOOLS[:1]),
+}
+BOXES = {
+    "whole grid": ((0, 0, 0), (17, 18, 17)),
+    "a box": ((1, 1, 5), (9, 11, 12)),
+    "a corner": ((14, 0, 13), (3, 7, 3)),
+}
+
+
+class Nodes:
+    """The arguments of a boundary's velocity kernel: tools among nodes of which a half is empty, and some at rest."""
+
+    def __init__(self, boundary, box):
+        self.types, self.boundary = precision("float32"), boundary
+        self.lattice = lattice("float32")()
+        self.lattice.origin, self.lattice.inv_dx = self.types.vec3(*ORIGIN), 1 / DX
+        self.lattice.first = wp.vec3i(*box[0])
+        self.lattice.nx, self.lattice.ny, self.lattice.nz = box[1]
+        self.cells = box[1][0] * box[1][1] * box[1][2]
+        mass = (draw(BATCH, self.cells, 1, seed=0)).clamp_min(0)
+        velocity = 4 * draw(BATCH, self.cells, 3, seed=1)
+        velocity[:, ::5] = 0.0
+        velocity[:, 1::7] = -0.0
+        self.grid_m = torch.cat([mass * velocity, mass], dim=2)
+        self.adj_grid_v = draw(BATCH, self.cells, 4, seed=2)
+        self.adj_grid_v[:, ::3] = -0.0
+        self.tools = 0.2 * draw(BATCH, STEP + 2, boundary.slots, 3, seed=3) + torch.tensor([0.0, 0.1, 0.0])
+
+    def run(self, kernel):
+        """Return velocities, and the adjoints of momenta and tools, as integers of the same bits."""
+        size, near = self.cells, []
+        if has_rows(kernel):
+            size, near = 1, [wp.zeros((BATCH, self.cells + 1), dtype=wp.int32)]
+        grid_v, adj_grid_m = (self.array(torch.full((BATCH, self.cells, 4), 7.0)) for _ in range(2))
+        tools, adj_tools = self.array(self.tools), self.array(torch.zeros_like(self.tools))
+        data, sums = self.boundary.data("float32", "cpu"), wp.zeros((1, 1), dtype=wp.int64)
+        inputs = [self.lattice, data, 2e-3, 9.81, 1e-6, STEP, 0.25, 100.0, tools, sums]
+        inputs += [self.array(self.grid_m), grid_v, *near]
+        wp.launch(kernel, (BATCH, size), inputs, record_tape=False)
+        adjoints = [type(self.lattice)(), type(data)(), *[None] * 6, adj_tools, None, adj_grid_m]
+        adjoints += [self.array(self.adj_grid_v), *[None] * len(near)]
+        how = {"adj_inputs": adjoints, "adj_outputs": [], "adjoint": True}
+        wp.launch(kernel, (BATCH, size), inputs, record_tape=False, **how)
+        self.near = near[0].numpy()[:, 0] if near else None
+        return [torch.from_numpy(array.numpy()).view(torch.int32) for array in (grid_v, adj_grid_m, adj_tools)]
+
+    def array(self, values):
+        kind = {3: self.types.vec3, 4: self.types.vec4}[values.shape[-1]]
+        return wp.array(values.float().contiguous().numpy(), dtype=kind, copy=True)
+
+
+@pytest.mark.parametrize("box", BOXES.values(), ids=BOXES)
+@pytest.mark.parametrize("boundary", BOUNDARIES.values(), ids=BOUNDARIES)
+def test_rows_of_a_cpu_have_the_same_bits(boundary, box):
+    nodes, rows = Nodes(boundary, box), velocity_on("cpu", "float32", boundary)
+    assert has_rows(rows)
+    wanted = nodes.run(velocity_kernel("float32", *boundary.function("float32")))
+    found = nodes.run(rows)
+    for one, other in zip(wanted, found, strict=True):
+        assert torch.equal(one, other)
+    assert wanted[0].any()
+    assert wanted[1].any()
+    assert (nodes.near < nodes.cells / 2).all()  # half of them are empty
+    if box is BOXES["whole grid"] and not isinstance(boundary, Open):
+        assert wanted[2].any(dim=3).any(dim=2)[:, STEP:].all()
+        assert (nodes.near > 0).all()
+        assert (nodes.near < nodes.cells / 4).all()
+
+
+def test_only_a_cpu_in_single_precision_has_rows():
+    assert not has_rows(velocity_on("cpu", "float64", TANK))
+    assert not has_rows(velocity_on("cuda", "float32", TANK))
