@@ -33,7 +33,8 @@ class Smoother:
         self.slope, self.share = hydrostatic_slope(model, body), material.smoothing
         self.kernels = self._kernels(model.precision)
         types = precision(model.precision)
-        self.amount, self.weight, self.adj_mean = (solver.allocator.array(types.real, model.cells) for _ in range(3))
+        room = model.cells + 1  # a CPU reads and writes four numbers where three are meant
+        self.amount, self.weight, self.adj_mean = (solver.allocator.array(types.real, room) for _ in range(3))
 
     def run(self, solver: Any, step: int, batch: int) -> None:
         """Fill the tape's first state from the checkpoint's."""

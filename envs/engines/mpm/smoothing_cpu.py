@@ -1,265 +1,185 @@
-"""The kernels of `smoothing` for a CPU in float32, in C++: a body's particles one after another, and the same bits."""
+"""The kernels of `smoothing` for a CPU in float32, in C++: eight particles or three nodes at a time, the same bits."""
 
 from functools import cache
 from types import SimpleNamespace
-from typing import no_type_check
 
-import warp as wp
-
-from ..runtime import precision, take_rows
+from ..rows import kernel_in_rows
 from .smoothing_kernels import smoothing_kernels
-from .stencil import lattice
-from .transfers_cpu import EACH, ROWS, SLOPES, STENCIL
+from .stencil_cpu import EACH, ONE_BY_ONE, ROWS_OF_ONE, SLOPES, STENCIL
 
+# Three nodes of a row at a time: what lies behind the third is read and written as it was.
 PRELUDE = (
     STENCIL
     + """
-    const float *X = (const float*)&wp::index(x, e, first), *JJ = &wp::index(J, e, 0);
+    const float* X = (const float*)&wp::index(x, e, first);
+    auto inverse = [](V4 w) { return w > 0.0f ? 1.0f / w : V4{0.0f, 0.0f, 0.0f, 0.0f}; };
+    auto at_row = [](const float* a, int row) { return *(const V4*)(a + row); };
+    auto add_row = [](float* a, int row, V4 v) {
+        V4 sum = *(V4*)(a + row) + v;
+        sum[3] = a[row + 3];
+        *(V4*)(a + row) = sum;
+    };
+    float *AMOUNT = &wp::index(amount, e, 0), *WEIGHT = &wp::index(weight, e, 0);
+"""
+)
+RATIOS = """
+    const float* JJ = &wp::index(J, e, 0);
     const int count = J.shape[1];
-    auto inverse = [](float w) { return w > 0.0f ? 1.0f / w : 0.0f; };
+"""
+DEAL = """
+        V wz4[4];
+        deal(wz[0], wz[1], wz[2], wz4);
+        V wij[9];
+        #pragma clang loop unroll(full)
+        for (int n = 0; n < 9; ++n) wij[n] = wx[n / 3] * wy[n % 3];
+"""
+DEAL_SLOPES = """
+        V along_x[3][4], along_y[3][4], along_z[3][4];
+        #pragma clang loop unroll(full)
+        for (int i = 0; i < 3; ++i) {
+            deal(dwx[i], wx[i], wx[i], along_x[i]);
+            deal(wy[i], dwy[i], wy[i], along_y[i]);
+            deal(wz[i], wz[i], dwz[i], along_z[i]);
+        }
+"""
+ROWS = (
+    ROWS_OF_ONE
+    + """
+                    const V4 w = of_one(wij[3 * i + j], l) * dealt(wz4, l);
 """
 )
 SPREAD = (
     PRELUDE
+    + RATIOS
     + """
     const float* VOLUME = &wp::index(volume, e, first);
-    float *AMOUNT = &wp::index(amount, e, 0), *WEIGHT = &wp::index(weight, e, 0);
 """
     + EACH
+    + DEAL
     + """
-        const float beyond = ::logf(JJ[p]) - slope * X[3 * p + 1];
+        const V beyond = logarithm(read(JJ, 1, at)) - slope * x3[1];
+"""
+    + ONE_BY_ONE
+    + """
+            const float volume = VOLUME[q], excess = of_one(beyond, l);
 """
     + ROWS
     + """
-                for (int k = 0; k < 3; ++k) {
-                    const float w = wij * wz[k] * VOLUME[p];
-                    AMOUNT[row + k] += w * beyond;
-                    WEIGHT[row + k] += w;
+                    add_row(AMOUNT, row, w * volume * excess);
+                    add_row(WEIGHT, row, w * volume);
                 }
-            }
+        }
     }
 """
 )
 COLLECT = (
     PRELUDE
+    + RATIOS
     + """
-    const float *AMOUNT = &wp::index(amount, e, 0), *WEIGHT = &wp::index(weight, e, 0);
     float* JN = &wp::index(J_new, e, 0);
 """
     + EACH
+    + DEAL
     + """
-        float mean = 0.0f;
+        V mean;
+"""
+    + ONE_BY_ONE
+    + """
+            float sum = 0.0f;
 """
     + ROWS
     + """
-                for (int k = 0; k < 3; ++k) mean += wij * wz[k] * AMOUNT[row + k] * inverse(WEIGHT[row + k]);
-            }
-        const float here = ::logf(JJ[p]);
-        JN[p] = ::expf(here + share * (mean - (here - slope * X[3 * p + 1])));
+                    const V4 part = w * at_row(AMOUNT, row) * inverse(at_row(WEIGHT, row));
+                    for (int k = 0; k < 3; ++k) sum += part[k];
+                }
+            ((float*)&mean)[l] = sum;
+        }
+        const V here = logarithm(read(JJ, 1, at));
+        write(JN, 1, p, some, exponential(here + share * (mean - (here - slope * x3[1]))));
     }
 """
 )
 ADJOINT_COLLECT = (
     PRELUDE
     + """
-    const float *AMOUNT = &wp::index(amount, e, 0), *WEIGHT = &wp::index(weight, e, 0);
+    const float* JN = &wp::index(J_new, e, 0);
+    const int count = J_new.shape[1];
     float *MEAN = &wp::index(mean_adjoint, e, 0), *JA = &wp::index(J_adjoint, e, 0);
     float* XA = (float*)&wp::index(x_adjoint, e, first);
 """
     + EACH
     + SLOPES
+    + DEAL
+    + DEAL_SLOPES
+    + ONE_BY_ONE
     + """
-        const float g = JA[p] * JJ[p];
-        V4 steep = {0.0f, 0.0f, 0.0f, 0.0f};
+            const float g = JA[q] * JN[q];
+            V4 steep = {0.0f, 0.0f, 0.0f, 0.0f};
 """
     + ROWS
     + """
-                const V4 along = {dwx[i] * wy[j], wx[i] * dwy[j], wij, 0.0f};
-                for (int k = 0; k < 3; ++k) {
-                    const float mean = AMOUNT[row + k] * inverse(WEIGHT[row + k]);
-                    steep += mean * (along * V4{wz[k], wz[k], dwz[k], 0.0f});
-                    MEAN[row + k] += wij * wz[k] * share * g;
+                    const V4 along = dealt(along_x[i], l) * dealt(along_y[j], l);
+                    const V4 mean = at_row(AMOUNT, row) * inverse(at_row(WEIGHT, row));
+                    for (int k = 0; k < 3; ++k) steep += mean[k] * (along * dealt(along_z[k], l));
+                    add_row(MEAN, row, w * share * g);
                 }
-            }
-        write3(XA + 3 * p, read3(XA + 3 * p) + (share * g * inv_dx) * steep);
-        JA[p] = g;
+            write3(XA + 3 * q, read3(XA + 3 * q) + (share * g * inv_dx) * steep);
+            JA[q] = g;
+        }
     }
 """
 )
 ADJOINT_SPREAD = (
     PRELUDE
+    + RATIOS
     + """
-    const float *AMOUNT = &wp::index(amount, e, 0), *WEIGHT = &wp::index(weight, e, 0);
-    const float *MEAN = &wp::index(mean_adjoint, e, 0), *VOLUME = &wp::index(volume, e, first);
+    float *MEAN = &wp::index(mean_adjoint, e, 0), *VOLUME = &wp::index(volume, e, first);
     float *JA = &wp::index(J_adjoint, e, 0), *XA = (float*)&wp::index(x_adjoint, e, first);
 """
     + EACH
     + SLOPES
+    + DEAL
+    + DEAL_SLOPES
     + """
-        const float beyond = ::logf(JJ[p]) - slope * X[3 * p + 1];
-        float here = 0.0f;
-        V4 steep = {0.0f, 0.0f, 0.0f, 0.0f};
+        const V beyond = logarithm(read(JJ, 1, at)) - slope * x3[1];
+"""
+    + ONE_BY_ONE
+    + """
+            const float excess = of_one(beyond, l), volume = VOLUME[q];
+            float here = 0.0f;
+            V4 steep = {0.0f, 0.0f, 0.0f, 0.0f};
 """
     + ROWS
     + """
-                const V4 along = {dwx[i] * wy[j], wx[i] * dwy[j], wij, 0.0f};
-                for (int k = 0; k < 3; ++k) {
-                    const float part = inverse(WEIGHT[row + k]), a = MEAN[row + k] * part;
-                    const float off = a * (beyond - AMOUNT[row + k] * part);
-                    here += wij * wz[k] * a;
-                    steep += off * (along * V4{wz[k], wz[k], dwz[k], 0.0f});
+                    const V4 along = dealt(along_x[i], l) * dealt(along_y[j], l), part = inverse(at_row(WEIGHT, row));
+                    const V4 a = at_row(MEAN, row) * part, off = a * (excess - at_row(AMOUNT, row) * part), wa = w * a;
+                    for (int k = 0; k < 3; ++k) {
+                        here += wa[k];
+                        steep += off[k] * (along * dealt(along_z[k], l));
+                    }
                 }
-            }
-        const float g = JA[p];
-        here = VOLUME[p] * here - share * g;
-        const V4 lift = {0.0f, slope * here, 0.0f, 0.0f};
-        write3(XA + 3 * p, read3(XA + 3 * p) + (VOLUME[p] * inv_dx) * steep - lift);
-        JA[p] = (g + here) / JJ[p];
+            const float g = JA[q];
+            here = volume * here - share * g;
+            const V4 lift = {0.0f, slope * here, 0.0f, 0.0f};
+            write3(XA + 3 * q, read3(XA + 3 * q) + (volume * inv_dx) * steep - lift);
+            JA[q] = (g + here) / JJ[q];
+        }
     }
 """
 )
 
 
 @cache
-@no_type_check
 def smoothing_in_rows() -> SimpleNamespace:
     """Return the kernels `clear, spread, collect, adjoint_collect, adjoint_spread`, all but the first in rows."""
-    types, module = precision("float32"), "gradscape.smoothing.rows"
-    real, vec3 = types.real, types.vec3
-    Lattice = lattice("float32")
-
-    @wp.func_native(SPREAD)
-    def spread_row(
-        e: int,
-        grid: Lattice,
-        first: int,
-        slope: real,
-        volume: wp.array2d[real],
-        x: wp.array2d[vec3],
-        J: wp.array2d[real],
-        amount: wp.array2d[real],
-        weight: wp.array2d[real],
-    ): ...
-
-    @wp.kernel(module=module, enable_backward=False)
-    def spread(
-        lattice: Lattice,
-        first: int,
-        slope: real,
-        volume: wp.array2d[real],
-        x: wp.array2d[vec3],
-        J: wp.array2d[real],
-        amount: wp.array2d[real],
-        weight: wp.array2d[real],
-    ):
-        e, _ = wp.tid()
-        spread_row(e, lattice, first, slope, volume, x, J, amount, weight)
-
-    @wp.func_native(COLLECT)
-    def collect_row(
-        e: int,
-        grid: Lattice,
-        first: int,
-        slope: real,
-        share: real,
-        x: wp.array2d[vec3],
-        J: wp.array2d[real],
-        amount: wp.array2d[real],
-        weight: wp.array2d[real],
-        J_new: wp.array2d[real],
-    ): ...
-
-    @wp.kernel(module=module, enable_backward=False)
-    def collect(
-        lattice: Lattice,
-        first: int,
-        slope: real,
-        share: real,
-        x: wp.array2d[vec3],
-        J: wp.array2d[real],
-        amount: wp.array2d[real],
-        weight: wp.array2d[real],
-        J_new: wp.array2d[real],
-    ):
-        e, _ = wp.tid()
-        collect_row(e, lattice, first, slope, share, x, J, amount, weight, J_new)
-
-    @wp.func_native(ADJOINT_COLLECT)
-    def adjoint_collect_row(
-        e: int,
-        grid: Lattice,
-        first: int,
-        share: real,
-        x: wp.array2d[vec3],
-        J: wp.array2d[real],
-        amount: wp.array2d[real],
-        weight: wp.array2d[real],
-        J_adjoint: wp.array2d[real],
-        x_adjoint: wp.array2d[vec3],
-        mean_adjoint: wp.array2d[real],
-    ): ...
-
-    @wp.kernel(module=module, enable_backward=False)
-    def adjoint_collect(
-        lattice: Lattice,
-        first: int,
-        share: real,
-        x: wp.array2d[vec3],
-        J_new: wp.array2d[real],
-        amount: wp.array2d[real],
-        weight: wp.array2d[real],
-        adj_J: wp.array2d[real],
-        adj_x: wp.array2d[vec3],
-        adj_mean: wp.array2d[real],
-    ):
-        e, _ = wp.tid()
-        adjoint_collect_row(e, lattice, first, share, x, J_new, amount, weight, adj_J, adj_x, adj_mean)
-
-    @wp.func_native(ADJOINT_SPREAD)
-    def adjoint_spread_row(
-        e: int,
-        grid: Lattice,
-        first: int,
-        slope: real,
-        share: real,
-        volume: wp.array2d[real],
-        x: wp.array2d[vec3],
-        J: wp.array2d[real],
-        amount: wp.array2d[real],
-        weight: wp.array2d[real],
-        mean_adjoint: wp.array2d[real],
-        J_adjoint: wp.array2d[real],
-        x_adjoint: wp.array2d[vec3],
-    ): ...
-
-    @wp.kernel(module=module, enable_backward=False)
-    def adjoint_spread(
-        lattice: Lattice,
-        first: int,
-        slope: real,
-        share: real,
-        volume: wp.array2d[real],
-        x: wp.array2d[vec3],
-        J: wp.array2d[real],
-        amount: wp.array2d[real],
-        weight: wp.array2d[real],
-        adj_mean: wp.array2d[real],
-        adj_J: wp.array2d[real],
-        adj_x: wp.array2d[vec3],
-    ):
-        e, _ = wp.tid()
-        adjoint_spread_row(e, lattice, first, slope, share, volume, x, J, amount, weight, adj_mean, adj_J, adj_x)
-
-    kernels = {
-        "spread": spread,
-        "collect": collect,
-        "adjoint_collect": adjoint_collect,
-        "adjoint_spread": adjoint_spread,
-    }
-    plain = smoothing_kernels("float32")
-    for key, kernel in kernels.items():
-        take_rows(kernel, getattr(plain, key), "J_new" if key == "adjoint_collect" else "J")
-    return SimpleNamespace(**kernels, clear=plain.clear)
+    plain, module = smoothing_kernels("float32"), "gradscape.smoothing.rows"
+    return SimpleNamespace(
+        clear=plain.clear,
+        spread=kernel_in_rows(plain.spread, SPREAD, "J", module),
+        collect=kernel_in_rows(plain.collect, COLLECT, "J", module),
+        adjoint_collect=kernel_in_rows(plain.adjoint_collect, ADJOINT_COLLECT, "J_new", module),
+        adjoint_spread=kernel_in_rows(plain.adjoint_spread, ADJOINT_SPREAD, "J", module),
+    )
 
 
 def smoothing_on_cpu(name: str) -> SimpleNamespace:

@@ -1,4 +1,4 @@
-"""The transfers for a CPU in float32, in C++: four numbers at a time, an environment's particles one after another.
+"""The transfers for a CPU in float32, in C++: an environment's particles eight at a time, or four numbers of one.
 
 They have the arguments of the kernels in `transfers`, which say what each does, and give the same bits, since every sum
 comes in the same order. Warp's own code for a CPU works on one number at a time.
@@ -6,43 +6,11 @@ comes in the same order. Warp's own code for a CPU works on one number at a time
 
 from functools import cache
 from types import SimpleNamespace
-from typing import no_type_check
 
-import warp as wp
-
-from ..runtime import precision, take_rows
-from .stencil import lattice
+from ..rows import kernel_in_rows
+from .stencil_cpu import EACH, ONE_BY_ONE, ROWS, ROWS_OF_ONE, SLOPES, STENCIL
 from .transfers import transfers
 
-# Of particle p: the node where its stencil begins, where it is from there [cells], its weights and their slopes. `V4`
-# are three numbers of a particle and one that is zero, or four of a node; nodes lie one after another, z fastest.
-STENCIL = """
-    typedef float V4 __attribute__((vector_size(16), aligned(4)));
-    const float inv_dx = grid.inv_dx, dx = 1.0f / grid.inv_dx;
-    const int ny = grid.ny, nz = grid.nz;
-    auto find_base = [](float s, int first, int count) {
-        const int i = (int)__builtin_floorf(s - 0.5f), last = first + count - 3;
-        return i < first ? first : i > last ? last : i;
-    };
-    auto find_weights = [](float f, float* w) {
-        w[0] = 0.5f * (1.5f - f) * (1.5f - f);
-        w[1] = 0.75f - (f - 1.0f) * (f - 1.0f);
-        w[2] = 0.5f * (f - 0.5f) * (f - 0.5f);
-    };
-    auto find_slopes = [](float f, float* w) {
-        w[0] = f - 1.5f;
-        w[1] = 2.0f - 2.0f * f;
-        w[2] = f - 0.5f;
-    };
-    auto read3 = [](const float* a) { return V4{a[0], a[1], a[2], 0.0f}; };
-    auto read_column = [](const float* a) { return V4{a[0], a[3], a[6], 0.0f}; };
-    auto write3 = [](float* a, V4 v) { a[0] = v[0]; a[1] = v[1]; a[2] = v[2]; };
-    auto write_columns = [](float* a, V4 x, V4 y, V4 z) {
-        a[0] = x[0]; a[1] = y[0]; a[2] = z[0];
-        a[3] = x[1]; a[4] = y[1]; a[5] = z[1];
-        a[6] = x[2]; a[7] = y[2]; a[8] = z[2];
-    };
-"""
 PRELUDE = (
     STENCIL
     + """
@@ -50,62 +18,48 @@ PRELUDE = (
     const int count = x.shape[1];
 """
 )
-EACH = """
-    for (int p = 0; p < count; ++p) {
-        const float s[3] = {
-            (X[3 * p] - grid.origin[0]) * inv_dx,
-            (X[3 * p + 1] - grid.origin[1]) * inv_dx,
-            (X[3 * p + 2] - grid.origin[2]) * inv_dx};
-        const int base[3] = {
-            find_base(s[0], grid.first[0], grid.nx),
-            find_base(s[1], grid.first[1], ny),
-            find_base(s[2], grid.first[2], nz)};
-        const float f[3] = {s[0] - (float)base[0], s[1] - (float)base[1], s[2] - (float)base[2]};
-        const int corner = ((base[0] - grid.first[0]) * ny + base[1] - grid.first[1]) * nz + base[2] - grid.first[2];
-        float wx[3], wy[3], wz[3];
-        find_weights(f[0], wx);
-        find_weights(f[1], wy);
-        find_weights(f[2], wz);
-"""
-SLOPES = """
-        float dwx[3], dwy[3], dwz[3];
-        find_slopes(f[0], dwx);
-        find_slopes(f[1], dwy);
-        find_slopes(f[2], dwz);
-"""
-ROWS = """
+# Each particle's weights, one node after another; then those of a row.
+WEIGHTS = """
+        V w[27];
         #pragma clang loop unroll(full)
-        for (int i = 0; i < 3; ++i)
-            #pragma clang loop unroll(full)
-            for (int j = 0; j < 3; ++j) {
-                const int row = corner + (i * ny + j) * nz;
-                const float wij = wx[i] * wy[j];
+        for (int n = 0; n < 27; ++n) w[n] = wx[n / 9] * wy[n / 3 % 3] * wz[n % 3];
 """
+ROWS_AND_WEIGHTS = (
+    ROWS_OF_ONE
+    + """
+                    const V* wij = w + 9 * i + 3 * j;
+                    const float w0 = of_one(wij[0], l), w1 = of_one(wij[1], l), w2 = of_one(wij[2], l);
+"""
+)
 P2G = (
     PRELUDE
     + """
-    const float *M = &wp::index(mass, e, 0), *V = (const float*)&wp::index(v, e, 0);
+    const float *M = &wp::index(mass, e, 0), *VV = (const float*)&wp::index(v, e, 0);
     const float* AA = (const float*)&wp::index(A, e, 0);
     V4* G = (V4*)&wp::index(grid_m, e, 0);
 """
     + EACH
+    + WEIGHTS
+    + ONE_BY_ONE
     + """
-        const float m = M[p];
-        const V4 ax = read_column(AA + 9 * p) * dx, ay = read_column(AA + 9 * p + 1) * dx;
-        const V4 az = read_column(AA + 9 * p + 2) * dx;
-        V4 af = ax * f[0];
-        af += ay * f[1];
-        af += az * f[2];
-        V4 q0 = m * read3(V + 3 * p) - af;
-        q0[3] = m;
+            const float fq[3] = {of_one(f[0], l), of_one(f[1], l), of_one(f[2], l)};
+            const float m = M[q];
+            const V4 ax = read_column(AA + 9 * q) * dx, ay = read_column(AA + 9 * q + 1) * dx;
+            const V4 az = read_column(AA + 9 * q + 2) * dx;
+            V4 af = ax * fq[0];
+            af += ay * fq[1];
+            af += az * fq[2];
+            V4 m0 = m * read3(VV + 3 * q) - af;
+            m0[3] = m;
 """
-    + ROWS
+    + ROWS_AND_WEIGHTS
     + """
-                const V4 q = q0 + (float)i * ax + (float)j * ay;
-                G[row] += (wij * wz[0]) * q;
-                G[row + 1] += (wij * wz[1]) * (q + az);
-                G[row + 2] += (wij * wz[2]) * (q + 2.0f * az);
-            }
+                    const V4 mij = m0 + (float)i * ax + (float)j * ay;
+                    G[row] += w0 * mij;
+                    G[row + 1] += w1 * (mij + az);
+                    G[row + 2] += w2 * (mij + 2.0f * az);
+                }
+        }
     }
 """
 )
@@ -115,36 +69,38 @@ G2P = (
     const V4* G = (const V4*)&wp::index(grid_v, e, 0);
     float *XN = (float*)&wp::index(x_new, e, 0), *VN = (float*)&wp::index(v_new, e, 0);
     float* CN = (float*)&wp::index(C_new, e, 0);
-    bool left = false;
+    Int left = {};
+    const float c = 4.0f * inv_dx;
 """
     + EACH
+    + WEIGHTS
+    + ONE_BY_ONE
     + """
-        V4 s0 = {0.0f, 0.0f, 0.0f, 0.0f}, sx = s0, sy = s0, sz = s0;
+            const float fq[3] = {of_one(f[0], l), of_one(f[1], l), of_one(f[2], l)};
+            V4 s0 = {0.0f, 0.0f, 0.0f, 0.0f}, sx = s0, sy = s0, sz = s0;
 """
-    + ROWS
+    + ROWS_AND_WEIGHTS
     + """
-                const V4 r1 = (wij * wz[1]) * G[row + 1], r2 = (wij * wz[2]) * G[row + 2];
-                const V4 r = (wij * wz[0]) * G[row] + r1 + r2;
-                s0 += r;
-                if (i) sx += (float)i * r;
-                if (j) sy += (float)j * r;
-                sz += r1 + 2.0f * r2;
-            }
-        const float c = 4.0f * inv_dx;
-        write3(VN + 3 * p, s0);
-        write_columns(CN + 9 * p, c * (sx - f[0] * s0), c * (sy - f[1] * s0), c * (sz - f[2] * s0));
-        for (int a = 0; a < 3; ++a) {
-            XN[3 * p + a] = X[3 * p + a] + dt * s0[a];
-            left |= f[a] < 0.49f || f[a] > 1.51f;
+                    const V4 r1 = w1 * G[row + 1], r2 = w2 * G[row + 2];
+                    const V4 r = w0 * G[row] + r1 + r2;
+                    s0 += r;
+                    if (i) sx += (float)i * r;
+                    if (j) sy += (float)j * r;
+                    sz += r1 + 2.0f * r2;
+                }
+            write3(VN + 3 * q, s0);
+            write3(XN + 3 * q, read3(X + 3 * q) + dt * s0);
+            write_columns(CN + 9 * q, c * (sx - fq[0] * s0), c * (sy - fq[1] * s0), c * (sz - fq[2] * s0));
         }
+        for (int a = 0; a < 3; ++a) left |= (f[a] < 0.49f) | (f[a] > 1.51f);
     }
-    if (left) wp::index(left_box, e) = 1;
+    if (__builtin_reduce_or(left)) wp::index(left_box, e) = 1;
 """
 )
 ADJOINT_P2G = (
     PRELUDE
     + """
-    const float *M = &wp::index(mass, e, 0), *V = (const float*)&wp::index(v, e, 0);
+    const float *M = &wp::index(mass, e, 0), *VV = (const float*)&wp::index(v, e, 0);
     const float* AA = (const float*)&wp::index(A, e, 0);
     const V4* G = (const V4*)&wp::index(grid_m_adjoint, e, 0);
     float *XA = (float*)&wp::index(x_adjoint, e, 0), *VA = (float*)&wp::index(v_adjoint, e, 0);
@@ -153,40 +109,57 @@ ADJOINT_P2G = (
     + EACH
     + SLOPES
     + """
-        const float m = M[p];
-        const V4 ax = read_column(AA + 9 * p) * dx, ay = read_column(AA + 9 * p + 1) * dx;
-        const V4 az = read_column(AA + 9 * p + 2) * dx;
-        V4 af = ax * f[0];
-        af += ay * f[1];
-        af += az * f[2];
-        V4 q0 = m * read3(V + 3 * p) - af;
-        q0[3] = m;
-        V4 h0 = {0.0f, 0.0f, 0.0f, 0.0f}, hx = h0, hy = h0, hz = h0, slope = h0;
+        const V m = read(M, 1, at);
+        V a9[9], v3[3], x_adjoints[3], ax[3], ay[3], az[3], m0[3];
+        read_all(AA, 9, at, a9);
+        read_all(VV, 3, at, v3);
+        read_all(XA, 3, at, x_adjoints);
+        for (int a = 0; a < 3; ++a) {
+            ax[a] = a9[3 * a] * dx;
+            ay[a] = a9[3 * a + 1] * dx;
+            az[a] = a9[3 * a + 2] * dx;
+            V af = ax[a] * f[0];
+            af += ay[a] * f[1];
+            af += az[a] * f[2];
+            m0[a] = m * v3[a] - af;
+        }
+        V h0[3] = {}, hx[3] = {}, hy[3] = {}, hz[3] = {}, slope[3] = {};
 """
     + ROWS
     + """
-                const V4 q = q0 + (float)i * ax + (float)j * ay;
-                const V4 along = {dwx[i] * wy[j], wx[i] * dwy[j], wij, 0.0f};
-                V4 r = {0.0f, 0.0f, 0.0f, 0.0f};
+                const V along[3] = {dwx[i] * wy[j], wx[i] * dwy[j], wij};
+                V mij[3], r[3] = {};
+                for (int a = 0; a < 3; ++a) mij[a] = m0[a] + (float)i * ax[a] + (float)j * ay[a];
                 #pragma clang loop unroll(full)
                 for (int k = 0; k < 3; ++k) {
-                    const V4 h = G[row + k], t = h * (k ? q + (float)k * az : q);
-                    const float sigma = t[0] + t[1] + t[2] + t[3];
-                    const V4 wh = (wij * wz[k]) * h;
-                    r += wh;
-                    if (k) hz += (float)k * wh;
-                    slope += sigma * (along * V4{wz[k], wz[k], dwz[k], 0.0f});
+                    V h[4], t[3];
+                    gather(G, corner, row + k, h);
+                    const V w = wij * wz[k];
+                    for (int a = 0; a < 3; ++a) {
+                        t[a] = h[a] * (k ? mij[a] + (float)k * az[a] : mij[a]);
+                        const V wh = w * h[a];
+                        r[a] += wh;
+                        if (k) hz[a] += (float)k * wh;
+                    }
+                    const V sigma = t[0] + t[1] + t[2] + h[3] * m;
+                    for (int a = 0; a < 3; ++a) slope[a] += sigma * (along[a] * (a == 2 ? dwz[k] : wz[k]));
                 }
-                h0 += r;
-                if (i) hx += (float)i * r;
-                if (j) hy += (float)j * r;
+                for (int a = 0; a < 3; ++a) {
+                    h0[a] += r[a];
+                    if (i) hx[a] += (float)i * r[a];
+                    if (j) hy[a] += (float)j * r[a];
+                }
             }
-        write3(VA + 3 * p, m * h0);
-        write_columns(AAA + 9 * p, dx * (hx - f[0] * h0), dx * (hy - f[1] * h0), dx * (hz - f[2] * h0));
-        V4 Ah = read3(AA + 9 * p) * h0[0];
-        Ah += read3(AA + 9 * p + 3) * h0[1];
-        Ah += read3(AA + 9 * p + 6) * h0[2];
-        write3(XA + 3 * p, read3(XA + 3 * p) + inv_dx * slope - Ah);
+        for (int a = 0; a < 3; ++a) {
+            write(VA + a, 3, p, some, m * h0[a]);
+            write(AAA + 3 * a, 9, p, some, dx * (hx[a] - f[0] * h0[a]));
+            write(AAA + 3 * a + 1, 9, p, some, dx * (hy[a] - f[1] * h0[a]));
+            write(AAA + 3 * a + 2, 9, p, some, dx * (hz[a] - f[2] * h0[a]));
+            V Ah = a9[a] * h0[0];
+            Ah += a9[3 + a] * h0[1];
+            Ah += a9[6 + a] * h0[2];
+            write(XA + a, 3, p, some, x_adjoints[a] + inv_dx * slope[a] - Ah);
+        }
     }
 """
 )
@@ -199,37 +172,61 @@ ADJOINT_G2P = (
     const float* VN = (const float*)&wp::index(v_new_adjoint, e, 0);
     const float* CN = (const float*)&wp::index(C_new_adjoint, e, 0);
     float* XA = (float*)&wp::index(x_adjoint, e, 0);
+    const float c = 4.0f * inv_dx;
 """
     + EACH
     + SLOPES
     + """
-        const float c = 4.0f * inv_dx;
-        const V4 cx = c * read_column(CN + 9 * p), cy = c * read_column(CN + 9 * p + 1);
-        const V4 cz = c * read_column(CN + 9 * p + 2);
-        V4 cf = cx * f[0];
-        cf += cy * f[1];
-        cf += cz * f[2];
-        const V4 q0 = read3(VN + 3 * p) + dt * read3(XN + 3 * p) - cf;
-        V4 s0 = {0.0f, 0.0f, 0.0f, 0.0f}, slope = s0;
+        V c9[9], xn[3], vn[3], cx[3], cy[3], cz[3], q0[3];
+        read_all(CN, 9, at, c9);
+        read_all(XN, 3, at, xn);
+        read_all(VN, 3, at, vn);
+        for (int a = 0; a < 9; ++a) c9[a] = c * c9[a];
+        for (int a = 0; a < 3; ++a) {
+            cx[a] = c9[3 * a];
+            cy[a] = c9[3 * a + 1];
+            cz[a] = c9[3 * a + 2];
+            V cf = cx[a] * f[0];
+            cf += cy[a] * f[1];
+            cf += cz[a] * f[2];
+            q0[a] = vn[a] + dt * xn[a] - cf;
+        }
+        V s0[3] = {}, slope[3] = {};
+        V given[27][4];
 """
     + ROWS
     + """
-                const V4 qij = q0 + (float)i * cx + (float)j * cy;
-                const V4 along = {dwx[i] * wy[j], wx[i] * dwy[j], wij, 0.0f};
+                const V along[3] = {dwx[i] * wy[j], wx[i] * dwy[j], wij};
+                V qij[3];
+                for (int a = 0; a < 3; ++a) qij[a] = q0[a] + (float)i * cx[a] + (float)j * cy[a];
                 #pragma clang loop unroll(full)
                 for (int k = 0; k < 3; ++k) {
-                    const float w = wij * wz[k];
-                    const V4 v = G[row + k], q = k ? qij + (float)k * cz : qij, t = q * v;
-                    const float sigma = t[0] + t[1] + t[2];
-                    s0 += w * v;
-                    slope += sigma * (along * V4{wz[k], wz[k], dwz[k], 0.0f});
-                    GA[row + k] += w * q;
+                    V v[4], t[3], q[3];
+                    const V w = wij * wz[k];
+                    gather(G, corner, row + k, v);
+                    for (int a = 0; a < 3; ++a) {
+                        q[a] = k ? qij[a] + (float)k * cz[a] : qij[a];
+                        t[a] = q[a] * v[a];
+                        s0[a] += w * v[a];
+                    }
+                    deal(w * q[0], w * q[1], w * q[2], given[9 * i + 3 * j + k]);
+                    const V sigma = t[0] + t[1] + t[2];
+                    for (int a = 0; a < 3; ++a) slope[a] += sigma * (along[a] * (a == 2 ? dwz[k] : wz[k]));
                 }
             }
-        V4 Cs = c * read3(CN + 9 * p) * s0[0];
-        Cs += c * read3(CN + 9 * p + 3) * s0[1];
-        Cs += c * read3(CN + 9 * p + 6) * s0[2];
-        write3(XA + 3 * p, read3(XN + 3 * p) + inv_dx * (slope - Cs));
+        for (int a = 0; a < 3; ++a) {
+            V Cs = c9[a] * s0[0];
+            Cs += c9[3 + a] * s0[1];
+            Cs += c9[6 + a] * s0[2];
+            write(XA + a, 3, p, some, xn[a] + inv_dx * (slope[a] - Cs));
+        }
+"""
+    + ONE_BY_ONE
+    + ROWS_OF_ONE
+    + """
+                    for (int k = 0; k < 3; ++k) GA[row + k] += dealt(given[9 * i + 3 * j + k], l);
+                }
+        }
     }
 """
 )
@@ -242,122 +239,11 @@ def transfers_on_cpu(name: str) -> SimpleNamespace:
 
 
 @cache
-@no_type_check
 def transfers_in_rows() -> SimpleNamespace:
     """Return the kernels `p2g, g2p, adjoint_p2g, adjoint_g2p`, each of whose threads has the row of an environment."""
-    types, module = precision("float32"), "gradscape.transfers.rows"
-    real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
-    Lattice = lattice("float32")
-
-    @wp.func_native(P2G)
-    def scatter(
-        e: int,
-        grid: Lattice,
-        mass: wp.array2d[real],
-        x: wp.array2d[vec3],
-        v: wp.array2d[vec3],
-        A: wp.array2d[mat33],
-        grid_m: wp.array2d[vec4],
-    ): ...
-
-    @wp.func_native(G2P)
-    def gather(
-        e: int,
-        grid: Lattice,
-        dt: real,
-        x: wp.array2d[vec3],
-        grid_v: wp.array2d[vec4],
-        x_new: wp.array2d[vec3],
-        v_new: wp.array2d[vec3],
-        C_new: wp.array2d[mat33],
-        left_box: wp.array[wp.int32],
-    ): ...
-
-    @wp.func_native(ADJOINT_P2G)
-    def gather_adjoints(
-        e: int,
-        grid: Lattice,
-        mass: wp.array2d[real],
-        x: wp.array2d[vec3],
-        v: wp.array2d[vec3],
-        A: wp.array2d[mat33],
-        grid_m_adjoint: wp.array2d[vec4],
-        x_adjoint: wp.array2d[vec3],
-        v_adjoint: wp.array2d[vec3],
-        A_adjoint: wp.array2d[mat33],
-    ): ...
-
-    @wp.func_native(ADJOINT_G2P)
-    def scatter_adjoints(
-        e: int,
-        grid: Lattice,
-        dt: real,
-        x: wp.array2d[vec3],
-        grid_v: wp.array2d[vec4],
-        x_new_adjoint: wp.array2d[vec3],
-        v_new_adjoint: wp.array2d[vec3],
-        C_new_adjoint: wp.array2d[mat33],
-        grid_v_adjoint: wp.array2d[vec4],
-        x_adjoint: wp.array2d[vec3],
-    ): ...
-
-    @wp.kernel(module=module, enable_backward=False)
-    def p2g(
-        lattice: Lattice,
-        mass: wp.array2d[real],
-        x: wp.array2d[vec3],
-        v: wp.array2d[vec3],
-        A: wp.array2d[mat33],
-        grid_m: wp.array2d[vec4],
-    ):
-        e, _ = wp.tid()
-        scatter(e, lattice, mass, x, v, A, grid_m)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def g2p(
-        lattice: Lattice,
-        dt: real,
-        x: wp.array2d[vec3],
-        grid_v: wp.array2d[vec4],
-        x_new: wp.array2d[vec3],
-        v_new: wp.array2d[vec3],
-        C_new: wp.array2d[mat33],
-        left_box: wp.array[wp.int32],
-    ):
-        e, _ = wp.tid()
-        gather(e, lattice, dt, x, grid_v, x_new, v_new, C_new, left_box)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def adjoint_p2g(
-        lattice: Lattice,
-        mass: wp.array2d[real],
-        x: wp.array2d[vec3],
-        v: wp.array2d[vec3],
-        A: wp.array2d[mat33],
-        adj_grid_m: wp.array2d[vec4],
-        adj_x: wp.array2d[vec3],
-        adj_v: wp.array2d[vec3],
-        adj_A: wp.array2d[mat33],
-    ):
-        e, _ = wp.tid()
-        gather_adjoints(e, lattice, mass, x, v, A, adj_grid_m, adj_x, adj_v, adj_A)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def adjoint_g2p(
-        lattice: Lattice,
-        dt: real,
-        x: wp.array2d[vec3],
-        grid_v: wp.array2d[vec4],
-        adj_x_new: wp.array2d[vec3],
-        adj_v_new: wp.array2d[vec3],
-        adj_C_new: wp.array2d[mat33],
-        adj_grid_v: wp.array2d[vec4],
-        adj_x: wp.array2d[vec3],
-    ):
-        e, _ = wp.tid()
-        scatter_adjoints(e, lattice, dt, x, grid_v, adj_x_new, adj_v_new, adj_C_new, adj_grid_v, adj_x)
-
-    kernels = {"p2g": p2g, "g2p": g2p, "adjoint_p2g": adjoint_p2g, "adjoint_g2p": adjoint_g2p}
-    for key, kernel in kernels.items():
-        take_rows(kernel, getattr(transfers("float32"), key), "x")
-    return SimpleNamespace(**kernels)
+    plain = transfers("float32")
+    texts = {"p2g": P2G, "g2p": G2P, "adjoint_p2g": ADJOINT_P2G, "adjoint_g2p": ADJOINT_G2P}
+    module = "gradscape.transfers.rows"
+    return SimpleNamespace(
+        **{key: kernel_in_rows(getattr(plain, key), text, "x", module) for key, text in texts.items()}
+    )

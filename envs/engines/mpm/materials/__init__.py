@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ...runtime import precision
-from . import elastic, fluid, plasticine, plasticine_cpu
+from . import elastic, fluid, fluid_cpu, plasticine, plasticine_cpu
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,9 @@ class Fluid:
         return np.asarray(np.exp(-pressure / self.bulk))  # K log J = -pressure
 
     def kernels(self, name: str, *, rows: bool = False) -> tuple[Any, Any]:
-        """Return (update, adjoint) for one precision; there are none whose threads have rows."""
-        update, adjoint = fluid.kernels(name)
+        """Return (update, adjoint) for one precision; in float32 there are some whose threads have `rows`."""
+        in_rows = rows and name == "float32"
+        update, adjoint = fluid_cpu.kernels_in_rows() if in_rows else fluid.kernels(name)
         return update, adjoint
 
     def constants(self) -> tuple[float, ...]:

@@ -1,14 +1,14 @@
 """Singular value decomposition, eight matrices at a time on a CPU in float32: C++ with the bits of `decomposition`."""
 
+from ..eight_cpu import EIGHT
 from .decomposition import ROUND_OFF, SWEEPS, TINY
 
-# V has a number of each of eight particles; matrices are V[9] in rows, as they are stored, U and W the rotations of a
+# Matrices are V[9] in rows, as they are stored, U and W the rotations of a
 # decomposition. Expressions are those of `decomposition` and of Warp's vectors and matrices, in their order.
 DECOMPOSE = (
-    f"""
-    typedef float V __attribute__((vector_size(32)));
+    EIGHT
+    + f"""
     struct Vec {{ V x, y, z; }};
-    const int lanes = 8;
     const float round_off = {ROUND_OFF["float32"]}f, tiny = {TINY}f;
     const int sweeps = {SWEEPS};
 """
@@ -51,16 +51,6 @@ DECOMPOSE = (
     auto stretch = [&](const V* a, Vec f, V* out) {
         const V zero = {}, d[9] = {f.x, zero, zero, zero, f.y, zero, zero, zero, f.z};
         multiply(a, d, out);
-    };
-    auto read = [&](const float* a, int size, int first, int count, V* out) {
-        for (int l = 0; l < lanes; ++l) {
-            const float* one = a + size * (first + (l < count ? l : count - 1));
-            for (int k = 0; k < size; ++k) out[k][l] = one[k];
-        }
-    };
-    auto write = [&](float* a, int size, int first, int count, const V* values) {
-        for (int l = 0; l < count; ++l)
-            for (int k = 0; k < size; ++k) a[size * (first + l) + k] = values[k][l];
     };
     auto rotation = [&](V app, V aqq, V apq, V& c, V& s, V& t) {
         const V twice = 2.0f * apq, gap = aqq - app;

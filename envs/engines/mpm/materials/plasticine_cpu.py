@@ -6,11 +6,10 @@ those of the C library, one by one, since others would round otherwise.
 """
 
 from functools import cache
-from typing import Any, no_type_check
+from typing import Any
 
-import warp as wp
-
-from ...runtime import precision, take_rows
+from ...rows import kernel_in_rows
+from ..eight_cpu import GROUPS
 from .decomposition_cpu import DECOMPOSE
 from .plasticine import ROUNDED, SMALLEST, kernels
 
@@ -41,13 +40,14 @@ UPDATE = (
     PRELUDE
     + """
     float *FN = (float*)&wp::index(F_new, e, 0), *AA = (float*)&wp::index(A, e, first);
-    for (int p = 0; p < count; p += lanes) {
-        const int some = count - p < lanes ? count - p : lanes;
+"""
+    + GROUPS
+    + """
         V f9[9], c9[9], moved[9], trial[9], U[9], W[9], m, v;
-        read(FF, 9, p, some, f9);
-        read(CC, 9, p, some, c9);
-        read(M, 1, p, some, &m);
-        read(VOLUME, 1, p, some, &v);
+        read_all(FF, 9, at, f9);
+        read_all(CC, 9, at, c9);
+        read_all(M, 1, at, &m);
+        read_all(VOLUME, 1, at, &v);
         for (int k = 0; k < 9; ++k) moved[k] = c9[k] * dt;
         multiply(moved, f9, trial);
         for (int k = 0; k < 9; ++k) trial[k] = f9[k] + trial[k];
@@ -79,13 +79,13 @@ UPDATE = (
         stretch(U, f, stretched);
         transpose(W, turned);
         multiply(stretched, turned, out);
-        write(FN, 9, p, some, out);
+        write_all(FN, 9, p, some, out);
         stretch(U, t, stretched);
         transpose(U, turned);
         multiply(stretched, turned, out);
         const V weight = scale * v;
         for (int k = 0; k < 9; ++k) out[k] = out[k] * weight + c9[k] * m;
-        write(AA, 9, p, some, out);
+        write_all(AA, 9, p, some, out);
     }
 """
 )
@@ -106,15 +106,16 @@ ADJOINT = (
         if (si <= least && sj <= least) return 0.0f;
         return (ei - ej) / (si - sj);
     };
-    for (int p = 0; p < count; p += lanes) {
-        const int some = count - p < lanes ? count - p : lanes;
+"""
+    + GROUPS
+    + """
         V f9[9], c9[9], advance[9], trial[9], U[9], W[9], fa[9], aa[9], m, v;
-        read(FF, 9, p, some, f9);
-        read(CC, 9, p, some, c9);
-        read(FA, 9, p, some, fa);
-        read(AA, 9, p, some, aa);
-        read(M, 1, p, some, &m);
-        read(VOLUME, 1, p, some, &v);
+        read_all(FF, 9, at, f9);
+        read_all(CC, 9, at, c9);
+        read_all(FA, 9, at, fa);
+        read_all(AA, 9, at, aa);
+        read_all(M, 1, at, &m);
+        read_all(VOLUME, 1, at, &v);
         for (int k = 0; k < 9; ++k) advance[k] = (k % 4 ? 0.0f : 1.0f) + c9[k] * dt;
         multiply(advance, f9, trial);
         Vec s;
@@ -185,98 +186,19 @@ ADJOINT = (
         multiply(part, Wt, adj_trial);
         transpose(advance, other);
         multiply(other, adj_trial, out);
-        write(FO, 9, p, some, out);
+        write_all(FO, 9, p, some, out);
         transpose(f9, other);
         for (int k = 0; k < 9; ++k) part[k] = adj_trial[k] * dt;
         multiply(part, other, out);
         for (int k = 0; k < 9; ++k) out[k] = aa[k] * m + out[k];
-        write(CO, 9, p, some, out);
+        write_all(CO, 9, p, some, out);
     }
 """
 )
 
 
 @cache
-@no_type_check
 def kernels_in_rows() -> tuple[Any, Any]:
     """Return (update, adjoint), each of whose threads has the row of an environment."""
-    types, module = precision("float32"), "gradscape.plasticine.rows"
-    real, mat33 = types.real, types.mat33
-
-    @wp.func_native(UPDATE)
-    def update_row(
-        e: int,
-        first: int,
-        dt: real,
-        scale: real,
-        mu: real,
-        lam: real,
-        kappa: real,
-        mass: wp.array2d[real],
-        volume: wp.array2d[real],
-        F: wp.array2d[mat33],
-        C: wp.array2d[mat33],
-        F_new: wp.array2d[mat33],
-        A: wp.array2d[mat33],
-    ): ...
-
-    @wp.func_native(ADJOINT)
-    def adjoint_row(
-        e: int,
-        first: int,
-        dt: real,
-        scale: real,
-        mu: real,
-        lam: real,
-        kappa: real,
-        mass: wp.array2d[real],
-        volume: wp.array2d[real],
-        F: wp.array2d[mat33],
-        C: wp.array2d[mat33],
-        F_new_adjoint: wp.array2d[mat33],
-        A_adjoint: wp.array2d[mat33],
-        F_adjoint: wp.array2d[mat33],
-        C_adjoint: wp.array2d[mat33],
-    ): ...
-
-    @wp.kernel(module=module, enable_backward=False)
-    def update(
-        first: int,
-        dt: real,
-        scale: real,
-        mu: real,
-        lam: real,
-        kappa: real,
-        mass: wp.array2d[real],
-        volume: wp.array2d[real],
-        F: wp.array2d[mat33],
-        C: wp.array2d[mat33],
-        F_new: wp.array2d[mat33],
-        A: wp.array2d[mat33],
-    ):
-        e, _ = wp.tid()
-        update_row(e, first, dt, scale, mu, lam, kappa, mass, volume, F, C, F_new, A)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def adjoint(
-        first: int,
-        dt: real,
-        scale: real,
-        mu: real,
-        lam: real,
-        kappa: real,
-        mass: wp.array2d[real],
-        volume: wp.array2d[real],
-        F: wp.array2d[mat33],
-        C: wp.array2d[mat33],
-        adj_F_new: wp.array2d[mat33],
-        adj_A: wp.array2d[mat33],
-        adj_F: wp.array2d[mat33],
-        adj_C: wp.array2d[mat33],
-    ):
-        e, _ = wp.tid()
-        adjoint_row(e, first, dt, scale, mu, lam, kappa, mass, volume, F, C, adj_F_new, adj_A, adj_F, adj_C)
-
-    for kernel, plain in zip((update, adjoint), kernels("float32"), strict=True):
-        take_rows(kernel, plain, "F")
-    return update, adjoint
+    (update, adjoint), module = kernels("float32"), "gradscape.plasticine.rows"
+    return kernel_in_rows(update, UPDATE, "F", module), kernel_in_rows(adjoint, ADJOINT, "F", module)
