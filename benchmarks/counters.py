@@ -3,9 +3,9 @@
     python -m benchmarks.counters fluid [--batch 1] [--set horizon=0.08] [--launches 300]
 
 Needs NVIDIA's Nsight Compute (`ncu`) and the right to read counters. It profiles the launches around the turn from
-forward to backward of episodes at standard, in batches as large as the scene likes unless told. A kernel is run again for each of
-its counters, and what it wrote put back, which takes minutes where a scene fills the memory: shorten it. `landscape
-bench SCENE --roofline` has the times of whole episodes.
+forward to backward of episodes at standard, in batches as large as the scene likes unless told. A kernel is run again
+for each of its counters, and what it wrote put back, which takes minutes where a scene fills the memory: shorten it.
+`landscape bench SCENE --roofline` has the times of whole episodes.
 """
 
 from __future__ import annotations

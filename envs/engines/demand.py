@@ -132,11 +132,15 @@ def _read_adjoint(adj: Any, functions: Mapping[str, Any]) -> _Code:
 
 
 def _read_function(function: Any, functions: Mapping[str, Any]) -> _Code:
-    """Read a function that a kernel calls; one in C++ reads its arrays, and adds to them where it returns nothing."""
+    """Read a function that a kernel calls.
+
+    One in C++ reads its arrays, and adds to them where it returns nothing, or sets them where its name says `write`.
+    """
     if function.native_snippet is None:
         return _read_adjoint(function.adj, functions)
-    arrays = frozenset(one.label for one in function.adj.args if wp.types.is_array(one.type))
-    return _Code(arrays, frozenset() if "return" in function.native_snippet else arrays, 0.0, walks=False)
+    arrays, none = frozenset(one.label for one in function.adj.args if wp.types.is_array(one.type)), frozenset[str]()
+    reads = none if function.key.rpartition("__")[2].startswith("write") else arrays
+    return _Code(reads, none if "return" in function.native_snippet else arrays, 0.0, walks=False)
 
 
 def _lines(adj: Any) -> Iterator[str]:

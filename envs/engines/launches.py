@@ -92,9 +92,7 @@ class Launches:
         self.seen: set[Hashable] = set()
         self.graphs: dict[Hashable, Any] = {}
 
-    def run(
-        self, key: Hashable, extent: Hashable, work: Callable[[], None], *, place: Any = None, small: bool
-    ) -> None:
+    def run(self, key: Hashable, extent: Hashable, work: Callable[[], None], *, place: Any = None, small: bool) -> None:
         """Do `work` over an extent, and say to launches that ask for it by their first argument which `place` that is.
 
         Where work is `small`, a GPU records it when it comes again over the same extent.

@@ -18,6 +18,7 @@ import warp as wp
 from ..launches import BLOCK
 from ..runtime import precision
 from .cells import SEGMENT, segments
+from .layout import in_precision, layout
 from .model import Box
 from .stencil import lattice, stencil
 
@@ -40,7 +41,6 @@ class Team:
 
 TEAMS = {True: Team(32, 3, 9), False: Team(1, 1, 1)}  # by whether it is a GPU: on a CPU a thread has a segment
 
-FOUR = "struct alignas(16) Four { REAL a, b, c, d; };"
 EMIT = """
         {
             *(Four *)&wp::index(parts, e, at + row * PLANES + now) = low;
@@ -169,10 +169,10 @@ ADD_UP = """
 
 def fill(code: str, name: str) -> str:
     """Put what a precision decides, and other constants, into C++."""
-    words = {"EMIT": EMIT, "FOUR": FOUR, "PLANES": PLANES, "PARTS": PARTS, "SEGMENT": SEGMENT, "REAL": f"wp::{name}"}
-    for word, value in {**words, "WARPS": BLOCK // 32}.items():
+    words = {"EMIT": EMIT, "PLANES": PLANES, "PARTS": PARTS, "SEGMENT": SEGMENT, "WARPS": BLOCK // 32}
+    for word, value in words.items():
         code = code.replace(word, str(value))
-    return code
+    return in_precision(code, name)
 
 
 @cache
@@ -267,6 +267,7 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
     take_segment, most = segment_taker(team), steps.most
     open_segment, walk, close_segment = steps.open, steps.walk, steps.close
     lanes, groups, size = team.lanes, team.groups, team.size
+    read_matrix, write_node = layout(name).read_matrix, layout(name).write_node
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def p2g(
@@ -298,7 +299,7 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
             base = base_node(s, lattice)
             f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
             m = mass[e, p]
-            a = A[e, p] * (real(1.0) / lattice.inv_dx)
+            a = read_matrix(A, e, p) * (real(1.0) / lattice.inv_dx)
             q = m * v[e, p] - a * f
             state = walk(parts, e, at, wp.min(size, count - i), base[2] % SEGMENT, f, m, q, a, state)
         close_segment(parts, e, at, span, state)
@@ -333,7 +334,7 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
             s = (x[e, p] - lattice.origin) * lattice.inv_dx
             base = base_node(s, lattice)
             f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
-            c = (real(4.0) * lattice.inv_dx) * adj_C_new[e, p]
+            c = (real(4.0) * lattice.inv_dx) * read_matrix(adj_C_new, e, p)
             q = adj_v_new[e, p] + dt * adj_x_new[e, p] - c * f
             state = walk(parts, e, at, wp.min(size, count - i), base[2] % SEGMENT, f, real(0.0), q, c, state)
         close_segment(parts, e, at, span, state)
@@ -341,6 +342,6 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def add_up(lattice: Lattice, spans: wp.array2d[wp.int32], parts: wp.array2d[vec4], grid: wp.array2d[vec4]):
         e, i = wp.tid()
-        grid[e, i] = add_up_node(lattice, spans, parts, e, i)
+        write_node(grid, e, i, add_up_node(lattice, spans, parts, e, i))
 
     return SimpleNamespace(p2g=p2g, adjoint_g2p=adjoint_g2p, add_up=add_up)

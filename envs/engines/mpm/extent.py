@@ -1,8 +1,8 @@
-"""Between which corners particles are, which decides on which nodes a control step runs: small enough to be read back."""
+"""Between which corners particles are, which decides on which nodes a control step runs."""
 
 from functools import cache
 from types import SimpleNamespace
-from typing import no_type_check
+from typing import Any, no_type_check
 
 import numpy as np
 import warp as wp
@@ -74,7 +74,7 @@ class Extent:
         size = allocator.capacity * self.shares
         self.low, self.high = (wp.zeros(size, dtype=types.vec3, device=device) for _ in range(2))
         self.found: wp.array = wp.zeros((lanes, 7), dtype=types.real, device=device)
-        self.event = None if device == "cpu" else wp.Event(device)
+        self.event: Any = None if device == "cpu" else wp.Event(device)
         self.host: wp.array = wp.zeros((lanes, 7), dtype=types.real, device="cpu", pinned=device != "cpu")
 
     def find(self, x: wp.array, left: wp.array, batch: int, *, small: bool) -> None:

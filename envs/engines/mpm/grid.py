@@ -7,10 +7,12 @@ import warp as wp
 
 from ..runtime import precision
 from .exact import LANES
+from .layout import READ_NODE, WRITE_NODE, in_precision
 from .stencil import lattice
 
-# A node is read once, so that its adjoint can be set, where Warp would add to it atomically.
-READ, ADJOINT_READ = "return wp::index(grid, e, i);", "wp::index(adj_grid, e, i) = adj_ret;"
+# A node is read once, so that its adjoint can be set, where Warp would add to it atomically; and it is set once.
+ADJOINT_READ = WRITE_NODE.replace("grid", "adj_grid").replace("value", "adj_ret")
+ADJOINT_WRITE = READ_NODE.replace("grid", "adj_grid").replace("return", "adj_value +=")
 
 
 @cache
@@ -21,8 +23,11 @@ def velocity_kernel(name: str, boundary_velocity: Any, Data: Any) -> Any:
     real, vec3, vec4 = types.real, types.vec3, types.vec4
     Lattice = lattice(name)
 
-    @wp.func_native(READ, adj_snippet=ADJOINT_READ)
+    @wp.func_native(in_precision(READ_NODE, name), adj_snippet=in_precision(ADJOINT_READ, name))
     def read(grid: wp.array2d[vec4], e: int, i: int) -> vec4: ...
+
+    @wp.func_native(in_precision(WRITE_NODE, name), adj_snippet=in_precision(ADJOINT_WRITE, name))
+    def write(grid: wp.array2d[vec4], e: int, i: int, value: vec4): ...
 
     @wp.kernel(module="unique")
     def velocity(
@@ -49,8 +54,8 @@ def velocity_kernel(name: str, boundary_velocity: Any, Data: Any) -> Any:
             p = lattice.origin + node * (real(1.0) / lattice.inv_dx)
             v = vec3(g[0], g[1], g[2]) / g[3] - vec3(real(0.0), dt * gravity, real(0.0))
             v = boundary_velocity(boundary, p, v, e, i % LANES, tools, sums, step, fraction, rate)
-            grid_v[e, i] = vec4(v[0], v[1], v[2], real(0.0))
+            write(grid_v, e, i, vec4(v[0], v[1], v[2], real(0.0)))
         else:
-            grid_v[e, i] = vec4()
+            write(grid_v, e, i, vec4())
 
     return velocity

@@ -15,6 +15,7 @@ import warp as wp
 
 from ..launches import Launches
 from ..runtime import load, precision, to_torch
+from .layout import layout
 from .model import Model, place_grid
 from .stencil import lattice
 
@@ -26,6 +27,7 @@ def sorting_kernels(name: str) -> SimpleNamespace:
     types = precision(name)
     real, vec3, mat33 = types.real, types.vec3, types.mat33
     Lattice, module = lattice(name), f"gradscape.order.{name}"
+    read_matrix, write_matrix = layout(name).read_matrix, layout(name).write_matrix
 
     @wp.kernel(module=module, enable_backward=False)
     def label(
@@ -72,7 +74,7 @@ def sorting_kernels(name: str) -> SimpleNamespace:
         volume[e, p] = old_volume[e, q]
         x[e, p] = old_x[e, q]
         v[e, p] = old_v[e, q]
-        C[e, p] = old_C[e, q]
+        write_matrix(C, e, p, read_matrix(old_C, e, q))
 
     @wp.kernel(module=module, enable_backward=False)
     def give(
@@ -88,23 +90,34 @@ def sorting_kernels(name: str) -> SimpleNamespace:
         q = place[e, p]
         old_x[e, q] = x[e, p]
         old_v[e, q] = v[e, p]
-        old_C[e, q] = C[e, p]
+        write_matrix(old_C, e, q, read_matrix(C, e, p))
 
-    states = {kind: _state_kernels(kind, f"{module}.{tail}") for tail, kind in (("number", real), ("matrix", mat33))}
+    @wp.func(module=module)
+    def read_number(values: wp.array2d[real], e: int, p: int) -> real:
+        return values[e, p]
+
+    @wp.func(module=module)
+    def write_number(values: wp.array2d[real], e: int, p: int, value: real):
+        values[e, p] = value
+
+    states = {
+        real: _state_kernels(real, f"{module}.number", read_number, write_number),
+        mat33: _state_kernels(mat33, f"{module}.matrix", read_matrix, write_matrix),
+    }
     return SimpleNamespace(label=label, take=take, give=give, states=states)
 
 
 @no_type_check
-def _state_kernels(kind: Any, module: str) -> tuple[Any, Any]:
+def _state_kernels(kind: Any, module: str, read: Any, write: Any) -> tuple[Any, Any]:
     @wp.kernel(module=module, enable_backward=False)
     def take_state(first: int, place: wp.array2d[wp.int32], before: wp.array2d[kind], after: wp.array2d[kind]):
         e, p = wp.tid()
-        after[e, p] = before[e, place[e, first + p] - first]
+        write(after, e, p, read(before, e, place[e, first + p] - first))
 
     @wp.kernel(module=module, enable_backward=False)
     def give_state(first: int, place: wp.array2d[wp.int32], after: wp.array2d[kind], before: wp.array2d[kind]):
         e, p = wp.tid()
-        before[e, place[e, first + p] - first] = after[e, p]
+        write(before, e, place[e, first + p] - first, read(after, e, p))
 
     return take_state, give_state
 

@@ -16,6 +16,7 @@ smoothed (`smoothing`).
 import threading
 import weakref
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from functools import partial
 from itertools import chain
 from typing import Any
@@ -31,6 +32,7 @@ from .exact import settle_kernel
 from .extent import Extent
 from .grid_cpu import velocity_on
 from .kernels import compile_all as compile_all
+from .layout import to_rows
 from .model import BOX_MARGIN, EMPTY, Box, Model, nodes_around
 from .order import Order, Sorter
 from .scatter import ByColumns, InPlace, Scatter, nodes
@@ -78,8 +80,8 @@ class Solver:
     """Run up to `capacity` environments of one model at once, and differentiate where their control steps end.
 
     Setting `stop` ends a run within a control step, with InterruptedError. Every sum has one order, which depends on
-    an environment's own particles only: on a GPU, or where `columns` says so, by columns of cells (`scatter`). Of a control
-    step in `pieces` one is kept, by default the largest that fits; no bit depends on their number.
+    an environment's own particles only: on a GPU, or where `columns` says so, by columns of cells (`scatter`). Of a
+    control step in `pieces` one is kept, by default the largest that fits; no bit depends on their number.
     """
 
     def __init__(
@@ -323,7 +325,7 @@ class Solver:
         first = self.checkpoints[0]
         to_torch(first.x)[:] = torch.from_numpy(np.concatenate([body.x for body in self.model.bodies]))
         for body, state in zip(self.model.bodies, first.S, strict=True):
-            to_torch(state)[:] = torch.from_numpy(body.material.initial(body.ratio))
+            to_torch(state)[:] = to_rows(torch.from_numpy(body.material.initial(body.ratio)), self.device)
 
 
 class _Adjoint:
@@ -411,6 +413,9 @@ class _Adjoint:
 
     def _adjoint_update(self, step: int, frame: Frame, batch: int) -> None:
         solver = self.solver
+        last = len(solver.materials) - 1
         for b, (_, adjoint) in enumerate(solver.materials):
             inputs = [*solver.material_inputs(b, step, frame), self.new.S[b], self.A, self.old.S[b], self.old.C]
-            solver.launch(adjoint, solver.size(b), batch, inputs)
+            with solver.launches.beside() if b < last else nullcontext():
+                solver.launch(adjoint, solver.size(b), batch, inputs)
+        solver.launches.join()

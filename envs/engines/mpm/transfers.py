@@ -15,6 +15,7 @@ from typing import no_type_check
 import warp as wp
 
 from ..runtime import precision
+from .layout import layout
 from .stencil import lattice, stencil
 
 
@@ -30,6 +31,8 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
     module = f"gradscape.transfers.{name}{'' if scattering else '.gathers'}"
     Lattice, spline = lattice(name), stencil(name)
     base_node, weights, weight_slopes = spline.base_node, spline.weights, spline.weight_slopes
+    lies = layout(name)
+    read_matrix, write_matrix, read_node = lies.read_matrix, lies.write_matrix, lies.read_node
     offset = wp.constant(vec3(0.0, 1.0, 2.0))  # real(i) on an unrolled index breaks the code generator in float64
 
     @wp.func(module=module)
@@ -62,7 +65,7 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
         corner = base - lattice.first
         wx, wy, wz = weights(f[0]), weights(f[1]), weights(f[2])
         m = mass[e, p]
-        a = A[e, p] * (real(1.0) / lattice.inv_dx)
+        a = read_matrix(A, e, p) * (real(1.0) / lattice.inv_dx)
         ax, ay, az = column(a, 0), column(a, 1), column(a, 2)
         q0 = m * v[e, p] - a * f
         for i in range(3):
@@ -97,7 +100,8 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
         dx_, dy_, dz_ = weight_slopes(f[0]), weight_slopes(f[1]), weight_slopes(f[2])
         m = mass[e, p]
         dx = real(1.0) / lattice.inv_dx
-        a = A[e, p] * dx
+        momentum = read_matrix(A, e, p)
+        a = momentum * dx
         ax, ay, az = column(a, 0), column(a, 1), column(a, 2)
         q0 = m * v[e, p] - a * f
         h0 = vec3()
@@ -114,7 +118,7 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
                 qij = q0 + offset[i] * ax + offset[j] * ay
                 rij = vec3()
                 for k in range(3):
-                    g = adj_grid_m[e, row + k]
+                    g = read_node(adj_grid_m, e, row + k)
                     h = head(g)
                     sigma = wp.dot(h, qij + offset[k] * az) + m * g[3]
                     wh = (wij * wz[k]) * h
@@ -125,8 +129,8 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
                 hx += offset[i] * rij
                 hy += offset[j] * rij
         adj_v[e, p] = m * h0
-        adj_A[e, p] = dx * wp.matrix_from_cols(hx - f[0] * h0, hy - f[1] * h0, hz - f[2] * h0)
-        adj_x[e, p] = adj_x[e, p] + lattice.inv_dx * slope - wp.transpose(A[e, p]) * h0
+        write_matrix(adj_A, e, p, dx * wp.matrix_from_cols(hx - f[0] * h0, hy - f[1] * h0, hz - f[2] * h0))
+        adj_x[e, p] = adj_x[e, p] + lattice.inv_dx * slope - wp.transpose(momentum) * h0
 
     @wp.kernel(module=module, enable_backward=False)
     def g2p(
@@ -153,7 +157,9 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
         for i in range(3):
             for j in range(3):
                 row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
-                g0, g1, g2 = head(grid_v[e, row]), head(grid_v[e, row + 1]), head(grid_v[e, row + 2])
+                g0 = head(read_node(grid_v, e, row))
+                g1 = head(read_node(grid_v, e, row + 1))
+                g2 = head(read_node(grid_v, e, row + 2))
                 wij = wx[i] * wy[j]
                 r1 = (wij * wz[1]) * g1
                 r2 = (wij * wz[2]) * g2
@@ -163,7 +169,8 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
                 sy += offset[j] * rij
                 sz += r1 + real(2.0) * r2
         v_new[e, p] = s0
-        C_new[e, p] = (real(4.0) * lattice.inv_dx) * wp.matrix_from_cols(sx - f[0] * s0, sy - f[1] * s0, sz - f[2] * s0)
+        C = wp.matrix_from_cols(sx - f[0] * s0, sy - f[1] * s0, sz - f[2] * s0)
+        write_matrix(C_new, e, p, (real(4.0) * lattice.inv_dx) * C)
         x_new[e, p] = x[e, p] + dt * s0
         if wp.min(wp.min(f[0], f[1]), f[2]) < real(0.49) or wp.max(wp.max(f[0], f[1]), f[2]) > real(1.51):
             left_box[e] = 1
@@ -188,7 +195,7 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
         corner = base - lattice.first
         wx, wy, wz = weights(f[0]), weights(f[1]), weights(f[2])
         dx_, dy_, dz_ = weight_slopes(f[0]), weight_slopes(f[1]), weight_slopes(f[2])
-        c = (real(4.0) * lattice.inv_dx) * adj_C_new[e, p]
+        c = (real(4.0) * lattice.inv_dx) * read_matrix(adj_C_new, e, p)
         cx, cy, cz = column(c, 0), column(c, 1), column(c, 2)
         q0 = adj_v_new[e, p] + dt * adj_x_new[e, p] - c * f
         slope = vec3()
@@ -201,7 +208,7 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
                 gy = wx[i] * dy_[j]
                 qij = q0 + offset[i] * cx + offset[j] * cy
                 for k in range(3):
-                    vi = head(grid_v[e, row + k])
+                    vi = head(read_node(grid_v, e, row + k))
                     w = wij * wz[k]
                     q = qij + offset[k] * cz
                     sigma = wp.dot(q, vi)

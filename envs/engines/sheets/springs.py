@@ -186,8 +186,8 @@ class Solver:
     def _step_back(self, step: int) -> None:
         moved = [self.x[step + 1], self.v[step + 1]]
         adjoints = [*self.adj_pose, self.adj_here, self.adj_pulled, self.adj_x, self.adj_v]
-        how = {"adj_inputs": [None, self.no_adjoint, None, *adjoints], "adjoint": True}
-        self._launch(self.touch, [*self._touch_inputs(step), *moved], **how)
+        adjoints = [None, self.no_adjoint, None, *adjoints]
+        self._launch(self.touch, [*self._touch_inputs(step), *moved], adj_inputs=adjoints, adjoint=True)
         for frame, by_vertex in zip((step, step + 1), self.adj_pose, strict=True):
             if by_vertex is not None:
                 self._launch(self.gather, [by_vertex, self.adj_parts], elements=self.adj_parts.shape[1])

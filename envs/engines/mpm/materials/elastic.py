@@ -6,6 +6,7 @@ from typing import Any, no_type_check
 import warp as wp
 
 from ...runtime import precision
+from ..layout import layout
 
 
 @cache
@@ -15,6 +16,7 @@ def kernels(name: str) -> tuple[Any, Any]:
     types = precision(name)
     real, mat33 = types.real, types.mat33
     module = f"gradscape.elastic.{name}"
+    read_matrix, write_matrix = layout(name).read_matrix, layout(name).write_matrix
 
     @wp.kernel(module=module, enable_backward=False)
     def update(
@@ -31,12 +33,12 @@ def kernels(name: str) -> tuple[Any, Any]:
         A: wp.array2d[mat33],
     ):
         e, p = wp.tid()
-        c = C[e, first + p]
-        f = F[e, p] + dt * c * F[e, p]
+        c, before = read_matrix(C, e, first + p), read_matrix(F, e, p)
+        f = before + dt * c * before
         identity = wp.identity(n=3, dtype=real)
         tau = mu * (f * wp.transpose(f) - identity) + lam * wp.log(wp.determinant(f)) * identity
-        F_new[e, p] = f
-        A[e, first + p] = scale * volume[e, first + p] * tau + mass[e, first + p] * c
+        write_matrix(F_new, e, p, f)
+        write_matrix(A, e, first + p, scale * volume[e, first + p] * tau + mass[e, first + p] * c)
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint(
@@ -56,11 +58,16 @@ def kernels(name: str) -> tuple[Any, Any]:
     ):
         e, p = wp.tid()
         identity = wp.identity(n=3, dtype=real)
-        advance = identity + dt * C[e, first + p]
-        f = advance * F[e, p]
-        g = (scale * volume[e, first + p]) * adj_A[e, first + p]  # the adjoint of tau
-        adj_f = adj_F_new[e, p] + mu * (g + wp.transpose(g)) * f + lam * wp.trace(g) * wp.transpose(wp.inverse(f))
-        adj_F[e, p] = wp.transpose(advance) * adj_f
-        adj_C[e, first + p] = mass[e, first + p] * adj_A[e, first + p] + dt * adj_f * wp.transpose(F[e, p])
+        advance = identity + dt * read_matrix(C, e, first + p)
+        before, adj_a = read_matrix(F, e, p), read_matrix(adj_A, e, first + p)
+        f = advance * before
+        g = (scale * volume[e, first + p]) * adj_a  # the adjoint of tau
+        adj_f = (
+            read_matrix(adj_F_new, e, p)
+            + mu * (g + wp.transpose(g)) * f
+            + lam * wp.trace(g) * wp.transpose(wp.inverse(f))
+        )
+        write_matrix(adj_F, e, p, wp.transpose(advance) * adj_f)
+        write_matrix(adj_C, e, first + p, mass[e, first + p] * adj_a + dt * adj_f * wp.transpose(before))
 
     return update, adjoint

@@ -6,6 +6,7 @@ from typing import Any, no_type_check
 import warp as wp
 
 from ...runtime import precision
+from ..layout import layout
 
 TORN = 1.04  # volume ratio at which a fluid tears
 
@@ -17,6 +18,7 @@ def kernels(name: str) -> tuple[Any, Any]:
     types = precision(name)
     real, mat33 = types.real, types.mat33
     module = f"gradscape.fluid.{name}"
+    read_matrix, write_matrix = layout(name).read_matrix, layout(name).write_matrix
 
     @wp.func(module=module)
     def shear(C: mat33) -> mat33:
@@ -37,11 +39,11 @@ def kernels(name: str) -> tuple[Any, Any]:
         A: wp.array2d[mat33],
     ):
         e, p = wp.tid()
-        c = C[e, first + p]
+        c = read_matrix(C, e, first + p)
         j = wp.min(wp.exp(dt * wp.trace(c)) * J[e, p], real(TORN))
         tau = bulk * wp.log(j) * wp.identity(n=3, dtype=real) + j * viscosity * shear(c)
         J_new[e, p] = j
-        A[e, first + p] = scale * volume[e, first + p] * tau + mass[e, first + p] * c
+        write_matrix(A, e, first + p, scale * volume[e, first + p] * tau + mass[e, first + p] * c)
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint(
@@ -60,15 +62,16 @@ def kernels(name: str) -> tuple[Any, Any]:
         adj_C: wp.array2d[mat33],
     ):
         e, p = wp.tid()
-        c = C[e, first + p]
+        c = read_matrix(C, e, first + p)
         growth = wp.exp(dt * wp.trace(c))
         j = wp.min(growth * J[e, p], real(TORN))
-        g = (scale * volume[e, first + p]) * adj_A[e, first + p]  # the adjoint of tau
+        adj_a = read_matrix(adj_A, e, first + p)
+        g = (scale * volume[e, first + p]) * adj_a  # the adjoint of tau
         adj_j = adj_J_new[e, p] + bulk * wp.trace(g) / j + viscosity * wp.ddot(g, shear(c))
         if growth * J[e, p] > real(TORN):
             adj_j = real(0.0)
         adj_J[e, p] = growth * adj_j
         dilation = dt * j * adj_j * wp.identity(n=3, dtype=real)
-        adj_C[e, first + p] = mass[e, first + p] * adj_A[e, first + p] + j * viscosity * shear(g) + dilation
+        write_matrix(adj_C, e, first + p, mass[e, first + p] * adj_a + j * viscosity * shear(g) + dilation)
 
     return update, adjoint

@@ -17,6 +17,7 @@ from typing import Any, no_type_check
 import warp as wp
 
 from ...runtime import precision
+from ..layout import layout
 from .decomposition import svd
 
 SMALLEST = 0.05  # singular values below count as this; what is pressed flatter has lost its shape
@@ -31,6 +32,7 @@ def kernels(name: str) -> tuple[Any, Any]:
     real, vec3, mat33 = types.real, types.vec3, types.mat33
     module = f"gradscape.plasticine.{name}"
     decompose = svd(name)
+    read_matrix, write_matrix = layout(name).read_matrix, layout(name).write_matrix
     one = wp.constant(vec3(1.0, 1.0, 1.0))
     tiny = wp.constant(real(1e-12))
 
@@ -108,14 +110,15 @@ def kernels(name: str) -> tuple[Any, Any]:
         A: wp.array2d[mat33],
     ):
         e, p = wp.tid()
-        c = C[e, first + p]
-        trial = F[e, p] + dt * c * F[e, p]
+        c, before = read_matrix(C, e, first + p), read_matrix(F, e, p)
+        trial = before + dt * c * before
         U, s, V = decompose(trial)
         f = map_to_yield(s, kappa)
         J = f[0] * f[1] * f[2]
         t = real(2.0) * mu * wp.cw_mul(f, f - one) + lam * J * (J - real(1.0)) * one
-        F_new[e, p] = U * wp.diag(f) * wp.transpose(V)
-        A[e, first + p] = scale * volume[e, first + p] * (U * wp.diag(t) * wp.transpose(U)) + mass[e, first + p] * c
+        write_matrix(F_new, e, p, U * wp.diag(f) * wp.transpose(V))
+        stress = U * wp.diag(t) * wp.transpose(U)
+        write_matrix(A, e, first + p, scale * volume[e, first + p] * stress + mass[e, first + p] * c)
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint(
@@ -135,8 +138,9 @@ def kernels(name: str) -> tuple[Any, Any]:
         adj_C: wp.array2d[mat33],
     ):
         n, p = wp.tid()
-        advance = wp.identity(n=3, dtype=real) + dt * C[n, first + p]
-        U, s, V = decompose(advance * F[n, p])
+        advance = wp.identity(n=3, dtype=real) + dt * read_matrix(C, n, first + p)
+        before, adj_a = read_matrix(F, n, p), read_matrix(adj_A, n, first + p)
+        U, s, V = decompose(advance * before)
         e = log_strain(s)
         d = e - mean(e)
         length = size(d)
@@ -152,8 +156,8 @@ def kernels(name: str) -> tuple[Any, Any]:
             a12 = c * shrink(k[1], k[2]) * slope(s[1], s[2], e[1], e[2])
             a = vec3(a01, a02, a12)
         J = f[0] * f[1] * f[2]
-        G = wp.transpose(U) * adj_F_new[n, p] * V
-        T = (scale * volume[n, first + p]) * (wp.transpose(U) * adj_A[n, first + p] * U)
+        G = wp.transpose(U) * read_matrix(adj_F_new, n, p) * V
+        T = (scale * volume[n, first + p]) * (wp.transpose(U) * adj_a * U)
         g = vec3(G[0, 0], G[1, 1], G[2, 2])  # the adjoint of f
         g += real(2.0) * mu * wp.cw_mul(vec3(T[0, 0], T[1, 1], T[2, 2]), f + f - one)
         g += lam * (J + J - real(1.0)) * wp.trace(T) * vec3(f[1] * f[2], f[0] * f[2], f[0] * f[1])
@@ -166,7 +170,8 @@ def kernels(name: str) -> tuple[Any, Any]:
         p12, p21 = pair(G, T, a[2], mu, f, s, 1, 2)
         P = mat33(g[0], p01, p02, p10, g[1], p12, p20, p21, g[2])
         adj_trial = U * P * wp.transpose(V)
-        adj_F[n, p] = wp.transpose(advance) * adj_trial
-        adj_C[n, first + p] = mass[n, first + p] * adj_A[n, first + p] + dt * adj_trial * wp.transpose(F[n, p])
+        write_matrix(adj_F, n, p, wp.transpose(advance) * adj_trial)
+        adj_c = mass[n, first + p] * adj_a + dt * adj_trial * wp.transpose(before)
+        write_matrix(adj_C, n, first + p, adj_c)
 
     return update, adjoint

@@ -139,4 +139,5 @@ def stirred(*, smoothing=0.0, columns=False, pieces=1):
     model = tank(replace(SYRUP, smoothing=smoothing), 0.05, at_rest=True, steps=6)
     time = torch.linspace(0, 1, model.steps + 1, dtype=torch.float64)
     path = torch.stack([0.003 + 0.02 * time, 0.1141 - 0.05 * time, 0.007 + 0.01 * time], dim=-1)[None, :, None]
-    return Solver(model, capacity=2, device="cpu", columns=columns, pieces=pieces), path.expand(2, -1, -1, -1).contiguous()
+    solver = Solver(model, capacity=2, device="cpu", columns=columns, pieces=pieces)
+    return solver, path.expand(2, -1, -1, -1).contiguous()
