@@ -24,14 +24,14 @@ class _Call:
         self.work()
 
 
+@dataclass(frozen=True)
 class _Mark:
-    """Where launches go to a second stream, go on on the first, and the first waits for the second."""
+    """Where launches go to another stream of a graph, by its number; go on on the first one, 0; or wait, None."""
+
+    stream: int | None
 
     def launch(self) -> None:
         """Do nothing: outside of a graph all launches are on one stream."""
-
-
-FORK, BACK, JOIN = _Mark(), _Mark(), _Mark()
 
 
 @dataclass
@@ -54,17 +54,23 @@ class _Sequence:
         """Return a graph of the launches."""
         with wp.ScopedCapture(device=device) as captured:
             stream = first = wp.get_stream(device)
-            second = wp.Stream(device)
+            others: dict[int, wp.Stream] = {}
+            busy: set[int] = set()
             for command in self.launches:
-                if command is FORK:
-                    second.wait_stream(first)
-                    stream = second
-                elif command is BACK:
-                    stream = first
-                elif command is JOIN:
-                    first.wait_stream(second)
-                else:
+                if not isinstance(command, _Mark):
                     command.launch(stream)
+                elif command.stream is None:
+                    for number in sorted(busy):
+                        first.wait_stream(others[number])
+                    busy.clear()
+                elif command.stream == 0:
+                    stream = first
+                else:
+                    if command.stream not in others:
+                        others[command.stream] = wp.Stream(device)
+                    stream = others[command.stream]
+                    stream.wait_stream(first)
+                    busy.add(command.stream)
         return captured.graph
 
     def move(self, extent: Any, place: Any) -> None:
@@ -131,15 +137,15 @@ class Launches:
         work()
 
     @contextmanager
-    def beside(self) -> Iterator[None]:
-        """Let a graph run what is launched within a with block beside what follows it, up to `join`."""
-        self._recording.launches.append(FORK)
+    def beside(self, stream: int) -> Iterator[None]:
+        """Let a graph run what is launched within a with block on a stream beside what follows it, up to `join`."""
+        self._recording.launches.append(_Mark(stream))
         yield
-        self._recording.launches.append(BACK)
+        self._recording.launches.append(_Mark(0))
 
     def join(self) -> None:
         """Let what follows wait for what was launched `beside`."""
-        self._recording.launches.append(JOIN)
+        self._recording.launches.append(_Mark(None))
 
     def clear(self) -> None:
         """Drop all that is stored."""

@@ -1,6 +1,7 @@
 """What a benchmark says is what was measured: rates, ratios, kernels, the sampler's share."""
 
 import math
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
@@ -196,6 +197,57 @@ def test_kernels_are_launched_one_by_one_to_be_timed(monkeypatch):
         launches.run("key", 1, launched.clear, small=True)
     launches.run("key", 1, launched.clear, small=True)
     assert launched == ["kernel", "kernel", "graph"]
+
+
+def test_a_graph_runs_beside_each_other_what_does_not_wait_for_each_other(monkeypatch):
+    class Stream:
+        def __init__(self, name):
+            self.name = name
+            made.append(name)
+
+        def wait_stream(self, other):
+            seen.append((self.name, "waits for", other.name))
+
+    class Command:
+        def __init__(self, name):
+            self.name = name
+
+        def launch(self, stream=None):
+            seen.append((self.name, "on", stream.name if stream else None))
+
+    made, seen = [], []
+    first = Stream("first")
+    monkeypatch.setattr(wp, "ScopedCapture", lambda device: nullcontext(SimpleNamespace(graph="graph")))
+    monkeypatch.setattr(wp, "capture_launch", lambda graph: seen.append(graph))
+    monkeypatch.setattr(wp, "get_stream", lambda device: first)
+    monkeypatch.setattr(wp, "Stream", lambda device: Stream(f"stream {len(made)}"))
+    launches = Launches("cuda")
+
+    def launch(name):
+        launches._recording.launches.append(Command(name))
+
+    def work():
+        for number in (1, 2, 1):
+            with launches.beside(number):
+                launch(f"beside {number}")
+        launch("meanwhile")
+        launches.join()
+        launches.join()
+        launch("after")
+
+    for _ in range(2):
+        launches.run("key", 1, work, small=True)
+    assert [what for what in seen if "on" in what] == [
+        ("beside 1", "on", "stream 1"),
+        ("beside 2", "on", "stream 2"),
+        ("beside 1", "on", "stream 1"),
+        ("meanwhile", "on", "first"),
+        ("after", "on", "first"),
+    ]
+    begun, joined = seen.index(("meanwhile", "on", "first")), seen.index(("after", "on", "first"))
+    assert seen[begun + 1 : joined] == [("first", "waits for", "stream 1"), ("first", "waits for", "stream 2")]
+    assert seen[0] == ("stream 1", "waits for", "first")
+    assert seen[-1] == "graph"
 
 
 @GPU

@@ -117,8 +117,9 @@ def cell_kernels(name: str) -> SimpleNamespace:
     ):
         """Tell each particle its cell, and its number there in the order of arrival."""
         e, p = wp.tid()
-        if p < 2:
-            used[e, p] = 0
+        if p == 0:
+            used[e, 0] = 0
+            used[e, 1] = 0
         base = base_node((x[e, p] - lattice.origin) * lattice.inv_dx, lattice)
         bottom = lattice.first[2] / SEGMENT
         depth = (lattice.first[2] + lattice.nz - 1) / SEGMENT - bottom + 1

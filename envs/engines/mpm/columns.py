@@ -39,7 +39,7 @@ class Team:
         return -(-segments(box) // self.groups) * self.lanes
 
 
-TEAMS = {True: Team(32, 3, 9), False: Team(1, 1, 1)}  # by whether it is a GPU: on a CPU a thread has a segment
+GPU_TEAM, CPU_TEAM = Team(32, 3, 9), Team(1, 1, 1)  # on a CPU a thread has a segment
 
 EMIT = """
         {

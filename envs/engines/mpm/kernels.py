@@ -7,8 +7,9 @@ from typing import Any
 
 from ..runtime import load
 from .cells import cell_kernels
-from .columns import TEAMS, column_kernels
+from .columns import GPU_TEAM, column_kernels
 from .exact import settle_kernel
+from .extent import extent_kernels
 from .grid_cpu import velocity_on
 from .model import Model
 from .order import sorting_kernels
@@ -33,6 +34,7 @@ def kernels(model: Model, device: str) -> Iterator[Any]:
     yield velocity_on(device, name, model.boundary)
     for body in model.bodies:
         yield from body.material.kernels(name, rows=device == "cpu")
+    yield extent_kernels(name).look
     sorting = sorting_kernels(name)
     yield sorting.label
     for body in model.bodies:
@@ -47,7 +49,7 @@ def _of_cpu(name: str, smooth: bool) -> Iterator[Any]:
 
 
 def _of_gpu(name: str, smooth: bool) -> Iterator[Any]:
-    yield from (transfers(name, scattering=False).g2p, column_kernels(name, TEAMS[True]).p2g, cell_kernels(name).count)
+    yield from (transfers(name, scattering=False).g2p, column_kernels(name, GPU_TEAM).p2g, cell_kernels(name).count)
     yield settle_kernel(name)
     if smooth:
-        yield from (smoothing_kernels(name, scattering=False).collect, smoothing_columns(name, TEAMS[True]).spread)
+        yield from (smoothing_kernels(name, scattering=False).collect, smoothing_columns(name, GPU_TEAM).spread)

@@ -3,7 +3,7 @@
 A matrix of each particle lies as Warp has it on a CPU. On a GPU an environment's row holds the first numbers of all
 matrices, then the second ones, and so on: threads beside each other then read what lies side by side, where the numbers
 of a matrix would be read 36 bytes apart. `to_rows` brings a tensor of matrices into that order. The four numbers of a
-node are read and written as one.
+node are read and written as one. A number is read without Warp's look at every index whether it counts from the end.
 """
 
 from functools import cache
@@ -57,6 +57,7 @@ WRITE_NODE = """
 # Warp's own adjoints of these, for a CPU, where tests hold those by hand against them.
 ADD_MATRIX = "if (adj_values.data) wp::index(adj_values, e, p) += adj_ret;"
 ADD_NODE = "if (adj_grid.data) wp::index(adj_grid, e, i) += adj_ret;"
+ADD_NUMBER = "if (adj_values.data) wp::index(adj_values, e, i) += adj_ret;"
 TAKE_MATRIX = "if (adj_values.data) adj_value += wp::index(adj_values, e, p);"
 
 
@@ -68,9 +69,9 @@ def in_precision(code: str, name: str) -> str:
 @cache
 @no_type_check
 def layout(name: str) -> SimpleNamespace:
-    """Return the functions `read_matrix, write_matrix, read_node, write_node` of one precision."""
+    """Return the functions `read_matrix, write_matrix, read_node, write_node, read_number` of one precision."""
     types = precision(name)
-    mat33, vec4 = types.mat33, types.vec4
+    real, mat33, vec4 = types.real, types.mat33, types.vec4
 
     @wp.func_native(in_precision(READ_MATRIX, name), adj_snippet=ADD_MATRIX)
     def read_matrix(values: wp.array2d[mat33], e: int, p: int) -> mat33: ...
@@ -84,8 +85,15 @@ def layout(name: str) -> SimpleNamespace:
     @wp.func_native(in_precision(WRITE_NODE, name))
     def write_node(grid: wp.array2d[vec4], e: int, i: int, value: vec4): ...
 
+    @wp.func_native("return (&wp::index(values, e, 0))[i];", adj_snippet=ADD_NUMBER)
+    def read_number(values: wp.array2d[real], e: int, i: int) -> real: ...
+
     return SimpleNamespace(
-        read_matrix=read_matrix, write_matrix=write_matrix, read_node=read_node, write_node=write_node
+        read_number=read_number,
+        read_matrix=read_matrix,
+        write_matrix=write_matrix,
+        read_node=read_node,
+        write_node=write_node,
     )
 
 

@@ -4,7 +4,7 @@ A scatter can then add up the particles of one cell before it adds them to the g
 the cache. Particles stay with their body, so that each body remains one piece of every array.
 """
 
-from functools import cache
+from functools import cache, partial
 from itertools import chain
 from types import SimpleNamespace
 from typing import Any, no_type_check
@@ -170,7 +170,8 @@ class Sorter:
         launch, count = self.launches.launch, self.model.particles
         inputs = [self.lattice, len(self.model.bodies), self.body, old.x, self.keys, self.places]
         launch(self.kernels.label, (batch, count), inputs)
-        self.launches.call(lambda: wp.utils.radix_sort_pairs(self.keys, self.places, batch * count, 0, self.bits))
+        # What is stored must not hold this: a cycle would keep a GPU's memory until it is collected.
+        self.launches.call(partial(wp.utils.radix_sort_pairs, self.keys, self.places, batch * count, 0, self.bits))
         theirs = [before.name, before.mass, before.volume, old.x, old.v, old.C]
         ours = [order.name, order.mass, order.volume, new.x, new.v, new.C]
         launch(self.kernels.take, (batch, count), [self.places, order.place, *theirs, *ours])

@@ -10,7 +10,7 @@ import warp as wp
 from ..runtime import load
 from .cells import SEGMENT, STARTS, Lists, cell_kernels, segments, warps
 from .checkpoints import Frame
-from .columns import PARTS, TEAMS, column_kernels
+from .columns import CPU_TEAM, GPU_TEAM, PARTS, column_kernels
 from .model import Box
 
 
@@ -72,7 +72,7 @@ class ByColumns:
     def __init__(self, solver: Any) -> None:
         model, device, allocator = solver.model, solver.device, solver.allocator
         self.solver = weakref.proxy(solver)
-        self.team = TEAMS[device != "cpu"]
+        self.team = CPU_TEAM if device == "cpu" else GPU_TEAM
         self.kernels = column_kernels(model.precision, self.team)
         self.listing = cell_kernels(model.precision)
         load([self.kernels.p2g, self.listing.count], device)
@@ -94,8 +94,6 @@ class ByColumns:
         solver, tape, kernels = self.solver, self.solver.tape(step), self.listing
         lists: Lists = tape.lists[substep]
         count = solver.model.particles
-        if count == 1:
-            solver.launches.call(self.used.zero_)  # of which the kernel clears a number for each particle, up to two
         inputs = [tape.lattice, frame.x, self.cells, self.numbers, self.counts, self.used]
         solver.launch(kernels.count, count, batch, inputs)
         inputs = [tape.lattice, self.counts, self.used, self.starts, *lists.segments()[1:]]
@@ -115,7 +113,7 @@ class ByColumns:
         self, step: int, substep: int, frame: Frame, new: Frame, grid_v: wp.array, adj_x: wp.array, batch: int
     ) -> None:
         """Fill the adjoint of the grid's velocity, and set that of x, from those of the frame `new`."""
-        with self.solver.launches.beside():
+        with self.solver.launches.beside(1):
             launch_adjoint_g2p(self.solver, step, substep, frame, new, grid_v, adj_x, batch)
         inputs = [self.solver.model.dt, frame.x, new.x, new.v, new.C]
         self.walk(self.kernels.adjoint_g2p, step, substep, batch, inputs)

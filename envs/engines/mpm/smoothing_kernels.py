@@ -7,6 +7,7 @@ from typing import no_type_check
 import warp as wp
 
 from ..runtime import precision
+from .layout import layout
 from .stencil import lattice, stencil
 
 
@@ -22,6 +23,7 @@ def smoothing_kernels(name: str, *, scattering: bool = True) -> SimpleNamespace:
     module = f"gradscape.smoothing.{name}{'' if scattering else '.gathers'}"
     Lattice, spline = lattice(name), stencil(name)
     base_node, weights, weight_slopes = spline.base_node, spline.weights, spline.weight_slopes
+    read_number = layout(name).read_number
 
     @wp.func(module=module)
     def inverse(weight: real):
@@ -91,7 +93,13 @@ def smoothing_kernels(name: str, *, scattering: bool = True) -> SimpleNamespace:
             for j in range(3):
                 row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
                 for k in range(3):
-                    mean += wx[i] * wy[j] * wz[k] * amount[e, row + k] * inverse(weight[e, row + k])
+                    mean += (
+                        wx[i]
+                        * wy[j]
+                        * wz[k]
+                        * read_number(amount, e, row + k)
+                        * inverse(read_number(weight, e, row + k))
+                    )
         here = wp.log(J[e, p])
         J_new[e, p] = wp.exp(here + share * (mean - (here - slope * x[e, q][1])))
 
@@ -123,7 +131,7 @@ def smoothing_kernels(name: str, *, scattering: bool = True) -> SimpleNamespace:
             for j in range(3):
                 row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
                 for k in range(3):
-                    mean = amount[e, row + k] * inverse(weight[e, row + k])
+                    mean = read_number(amount, e, row + k) * inverse(read_number(weight, e, row + k))
                     steep += mean * vec3(dx_[i] * wy[j] * wz[k], wx[i] * dy_[j] * wz[k], wx[i] * wy[j] * dz_[k])
                     add(adj_mean, e, row + k, wx[i] * wy[j] * wz[k] * share * g)
         adj_x[e, q] = adj_x[e, q] + (share * g * lattice.inv_dx) * steep
@@ -160,9 +168,9 @@ def smoothing_kernels(name: str, *, scattering: bool = True) -> SimpleNamespace:
             for j in range(3):
                 row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
                 for k in range(3):
-                    share_of_one = inverse(weight[e, row + k])
-                    a = adj_mean[e, row + k] * share_of_one
-                    off = a * (beyond - amount[e, row + k] * share_of_one)
+                    share_of_one = inverse(read_number(weight, e, row + k))
+                    a = read_number(adj_mean, e, row + k) * share_of_one
+                    off = a * (beyond - read_number(amount, e, row + k) * share_of_one)
                     adj_s += wx[i] * wy[j] * wz[k] * a
                     steep += off * vec3(dx_[i] * wy[j] * wz[k], wx[i] * dy_[j] * wz[k], wx[i] * wy[j] * dz_[k])
         g = adj_J[e, p]

@@ -16,7 +16,7 @@ smoothed (`smoothing`).
 import threading
 import weakref
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from itertools import chain
 from typing import Any
@@ -255,7 +255,7 @@ class Solver:
         """Launch substeps of a control step."""
         tape, frames = self.tape(step), self.frames(step)
         for s in substeps:
-            with self.launches.beside():
+            with self.launches.beside(1):
                 self.scatter.list_particles(step, s, frames[s], batch)
             if s == 0 and self.smoothers:
                 self.launches.join()
@@ -268,7 +268,8 @@ class Solver:
 
     def _update(self, step: int, frame: Frame, new: Frame, A: wp.array, batch: int) -> None:
         for b, (update, _) in enumerate(self.materials):
-            self.launch(update, self.size(b), batch, [*self.material_inputs(b, step, frame), new.S[b], A])
+            with self.beside_others(b):
+                self.launch(update, self.size(b), batch, [*self.material_inputs(b, step, frame), new.S[b], A])
 
     def _fill_grid(self, frame: Frame, step: int, substep: int, batch: int) -> None:
         """Fill the substep's grid: momentum and mass from particles, then velocity."""
@@ -306,6 +307,10 @@ class Solver:
             grid.v,
             *self.listed,
         ]
+
+    def beside_others(self, b: int) -> AbstractContextManager[None]:
+        """Let a graph run what is launched for a body beside what is for the others, up to the next join."""
+        return self.launches.beside(2 + b) if b < len(self.materials) - 1 else nullcontext()
 
     def size(self, b: int) -> int:
         """Return the number of particles of body b."""
@@ -413,9 +418,8 @@ class _Adjoint:
 
     def _adjoint_update(self, step: int, frame: Frame, batch: int) -> None:
         solver = self.solver
-        last = len(solver.materials) - 1
         for b, (_, adjoint) in enumerate(solver.materials):
             inputs = [*solver.material_inputs(b, step, frame), self.new.S[b], self.A, self.old.S[b], self.old.C]
-            with solver.launches.beside() if b < last else nullcontext():
+            with solver.beside_others(b):
                 solver.launch(adjoint, solver.size(b), batch, inputs)
         solver.launches.join()

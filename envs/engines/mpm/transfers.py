@@ -24,7 +24,7 @@ from .stencil import lattice, stencil
 def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
     """Return the transfer kernels `p2g, g2p, adjoint_p2g, adjoint_g2p` of one precision.
 
-    Unless `scattering`, `adjoint_g2p` does not add to the grid: `columns` does on a GPU, and p2g is there instead.
+    Unless `scattering`, there is no p2g, and `adjoint_g2p` does not add to the grid: `columns` has both for a GPU.
     """
     types = precision(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
@@ -48,35 +48,37 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
 
     add = wp.func(add, module=module) if scattering else wp.func_native("")(add)
 
-    @wp.kernel(module=module, enable_backward=False)
-    def p2g(
-        lattice: Lattice,
-        mass: wp.array2d[real],
-        x: wp.array2d[vec3],
-        v: wp.array2d[vec3],
-        A: wp.array2d[mat33],
-        grid_m: wp.array2d[vec4],
-    ):
-        """Scatter momentum m v + A (x_i - x) and mass."""
-        e, p = wp.tid()
-        s = (x[e, p] - lattice.origin) * lattice.inv_dx
-        base = base_node(s, lattice)
-        f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
-        corner = base - lattice.first
-        wx, wy, wz = weights(f[0]), weights(f[1]), weights(f[2])
-        m = mass[e, p]
-        a = read_matrix(A, e, p) * (real(1.0) / lattice.inv_dx)
-        ax, ay, az = column(a, 0), column(a, 1), column(a, 2)
-        q0 = m * v[e, p] - a * f
-        for i in range(3):
-            for j in range(3):
-                row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
-                wij = wx[i] * wy[j]
-                qij = q0 + offset[i] * ax + offset[j] * ay
-                for k in range(3):
-                    w = wij * wz[k]
-                    q = w * (qij + offset[k] * az)
-                    add(grid_m, e, row + k, vec4(q[0], q[1], q[2], w * m))
+    if scattering:
+
+        @wp.kernel(module=module, enable_backward=False)
+        def p2g(
+            lattice: Lattice,
+            mass: wp.array2d[real],
+            x: wp.array2d[vec3],
+            v: wp.array2d[vec3],
+            A: wp.array2d[mat33],
+            grid_m: wp.array2d[vec4],
+        ):
+            """Scatter momentum m v + A (x_i - x) and mass."""
+            e, p = wp.tid()
+            s = (x[e, p] - lattice.origin) * lattice.inv_dx
+            base = base_node(s, lattice)
+            f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
+            corner = base - lattice.first
+            wx, wy, wz = weights(f[0]), weights(f[1]), weights(f[2])
+            m = mass[e, p]
+            a = read_matrix(A, e, p) * (real(1.0) / lattice.inv_dx)
+            ax, ay, az = column(a, 0), column(a, 1), column(a, 2)
+            q0 = m * v[e, p] - a * f
+            for i in range(3):
+                for j in range(3):
+                    row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
+                    wij = wx[i] * wy[j]
+                    qij = q0 + offset[i] * ax + offset[j] * ay
+                    for k in range(3):
+                        w = wij * wz[k]
+                        q = w * (qij + offset[k] * az)
+                        add(grid_m, e, row + k, vec4(q[0], q[1], q[2], w * m))
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint_p2g(
@@ -217,5 +219,5 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
                     add(adj_grid_v, e, row + k, vec4(w * q[0], w * q[1], w * q[2], real(0.0)))
         adj_x[e, p] = adj_x_new[e, p] + lattice.inv_dx * (slope - wp.transpose(c) * s0)
 
-    kernels = {"p2g": p2g, "g2p": g2p, "adjoint_p2g": adjoint_p2g, "adjoint_g2p": adjoint_g2p}
-    return SimpleNamespace(**kernels)
+    kernels = {"g2p": g2p, "adjoint_p2g": adjoint_p2g, "adjoint_g2p": adjoint_g2p}
+    return SimpleNamespace(**kernels, **({"p2g": p2g} if scattering else {}))

@@ -3,7 +3,7 @@
 import warp as wp
 
 from gradscape.envs.engines.demand import Demand, demand
-from gradscape.envs.engines.mpm.columns import TEAMS, column_kernels
+from gradscape.envs.engines.mpm.columns import GPU_TEAM, column_kernels
 from gradscape.envs.engines.mpm.transfers import transfers
 from gradscape.envs.engines.profiling import count_demands, time_kernels
 from gradscape.envs.mpm.fluid import Fluid
@@ -122,7 +122,7 @@ def test_every_kernel_that_is_timed_is_counted():
 
 def test_of_partial_sums_no_more_is_counted_than_is_told():
     """As many are met as there are segments with particles, which no argument says; what is walked is counted whole."""
-    kernels, count = column_kernels("float32", TEAMS[True]), 40
+    kernels, count = column_kernels("float32", GPU_TEAM), 40
     segments = [wp.zeros(BATCH, dtype=wp.int32), *(wp.zeros((BATCH, 4), dtype=wp.int32) for _ in range(4))]
     order = wp.zeros((BATCH, count), dtype=wp.int32)
     particles = [wp.zeros((BATCH, count), dtype=kind) for kind in (wp.float32, wp.vec3, wp.vec3, wp.mat33)]

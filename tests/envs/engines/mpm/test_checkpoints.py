@@ -1,5 +1,7 @@
 """What MLS-MPM keeps of an episode changes no bit of it: parts of the grid, control steps whole or repeated, memory."""
 
+import gc
+import weakref
 from dataclasses import fields, is_dataclass
 
 import pytest
@@ -150,6 +152,21 @@ def test_control_steps_are_given_up_for_memory_and_no_bit_is_lost(monkeypatch, w
     assert (len(kept[0].tapes), len(fewer[0].tapes)) == (model.steps, 2)
     assert torch.equal(kept[1], fewer[1])
     assert torch.equal(kept[2], fewer[2])
+
+
+@pytest.mark.parametrize("columns", [False, True])
+def test_a_solver_goes_when_nothing_needs_it(columns):
+    """Nothing that it stores may hold it: a GPU's memory would stay taken until it is collected."""
+    model, paths = kneading()
+    gc.collect()
+    gc.disable()
+    try:
+        solver, *_ = kneaded(model, paths, {model.steps: weights(model, 3, 3)}, columns=columns)
+        there = weakref.ref(solver)
+        del solver
+        assert there() is None
+    finally:
+        gc.enable()
 
 
 @GPU
