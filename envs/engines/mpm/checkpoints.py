@@ -112,7 +112,7 @@ class Tape:
         self.A: Cycle[wp.array] = Cycle(allocator.affine_momentum() for _ in range(held))
         self.grids: Cycle[Grid] = Cycle(allocator.grid(cells) for _ in range(held))
         self.lists: Cycle[Lists] = Cycle(allocator.lists(1) for _ in range(held if allocator.columns else 0))
-        self.lattice = place_grid(model)
+        self.box, self.lattice = Box((0, 0, 0), (0, 0, 0)), place_grid(model)
         self._allocator = allocator
 
     @property
@@ -125,6 +125,8 @@ class Tape:
 
     def growth(self, box: Box) -> int:
         """Return the bytes that a box of nodes takes beyond those that are there, 0 where these suffice."""
+        if box == self.box:
+            return 0
         size, growth = int(wp.types.type_size_in_bytes(self._allocator.types.vec4)), 0
         if self._cells < box.cells:
             growth += 2 * size * (self._room(box.cells) - self._cells)
@@ -138,14 +140,17 @@ class Tape:
 
     def make_room(self, step: int, box: Box) -> None:
         """Become the place of a control step that runs on a box of nodes."""
-        self.step = -1
+        self.step = step
+        if box == self.box:
+            return
+        self.step, self.box = -1, Box((0, 0, 0), (0, 0, 0))
         if self._cells < box.cells:
             for substep in range(len(self.grids)):
                 self.grids[substep] = self._allocator.grid(0)  # the old one goes first
                 self.grids[substep] = self._allocator.grid(self._room(box.cells))
         if self.lists and self._segments < segments(box):
             self.lists = Cycle(self._allocator.lists(segments(box) * 5 // 4) for _ in self.lists)
-        self.step, self.lattice = step, place_grid(self._allocator.model, box)
+        self.step, self.box, self.lattice = step, box, place_grid(self._allocator.model, box)
 
     @property
     def _cells(self) -> int:

@@ -115,7 +115,7 @@ class Box:
     @property
     def cells(self) -> int:
         """Number of nodes."""
-        return int(np.prod(self.nodes))
+        return math.prod(self.nodes)
 
 
 def place_grid(model: Model, box: Box | None = None) -> Any:
