@@ -9,7 +9,7 @@ records stay what they are. A scene's numbers are the same where
 
 - losses, gradients and what failed are, bit for bit, at some points on a CPU: at draft in two batches, at standard one;
 - what runs on CUDA is compiled to the same PTX, kernel by kernel, which needs no GPU, or
-- `--gpu` says of both codes that what they compute on a GPU is the same but for the order of sums (`gpu_numbers`).
+- `--gpu` says of both codes that what they compute on a GPU is the same but for last digits (`gpu_numbers`).
 
 A scene that differs in either is left out, with those that share its code, and the exit code is 1.
 """
@@ -67,7 +67,7 @@ def is_same(scene: str, old: Path, gpu: dict[str, Any]) -> bool:
     held = [part for part in ours if part in POINTS or (part not in ("code", "known") and not excused)]
     differ = [part for part in held if ours[part] != theirs.get(part)]
     said = f"differs in {', '.join(differ)}" if differ else f"the same in {', '.join(held)}"
-    print(f"{scene}: {said}{' and on a GPU but for the order of sums' if excused else ''}", flush=True)
+    print(f"{scene}: {said}{' and on a GPU but for last digits' if excused else ''}", flush=True)
     return not differ
 
 

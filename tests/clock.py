@@ -1,22 +1,27 @@
 """A clock for what measures time, so that no test depends on how long anything takes."""
 
+import threading
+
 
 class Clock:
     """Stand in for the module `time`: time passes where somebody sleeps, and by `tick` where somebody looks.
 
-    `slept` holds how long each sleep was [s].
+    `slept` holds how long each sleep was [s]. Threads may sleep beside each other: what each sleeps is added up.
     """
 
     def __init__(self, *, tick: float = 0.0) -> None:
         self.now, self.tick = 0.0, tick
         self.slept: list[float] = []
+        self._lock = threading.Lock()
 
     def perf_counter(self) -> float:
-        self.now += self.tick
-        return self.now
+        with self._lock:
+            self.now += self.tick
+            return self.now
 
     monotonic = process_time = perf_counter
 
     def sleep(self, seconds: float) -> None:
-        self.slept.append(seconds)
-        self.now += seconds
+        with self._lock:
+            self.slept.append(seconds)
+            self.now += seconds

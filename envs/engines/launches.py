@@ -26,7 +26,7 @@ class _Call:
 
 @dataclass(frozen=True)
 class _Mark:
-    """Where launches go to another stream of a graph, by its number; go on on the first one, 0; or wait, None."""
+    """Where launches go on, on a stream of a graph by its number, 0 being the first; or the first waits, if None."""
 
     stream: int | None
 

@@ -99,7 +99,7 @@ class Cycle(list[T]):
 class Tape:
     """Hold one control step whole: frames between its ends, A and grids of its substeps, and where the grids lie.
 
-    Of a step in `pieces` it holds the frames between these, and the rest of one piece, whose room all of them share.
+    Of a step in `pieces` it holds the frames at which these begin; for all else pieces share the room of one.
     """
 
     def __init__(self, allocator: Allocator, cells: int = 1, pieces: int = 1) -> None:
