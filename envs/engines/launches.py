@@ -107,10 +107,10 @@ class Launches:
         if known is None:
             if len(self.sequences) == MAX_SEQUENCES:
                 self.clear()
-            self.sequences[key] = self._recording = _Sequence(extent)
-            self._place = place
-            self.seen.add((key, extent))
+            self._recording, self._place = _Sequence(extent), place
             work()
+            self.sequences[key] = self._recording  # only now: of work that was interrupted a part would be stored
+            self.seen.add((key, extent))
         elif small and self.use_graphs and self.device != "cpu":
             self._run_graph((key, extent), known, place)
         else:

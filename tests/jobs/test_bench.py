@@ -199,6 +199,23 @@ def test_kernels_are_launched_one_by_one_to_be_timed(monkeypatch):
     assert launched == ["kernel", "kernel", "graph"]
 
 
+def test_work_that_is_interrupted_is_not_taken_for_whole_when_it_comes_again():
+    launches, done = Launches("cpu"), []
+
+    def work():
+        launches.call(lambda: done.append("first"))
+        if len(done) == 1:
+            raise KeyboardInterrupt
+        launches.call(lambda: done.append("second"))
+
+    with pytest.raises(KeyboardInterrupt):
+        launches.run("key", 1, work, small=True)
+    done.append("again")
+    for _ in range(2):
+        launches.run("key", 1, work, small=True)
+    assert done == ["first", "again", *["first", "second"] * 2]
+
+
 def test_a_graph_runs_beside_each_other_what_does_not_wait_for_each_other(monkeypatch):
     class Stream:
         def __init__(self, name):
