@@ -51,7 +51,7 @@ def test_launches_repeated_as_graphs_do_what_they_did_at_first(name: str, known:
     again = env.evaluate(one)
     assert env._solvers is not None
     with env._solvers.lend() as lent:
-        assert {key[0][0] for key in lent.solver.launches.graphs} == {"forward", "backward"}
+        assert {"forward", "backward"} <= {key[0][0] for key in lent.solver.launches.graphs}
     assert first.grad is not None
     assert again.grad is not None
     torch.testing.assert_close(again.loss, first.loss, rtol=1e-12, atol=0)

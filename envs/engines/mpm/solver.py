@@ -14,7 +14,6 @@ smoothed (`smoothing`).
 """
 
 import threading
-import weakref
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
@@ -27,8 +26,8 @@ import warp as wp
 
 from ..launches import Launches
 from ..runtime import free_memory, has_rows, load, to_torch
+from .adjoint import Adjoint
 from .checkpoints import Allocator, Frame, Tape
-from .exact import settle_kernel
 from .extent import Extent
 from .grid_cpu import velocity_on
 from .kernels import compile_all as compile_all
@@ -37,7 +36,6 @@ from .model import BOX_MARGIN, EMPTY, Box, Model, nodes_around
 from .order import Order, Sorter
 from .scatter import ByColumns, InPlace, Scatter, nodes
 from .smoothing import ColumnSmoother, Smoother
-from .stencil import lattice
 from .transfers import transfers
 from .transfers_cpu import transfers_on_cpu
 
@@ -125,7 +123,7 @@ class Solver:
         self.sums = self.allocator.sums()
         self.listed = [self.allocator.array(wp.int32, model.cells + 1)] if has_rows(self.velocity) else []
         self.left_box, self.escaped = (wp.zeros(capacity, dtype=wp.int32, device=device) for _ in range(2))
-        self.adjoint: _Adjoint | None = None
+        self.adjoint: Adjoint | None = None
         self._start()
 
     def run(self, tools: torch.Tensor) -> torch.Tensor:
@@ -165,7 +163,7 @@ class Solver:
     def gradient(self, adj_x: Mapping[int, torch.Tensor]) -> torch.Tensor:
         """Return the adjoint of the tools of the last run from those of x before some control steps, same shapes."""
         if self.adjoint is None:
-            self.adjoint = _Adjoint(self)
+            self.adjoint = Adjoint(self)
         return self.adjoint.run(adj_x)
 
     def frames(self, step: int) -> list[Frame]:
@@ -188,7 +186,7 @@ class Solver:
         grain = GRAIN if self.device != "cpu" and self._small(batch) else 1
         while True:
             self.boxes[step] = nodes_around(self.model, low, high, self.margins[step], grain)
-            self._advance(step, batch)
+            self.advance(step, batch)
             self.extent.find(self.end.x, self.left_box, batch, small=self._small(batch))
             self._sort(step, batch)  # which a GPU does while corners are read, whether or not the step holds
             *corners, left = self.extent.read()
@@ -205,7 +203,11 @@ class Solver:
         work = partial(self.sorter.sort, self.end, after, *orders, batch)
         self.launches.run(("sort", step, batch), None, work, small=self._small(batch))
 
-    def _advance(self, step: int, batch: int) -> None:
+    def advance(self, step: int, batch: int) -> None:
+        """Simulate a control step on the nodes that it has been given, and keep it whole, or its last piece.
+
+        Raises InterruptedError where `stop` has been set.
+        """
         if self.stop.is_set():
             raise InterruptedError("the simulation was stopped")
         self._make_room(step)
@@ -331,95 +333,3 @@ class Solver:
         to_torch(first.x)[:] = torch.from_numpy(np.concatenate([body.x for body in self.model.bodies]))
         for body, state in zip(self.model.bodies, first.S, strict=True):
             to_torch(state)[:] = to_rows(torch.from_numpy(body.material.initial(body.ratio)), self.device)
-
-
-class _Adjoint:
-    """Hold the adjoint arrays of a solver and run its backward pass."""
-
-    def __init__(self, solver: Solver) -> None:
-        self.solver = weakref.proxy(solver)  # which holds this: a cycle would keep a GPU's memory until it is collected
-        self.new, self.old = solver.allocator.frame(), solver.allocator.frame()
-        self.A = solver.allocator.affine_momentum()
-        self.grid = solver.allocator.grid(max(box.cells for box in solver.boxes))
-        self.tools = solver.allocator.paths()
-        self.tools_by_axis: Any = wp.from_torch(to_torch(self.tools), requires_grad=False)
-        self.settle = settle_kernel(solver.model.precision)  # of a GPU, where nodes do not add to the adjoint itself
-        load([self.settle] if solver.device != "cpu" else [], solver.device)
-        self.structs = (
-            lattice(solver.model.precision)(),
-            type(solver.boundary)(),
-        )  # unwanted adjoints, whose place Warp wants
-
-    def run(self, adj_x: Mapping[int, torch.Tensor]) -> torch.Tensor:
-        """Return the adjoint of the tools, shape (batch, step + 1, slot, 3)."""
-        solver, batch = self.solver, len(next(iter(adj_x.values())))
-        for array in (*self.new.arrays(), self.tools, solver.sums):
-            array.zero_()
-        for step in reversed(range(max(adj_x))):
-            if step + 1 in adj_x:
-                x = to_torch(self.new.x)[:batch]
-                x += solver.orders[step + 1].from_model(adj_x[step + 1].to(x))
-            if solver.tape(step).step != step:
-                solver._advance(step, batch)
-            self._retreat(step, batch)
-        return to_torch(self.tools)[:batch].clone()
-
-    def _retreat(self, step: int, batch: int) -> None:
-        solver = self.solver
-        if self.grid.m.shape[1] < solver.boxes[step].cells:
-            self.grid = solver.allocator.grid(solver.boxes[step].cells)
-            solver.launches.clear()
-        ends = (self.new, self.old) if solver.model.substeps % 2 else (self.old, self.new)  # as often exchanged
-        key = "backward", step, batch, id(self.new)
-        solver.launch_again(key, step, batch, lambda: self._substeps(step, batch))
-        self.new, self.old = ends  # launches that are kept exchange nothing here
-        if solver.pieces > 1:
-            solver.tape(step).step = -1  # it holds the first piece now
-
-    def _substeps(self, step: int, batch: int) -> None:
-        solver, count = self.solver, self.solver.model.substeps
-        solver.sorter.unsort(self.new, self.old, solver.orders[step + 1], batch)
-        self.new, self.old = self.old, self.new
-        length = solver.model.piece(solver.pieces)
-        for first in reversed(range(0, count, length)):
-            piece = range(first, min(first + length, count))
-            if piece.stop < count:
-                solver.substeps(step, batch, piece)
-            self._substeps_back(step, batch, piece)
-        for smoother in solver.smoothers:
-            smoother.run_back(solver, step, batch, self.new)
-        if solver.device != "cpu":
-            solver.launch(self.settle, 6 * solver.model.boundary.slots, batch, [step, solver.sums, self.tools_by_axis])
-
-    def _substeps_back(self, step: int, batch: int, substeps: range) -> None:
-        solver = self.solver
-        tape, frames = solver.tape(step), solver.frames(step)
-        for s in reversed(substeps):
-            solver.scatter.adjoint_g2p(step, s, frames[s], self.new, self.grid.v, self.old.x, batch)
-            self._adjoint_velocity(step, s, batch)
-            solver.launches.join()
-            self._adjoint_p2g(step, frames[s], tape, s, batch)
-            self._adjoint_update(step, frames[s], batch)
-            self.new, self.old = self.old, self.new
-
-    def _adjoint_velocity(self, step: int, substep: int, batch: int) -> None:
-        solver = self.solver
-        inputs = solver.velocity_inputs(step, substep)
-        given = [self.tools, None, self.grid.m, self.grid.v, *[None] * len(solver.listed)]
-        adjoints = [*self.structs, *[None] * (len(inputs) - 2 - len(given)), *given]
-        how = {"adj_inputs": adjoints, "adj_outputs": [], "adjoint": True}
-        solver.launch_on_box(solver.velocity, nodes, step, batch, inputs, **how)
-
-    def _adjoint_p2g(self, step: int, frame: Frame, tape: Tape, substep: int, batch: int) -> None:
-        solver = self.solver
-        inputs = [tape.lattice, solver.orders[step].mass, frame.x, frame.v, tape.A[substep], self.grid.m]
-        inputs += [self.old.x, self.old.v, self.A]
-        solver.launch(solver.kernels.adjoint_p2g, solver.model.particles, batch, inputs)
-
-    def _adjoint_update(self, step: int, frame: Frame, batch: int) -> None:
-        solver = self.solver
-        for b, (_, adjoint) in enumerate(solver.materials):
-            inputs = [*solver.material_inputs(b, step, frame), self.new.S[b], self.A, self.old.S[b], self.old.C]
-            with solver.beside_others(b):
-                solver.launch(adjoint, solver.size(b), batch, inputs)
-        solver.launches.join()
