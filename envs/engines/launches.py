@@ -76,6 +76,7 @@ class _Sequence:
     def move(self, extent: Any, place: Any) -> None:
         """Make the launches run over another extent."""
         if extent != self.extent:
+            self.extent = None  # of launches of which only some were moved, should this be interrupted
             for command in self.located:
                 command.set_param_at_index(0, place)
             for command, dim in self.sized:

@@ -216,6 +216,33 @@ def test_work_that_is_interrupted_is_not_taken_for_whole_when_it_comes_again():
     assert done == ["first", "again", *["first", "second"] * 2]
 
 
+def test_launches_of_which_some_were_moved_are_all_moved_again():
+    class Sized:
+        dim = 1
+
+        def set_dim(self, dim):
+            if interrupted.pop("now", False):
+                raise KeyboardInterrupt
+            self.dim = dim
+
+        def launch(self, stream=None):
+            launched.append(self.dim)
+
+    launches, launched, interrupted = Launches("cpu"), [], {}
+
+    def work():
+        launches._recording.launches += commands
+        launches._recording.sized += [(command, lambda extent: extent) for command in commands]
+
+    commands = [Sized(), Sized()]
+    launches.run("key", 1, work, small=True)
+    commands[0].dim, interrupted["now"] = 2, True  # as if the second of them were moved when it is interrupted
+    with pytest.raises(KeyboardInterrupt):
+        launches.run("key", 2, work, small=True)
+    launches.run("key", 1, work, small=True)
+    assert launched == [1, 1]
+
+
 def test_a_graph_runs_beside_each_other_what_does_not_wait_for_each_other(monkeypatch):
     class Stream:
         def __init__(self, name):

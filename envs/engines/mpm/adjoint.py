@@ -89,7 +89,7 @@ class Adjoint:
         given = [self.tools, None, self.grid.m, self.grid.v, *[None] * len(solver.listed)]
         adjoints = [*self.structs, *[None] * (len(inputs) - 2 - len(given)), *given]
         how = {"adj_inputs": adjoints, "adj_outputs": [], "adjoint": True}
-        solver.launch_on_box(solver.velocity, nodes, step, batch, inputs, **how)
+        solver.launch_on_box(solver.velocity, nodes, batch, inputs, **how)
 
     def _adjoint_p2g(self, step: int, frame: Frame, tape: Tape, substep: int, batch: int) -> None:
         solver = self.solver

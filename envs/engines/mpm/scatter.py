@@ -97,7 +97,7 @@ class ByColumns:
         inputs = [tape.lattice, frame.x, self.cells, self.numbers, self.counts, self.used]
         solver.launch(kernels.count, count, batch, inputs)
         inputs = [tape.lattice, self.counts, self.used, self.starts, *lists.segments()[1:]]
-        solver.launch_on_box(kernels.place_segments, warps, step, batch, inputs)
+        solver.launch_on_box(kernels.place_segments, warps, batch, inputs)
         inputs = [self.cells, self.numbers, self.starts, self.used, self.arrived, lists.full]
         solver.launch(kernels.place, count, batch, inputs)
         solver.launch(kernels.tidy, count, batch, [self.cells, self.starts, self.arrived, lists.order])
@@ -124,13 +124,13 @@ class ByColumns:
         tape = self.solver.tape(step)
         lists: Lists = tape.lists[substep]
         given = [tape.lattice, lists.order, *lists.segments(), *inputs, self.parts]
-        self.solver.launch_on_box(kernel, self.team.threads, step, batch, given)
+        self.solver.launch_on_box(kernel, self.team.threads, batch, given)
 
     def add_up(self, kernel: Any, step: int, substep: int, batch: int, grids: list[wp.array]) -> None:
         """Launch a kernel that adds up the parts at nodes."""
         tape = self.solver.tape(step)
         inputs = [tape.lattice, tape.lists[substep].span, self.parts, *grids]
-        self.solver.launch_on_box(kernel, nodes, step, batch, inputs)
+        self.solver.launch_on_box(kernel, nodes, batch, inputs)
 
     def _allocate(self, count: int) -> None:
         """Allocate what so many segments take."""

@@ -59,14 +59,14 @@ class Smoother:
     def _spread(self, solver: Any, step: int, batch: int) -> None:
         """Fill `amount` and `weight`."""
         for values in (self.amount, self.weight):
-            solver.launch_on_box(self.kernels.clear, nodes, step, batch, [values])
+            solver.launch_on_box(self.kernels.clear, nodes, batch, [values])
         x, J = solver.checkpoints[step].x, solver.checkpoints[step].S[self.body]
         inputs = [solver.tape(step).lattice, self.first, self.slope, solver.orders[step].volume, x, J]
         solver.launch(self.kernels.spread, self.size, batch, [*inputs, self.amount, self.weight])
 
     def _collect_back(self, solver: Any, step: int, batch: int, adjoint: Any) -> None:
         """Fill `adj_mean`, turn the adjoint of J' into that of its logarithm, and add to that of x."""
-        solver.launch_on_box(self.kernels.clear, nodes, step, batch, [self.adj_mean])
+        solver.launch_on_box(self.kernels.clear, nodes, batch, [self.adj_mean])
         self._launch_adjoint_collect(solver, step, batch, adjoint)
 
     def _launch_adjoint_collect(self, solver: Any, step: int, batch: int, adjoint: Any) -> None:

@@ -276,7 +276,7 @@ class Solver:
     def _fill_grid(self, frame: Frame, step: int, substep: int, batch: int) -> None:
         """Fill the substep's grid: momentum and mass from particles, then velocity."""
         self.scatter.p2g(step, substep, frame, batch)
-        self.launch_on_box(self.velocity, nodes, step, batch, self.velocity_inputs(step, substep))
+        self.launch_on_box(self.velocity, nodes, batch, self.velocity_inputs(step, substep))
 
     def _move_particles(self, frame: Frame, new: Frame, step: int, substep: int, batch: int) -> None:
         tape = self.tape(step)
@@ -322,10 +322,8 @@ class Solver:
         """Launch a kernel over [environment, element], or over environments where it takes their rows."""
         self.launches.launch(kernel, (batch, 1 if has_rows(kernel) else size), inputs)
 
-    def launch_on_box(
-        self, kernel: Any, size: Callable[[Box], int], step: int, batch: int, inputs: list[Any], **how: Any
-    ) -> None:
-        """Launch a kernel over [environment, whatever `size` counts of a control step's box]."""
+    def launch_on_box(self, kernel: Any, size: Callable[[Box], int], batch: int, inputs: list[Any], **how: Any) -> None:
+        """Launch a kernel over [environment, whatever `size` counts of the box of the control step under way]."""
         self.launches.launch(kernel, lambda box: (batch, 1 if has_rows(kernel) else size(box)), inputs, **how)
 
     def _start(self) -> None:

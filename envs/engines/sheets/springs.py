@@ -185,8 +185,7 @@ class Solver:
 
     def _step_back(self, step: int) -> None:
         moved = [self.x[step + 1], self.v[step + 1]]
-        adjoints = [*self.adj_pose, self.adj_here, self.adj_pulled, self.adj_x, self.adj_v]
-        adjoints = [None, self.no_adjoint, None, *adjoints]
+        adjoints = [None, self.no_adjoint, None, *self.adj_pose, self.adj_here, self.adj_pulled, self.adj_x, self.adj_v]
         self._launch(self.touch, [*self._touch_inputs(step), *moved], adj_inputs=adjoints, adjoint=True)
         for frame, by_vertex in zip((step, step + 1), self.adj_pose, strict=True):
             if by_vertex is not None:
