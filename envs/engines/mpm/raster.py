@@ -7,10 +7,11 @@ import numpy as np
 import torch
 import warp as wp
 
-from ..runtime import load, precision, to_torch
+from ..runtime import has_rows, load, precision, to_torch
 from .model import Model, place_grid
 from .stencil import lattice, stencil
 from .transfers import transfers
+from .transfers_cpu import transfers_on_cpu
 
 WHOLE = 2.0**60  # units of the mass of all particles
 
@@ -60,7 +61,8 @@ class Raster:
     ) -> None:
         types = precision(model.precision)
         self.counting = device != "cpu" if counting is None else counting
-        self.kernels = transfers(model.precision, scattering=not self.counting)
+        name = model.precision
+        self.kernels = transfers(name, scattering=False) if self.counting else transfers_on_cpu(name)
         self.count = count_kernel(model.precision)
         self.lattice, self.device = place_grid(model), device
         load([self.kernels.adjoint_p2g, *([self.count] if self.counting else [])], device)
@@ -110,7 +112,8 @@ class Raster:
     def _launch(self, kernel: Any, x: torch.Tensor, adjoints: list[Any]) -> None:
         self._place(x)
         inputs = [self.lattice, self.mass, *self.particles, self.grid, *adjoints]
-        wp.launch(kernel, (len(x), self.mass.shape[1]), inputs, device=self.device, record_tape=False)
+        size = 1 if has_rows(kernel) else self.mass.shape[1]
+        wp.launch(kernel, (len(x), size), inputs, device=self.device, record_tape=False)
 
 
 class _Spread(torch.autograd.Function):
