@@ -51,7 +51,7 @@ def main() -> None:
     gpu = json.loads(asked.gpu.read_text()) if asked.gpu else {}
     same = [scene for scene in scenes if is_same(scene, asked.old, gpu.get(scene, {}))]
     if asked.write:
-        codes = {now[scene]["code"] for scene in same}
+        codes = {now[scene]["code"] for scene in same if scene in changed}
         families = {code: sorted(name for name in changed if now[name]["code"] == code) for code in codes}
         keep({code: (names, before[names[0]]["known"]) for code, names in families.items() if set(names) <= set(same)})
     sys.exit(int(same != scenes))
