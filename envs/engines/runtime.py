@@ -68,6 +68,11 @@ def has_rows(kernel: Any) -> bool:
     return hasattr(kernel, "plain")
 
 
+def threads(kernel: Any, elements: int) -> int:
+    """Return how many threads of a kernel an environment takes that has so many elements: one where it has rows."""
+    return 1 if has_rows(kernel) else elements
+
+
 def cuda_available() -> bool:
     """Say whether Warp can drive a CUDA device here."""
     return bool(wp.is_cuda_available())

@@ -26,10 +26,8 @@ class Adjoint:
         self.tools_by_axis: Any = wp.from_torch(to_torch(self.tools), requires_grad=False)
         self.settle = settle_kernel(solver.model.precision)  # of a GPU, where nodes do not add to the adjoint itself
         load([self.settle] if solver.device != "cpu" else [], solver.device)
-        self.structs = (
-            lattice(solver.model.precision)(),
-            type(solver.boundary)(),
-        )  # unwanted adjoints, whose place Warp wants
+        # Adjoints that nobody wants, but Warp their place.
+        self.structs = lattice(solver.model.precision)(), type(solver.boundary)()
 
     def run(self, adj_x: Mapping[int, torch.Tensor]) -> torch.Tensor:
         """Return the adjoint of the tools, shape (batch, step + 1, slot, 3)."""
@@ -86,8 +84,8 @@ class Adjoint:
     def _adjoint_velocity(self, step: int, substep: int, batch: int) -> None:
         solver = self.solver
         inputs = solver.velocity_inputs(step, substep)
-        given = [self.tools, None, self.grid.m, self.grid.v, *[None] * len(solver.listed)]
-        adjoints = [*self.structs, *[None] * (len(inputs) - 2 - len(given)), *given]
+        adjoints = [*self.structs, *[None] * 6, self.tools, None, self.grid.m, self.grid.v]
+        adjoints += [None] * (len(inputs) - len(adjoints))
         how = {"adj_inputs": adjoints, "adj_outputs": [], "adjoint": True}
         solver.launch_on_box(solver.velocity, nodes, batch, inputs, **how)
 

@@ -12,6 +12,8 @@ from .model import Box, Model, place_grid
 
 T = TypeVar("T")
 
+NOWHERE = Box((0, 0, 0), (0, 0, 0))
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
@@ -112,7 +114,7 @@ class Tape:
         self.A: Cycle[wp.array] = Cycle(allocator.affine_momentum() for _ in range(held))
         self.grids: Cycle[Grid] = Cycle(allocator.grid(cells) for _ in range(held))
         self.lists: Cycle[Lists] = Cycle(allocator.lists(1) for _ in range(held if allocator.columns else 0))
-        self.box, self.lattice = Box((0, 0, 0), (0, 0, 0)), place_grid(model)
+        self.box, self.lattice = NOWHERE, place_grid(model)
         self._allocator = allocator
 
     @property
@@ -143,7 +145,7 @@ class Tape:
         self.step = step
         if box == self.box:
             return
-        self.step, self.box = -1, Box((0, 0, 0), (0, 0, 0))
+        self.step, self.box = -1, NOWHERE
         if self._cells < box.cells:
             for substep in range(len(self.grids)):
                 self.grids[substep] = self._allocator.grid(0)  # the old one goes first

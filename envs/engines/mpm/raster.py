@@ -7,7 +7,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from ..runtime import has_rows, load, precision, to_torch
+from ..runtime import load, precision, threads, to_torch
 from .model import Model, place_grid
 from .stencil import lattice, stencil
 from .transfers import transfers
@@ -59,11 +59,10 @@ class Raster:
     def __init__(
         self, model: Model, mass: np.ndarray, *, capacity: int, device: str, counting: bool | None = None
     ) -> None:
-        types = precision(model.precision)
+        name, types = model.precision, precision(model.precision)
         self.counting = device != "cpu" if counting is None else counting
-        name = model.precision
         self.kernels = transfers(name, scattering=False) if self.counting else transfers_on_cpu(name)
-        self.count = count_kernel(model.precision)
+        self.count = count_kernel(name)
         self.lattice, self.device = place_grid(model), device
         load([self.kernels.adjoint_p2g, *([self.count] if self.counting else [])], device)
         self.unit = float(mass.sum()) / WHOLE
@@ -112,8 +111,8 @@ class Raster:
     def _launch(self, kernel: Any, x: torch.Tensor, adjoints: list[Any]) -> None:
         self._place(x)
         inputs = [self.lattice, self.mass, *self.particles, self.grid, *adjoints]
-        size = 1 if has_rows(kernel) else self.mass.shape[1]
-        wp.launch(kernel, (len(x), size), inputs, device=self.device, record_tape=False)
+        dim = len(x), threads(kernel, self.mass.shape[1])
+        wp.launch(kernel, dim, inputs, device=self.device, record_tape=False)
 
 
 class _Spread(torch.autograd.Function):

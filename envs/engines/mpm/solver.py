@@ -25,7 +25,7 @@ import torch
 import warp as wp
 
 from ..launches import Launches
-from ..runtime import free_memory, has_rows, load, to_torch
+from ..runtime import free_memory, has_rows, load, threads, to_torch
 from .adjoint import Adjoint
 from .checkpoints import Allocator, Frame, Tape
 from .extent import Extent
@@ -320,11 +320,11 @@ class Solver:
 
     def launch(self, kernel: Any, size: int, batch: int, inputs: list[Any]) -> None:
         """Launch a kernel over [environment, element], or over environments where it takes their rows."""
-        self.launches.launch(kernel, (batch, 1 if has_rows(kernel) else size), inputs)
+        self.launches.launch(kernel, (batch, threads(kernel, size)), inputs)
 
     def launch_on_box(self, kernel: Any, size: Callable[[Box], int], batch: int, inputs: list[Any], **how: Any) -> None:
         """Launch a kernel over [environment, whatever `size` counts of the box of the control step under way]."""
-        self.launches.launch(kernel, lambda box: (batch, 1 if has_rows(kernel) else size(box)), inputs, **how)
+        self.launches.launch(kernel, lambda box: (batch, threads(kernel, size(box))), inputs, **how)
 
     def _start(self) -> None:
         first = self.checkpoints[0]

@@ -9,11 +9,10 @@ import warp as wp
 from gradscape.envs.engines.mpm.boundaries import LadleInTank, Open
 from gradscape.envs.engines.mpm.grid import velocity_kernel
 from gradscape.envs.engines.mpm.grid_cpu import velocity_on
-from gradscape.envs.engines.mpm.stencil import lattice
 from gradscape.envs.engines.mpm.tools import STICKY, Kind, Tool, ToolsInRoom
-from gradscape.envs.engines.runtime import has_rows, precision
+from gradscape.envs.engines.runtime import has_rows, precision, threads
 
-from ..bench import draw
+from ..bench import draw, placed
 
 BATCH, DX, ORIGIN, STEP = 3, 1 / 32, (-0.25, -0.0625, -0.25), 1
 TANK = LadleInTank(half_width=0.1875, lid=0.4, radius=0.07, half_thickness=0.01, height=0.25, band=0.02, friction=0.25)
@@ -46,10 +45,7 @@ class Nodes:
 
     def __init__(self, boundary, box):
         self.types, self.boundary = precision("float32"), boundary
-        self.lattice = lattice("float32")()
-        self.lattice.origin, self.lattice.inv_dx = self.types.vec3(*ORIGIN), 1 / DX
-        self.lattice.first = wp.vec3i(*box[0])
-        self.lattice.nx, self.lattice.ny, self.lattice.nz = box[1]
+        self.lattice = placed("float32", ORIGIN, DX, box[1], box[0])
         self.cells = box[1][0] * box[1][1] * box[1][2]
         mass = (draw(BATCH, self.cells, 1, seed=0)).clamp_min(0)
         velocity = 4 * draw(BATCH, self.cells, 3, seed=1)
@@ -62,9 +58,8 @@ class Nodes:
 
     def run(self, kernel):
         """Return velocities, and the adjoints of momenta and tools, as integers of the same bits."""
-        size, near = self.cells, []
-        if has_rows(kernel):
-            size, near = 1, [wp.zeros((BATCH, self.cells + 1), dtype=wp.int32)]
+        size = threads(kernel, self.cells)
+        near = [wp.zeros((BATCH, self.cells + 1), dtype=wp.int32)] if has_rows(kernel) else []
         grid_v, adj_grid_m = (self.array(torch.full((BATCH, self.cells, 4), 7.0)) for _ in range(2))
         tools, adj_tools = self.array(self.tools), self.array(torch.zeros_like(self.tools))
         data, sums = self.boundary.data("float32", "cpu"), wp.zeros((1, 1), dtype=wp.int64)

@@ -8,9 +8,8 @@ from hypothesis import strategies as st
 
 from gradscape.envs.engines.mpm.materials import Plasticine
 from gradscape.envs.engines.mpm.materials.plasticine import ROUNDED, SMALLEST
-from gradscape.envs.engines.runtime import has_rows
 
-from ..bench import IDENTITY, NAMES, MaterialBench, draw, rotations
+from ..bench import IDENTITY, NAMES, MaterialBench, assert_rows_have_the_same_bits, draw, rotations
 
 CLAY = Plasticine(1000.0, 5e3, 0.2, yield_stress=50.0)
 KAPPA = CLAY.yield_stress / (2 * CLAY.mu)  # largest deviatoric log strain
@@ -156,13 +155,4 @@ def test_rows_of_a_cpu_have_the_same_bits():
     odd = [torch.diag(torch.tensor(one)) for one in ([0.0, 0, 0], [1.0, 1, 0], [2.0, 1, -1], [1.0, 0, 0])]
     F = torch.cat([torch.stack(odd).double(), IDENTITY + sizes * draw(125, 3, 3, seed=30)])
     C, adj_F, adj_A = (scale * draw(len(F), 3, 3, seed=31 + k) for k, scale in enumerate((30.0, 1.0, 1.0)))
-    one, rows = MaterialBench(CLAY, "float32"), MaterialBench(CLAY, "float32")
-    rows.kernels = CLAY.kernels("float32", rows=True)
-    assert all(map(has_rows, rows.kernels))
-    for wanted, found in (
-        *zip(one.update(F, C), rows.update(F, C), strict=True),
-        *zip(one.adjoint(F, C, adj_F, adj_A), rows.adjoint(F, C, adj_F, adj_A), strict=True),
-    ):
-        assert wanted.isfinite().all()
-        assert (wanted == found).all()
-    assert not any(map(has_rows, CLAY.kernels("float64", rows=True)))
+    assert_rows_have_the_same_bits(CLAY, F, C, adj_F, adj_A)

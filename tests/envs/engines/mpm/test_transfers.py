@@ -11,6 +11,8 @@ from gradscape.envs.engines.mpm.transfers import lattice, transfers
 from gradscape.envs.engines.mpm.transfers_cpu import transfers_in_rows, transfers_on_cpu
 from gradscape.envs.engines.runtime import has_rows, precision, to_torch
 
+from ..bench import placed
+
 ORIGIN, DX, NODES, DT = (-0.3, 0.2, 1.1), 0.05, (9, 8, 10), 2e-3
 BATCH, COUNT = 2, 43
 NAMES = ["float32", "float64"]
@@ -39,10 +41,7 @@ class Bench:
 
     def __init__(self, name):
         self.types, self.kernels = precision(name), transfers(name)
-        self.lattice = lattice(name)()
-        self.lattice.origin, self.lattice.inv_dx = self.types.vec3(*ORIGIN), 1 / DX
-        self.lattice.first = wp.vec3i(0, 0, 0)
-        self.lattice.nx, self.lattice.ny, self.lattice.nz = NODES
+        self.lattice = placed(name, ORIGIN, DX, NODES)
         self.kinds = {(): self.types.real, (3,): self.types.vec3, (4,): self.types.vec4, (3, 3): self.types.mat33}
 
     def array(self, values, kind=None):
