@@ -34,6 +34,7 @@ class Adjoint:
         solver, batch = self.solver, len(next(iter(adj_x.values())))
         for array in (*self.new.arrays(), self.tools, solver.sums):
             array.zero_()
+        solver.scatter.begin()
         for step in reversed(range(max(adj_x))):
             if step + 1 in adj_x:
                 x = to_torch(self.new.x)[:batch]

@@ -2,8 +2,9 @@
 
 Between control steps particles lie in memory by body and cell (`order`), but they move on in between. So each substep
 lists its particles by cell, and those of a cell as they lie in memory. SEGMENT cells along z, from a multiple of
-SEGMENT on, make a segment, whose particles come one after the other in the list. Where in the list a segment is,
-chance may decide: nothing depends on it.
+SEGMENT on, make a segment, whose particles come one after the other in the list. Where in the list they are, chance
+may decide: nothing depends on it. Segments themselves are listed from those with most particles to those with fewest,
+by steps of STEP, so that threads that work on neighbours in the list have as much to do.
 """
 
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from .stencil import lattice, stencil
 
 SEGMENT = 8  # cells
 STARTS = SEGMENT + 1  # of the cells of a segment, and of what comes after it
+STEP, SIZES = 4, 32  # segments are of one size up to so many particles apart, and the largest of so many sizes
 
 # Neighbours in memory are mostly of one cell: on a GPU one of them counts for all of a warp.
 TAKE_NUMBER = """
@@ -64,22 +66,20 @@ TAKE_PLACES = """
 class Lists:
     """The particles by cell: `order` [environment, place], and its segments.
 
-    Those with particles are `full` [environment] in number, and of each of them `which` says which one it is, and
-    `first` and `end` at which places its particles are, all [environment, segment with particles]. `span`
+    Those with particles are `full` [environment] in number, and `segments` [environment, segment with particles] says
+    of each of them which one it is, the first place of its particles, how many there are, and its span. `span`
     [environment, segment] holds which planes of nodes they touch, counted from the segment's first: the lowest, and
     256 times the one beyond the highest; 0 where it has no particles.
     """
 
     order: wp.array
     full: wp.array
-    which: wp.array
-    first: wp.array
-    end: wp.array
+    segments: wp.array
     span: wp.array
 
-    def segments(self) -> list[wp.array]:
-        """Return all that tells about segments."""
-        return [self.full, self.which, self.first, self.end, self.span]
+    def arrays(self) -> tuple[wp.array, ...]:
+        """Return every array of the lists."""
+        return (self.order, self.full, self.segments, self.span)
 
 
 def warps(box: Box) -> int:
@@ -93,18 +93,54 @@ def segments(box: Box) -> int:
     return box.nodes[0] * box.nodes[1] * ((first + count - 1) // SEGMENT - first // SEGMENT + 1)
 
 
+@wp.func_native(TAKE_NUMBER)
+def take_number(counts: wp.array2d[wp.int32], e: int, cell: int) -> int: ...
+
+
+@cache
+@no_type_check
+def counter(name: str):
+    """Return the function that tells a particle at x its cell, and its number there in the order of arrival."""
+    vec3 = precision(name).vec3
+    Lattice, base_node = lattice(name), stencil(name).base_node
+
+    @wp.func(module=f"gradscape.cells.{name}")
+    def count_in_cell(
+        lattice: Lattice,
+        x: vec3,
+        e: int,
+        p: int,
+        cells: wp.array2d[wp.int32],
+        numbers: wp.array2d[wp.int32],
+        counts: wp.array2d[wp.int32],
+    ):
+        base = base_node((x - lattice.origin) * lattice.inv_dx, lattice)
+        bottom = lattice.first[2] / SEGMENT
+        depth = (lattice.first[2] + lattice.nz - 1) / SEGMENT - bottom + 1
+        column = (base[0] - lattice.first[0]) * lattice.ny + base[1] - lattice.first[1]
+        cell = (column * depth - bottom) * SEGMENT + base[2]
+        cells[e, p] = cell
+        numbers[e, p] = take_number(counts, e, cell)
+
+    return count_in_cell
+
+
 @cache
 @no_type_check
 def cell_kernels(name: str) -> SimpleNamespace:
-    """Return the kernels `count, place_segments, place, tidy` of one precision, which make lists in this order."""
-    vec3 = precision(name).vec3
-    Lattice, base_node, module = lattice(name), stencil(name).base_node, f"gradscape.cells.{name}"
+    """Return the kernels `count, place_segments, place, tidy` of one precision, which make lists in this order.
 
-    @wp.func_native(TAKE_NUMBER)
-    def take_number(counts: wp.array2d[wp.int32], e: int, cell: int) -> int: ...
+    Where g2p has counted particles, `count` need not.
+    """
+    vec3 = precision(name).vec3
+    Lattice, count_in_cell, module = lattice(name), counter(name), f"gradscape.cells.{name}"
 
     @wp.func_native(TAKE_PLACES)
     def take_places(used: wp.array2d[wp.int32], e: int, total: int) -> wp.vec2i: ...
+
+    @wp.func(module=module)
+    def size_of(particles: int):
+        return wp.min(particles / STEP, SIZES - 1)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def count(
@@ -113,33 +149,23 @@ def cell_kernels(name: str) -> SimpleNamespace:
         cells: wp.array2d[wp.int32],
         numbers: wp.array2d[wp.int32],
         counts: wp.array2d[wp.int32],
-        used: wp.array2d[wp.int32],
     ):
         """Tell each particle its cell, and its number there in the order of arrival."""
         e, p = wp.tid()
-        if p == 0:
-            used[e, 0] = 0
-            used[e, 1] = 0
-        base = base_node((x[e, p] - lattice.origin) * lattice.inv_dx, lattice)
-        bottom = lattice.first[2] / SEGMENT
-        depth = (lattice.first[2] + lattice.nz - 1) / SEGMENT - bottom + 1
-        column = (base[0] - lattice.first[0]) * lattice.ny + base[1] - lattice.first[1]
-        cell = (column * depth - bottom) * SEGMENT + base[2]
-        cells[e, p] = cell
-        numbers[e, p] = take_number(counts, e, cell)
+        count_in_cell(lattice, x[e, p], e, p, cells, numbers, counts)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def place_segments(
         lattice: Lattice,
         counts: wp.array2d[wp.int32],
         used: wp.array2d[wp.int32],
+        sizes: wp.array2d[wp.int32],
         starts: wp.array2d[wp.int32],
-        which: wp.array2d[wp.int32],
-        first: wp.array2d[wp.int32],
-        end: wp.array2d[wp.int32],
+        found: wp.array2d[wp.vec4i],
+        numbers: wp.array2d[wp.int32],
         span: wp.array2d[wp.int32],
     ):
-        """Give each segment its places in the list, and each of its cells; count from 0 again."""
+        """Give each segment its places in the list, each of its cells, too, and it a number among those of its size."""
         e, s = wp.tid()
         bottom = lattice.first[2] / SEGMENT
         depth = (lattice.first[2] + lattice.nz - 1) / SEGMENT - bottom + 1
@@ -157,9 +183,8 @@ def cell_kernels(name: str) -> SimpleNamespace:
         taken = take_places(used, e, total)
         if total > 0:
             at, segment = taken[0], taken[1]
-            which[e, segment] = s
-            first[e, segment] = at
-            end[e, segment] = at + total
+            found[e, segment] = wp.vec4i(s, at, total, low + 256 * high)
+            numbers[e, segment] = take_number(sizes, e, size_of(total))
             for k in range(SEGMENT):
                 starts[e, s * STARTS + k] = at
                 at += counts[e, s * SEGMENT + k]
@@ -172,25 +197,42 @@ def cell_kernels(name: str) -> SimpleNamespace:
         numbers: wp.array2d[wp.int32],
         starts: wp.array2d[wp.int32],
         used: wp.array2d[wp.int32],
+        sizes: wp.array2d[wp.int32],
+        found: wp.array2d[wp.vec4i],
+        numbers_of_segments: wp.array2d[wp.int32],
         arrived: wp.array2d[wp.int32],
         full: wp.array[wp.int32],
+        segments: wp.array2d[wp.vec4i],
     ):
-        """List particles by cell, those of a cell as they arrived."""
+        """List particles by cell, those of a cell as they arrived, and segments by size, the largest first."""
         e, p = wp.tid()
         if p == 0:
             full[e] = used[e, 1]
         cell = cells[e, p]
         arrived[e, starts[e, cell + cell / SEGMENT] + numbers[e, p]] = p
+        if p < used[e, 1]:
+            segment = found[e, p]
+            at = numbers_of_segments[e, p]
+            for larger in range(size_of(segment[2]) + 1, SIZES):
+                at += sizes[e, larger]
+            segments[e, at] = segment
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def tidy(
         cells: wp.array2d[wp.int32],
         starts: wp.array2d[wp.int32],
         arrived: wp.array2d[wp.int32],
+        used: wp.array2d[wp.int32],
+        sizes: wp.array2d[wp.int32],
         order: wp.array2d[wp.int32],
     ):
-        """List them by cell, those of a cell as they lie in memory."""
+        """List them by cell, those of a cell as they lie in memory; count segments from 0 again."""
         e, p = wp.tid()
+        if p == 0:
+            used[e, 0] = 0
+            used[e, 1] = 0
+        for i in range(p, SIZES, cells.shape[1]):
+            sizes[e, i] = 0
         at = cells[e, p] + cells[e, p] / SEGMENT
         before = wp.int32(0)
         for i in range(starts[e, at], starts[e, at + 1]):

@@ -74,8 +74,8 @@ class Allocator:
     def lists(self, segments: int) -> Lists:
         """Return lists of no particles."""
         full: wp.array = wp.zeros(self.capacity, dtype=wp.int32, device=self.device)
-        by_segment = (self.array(wp.int32, segments) for _ in range(4))
-        return Lists(self.array(wp.int32, self.model.particles), full, *by_segment)
+        order = self.array(wp.int32, self.model.particles)
+        return Lists(order, full, self.array(wp.vec4i, segments), self.array(wp.int32, segments))
 
     def paths(self) -> wp.array:
         """Return zeros [environment, step, slot]."""
@@ -122,7 +122,7 @@ class Tape:
         """What its arrays take."""
         grids = [array for grid in self.grids for array in (grid.m, grid.v)]
         frames = [array for frame in set(self.frames) for array in frame.arrays()]
-        lists = [array for one in self.lists for array in (one.order, *one.segments())]
+        lists = [array for one in self.lists for array in one.arrays()]
         return sum(array.capacity for array in (*frames, *self.smoothed.values(), *self.A, *grids, *lists))
 
     def growth(self, box: Box) -> int:
@@ -133,7 +133,7 @@ class Tape:
         if self._cells < box.cells:
             growth += 2 * size * (self._room(box.cells) - self._cells)
         if self.lists and self._segments < segments(box):
-            growth += 4 * 4 * (segments(box) * 5 // 4 - self._segments)
+            growth += 4 * 5 * (segments(box) * 5 // 4 - self._segments)
         return growth * len(self.grids) * self._allocator.capacity
 
     def start(self, checkpoint: Frame) -> Frame:
@@ -162,7 +162,7 @@ class Tape:
     @property
     def _segments(self) -> int:
         """How many segments all its lists have room for."""
-        return min(int(lists.end.shape[1]) for lists in self.lists)
+        return min(int(lists.span.shape[1]) for lists in self.lists)
 
     def _room(self, cells: int) -> int:
         """Return how many nodes to make room for where so many are needed."""

@@ -9,7 +9,7 @@ nor on chance.
 """
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
 from typing import no_type_check
 
@@ -43,7 +43,7 @@ GPU_TEAM, CPU_TEAM = Team(32, 3, 9), Team(1, 1, 1)  # on a CPU a thread has a se
 
 EMIT = """
         {
-            *(Four *)&wp::index(parts, e, at + row * PLANES + now) = low;
+            out[now++] = low;
             low = middle, middle = high, high = Four{};
         }
 """
@@ -58,31 +58,39 @@ OPEN = """
 WALK = """
 #if defined(__CUDA_ARCH__)
     FOUR
-    __shared__ Four stage[WARPS][32][5];
+    struct alignas(16) Weights { REAL low, middle, high; int cell; };
+    struct Particle { Four q, x, y, z; Weights weights; };
+    __shared__ Particle stage[WARPS][3 * ROUND];
     const int lane = threadIdx.x & 31, row = lane % 9, i = row / 3, j = row % 3;
-    Four (*rows)[5] = stage[threadIdx.x >> 5];
-    __syncwarp();
-    rows[lane][0] = Four{q[0], q[1], q[2], mass};
-    rows[lane][1] = Four{a.data[0][0], a.data[1][0], a.data[2][0], f[0]};
-    rows[lane][2] = Four{a.data[0][1], a.data[1][1], a.data[2][1], f[1]};
-    rows[lane][3] = Four{a.data[0][2], a.data[1][2], a.data[2][2], f[2]};
-    rows[lane][4].a = REAL(cell);
-    __syncwarp();
     const REAL oi = REAL(i), oj = REAL(j), half = REAL(0.5), one = REAL(1.0), more = REAL(1.5), three = REAL(0.75);
+    const auto pack = [&](const auto &p) {
+        const REAL u = p.f[2] - more, v = p.f[2] - one, w = p.f[2] - half;
+        return Particle{
+            {p.q[0], p.q[1], p.q[2], p.mass},
+            {p.a.data[0][0], p.a.data[1][0], p.a.data[2][0], p.f[0]},
+            {p.a.data[0][1], p.a.data[1][1], p.a.data[2][1], p.f[1]},
+            {p.a.data[0][2], p.a.data[1][2], p.a.data[2][2], REAL(0.0)},
+            {half * u * u, three - v * v, half * w * w, p.cell}};
+    };
+    Particle *staged = stage[threadIdx.x >> 5] + lane / 9 * ROUND;
+    __syncwarp();
+    if (lane < 27) staged[row] = pack(first), staged[row + 9] = pack(second);
+    __syncwarp();
     const REAL ui = i == 1 ? three : REAL(0.0), si = i == 1 ? -one : half, mi = more - half * oi;
     const REAL uj = j == 1 ? three : REAL(0.0), sj = j == 1 ? -one : half, mj = more - half * oj;
     Four low{state[0], state[1], state[2], state[3]};
     Four middle{state[4], state[5], state[6], state[7]};
     Four high{state[8], state[9], state[10], state[11]};
+    Four *out = (Four *)&wp::index(parts, e, at) + row * PLANES;
     int now = (int)state[12];
     for (int t = 0; t < count; ++t) {
-        const Four *given = rows[lane - row + t];
-        const Four b = given[0], x = given[1], y = given[2], z = given[3];
-        const int here = (int)given[4].a;
-        for (; now < here; ++now) EMIT
-        const REAL tx = x.d - mi, ty = y.d - mj, u = z.d - more, v = z.d - one, w = z.d - half;
+        const Four b = staged[t].q, x = staged[t].x, y = staged[t].y, z = staged[t].z;
+        const Weights w = staged[t].weights;
+#pragma unroll 1
+        while (now < w.cell) EMIT
+        const REAL tx = x.d - mi, ty = y.d - mj;
         const REAL wij = (ui + si * tx * tx) * (uj + sj * ty * ty);
-        const REAL w0 = wij * (half * u * u), w1 = wij * (three - v * v), w2 = wij * (half * w * w);
+        const REAL w0 = wij * w.low, w1 = wij * w.middle, w2 = wij * w.high;
         REAL qa = b.a + oi * x.a + oj * y.a, qb = b.b + oi * x.b + oj * y.b, qc = b.c + oi * x.c + oj * y.c;
         low.a += w0 * qa, low.b += w0 * qb, low.c += w0 * qc, low.d += w0 * b.d;
         qa += z.a, qb += z.b, qc += z.c;
@@ -97,24 +105,27 @@ WALK = """
     left[12] = REAL(now);
     return left;
 #else
-    REAL w[3][3];
-    for (int axis = 0; axis < 3; ++axis) {
-        const REAL g = f[axis], half = REAL(0.5);
-        w[axis][0] = half * (g - REAL(1.5)) * (g - REAL(1.5));
-        w[axis][1] = REAL(0.75) - (g - REAL(1.0)) * (g - REAL(1.0));
-        w[axis][2] = half * (g - half) * (g - half);
-    }
-    for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j)
-            for (int k = 0; k < 3; ++k) {
-                const REAL weight = w[0][i] * w[1][j] * w[2][k];
-                wp::vec_t<4, REAL> &sum = wp::index(parts, e, at + (3 * i + j) * PLANES + cell + k);
-                for (int d = 0; d < 3; ++d) {
-                    const REAL move = REAL(i) * a.data[d][0] + REAL(j) * a.data[d][1] + REAL(k) * a.data[d][2];
-                    sum[d] += weight * (q[d] + move);
+    for (int n = 0; n < count; ++n) {
+        const auto &p = n ? second : first;
+        REAL w[3][3];
+        for (int axis = 0; axis < 3; ++axis) {
+            const REAL g = p.f[axis], half = REAL(0.5);
+            w[axis][0] = half * (g - REAL(1.5)) * (g - REAL(1.5));
+            w[axis][1] = REAL(0.75) - (g - REAL(1.0)) * (g - REAL(1.0));
+            w[axis][2] = half * (g - half) * (g - half);
+        }
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j)
+                for (int k = 0; k < 3; ++k) {
+                    const REAL weight = w[0][i] * w[1][j] * w[2][k];
+                    wp::vec_t<4, REAL> &sum = wp::index(parts, e, at + (3 * i + j) * PLANES + p.cell + k);
+                    for (int d = 0; d < 3; ++d) {
+                        const REAL move = REAL(i) * p.a.data[d][0] + REAL(j) * p.a.data[d][1] + REAL(k) * p.a.data[d][2];
+                        sum[d] += weight * (p.q[d] + move);
+                    }
+                    sum[3] += weight * p.mass;
                 }
-                sum[3] += weight * mass;
-            }
+    }
     return state;
 #endif
 """
@@ -125,7 +136,10 @@ CLOSE = """
     Four low{state[0], state[1], state[2], state[3]};
     Four middle{state[4], state[5], state[6], state[7]};
     Four high{state[8], state[9], state[10], state[11]};
-    for (int now = (int)state[12]; now < span >> 8; ++now) EMIT
+    Four *out = (Four *)&wp::index(parts, e, at) + row * PLANES;
+    int now = (int)state[12];
+#pragma unroll 1
+    while (now < span >> 8) EMIT
 #endif
 """
 MOST = """
@@ -169,7 +183,7 @@ ADD_UP = """
 
 def fill(code: str, name: str) -> str:
     """Put what a precision decides, and other constants, into C++."""
-    words = {"EMIT": EMIT, "PLANES": PLANES, "PARTS": PARTS, "SEGMENT": SEGMENT, "WARPS": BLOCK // 32}
+    words = {"EMIT": EMIT, "PLANES": PLANES, "PARTS": PARTS, "SEGMENT": SEGMENT, "WARPS": BLOCK // 32, "ROUND": 18}
     for word, value in words.items():
         code = code.replace(word, str(value))
     return in_precision(code, name)
@@ -178,16 +192,29 @@ def fill(code: str, name: str) -> str:
 @cache
 @no_type_check
 def walker(name: str) -> SimpleNamespace:
-    """Return the functions `most, open, walk, close` of one precision.
+    """Return the functions `at_nodes, most, open, walk, close` of one precision.
 
-    A warp's lanes call all of them, together: `most` for the greatest of their counts, `open` before their segment,
+    `at_nodes` says what a particle gives to its nodes, as a `Given`. A warp's lanes call all of them, together: `most` for the greatest of their counts, `open` before their segment,
     whose parts begin at `at`, `close` after it. `walk` adds the next `count` particles of each group to its parts. A
-    lane knows one of them: its cell in the segment, where it is from its base node, `f`, its mass, and the q and a of
-    what it gives node i, w_i (q + a i), and w_i mass.
+    lane knows two of them, as far apart in the list as a group has lanes.
     """
     types = precision(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
     State = wp.types.vector(13, real)
+    Lattice, base_node = lattice(name), stencil(name).base_node
+
+    @partial(wp.struct, module=f"gradscape.given.{name}")
+    class Given:
+        """A particle's cell in its segment, where it is from its base node, and what node i gets of it.
+
+        That is w_i (q + a i), i counted from the base node, and w_i mass.
+        """
+
+        cell: int
+        f: vec3
+        mass: real
+        q: vec3
+        a: mat33
 
     @wp.func_native(MOST)
     def most(count: int) -> int: ...
@@ -197,45 +224,39 @@ def walker(name: str) -> SimpleNamespace:
 
     @wp.func_native(fill(WALK, name))
     def walk(
-        parts: wp.array2d[vec4],
-        e: int,
-        at: int,
-        count: int,
-        cell: int,
-        f: vec3,
-        mass: real,
-        q: vec3,
-        a: mat33,
-        state: State,
+        parts: wp.array2d[vec4], e: int, at: int, count: int, first: Given, second: Given, state: State
     ) -> State: ...
 
     @wp.func_native(fill(CLOSE, name))
     def close_segment(parts: wp.array2d[vec4], e: int, at: int, span: int, state: State): ...
 
-    return SimpleNamespace(most=most, open=open_segment, walk=walk, close=close_segment)
+    @wp.func(module=f"gradscape.given.{name}")
+    def at_nodes(lattice: Lattice, x: vec3):
+        """Return what a particle there gives to its nodes: nothing as yet."""
+        given = Given()
+        s = (x - lattice.origin) * lattice.inv_dx
+        base = base_node(s, lattice)
+        given.cell = base[2] % SEGMENT
+        given.f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
+        return given
+
+    return SimpleNamespace(at_nodes=at_nodes, most=most, open=open_segment, walk=walk, close=close_segment)
 
 
 @cache
 @no_type_check
 def segment_taker(team: Team):
-    """Return the function that says of a thread's segment (number, span, first place, count), none if it has none."""
+    """Return the function that says of a thread's segment (number, first place, count, span), none if it has none."""
     lanes, groups, size = team.lanes, team.groups, team.size
 
     @wp.func(module=f"gradscape.columns.{lanes}")
-    def take_segment(
-        e: int,
-        t: int,
-        full: int,
-        which: wp.array2d[wp.int32],
-        first: wp.array2d[wp.int32],
-        end: wp.array2d[wp.int32],
-        spans: wp.array2d[wp.int32],
-    ):
+    def take_segment(e: int, t: int, full: wp.array[wp.int32], segments: wp.array2d[wp.vec4i]):
         group = t % lanes / size
         i = t / lanes * groups + group
-        if group >= groups or i >= full:
+        mine = segments[e, wp.min(i, segments.shape[1] - 1)]  # does not wait for how many there are
+        if group >= groups or i >= full[e]:
             return wp.vec4i(0, 0, 0, 0)
-        return wp.vec4i(which[e, i], spans[e, which[e, i]], first[e, i], end[e, i] - first[e, i])
+        return mine
 
     return take_segment
 
@@ -262,22 +283,57 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
     """
     types = precision(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
-    Lattice, base_node, steps = lattice(name), stencil(name).base_node, walker(name)
+    Lattice, steps = lattice(name), walker(name)
     add_up_node, module = node_sum(name), f"gradscape.columns.{name}.{team.lanes}"
     take_segment, most = segment_taker(team), steps.most
-    open_segment, walk, close_segment = steps.open, steps.walk, steps.close
+    at_nodes, open_segment, walk, close_segment = steps.at_nodes, steps.open, steps.walk, steps.close
     lanes, groups, size = team.lanes, team.groups, team.size
-    read_matrix, write_node = layout(name).read_matrix, layout(name).write_node
+    lies = layout(name)
+    read_number, read_vector, read_matrix, write_node = (
+        lies.read_number,
+        lies.read_vector,
+        lies.read_matrix,
+        lies.write_node,
+    )
+
+    @wp.func(module=module)
+    def momentum(
+        lattice: Lattice,
+        mass: wp.array2d[real],
+        x: wp.array2d[vec3],
+        v: wp.array2d[vec3],
+        A: wp.array2d[mat33],
+        e: int,
+        p: int,
+    ):
+        given = at_nodes(lattice, read_vector(x, e, p))
+        given.mass = read_number(mass, e, p)
+        given.a = read_matrix(A, e, p) * (real(1.0) / lattice.inv_dx)
+        given.q = given.mass * read_vector(v, e, p) - given.a * given.f
+        return given
+
+    @wp.func(module=module)
+    def velocity_adjoint(
+        lattice: Lattice,
+        dt: real,
+        x: wp.array2d[vec3],
+        adj_x_new: wp.array2d[vec3],
+        adj_v_new: wp.array2d[vec3],
+        adj_C_new: wp.array2d[mat33],
+        e: int,
+        p: int,
+    ):
+        given = at_nodes(lattice, read_vector(x, e, p))
+        given.a = (real(4.0) * lattice.inv_dx) * read_matrix(adj_C_new, e, p)
+        given.q = read_vector(adj_v_new, e, p) + dt * read_vector(adj_x_new, e, p) - given.a * given.f
+        return given
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def p2g(
         lattice: Lattice,
         order: wp.array2d[wp.int32],
         full: wp.array[wp.int32],
-        which: wp.array2d[wp.int32],
-        first: wp.array2d[wp.int32],
-        end: wp.array2d[wp.int32],
-        spans: wp.array2d[wp.int32],
+        segments: wp.array2d[wp.vec4i],
         mass: wp.array2d[real],
         x: wp.array2d[vec3],
         v: wp.array2d[vec3],
@@ -286,22 +342,17 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
     ):
         """Scatter momentum m v + A (x_i - x) and mass."""
         e, t = wp.tid()
+        mine = take_segment(e, t, full, segments)
         if t / lanes * groups >= full[e]:
             return
-        mine = take_segment(e, t, full[e], which, first, end, spans)
-        at, span, begin, count = mine[0] * PARTS, mine[1], mine[2], mine[3]
+        at, begin, count, span = mine[0] * PARTS, mine[1], mine[2], mine[3]
         state = open_segment(parts, e, at, span)
-        following = order[e, begin + wp.min(t % lanes % size, wp.max(count - 1, 0))]
-        for i in range(0, most(count), size):
-            p = following
-            following = order[e, begin + wp.min(i + size + t % lanes % size, wp.max(count - 1, 0))]
-            s = (x[e, p] - lattice.origin) * lattice.inv_dx
-            base = base_node(s, lattice)
-            f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
-            m = mass[e, p]
-            a = read_matrix(A, e, p) * (real(1.0) / lattice.inv_dx)
-            q = m * v[e, p] - a * f
-            state = walk(parts, e, at, wp.min(size, count - i), base[2] % SEGMENT, f, m, q, a, state)
+        last = begin + wp.max(count - 1, 0)
+        place = begin + t % lanes % size
+        for i in range(0, most(count), 2 * size):
+            first = momentum(lattice, mass, x, v, A, e, order[e, wp.min(place + i, last)])
+            second = momentum(lattice, mass, x, v, A, e, order[e, wp.min(place + i + size, last)])
+            state = walk(parts, e, at, wp.min(2 * size, count - i), first, second, state)
         close_segment(parts, e, at, span, state)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
@@ -309,10 +360,7 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
         lattice: Lattice,
         order: wp.array2d[wp.int32],
         full: wp.array[wp.int32],
-        which: wp.array2d[wp.int32],
-        first: wp.array2d[wp.int32],
-        end: wp.array2d[wp.int32],
-        spans: wp.array2d[wp.int32],
+        segments: wp.array2d[wp.vec4i],
         dt: real,
         x: wp.array2d[vec3],
         adj_x_new: wp.array2d[vec3],
@@ -322,21 +370,21 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
     ):
         """Scatter the adjoints of the velocities that g2p gathered."""
         e, t = wp.tid()
+        mine = take_segment(e, t, full, segments)
         if t / lanes * groups >= full[e]:
             return
-        mine = take_segment(e, t, full[e], which, first, end, spans)
-        at, span, begin, count = mine[0] * PARTS, mine[1], mine[2], mine[3]
+        at, begin, count, span = mine[0] * PARTS, mine[1], mine[2], mine[3]
         state = open_segment(parts, e, at, span)
-        following = order[e, begin + wp.min(t % lanes % size, wp.max(count - 1, 0))]
-        for i in range(0, most(count), size):
-            p = following
-            following = order[e, begin + wp.min(i + size + t % lanes % size, wp.max(count - 1, 0))]
-            s = (x[e, p] - lattice.origin) * lattice.inv_dx
-            base = base_node(s, lattice)
-            f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
-            c = (real(4.0) * lattice.inv_dx) * read_matrix(adj_C_new, e, p)
-            q = adj_v_new[e, p] + dt * adj_x_new[e, p] - c * f
-            state = walk(parts, e, at, wp.min(size, count - i), base[2] % SEGMENT, f, real(0.0), q, c, state)
+        last = begin + wp.max(count - 1, 0)
+        place = begin + t % lanes % size
+        for i in range(0, most(count), 2 * size):
+            first = velocity_adjoint(
+                lattice, dt, x, adj_x_new, adj_v_new, adj_C_new, e, order[e, wp.min(place + i, last)]
+            )
+            second = velocity_adjoint(
+                lattice, dt, x, adj_x_new, adj_v_new, adj_C_new, e, order[e, wp.min(place + i + size, last)]
+            )
+            state = walk(parts, e, at, wp.min(2 * size, count - i), first, second, state)
         close_segment(parts, e, at, span, state)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)

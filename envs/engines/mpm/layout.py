@@ -53,6 +53,7 @@ WRITE_NODE = """
     wp::index(grid, e, i) = value;
 #endif
 """
+READ_ELEMENT = "return (&wp::index(values, e, 0))[i];"
 
 # Warp's own adjoints of these, for a CPU, where tests hold those by hand against them.
 ADD_MATRIX = "if (adj_values.data) wp::index(adj_values, e, p) += adj_ret;"
@@ -69,9 +70,9 @@ def in_precision(code: str, name: str) -> str:
 @cache
 @no_type_check
 def layout(name: str) -> SimpleNamespace:
-    """Return the functions `read_matrix, write_matrix, read_node, write_node, read_number` of one precision."""
+    """Return the functions `read_matrix, write_matrix, read_node, write_node, read_number, read_vector`."""
     types = precision(name)
-    real, mat33, vec4 = types.real, types.mat33, types.vec4
+    real, vec3, mat33, vec4 = types.real, types.vec3, types.mat33, types.vec4
 
     @wp.func_native(in_precision(READ_MATRIX, name), adj_snippet=ADD_MATRIX)
     def read_matrix(values: wp.array2d[mat33], e: int, p: int) -> mat33: ...
@@ -85,11 +86,15 @@ def layout(name: str) -> SimpleNamespace:
     @wp.func_native(in_precision(WRITE_NODE, name))
     def write_node(grid: wp.array2d[vec4], e: int, i: int, value: vec4): ...
 
-    @wp.func_native("return (&wp::index(values, e, 0))[i];", adj_snippet=ADD_NUMBER)
+    @wp.func_native(READ_ELEMENT, adj_snippet=ADD_NUMBER)
     def read_number(values: wp.array2d[real], e: int, i: int) -> real: ...
+
+    @wp.func_native(READ_ELEMENT, adj_snippet=ADD_NUMBER)
+    def read_vector(values: wp.array2d[vec3], e: int, i: int) -> vec3: ...
 
     return SimpleNamespace(
         read_number=read_number,
+        read_vector=read_vector,
         read_matrix=read_matrix,
         write_matrix=write_matrix,
         read_node=read_node,

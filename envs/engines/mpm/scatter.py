@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import warp as wp
 
 from ..runtime import load
-from .cells import SEGMENT, STARTS, Lists, cell_kernels, segments, warps
+from .cells import SEGMENT, SIZES, STARTS, Lists, cell_kernels, segments, warps
 from .checkpoints import Frame
 from .columns import CPU_TEAM, GPU_TEAM, PARTS, column_kernels
 from .model import Box
@@ -20,8 +20,14 @@ class Scatter(Protocol):
     def make_room(self, box: Box) -> bool:
         """Make room for a box of nodes, and say whether arrays were replaced."""
 
-    def list_particles(self, step: int, substep: int, frame: Frame, batch: int) -> None:
-        """Find out where particles are, before a substep."""
+    def begin(self) -> None:
+        """Forget what a run that was interrupted has left."""
+
+    def list_particles(self, step: int, substep: int, frame: Frame, batch: int, *, counted: bool) -> None:
+        """Find out where particles are, before a substep; g2p may have `counted` them already."""
+
+    def counting(self, counted: bool) -> list[Any]:
+        """Return what g2p takes so as to count particles where it moves them to."""
 
     def p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
         """Fill the substep's grid with momentum and mass."""
@@ -42,8 +48,15 @@ class InPlace:
         """Make room for a box of nodes, and say whether arrays were replaced."""
         return False
 
-    def list_particles(self, step: int, substep: int, frame: Frame, batch: int) -> None:
-        """Find out where particles are, before a substep."""
+    def begin(self) -> None:
+        """Forget what a run that was interrupted has left."""
+
+    def list_particles(self, step: int, substep: int, frame: Frame, batch: int, *, counted: bool) -> None:
+        """Find out where particles are, before a substep; g2p may have `counted` them already."""
+
+    def counting(self, counted: bool) -> list[Any]:
+        """Return what g2p takes so as to count particles where it moves them to."""
+        return []
 
     def p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
         """Fill the substep's grid with momentum and mass."""
@@ -77,7 +90,7 @@ class ByColumns:
         self.listing = cell_kernels(model.precision)
         load([self.kernels.p2g, self.listing.count], device)
         self.cells, self.numbers, self.arrived = (allocator.array(wp.int32, model.particles) for _ in range(3))
-        self.used = allocator.array(wp.int32, 2)
+        self.used, self.sizes = (allocator.array(wp.int32, count) for count in (2, SIZES))
         self._allocate(1)
 
     def make_room(self, box: Box) -> bool:
@@ -89,18 +102,29 @@ class ByColumns:
         self._allocate(wanted * 5 // 4)
         return True
 
-    def list_particles(self, step: int, substep: int, frame: Frame, batch: int) -> None:
-        """Find out where particles are, before a substep."""
+    def begin(self) -> None:
+        """Forget what a run that was interrupted has left."""
+        for array in (self.counts, self.used, self.sizes):
+            array.zero_()
+
+    def list_particles(self, step: int, substep: int, frame: Frame, batch: int, *, counted: bool) -> None:
+        """Find out where particles are, before a substep; g2p may have `counted` them already."""
         solver, tape, kernels = self.solver, self.solver.tape(step), self.listing
         lists: Lists = tape.lists[substep]
         count = solver.model.particles
-        inputs = [tape.lattice, frame.x, self.cells, self.numbers, self.counts, self.used]
-        solver.launch(kernels.count, count, batch, inputs)
-        inputs = [tape.lattice, self.counts, self.used, self.starts, *lists.segments()[1:]]
+        if not counted:
+            inputs = [tape.lattice, frame.x, self.cells, self.numbers, self.counts]
+            solver.launch(kernels.count, count, batch, inputs)
+        inputs = [tape.lattice, self.counts, self.used, self.sizes, self.starts, *self.found, lists.span]
         solver.launch_on_box(kernels.place_segments, warps, batch, inputs)
-        inputs = [self.cells, self.numbers, self.starts, self.used, self.arrived, lists.full]
-        solver.launch(kernels.place, count, batch, inputs)
-        solver.launch(kernels.tidy, count, batch, [self.cells, self.starts, self.arrived, lists.order])
+        inputs = [self.cells, self.numbers, self.starts, self.used, self.sizes, *self.found, self.arrived]
+        solver.launch(kernels.place, count, batch, [*inputs, lists.full, lists.segments])
+        inputs = [self.cells, self.starts, self.arrived, self.used, self.sizes, lists.order]
+        solver.launch(kernels.tidy, count, batch, inputs)
+
+    def counting(self, counted: bool) -> list[Any]:
+        """Return what g2p takes so as to count particles where it moves them to."""
+        return [int(counted), self.cells, self.numbers, self.counts]
 
     def p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
         """Fill the substep's grid with momentum and mass."""
@@ -123,7 +147,7 @@ class ByColumns:
         """Launch a kernel that leaves parts of sums at nodes, after the substep's lists."""
         tape = self.solver.tape(step)
         lists: Lists = tape.lists[substep]
-        given = [tape.lattice, lists.order, *lists.segments(), *inputs, self.parts]
+        given = [tape.lattice, lists.order, lists.full, lists.segments, *inputs, self.parts]
         self.solver.launch_on_box(kernel, self.team.threads, batch, given)
 
     def add_up(self, kernel: Any, step: int, substep: int, batch: int, grids: list[wp.array]) -> None:
@@ -137,6 +161,7 @@ class ByColumns:
         allocator = self.solver.allocator
         self.parts: wp.array = allocator.array(allocator.types.vec4, count * PARTS)
         self.counts, self.starts = (allocator.array(wp.int32, count * size) for size in (SEGMENT, STARTS))
+        self.found = allocator.array(wp.vec4i, count), allocator.array(wp.int32, count)
 
 
 def nodes(box: Box) -> int:

@@ -7,9 +7,9 @@ from typing import no_type_check
 import warp as wp
 
 from ..runtime import precision
-from .cells import SEGMENT
 from .columns import PARTS, Team, node_sum, segment_taker, walker
-from .stencil import lattice, stencil
+from .layout import layout
+from .stencil import lattice
 
 
 @cache
@@ -20,22 +20,46 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
     The body's particles are `size` from number `first` on; others in the same cells give nothing.
     """
     types = precision(name)
-    real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
-    Lattice, base_node, steps = lattice(name), stencil(name).base_node, walker(name)
+    real, vec3, vec4 = types.real, types.vec3, types.vec4
+    Lattice, steps = lattice(name), walker(name)
     take_segment, most = segment_taker(team), steps.most
-    open_segment, walk, close_segment = steps.open, steps.walk, steps.close
+    at_nodes, open_segment, walk, close_segment = steps.at_nodes, steps.open, steps.walk, steps.close
     lanes, groups, size = team.lanes, team.groups, team.size
     add_up_node, module = node_sum(name), f"gradscape.smoothing.{name}.columns.{team.lanes}"
+    read_number, read_vector = layout(name).read_number, layout(name).read_vector
+
+    @wp.func(module=module)
+    def given_volume(
+        lattice: Lattice,
+        body: int,
+        slope: real,
+        volume: wp.array2d[real],
+        x: wp.array2d[vec3],
+        J: wp.array2d[real],
+        e: int,
+        p: int,
+    ):
+        given = at_nodes(lattice, read_vector(x, e, p))
+        if p >= body and p < body + J.shape[1]:
+            V = read_number(volume, e, p)
+            given.q = vec3(V * (wp.log(read_number(J, e, p - body)) - slope * read_vector(x, e, p)[1]), V, real(0.0))
+        return given
+
+    @wp.func(module=module)
+    def given_adjoint(
+        lattice: Lattice, body: int, share: real, x: wp.array2d[vec3], adj_log: wp.array2d[real], e: int, p: int
+    ):
+        given = at_nodes(lattice, read_vector(x, e, p))
+        if p >= body and p < body + adj_log.shape[1]:
+            given.q = vec3(share * read_number(adj_log, e, p - body), real(0.0), real(0.0))
+        return given
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def spread(
         lattice: Lattice,
         order: wp.array2d[wp.int32],
         full: wp.array[wp.int32],
-        which: wp.array2d[wp.int32],
-        first: wp.array2d[wp.int32],
-        end: wp.array2d[wp.int32],
-        spans: wp.array2d[wp.int32],
+        segments: wp.array2d[wp.vec4i],
         body: int,
         slope: real,
         volume: wp.array2d[real],
@@ -45,23 +69,17 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
     ):
         """Scatter V s and V."""
         e, t = wp.tid()
+        mine = take_segment(e, t, full, segments)
         if t / lanes * groups >= full[e]:
             return
-        mine = take_segment(e, t, full[e], which, first, end, spans)
-        at, span, begin, count = mine[0] * PARTS, mine[1], mine[2], mine[3]
+        at, begin, count, span = mine[0] * PARTS, mine[1], mine[2], mine[3]
         state = open_segment(parts, e, at, span)
-        following = order[e, begin + wp.min(t % lanes % size, wp.max(count - 1, 0))]
-        for i in range(0, most(count), size):
-            p = following
-            following = order[e, begin + wp.min(i + size + t % lanes % size, wp.max(count - 1, 0))]
-            s = (x[e, p] - lattice.origin) * lattice.inv_dx
-            base = base_node(s, lattice)
-            f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
-            q = vec3()
-            if p >= body and p < body + J.shape[1]:
-                V = volume[e, p]
-                q = vec3(V * (wp.log(J[e, p - body]) - slope * x[e, p][1]), V, real(0.0))
-            state = walk(parts, e, at, wp.min(size, count - i), base[2] % SEGMENT, f, real(0.0), q, mat33(), state)
+        last = begin + wp.max(count - 1, 0)
+        place = begin + t % lanes % size
+        for i in range(0, most(count), 2 * size):
+            first = given_volume(lattice, body, slope, volume, x, J, e, order[e, wp.min(place + i, last)])
+            second = given_volume(lattice, body, slope, volume, x, J, e, order[e, wp.min(place + i + size, last)])
+            state = walk(parts, e, at, wp.min(2 * size, count - i), first, second, state)
         close_segment(parts, e, at, span, state)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
@@ -82,10 +100,7 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         lattice: Lattice,
         order: wp.array2d[wp.int32],
         full: wp.array[wp.int32],
-        which: wp.array2d[wp.int32],
-        first: wp.array2d[wp.int32],
-        end: wp.array2d[wp.int32],
-        spans: wp.array2d[wp.int32],
+        segments: wp.array2d[wp.vec4i],
         body: int,
         share: real,
         x: wp.array2d[vec3],
@@ -94,22 +109,17 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
     ):
         """Scatter the adjoints of the nodes' means, from those of log J'."""
         e, t = wp.tid()
+        mine = take_segment(e, t, full, segments)
         if t / lanes * groups >= full[e]:
             return
-        mine = take_segment(e, t, full[e], which, first, end, spans)
-        at, span, begin, count = mine[0] * PARTS, mine[1], mine[2], mine[3]
+        at, begin, count, span = mine[0] * PARTS, mine[1], mine[2], mine[3]
         state = open_segment(parts, e, at, span)
-        following = order[e, begin + wp.min(t % lanes % size, wp.max(count - 1, 0))]
-        for i in range(0, most(count), size):
-            p = following
-            following = order[e, begin + wp.min(i + size + t % lanes % size, wp.max(count - 1, 0))]
-            s = (x[e, p] - lattice.origin) * lattice.inv_dx
-            base = base_node(s, lattice)
-            f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
-            q = vec3()
-            if p >= body and p < body + adj_log.shape[1]:
-                q = vec3(share * adj_log[e, p - body], real(0.0), real(0.0))
-            state = walk(parts, e, at, wp.min(size, count - i), base[2] % SEGMENT, f, real(0.0), q, mat33(), state)
+        last = begin + wp.max(count - 1, 0)
+        place = begin + t % lanes % size
+        for i in range(0, most(count), 2 * size):
+            first = given_adjoint(lattice, body, share, x, adj_log, e, order[e, wp.min(place + i, last)])
+            second = given_adjoint(lattice, body, share, x, adj_log, e, order[e, wp.min(place + i + size, last)])
+            state = walk(parts, e, at, wp.min(2 * size, count - i), first, second, state)
         close_segment(parts, e, at, span, state)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)

@@ -130,6 +130,7 @@ class Solver:
         """Simulate with the boundary's `tools`, shape (batch, step + 1, slot, 3); return x at their end [m]."""
         batch, steps = len(tools), tools.shape[1] - 1
         self.escaped.zero_()
+        self.scatter.begin()
         to_torch(self.tools)[:batch, : steps + 1] = tools.to(self.types.torch)
         corners = self.model.corners
         for step in range(steps):
@@ -258,7 +259,7 @@ class Solver:
         tape, frames = self.tape(step), self.frames(step)
         for s in substeps:
             with self.launches.beside(1):
-                self.scatter.list_particles(step, s, frames[s], batch)
+                self.scatter.list_particles(step, s, frames[s], batch, counted=s != substeps.start)
             if s == 0 and self.smoothers:
                 self.launches.join()
                 for smoother in self.smoothers:
@@ -266,7 +267,7 @@ class Solver:
             self._update(step, frames[s], frames[s + 1], tape.A[s], batch)
             self.launches.join()
             self._fill_grid(frames[s], step, s, batch)
-            self._move_particles(frames[s], frames[s + 1], step, s, batch)
+            self._move_particles(frames[s], frames[s + 1], step, s, batch, followed=s + 1 in substeps)
 
     def _update(self, step: int, frame: Frame, new: Frame, A: wp.array, batch: int) -> None:
         for b, (update, _) in enumerate(self.materials):
@@ -278,10 +279,11 @@ class Solver:
         self.scatter.p2g(step, substep, frame, batch)
         self.launch_on_box(self.velocity, nodes, batch, self.velocity_inputs(step, substep))
 
-    def _move_particles(self, frame: Frame, new: Frame, step: int, substep: int, batch: int) -> None:
+    def _move_particles(self, frame: Frame, new: Frame, step: int, substep: int, batch: int, *, followed: bool) -> None:
         tape = self.tape(step)
         grid_v = tape.grids[substep].v
         inputs = [tape.lattice, self.model.dt, frame.x, grid_v, new.x, new.v, new.C, self.left_box]
+        inputs += self.scatter.counting(followed)
         self.launch(self.kernels.g2p, self.model.particles, batch, inputs)
 
     def material_inputs(self, b: int, step: int, frame: Frame) -> list[Any]:

@@ -8,6 +8,16 @@ import warp as wp
 
 from ..runtime import precision
 
+# A compiler that makes one operation of a product and a sum would round otherwise in one kernel than in another, and a
+# particle close to the border of two cells would be listed in one and add to the nodes of the other.
+LOWEST = """
+#if defined(__CUDA_ARCH__)
+    return (int)floor(ADD(s, REAL(-0.5)));
+#else
+    return (int)floor(s - REAL(0.5));
+#endif
+"""
+
 
 @cache
 @no_type_check
@@ -46,13 +56,18 @@ def stencil(name: str) -> SimpleNamespace:
     real, vec3 = types.real, types.vec3
     Lattice, module = lattice(name), f"gradscape.stencil.{name}"
 
+    @wp.func_native(
+        LOWEST.replace("REAL", f"wp::{name}").replace("ADD", "__fadd_rn" if name == "float32" else "__dadd_rn")
+    )
+    def lowest(s: real) -> int: ...
+
     @wp.func(module=module)
     def base_node(s: vec3, lattice: Lattice):
         # Clamped, so that a particle out of the grid (its episode is reported as escaped) touches no foreign memory.
         return wp.vec3i(
-            wp.clamp(int(wp.floor(s[0] - real(0.5))), lattice.first[0], lattice.first[0] + lattice.nx - 3),
-            wp.clamp(int(wp.floor(s[1] - real(0.5))), lattice.first[1], lattice.first[1] + lattice.ny - 3),
-            wp.clamp(int(wp.floor(s[2] - real(0.5))), lattice.first[2], lattice.first[2] + lattice.nz - 3),
+            wp.clamp(lowest(s[0]), lattice.first[0], lattice.first[0] + lattice.nx - 3),
+            wp.clamp(lowest(s[1]), lattice.first[1], lattice.first[1] + lattice.ny - 3),
+            wp.clamp(lowest(s[2]), lattice.first[2], lattice.first[2] + lattice.nz - 3),
         )
 
     @wp.func(module=module)

@@ -15,6 +15,7 @@ from typing import no_type_check
 import warp as wp
 
 from ..runtime import precision
+from .cells import counter
 from .layout import layout
 from .stencil import lattice, stencil
 
@@ -24,13 +25,15 @@ from .stencil import lattice, stencil
 def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
     """Return the transfer kernels `p2g, g2p, adjoint_p2g, adjoint_g2p` of one precision.
 
-    Unless `scattering`, there is no p2g, and `adjoint_g2p` does not add to the grid: `columns` has both for a GPU.
+    Unless `scattering`, there is no p2g, and `adjoint_g2p` does not add to the grid: `columns` has both for a GPU. Then
+    g2p counts particles by cell, where they are now, if it is told to.
     """
     types = precision(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
     module = f"gradscape.transfers.{name}{'' if scattering else '.gathers'}"
     Lattice, spline = lattice(name), stencil(name)
     base_node, weights, weight_slopes = spline.base_node, spline.weights, spline.weight_slopes
+    count_in_cell = counter(name)
     lies = layout(name)
     read_matrix, write_matrix, read_node = lies.read_matrix, lies.write_matrix, lies.read_node
     offset = wp.constant(vec3(0.0, 1.0, 2.0))  # real(i) on an unrolled index breaks the code generator in float64
@@ -134,8 +137,8 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
         write_matrix(adj_A, e, p, dx * wp.matrix_from_cols(hx - f[0] * h0, hy - f[1] * h0, hz - f[2] * h0))
         adj_x[e, p] = adj_x[e, p] + lattice.inv_dx * slope - wp.transpose(momentum) * h0
 
-    @wp.kernel(module=module, enable_backward=False)
-    def g2p(
+    @wp.func(module=module)
+    def move(
         lattice: Lattice,
         dt: real,
         x: wp.array2d[vec3],
@@ -144,9 +147,10 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
         v_new: wp.array2d[vec3],
         C_new: wp.array2d[mat33],
         left_box: wp.array[wp.int32],
+        e: int,
+        p: int,
     ):
-        """Gather v' = sum w v_i and C' = 4/dx^2 sum w v_i (x_i - x)^T; move x' = x + dt v'."""
-        e, p = wp.tid()
+        """Gather v' = sum w v_i and C' = 4/dx^2 sum w v_i (x_i - x)^T; return x' = x + dt v'."""
         s = (x[e, p] - lattice.origin) * lattice.inv_dx
         base = base_node(s, lattice)
         f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
@@ -173,9 +177,49 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
         v_new[e, p] = s0
         C = wp.matrix_from_cols(sx - f[0] * s0, sy - f[1] * s0, sz - f[2] * s0)
         write_matrix(C_new, e, p, (real(4.0) * lattice.inv_dx) * C)
-        x_new[e, p] = x[e, p] + dt * s0
+        there = x[e, p] + dt * s0
+        x_new[e, p] = there
         if wp.min(wp.min(f[0], f[1]), f[2]) < real(0.49) or wp.max(wp.max(f[0], f[1]), f[2]) > real(1.51):
             left_box[e] = 1
+        return there
+
+    if scattering:
+
+        @wp.kernel(module=module, enable_backward=False)
+        def g2p(
+            lattice: Lattice,
+            dt: real,
+            x: wp.array2d[vec3],
+            grid_v: wp.array2d[vec4],
+            x_new: wp.array2d[vec3],
+            v_new: wp.array2d[vec3],
+            C_new: wp.array2d[mat33],
+            left_box: wp.array[wp.int32],
+        ):
+            e, p = wp.tid()
+            move(lattice, dt, x, grid_v, x_new, v_new, C_new, left_box, e, p)
+
+    else:
+
+        @wp.kernel(module=module, enable_backward=False)
+        def g2p(
+            lattice: Lattice,
+            dt: real,
+            x: wp.array2d[vec3],
+            grid_v: wp.array2d[vec4],
+            x_new: wp.array2d[vec3],
+            v_new: wp.array2d[vec3],
+            C_new: wp.array2d[mat33],
+            left_box: wp.array[wp.int32],
+            counting: int,
+            cells: wp.array2d[wp.int32],
+            numbers: wp.array2d[wp.int32],
+            counts: wp.array2d[wp.int32],
+        ):
+            e, p = wp.tid()
+            there = move(lattice, dt, x, grid_v, x_new, v_new, C_new, left_box, e, p)
+            if counting > 0:
+                count_in_cell(lattice, there, e, p, cells, numbers, counts)
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint_g2p(

@@ -123,7 +123,7 @@ def test_every_kernel_that_is_timed_is_counted():
 def test_of_partial_sums_no_more_is_counted_than_is_told():
     """As many are met as there are segments with particles, which no argument says; what is walked is counted whole."""
     kernels, count = column_kernels("float32", GPU_TEAM), 40
-    segments = [wp.zeros(BATCH, dtype=wp.int32), *(wp.zeros((BATCH, 4), dtype=wp.int32) for _ in range(4))]
+    segments = [wp.zeros(BATCH, dtype=wp.int32), wp.zeros((BATCH, 4), dtype=wp.vec4i)]
     order = wp.zeros((BATCH, count), dtype=wp.int32)
     particles = [wp.zeros((BATCH, count), dtype=kind) for kind in (wp.float32, wp.vec3, wp.vec3, wp.mat33)]
     given = [kernels.p2g.adj.args[0].type(), order, *segments, *particles]

@@ -7,7 +7,7 @@ import pytest
 import torch
 import warp as wp
 
-from gradscape.envs.engines.mpm.cells import SEGMENT, STARTS, cell_kernels, segments, warps
+from gradscape.envs.engines.mpm.cells import SEGMENT, SIZES, STARTS, STEP, cell_kernels, segments, warps
 from gradscape.envs.engines.mpm.model import Body, Box, place_grid
 from gradscape.envs.engines.runtime import to_torch
 
@@ -59,16 +59,17 @@ def test_particles_are_listed_by_cell_and_then_as_they_lie(first):
     cell = ((x - torch.tensor(model.origin)) / model.dx - 0.5).floor().long()
     depth = segments(box) // (box.nodes[0] * box.nodes[1])
     for _ in range(2):  # the second time it begins where the first has ended
-        order, full, which, begins, ends, spans = listed(model, box, x)
+        order, full, segments_found, spans = listed(model, box, x)
         for row in range(2):
             keys = sorted((i, j, k // SEGMENT, k % SEGMENT, p) for p, (i, j, k) in enumerate(cell[row].tolist()))
             found = {}
-            for s, begin, end in zip(
-                *(array[row, : full[row]].tolist() for array in (which, begins, ends)), strict=True
-            ):
+            sizes = [min(count // STEP, SIZES - 1) for count in segments_found[row, : full[row], 2].tolist()]
+            assert sizes == sorted(sizes, reverse=True)
+            for s, begin, count, span in segments_found[row, : full[row]].tolist():
                 column, layer = divmod(s, depth)
                 place = *divmod(column, box.nodes[1]), layer + first // SEGMENT
-                found[place] = (order[row, begin:end].tolist(), divmod(int(spans[row, s]), 256))
+                found[place] = (order[row, begin : begin + count].tolist(), divmod(span, 256))
+                assert span == spans[row, s]
             wanted = {where: list(group) for where, group in groupby(keys, key=lambda key: key[:3])}
             assert found == {
                 where: ([key[-1] for key in group], (group[-1][3] + 3, group[0][3])) for where, group in wanted.items()
@@ -77,16 +78,19 @@ def test_particles_are_listed_by_cell_and_then_as_they_lie(first):
 
 
 def listed(model, box, x):
-    """Return the order of particles, and the full, which, first, end, and span of segments, all [row, *]."""
+    """Return the order of particles, and the number of full segments, these, and the span of all, all [row, *]."""
     kernels, lattice, (batch, count) = cell_kernels("float64"), place_grid(model, box), x.shape[:2]
-    at = wp.array(x.numpy(), dtype=wp.vec3d)
+    at, room = wp.array(x.numpy(), dtype=wp.vec3d), segments(box)
     cells, numbers, arrived, order = (wp.zeros((batch, count), dtype=wp.int32) for _ in range(4))
-    counts, starts = (wp.zeros((batch, segments(box) * size), dtype=wp.int32) for size in (SEGMENT, STARTS))
-    found = [wp.zeros((batch, segments(box)), dtype=wp.int32) for _ in range(4)]
-    full, used = wp.zeros(batch, dtype=wp.int32), wp.zeros((batch, 2), dtype=wp.int32)
-    wp.launch(kernels.count, (batch, count), [lattice, at, cells, numbers, counts, used])
-    wp.launch(kernels.place_segments, (batch, warps(box)), [lattice, counts, used, starts, *found])
-    wp.launch(kernels.place, (batch, count), [cells, numbers, starts, used, arrived, full])
-    wp.launch(kernels.tidy, (batch, count), [cells, starts, arrived, order])
-    assert not to_torch(counts).any()
-    return [to_torch(array).clone() for array in (order, full, *found)]
+    counts, starts = (wp.zeros((batch, room * size), dtype=wp.int32) for size in (SEGMENT, STARTS))
+    used, sizes, ranks, span = (wp.zeros((batch, size), dtype=wp.int32) for size in (2, SIZES, room, room))
+    unsorted, found = (wp.zeros((batch, room), dtype=wp.vec4i) for _ in range(2))
+    full = wp.zeros(batch, dtype=wp.int32)
+    wp.launch(kernels.count, (batch, count), [lattice, at, cells, numbers, counts])
+    inputs = [lattice, counts, used, sizes, starts, unsorted, ranks, span]
+    wp.launch(kernels.place_segments, (batch, warps(box)), inputs)
+    inputs = [cells, numbers, starts, used, sizes, unsorted, ranks, arrived, full, found]
+    wp.launch(kernels.place, (batch, count), inputs)
+    wp.launch(kernels.tidy, (batch, count), [cells, starts, arrived, used, sizes, order])
+    assert not any(to_torch(array).any() for array in (counts, used, sizes))
+    return [to_torch(array).clone() for array in (order, full, found, span)]
