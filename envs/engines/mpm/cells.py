@@ -94,7 +94,8 @@ def segments(box: Box) -> int:
 
 
 @wp.func_native(TAKE_NUMBER)
-def take_number(counts: wp.array2d[wp.int32], e: int, cell: int) -> int: ...
+def take_number(counts: wp.array2d[wp.int32], e: int, cell: int) -> int:
+    """Count one more, and return how many there were."""
 
 
 @cache

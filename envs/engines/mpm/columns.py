@@ -120,7 +120,7 @@ WALK = """
                     const REAL weight = w[0][i] * w[1][j] * w[2][k];
                     wp::vec_t<4, REAL> &sum = wp::index(parts, e, at + (3 * i + j) * PLANES + p.cell + k);
                     for (int d = 0; d < 3; ++d) {
-                        const REAL move = REAL(i) * p.a.data[d][0] + REAL(j) * p.a.data[d][1] + REAL(k) * p.a.data[d][2];
+                        const REAL *a = p.a.data[d], move = REAL(i) * a[0] + REAL(j) * a[1] + REAL(k) * a[2];
                         sum[d] += weight * (p.q[d] + move);
                     }
                     sum[3] += weight * p.mass;
@@ -151,8 +151,8 @@ MOST = """
 """
 ADD_UP = """
     FOUR
-    const int nz = grid.nz, ny = grid.ny, z = grid.first[2] + i % nz, y = i / nz % ny, x = i / nz / ny;
-    const int bottom = grid.first[2] / SEGMENT, depth = (grid.first[2] + nz - 1) / SEGMENT - bottom + 1;
+    const int nz = lattice.nz, ny = lattice.ny, z = lattice.first[2] + i % nz, y = i / nz % ny, x = i / nz / ny;
+    const int bottom = lattice.first[2] / SEGMENT, depth = (lattice.first[2] + nz - 1) / SEGMENT - bottom + 1;
     const int segment = z / SEGMENT - bottom, plane = z % SEGMENT;
     const bool both = plane < 2 && segment > 0;
     const int *row = &wp::index(spans, e, 0);
@@ -194,9 +194,10 @@ def fill(code: str, name: str) -> str:
 def walker(name: str) -> SimpleNamespace:
     """Return the functions `at_nodes, most, open, walk, close` of one precision.
 
-    `at_nodes` says what a particle gives to its nodes, as a `Given`. A warp's lanes call all of them, together: `most` for the greatest of their counts, `open` before their segment,
-    whose parts begin at `at`, `close` after it. `walk` adds the next `count` particles of each group to its parts. A
-    lane knows two of them, as far apart in the list as a group has lanes.
+    `at_nodes` says what a particle gives to its nodes, as a `Given`. A warp's lanes call the others together: `most`
+    for the greatest of their counts, `open` before their segment, whose parts begin at `at`, `close` after it. `walk`
+    adds the next `count` particles of each group to its parts. A lane knows two of them, as far apart in the list as a
+    group has lanes.
     """
     types = precision(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
@@ -268,7 +269,7 @@ def node_sum(name: str):
     Lattice, vec4 = lattice(name), precision(name).vec4
 
     @wp.func_native(fill(ADD_UP, name))
-    def add_up_node(grid: Lattice, spans: wp.array2d[wp.int32], parts: wp.array2d[vec4], e: int, i: int) -> vec4: ...
+    def add_up_node(lattice: Lattice, spans: wp.array2d[wp.int32], parts: wp.array2d[vec4], e: int, i: int) -> vec4: ...
 
     return add_up_node
 
@@ -276,25 +277,19 @@ def node_sum(name: str):
 @cache
 @no_type_check
 def column_kernels(name: str, team: Team) -> SimpleNamespace:
-    """Return the kernels `p2g, adjoint_g2p, add_up` of one precision for threads in a `team`.
+    """Return the kernels `p2g, adjoint_g2p` of one precision, over [environment, thread of a `team`].
 
-    The first two are the scatters of `transfers`, over [environment, thread of the team]; `add_up`, over [environment,
-    node], takes their parts to the nodes.
+    They are the scatters of `transfers`, up to the parts of sums that nodes then add up (`grid`).
     """
     types = precision(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
     Lattice, steps = lattice(name), walker(name)
-    add_up_node, module = node_sum(name), f"gradscape.columns.{name}.{team.lanes}"
+    module = f"gradscape.columns.{name}.{team.lanes}"
     take_segment, most = segment_taker(team), steps.most
     at_nodes, open_segment, walk, close_segment = steps.at_nodes, steps.open, steps.walk, steps.close
     lanes, groups, size = team.lanes, team.groups, team.size
     lies = layout(name)
-    read_number, read_vector, read_matrix, write_node = (
-        lies.read_number,
-        lies.read_vector,
-        lies.read_matrix,
-        lies.write_node,
-    )
+    read_number, read_vector, read_matrix = lies.read_number, lies.read_vector, lies.read_matrix
 
     @wp.func(module=module)
     def momentum(
@@ -387,9 +382,4 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
             state = walk(parts, e, at, wp.min(2 * size, count - i), first, second, state)
         close_segment(parts, e, at, span, state)
 
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def add_up(lattice: Lattice, spans: wp.array2d[wp.int32], parts: wp.array2d[vec4], grid: wp.array2d[vec4]):
-        e, i = wp.tid()
-        write_node(grid, e, i, add_up_node(lattice, spans, parts, e, i))
-
-    return SimpleNamespace(p2g=p2g, adjoint_g2p=adjoint_g2p, add_up=add_up)
+    return SimpleNamespace(p2g=p2g, adjoint_g2p=adjoint_g2p)

@@ -6,6 +6,7 @@ from typing import Any, no_type_check
 import warp as wp
 
 from ..runtime import precision
+from .columns import ADD_UP, fill
 from .exact import LANES
 from .layout import READ_NODE, WRITE_NODE, in_precision
 from .stencil import lattice
@@ -17,16 +18,50 @@ ADJOINT_WRITE = READ_NODE.replace("grid", "adj_grid").replace("return", "adj_val
 
 @cache
 @no_type_check
-def velocity_kernel(name: str, boundary_velocity: Any, Data: Any) -> Any:
-    """Return the kernel that turns a node's momentum into its velocity after gravity and boundary."""
+def velocity_at(name: str, boundary_velocity: Any, Data: Any) -> Any:
+    """Return the function that makes of a node's momentum and mass its velocity after gravity and boundary."""
     types = precision(name)
     real, vec3, vec4 = types.real, types.vec3, types.vec4
     Lattice = lattice(name)
 
+    @wp.func(module=f"gradscape.grid.{name}")
+    def velocity_at_node(
+        lattice: Lattice,
+        boundary: Data,
+        dt: real,
+        gravity: real,
+        g: vec4,
+        e: int,
+        i: int,
+        tools: wp.array3d[vec3],
+        sums: wp.array2d[wp.int64],
+        step: int,
+        fraction: real,
+        rate: real,
+    ) -> vec3:
+        first = lattice.first
+        k = i % lattice.nz
+        j = (i / lattice.nz) % lattice.ny
+        node = vec3(real(i / (lattice.nz * lattice.ny) + first[0]), real(j + first[1]), real(k + first[2]))
+        p = lattice.origin + node * (real(1.0) / lattice.inv_dx)
+        v = vec3(g[0], g[1], g[2]) / g[3] - vec3(real(0.0), dt * gravity, real(0.0))
+        return boundary_velocity(boundary, p, v, e, i % LANES, tools, sums, step, fraction, rate)
+
+    return velocity_at_node
+
+
+@cache
+@no_type_check
+def velocity_kernel(name: str, boundary_velocity: Any, Data: Any) -> Any:
+    """Return the kernel that turns a node's momentum into its velocity after gravity and boundary."""
+    types = precision(name)
+    real, vec3, vec4 = types.real, types.vec3, types.vec4
+    Lattice, velocity_at_node = lattice(name), velocity_at(name, boundary_velocity, Data)
+
     @wp.func_native(in_precision(READ_NODE, name), adj_snippet=in_precision(ADJOINT_READ, name))
     def read(grid: wp.array2d[vec4], e: int, i: int) -> vec4: ...
 
-    @wp.func_native(in_precision(WRITE_NODE, name), adj_snippet=in_precision(ADJOINT_WRITE, name))
+    @wp.func_native(in_precision(WRITE_NODE, name), adj_snippet=in_precision(ADJOINT_WRITE, name), replay_snippet="")
     def write(grid: wp.array2d[vec4], e: int, i: int, value: vec4): ...
 
     @wp.kernel(module="unique")
@@ -47,15 +82,66 @@ def velocity_kernel(name: str, boundary_velocity: Any, Data: Any) -> Any:
         e, i = wp.tid()
         g = read(grid_m, e, i)
         if g[3] > empty:
-            first = lattice.first
-            k = i % lattice.nz
-            j = (i / lattice.nz) % lattice.ny
-            node = vec3(real(i / (lattice.nz * lattice.ny) + first[0]), real(j + first[1]), real(k + first[2]))
-            p = lattice.origin + node * (real(1.0) / lattice.inv_dx)
-            v = vec3(g[0], g[1], g[2]) / g[3] - vec3(real(0.0), dt * gravity, real(0.0))
-            v = boundary_velocity(boundary, p, v, e, i % LANES, tools, sums, step, fraction, rate)
+            v = velocity_at_node(lattice, boundary, dt, gravity, g, e, i, tools, sums, step, fraction, rate)
             write(grid_v, e, i, vec4(v[0], v[1], v[2], real(0.0)))
         else:
             write(grid_v, e, i, vec4())
+
+    return velocity
+
+
+@cache
+@no_type_check
+def velocity_of_columns(name: str, boundary_velocity: Any, Data: Any) -> Any:
+    """Return the same kernel, for sums by `columns`: it adds up a node's momentum, its adjoint that of the velocity."""
+    types = precision(name)
+    real, vec3, vec4 = types.real, types.vec3, types.vec4
+    Lattice, velocity_at_node = lattice(name), velocity_at(name, boundary_velocity, Data)
+    keep = in_precision(WRITE_NODE, name)
+
+    @wp.func_native(f"const auto value = [&] {{ {fill(ADD_UP, name)} }}();\n{keep}", adj_snippet="", replay_snippet="")
+    def add_up(
+        lattice: Lattice, spans: wp.array2d[wp.int32], parts: wp.array2d[vec4], grid: wp.array2d[vec4], e: int, i: int
+    ): ...
+
+    @wp.func_native(in_precision(READ_NODE, name), adj_snippet=in_precision(ADJOINT_READ, name))
+    def read(grid: wp.array2d[vec4], e: int, i: int) -> vec4: ...
+
+    @wp.func_native(keep, adj_snippet=f"adj_value += [&] {{ {fill(ADD_UP, name)} }}();", replay_snippet="")
+    def write(
+        lattice: Lattice,
+        spans: wp.array2d[wp.int32],
+        parts: wp.array2d[vec4],
+        grid: wp.array2d[vec4],
+        e: int,
+        i: int,
+        value: vec4,
+    ): ...
+
+    @wp.kernel(module="unique")
+    def velocity(
+        lattice: Lattice,
+        boundary: Data,
+        dt: real,
+        gravity: real,
+        empty: real,
+        step: int,
+        fraction: real,
+        rate: real,
+        tools: wp.array3d[vec3],
+        sums: wp.array2d[wp.int64],
+        grid_m: wp.array2d[vec4],
+        grid_v: wp.array2d[vec4],
+        spans: wp.array2d[wp.int32],
+        parts: wp.array2d[vec4],
+    ):
+        e, i = wp.tid()
+        add_up(lattice, spans, parts, grid_m, e, i)  # its adjoint is not wanted, and finds in grid_m what it needs
+        g = read(grid_m, e, i)
+        if g[3] > empty:
+            v = velocity_at_node(lattice, boundary, dt, gravity, g, e, i, tools, sums, step, fraction, rate)
+            write(lattice, spans, parts, grid_v, e, i, vec4(v[0], v[1], v[2], real(0.0)))
+        else:
+            write(lattice, spans, parts, grid_v, e, i, vec4())
 
     return velocity

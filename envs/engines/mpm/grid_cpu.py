@@ -13,7 +13,7 @@ from ..runtime import precision, take_rows
 from .boundaries import Boundary
 from .boundaries_cpu import WALLS
 from .exact import LANES
-from .grid import velocity_kernel
+from .grid import velocity_kernel, velocity_of_columns
 from .stencil import lattice
 
 # Expressions are those of `grid` and of what Warp's adjoint of it computes, in their order. Its sums begin with 0, and
@@ -124,9 +124,11 @@ ADJOINT = (
 )
 
 
-def velocity_on(device: str, name: str, boundary: Boundary) -> Any:
-    """Return the velocity kernel of one precision that is quickest on a device."""
+def velocity_on(device: str, name: str, boundary: Boundary, *, columns: bool) -> Any:
+    """Return the velocity kernel of one precision that is quickest on a device, after scatters by columns or others."""
     function, Data = boundary.function(name)
+    if columns:
+        return velocity_of_columns(name, function, Data)
     walls = WALLS.get(type(boundary))
     if device == "cpu" and name == "float32" and walls:
         return velocity_in_rows(function, Data, walls)

@@ -31,7 +31,7 @@ def kernels(model: Model, device: str) -> Iterator[Any]:
     """Yield a kernel or more of each module, those first that take longest to compile."""
     name = model.precision
     yield from (_of_cpu if device == "cpu" else _of_gpu)(name, any(body.material.smoothing for body in model.bodies))
-    yield velocity_on(device, name, model.boundary)
+    yield velocity_on(device, name, model.boundary, columns=device != "cpu")
     for body in model.bodies:
         yield from body.material.kernels(name, rows=device == "cpu")
     yield extent_kernels(name).look

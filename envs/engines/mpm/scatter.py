@@ -30,12 +30,15 @@ class Scatter(Protocol):
         """Return what g2p takes so as to count particles where it moves them to."""
 
     def p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
-        """Fill the substep's grid with momentum and mass."""
+        """Fill the substep's grid with momentum and mass, but for what nodes have to add up themselves."""
 
     def adjoint_g2p(
         self, step: int, substep: int, frame: Frame, new: Frame, grid_v: wp.array, adj_x: wp.array, batch: int
     ) -> None:
-        """Fill the adjoint of the grid's velocity, and set that of x, from those of the frame `new`."""
+        """Fill the adjoint of the grid's velocity likewise, and set that of x, from those of the frame `new`."""
+
+    def to_add_up(self, step: int, substep: int) -> list[wp.array]:
+        """Return what nodes add up themselves, as their kernel takes it."""
 
 
 class InPlace:
@@ -72,6 +75,10 @@ class InPlace:
         """Fill the adjoint of the grid's velocity, and set that of x, from those of the frame `new`."""
         self._clear(grid_v, step, batch)
         launch_adjoint_g2p(self.solver, step, substep, frame, new, grid_v, adj_x, batch)
+
+    def to_add_up(self, step: int, substep: int) -> list[wp.array]:
+        """Return what nodes add up themselves, as their kernel takes it."""
+        return []
 
     def _clear(self, grid: wp.array, step: int, batch: int) -> None:
         """Zero what a control step uses of a grid, by numpy: torch would spread it over threads that others want."""
@@ -127,21 +134,18 @@ class ByColumns:
         return [int(counted), self.cells, self.numbers, self.counts]
 
     def p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
-        """Fill the substep's grid with momentum and mass."""
-        tape = self.solver.tape(step)
-        inputs = [self.solver.orders[step].mass, frame.x, frame.v, tape.A[substep]]
+        """Make parts of what nodes get of momentum and mass."""
+        inputs = [self.solver.orders[step].mass, frame.x, frame.v, self.solver.tape(step).A[substep]]
         self.walk(self.kernels.p2g, step, substep, batch, inputs)
-        self.add_up(self.kernels.add_up, step, substep, batch, [tape.grids[substep].m])
 
     def adjoint_g2p(
         self, step: int, substep: int, frame: Frame, new: Frame, grid_v: wp.array, adj_x: wp.array, batch: int
     ) -> None:
-        """Fill the adjoint of the grid's velocity, and set that of x, from those of the frame `new`."""
+        """Make parts of the adjoint of the grid's velocity, and set that of x, from those of the frame `new`."""
         with self.solver.launches.beside(1):
             launch_adjoint_g2p(self.solver, step, substep, frame, new, grid_v, adj_x, batch)
         inputs = [self.solver.model.dt, frame.x, new.x, new.v, new.C]
         self.walk(self.kernels.adjoint_g2p, step, substep, batch, inputs)
-        self.add_up(self.kernels.add_up, step, substep, batch, [grid_v])
 
     def walk(self, kernel: Any, step: int, substep: int, batch: int, inputs: list[Any]) -> None:
         """Launch a kernel that leaves parts of sums at nodes, after the substep's lists."""
@@ -155,6 +159,10 @@ class ByColumns:
         tape = self.solver.tape(step)
         inputs = [tape.lattice, tape.lists[substep].span, self.parts, *grids]
         self.solver.launch_on_box(kernel, nodes, batch, inputs)
+
+    def to_add_up(self, step: int, substep: int) -> list[wp.array]:
+        """Return what nodes add up themselves, as their kernel takes it."""
+        return [self.solver.tape(step).lists[substep].span, self.parts]
 
     def _allocate(self, count: int) -> None:
         """Allocate what so many segments take."""

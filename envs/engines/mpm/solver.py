@@ -99,7 +99,7 @@ class Solver:
         self.allocator = Allocator(model, capacity, device, columns=columns)
         self.types = self.allocator.types
         self.kernels = transfers(model.precision, scattering=False) if columns else transfers_on_cpu(model.precision)
-        self.velocity = velocity_on(device, model.precision, model.boundary)
+        self.velocity = velocity_on(device, model.precision, model.boundary, columns=columns)
         self.boundary = model.boundary.data(model.precision, device)
         self.materials = [body.material.kernels(model.precision, rows=device == "cpu") for body in model.bodies]
         load([*vars(self.kernels).values(), self.velocity, *chain.from_iterable(self.materials)], device)
@@ -309,6 +309,7 @@ class Solver:
             self.sums,
             grid.m,
             grid.v,
+            *self.scatter.to_add_up(step, substep),
             *self.listed,
         ]
 

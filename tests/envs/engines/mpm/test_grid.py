@@ -81,7 +81,7 @@ class Nodes:
 @pytest.mark.parametrize("box", BOXES.values(), ids=BOXES)
 @pytest.mark.parametrize("boundary", BOUNDARIES.values(), ids=BOUNDARIES)
 def test_rows_of_a_cpu_have_the_same_bits(boundary, box):
-    nodes, rows = Nodes(boundary, box), velocity_on("cpu", "float32", boundary)
+    nodes, rows = Nodes(boundary, box), velocity_on("cpu", "float32", boundary, columns=False)
     assert has_rows(rows)
     wanted = nodes.run(velocity_kernel("float32", *boundary.function("float32")))
     found = nodes.run(rows)
@@ -97,5 +97,5 @@ def test_rows_of_a_cpu_have_the_same_bits(boundary, box):
 
 
 def test_only_a_cpu_in_single_precision_has_rows():
-    assert not has_rows(velocity_on("cpu", "float64", TANK))
-    assert not has_rows(velocity_on("cuda", "float32", TANK))
+    assert not has_rows(velocity_on("cpu", "float64", TANK, columns=False))
+    assert not has_rows(velocity_on("cuda", "float32", TANK, columns=True))
