@@ -10,13 +10,13 @@ from .cells import cell_kernels
 from .columns import GPU_TEAM, column_kernels
 from .exact import settle_kernel
 from .extent import extent_kernels
+from .gathers import gathers
 from .grid_cpu import velocity_on
 from .model import Model
 from .order import sorting_kernels
 from .smoothing_columns import smoothing_columns
 from .smoothing_cpu import smoothing_on_cpu
 from .smoothing_kernels import smoothing_kernels
-from .transfers import transfers
 from .transfers_cpu import transfers_on_cpu
 
 COMPUTES_LOSSES = False  # for `code`: what is compiled here, a solver would compile itself
@@ -49,7 +49,7 @@ def _of_cpu(name: str, smooth: bool) -> Iterator[Any]:
 
 
 def _of_gpu(name: str, smooth: bool) -> Iterator[Any]:
-    yield from (transfers(name, scattering=False).g2p, column_kernels(name, GPU_TEAM).p2g, cell_kernels(name).count)
+    yield from (gathers(name).g2p, column_kernels(name, GPU_TEAM).p2g, cell_kernels(name).count)
     yield settle_kernel(name)
     if smooth:
         yield from (smoothing_kernels(name, scattering=False).collect, smoothing_columns(name, GPU_TEAM).spread)

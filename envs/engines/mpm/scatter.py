@@ -74,7 +74,7 @@ class InPlace:
     ) -> None:
         """Fill the adjoint of the grid's velocity, and set that of x, from those of the frame `new`."""
         self._clear(grid_v, step, batch)
-        launch_adjoint_g2p(self.solver, step, substep, frame, new, grid_v, adj_x, batch)
+        launch_adjoint_g2p(self.solver, step, substep, frame, new, [grid_v, adj_x], batch)
 
     def to_add_up(self, step: int, substep: int) -> list[wp.array]:
         """Return what nodes add up themselves, as their kernel takes it."""
@@ -143,7 +143,7 @@ class ByColumns:
     ) -> None:
         """Make parts of the adjoint of the grid's velocity, and set that of x, from those of the frame `new`."""
         with self.solver.launches.beside(1):
-            launch_adjoint_g2p(self.solver, step, substep, frame, new, grid_v, adj_x, batch)
+            launch_adjoint_g2p(self.solver, step, substep, frame, new, [adj_x], batch)
         inputs = [self.solver.model.dt, frame.x, new.x, new.v, new.C]
         self.walk(self.kernels.adjoint_g2p, step, substep, batch, inputs)
 
@@ -178,9 +178,9 @@ def nodes(box: Box) -> int:
 
 
 def launch_adjoint_g2p(
-    solver: Any, step: int, substep: int, frame: Frame, new: Frame, grid_v: wp.array, adj_x: wp.array, batch: int
+    solver: Any, step: int, substep: int, frame: Frame, new: Frame, adjoints: list[wp.array], batch: int
 ) -> None:
-    """Launch the transfers' adjoint of g2p."""
+    """Launch the transfers' adjoint of g2p, which adds to the first of the adjoints or sets them."""
     tape = solver.tape(step)
-    inputs = [tape.lattice, solver.model.dt, frame.x, tape.grids[substep].v, new.x, new.v, new.C, grid_v, adj_x]
+    inputs = [tape.lattice, solver.model.dt, frame.x, tape.grids[substep].v, new.x, new.v, new.C, *adjoints]
     solver.launch(solver.kernels.adjoint_g2p, solver.model.particles, batch, inputs)

@@ -29,6 +29,7 @@ from ..runtime import free_memory, has_rows, load, threads, to_torch
 from .adjoint import Adjoint
 from .checkpoints import Allocator, Frame, Tape
 from .extent import Extent
+from .gathers import gathers
 from .grid_cpu import velocity_on
 from .kernels import compile_all as compile_all
 from .layout import to_rows
@@ -36,7 +37,6 @@ from .model import BOX_MARGIN, EMPTY, Box, Model, nodes_around
 from .order import Order, Sorter
 from .scatter import ByColumns, InPlace, Scatter, nodes
 from .smoothing import ColumnSmoother, Smoother
-from .transfers import transfers
 from .transfers_cpu import transfers_on_cpu
 
 CROWD = 8_000  # particles that hide what a launch costs on one core
@@ -98,7 +98,7 @@ class Solver:
         columns = device != "cpu" if columns is None else columns
         self.allocator = Allocator(model, capacity, device, columns=columns)
         self.types = self.allocator.types
-        self.kernels = transfers(model.precision, scattering=False) if columns else transfers_on_cpu(model.precision)
+        self.kernels = (gathers if columns else transfers_on_cpu)(model.precision)
         self.velocity = velocity_on(device, model.precision, model.boundary, columns=columns)
         self.boundary = model.boundary.data(model.precision, device)
         self.materials = [body.material.kernels(model.precision, rows=device == "cpu") for body in model.bodies]

@@ -15,25 +15,19 @@ from typing import no_type_check
 import warp as wp
 
 from ..runtime import precision
-from .cells import counter
 from .layout import layout
 from .stencil import lattice, stencil
 
 
 @cache
 @no_type_check
-def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
-    """Return the transfer kernels `p2g, g2p, adjoint_p2g, adjoint_g2p` of one precision.
-
-    Unless `scattering`, there is no p2g, and `adjoint_g2p` does not add to the grid: `columns` has both for a GPU. Then
-    g2p counts particles by cell, where they are now, if it is told to.
-    """
+def transfers(name: str) -> SimpleNamespace:
+    """Return the transfer kernels `p2g, g2p, adjoint_p2g, adjoint_g2p` of one precision."""
     types = precision(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
-    module = f"gradscape.transfers.{name}{'' if scattering else '.gathers'}"
+    module = f"gradscape.transfers.{name}"
     Lattice, spline = lattice(name), stencil(name)
     base_node, weights, weight_slopes = spline.base_node, spline.weights, spline.weight_slopes
-    count_in_cell = counter(name)
     lies = layout(name)
     read_matrix, write_matrix, read_node = lies.read_matrix, lies.write_matrix, lies.read_node
     offset = wp.constant(vec3(0.0, 1.0, 2.0))  # real(i) on an unrolled index breaks the code generator in float64
@@ -46,42 +40,35 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
     def head(g: vec4):
         return vec3(g[0], g[1], g[2])
 
-    def add(grid: wp.array2d[vec4], e: int, i: int, value: vec4):
-        wp.atomic_add(grid, e, i, value)
-
-    add = wp.func(add, module=module) if scattering else wp.func_native("")(add)
-
-    if scattering:
-
-        @wp.kernel(module=module, enable_backward=False)
-        def p2g(
-            lattice: Lattice,
-            mass: wp.array2d[real],
-            x: wp.array2d[vec3],
-            v: wp.array2d[vec3],
-            A: wp.array2d[mat33],
-            grid_m: wp.array2d[vec4],
-        ):
-            """Scatter momentum m v + A (x_i - x) and mass."""
-            e, p = wp.tid()
-            s = (x[e, p] - lattice.origin) * lattice.inv_dx
-            base = base_node(s, lattice)
-            f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
-            corner = base - lattice.first
-            wx, wy, wz = weights(f[0]), weights(f[1]), weights(f[2])
-            m = mass[e, p]
-            a = read_matrix(A, e, p) * (real(1.0) / lattice.inv_dx)
-            ax, ay, az = column(a, 0), column(a, 1), column(a, 2)
-            q0 = m * v[e, p] - a * f
-            for i in range(3):
-                for j in range(3):
-                    row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
-                    wij = wx[i] * wy[j]
-                    qij = q0 + offset[i] * ax + offset[j] * ay
-                    for k in range(3):
-                        w = wij * wz[k]
-                        q = w * (qij + offset[k] * az)
-                        add(grid_m, e, row + k, vec4(q[0], q[1], q[2], w * m))
+    @wp.kernel(module=module, enable_backward=False)
+    def p2g(
+        lattice: Lattice,
+        mass: wp.array2d[real],
+        x: wp.array2d[vec3],
+        v: wp.array2d[vec3],
+        A: wp.array2d[mat33],
+        grid_m: wp.array2d[vec4],
+    ):
+        """Scatter momentum m v + A (x_i - x) and mass."""
+        e, p = wp.tid()
+        s = (x[e, p] - lattice.origin) * lattice.inv_dx
+        base = base_node(s, lattice)
+        f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
+        corner = base - lattice.first
+        wx, wy, wz = weights(f[0]), weights(f[1]), weights(f[2])
+        m = mass[e, p]
+        a = read_matrix(A, e, p) * (real(1.0) / lattice.inv_dx)
+        ax, ay, az = column(a, 0), column(a, 1), column(a, 2)
+        q0 = m * v[e, p] - a * f
+        for i in range(3):
+            for j in range(3):
+                row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
+                wij = wx[i] * wy[j]
+                qij = q0 + offset[i] * ax + offset[j] * ay
+                for k in range(3):
+                    w = wij * wz[k]
+                    q = w * (qij + offset[k] * az)
+                    wp.atomic_add(grid_m, e, row + k, vec4(q[0], q[1], q[2], w * m))
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint_p2g(
@@ -137,8 +124,8 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
         write_matrix(adj_A, e, p, dx * wp.matrix_from_cols(hx - f[0] * h0, hy - f[1] * h0, hz - f[2] * h0))
         adj_x[e, p] = adj_x[e, p] + lattice.inv_dx * slope - wp.transpose(momentum) * h0
 
-    @wp.func(module=module)
-    def move(
+    @wp.kernel(module=module, enable_backward=False)
+    def g2p(
         lattice: Lattice,
         dt: real,
         x: wp.array2d[vec3],
@@ -147,10 +134,9 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
         v_new: wp.array2d[vec3],
         C_new: wp.array2d[mat33],
         left_box: wp.array[wp.int32],
-        e: int,
-        p: int,
     ):
-        """Gather v' = sum w v_i and C' = 4/dx^2 sum w v_i (x_i - x)^T; return x' = x + dt v'."""
+        """Gather v' = sum w v_i and C' = 4/dx^2 sum w v_i (x_i - x)^T; move x' = x + dt v'."""
+        e, p = wp.tid()
         s = (x[e, p] - lattice.origin) * lattice.inv_dx
         base = base_node(s, lattice)
         f = s - vec3(real(base[0]), real(base[1]), real(base[2]))
@@ -177,49 +163,9 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
         v_new[e, p] = s0
         C = wp.matrix_from_cols(sx - f[0] * s0, sy - f[1] * s0, sz - f[2] * s0)
         write_matrix(C_new, e, p, (real(4.0) * lattice.inv_dx) * C)
-        there = x[e, p] + dt * s0
-        x_new[e, p] = there
+        x_new[e, p] = x[e, p] + dt * s0
         if wp.min(wp.min(f[0], f[1]), f[2]) < real(0.49) or wp.max(wp.max(f[0], f[1]), f[2]) > real(1.51):
             left_box[e] = 1
-        return there
-
-    if scattering:
-
-        @wp.kernel(module=module, enable_backward=False)
-        def g2p(
-            lattice: Lattice,
-            dt: real,
-            x: wp.array2d[vec3],
-            grid_v: wp.array2d[vec4],
-            x_new: wp.array2d[vec3],
-            v_new: wp.array2d[vec3],
-            C_new: wp.array2d[mat33],
-            left_box: wp.array[wp.int32],
-        ):
-            e, p = wp.tid()
-            move(lattice, dt, x, grid_v, x_new, v_new, C_new, left_box, e, p)
-
-    else:
-
-        @wp.kernel(module=module, enable_backward=False)
-        def g2p(
-            lattice: Lattice,
-            dt: real,
-            x: wp.array2d[vec3],
-            grid_v: wp.array2d[vec4],
-            x_new: wp.array2d[vec3],
-            v_new: wp.array2d[vec3],
-            C_new: wp.array2d[mat33],
-            left_box: wp.array[wp.int32],
-            counting: int,
-            cells: wp.array2d[wp.int32],
-            numbers: wp.array2d[wp.int32],
-            counts: wp.array2d[wp.int32],
-        ):
-            e, p = wp.tid()
-            there = move(lattice, dt, x, grid_v, x_new, v_new, C_new, left_box, e, p)
-            if counting > 0:
-                count_in_cell(lattice, there, e, p, cells, numbers, counts)
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint_g2p(
@@ -260,8 +206,7 @@ def transfers(name: str, *, scattering: bool = True) -> SimpleNamespace:
                     sigma = wp.dot(q, vi)
                     s0 += w * vi
                     slope += sigma * vec3(gx * wz[k], gy * wz[k], wij * dz_[k])
-                    add(adj_grid_v, e, row + k, vec4(w * q[0], w * q[1], w * q[2], real(0.0)))
+                    wp.atomic_add(adj_grid_v, e, row + k, vec4(w * q[0], w * q[1], w * q[2], real(0.0)))
         adj_x[e, p] = adj_x_new[e, p] + lattice.inv_dx * (slope - wp.transpose(c) * s0)
 
-    kernels = {"g2p": g2p, "adjoint_p2g": adjoint_p2g, "adjoint_g2p": adjoint_g2p}
-    return SimpleNamespace(**kernels, **({"p2g": p2g} if scattering else {}))
+    return SimpleNamespace(p2g=p2g, g2p=g2p, adjoint_p2g=adjoint_p2g, adjoint_g2p=adjoint_g2p)

@@ -1,0 +1,196 @@
+"""What particles gather from their nodes, for a GPU: g2p, and of the adjoints of both transfers what is not scattered.
+
+The formulas are those of `transfers`, summed along z first, then y, then x: fewer operations, and fewer numbers under
+way. `columns` has the scatters.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import no_type_check
+
+import warp as wp
+
+from ..runtime import precision
+from .cells import counter
+from .layout import in_precision, layout
+from .stencil import lattice, stencil
+
+# Sums over the nodes of a particle, which is at `f` from its corner, node (0, 0, 0): of w v, w i v, w j v, w k v, v
+# being a node's first three numbers and w its weight, and of the slopes of w, times what the node is given of v: its
+# product with q + a (i, j, k), and MASS. Sums that are not wanted a compiler leaves out.
+GATHER = """
+    FOUR
+    struct Vec {
+        REAL x, y, z;
+        Vec operator+(const Vec &b) const { return Vec{x + b.x, y + b.y, z + b.z}; }
+        Vec operator*(REAL s) const { return Vec{x * s, y * s, z * s}; }
+        REAL dot(const Vec &b) const { return x * b.x + y * b.y + z * b.z; }
+    };
+    const REAL half = REAL(0.5), one = REAL(1.0), more = REAL(1.5), two = REAL(2.0);
+    REAL w[3][3], d[3][3];
+    for (int axis = 0; axis < 3; ++axis) {
+        const REAL low = f[axis] - more, middle = f[axis] - one, high = f[axis] - half;
+        w[axis][0] = half * low * low, w[axis][1] = REAL(0.75) - middle * middle, w[axis][2] = half * high * high;
+        d[axis][0] = low, d[axis][1] = -two * middle, d[axis][2] = high;
+    }
+    const auto column = [&](int k) { return Vec{a.data[0][k], a.data[1][k], a.data[2][k]}; };
+    const Vec ax = column(0), ay = column(1), az = column(2);
+    const int across = lattice.nz, through = lattice.ny * lattice.nz;
+    const Four *plane = (const Four *)&wp::index(grid, e, 0) + corner[0] * through + corner[1] * across + corner[2];
+    Vec s{}, si{}, sj{}, sk{}, slope{};
+#pragma unroll
+    for (int i = 0; i < 3; ++i, plane += through) {
+        const REAL wi = w[0][i];
+        const Vec first{q[0], q[1], q[2]}, qi = i ? first + ax * REAL(i) : first;
+        Vec r{}, rj{}, rk{}, change{};
+#pragma unroll
+        for (int j = 0; j < 3; ++j) {
+            const Four n0 = plane[j * across], n1 = plane[j * across + 1], n2 = plane[j * across + 2];
+            const Vec v0{n0.a, n0.b, n0.c}, v1{n1.a, n1.b, n1.c}, v2{n2.a, n2.b, n2.c};
+            const REAL wj = w[1][j];
+            const Vec w1 = v1 * w[2][1], w2 = v2 * w[2][2], wv = v0 * w[2][0] + w1 + w2;
+            const Vec q0 = j ? qi + ay * REAL(j) : qi, q1 = q0 + az, q2 = q1 + az;
+            r = r + wv * wj, rk = rk + (w1 + w2 * two) * wj;
+            if (j) rj = rj + wv * (wj * REAL(j));
+            const REAL t0 = q0.dot(v0)MASS(0), t1 = q1.dot(v1)MASS(1), t2 = q2.dot(v2)MASS(2);
+            const REAL t = w[2][0] * t0 + w[2][1] * t1 + w[2][2] * t2;
+            const REAL u = d[2][0] * t0 + d[2][1] * t1 + d[2][2] * t2;
+            change = change + Vec{wj * t, d[1][j] * t, wj * u};
+        }
+        s = s + r * wi, sj = sj + rj * wi, sk = sk + rk * wi;
+        if (i) si = si + r * (wi * REAL(i));
+        slope = slope + Vec{d[0][i] * change.x, wi * change.y, wi * change.z};
+    }
+    wp::mat_t<5, 3, REAL> sums;
+    const Vec rows[] = {s, si, sj, sk, slope};
+    for (int row = 0; row < 5; ++row)
+        sums.data[row][0] = rows[row].x, sums.data[row][1] = rows[row].y, sums.data[row][2] = rows[row].z;
+    return sums;
+"""
+
+
+def with_mass(code: str, mass: str) -> str:
+    """Say what is added to a product of nodes NUMBER."""
+    for number in "012":
+        code = code.replace(f"MASS({number})", mass.replace("NUMBER", number))
+    return code
+
+
+@cache
+@no_type_check
+def gathers(name: str) -> SimpleNamespace:
+    """Return the kernels `g2p, adjoint_p2g, adjoint_g2p` of one precision, all over [environment, particle].
+
+    They take what those of `transfers` do, but adjoint_g2p takes no adjoint of the grid, and g2p counts particles by
+    cell, where they are then, if it is told to.
+    """
+    types = precision(name)
+    real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
+    module = f"gradscape.gathers.{name}"
+    Lattice, base_node, count_in_cell = lattice(name), stencil(name).base_node, counter(name)
+    lies = layout(name)
+    read_number, read_vector, read_matrix, write_matrix = (
+        lies.read_number,
+        lies.read_vector,
+        lies.read_matrix,
+        lies.write_matrix,
+    )
+    Sums = wp.types.matrix((5, 3), real)
+
+    @wp.func_native(in_precision(with_mass(GATHER, ""), name))
+    def gather(
+        lattice: Lattice, grid: wp.array2d[vec4], e: int, corner: wp.vec3i, f: vec3, q: vec3, a: mat33
+    ) -> Sums: ...
+
+    @wp.func_native(in_precision(with_mass(GATHER, " + mass * nNUMBER.d"), name))
+    def gather_with_mass(
+        lattice: Lattice, grid: wp.array2d[vec4], e: int, corner: wp.vec3i, f: vec3, q: vec3, a: mat33, mass: real
+    ) -> Sums: ...
+
+    @wp.func(module=module)
+    def from_base(x: vec3, base: wp.vec3i, lattice: Lattice):
+        return (x - lattice.origin) * lattice.inv_dx - vec3(real(base[0]), real(base[1]), real(base[2]))
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    def g2p(
+        lattice: Lattice,
+        dt: real,
+        x: wp.array2d[vec3],
+        grid_v: wp.array2d[vec4],
+        x_new: wp.array2d[vec3],
+        v_new: wp.array2d[vec3],
+        C_new: wp.array2d[mat33],
+        left_box: wp.array[wp.int32],
+        counting: int,
+        cells: wp.array2d[wp.int32],
+        numbers: wp.array2d[wp.int32],
+        counts: wp.array2d[wp.int32],
+    ):
+        """Gather v' = sum w v_i and C' = 4/dx^2 sum w v_i (x_i - x)^T; move x' = x + dt v'."""
+        e, p = wp.tid()
+        here = read_vector(x, e, p)
+        base = base_node((here - lattice.origin) * lattice.inv_dx, lattice)
+        f = from_base(here, base, lattice)
+        sums = gather(lattice, grid_v, e, base - lattice.first, f, vec3(), mat33())
+        v = sums[0]
+        C = wp.matrix_from_cols(sums[1] - f[0] * v, sums[2] - f[1] * v, sums[3] - f[2] * v)
+        write_matrix(C_new, e, p, (real(4.0) * lattice.inv_dx) * C)
+        there = here + dt * v
+        v_new[e, p] = v
+        x_new[e, p] = there
+        if wp.min(wp.min(f[0], f[1]), f[2]) < real(0.49) or wp.max(wp.max(f[0], f[1]), f[2]) > real(1.51):
+            left_box[e] = 1
+        if counting > 0:
+            count_in_cell(lattice, there, e, p, cells, numbers, counts)
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    def adjoint_p2g(
+        lattice: Lattice,
+        mass: wp.array2d[real],
+        x: wp.array2d[vec3],
+        v: wp.array2d[vec3],
+        A: wp.array2d[mat33],
+        adj_grid_m: wp.array2d[vec4],
+        adj_x: wp.array2d[vec3],
+        adj_v: wp.array2d[vec3],
+        adj_A: wp.array2d[mat33],
+    ):
+        """Gather the adjoints of p2g: add to adj_x, set adj_v and adj_A."""
+        e, p = wp.tid()
+        here = read_vector(x, e, p)
+        base = base_node((here - lattice.origin) * lattice.inv_dx, lattice)
+        f = from_base(here, base, lattice)
+        m = read_number(mass, e, p)
+        dx = real(1.0) / lattice.inv_dx
+        momentum = read_matrix(A, e, p)
+        a = momentum * dx
+        q = m * read_vector(v, e, p) - a * f
+        sums = gather_with_mass(lattice, adj_grid_m, e, base - lattice.first, f, q, a, m)
+        h = sums[0]
+        adj_v[e, p] = m * h
+        write_matrix(adj_A, e, p, dx * wp.matrix_from_cols(sums[1] - f[0] * h, sums[2] - f[1] * h, sums[3] - f[2] * h))
+        adj_x[e, p] = read_vector(adj_x, e, p) + lattice.inv_dx * sums[4] - wp.transpose(momentum) * h
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    def adjoint_g2p(
+        lattice: Lattice,
+        dt: real,
+        x: wp.array2d[vec3],
+        grid_v: wp.array2d[vec4],
+        adj_x_new: wp.array2d[vec3],
+        adj_v_new: wp.array2d[vec3],
+        adj_C_new: wp.array2d[mat33],
+        adj_x: wp.array2d[vec3],
+    ):
+        """Gather the adjoints of g2p: set adj_x."""
+        e, p = wp.tid()
+        here = read_vector(x, e, p)
+        base = base_node((here - lattice.origin) * lattice.inv_dx, lattice)
+        f = from_base(here, base, lattice)
+        a = (real(4.0) * lattice.inv_dx) * read_matrix(adj_C_new, e, p)
+        adj = read_vector(adj_x_new, e, p)
+        q = read_vector(adj_v_new, e, p) + dt * adj - a * f
+        sums = gather(lattice, grid_v, e, base - lattice.first, f, q, a)
+        adj_x[e, p] = adj + lattice.inv_dx * (sums[4] - wp.transpose(a) * sums[0])
+
+    return SimpleNamespace(g2p=g2p, adjoint_p2g=adjoint_p2g, adjoint_g2p=adjoint_g2p)
