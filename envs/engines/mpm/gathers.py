@@ -78,24 +78,14 @@ def with_mass(code: str, mass: str) -> str:
 
 @cache
 @no_type_check
-def gathers(name: str) -> SimpleNamespace:
-    """Return the kernels `g2p, adjoint_p2g, adjoint_g2p` of one precision, all over [environment, particle].
+def gatherers(name: str) -> SimpleNamespace:
+    """Return the functions `gather, gather_with_mass, from_base` of one precision.
 
-    They take what those of `transfers` do, but adjoint_g2p takes no adjoint of the grid, and g2p counts particles by
-    cell, where they are then, if it is told to.
+    `from_base(x, base, lattice)` is where x is from node `base`, in cells.
     """
     types = precision(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
-    module = f"gradscape.gathers.{name}"
-    Lattice, base_node, count_in_cell = lattice(name), stencil(name).base_node, counter(name)
-    lies = layout(name)
-    read_number, read_vector, read_matrix, write_matrix = (
-        lies.read_number,
-        lies.read_vector,
-        lies.read_matrix,
-        lies.write_matrix,
-    )
-    Sums = wp.types.matrix((5, 3), real)
+    Lattice, Sums = lattice(name), wp.types.matrix((5, 3), real)
 
     @wp.func_native(in_precision(with_mass(GATHER, ""), name))
     def gather(
@@ -107,9 +97,28 @@ def gathers(name: str) -> SimpleNamespace:
         lattice: Lattice, grid: wp.array2d[vec4], e: int, corner: wp.vec3i, f: vec3, q: vec3, a: mat33, mass: real
     ) -> Sums: ...
 
-    @wp.func(module=module)
+    @wp.func(module=f"gradscape.gathers.{name}")
     def from_base(x: vec3, base: wp.vec3i, lattice: Lattice):
         return (x - lattice.origin) * lattice.inv_dx - vec3(real(base[0]), real(base[1]), real(base[2]))
+
+    return SimpleNamespace(gather=gather, gather_with_mass=gather_with_mass, from_base=from_base)
+
+
+@cache
+@no_type_check
+def gathers(name: str) -> SimpleNamespace:
+    """Return the kernels `g2p, adjoint_p2g, adjoint_g2p` of one precision, all over [environment, particle].
+
+    They take what those of `transfers` do, but adjoint_g2p takes no adjoint of the grid, and g2p counts particles by
+    cell, where they are then, if it is told to.
+    """
+    types, sums_of = precision(name), gatherers(name)
+    real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
+    module, lies = f"gradscape.gathers.{name}", layout(name)
+    Lattice, base_node, count_in_cell = lattice(name), stencil(name).base_node, counter(name)
+    gather, gather_with_mass, from_base = sums_of.gather, sums_of.gather_with_mass, sums_of.from_base
+    read_number, read_vector = lies.read_number, lies.read_vector
+    read_matrix, write_matrix = lies.read_matrix, lies.write_matrix
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def g2p(

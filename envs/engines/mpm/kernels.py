@@ -16,7 +16,6 @@ from .model import Model
 from .order import sorting_kernels
 from .smoothing_columns import smoothing_columns
 from .smoothing_cpu import smoothing_on_cpu
-from .smoothing_kernels import smoothing_kernels
 from .transfers_cpu import transfers_on_cpu
 
 COMPUTES_LOSSES = False  # for `code`: what is compiled here, a solver would compile itself
@@ -52,4 +51,4 @@ def _of_gpu(name: str, smooth: bool) -> Iterator[Any]:
     yield from (gathers(name).g2p, column_kernels(name, GPU_TEAM).p2g, cell_kernels(name).count)
     yield settle_kernel(name)
     if smooth:
-        yield from (smoothing_kernels(name, scattering=False).collect, smoothing_columns(name, GPU_TEAM).spread)
+        yield smoothing_columns(name, GPU_TEAM).spread

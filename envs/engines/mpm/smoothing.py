@@ -16,12 +16,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..runtime import precision
 from .model import Model
 from .scatter import nodes
 from .smoothing_columns import smoothing_columns
 from .smoothing_cpu import smoothing_on_cpu
-from .smoothing_kernels import smoothing_kernels
 
 
 class Smoother:
@@ -31,49 +29,40 @@ class Smoother:
         model, material = solver.model, solver.model.bodies[body].material
         self.body, self.first, self.size = body, solver.first[body], solver.size(body)
         self.slope, self.share = hydrostatic_slope(model, body), material.smoothing
-        self.kernels = self._kernels(model.precision)
-        types = precision(model.precision)
+        self.kernels: Any = smoothing_on_cpu(model.precision)
         room = model.cells + 1  # a CPU reads and writes four numbers where three are meant
-        self.amount, self.weight, self.adj_mean = (solver.allocator.array(types.real, room) for _ in range(3))
+        self.nodes = [solver.allocator.array(solver.types.real, room) for _ in range(3)]  # amount, weight, adj_mean
 
     def run(self, solver: Any, step: int, batch: int) -> None:
         """Fill the tape's first state from the checkpoint's."""
         self._spread(solver, step, batch)
-        x, J = solver.checkpoints[step].x, solver.checkpoints[step].S[self.body]
         tape = solver.tape(step)
-        inputs = [tape.lattice, self.first, self.slope, self.share, x, J, self.amount, self.weight]
+        inputs = [tape.lattice, self.first, self.slope, self.share, *self._particles(solver, step), *self.nodes[:2]]
         solver.launch(self.kernels.collect, self.size, batch, [*inputs, tape.smoothed[self.body]])
 
     def run_back(self, solver: Any, step: int, batch: int, adjoint: Any) -> None:
         """Turn the adjoint of the tape's first state into that of the checkpoint's, and add to that of x."""
+        amount, weight, adj_mean = self.nodes
+        tape, (x, J) = solver.tape(step), self._particles(solver, step)
+        adj_J, adj_x = adjoint.S[self.body], adjoint.x
         self._spread(solver, step, batch)
-        self._collect_back(solver, step, batch, adjoint)
-        tape, checkpoint = solver.tape(step), solver.checkpoints[step]
-        inputs = [tape.lattice, self.first, self.slope, self.share, solver.orders[step].volume, checkpoint.x]
-        inputs += [checkpoint.S[self.body], self.amount, self.weight, self.adj_mean, adjoint.S[self.body], adjoint.x]
-        solver.launch(self.kernels.adjoint_spread, self.size, batch, inputs)
-
-    def _kernels(self, name: str) -> Any:
-        return smoothing_on_cpu(name)
+        solver.launch_on_box(self.kernels.clear, nodes, batch, [adj_mean])
+        inputs = [tape.lattice, self.first, self.share, x, tape.smoothed[self.body], amount, weight]
+        solver.launch(self.kernels.adjoint_collect, self.size, batch, [*inputs, adj_J, adj_x, adj_mean])
+        inputs = [tape.lattice, self.first, self.slope, self.share, solver.orders[step].volume, x, J, *self.nodes]
+        solver.launch(self.kernels.adjoint_spread, self.size, batch, [*inputs, adj_J, adj_x])
 
     def _spread(self, solver: Any, step: int, batch: int) -> None:
         """Fill `amount` and `weight`."""
-        for values in (self.amount, self.weight):
+        for values in self.nodes[:2]:
             solver.launch_on_box(self.kernels.clear, nodes, batch, [values])
-        x, J = solver.checkpoints[step].x, solver.checkpoints[step].S[self.body]
-        inputs = [solver.tape(step).lattice, self.first, self.slope, solver.orders[step].volume, x, J]
-        solver.launch(self.kernels.spread, self.size, batch, [*inputs, self.amount, self.weight])
+        inputs = [solver.tape(step).lattice, self.first, self.slope, solver.orders[step].volume]
+        inputs += [*self._particles(solver, step), *self.nodes[:2]]
+        solver.launch(self.kernels.spread, self.size, batch, inputs)
 
-    def _collect_back(self, solver: Any, step: int, batch: int, adjoint: Any) -> None:
-        """Fill `adj_mean`, turn the adjoint of J' into that of its logarithm, and add to that of x."""
-        solver.launch_on_box(self.kernels.clear, nodes, batch, [self.adj_mean])
-        self._launch_adjoint_collect(solver, step, batch, adjoint)
-
-    def _launch_adjoint_collect(self, solver: Any, step: int, batch: int, adjoint: Any) -> None:
-        tape = solver.tape(step)
-        inputs = [tape.lattice, self.first, self.share, solver.checkpoints[step].x, tape.smoothed[self.body]]
-        inputs += [self.amount, self.weight, adjoint.S[self.body], adjoint.x, self.adj_mean]
-        solver.launch(self.kernels.adjoint_collect, self.size, batch, inputs)
+    def _particles(self, solver: Any, step: int) -> tuple[Any, Any]:
+        """Return all particles' x and the body's J at the step's beginning."""
+        return solver.checkpoints[step].x, solver.checkpoints[step].S[self.body]
 
 
 class ColumnSmoother(Smoother):
@@ -81,22 +70,25 @@ class ColumnSmoother(Smoother):
 
     def __init__(self, solver: Any, body: int) -> None:
         super().__init__(solver, body)
-        self.columns = smoothing_columns(solver.model.precision, solver.scatter.team)
+        self.kernels = smoothing_columns(solver.model.precision, solver.scatter.team)
+        self.nodes = [solver.allocator.array(solver.types.vec4, solver.model.cells)]
 
-    def _kernels(self, name: str) -> Any:
-        return smoothing_kernels(name, scattering=False)
+    def run_back(self, solver: Any, step: int, batch: int, adjoint: Any) -> None:
+        """Turn the adjoint of the tape's first state into that of the checkpoint's, and add to that of x."""
+        tape, (x, J) = solver.tape(step), self._particles(solver, step)
+        adj_J, adj_x = adjoint.S[self.body], adjoint.x
+        self._spread(solver, step, batch)
+        inputs = [tape.lattice, self.first, self.share, x, tape.smoothed[self.body], *self.nodes, adj_J, adj_x]
+        solver.launch(self.kernels.adjoint_collect, self.size, batch, inputs)
+        solver.scatter.walk(self.kernels.spread_adjoint, step, 0, batch, [self.first, self.share, x, adj_J])
+        solver.scatter.add_up(self.kernels.add_up_adjoint, step, 0, batch, self.nodes)
+        inputs = [tape.lattice, self.first, self.slope, self.share, solver.orders[step].volume, x, J, *self.nodes]
+        solver.launch(self.kernels.adjoint_spread, self.size, batch, [*inputs, adj_J, adj_x])
 
     def _spread(self, solver: Any, step: int, batch: int) -> None:
-        x, J = solver.checkpoints[step].x, solver.checkpoints[step].S[self.body]
-        inputs = [self.first, self.slope, solver.orders[step].volume, x, J]
-        solver.scatter.walk(self.columns.spread, step, 0, batch, inputs)
-        solver.scatter.add_up(self.columns.add_up, step, 0, batch, [self.amount, self.weight])
-
-    def _collect_back(self, solver: Any, step: int, batch: int, adjoint: Any) -> None:
-        self._launch_adjoint_collect(solver, step, batch, adjoint)
-        inputs = [self.first, self.share, solver.checkpoints[step].x, adjoint.S[self.body]]
-        solver.scatter.walk(self.columns.spread_adjoint, step, 0, batch, inputs)
-        solver.scatter.add_up(self.columns.add_up_adjoint, step, 0, batch, [self.adj_mean])
+        inputs = [self.first, self.slope, solver.orders[step].volume, *self._particles(solver, step)]
+        solver.scatter.walk(self.kernels.spread, step, 0, batch, inputs)
+        solver.scatter.add_up(self.kernels.add_up, step, 0, batch, self.nodes)
 
 
 def hydrostatic_slope(model: Model, body: int) -> float:

@@ -1,4 +1,7 @@
-"""The scatters of a fluid's smoothing by columns of cells, for a GPU; `smoothing` has the formulas."""
+"""The smoothing of a fluid by columns of cells, for a GPU; `smoothing` has the formulas.
+
+A node holds its mean s_i, its part a_i of the adjoint of s, a_i s_i, and 1 / sum w V.
+"""
 
 from functools import cache
 from types import SimpleNamespace
@@ -8,25 +11,40 @@ import warp as wp
 
 from ..runtime import precision
 from .columns import PARTS, Team, node_sum, segment_taker, walker
+from .gathers import gatherers
 from .layout import layout
-from .stencil import lattice
+from .stencil import lattice, stencil
 
 
 @cache
 @no_type_check
 def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
-    """Return the kernels `spread, add_up, spread_adjoint, add_up_adjoint` of one precision, for threads in a `team`.
+    """Return `spread, add_up, collect, spread_adjoint, adjoint_collect, add_up_adjoint, adjoint_spread`, kernels.
 
-    The body's particles are `size` from number `first` on; others in the same cells give nothing.
+    Those that spread take threads in a `team`; particles of other bodies in the same cells give nothing. `collect` and
+    the last but one and two of that order are over [environment, particle of the body].
     """
     types = precision(name)
     real, vec3, vec4 = types.real, types.vec3, types.vec4
-    Lattice, steps = lattice(name), walker(name)
+    Lattice, base_node, steps = lattice(name), stencil(name).base_node, walker(name)
+    from_base = gatherers(name).from_base
     take_segment, most = segment_taker(team), steps.most
     at_nodes, open_segment, walk, close_segment = steps.at_nodes, steps.open, steps.walk, steps.close
     lanes, groups, size = team.lanes, team.groups, team.size
     add_up_node, module = node_sum(name), f"gradscape.smoothing.{name}.columns.{team.lanes}"
-    read_number, read_vector = layout(name).read_number, layout(name).read_vector
+    lies, gather, mat33 = layout(name), gatherers(name).gather, types.mat33
+    read_number, read_vector, read_node, write_node = (
+        lies.read_number,
+        lies.read_vector,
+        lies.read_node,
+        lies.write_node,
+    )
+
+    @wp.func(module=module)
+    def at(lattice: Lattice, nodes: wp.array2d[vec4], e: int, x: vec3, q: vec3):
+        """Return the sums of `gathers` at x, of what nodes hold, and of the slopes of w times its product with q."""
+        base = base_node((x - lattice.origin) * lattice.inv_dx, lattice)
+        return gather(lattice, nodes, e, base - lattice.first, from_base(x, base, lattice), q, mat33())
 
     @wp.func(module=module)
     def given_volume(
@@ -83,17 +101,31 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         close_segment(parts, e, at, span, state)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def add_up(
-        lattice: Lattice,
-        spans: wp.array2d[wp.int32],
-        parts: wp.array2d[vec4],
-        amount: wp.array2d[real],
-        weight: wp.array2d[real],
-    ):
+    def add_up(lattice: Lattice, spans: wp.array2d[wp.int32], parts: wp.array2d[vec4], nodes: wp.array2d[vec4]):
+        """Set the nodes' means, and what these are shared by."""
         e, i = wp.tid()
         total = add_up_node(lattice, spans, parts, e, i)
-        amount[e, i] = total[0]
-        weight[e, i] = total[1]
+        # A particle in the middle of a cell gives the farthest of its nodes nothing, and others may not meet these.
+        inverse = wp.where(total[1] > real(0.0), real(1.0) / total[1], real(0.0))
+        write_node(nodes, e, i, vec4(total[0] * inverse, real(0.0), real(0.0), inverse))
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    def collect(
+        lattice: Lattice,
+        body: int,
+        slope: real,
+        share: real,
+        x: wp.array2d[vec3],
+        J: wp.array2d[real],
+        nodes: wp.array2d[vec4],
+        J_new: wp.array2d[real],
+    ):
+        """Gather the nodes' means and take J so far towards them."""
+        e, p = wp.tid()
+        there = read_vector(x, e, body + p)
+        sums = at(lattice, nodes, e, there, vec3())
+        here = wp.log(read_number(J, e, p))
+        J_new[e, p] = wp.exp(here + share * (sums[0][0] - (here - slope * there[1])))
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def spread_adjoint(
@@ -123,10 +155,62 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         close_segment(parts, e, at, span, state)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def add_up_adjoint(
-        lattice: Lattice, spans: wp.array2d[wp.int32], parts: wp.array2d[vec4], adj_mean: wp.array2d[real]
+    def adjoint_collect(
+        lattice: Lattice,
+        body: int,
+        share: real,
+        x: wp.array2d[vec3],
+        J_new: wp.array2d[real],
+        nodes: wp.array2d[vec4],
+        adj_J: wp.array2d[real],
+        adj_x: wp.array2d[vec3],
     ):
-        e, i = wp.tid()
-        adj_mean[e, i] = add_up_node(lattice, spans, parts, e, i)[0]
+        """Add to adj_x; turn adj_J from that of J' into that of log J'."""
+        e, p = wp.tid()
+        sums = at(lattice, nodes, e, read_vector(x, e, body + p), vec3(real(1.0), real(0.0), real(0.0)))
+        g = read_number(adj_J, e, p) * read_number(J_new, e, p)
+        adj_x[e, body + p] = read_vector(adj_x, e, body + p) + (share * g * lattice.inv_dx) * sums[4]
+        adj_J[e, p] = g
 
-    return SimpleNamespace(spread=spread, add_up=add_up, spread_adjoint=spread_adjoint, add_up_adjoint=add_up_adjoint)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    def add_up_adjoint(lattice: Lattice, spans: wp.array2d[wp.int32], parts: wp.array2d[vec4], nodes: wp.array2d[vec4]):
+        """Set the nodes' parts of the adjoint of s."""
+        e, i = wp.tid()
+        node = read_node(nodes, e, i)
+        a = add_up_node(lattice, spans, parts, e, i)[0] * node[3]
+        write_node(nodes, e, i, vec4(node[0], a, a * node[0], node[3]))
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    def adjoint_spread(
+        lattice: Lattice,
+        body: int,
+        slope: real,
+        share: real,
+        volume: wp.array2d[real],
+        x: wp.array2d[vec3],
+        J: wp.array2d[real],
+        nodes: wp.array2d[vec4],
+        adj_J: wp.array2d[real],
+        adj_x: wp.array2d[vec3],
+    ):
+        """Gather the adjoint of s; add to adj_x, turn adj_J from that of log J' into that of J."""
+        e, p = wp.tid()
+        there = read_vector(x, e, body + p)
+        ratio, V = read_number(J, e, p), read_number(volume, e, body + p)
+        beyond = wp.log(ratio) - slope * there[1]
+        sums = at(lattice, nodes, e, there, vec3(real(0.0), beyond, real(-1.0)))
+        g = read_number(adj_J, e, p)
+        adj_s = V * sums[0][1] - share * g
+        change = (V * lattice.inv_dx) * sums[4] - vec3(real(0.0), slope * adj_s, real(0.0))
+        adj_x[e, body + p] = read_vector(adj_x, e, body + p) + change
+        adj_J[e, p] = (g + adj_s) / ratio
+
+    return SimpleNamespace(
+        spread=spread,
+        add_up=add_up,
+        collect=collect,
+        adjoint_collect=adjoint_collect,
+        spread_adjoint=spread_adjoint,
+        add_up_adjoint=add_up_adjoint,
+        adjoint_spread=adjoint_spread,
+    )

@@ -13,14 +13,11 @@ from .stencil import lattice, stencil
 
 @cache
 @no_type_check
-def smoothing_kernels(name: str, *, scattering: bool = True) -> SimpleNamespace:
-    """Return the kernels `clear, spread, collect, adjoint_collect, adjoint_spread` of one precision.
-
-    Unless `scattering`, `adjoint_collect` does not add to the nodes: `smoothing_columns` has kernels that do.
-    """
+def smoothing_kernels(name: str) -> SimpleNamespace:
+    """Return the kernels `clear, spread, collect, adjoint_collect, adjoint_spread` of one precision."""
     types = precision(name)
     real, vec3 = types.real, types.vec3
-    module = f"gradscape.smoothing.{name}{'' if scattering else '.gathers'}"
+    module = f"gradscape.smoothing.{name}"
     Lattice, spline = lattice(name), stencil(name)
     base_node, weights, weight_slopes = spline.base_node, spline.weights, spline.weight_slopes
     read_number = layout(name).read_number
@@ -29,11 +26,6 @@ def smoothing_kernels(name: str, *, scattering: bool = True) -> SimpleNamespace:
     def inverse(weight: real):
         # A particle in the middle of a cell gives the farthest of its nodes nothing, and others may not meet these.
         return wp.where(weight > real(0.0), real(1.0) / weight, real(0.0))
-
-    def add(values: wp.array2d[real], e: int, i: int, value: real):
-        wp.atomic_add(values, e, i, value)
-
-    add = wp.func(add, module=module) if scattering else wp.func_native("")(add)
 
     @wp.kernel(module=module, enable_backward=False)
     def clear(values: wp.array2d[real]):
@@ -65,8 +57,8 @@ def smoothing_kernels(name: str, *, scattering: bool = True) -> SimpleNamespace:
                 row = ((corner[0] + i) * lattice.ny + corner[1] + j) * lattice.nz + corner[2]
                 for k in range(3):
                     w = wx[i] * wy[j] * wz[k] * volume[e, q]
-                    add(amount, e, row + k, w * beyond)
-                    add(weight, e, row + k, w)
+                    wp.atomic_add(amount, e, row + k, w * beyond)
+                    wp.atomic_add(weight, e, row + k, w)
 
     @wp.kernel(module=module, enable_backward=False)
     def collect(
@@ -133,7 +125,7 @@ def smoothing_kernels(name: str, *, scattering: bool = True) -> SimpleNamespace:
                 for k in range(3):
                     mean = read_number(amount, e, row + k) * inverse(read_number(weight, e, row + k))
                     steep += mean * vec3(dx_[i] * wy[j] * wz[k], wx[i] * dy_[j] * wz[k], wx[i] * wy[j] * dz_[k])
-                    add(adj_mean, e, row + k, wx[i] * wy[j] * wz[k] * share * g)
+                    wp.atomic_add(adj_mean, e, row + k, wx[i] * wy[j] * wz[k] * share * g)
         adj_x[e, q] = adj_x[e, q] + (share * g * lattice.inv_dx) * steep
         adj_J[e, p] = g
 
