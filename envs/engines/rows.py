@@ -23,10 +23,10 @@ def kernel_in_rows(plain: Any, text: str, elements: str, module: str) -> Any:
     def kernel() -> Any:
         return row  # which Warp finds here by its name
 
-    row = wp.func_native(text)(_with_arguments(row, {"e": int, **known}))
+    row = wp.func_native(text)(with_arguments(row, {"e": int, **known}))
     given = ", ".join(kinds)
     made = wp.Kernel(
-        _with_arguments(kernel, kinds),
+        with_arguments(kernel, kinds),
         key=plain.key.replace("__locals__", "_in_rows__locals__"),
         module=wp.get_module(module),
         options={"enable_backward": False},
@@ -40,7 +40,7 @@ def _adjoint_last(name: str) -> str:
     return f"{name.removeprefix('adj_')}_adjoint" if name.startswith("adj_") else name
 
 
-def _with_arguments(function: Any, kinds: Mapping[str, Any]) -> Any:
+def with_arguments(function: Any, kinds: Mapping[str, Any]) -> Any:
     """Return a function that says of itself that it takes arguments of these names and kinds, as Warp asks it."""
     parameters = [Parameter(name, Parameter.POSITIONAL_OR_KEYWORD, annotation=kind) for name, kind in kinds.items()]
     function.__signature__, function.__annotations__ = Signature(parameters), dict(kinds)

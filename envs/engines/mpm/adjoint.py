@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from ..runtime import load, to_torch
-from .checkpoints import Frame, Tape
+from .checkpoints import Frame
 from .exact import settle_kernel
 from .scatter import nodes
 from .stencil import lattice
@@ -20,7 +20,7 @@ class Adjoint:
     def __init__(self, solver: Any) -> None:
         self.solver = weakref.proxy(solver)  # which holds this: a cycle would keep a GPU's memory until it is collected
         self.new, self.old = solver.allocator.frame(), solver.allocator.frame()
-        self.A = solver.allocator.affine_momentum()
+        self.A = None if solver.columns else solver.allocator.affine_momentum()
         self.grid = solver.allocator.grid(max(box.cells for box in solver.boxes))
         self.tools = solver.allocator.paths()
         self.tools_by_axis: Any = wp.from_torch(to_torch(self.tools), requires_grad=False)
@@ -78,8 +78,7 @@ class Adjoint:
             solver.scatter.adjoint_g2p(step, s, frames[s], self.new, self.grid.v, self.old.x, batch)
             self._adjoint_velocity(step, s, batch)
             solver.launches.join()
-            self._adjoint_p2g(step, frames[s], tape, s, batch)
-            self._adjoint_update(step, frames[s], batch)
+            self._adjoint_p2g(step, frames[s], tape.A[s], batch)
             self.new, self.old = self.old, self.new
 
     def _adjoint_velocity(self, step: int, substep: int, batch: int) -> None:
@@ -90,16 +89,17 @@ class Adjoint:
         how = {"adj_inputs": adjoints, "adj_outputs": [], "adjoint": True}
         solver.launch_on_box(solver.velocity, nodes, batch, inputs, **how)
 
-    def _adjoint_p2g(self, step: int, frame: Frame, tape: Tape, substep: int, batch: int) -> None:
-        solver = self.solver
-        inputs = [tape.lattice, solver.orders[step].mass, frame.x, frame.v, tape.A[substep], self.grid.m]
-        inputs += [self.old.x, self.old.v, self.A]
-        solver.launch(solver.kernels.adjoint_p2g, solver.model.particles, batch, inputs)
-
-    def _adjoint_update(self, step: int, frame: Frame, batch: int) -> None:
-        solver = self.solver
+    def _adjoint_p2g(self, step: int, frame: Frame, A: wp.array, batch: int) -> None:
+        """Launch the adjoint of p2g, and those of the materials after it or as its continuation."""
+        solver, old = self.solver, self.old
+        lattice, mass = solver.tape(step).lattice, solver.orders[step].mass
+        given = [lattice, frame.x, frame.v, A, self.grid.m, old.x, old.v]
+        if not solver.columns:
+            inputs = [lattice, mass, *given[1:], self.A]
+            solver.launch(solver.kernels.adjoint_p2g, solver.model.particles, batch, inputs)
         for b, (_, adjoint) in enumerate(solver.materials):
-            inputs = [*solver.material_inputs(b, step, frame), self.new.S[b], self.A, self.old.S[b], self.old.C]
+            inputs = [*solver.material_inputs(b, step, frame), self.new.S[b]]
+            inputs = [*given, *inputs] if solver.columns else [*inputs, self.A]
             with solver.beside_others(b):
-                solver.launch(adjoint, solver.size(b), batch, inputs)
+                solver.launch(adjoint, solver.size(b), batch, [*inputs, old.S[b], old.C])
         solver.launches.join()

@@ -1,7 +1,7 @@
-"""What particles gather from their nodes, for a GPU: g2p, and of the adjoints of both transfers what is not scattered.
+"""What particles gather from their nodes, for a GPU, as functions.
 
 The formulas are those of `transfers`, summed along z first, then y, then x: fewer operations, and fewer numbers under
-way. `columns` has the scatters.
+way.
 """
 
 from functools import cache
@@ -11,7 +11,6 @@ from typing import no_type_check
 import warp as wp
 
 from ..runtime import precision
-from .cells import counter
 from .layout import in_precision, layout
 from .stencil import lattice, stencil
 
@@ -106,54 +105,16 @@ def gatherers(name: str) -> SimpleNamespace:
 
 @cache
 @no_type_check
-def gathers(name: str) -> SimpleNamespace:
-    """Return the kernels `g2p, adjoint_p2g, adjoint_g2p` of one precision, all over [environment, particle].
-
-    They take what those of `transfers` do, but adjoint_g2p takes no adjoint of the grid, and g2p counts particles by
-    cell, where they are then, if it is told to.
-    """
-    types, sums_of = precision(name), gatherers(name)
+def adjoint_gatherer(name: str):
+    """Return the function that gathers the adjoints of p2g: it adds to adj_x, sets adj_v, and returns adj_A."""
+    types, lies, sums_of = precision(name), layout(name), gatherers(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
-    module, lies = f"gradscape.gathers.{name}", layout(name)
-    Lattice, base_node, count_in_cell = lattice(name), stencil(name).base_node, counter(name)
-    gather, gather_with_mass, from_base = sums_of.gather, sums_of.gather_with_mass, sums_of.from_base
-    read_number, read_vector = lies.read_number, lies.read_vector
-    read_matrix, write_matrix = lies.read_matrix, lies.write_matrix
+    Lattice, base_node = lattice(name), stencil(name).base_node
+    gather_with_mass, from_base = sums_of.gather_with_mass, sums_of.from_base
+    read_number, read_vector, read_matrix = lies.read_number, lies.read_vector, lies.read_matrix
 
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def g2p(
-        lattice: Lattice,
-        dt: real,
-        x: wp.array2d[vec3],
-        grid_v: wp.array2d[vec4],
-        x_new: wp.array2d[vec3],
-        v_new: wp.array2d[vec3],
-        C_new: wp.array2d[mat33],
-        left_box: wp.array[wp.int32],
-        counting: int,
-        cells: wp.array2d[wp.int32],
-        numbers: wp.array2d[wp.int32],
-        counts: wp.array2d[wp.int32],
-    ):
-        """Gather v' = sum w v_i and C' = 4/dx^2 sum w v_i (x_i - x)^T; move x' = x + dt v'."""
-        e, p = wp.tid()
-        here = read_vector(x, e, p)
-        base = base_node((here - lattice.origin) * lattice.inv_dx, lattice)
-        f = from_base(here, base, lattice)
-        sums = gather(lattice, grid_v, e, base - lattice.first, f, vec3(), mat33())
-        v = sums[0]
-        C = wp.matrix_from_cols(sums[1] - f[0] * v, sums[2] - f[1] * v, sums[3] - f[2] * v)
-        write_matrix(C_new, e, p, (real(4.0) * lattice.inv_dx) * C)
-        there = here + dt * v
-        v_new[e, p] = v
-        x_new[e, p] = there
-        if wp.min(wp.min(f[0], f[1]), f[2]) < real(0.49) or wp.max(wp.max(f[0], f[1]), f[2]) > real(1.51):
-            left_box[e] = 1
-        if counting > 0:
-            count_in_cell(lattice, there, e, p, cells, numbers, counts)
-
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def adjoint_p2g(
+    @wp.func(module=f"gradscape.gathers.{name}")
+    def gather_back(
         lattice: Lattice,
         mass: wp.array2d[real],
         x: wp.array2d[vec3],
@@ -162,10 +123,9 @@ def gathers(name: str) -> SimpleNamespace:
         adj_grid_m: wp.array2d[vec4],
         adj_x: wp.array2d[vec3],
         adj_v: wp.array2d[vec3],
-        adj_A: wp.array2d[mat33],
+        e: int,
+        p: int,
     ):
-        """Gather the adjoints of p2g: add to adj_x, set adj_v and adj_A."""
-        e, p = wp.tid()
         here = read_vector(x, e, p)
         base = base_node((here - lattice.origin) * lattice.inv_dx, lattice)
         f = from_base(here, base, lattice)
@@ -177,29 +137,7 @@ def gathers(name: str) -> SimpleNamespace:
         sums = gather_with_mass(lattice, adj_grid_m, e, base - lattice.first, f, q, a, m)
         h = sums[0]
         adj_v[e, p] = m * h
-        write_matrix(adj_A, e, p, dx * wp.matrix_from_cols(sums[1] - f[0] * h, sums[2] - f[1] * h, sums[3] - f[2] * h))
         adj_x[e, p] = read_vector(adj_x, e, p) + lattice.inv_dx * sums[4] - wp.transpose(momentum) * h
+        return dx * wp.matrix_from_cols(sums[1] - f[0] * h, sums[2] - f[1] * h, sums[3] - f[2] * h)
 
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def adjoint_g2p(
-        lattice: Lattice,
-        dt: real,
-        x: wp.array2d[vec3],
-        grid_v: wp.array2d[vec4],
-        adj_x_new: wp.array2d[vec3],
-        adj_v_new: wp.array2d[vec3],
-        adj_C_new: wp.array2d[mat33],
-        adj_x: wp.array2d[vec3],
-    ):
-        """Gather the adjoints of g2p: set adj_x."""
-        e, p = wp.tid()
-        here = read_vector(x, e, p)
-        base = base_node((here - lattice.origin) * lattice.inv_dx, lattice)
-        f = from_base(here, base, lattice)
-        a = (real(4.0) * lattice.inv_dx) * read_matrix(adj_C_new, e, p)
-        adj = read_vector(adj_x_new, e, p)
-        q = read_vector(adj_v_new, e, p) + dt * adj - a * f
-        sums = gather(lattice, grid_v, e, base - lattice.first, f, q, a)
-        adj_x[e, p] = adj + lattice.inv_dx * (sums[4] - wp.transpose(a) * sums[0])
-
-    return SimpleNamespace(g2p=g2p, adjoint_p2g=adjoint_p2g, adjoint_g2p=adjoint_g2p)
+    return gather_back

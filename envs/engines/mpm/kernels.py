@@ -10,12 +10,12 @@ from .cells import cell_kernels
 from .columns import GPU_TEAM, column_kernels
 from .exact import settle_kernel
 from .extent import extent_kernels
-from .gathers import gathers
 from .grid_cpu import velocity_on
 from .model import Model
 from .order import sorting_kernels
 from .smoothing_columns import smoothing_columns
 from .smoothing_cpu import smoothing_on_cpu
+from .transfers_columns import transfers_of_columns
 from .transfers_cpu import transfers_on_cpu
 
 COMPUTES_LOSSES = False  # for `code`: what is compiled here, a solver would compile itself
@@ -32,7 +32,7 @@ def kernels(model: Model, device: str) -> Iterator[Any]:
     yield from (_of_cpu if device == "cpu" else _of_gpu)(name, any(body.material.smoothing for body in model.bodies))
     yield velocity_on(device, name, model.boundary, columns=device != "cpu")
     for body in model.bodies:
-        yield from body.material.kernels(name, rows=device == "cpu")
+        yield from body.material.kernels(name, rows=device == "cpu", columns=device != "cpu")
     yield extent_kernels(name).look
     sorting = sorting_kernels(name)
     yield sorting.label
@@ -48,7 +48,7 @@ def _of_cpu(name: str, smooth: bool) -> Iterator[Any]:
 
 
 def _of_gpu(name: str, smooth: bool) -> Iterator[Any]:
-    yield from (gathers(name).g2p, column_kernels(name, GPU_TEAM).p2g, cell_kernels(name).count)
+    yield from (transfers_of_columns(name).g2p, column_kernels(name, GPU_TEAM).p2g, cell_kernels(name).count)
     yield settle_kernel(name)
     if smooth:
         yield smoothing_columns(name, GPU_TEAM).spread

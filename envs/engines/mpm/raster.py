@@ -10,7 +10,7 @@ import warp as wp
 from ..runtime import load, precision, threads, to_torch
 from .model import Model, place_grid
 from .stencil import lattice, stencil
-from .gathers import gathers
+from .transfers_columns import transfers_of_columns
 from .transfers_cpu import transfers_on_cpu
 
 WHOLE = 2.0**60  # units of the mass of all particles
@@ -61,7 +61,7 @@ class Raster:
     ) -> None:
         name, types = model.precision, precision(model.precision)
         self.counting = device != "cpu" if counting is None else counting
-        self.kernels = (gathers if self.counting else transfers_on_cpu)(name)
+        self.kernels = (transfers_of_columns if self.counting else transfers_on_cpu)(name)
         self.count = count_kernel(name)
         self.lattice, self.device = place_grid(model), device
         load([self.kernels.adjoint_p2g, *([self.count] if self.counting else [])], device)

@@ -29,7 +29,6 @@ from ..runtime import free_memory, has_rows, load, threads, to_torch
 from .adjoint import Adjoint
 from .checkpoints import Allocator, Frame, Tape
 from .extent import Extent
-from .gathers import gathers
 from .grid_cpu import velocity_on
 from .kernels import compile_all as compile_all
 from .layout import to_rows
@@ -37,6 +36,7 @@ from .model import BOX_MARGIN, EMPTY, Box, Model, nodes_around
 from .order import Order, Sorter
 from .scatter import ByColumns, InPlace, Scatter, nodes
 from .smoothing import ColumnSmoother, Smoother
+from .transfers_columns import transfers_of_columns
 from .transfers_cpu import transfers_on_cpu
 
 CROWD = 8_000  # particles that hide what a launch costs on one core
@@ -95,13 +95,16 @@ class Solver:
         self.model, self.capacity, self.device = model, capacity, device
         self.pieces = pieces or pieces_that_fit(model, device)
         self.stop = stop or threading.Event()
-        columns = device != "cpu" if columns is None else columns
+        self.columns = columns = device != "cpu" if columns is None else columns
         self.allocator = Allocator(model, capacity, device, columns=columns)
         self.types = self.allocator.types
-        self.kernels = (gathers if columns else transfers_on_cpu)(model.precision)
+        self.kernels = (transfers_of_columns if columns else transfers_on_cpu)(model.precision)
         self.velocity = velocity_on(device, model.precision, model.boundary, columns=columns)
         self.boundary = model.boundary.data(model.precision, device)
-        self.materials = [body.material.kernels(model.precision, rows=device == "cpu") for body in model.bodies]
+        self.materials = [
+            body.material.kernels(model.precision, rows=device == "cpu" and not columns, columns=columns)
+            for body in model.bodies
+        ]
         load([*vars(self.kernels).values(), self.velocity, *chain.from_iterable(self.materials)], device)
         self.first = np.concatenate([[0], np.cumsum([len(body.x) for body in model.bodies])]).tolist()
         self.empty = EMPTY * float(model.mass.min())

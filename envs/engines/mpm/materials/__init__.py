@@ -6,7 +6,8 @@ has two kernels: `update` advances the state by the affine velocity C and fills 
     S' = deform(S, C),    A = -dt V 4/dx^2 tau(S', C) + m C,
 
 and `adjoint` turns the adjoints of S' and A into those of S and C. Both are written by hand; the tests hold the second
-against differences of the first. tau is the Kirchhoff stress J sigma [Pa].
+against differences of the first. On a GPU the adjoint gathers that of A first (`gathers`). tau is the Kirchhoff stress
+J sigma [Pa].
 """
 
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ import numpy as np
 
 from ...runtime import precision
 from . import elastic, fluid, fluid_cpu, plasticine, plasticine_cpu
+from .after_p2g import after_p2g
 
 
 @dataclass(frozen=True)
@@ -37,11 +39,11 @@ class Fluid:
         """Return J at which the fluid bears `pressure` [Pa], counted on its reference volume."""
         return np.asarray(np.exp(-pressure / self.bulk))  # K log J = -pressure
 
-    def kernels(self, name: str, *, rows: bool = False) -> tuple[Any, Any]:
-        """Return (update, adjoint) for one precision; in float32 there are some whose threads have `rows`."""
-        in_rows = rows and name == "float32"
-        update, adjoint = fluid_cpu.kernels_in_rows() if in_rows else fluid.kernels(name)
-        return update, adjoint
+    def kernels(self, name: str, *, rows: bool = False, columns: bool = False) -> tuple[Any, Any]:
+        """Return (update, adjoint) for one precision: those whose threads have `rows`, in float32, or for `columns`."""
+        if rows and name == "float32":
+            return fluid_cpu.kernels_in_rows()
+        return _choose(name, *fluid.kernels(name), columns=columns)
 
     def constants(self) -> tuple[float, ...]:
         """Return what the kernels take besides state and motion."""
@@ -98,10 +100,9 @@ class Elastic(_Solid):
         modulus = density * speed**2  # lam + 2 mu
         return cls(density, modulus * (1.0 + poisson) * (1.0 - 2.0 * poisson) / (1.0 - poisson), poisson)
 
-    def kernels(self, name: str, *, rows: bool = False) -> tuple[Any, Any]:
-        """Return (update, adjoint) for one precision; there are none whose threads have rows."""
-        update, adjoint = elastic.kernels(name)
-        return update, adjoint
+    def kernels(self, name: str, *, rows: bool = False, columns: bool = False) -> tuple[Any, Any]:
+        """Return (update, adjoint) for one precision, or for `columns`; there are none whose threads have rows."""
+        return _choose(name, *elastic.kernels(name), columns=columns)
 
     def constants(self) -> tuple[float, ...]:
         """Return what the kernels take besides state and motion."""
@@ -114,11 +115,11 @@ class Plasticine(_Solid):
 
     yield_stress: float
 
-    def kernels(self, name: str, *, rows: bool = False) -> tuple[Any, Any]:
-        """Return (update, adjoint) for one precision; in float32 there are some whose threads have `rows`."""
-        in_rows = rows and name == "float32"
-        update, adjoint = plasticine_cpu.kernels_in_rows() if in_rows else plasticine.kernels(name)
-        return update, adjoint
+    def kernels(self, name: str, *, rows: bool = False, columns: bool = False) -> tuple[Any, Any]:
+        """Return (update, adjoint) for one precision: those whose threads have `rows`, in float32, or for `columns`."""
+        if rows and name == "float32":
+            return plasticine_cpu.kernels_in_rows()
+        return _choose(name, *plasticine.kernels(name), columns=columns)
 
     def constants(self) -> tuple[float, ...]:
         """Return what the kernels take besides state and motion; the last is the largest deviatoric log strain."""
@@ -126,3 +127,7 @@ class Plasticine(_Solid):
 
 
 Material = Fluid | Elastic | Plasticine
+
+
+def _choose(name: str, update: Any, adjoint: Any, turn_back: Any, *, columns: bool) -> tuple[Any, Any]:
+    return update, after_p2g(name, adjoint, turn_back) if columns else adjoint

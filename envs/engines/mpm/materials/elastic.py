@@ -11,8 +11,11 @@ from ..layout import layout
 
 @cache
 @no_type_check
-def kernels(name: str) -> tuple[Any, Any]:
-    """Return (update, adjoint): F' = (I + dt C) F, tau = mu (F' F'^T - I) + lam log(det F') I."""
+def kernels(name: str) -> tuple[Any, Any, Any]:
+    """Return the kernels (update, adjoint), and what the second does with the adjoint of A of a particle.
+
+    F' = (I + dt C) F, tau = mu (F' F'^T - I) + lam log(det F') I.
+    """
     types = precision(name)
     real, mat33 = types.real, types.mat33
     module = f"gradscape.elastic.{name}"
@@ -40,6 +43,37 @@ def kernels(name: str) -> tuple[Any, Any]:
         write_matrix(F_new, e, p, f)
         write_matrix(A, e, first + p, scale * volume[e, first + p] * tau + mass[e, first + p] * c)
 
+    @wp.func(module=module)
+    def turn_back(
+        first: int,
+        dt: real,
+        scale: real,
+        mu: real,
+        lam: real,
+        mass: wp.array2d[real],
+        volume: wp.array2d[real],
+        F: wp.array2d[mat33],
+        C: wp.array2d[mat33],
+        adj_F_new: wp.array2d[mat33],
+        adj_a: mat33,
+        adj_F: wp.array2d[mat33],
+        adj_C: wp.array2d[mat33],
+        e: int,
+        p: int,
+    ):
+        identity = wp.identity(n=3, dtype=real)
+        advance = identity + dt * read_matrix(C, e, first + p)
+        before = read_matrix(F, e, p)
+        f = advance * before
+        g = (scale * volume[e, first + p]) * adj_a  # the adjoint of tau
+        adj_f = (
+            read_matrix(adj_F_new, e, p)
+            + mu * (g + wp.transpose(g)) * f
+            + lam * wp.trace(g) * wp.transpose(wp.inverse(f))
+        )
+        write_matrix(adj_F, e, p, wp.transpose(advance) * adj_f)
+        write_matrix(adj_C, e, first + p, mass[e, first + p] * adj_a + dt * adj_f * wp.transpose(before))
+
     @wp.kernel(module=module, enable_backward=False)
     def adjoint(
         first: int,
@@ -57,17 +91,7 @@ def kernels(name: str) -> tuple[Any, Any]:
         adj_C: wp.array2d[mat33],
     ):
         e, p = wp.tid()
-        identity = wp.identity(n=3, dtype=real)
-        advance = identity + dt * read_matrix(C, e, first + p)
-        before, adj_a = read_matrix(F, e, p), read_matrix(adj_A, e, first + p)
-        f = advance * before
-        g = (scale * volume[e, first + p]) * adj_a  # the adjoint of tau
-        adj_f = (
-            read_matrix(adj_F_new, e, p)
-            + mu * (g + wp.transpose(g)) * f
-            + lam * wp.trace(g) * wp.transpose(wp.inverse(f))
-        )
-        write_matrix(adj_F, e, p, wp.transpose(advance) * adj_f)
-        write_matrix(adj_C, e, first + p, mass[e, first + p] * adj_a + dt * adj_f * wp.transpose(before))
+        adj_a = read_matrix(adj_A, e, first + p)
+        turn_back(first, dt, scale, mu, lam, mass, volume, F, C, adj_F_new, adj_a, adj_F, adj_C, e, p)
 
-    return update, adjoint
+    return update, adjoint, turn_back

@@ -13,8 +13,11 @@ TORN = 1.04  # volume ratio at which a fluid tears
 
 @cache
 @no_type_check
-def kernels(name: str) -> tuple[Any, Any]:
-    """Return (update, adjoint): J' = min(exp(dt tr C) J, TORN), tau = K log J' I + J' mu (C + C^T - 2/3 tr C I)."""
+def kernels(name: str) -> tuple[Any, Any, Any]:
+    """Return the kernels (update, adjoint), and what the second does with the adjoint of A of a particle.
+
+    J' = min(exp(dt tr C) J, TORN), tau = K log J' I + J' mu (C + C^T - 2/3 tr C I).
+    """
     types = precision(name)
     real, mat33 = types.real, types.mat33
     module = f"gradscape.fluid.{name}"
@@ -45,6 +48,35 @@ def kernels(name: str) -> tuple[Any, Any]:
         J_new[e, p] = j
         write_matrix(A, e, first + p, scale * volume[e, first + p] * tau + mass[e, first + p] * c)
 
+    @wp.func(module=module)
+    def turn_back(
+        first: int,
+        dt: real,
+        scale: real,
+        bulk: real,
+        viscosity: real,
+        mass: wp.array2d[real],
+        volume: wp.array2d[real],
+        J: wp.array2d[real],
+        C: wp.array2d[mat33],
+        adj_J_new: wp.array2d[real],
+        adj_a: mat33,
+        adj_J: wp.array2d[real],
+        adj_C: wp.array2d[mat33],
+        e: int,
+        p: int,
+    ):
+        c = read_matrix(C, e, first + p)
+        growth = wp.exp(dt * wp.trace(c))
+        j = wp.min(growth * J[e, p], real(TORN))
+        g = (scale * volume[e, first + p]) * adj_a  # the adjoint of tau
+        adj_j = adj_J_new[e, p] + bulk * wp.trace(g) / j + viscosity * wp.ddot(g, shear(c))
+        if growth * J[e, p] > real(TORN):
+            adj_j = real(0.0)
+        adj_J[e, p] = growth * adj_j
+        dilation = dt * j * adj_j * wp.identity(n=3, dtype=real)
+        write_matrix(adj_C, e, first + p, mass[e, first + p] * adj_a + j * viscosity * shear(g) + dilation)
+
     @wp.kernel(module=module, enable_backward=False)
     def adjoint(
         first: int,
@@ -62,16 +94,7 @@ def kernels(name: str) -> tuple[Any, Any]:
         adj_C: wp.array2d[mat33],
     ):
         e, p = wp.tid()
-        c = read_matrix(C, e, first + p)
-        growth = wp.exp(dt * wp.trace(c))
-        j = wp.min(growth * J[e, p], real(TORN))
         adj_a = read_matrix(adj_A, e, first + p)
-        g = (scale * volume[e, first + p]) * adj_a  # the adjoint of tau
-        adj_j = adj_J_new[e, p] + bulk * wp.trace(g) / j + viscosity * wp.ddot(g, shear(c))
-        if growth * J[e, p] > real(TORN):
-            adj_j = real(0.0)
-        adj_J[e, p] = growth * adj_j
-        dilation = dt * j * adj_j * wp.identity(n=3, dtype=real)
-        write_matrix(adj_C, e, first + p, mass[e, first + p] * adj_a + j * viscosity * shear(g) + dilation)
+        turn_back(first, dt, scale, bulk, viscosity, mass, volume, J, C, adj_J_new, adj_a, adj_J, adj_C, e, p)
 
-    return update, adjoint
+    return update, adjoint, turn_back

@@ -26,8 +26,8 @@ ROUNDED = 1e-8  # added to |d|^2, so that an undeformed body has a gradient
 
 @cache
 @no_type_check
-def kernels(name: str) -> tuple[Any, Any]:
-    """Return (update, adjoint)."""
+def kernels(name: str) -> tuple[Any, Any, Any]:
+    """Return the kernels (update, adjoint), and what the second does with the adjoint of A of a particle."""
     types = precision(name)
     real, vec3, mat33 = types.real, types.vec3, types.mat33
     module = f"gradscape.plasticine.{name}"
@@ -120,8 +120,8 @@ def kernels(name: str) -> tuple[Any, Any]:
         stress = U * wp.diag(t) * wp.transpose(U)
         write_matrix(A, e, first + p, scale * volume[e, first + p] * stress + mass[e, first + p] * c)
 
-    @wp.kernel(module=module, enable_backward=False)
-    def adjoint(
+    @wp.func(module=module)
+    def turn_back(
         first: int,
         dt: real,
         scale: real,
@@ -133,13 +133,14 @@ def kernels(name: str) -> tuple[Any, Any]:
         F: wp.array2d[mat33],
         C: wp.array2d[mat33],
         adj_F_new: wp.array2d[mat33],
-        adj_A: wp.array2d[mat33],
+        adj_a: mat33,
         adj_F: wp.array2d[mat33],
         adj_C: wp.array2d[mat33],
+        n: int,
+        p: int,
     ):
-        n, p = wp.tid()
         advance = wp.identity(n=3, dtype=real) + dt * read_matrix(C, n, first + p)
-        before, adj_a = read_matrix(F, n, p), read_matrix(adj_A, n, first + p)
+        before = read_matrix(F, n, p)
         U, s, V = decompose(advance * before)
         e = log_strain(s)
         d = e - mean(e)
@@ -174,4 +175,25 @@ def kernels(name: str) -> tuple[Any, Any]:
         adj_c = mass[n, first + p] * adj_a + dt * adj_trial * wp.transpose(before)
         write_matrix(adj_C, n, first + p, adj_c)
 
-    return update, adjoint
+    @wp.kernel(module=module, enable_backward=False)
+    def adjoint(
+        first: int,
+        dt: real,
+        scale: real,
+        mu: real,
+        lam: real,
+        kappa: real,
+        mass: wp.array2d[real],
+        volume: wp.array2d[real],
+        F: wp.array2d[mat33],
+        C: wp.array2d[mat33],
+        adj_F_new: wp.array2d[mat33],
+        adj_A: wp.array2d[mat33],
+        adj_F: wp.array2d[mat33],
+        adj_C: wp.array2d[mat33],
+    ):
+        n, p = wp.tid()
+        adj_a = read_matrix(adj_A, n, first + p)
+        turn_back(first, dt, scale, mu, lam, kappa, mass, volume, F, C, adj_F_new, adj_a, adj_F, adj_C, n, p)
+
+    return update, adjoint, turn_back

@@ -1,0 +1,104 @@
+"""Transfers for a GPU, but for their scatters: g2p, and of both adjoints what particles gather.
+
+`columns` has the scatters.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import no_type_check
+
+import warp as wp
+
+from ..runtime import precision
+from .cells import counter
+from .gathers import adjoint_gatherer, gatherers
+from .layout import layout
+from .stencil import lattice, stencil
+
+
+@cache
+@no_type_check
+def transfers_of_columns(name: str) -> SimpleNamespace:
+    """Return the kernels `g2p, adjoint_p2g, adjoint_g2p` of one precision, all over [environment, particle].
+
+    They take what those of `transfers` do, but adjoint_g2p takes no adjoint of the grid, and g2p counts particles by
+    cell, where they are then, if it is told to.
+    """
+    types, sums_of = precision(name), gatherers(name)
+    real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
+    module, lies = f"gradscape.transfers.{name}.columns", layout(name)
+    Lattice, base_node, count_in_cell = lattice(name), stencil(name).base_node, counter(name)
+    gather, from_base, gather_back = sums_of.gather, sums_of.from_base, adjoint_gatherer(name)
+    read_vector, read_matrix, write_matrix = lies.read_vector, lies.read_matrix, lies.write_matrix
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    def g2p(
+        lattice: Lattice,
+        dt: real,
+        x: wp.array2d[vec3],
+        grid_v: wp.array2d[vec4],
+        x_new: wp.array2d[vec3],
+        v_new: wp.array2d[vec3],
+        C_new: wp.array2d[mat33],
+        left_box: wp.array[wp.int32],
+        counting: int,
+        cells: wp.array2d[wp.int32],
+        numbers: wp.array2d[wp.int32],
+        counts: wp.array2d[wp.int32],
+    ):
+        """Gather v' = sum w v_i and C' = 4/dx^2 sum w v_i (x_i - x)^T; move x' = x + dt v'."""
+        e, p = wp.tid()
+        here = read_vector(x, e, p)
+        base = base_node((here - lattice.origin) * lattice.inv_dx, lattice)
+        f = from_base(here, base, lattice)
+        sums = gather(lattice, grid_v, e, base - lattice.first, f, vec3(), mat33())
+        v = sums[0]
+        C = wp.matrix_from_cols(sums[1] - f[0] * v, sums[2] - f[1] * v, sums[3] - f[2] * v)
+        write_matrix(C_new, e, p, (real(4.0) * lattice.inv_dx) * C)
+        there = here + dt * v
+        v_new[e, p] = v
+        x_new[e, p] = there
+        if wp.min(wp.min(f[0], f[1]), f[2]) < real(0.49) or wp.max(wp.max(f[0], f[1]), f[2]) > real(1.51):
+            left_box[e] = 1
+        if counting > 0:
+            count_in_cell(lattice, there, e, p, cells, numbers, counts)
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    def adjoint_p2g(
+        lattice: Lattice,
+        mass: wp.array2d[real],
+        x: wp.array2d[vec3],
+        v: wp.array2d[vec3],
+        A: wp.array2d[mat33],
+        adj_grid_m: wp.array2d[vec4],
+        adj_x: wp.array2d[vec3],
+        adj_v: wp.array2d[vec3],
+        adj_A: wp.array2d[mat33],
+    ):
+        """Gather the adjoints of p2g: add to adj_x, set adj_v and adj_A."""
+        e, p = wp.tid()
+        write_matrix(adj_A, e, p, gather_back(lattice, mass, x, v, A, adj_grid_m, adj_x, adj_v, e, p))
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    def adjoint_g2p(
+        lattice: Lattice,
+        dt: real,
+        x: wp.array2d[vec3],
+        grid_v: wp.array2d[vec4],
+        adj_x_new: wp.array2d[vec3],
+        adj_v_new: wp.array2d[vec3],
+        adj_C_new: wp.array2d[mat33],
+        adj_x: wp.array2d[vec3],
+    ):
+        """Gather the adjoints of g2p: set adj_x."""
+        e, p = wp.tid()
+        here = read_vector(x, e, p)
+        base = base_node((here - lattice.origin) * lattice.inv_dx, lattice)
+        f = from_base(here, base, lattice)
+        a = (real(4.0) * lattice.inv_dx) * read_matrix(adj_C_new, e, p)
+        adj = read_vector(adj_x_new, e, p)
+        q = read_vector(adj_v_new, e, p) + dt * adj - a * f
+        sums = gather(lattice, grid_v, e, base - lattice.first, f, q, a)
+        adj_x[e, p] = adj + lattice.inv_dx * (sums[4] - wp.transpose(a) * sums[0])
+
+    return SimpleNamespace(g2p=g2p, adjoint_p2g=adjoint_p2g, adjoint_g2p=adjoint_g2p)
