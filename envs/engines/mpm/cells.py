@@ -93,9 +93,15 @@ def segments(box: Box) -> int:
     return box.nodes[0] * box.nodes[1] * ((first + count - 1) // SEGMENT - first // SEGMENT + 1)
 
 
-@wp.func_native(TAKE_NUMBER)
-def take_number(counts: wp.array2d[wp.int32], e: int, cell: int) -> int:
-    """Count one more, and return how many there were."""
+@cache
+@no_type_check
+def number_taker():
+    """Return the function that counts one more at a place, and returns how many there were."""
+
+    @wp.func_native(TAKE_NUMBER)
+    def take_number(counts: wp.array2d[wp.int32], e: int, cell: int) -> int: ...
+
+    return take_number
 
 
 @cache
@@ -103,7 +109,7 @@ def take_number(counts: wp.array2d[wp.int32], e: int, cell: int) -> int:
 def counter(name: str):
     """Return the function that tells a particle at x its cell, and its number there in the order of arrival."""
     vec3 = precision(name).vec3
-    Lattice, base_node = lattice(name), stencil(name).base_node
+    Lattice, base_node, take_number = lattice(name), stencil(name).base_node, number_taker()
 
     @wp.func(module=f"gradscape.cells.{name}")
     def count_in_cell(
@@ -135,6 +141,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
     """
     vec3 = precision(name).vec3
     Lattice, count_in_cell, module = lattice(name), counter(name), f"gradscape.cells.{name}"
+    take_number = number_taker()
 
     @wp.func_native(TAKE_PLACES)
     def take_places(used: wp.array2d[wp.int32], e: int, total: int) -> wp.vec2i: ...

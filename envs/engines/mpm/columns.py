@@ -143,8 +143,11 @@ CLOSE = """
 #endif
 """
 MOST = """
-#if defined(__CUDA_ARCH__)
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
     return __reduce_max_sync(0xffffffffu, count);
+#elif defined(__CUDA_ARCH__)
+    for (int step = 16; step > 0; step /= 2) count = max(count, __shfl_xor_sync(0xffffffffu, count, step));
+    return count;
 #else
     return count;
 #endif
