@@ -185,9 +185,11 @@ def _ladle_in_tank(name: str) -> tuple[Any, Any]:
         rate: real,
     ) -> vec3:
         beside = scene.half_thickness + scene.band
-        near = scene.radius + beside
+        rounded = real(1.001) * beside
+        outer, inner = scene.radius + rounded, wp.max(scene.radius - rounded, real(0.0))
         local = p - look_between(tools, e, step, fraction)
-        if wp.abs(local[2]) < near and wp.abs(local[0]) < near and wp.abs(local[1]) < near:
+        apart = wp.dot(local, local)
+        if apart < outer * outer and apart >= inner * inner:  # elsewhere the bowl is too far off to change anything
             hit = bowl_distance(p - between(tools, sums, e, lane, step, fraction), scene.radius, scene.half_thickness)
             v = slide(v, velocity(tools, sums, e, lane, step, rate), hit, scene.band, scene.friction)
         handle = scene.height > real(0.0)

@@ -25,7 +25,8 @@ STEP, SIZES = 4, 32  # segments are of one size up to so many particles apart, a
 # Neighbours in memory are mostly of one cell: on a GPU one of them counts for all of a warp.
 TAKE_NUMBER = """
 #if defined(__CUDA_ARCH__)
-    const unsigned alike = __match_any_sync(__activemask(), (unsigned long long)&wp::index(counts, e, cell));
+    const unsigned place = (unsigned)((unsigned long long)&wp::index(counts, e, cell) >> 2);
+    const unsigned alike = __match_any_sync(__activemask(), place);
     const int lane = threadIdx.x & 31, leader = __ffs(alike) - 1;
     int number = 0;
     if (lane == leader) number = atomicAdd(&wp::index(counts, e, cell), __popc(alike));
