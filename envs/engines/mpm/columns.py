@@ -59,18 +59,13 @@ WALK = """
 #if defined(__CUDA_ARCH__)
     FOUR
     struct alignas(16) Weights { REAL low, middle, high; int cell; };
-    struct Particle { Four q, x, y, z; Weights weights; };
+    struct Particle { STAGED Weights weights; };
     __shared__ Particle stage[WARPS][3 * ROUND];
     const int lane = threadIdx.x & 31, row = lane % 9, i = row / 3, j = row % 3;
     const REAL oi = REAL(i), oj = REAL(j), half = REAL(0.5), one = REAL(1.0), more = REAL(1.5), three = REAL(0.75);
     const auto pack = [&](const auto &p) {
         const REAL u = p.f[2] - more, v = p.f[2] - one, w = p.f[2] - half;
-        return Particle{
-            {p.q[0], p.q[1], p.q[2], p.mass},
-            {p.a.data[0][0], p.a.data[1][0], p.a.data[2][0], p.f[0]},
-            {p.a.data[0][1], p.a.data[1][1], p.a.data[2][1], p.f[1]},
-            {p.a.data[0][2], p.a.data[1][2], p.a.data[2][2], REAL(0.0)},
-            {half * u * u, three - v * v, half * w * w, p.cell}};
+        return Particle{PACKED {half * u * u, three - v * v, half * w * w, p.cell}};
     };
     Particle *staged = stage[threadIdx.x >> 5] + lane / 9 * ROUND;
     __syncwarp();
@@ -84,19 +79,14 @@ WALK = """
     Four *out = (Four *)&wp::index(parts, e, at) + row * PLANES;
     int now = (int)state[12];
     for (int t = 0; t < count; ++t) {
-        const Four b = staged[t].q, x = staged[t].x, y = staged[t].y, z = staged[t].z;
-        const Weights w = staged[t].weights;
+        const Particle given = staged[t];
+        const Weights w = given.weights;
 #pragma unroll 1
         while (now < w.cell) EMIT
-        const REAL tx = x.d - mi, ty = y.d - mj;
+        const REAL tx = FIRST - mi, ty = SECOND - mj;
         const REAL wij = (ui + si * tx * tx) * (uj + sj * ty * ty);
         const REAL w0 = wij * w.low, w1 = wij * w.middle, w2 = wij * w.high;
-        REAL qa = b.a + oi * x.a + oj * y.a, qb = b.b + oi * x.b + oj * y.b, qc = b.c + oi * x.c + oj * y.c;
-        low.a += w0 * qa, low.b += w0 * qb, low.c += w0 * qc, low.d += w0 * b.d;
-        qa += z.a, qb += z.b, qc += z.c;
-        middle.a += w1 * qa, middle.b += w1 * qb, middle.c += w1 * qc, middle.d += w1 * b.d;
-        qa += z.a, qb += z.b, qc += z.c;
-        high.a += w2 * qa, high.b += w2 * qb, high.c += w2 * qc, high.d += w2 * b.d;
+        ADDED
     }
     wp::vec_t<13, REAL> left;
     left[0] = low.a, left[1] = low.b, left[2] = low.c, left[3] = low.d;
@@ -129,6 +119,38 @@ WALK = """
     return state;
 #endif
 """
+# What is staged of a particle whose gift to nodes has a slope and mass, and of one without.
+SLOPING = {
+    "STAGED": "Four q, x, y, z;",
+    "PACKED": """
+            {p.q[0], p.q[1], p.q[2], p.mass},
+            {p.a.data[0][0], p.a.data[1][0], p.a.data[2][0], p.f[0]},
+            {p.a.data[0][1], p.a.data[1][1], p.a.data[2][1], p.f[1]},
+            {p.a.data[0][2], p.a.data[1][2], p.a.data[2][2], REAL(0.0)},
+""",
+    "FIRST": "given.x.d",
+    "SECOND": "given.y.d",
+    "ADDED": """
+        const Four b = given.q, x = given.x, y = given.y, z = given.z;
+        REAL qa = b.a + oi * x.a + oj * y.a, qb = b.b + oi * x.b + oj * y.b, qc = b.c + oi * x.c + oj * y.c;
+        low.a += w0 * qa, low.b += w0 * qb, low.c += w0 * qc, low.d += w0 * b.d;
+        qa += z.a, qb += z.b, qc += z.c;
+        middle.a += w1 * qa, middle.b += w1 * qb, middle.c += w1 * qc, middle.d += w1 * b.d;
+        qa += z.a, qb += z.b, qc += z.c;
+        high.a += w2 * qa, high.b += w2 * qb, high.c += w2 * qc, high.d += w2 * b.d;
+""",
+}
+LEVEL = {
+    "STAGED": "Four q;",
+    "PACKED": "{p.q[0], p.q[1], p.f[0], p.f[1]},",
+    "FIRST": "given.q.c",
+    "SECOND": "given.q.d",
+    "ADDED": """
+        low.a += w0 * given.q.a, low.b += w0 * given.q.b;
+        middle.a += w1 * given.q.a, middle.b += w1 * given.q.b;
+        high.a += w2 * given.q.a, high.b += w2 * given.q.b;
+""",
+}
 CLOSE = """
 #if defined(__CUDA_ARCH__)
     FOUR
@@ -184,9 +206,16 @@ ADD_UP = """
 """
 
 
-def fill(code: str, name: str) -> str:
+def fill(code: str, name: str, **more: str) -> str:
     """Put what a precision decides, and other constants, into C++."""
-    words = {"EMIT": EMIT, "PLANES": PLANES, "PARTS": PARTS, "SEGMENT": SEGMENT, "WARPS": BLOCK // 32, "ROUND": 18}
+    words = more | {
+        "EMIT": EMIT,
+        "PLANES": PLANES,
+        "PARTS": PARTS,
+        "SEGMENT": SEGMENT,
+        "WARPS": BLOCK // 32,
+        "ROUND": 18,
+    }
     for word, value in words.items():
         code = code.replace(word, str(value))
     return in_precision(code, name)
@@ -194,13 +223,13 @@ def fill(code: str, name: str) -> str:
 
 @cache
 @no_type_check
-def walker(name: str) -> SimpleNamespace:
+def walker(name: str, *, sloping: bool = True) -> SimpleNamespace:
     """Return the functions `at_nodes, most, open, walk, close` of one precision.
 
-    `at_nodes` says what a particle gives to its nodes, as a `Given`. A warp's lanes call the others together: `most`
-    for the greatest of their counts, `open` before their segment, whose parts begin at `at`, `close` after it. `walk`
-    adds the next `count` particles of each group to its parts. A lane knows two of them, as far apart in the list as a
-    group has lanes.
+    `at_nodes` says what a particle gives to its nodes, as a `Given`, whose a, mass and third q must be 0 unless it is
+    `sloping`. A warp's lanes call the others together: `most` for the greatest of their counts, `open` before their
+    segment, whose parts begin at `at`, `close` after it. `walk` adds the next `count` particles of each group to its
+    parts. A lane knows two of them, as far apart in the list as a group has lanes.
     """
     types = precision(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
@@ -226,7 +255,7 @@ def walker(name: str) -> SimpleNamespace:
     @wp.func_native(fill(OPEN, name))
     def open_segment(parts: wp.array2d[vec4], e: int, at: int, span: int) -> State: ...
 
-    @wp.func_native(fill(WALK, name))
+    @wp.func_native(fill(WALK, name, **(SLOPING if sloping else LEVEL)))
     def walk(
         parts: wp.array2d[vec4], e: int, at: int, count: int, first: Given, second: Given, state: State
     ) -> State: ...

@@ -26,7 +26,7 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
     """
     types = precision(name)
     real, vec3, vec4 = types.real, types.vec3, types.vec4
-    Lattice, base_node, steps = lattice(name), stencil(name).base_node, walker(name)
+    Lattice, base_node, steps = lattice(name), stencil(name).base_node, walker(name, sloping=False)
     from_base = gatherers(name).from_base
     take_segment, most = segment_taker(team), steps.most
     at_nodes, open_segment, walk, close_segment = steps.at_nodes, steps.open, steps.walk, steps.close
