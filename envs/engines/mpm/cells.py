@@ -68,19 +68,19 @@ class Lists:
     """The particles by cell: `order` [environment, place], and its segments.
 
     Those with particles are `full` [environment] in number, and `segments` [environment, segment with particles] says
-    of each of them which one it is, the first place of its particles, how many there are, and its span. `span`
-    [environment, segment] holds which planes of nodes they touch, counted from the segment's first: the lowest, and
-    256 times the one beyond the highest; 0 where it has no particles.
+    of each of them which one it is, the first place of its particles, how many there are, and which planes of nodes
+    they touch, counted from the segment's first: the lowest, and 256 times the one beyond the highest. Those planes are
+    the bits of `planes` [environment, segment], which is 0 where there are no particles.
     """
 
     order: wp.array
     full: wp.array
     segments: wp.array
-    span: wp.array
+    planes: wp.array
 
     def arrays(self) -> tuple[wp.array, ...]:
         """Return every array of the lists."""
-        return (self.order, self.full, self.segments, self.span)
+        return (self.order, self.full, self.segments, self.planes)
 
 
 def warps(box: Box) -> int:
@@ -172,7 +172,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
         starts: wp.array2d[wp.int32],
         found: wp.array2d[wp.vec4i],
         numbers: wp.array2d[wp.int32],
-        span: wp.array2d[wp.int32],
+        planes: wp.array2d[wp.int32],
     ):
         """Give each segment its places in the list, each of its cells, too, and it a number among those of its size."""
         e, s = wp.tid()
@@ -188,7 +188,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
                         low = k
                     high = k + 3
                 total += here
-            span[e, s] = low + 256 * high
+            planes[e, s] = (1 << high) - (1 << low)
         taken = take_places(used, e, total)
         if total > 0:
             at, segment = taken[0], taken[1]

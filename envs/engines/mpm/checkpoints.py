@@ -162,7 +162,7 @@ class Tape:
     @property
     def _segments(self) -> int:
         """How many segments all its lists have room for."""
-        return min(int(lists.span.shape[1]) for lists in self.lists)
+        return min(int(lists.planes.shape[1]) for lists in self.lists)
 
     def _room(self, cells: int) -> int:
         """Return how many nodes to make room for where so many are needed."""

@@ -180,7 +180,7 @@ ADD_UP = """
     const int bottom = lattice.first[2] / SEGMENT, depth = (lattice.first[2] + nz - 1) / SEGMENT - bottom + 1;
     const int segment = z / SEGMENT - bottom, plane = z % SEGMENT;
     const bool both = plane < 2 && segment > 0;
-    const int *row = &wp::index(spans, e, 0);
+    const int *row = &wp::index(planes, e, 0);
     const Four *given = (const Four *)&wp::index(parts, e, 0);
     int lower[9], upper[9];
 #pragma unroll
@@ -195,10 +195,8 @@ ADD_UP = """
     for (int c = 0; c < 9; ++c) {
         const int here = ((x - c / 3) * ny + y - c % 3) * depth + segment, at = plane + SEGMENT;
         const Four none{};
-        const bool is_low = at >= (lower[c] & 255) && at < lower[c] >> 8;
-        const bool is_high = plane >= (upper[c] & 255) && plane < upper[c] >> 8;
-        const Four a = is_low ? given[(here - 1) * PARTS + c * PLANES + at] : none;
-        const Four b = is_high ? given[here * PARTS + c * PLANES + plane] : none;
+        const Four a = lower[c] >> at & 1 ? given[(here - 1) * PARTS + c * PLANES + at] : none;
+        const Four b = upper[c] >> plane & 1 ? given[here * PARTS + c * PLANES + plane] : none;
         low.a += a.a, low.b += a.b, low.c += a.c, low.d += a.d;
         high.a += b.a, high.b += b.b, high.c += b.c, high.d += b.d;
     }
@@ -297,11 +295,11 @@ def segment_taker(team: Team):
 @cache
 @no_type_check
 def node_sum(name: str):
-    """Return the function (lattice, spans, parts, e, i) that adds up what the parts say of node i, in one order."""
+    """Return the function (lattice, planes, parts, e, i) that adds up what the parts say of node i, in one order."""
     Lattice, vec4 = lattice(name), precision(name).vec4
 
     @wp.func_native(fill(ADD_UP, name))
-    def add_up_node(lattice: Lattice, spans: wp.array2d[wp.int32], parts: wp.array2d[vec4], e: int, i: int) -> vec4: ...
+    def add_up_node(lattice: Lattice, planes: wp.array2d[wp.int32], parts: wp.array2d[vec4], e: int, i: int) -> vec4: ...
 
     return add_up_node
 

@@ -101,7 +101,7 @@ def velocity_of_columns(name: str, boundary_velocity: Any, Data: Any) -> Any:
 
     @wp.func_native(f"const auto value = [&] {{ {fill(ADD_UP, name)} }}();\n{keep}", adj_snippet="", replay_snippet="")
     def add_up(
-        lattice: Lattice, spans: wp.array2d[wp.int32], parts: wp.array2d[vec4], grid: wp.array2d[vec4], e: int, i: int
+        lattice: Lattice, planes: wp.array2d[wp.int32], parts: wp.array2d[vec4], grid: wp.array2d[vec4], e: int, i: int
     ): ...
 
     @wp.func_native(in_precision(READ_NODE, name), adj_snippet=in_precision(ADJOINT_READ, name))
@@ -110,7 +110,7 @@ def velocity_of_columns(name: str, boundary_velocity: Any, Data: Any) -> Any:
     @wp.func_native(keep, adj_snippet=f"adj_value += [&] {{ {fill(ADD_UP, name)} }}();", replay_snippet="")
     def write(
         lattice: Lattice,
-        spans: wp.array2d[wp.int32],
+        planes: wp.array2d[wp.int32],
         parts: wp.array2d[vec4],
         grid: wp.array2d[vec4],
         e: int,
@@ -132,16 +132,16 @@ def velocity_of_columns(name: str, boundary_velocity: Any, Data: Any) -> Any:
         sums: wp.array2d[wp.int64],
         grid_m: wp.array2d[vec4],
         grid_v: wp.array2d[vec4],
-        spans: wp.array2d[wp.int32],
+        planes: wp.array2d[wp.int32],
         parts: wp.array2d[vec4],
     ):
         e, i = wp.tid()
-        add_up(lattice, spans, parts, grid_m, e, i)  # its adjoint is not wanted, and finds in grid_m what it needs
+        add_up(lattice, planes, parts, grid_m, e, i)  # its adjoint is not wanted, and finds in grid_m what it needs
         g = read(grid_m, e, i)
         if g[3] > empty:
             v = velocity_at_node(lattice, boundary, dt, gravity, g, e, i, tools, sums, step, fraction, rate)
-            write(lattice, spans, parts, grid_v, e, i, vec4(v[0], v[1], v[2], real(0.0)))
+            write(lattice, planes, parts, grid_v, e, i, vec4(v[0], v[1], v[2], real(0.0)))
         else:
-            write(lattice, spans, parts, grid_v, e, i, vec4())
+            write(lattice, planes, parts, grid_v, e, i, vec4())
 
     return velocity

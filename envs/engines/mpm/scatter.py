@@ -122,7 +122,7 @@ class ByColumns:
         if not counted:
             inputs = [tape.lattice, frame.x, self.cells, self.numbers, self.counts]
             solver.launch(kernels.count, count, batch, inputs)
-        inputs = [tape.lattice, self.counts, self.used, self.sizes, self.starts, *self.found, lists.span]
+        inputs = [tape.lattice, self.counts, self.used, self.sizes, self.starts, *self.found, lists.planes]
         solver.launch_on_box(kernels.place_segments, warps, batch, inputs)
         inputs = [self.cells, self.numbers, self.starts, self.used, self.sizes, *self.found, self.arrived]
         solver.launch(kernels.place, count, batch, [*inputs, lists.full, lists.segments])
@@ -157,12 +157,12 @@ class ByColumns:
     def add_up(self, kernel: Any, step: int, substep: int, batch: int, grids: list[wp.array]) -> None:
         """Launch a kernel that adds up the parts at nodes."""
         tape = self.solver.tape(step)
-        inputs = [tape.lattice, tape.lists[substep].span, self.parts, *grids]
+        inputs = [tape.lattice, tape.lists[substep].planes, self.parts, *grids]
         self.solver.launch_on_box(kernel, nodes, batch, inputs)
 
     def to_add_up(self, step: int, substep: int) -> list[wp.array]:
         """Return what nodes add up themselves, as their kernel takes it."""
-        return [self.solver.tape(step).lists[substep].span, self.parts]
+        return [self.solver.tape(step).lists[substep].planes, self.parts]
 
     def _allocate(self, count: int) -> None:
         """Allocate what so many segments take."""

@@ -101,10 +101,10 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         close_segment(parts, e, at, span, state)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def add_up(lattice: Lattice, spans: wp.array2d[wp.int32], parts: wp.array2d[vec4], nodes: wp.array2d[vec4]):
+    def add_up(lattice: Lattice, planes: wp.array2d[wp.int32], parts: wp.array2d[vec4], nodes: wp.array2d[vec4]):
         """Set the nodes' means, and what these are shared by."""
         e, i = wp.tid()
-        total = add_up_node(lattice, spans, parts, e, i)
+        total = add_up_node(lattice, planes, parts, e, i)
         # A particle in the middle of a cell gives the farthest of its nodes nothing, and others may not meet these.
         inverse = wp.where(total[1] > real(0.0), real(1.0) / total[1], real(0.0))
         write_node(nodes, e, i, vec4(total[0] * inverse, real(0.0), real(0.0), inverse))
@@ -173,11 +173,11 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         adj_J[e, p] = g
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def add_up_adjoint(lattice: Lattice, spans: wp.array2d[wp.int32], parts: wp.array2d[vec4], nodes: wp.array2d[vec4]):
+    def add_up_adjoint(lattice: Lattice, planes: wp.array2d[wp.int32], parts: wp.array2d[vec4], nodes: wp.array2d[vec4]):
         """Set the nodes' parts of the adjoint of s."""
         e, i = wp.tid()
         node = read_node(nodes, e, i)
-        a = add_up_node(lattice, spans, parts, e, i)[0] * node[3]
+        a = add_up_node(lattice, planes, parts, e, i)[0] * node[3]
         write_node(nodes, e, i, vec4(node[0], a, a * node[0], node[3]))
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)

@@ -59,7 +59,7 @@ def test_particles_are_listed_by_cell_and_then_as_they_lie(first):
     cell = ((x - torch.tensor(model.origin)) / model.dx - 0.5).floor().long()
     depth = segments(box) // (box.nodes[0] * box.nodes[1])
     for _ in range(2):  # the second time it begins where the first has ended
-        order, full, segments_found, spans = listed(model, box, x)
+        order, full, segments_found, planes = listed(model, box, x)
         for row in range(2):
             keys = sorted((i, j, k // SEGMENT, k % SEGMENT, p) for p, (i, j, k) in enumerate(cell[row].tolist()))
             found = {}
@@ -69,16 +69,16 @@ def test_particles_are_listed_by_cell_and_then_as_they_lie(first):
                 column, layer = divmod(s, depth)
                 place = *divmod(column, box.nodes[1]), layer + first // SEGMENT
                 found[place] = (order[row, begin : begin + count].tolist(), divmod(span, 256))
-                assert span == spans[row, s]
+                assert planes[row, s] == sum(1 << plane for plane in range(span % 256, span // 256))
             wanted = {where: list(group) for where, group in groupby(keys, key=lambda key: key[:3])}
             assert found == {
                 where: ([key[-1] for key in group], (group[-1][3] + 3, group[0][3])) for where, group in wanted.items()
             }
-            assert int((spans[row] > 0).sum()) == full[row]
+            assert int((planes[row] > 0).sum()) == full[row]
 
 
 def listed(model, box, x):
-    """Return the order of particles, and the number of full segments, these, and the span of all, all [row, *]."""
+    """Return the order of particles, and the number of full segments, these, and the planes of all, all [row, *]."""
     kernels, lattice, (batch, count) = cell_kernels("float64"), place_grid(model, box), x.shape[:2]
     at, room = wp.array(x.numpy(), dtype=wp.vec3d), segments(box)
     cells, numbers, arrived, order = (wp.zeros((batch, count), dtype=wp.int32) for _ in range(4))
