@@ -1,0 +1,118 @@
+"""Scatters as a GPU's warps do them, without a GPU: what Warp makes for one, compiled for the CPU and emulated."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+import warp as wp
+
+from gradscape.envs.engines.mpm.boundaries import Open
+from gradscape.envs.engines.mpm.cells import SEGMENT, SIZES, STARTS, cell_kernels, segments, warps
+from gradscape.envs.engines.mpm.columns import GPU_TEAM, PARTS, column_kernels
+from gradscape.envs.engines.mpm.grid_cpu import velocity_on
+from gradscape.envs.engines.mpm.model import Box, place_grid
+from gradscape.envs.engines.mpm.smoothing_columns import smoothing_columns
+from gradscape.envs.engines.mpm.transfers import transfers
+from gradscape.envs.engines.runtime import to_torch
+
+from .bodies import kneading
+from .emulation import emulate
+
+ROWS, COUNT, BODY = 2, 300, slice(40, 270)
+
+
+class Scattering:
+    """Particles listed by cell in emulation, and nodes that add up what warps leave."""
+
+    def __init__(self, box, spread):
+        model = replace(kneading()[0], precision="float32")
+        self.box, self.lattice = box, place_grid(model, box)
+        lowest = torch.tensor([0.6 + first for first in box.first])
+        reach = spread * torch.tensor([nodes - 3.2 for nodes in box.nodes])
+        draw = torch.Generator().manual_seed(5)
+        self.x = torch.tensor(model.origin) + model.dx * (lowest + reach * torch.rand((ROWS, COUNT, 3), generator=draw))
+        self.v, self.A = torch.randn((ROWS, COUNT, 3), generator=draw), torch.randn((ROWS, COUNT, 3, 3), generator=draw)
+        self.mass = 0.5 + torch.rand((ROWS, COUNT), generator=draw)
+        room = segments(box)
+        self.order, cells, numbers, arrived = (self.zeros(COUNT) for _ in range(4))
+        counts, starts = self.zeros(room * SEGMENT), self.zeros(room * STARTS)
+        used, sizes, ranks, self.planes = (self.zeros(count) for count in (2, SIZES, room, room))
+        unsorted, self.segments = self.zeros(room, wp.vec4i), self.zeros(room, wp.vec4i)
+        self.full, kernels = wp.zeros(ROWS, dtype=wp.int32), cell_kernels("float32")
+        for _ in range(2):  # the second time it begins where the first has ended
+            emulate(kernels.count, (ROWS, COUNT), [self.lattice, self.array(self.x), cells, numbers, counts])
+            inputs = [self.lattice, counts, used, sizes, starts, unsorted, ranks, self.planes]
+            emulate(kernels.place_segments, (ROWS, warps(box)), inputs)
+            inputs = [cells, numbers, starts, used, sizes, unsorted, ranks, arrived, self.full, self.segments]
+            emulate(kernels.place, (ROWS, COUNT), inputs)
+            emulate(kernels.tidy, (ROWS, COUNT), [cells, starts, arrived, used, sizes, self.order])
+
+    def walk(self, kernel, inputs):
+        """Return what nodes add up of what warps leave, [row, node, 4]."""
+        parts = wp.array(torch.full((ROWS, segments(self.box) * PARTS, 4), torch.nan).numpy(), dtype=wp.vec4)
+        lists = [self.lattice, self.order, self.full, self.segments]
+        emulate(kernel, (ROWS, GPU_TEAM.threads(self.box)), [*lists, *inputs, parts])
+        momentum, velocity = self.zeros(self.box.cells, wp.vec4), self.zeros(self.box.cells, wp.vec4)
+        numbers = [0.0, 0.0, -1.0, 0, 0.0, 0.0]  # no gravity, and no node is empty
+        tools, sums = wp.zeros((ROWS, 1, 1), dtype=wp.vec3), wp.zeros((1, 1), dtype=wp.int64)
+        given = [self.lattice, Open().data("float32", "cpu"), *numbers, tools, sums, momentum, velocity]
+        kernel = velocity_on("cuda", "float32", Open(), columns=True)
+        emulate(kernel, (ROWS, self.box.cells), [*given, self.planes, parts])
+        return to_torch(momentum).clone()
+
+    def transfer(self, mass, q, A):
+        """Return what `transfers` scatter of particles of momentum q and affine momentum A."""
+        grid = self.zeros(self.box.cells, wp.vec4)
+        inputs = [self.lattice, *map(self.array, (mass, self.x, q / mass[:, :, None], A)), grid]
+        wp.launch(transfers("float32").p2g, (ROWS, COUNT), inputs)
+        return to_torch(grid).clone()
+
+    def zeros(self, count, kind=wp.int32):
+        return wp.zeros((ROWS, count), dtype=kind)
+
+    def array(self, values):
+        kind = {2: wp.float32, 3: wp.vec3, 4: wp.mat33}[values.ndim]
+        return wp.array(values.contiguous().numpy(), dtype=kind)
+
+    def side_by_side(self, matrices):
+        """Return matrices as they lie on a GPU."""
+        return self.array(matrices.flatten(2).transpose(1, 2).reshape(matrices.shape))
+
+
+@pytest.fixture(scope="module", params=[(0, 1.0), (3, 1.0), (5, 0.05)])
+def scattering(request):
+    first, spread = request.param
+    return Scattering(Box((1, 0, first), (8, 7, 17 - first)), spread)
+
+
+def assert_close(got, wanted):
+    torch.testing.assert_close(got, wanted, rtol=0, atol=2e-5 * float(wanted.abs().max()))
+
+
+def test_warps_scatter_momentum_and_mass(scattering):
+    s = scattering
+    inputs = [*map(s.array, (s.mass, s.x, s.v)), s.side_by_side(s.A)]
+    got = s.walk(column_kernels("float32", GPU_TEAM).p2g, inputs)
+    assert_close(got, s.transfer(s.mass, s.mass[:, :, None] * s.v, s.A))
+
+
+def test_warps_scatter_adjoints_of_velocities(scattering):
+    s, dt = scattering, 0.25
+    adj_x, adj_C = s.v.flip(1), 0.01 * s.A
+    inputs = [dt, *map(s.array, (s.x, adj_x, s.v)), s.side_by_side(adj_C)]
+    got = s.walk(column_kernels("float32", GPU_TEAM).adjoint_g2p, inputs)
+    inverse_dx = s.lattice.inv_dx
+    wanted = s.transfer(torch.ones_like(s.mass), s.v + dt * adj_x, 4 * inverse_dx**2 * adj_C)
+    assert_close(got[:, :, :3], wanted[:, :, :3])
+
+
+def test_warps_scatter_what_one_body_smooths(scattering):
+    s, slope = scattering, 0.3
+    J = 0.9 + 0.2 * s.mass[:, BODY]
+    inputs = [BODY.start, slope, *map(s.array, (s.mass, s.x, J))]
+    got = s.walk(smoothing_columns("float32", GPU_TEAM).spread, inputs)
+    volume = torch.zeros_like(s.mass)
+    volume[:, BODY] = s.mass[:, BODY]
+    q = torch.zeros_like(s.x)
+    q[:, BODY, 0], q[:, :, 1] = volume[:, BODY] * (J.log() - slope * s.x[:, BODY, 1]), volume
+    assert_close(got[:, :, :2], s.transfer(torch.ones_like(s.mass), q, 0 * s.A)[:, :, :2])
