@@ -299,7 +299,9 @@ def node_sum(name: str):
     Lattice, vec4 = lattice(name), precision(name).vec4
 
     @wp.func_native(fill(ADD_UP, name))
-    def add_up_node(lattice: Lattice, planes: wp.array2d[wp.int32], parts: wp.array2d[vec4], e: int, i: int) -> vec4: ...
+    def add_up_node(
+        lattice: Lattice, planes: wp.array2d[wp.int32], parts: wp.array2d[vec4], e: int, i: int
+    ) -> vec4: ...
 
     return add_up_node
 

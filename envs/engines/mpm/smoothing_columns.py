@@ -173,7 +173,9 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         adj_J[e, p] = g
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def add_up_adjoint(lattice: Lattice, planes: wp.array2d[wp.int32], parts: wp.array2d[vec4], nodes: wp.array2d[vec4]):
+    def add_up_adjoint(
+        lattice: Lattice, planes: wp.array2d[wp.int32], parts: wp.array2d[vec4], nodes: wp.array2d[vec4]
+    ):
         """Set the nodes' parts of the adjoint of s."""
         e, i = wp.tid()
         node = read_node(nodes, e, i)
