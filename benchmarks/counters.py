@@ -20,7 +20,7 @@ from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from gradscape.envs.engines.launches import suspend_graphs
+from gradscape.envs.engines.launches import one_by_one
 from gradscape.envs.engines.profiling import count_demands, kernel_name, time_kernels
 from gradscape.envs.registry import make
 
@@ -71,7 +71,7 @@ def read_counters(lines: Iterable[str]) -> dict[str, Counted]:
 def simulate(scene: str, options: list[str], batch: int | None) -> None:
     """Simulate a batch with gradient, twice: the first compiles, and fills what is filled once."""
     env, points = prepare(scene, options, batch)
-    with suspend_graphs():
+    with one_by_one():
         for _ in range(2):
             env._simulate(points, grad=True)
 

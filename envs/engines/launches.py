@@ -16,6 +16,11 @@ MAX_GRAPHS, MAX_SEQUENCES = 512, 1024  # that are stored; more are not worth the
 BLOCK = 128  # threads of a GPU that share registers; scatters and gathers like few
 
 
+def blocks(precision: str) -> tuple[int, int] | None:
+    """Return the bounds of a kernel that is slow for want of warps: as many blocks as share 80 registers a thread."""
+    return (BLOCK, 6) if precision == "float32" else None
+
+
 @dataclass(frozen=True)
 class _Call:
     work: Callable[[], None]
@@ -26,12 +31,27 @@ class _Call:
 
 @dataclass(frozen=True)
 class _Mark:
-    """Where launches go on, on a stream of a graph by its number, 0 being the first; or the first waits, if None."""
+    """Where launches go on, on a stream of a GPU by its number, 0 being the first; or the first waits, if None."""
 
     stream: int | None
 
     def launch(self) -> None:
-        """Do nothing: outside of a graph all launches are on one stream."""
+        """Do nothing where all launches are on one stream."""
+
+
+class _Streams(dict[int, wp.Stream]):
+    """Streams of a GPU by their number, made when they are asked for, beside the present one, which is the first."""
+
+    def __init__(self, device: str) -> None:
+        super().__init__()
+        self.device = device
+
+    def __missing__(self, number: int) -> wp.Stream:
+        self[number] = wp.Stream(self.device)
+        return self[number]
+
+    def first(self) -> wp.Stream:
+        return wp.get_stream(self.device)
 
 
 @dataclass
@@ -50,27 +70,28 @@ class _Sequence:
         for command in self.launches:
             command.launch()
 
-    def capture(self, device: str) -> Any:
+    def run_on(self, streams: _Streams) -> None:
+        """Launch on several streams of a GPU, so that what does not wait for each other runs beside each other."""
+        stream = first = streams.first()
+        busy: set[int] = set()
+        for command in self.launches:
+            if not isinstance(command, _Mark):
+                command.launch(stream)
+            elif command.stream is None:
+                for number in sorted(busy):
+                    first.wait_stream(streams[number])
+                busy.clear()
+            elif command.stream == 0:
+                stream = first
+            else:
+                stream = streams[command.stream]
+                stream.wait_stream(first)
+                busy.add(command.stream)
+
+    def capture(self, streams: _Streams) -> Any:
         """Return a graph of the launches."""
-        with wp.ScopedCapture(device=device) as captured:
-            stream = first = wp.get_stream(device)
-            others: dict[int, wp.Stream] = {}
-            busy: set[int] = set()
-            for command in self.launches:
-                if not isinstance(command, _Mark):
-                    command.launch(stream)
-                elif command.stream is None:
-                    for number in sorted(busy):
-                        first.wait_stream(others[number])
-                    busy.clear()
-                elif command.stream == 0:
-                    stream = first
-                else:
-                    if command.stream not in others:
-                        others[command.stream] = wp.Stream(device)
-                    stream = others[command.stream]
-                    stream.wait_stream(first)
-                    busy.add(command.stream)
+        with wp.ScopedCapture(device=streams.device) as captured:
+            self.run_on(streams)
         return captured.graph
 
     def move(self, extent: Any, place: Any) -> None:
@@ -91,13 +112,14 @@ class Launches:
     box of nodes or a number of rows. Where an array is replaced by another, `clear` must be called.
     """
 
-    use_graphs: ClassVar[bool] = True
+    one_by_one: ClassVar[bool] = False  # even on a GPU
 
     def __init__(self, device: str) -> None:
         self.device = device
         self.sequences: dict[Hashable, _Sequence] = {}
         self.seen: set[Hashable] = set()
         self.graphs: dict[Hashable, Any] = {}
+        self.streams = _Streams(device)
 
     def run(self, key: Hashable, extent: Hashable, work: Callable[[], None], *, place: Any = None, small: bool) -> None:
         """Do `work` over an extent, and say to launches that ask for it by their first argument which `place` that is.
@@ -112,11 +134,14 @@ class Launches:
             work()
             self.sequences[key] = self._recording  # only now: of work that was interrupted a part would be stored
             self.seen.add((key, extent))
-        elif small and self.use_graphs and self.device != "cpu":
+        elif self.one_by_one or self.device == "cpu":
+            known.move(extent, place)
+            known.run()
+        elif small:
             self._run_graph((key, extent), known, place)
         else:
             known.move(extent, place)
-            known.run()
+            known.run_on(self.streams)
 
     def launch(
         self, kernel: Any, dim: tuple[int, int] | Callable[[Any], tuple[int, int]], inputs: list[Any], **how: Any
@@ -139,7 +164,7 @@ class Launches:
 
     @contextmanager
     def beside(self, stream: int) -> Iterator[None]:
-        """Let a graph run what is launched within a with block on a stream beside what follows it, up to `join`."""
+        """Let a GPU run what is launched within a with block on a stream beside what follows it, up to `join`."""
         self._recording.launches.append(_Mark(stream))
         yield
         self._recording.launches.append(_Mark(0))
@@ -159,20 +184,20 @@ class Launches:
             known.move(key[1], place)
             if key not in self.seen:
                 self.seen.add(key)
-                known.run()
+                known.run_on(self.streams)
                 return
             if len(self.graphs) == MAX_GRAPHS:
                 self.seen.clear()
                 self.graphs.clear()
-            self.graphs[key] = known.capture(self.device)
+            self.graphs[key] = known.capture(self.streams)
         wp.capture_launch(self.graphs[key])
 
 
 @contextmanager
-def suspend_graphs() -> Iterator[None]:
-    """Launch kernels one by one within a with block, not as graphs."""
-    Launches.use_graphs = False
+def one_by_one() -> Iterator[None]:
+    """Launch kernels one after the other within a with block, neither as graphs nor beside each other."""
+    Launches.one_by_one = True
     try:
         yield
     finally:
-        Launches.use_graphs = True
+        Launches.one_by_one = False

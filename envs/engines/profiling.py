@@ -14,7 +14,7 @@ from typing import Any
 import warp as wp
 
 from .demand import Demand, demand
-from .launches import suspend_graphs
+from .launches import one_by_one
 
 
 @dataclass
@@ -57,7 +57,7 @@ def count_demands() -> Iterator[dict[str, Demand]]:
         found[name] = Demand(found[name].bytes + one.bytes, found[name].flops + one.flops)
         return nullcontext()
 
-    with suspend_graphs(), _around_launches(count):
+    with one_by_one(), _around_launches(count):
         yield found
 
 
@@ -120,7 +120,7 @@ def _time_on_cpu(times: dict[str, KernelTime]) -> Iterator[None]:
 def _time_on_cuda(times: dict[str, KernelTime]) -> Iterator[None]:
     wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
     try:
-        with suspend_graphs():  # a graph hides its kernels
+        with one_by_one():  # a graph hides its kernels, and those beside each other take longer
             yield
     finally:
         for run in wp.timing_end():

@@ -19,7 +19,6 @@ from .model import Box
 from .stencil import lattice, stencil
 
 SEGMENT = 8  # cells
-STARTS = SEGMENT + 1  # of the cells of a segment, and of what comes after it
 STEP, SIZES = 4, 32  # segments are of one size up to so many particles apart, and the largest of so many sizes
 
 # Neighbours in memory are mostly of one cell: on a GPU one of them counts for all of a warp.
@@ -60,6 +59,32 @@ TAKE_PLACES = """
     wp::index(used, e, 1) += total > 0;
 #endif
     return wp::vec_t<2, wp::int32>(place, segment);
+"""
+
+# The eight numbers of a segment are read and written as two times four.
+TAKE_COUNTS = """
+    struct alignas(16) Four { int n[4]; };
+    Four *four = (Four *)&wp::index(counts, e, segment * SEGMENT);
+    const Four given[2] = {four[0], four[1]};
+    wp::vec_t<SEGMENT, wp::int32> found;
+    for (int k = 0; k < SEGMENT; ++k) found[k] = given[k / 4].n[k % 4];
+    four[0] = four[1] = Four{};
+    return found;
+"""
+WRITE_PLACES = """
+    struct alignas(16) Two { int low, high, next_low, next_high; };
+    Two *two = (Two *)&wp::index(places, e, segment * SEGMENT);
+    for (int k = 0; k < SEGMENT; k += 2) {
+        const int middle = at + counted[k], end = middle + counted[k + 1];
+        two[k / 2] = Two{at, middle, middle, end};
+        at = end;
+    }
+"""
+COUNT_BEFORE = """
+    const int *row = &wp::index(arrived, e, 0);
+    int before = 0;
+    for (int i = places[0]; i < places[1]; ++i) before += row[i] < p;
+    return before;
 """
 
 
@@ -147,6 +172,17 @@ def cell_kernels(name: str) -> SimpleNamespace:
     @wp.func_native(TAKE_PLACES)
     def take_places(used: wp.array2d[wp.int32], e: int, total: int) -> wp.vec2i: ...
 
+    Counts = wp.types.vector(SEGMENT, wp.int32)
+
+    @wp.func_native(TAKE_COUNTS.replace("SEGMENT", str(SEGMENT)))
+    def take_counts(counts: wp.array2d[wp.int32], e: int, segment: int) -> Counts: ...
+
+    @wp.func_native(WRITE_PLACES.replace("SEGMENT", str(SEGMENT)))
+    def write_places(places: wp.array2d[wp.vec2i], e: int, segment: int, at: int, counted: Counts): ...
+
+    @wp.func_native(COUNT_BEFORE)
+    def count_before(arrived: wp.array2d[wp.int32], e: int, places: wp.vec2i, p: int) -> int: ...
+
     @wp.func(module=module)
     def size_of(particles: int):
         return wp.min(particles / STEP, SIZES - 1)
@@ -169,42 +205,42 @@ def cell_kernels(name: str) -> SimpleNamespace:
         counts: wp.array2d[wp.int32],
         used: wp.array2d[wp.int32],
         sizes: wp.array2d[wp.int32],
-        starts: wp.array2d[wp.int32],
+        places: wp.array2d[wp.vec2i],
         found: wp.array2d[wp.vec4i],
         numbers: wp.array2d[wp.int32],
         planes: wp.array2d[wp.int32],
     ):
-        """Give each segment its places in the list, each of its cells, too, and it a number among those of its size."""
+        """Give each segment its places in the list, each of its cells, too, and it a number among those of its size.
+
+        A cell's `places` are its first in the list and the one beyond its last. `counts` are 0 again.
+        """
         e, s = wp.tid()
         bottom = lattice.first[2] / SEGMENT
         depth = (lattice.first[2] + lattice.nz - 1) / SEGMENT - bottom + 1
         there = s < lattice.nx * lattice.ny * depth
         total, low, high = wp.int32(0), wp.int32(0), wp.int32(0)
+        counted = Counts()
         if there:
+            counted = take_counts(counts, e, s)
             for k in range(SEGMENT):
-                here = counts[e, s * SEGMENT + k]
-                if here > 0:
+                if counted[k] > 0:
                     if total == 0:
                         low = k
                     high = k + 3
-                total += here
+                total += counted[k]
             planes[e, s] = (1 << high) - (1 << low)
         taken = take_places(used, e, total)
         if total > 0:
             at, segment = taken[0], taken[1]
+            write_places(places, e, s, at, counted)
             found[e, segment] = wp.vec4i(s, at, total, low + 256 * high)
             numbers[e, segment] = take_number(sizes, e, size_of(total))
-            for k in range(SEGMENT):
-                starts[e, s * STARTS + k] = at
-                at += counts[e, s * SEGMENT + k]
-                counts[e, s * SEGMENT + k] = 0
-            starts[e, s * STARTS + SEGMENT] = at
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def place(
         cells: wp.array2d[wp.int32],
         numbers: wp.array2d[wp.int32],
-        starts: wp.array2d[wp.int32],
+        places: wp.array2d[wp.vec2i],
         used: wp.array2d[wp.int32],
         sizes: wp.array2d[wp.int32],
         found: wp.array2d[wp.vec4i],
@@ -217,8 +253,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
         e, p = wp.tid()
         if p == 0:
             full[e] = used[e, 1]
-        cell = cells[e, p]
-        arrived[e, starts[e, cell + cell / SEGMENT] + numbers[e, p]] = p
+        arrived[e, places[e, cells[e, p]][0] + numbers[e, p]] = p
         if p < used[e, 1]:
             segment = found[e, p]
             at = numbers_of_segments[e, p]
@@ -229,7 +264,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def tidy(
         cells: wp.array2d[wp.int32],
-        starts: wp.array2d[wp.int32],
+        places: wp.array2d[wp.vec2i],
         arrived: wp.array2d[wp.int32],
         used: wp.array2d[wp.int32],
         sizes: wp.array2d[wp.int32],
@@ -242,11 +277,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
             used[e, 1] = 0
         for i in range(p, SIZES, cells.shape[1]):
             sizes[e, i] = 0
-        at = cells[e, p] + cells[e, p] / SEGMENT
-        before = wp.int32(0)
-        for i in range(starts[e, at], starts[e, at + 1]):
-            if arrived[e, i] < p:
-                before += 1
-        order[e, starts[e, at] + before] = p
+        mine = places[e, cells[e, p]]
+        order[e, mine[0] + count_before(arrived, e, mine, p)] = p
 
     return SimpleNamespace(count=count, place_segments=place_segments, place=place, tidy=tidy)

@@ -2,10 +2,10 @@
 
 Particles are listed by cell (`cells`). Nine lanes of a warp take the particles of SEGMENT cells along z, one after the
 other; each holds the sums of three of the 27 nodes around the present cell, a row along z. Where the next cell begins,
-the lowest nine are written down and the others become lower by one. A segment so leaves 9 rows of up to SEGMENT + 2
-numbers of four parts, and each node then adds up those of the nine columns that it is part of. Every sum has one order,
-which depends on nothing but an environment's own particles: neither on its place in a batch, nor on the box of nodes,
-nor on chance.
+the lowest nine are written down, beside each other, since a cache takes whole sectors much faster than parts of them,
+and the others become lower by one. A segment so leaves up to SEGMENT + 2 planes of nine numbers of four parts, and each
+node then adds up those of the nine columns that it is part of. Every sum has one order, which depends on nothing but an
+environment's own particles: neither on its place in a batch, nor on the box of nodes, nor on chance.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from typing import no_type_check
 
 import warp as wp
 
-from ..launches import BLOCK
+from ..launches import BLOCK, blocks
 from ..runtime import precision
 from .cells import SEGMENT, segments
 from .layout import in_precision, layout
@@ -43,7 +43,7 @@ GPU_TEAM, CPU_TEAM = Team(32, 3, 9), Team(1, 1, 1)  # on a CPU a thread has a se
 
 EMIT = """
         {
-            out[now++] = low;
+            out[9 * now++] = low;
             low = middle, middle = high, high = Four{};
         }
 """
@@ -76,7 +76,7 @@ WALK = """
     Four low{state[0], state[1], state[2], state[3]};
     Four middle{state[4], state[5], state[6], state[7]};
     Four high{state[8], state[9], state[10], state[11]};
-    Four *out = (Four *)&wp::index(parts, e, at) + row * PLANES;
+    Four *out = (Four *)&wp::index(parts, e, at) + row;
     int now = (int)state[12];
     for (int t = 0; t < count; ++t) {
         const Particle given = staged[t];
@@ -108,7 +108,7 @@ WALK = """
             for (int j = 0; j < 3; ++j)
                 for (int k = 0; k < 3; ++k) {
                     const REAL weight = w[0][i] * w[1][j] * w[2][k];
-                    wp::vec_t<4, REAL> &sum = wp::index(parts, e, at + (3 * i + j) * PLANES + p.cell + k);
+                    wp::vec_t<4, REAL> &sum = wp::index(parts, e, at + 9 * (p.cell + k) + 3 * i + j);
                     for (int d = 0; d < 3; ++d) {
                         const REAL *a = p.a.data[d], move = REAL(i) * a[0] + REAL(j) * a[1] + REAL(k) * a[2];
                         sum[d] += weight * (p.q[d] + move);
@@ -158,7 +158,7 @@ CLOSE = """
     Four low{state[0], state[1], state[2], state[3]};
     Four middle{state[4], state[5], state[6], state[7]};
     Four high{state[8], state[9], state[10], state[11]};
-    Four *out = (Four *)&wp::index(parts, e, at) + row * PLANES;
+    Four *out = (Four *)&wp::index(parts, e, at) + row;
     int now = (int)state[12];
 #pragma unroll 1
     while (now < span >> 8) EMIT
@@ -195,8 +195,8 @@ ADD_UP = """
     for (int c = 0; c < 9; ++c) {
         const int here = ((x - c / 3) * ny + y - c % 3) * depth + segment, at = plane + SEGMENT;
         const Four none{};
-        const Four a = lower[c] >> at & 1 ? given[(here - 1) * PARTS + c * PLANES + at] : none;
-        const Four b = upper[c] >> plane & 1 ? given[here * PARTS + c * PLANES + plane] : none;
+        const Four a = lower[c] >> at & 1 ? given[(here - 1) * PARTS + 9 * at + c] : none;
+        const Four b = upper[c] >> plane & 1 ? given[here * PARTS + 9 * plane + c] : none;
         low.a += a.a, low.b += a.b, low.c += a.c, low.d += a.d;
         high.a += b.a, high.b += b.b, high.c += b.c, high.d += b.d;
     }
@@ -208,7 +208,6 @@ def fill(code: str, name: str, **more: str) -> str:
     """Put what a precision decides, and other constants, into C++."""
     words = more | {
         "EMIT": EMIT,
-        "PLANES": PLANES,
         "PARTS": PARTS,
         "SEGMENT": SEGMENT,
         "WARPS": BLOCK // 32,
@@ -355,7 +354,7 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
         given.q = read_vector(adj_v_new, e, p) + dt * read_vector(adj_x_new, e, p) - given.a * given.f
         return given
 
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False, launch_bounds=blocks(name))
     def p2g(
         lattice: Lattice,
         order: wp.array2d[wp.int32],
@@ -382,7 +381,7 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
             state = walk(parts, e, at, wp.min(2 * size, count - i), first, second, state)
         close_segment(parts, e, at, span, state)
 
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False, launch_bounds=blocks(name))
     def adjoint_g2p(
         lattice: Lattice,
         order: wp.array2d[wp.int32],

@@ -11,7 +11,7 @@ from ..launches import Launches
 from ..runtime import load, precision
 from .checkpoints import Allocator
 
-SHARES, LANES = 1024, 64  # of a GPU
+SHARES, LANES = 1024, 256  # of a GPU
 
 
 @cache

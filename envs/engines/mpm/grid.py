@@ -5,6 +5,7 @@ from typing import Any, no_type_check
 
 import warp as wp
 
+from ..launches import blocks
 from ..runtime import precision
 from .columns import ADD_UP, fill
 from .exact import LANES
@@ -118,7 +119,7 @@ def velocity_of_columns(name: str, boundary_velocity: Any, Data: Any) -> Any:
         value: vec4,
     ): ...
 
-    @wp.kernel(module="unique")
+    @wp.kernel(module="unique", launch_bounds=blocks(name))
     def velocity(
         lattice: Lattice,
         boundary: Data,

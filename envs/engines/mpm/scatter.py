@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import warp as wp
 
 from ..runtime import load
-from .cells import SEGMENT, SIZES, STARTS, Lists, cell_kernels, segments, warps
+from .cells import SEGMENT, SIZES, Lists, cell_kernels, segments, warps
 from .checkpoints import Frame
 from .columns import CPU_TEAM, GPU_TEAM, PARTS, column_kernels
 from .model import Box
@@ -122,11 +122,11 @@ class ByColumns:
         if not counted:
             inputs = [tape.lattice, frame.x, self.cells, self.numbers, self.counts]
             solver.launch(kernels.count, count, batch, inputs)
-        inputs = [tape.lattice, self.counts, self.used, self.sizes, self.starts, *self.found, lists.planes]
+        inputs = [tape.lattice, self.counts, self.used, self.sizes, self.places, *self.found, lists.planes]
         solver.launch_on_box(kernels.place_segments, warps, batch, inputs)
-        inputs = [self.cells, self.numbers, self.starts, self.used, self.sizes, *self.found, self.arrived]
+        inputs = [self.cells, self.numbers, self.places, self.used, self.sizes, *self.found, self.arrived]
         solver.launch(kernels.place, count, batch, [*inputs, lists.full, lists.segments])
-        inputs = [self.cells, self.starts, self.arrived, self.used, self.sizes, lists.order]
+        inputs = [self.cells, self.places, self.arrived, self.used, self.sizes, lists.order]
         solver.launch(kernels.tidy, count, batch, inputs)
 
     def counting(self, counted: bool) -> list[Any]:
@@ -168,7 +168,8 @@ class ByColumns:
         """Allocate what so many segments take."""
         allocator = self.solver.allocator
         self.parts: wp.array = allocator.array(allocator.types.vec4, count * PARTS)
-        self.counts, self.starts = (allocator.array(wp.int32, count * size) for size in (SEGMENT, STARTS))
+        self.counts: wp.array = allocator.array(wp.int32, count * SEGMENT)
+        self.places: wp.array = allocator.array(wp.vec2i, count * SEGMENT)
         self.found = allocator.array(wp.vec4i, count), allocator.array(wp.int32, count)
 
 

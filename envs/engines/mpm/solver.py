@@ -317,7 +317,7 @@ class Solver:
         ]
 
     def beside_others(self, b: int) -> AbstractContextManager[None]:
-        """Let a graph run what is launched for a body beside what is for the others, up to the next join."""
+        """Let a GPU run what is launched for a body beside what is for the others, up to the next join."""
         return self.launches.beside(2 + b) if b < len(self.materials) - 1 else nullcontext()
 
     def size(self, b: int) -> int:

@@ -7,7 +7,7 @@ import torch
 import warp as wp
 
 from gradscape.envs.engines.mpm.boundaries import Open
-from gradscape.envs.engines.mpm.cells import SEGMENT, SIZES, STARTS, cell_kernels, segments, warps
+from gradscape.envs.engines.mpm.cells import SEGMENT, SIZES, cell_kernels, segments, warps
 from gradscape.envs.engines.mpm.columns import GPU_TEAM, PARTS, column_kernels
 from gradscape.envs.engines.mpm.grid_cpu import velocity_on
 from gradscape.envs.engines.mpm.model import Box, place_grid
@@ -35,17 +35,17 @@ class Scattering:
         self.mass = 0.5 + torch.rand((ROWS, COUNT), generator=draw)
         room = segments(box)
         self.order, cells, numbers, arrived = (self.zeros(COUNT) for _ in range(4))
-        counts, starts = self.zeros(room * SEGMENT), self.zeros(room * STARTS)
+        counts, places = self.zeros(room * SEGMENT), self.zeros(room * SEGMENT, wp.vec2i)
         used, sizes, ranks, self.planes = (self.zeros(count) for count in (2, SIZES, room, room))
         unsorted, self.segments = self.zeros(room, wp.vec4i), self.zeros(room, wp.vec4i)
         self.full, kernels = wp.zeros(ROWS, dtype=wp.int32), cell_kernels("float32")
         for _ in range(2):  # the second time it begins where the first has ended
             emulate(kernels.count, (ROWS, COUNT), [self.lattice, self.array(self.x), cells, numbers, counts])
-            inputs = [self.lattice, counts, used, sizes, starts, unsorted, ranks, self.planes]
+            inputs = [self.lattice, counts, used, sizes, places, unsorted, ranks, self.planes]
             emulate(kernels.place_segments, (ROWS, warps(box)), inputs)
-            inputs = [cells, numbers, starts, used, sizes, unsorted, ranks, arrived, self.full, self.segments]
+            inputs = [cells, numbers, places, used, sizes, unsorted, ranks, arrived, self.full, self.segments]
             emulate(kernels.place, (ROWS, COUNT), inputs)
-            emulate(kernels.tidy, (ROWS, COUNT), [cells, starts, arrived, used, sizes, self.order])
+            emulate(kernels.tidy, (ROWS, COUNT), [cells, places, arrived, used, sizes, self.order])
 
     def walk(self, kernel, inputs):
         """Return what nodes add up of what warps leave, [row, node, 4]."""

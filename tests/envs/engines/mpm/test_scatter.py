@@ -7,7 +7,7 @@ import pytest
 import torch
 import warp as wp
 
-from gradscape.envs.engines.mpm.cells import SEGMENT, SIZES, STARTS, STEP, cell_kernels, segments, warps
+from gradscape.envs.engines.mpm.cells import SEGMENT, SIZES, STEP, cell_kernels, segments, warps
 from gradscape.envs.engines.mpm.model import Body, Box, place_grid
 from gradscape.envs.engines.runtime import to_torch
 
@@ -82,15 +82,16 @@ def listed(model, box, x):
     kernels, lattice, (batch, count) = cell_kernels("float64"), place_grid(model, box), x.shape[:2]
     at, room = wp.array(x.numpy(), dtype=wp.vec3d), segments(box)
     cells, numbers, arrived, order = (wp.zeros((batch, count), dtype=wp.int32) for _ in range(4))
-    counts, starts = (wp.zeros((batch, room * size), dtype=wp.int32) for size in (SEGMENT, STARTS))
+    counts = wp.zeros((batch, room * SEGMENT), dtype=wp.int32)
+    places = wp.zeros((batch, room * SEGMENT), dtype=wp.vec2i)
     used, sizes, ranks, span = (wp.zeros((batch, size), dtype=wp.int32) for size in (2, SIZES, room, room))
     unsorted, found = (wp.zeros((batch, room), dtype=wp.vec4i) for _ in range(2))
     full = wp.zeros(batch, dtype=wp.int32)
     wp.launch(kernels.count, (batch, count), [lattice, at, cells, numbers, counts])
-    inputs = [lattice, counts, used, sizes, starts, unsorted, ranks, span]
+    inputs = [lattice, counts, used, sizes, places, unsorted, ranks, span]
     wp.launch(kernels.place_segments, (batch, warps(box)), inputs)
-    inputs = [cells, numbers, starts, used, sizes, unsorted, ranks, arrived, full, found]
+    inputs = [cells, numbers, places, used, sizes, unsorted, ranks, arrived, full, found]
     wp.launch(kernels.place, (batch, count), inputs)
-    wp.launch(kernels.tidy, (batch, count), [cells, starts, arrived, used, sizes, order])
+    wp.launch(kernels.tidy, (batch, count), [cells, places, arrived, used, sizes, order])
     assert not any(to_torch(array).any() for array in (counts, used, sizes))
     return [to_torch(array).clone() for array in (order, full, found, span)]
