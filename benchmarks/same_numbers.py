@@ -9,7 +9,8 @@ records stay what they are. A scene's numbers are the same where
 
 - losses, gradients and what failed are, bit for bit, at some points on a CPU: at draft in two batches, at standard one;
 - what runs on CUDA is compiled to the same PTX, kernel by kernel, which needs no GPU, or
-- `--gpu` says of both codes that what they compute on a GPU is the same but for last digits (`gpu_numbers`).
+- `--gpu` says of both codes that what they compute on a GPU is the same but for last digits (`gpu_numbers`), or of
+  other scenes' codes that are compiled to the same before and now wherever something has changed.
 
 A scene that differs in either is left out, with those that share its code, and the exit code is 1.
 """
@@ -49,7 +50,12 @@ def main() -> None:
     changed = [name for name, one in now.items() if name in before and one["code"] != before[name]["code"]]
     scenes = asked.scene or changed
     gpu = json.loads(asked.gpu.read_text()) if asked.gpu else {}
-    same = [scene for scene in scenes if is_same(scene, asked.old, gpu.get(scene, {}))]
+    held: set[tuple[str, str | None, str]] = set()
+    found = {
+        scene: is_same(scene, asked.old, gpu.get(scene, {}), held)
+        for scene in sorted(scenes, key=lambda s: s not in gpu)
+    }
+    same = [scene for scene in scenes if found[scene]]
     if asked.write:
         codes = {now[scene]["code"] for scene in same if scene in changed}
         families = {code: sorted(name for name in changed if now[name]["code"] == code) for code in codes}
@@ -57,17 +63,24 @@ def main() -> None:
     sys.exit(int(same != scenes))
 
 
-def is_same(scene: str, old: Path, gpu: dict[str, Any]) -> bool:
-    """Say whether both checkouts compute the same numbers, and print what was compared."""
+def is_same(scene: str, old: Path, gpu: dict[str, Any], held: set[tuple[str, str | None, str]]) -> bool:
+    """Say whether both checkouts compute the same numbers, and print what was compared.
+
+    `held` are modules and what they were and are compiled to where a GPU has shown that it computes the same: those of
+    a scene of which `gpu` says so are added.
+    """
     from benchmarks import gpu_numbers
 
     theirs, ours = (ask(root, [scene])[scene] for root in (old, Path.cwd()))
-    codes = theirs["code"], ours["code"]
-    excused = (gpu.get("old"), gpu.get("new")) == codes and gpu_numbers.is_same(gpu["distances"])
-    held = [part for part in ours if part in POINTS or (part not in ("code", "known") and not excused)]
-    differ = [part for part in held if ours[part] != theirs.get(part)]
-    said = f"differs in {', '.join(differ)}" if differ else f"the same in {', '.join(held)}"
-    print(f"{scene}: {said}{' and on a GPU but for last digits' if excused else ''}", flush=True)
+    compiled = {part: (part, theirs.get(part), ours[part]) for part in ours if part not in (*POINTS, "code", "known")}
+    if (gpu.get("old"), gpu.get("new")) == (theirs["code"], ours["code"]) and gpu_numbers.is_same(gpu["distances"]):
+        held |= set(compiled.values())
+    excused = {part for part, change in compiled.items() if change in held}
+    compared = [part for part in (*POINTS, *compiled) if part in ours and part not in excused]
+    differ = [part for part in compared if ours[part] != theirs.get(part)]
+    said = f"differs in {', '.join(differ)}" if differ else f"the same in {', '.join(compared)}"
+    where = f"on a GPU but for last digits{'' if gpu else ', as other scenes are whose kernels change likewise'}"
+    print(f"{scene}: {said}{f', and {where}' if excused else ''}", flush=True)
     return not differ
 
 

@@ -1,7 +1,10 @@
 """When results of a GPU whose last digits differ count as the same."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from benchmarks import same_numbers
 from benchmarks.gpu_numbers import POINTS, compare, distance, is_same
 
 
@@ -34,3 +37,22 @@ def test_a_distance_is_relative_and_none_where_both_failed():
     ones = np.array([[3.0, 4.0], [np.nan, 1.0]])
     assert distance(np.array([[3.0, 4.5], [np.nan, 1.0]]), ones).tolist() == [0.1, 0.0]
     assert distance(np.array([1.0, 2.1]), np.array([1.0, 2.0])) == pytest.approx([0.0, 0.05])
+
+
+def test_a_kernel_may_change_as_in_a_scene_that_a_gpu_has_held_and_not_otherwise(monkeypatch):
+    codes = {
+        "old": {"held": {"walk": "a", "tank": "a"}, "likewise": {"walk": "a"}, "other": {"walk": "a", "pin": "a"}},
+        "new": {"held": {"walk": "b", "tank": "b"}, "likewise": {"walk": "b"}, "other": {"walk": "b", "pin": "b"}},
+    }
+
+    def ask(root, scenes):
+        which = "old" if root == Path("old") else "new"
+        return {scene: {"draft": "1", "code": which, "known": which} | codes[which][scene] for scene in scenes}
+
+    monkeypatch.setattr(same_numbers, "ask", ask)
+    gpu, held = {"old": "old", "new": "new", "distances": {"draft loss median": (1e-6, 1e-6)}}, set()
+    assert not same_numbers.is_same("likewise", Path("old"), {}, held)
+    assert same_numbers.is_same("held", Path("old"), gpu, held)
+    assert same_numbers.is_same("likewise", Path("old"), {}, held)
+    assert not same_numbers.is_same("other", Path("old"), {}, held)
+    assert not same_numbers.is_same("likewise", Path("old"), gpu | {"new": "other"}, set())

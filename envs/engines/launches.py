@@ -16,9 +16,12 @@ MAX_GRAPHS, MAX_SEQUENCES = 512, 1024  # that are stored; more are not worth the
 BLOCK = 128  # threads of a GPU that share registers; scatters and gathers like few
 
 
-def blocks(precision: str) -> tuple[int, int] | None:
-    """Return the bounds of a kernel that is slow for want of warps: as many blocks as share 80 registers a thread."""
-    return (BLOCK, 6) if precision == "float32" else None
+def blocks(precision: str, count: int = 6) -> tuple[int, int] | None:
+    """Return the bounds of a kernel that is slow for want of warps: so many blocks are to find registers at once.
+
+    In float64 they cannot, and a kernel that has to would keep numbers in memory.
+    """
+    return (BLOCK, count) if precision == "float32" else None
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,11 @@ import warp as wp
 
 from ..launches import blocks
 from ..runtime import precision
-from .columns import ADD_UP, fill
+from .columns import ADD_UP
 from .exact import LANES
 from .layout import READ_NODE, WRITE_NODE, in_precision
 from .stencil import lattice
+from .walk import fill
 
 # A node is read once, so that its adjoint can be set, where Warp would add to it atomically; and it is set once.
 ADJOINT_READ = WRITE_NODE.replace("grid", "adj_grid").replace("value", "adj_ret")

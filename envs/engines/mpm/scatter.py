@@ -10,8 +10,9 @@ import warp as wp
 from ..runtime import load
 from .cells import SEGMENT, SIZES, Lists, cell_kernels, segments, warps
 from .checkpoints import Frame
-from .columns import CPU_TEAM, GPU_TEAM, PARTS, column_kernels
+from .columns import CPU_TEAM, GPU_TEAM, column_kernels
 from .model import Box
+from .walk import PARTS
 
 
 class Scatter(Protocol):

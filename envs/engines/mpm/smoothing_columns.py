@@ -10,10 +10,11 @@ from typing import no_type_check
 import warp as wp
 
 from ..runtime import precision
-from .columns import PARTS, Team, node_sum, segment_taker, walker
+from .columns import Team, node_sum, segment_taker
 from .gathers import gatherers
 from .layout import layout
 from .stencil import lattice, stencil
+from .walk import PARTS, walker
 
 
 @cache

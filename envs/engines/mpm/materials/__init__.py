@@ -43,7 +43,7 @@ class Fluid:
         """Return (update, adjoint) for one precision: those whose threads have `rows`, in float32, or for `columns`."""
         if rows and name == "float32":
             return fluid_cpu.kernels_in_rows()
-        return _choose(name, *fluid.kernels(name), columns=columns)
+        return _choose(name, *fluid.kernels(name), columns=columns, blocks=5)
 
     def constants(self) -> tuple[float, ...]:
         """Return what the kernels take besides state and motion."""
@@ -129,5 +129,5 @@ class Plasticine(_Solid):
 Material = Fluid | Elastic | Plasticine
 
 
-def _choose(name: str, update: Any, adjoint: Any, turn_back: Any, *, columns: bool) -> tuple[Any, Any]:
-    return update, after_p2g(name, adjoint, turn_back) if columns else adjoint
+def _choose(name: str, update: Any, adjoint: Any, turn_back: Any, *, columns: bool, blocks: int = 4) -> tuple[Any, Any]:
+    return update, after_p2g(name, adjoint, turn_back, blocks) if columns else adjoint

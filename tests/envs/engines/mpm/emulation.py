@@ -14,7 +14,9 @@ import warp as wp
 
 HEADER = Path(__file__).with_name("emulation.h")
 INCLUDES = '#include "builtin.h"\n#include "deterministic.h"\n'
-KERNEL = re.compile(r'extern "C" __global__ void (\w+)_cuda_kernel_forward\((.*?)\)\s*\{', re.DOTALL)
+KERNEL = re.compile(
+    r'extern "C" (?:__launch_bounds__\(.*?\) )?__global__ void (\w+)_cuda_kernel_forward\((.*?)\)\s*\{', re.DOTALL
+)
 WRAPPER = """
 extern "C" void run_{name}(unsigned rows, unsigned columns, void **given) {{
     wp::launch_bounds_t<2> bounds;
@@ -56,7 +58,9 @@ def _program(module: Any) -> _Program:
             INCLUDES, f'{INCLUDES}#undef __CUDA_ARCH__\n#include "{HEADER}"\n'
         )
         code = re.sub(
-            r"wp::tile_shared_storage_t(::init\(\)| tile_mem);", "", code.replace('extern "C" __global__', "__global__")
+            r"wp::tile_shared_storage_t(::init\(\)| tile_mem);",
+            "",
+            re.sub(r'extern "C" (__launch_bounds__\(.*?\) )?__global__', "__global__", code),
         )
         for name, parameters in found:
             kinds = [" ".join(one.split()[:-1]) for one in re.split(r",\n", parameters)[1:]]

@@ -8,11 +8,12 @@ import warp as wp
 
 from gradscape.envs.engines.mpm.boundaries import Open
 from gradscape.envs.engines.mpm.cells import SEGMENT, SIZES, cell_kernels, segments, warps
-from gradscape.envs.engines.mpm.columns import GPU_TEAM, PARTS, column_kernels
+from gradscape.envs.engines.mpm.columns import GPU_TEAM, column_kernels
 from gradscape.envs.engines.mpm.grid_cpu import velocity_on
 from gradscape.envs.engines.mpm.model import Box, place_grid
 from gradscape.envs.engines.mpm.smoothing_columns import smoothing_columns
 from gradscape.envs.engines.mpm.transfers import transfers
+from gradscape.envs.engines.mpm.walk import PARTS
 from gradscape.envs.engines.runtime import to_torch
 
 from .bodies import kneading

@@ -1,0 +1,105 @@
+"""Launches that come again, with stand-ins for a GPU's streams and graphs."""
+
+from contextlib import nullcontext
+from types import SimpleNamespace
+
+import pytest
+import warp as wp
+
+from gradscape.envs.engines.launches import Launches
+
+
+def test_work_that_is_interrupted_is_not_taken_for_whole_when_it_comes_again():
+    launches, done = Launches("cpu"), []
+
+    def work():
+        launches.call(lambda: done.append("first"))
+        if len(done) == 1:
+            raise KeyboardInterrupt
+        launches.call(lambda: done.append("second"))
+
+    with pytest.raises(KeyboardInterrupt):
+        launches.run("key", 1, work, small=True)
+    done.append("again")
+    for _ in range(2):
+        launches.run("key", 1, work, small=True)
+    assert done == ["first", "again", *["first", "second"] * 2]
+
+
+def test_launches_of_which_some_were_moved_are_all_moved_again():
+    class Sized:
+        dim = 1
+
+        def set_dim(self, dim):
+            if interrupted.pop("now", False):
+                raise KeyboardInterrupt
+            self.dim = dim
+
+        def launch(self, stream=None):
+            launched.append(self.dim)
+
+    launches, launched, interrupted = Launches("cpu"), [], {}
+
+    def work():
+        launches._recording.launches += commands
+        launches._recording.sized += [(command, lambda extent: extent) for command in commands]
+
+    commands = [Sized(), Sized()]
+    launches.run("key", 1, work, small=True)
+    commands[0].dim, interrupted["now"] = 2, True  # as if the second of them were moved when it is interrupted
+    with pytest.raises(KeyboardInterrupt):
+        launches.run("key", 2, work, small=True)
+    launches.run("key", 1, work, small=True)
+    assert launched == [1, 1]
+
+
+@pytest.mark.parametrize("small", [True, False])
+def test_a_gpu_runs_beside_each_other_what_does_not_wait_for_each_other(monkeypatch, small):
+    class Stream:
+        def __init__(self, name):
+            self.name = name
+            made.append(name)
+
+        def wait_stream(self, other):
+            seen.append((self.name, "waits for", other.name))
+
+    class Command:
+        def __init__(self, name):
+            self.name = name
+
+        def launch(self, stream=None):
+            seen.append((self.name, "on", stream.name if stream else None))
+
+    made, seen = [], []
+    first = Stream("first")
+    monkeypatch.setattr(wp, "ScopedCapture", lambda device: nullcontext(SimpleNamespace(graph="graph")))
+    monkeypatch.setattr(wp, "capture_launch", lambda graph: seen.append(graph))
+    monkeypatch.setattr(wp, "get_stream", lambda device: first)
+    monkeypatch.setattr(wp, "Stream", lambda device: Stream(f"stream {len(made)}"))
+    launches = Launches("cuda")
+
+    def launch(name):
+        launches._recording.launches.append(Command(name))
+
+    def work():
+        for number in (1, 2, 1):
+            with launches.beside(number):
+                launch(f"beside {number}")
+        launch("meanwhile")
+        launches.join()
+        launches.join()
+        launch("after")
+
+    for _ in range(2):
+        launches.run("key", 1, work, small=small)
+    assert [what for what in seen if "on" in what] == [
+        ("beside 1", "on", "stream 1"),
+        ("beside 2", "on", "stream 2"),
+        ("beside 1", "on", "stream 1"),
+        ("meanwhile", "on", "first"),
+        ("after", "on", "first"),
+    ]
+    begun, joined = seen.index(("meanwhile", "on", "first")), seen.index(("after", "on", "first"))
+    assert seen[begun + 1 : joined] == [("first", "waits for", "stream 1"), ("first", "waits for", "stream 2")]
+    assert seen[0] == ("stream 1", "waits for", "first")
+    assert seen[-1] == ("graph" if small else ("after", "on", "first"))
