@@ -129,12 +129,15 @@ class Tape:
         """Return the bytes that a box of nodes takes beyond those that are there, 0 where these suffice."""
         if box == self.box:
             return 0
-        size, growth = int(wp.types.type_size_in_bytes(self._allocator.types.vec4)), 0
-        if self._cells < box.cells:
-            growth += 2 * size * (self._room(box.cells) - self._cells)
-        if self.lists and self._segments < segments(box):
-            growth += 4 * 5 * (segments(box) * 5 // 4 - self._segments)
-        return growth * len(self.grids) * self._allocator.capacity
+        more_cells = self.room(box) - self._cells if self._cells < box.cells else 0
+        more_segments = segments(box) * 5 // 4 - self._segments if self.lists and self._segments < segments(box) else 0
+        return self._bytes_of(more_cells, more_segments)
+
+    def bytes_on(self, box: Box) -> int:
+        """Return the bytes that a tape like this takes that is made for a box of nodes."""
+        if not self.lists:
+            return self.bytes + self._bytes_of(self.room(box) - self._cells, 0)
+        return self.bytes + self._bytes_of(self.room(box) - self._cells, segments(box) * 5 // 4 - self._segments)
 
     def start(self, checkpoint: Frame) -> Frame:
         """Return the frame that the control step starts from: the checkpoint, with the states that are smoothed."""
@@ -149,7 +152,7 @@ class Tape:
         if self._cells < box.cells:
             for substep in range(len(self.grids)):
                 self.grids[substep] = self._allocator.grid(0)  # the old one goes first
-                self.grids[substep] = self._allocator.grid(self._room(box.cells))
+                self.grids[substep] = self._allocator.grid(self.room(box))
         if self.lists and self._segments < segments(box):
             self.lists = Cycle(self._allocator.lists(segments(box) * 5 // 4) for _ in self.lists)
         self.step, self.box, self.lattice = step, box, place_grid(self._allocator.model, box)
@@ -164,6 +167,11 @@ class Tape:
         """How many segments all its lists have room for."""
         return min(int(lists.planes.shape[1]) for lists in self.lists)
 
-    def _room(self, cells: int) -> int:
-        """Return how many nodes to make room for where so many are needed."""
-        return int(min(cells * 5 // 4, self._allocator.model.cells))
+    def room(self, box: Box) -> int:
+        """Return how many nodes to make room for where a box is needed."""
+        return int(min(box.cells * 5 // 4, self._allocator.model.cells))
+
+    def _bytes_of(self, cells: int, segments: int) -> int:
+        """Return the bytes of so many nodes of all its grids, and segments of all its lists."""
+        size = int(wp.types.type_size_in_bytes(self._allocator.types.vec4))
+        return (2 * size * cells + 4 * 5 * segments) * len(self.grids) * self._allocator.capacity

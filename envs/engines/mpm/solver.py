@@ -144,11 +144,13 @@ class Solver:
 
     def _add_tapes(self) -> None:
         """Store more control steps whole from the next run on, in most of a GPU's memory that is free after a first."""
-        self.spare_used = True
-        more = min(self.model.steps - 1, int(SPARE * free_memory()) // self.tapes[0].bytes)
-        cells = self.tapes[0].grids[0].m.shape[1]
-        self.tapes += [Tape(self.allocator, cells, self.pieces) for _ in range(more)]
-        self.tapes[0].step = -1  # it keeps other steps now
+        self.spare_used, first, spare = True, self.tapes[0], int(SPARE * free_memory())
+        for count in range(self.model.steps, 0, -1):
+            boxes = [max(self.boxes[i::count], key=lambda box: box.cells) for i in range(1, count)]
+            if sum(map(first.bytes_on, boxes)) <= spare:
+                break
+        self.tapes += [Tape(self.allocator, first.room(box), self.pieces) for box in boxes]
+        first.step = -1  # it keeps other steps now
         self.launches.clear()
 
     def read_positions(self, step: int, batch: int) -> torch.Tensor:

@@ -124,6 +124,30 @@ def test_a_tape_grows_by_the_bytes_it_says(columns):
     assert tape.growth(box) == 0
 
 
+def test_as_many_control_steps_are_kept_as_fit_on_their_own_boxes(monkeypatch):
+    model, paths = kneading()
+    adj_x = {2: weights(model, 3, 5), model.steps: weights(model, 3, 6)}
+
+    def keep(free):
+        monkeypatch.setattr(mpm, "free_memory", lambda: free)
+        solver = Solver(model, capacity=len(paths), device="cpu", columns=True)
+        solver.tapes, solver.spare_used = solver.tapes[:1], False
+        return solver, *[(solver.run(paths).clone(), solver.gradient(adj_x)) for _ in range(2)]
+
+    whole, *found = keep(1 << 40)
+    sizes = [tape.bytes for tape in whole.tapes]
+    assert len(sizes) == model.steps
+    assert max(sizes) > min(sizes)
+    enough = int(sum(sizes[1:]) / mpm.SPARE) + 1
+    for free, kept in ((enough, model.steps), (int(0.99 * enough), model.steps - 1), (0, 1)):
+        solver, *again = keep(free)
+        assert len(solver.tapes) == kept
+        found += again
+    for end, gradient in found[1:]:
+        assert torch.equal(end, found[0][0])
+        assert torch.equal(gradient, found[0][1])
+
+
 @pytest.mark.parametrize("warned", [True, False])
 def test_control_steps_are_given_up_for_memory_and_no_bit_is_lost(monkeypatch, warned):
     """Either it is foreseen that a tape does not fit, or the allocation fails."""
