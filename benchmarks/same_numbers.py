@@ -12,7 +12,7 @@ records stay what they are. A scene's numbers are the same where
 - `--gpu` says of both codes that what they compute on a GPU is the same but for last digits (`gpu_numbers`), or of
   other scenes' codes that are compiled to the same before and now wherever something has changed.
 
-A scene that differs in either is left out, with those that share its code, and the exit code is 1.
+A scene that differs in either is left out, and the exit code is 1.
 """
 
 from __future__ import annotations
@@ -57,9 +57,7 @@ def main() -> None:
     }
     same = [scene for scene in scenes if found[scene]]
     if asked.write:
-        codes = {now[scene]["code"] for scene in same if scene in changed}
-        families = {code: sorted(name for name in changed if now[name]["code"] == code) for code in codes}
-        keep({code: (names, before[names[0]]["known"]) for code, names in families.items() if set(names) <= set(same)})
+        keep(changed, {name: (now[name]["code"], before[name]["known"]) for name in changed if name in same})
     sys.exit(int(same != scenes))
 
 
@@ -166,12 +164,13 @@ def hash_of(pieces: Iterable[bytes]) -> str:
     return digest.hexdigest()[:16]
 
 
-def keep(same: dict[str, tuple[list[str], str]]) -> None:
-    """Write down of codes which scenes are theirs, and the oldest code that computes the same numbers."""
-    scenes = {scene for names, _ in same.values() for scene in names}
-    kept = {code: one for code, one in json.loads(KEPT.read_text()).items() if not scenes & set(one["scenes"])}
-    kept |= {code: {"numbers_of": known, "scenes": names} for code, (names, known) in same.items()}
-    KEPT.write_text(json.dumps(dict(sorted(kept.items(), key=lambda item: item[1]["scenes"])), indent=1) + "\n")
+def keep(changed: Iterable[str], same: dict[str, tuple[str, str]]) -> None:
+    """Write down of scenes that have changed their code, and the oldest code that computes the same numbers."""
+    kept = json.loads(KEPT.read_text())
+    for scene in changed:
+        kept.pop(scene, None)
+    kept |= {scene: {"code": code, "numbers_of": known} for scene, (code, known) in same.items()}
+    KEPT.write_text(json.dumps(dict(sorted(kept.items())), indent=1) + "\n")
 
 
 if __name__ == "__main__":

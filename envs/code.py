@@ -40,13 +40,14 @@ def code_digest(kind: type, engine: str = "warp") -> str:
     It is that of the oldest code that computes the same numbers, as far as that was measured.
     """
     own = own_digest(kind, engine)
-    return _numbers_of().get(own, own)
+    return _numbers_of().get((getattr(kind, "name", ""), own), own)
 
 
 @cache
-def _numbers_of() -> dict[str, str]:
-    """Return digests of older code by those of code that computes the same numbers."""
-    return {new: str(one["numbers_of"]) for new, one in json.loads(SAME_NUMBERS.read_text()).items()}
+def _numbers_of() -> dict[tuple[str, str], str]:
+    """Return digests of older code by scene and the digest of code that computes the same numbers of it."""
+    kept = json.loads(SAME_NUMBERS.read_text())
+    return {(scene, one["code"]): str(one["numbers_of"]) for scene, one in kept.items()}
 
 
 @cache

@@ -57,22 +57,22 @@ def test_a_class_of_a_notebook_has_a_digest() -> None:
 def test_code_that_computes_the_same_numbers_has_the_digest_of_older_code(monkeypatch: pytest.MonkeyPatch) -> None:
     kind = environment_class("bounce")
     own = code.own_digest(kind)
-    monkeypatch.setattr(code, "_numbers_of", lambda: {own: "older"})
+    monkeypatch.setattr(code, "_numbers_of", lambda: {("bounce", own): "older"})
     assert code_digest.__wrapped__(kind) == "older"
-    monkeypatch.setattr(code, "_numbers_of", lambda: {"another": "older"})
-    assert code_digest.__wrapped__(kind) == own
+    for scene, digest in (("bounce", "another"), ("cartpole", own)):
+        monkeypatch.setattr(code, "_numbers_of", lambda key=(scene, digest): {key: "older"})
+        assert code_digest.__wrapped__(kind) == own
 
 
-def test_what_computes_the_same_numbers_is_said_once_of_a_scene_and_names_the_oldest() -> None:
+def test_what_computes_the_same_numbers_is_said_of_the_code_that_is_here_and_names_the_oldest() -> None:
     kept = json.loads(code.SAME_NUMBERS.read_text())
-    digests = {name: code.own_digest(environment_class(name)) for name in SCENES}
-    for digest, one in kept.items():
-        theirs = sorted(name for name in SCENES if digests[name] == digest)
-        assert theirs == one["scenes"], (
-            f"{digest} is not their code: run benchmarks.same_numbers, or delete what it says"
+    for scene, one in kept.items():
+        kind = environment_class(scene)
+        assert code.own_digest(kind) == one["code"], (
+            f"that is not {scene}'s code: run benchmarks.same_numbers, or delete what it says"
         )
-        assert {code_digest(environment_class(name)) for name in theirs} == {one["numbers_of"]}
-        assert one["numbers_of"] not in kept
+        assert code_digest(kind) == one["numbers_of"]
+        assert one["numbers_of"] not in {other["code"] for other in kept.values()}
 
 
 @pytest.fixture
