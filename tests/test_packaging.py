@@ -2,7 +2,12 @@
 
 import re
 import tomllib
+from importlib.metadata import distributions
 from pathlib import Path
+
+import pytest
+from packaging.specifiers import SpecifierSet
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -22,6 +27,23 @@ def test_constraints_are_plain_and_cover_every_dependency() -> None:
     extras = PROJECT["project"]["optional-dependencies"].values()
     wanted = [*PROJECT["project"]["dependencies"], *(name for extra in extras for name in extra)]
     assert {re.split(r"[<>=;\[ ]", name)[0].lower() for name in wanted} <= {*tested, "gradscape"}  # its own extras
+
+
+@pytest.mark.parametrize("python", ["3.11.0", "3.12.0"])
+def test_constraints_hold_for_the_first_patch_of_every_python(python: str) -> None:
+    """Debian 12 has 3.11.2, for which pip would look for versions without an end, since a constraint allows none."""
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pinned = {canonicalize_name(name): version for name, _, version in (line.partition("==") for line in lines)}
+    tried = [
+        one
+        for one in distributions()
+        if pinned.get(canonicalize_name(one.metadata["Name"])) == one.version.partition("+")[0]
+    ]
+    assert len(tried) > 50
+    refused = {
+        one.metadata["Name"]: one.metadata["Requires-Python"] for one in tried if one.metadata["Requires-Python"]
+    }
+    assert {name: said for name, said in refused.items() if not SpecifierSet(said).contains(python)} == {}
 
 
 def test_every_dependency_states_its_reason() -> None:
