@@ -77,19 +77,26 @@ class _Sequence:
         """Launch on several streams of a GPU, so that what does not wait for each other runs beside each other."""
         stream = first = streams.first()
         busy: set[int] = set()
-        for command in self.launches:
-            if not isinstance(command, _Mark):
-                command.launch(stream)
-            elif command.stream is None:
-                for number in sorted(busy):
-                    first.wait_stream(streams[number])
-                busy.clear()
-            elif command.stream == 0:
-                stream = first
-            else:
-                stream = streams[command.stream]
-                stream.wait_stream(first)
-                busy.add(command.stream)
+
+        def join() -> None:
+            while busy:
+                first.wait_stream(streams[min(busy)])
+                busy.remove(min(busy))
+
+        try:
+            for command in self.launches:
+                if not isinstance(command, _Mark):
+                    command.launch(stream)
+                elif command.stream is None:
+                    join()
+                elif command.stream == 0:
+                    stream = first
+                else:
+                    busy.add(command.stream)
+                    stream = streams[command.stream]
+                    stream.wait_stream(first)
+        finally:
+            join()  # so that what comes next waits, even if this was interrupted
 
     def capture(self, streams: _Streams) -> Any:
         """Return a graph of the launches."""

@@ -26,6 +26,36 @@ def test_work_that_is_interrupted_is_not_taken_for_whole_when_it_comes_again():
     assert done == ["first", "again", *["first", "second"] * 2]
 
 
+def test_what_comes_after_an_interrupted_run_waits_for_what_that_has_begun(monkeypatch):
+    class Stream:
+        def __init__(self, name):
+            self.name = name
+
+        def wait_stream(self, other):
+            waits.append((self.name, other.name))
+
+    class Command:
+        def launch(self, stream=None):
+            if stream and stream.name == "first":
+                raise KeyboardInterrupt
+
+    waits = []
+    monkeypatch.setattr(wp, "get_stream", lambda device: Stream("first"))
+    monkeypatch.setattr(wp, "Stream", lambda device: Stream("beside"))
+    launches = Launches("cuda")
+
+    def work():
+        with launches.beside(1):
+            launches._recording.launches.append(Command())
+        launches._recording.launches.append(Command())
+        launches.join()
+
+    launches.run("key", 1, work, small=False)
+    with pytest.raises(KeyboardInterrupt):
+        launches.run("key", 1, work, small=False)
+    assert waits == [("beside", "first"), ("first", "beside")]
+
+
 def test_launches_of_which_some_were_moved_are_all_moved_again():
     class Sized:
         dim = 1
