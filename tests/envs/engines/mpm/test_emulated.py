@@ -7,7 +7,7 @@ import torch
 import warp as wp
 
 from gradscape.envs.engines.mpm.boundaries import Open
-from gradscape.envs.engines.mpm.cells import SEGMENT, SIZES, cell_kernels, segments, warps
+from gradscape.envs.engines.mpm.cells import segments
 from gradscape.envs.engines.mpm.columns import GPU_TEAM, column_kernels
 from gradscape.envs.engines.mpm.grid_cpu import velocity_on
 from gradscape.envs.engines.mpm.model import Box, place_grid
@@ -18,6 +18,7 @@ from gradscape.envs.engines.runtime import to_torch
 
 from .bodies import kneading
 from .emulation import emulate
+from .listing import Listing
 
 ROWS, COUNT, BODY = 2, 300, slice(40, 270)
 
@@ -34,31 +35,22 @@ class Scattering:
         self.x = torch.tensor(model.origin) + model.dx * (lowest + reach * torch.rand((ROWS, COUNT, 3), generator=draw))
         self.v, self.A = torch.randn((ROWS, COUNT, 3), generator=draw), torch.randn((ROWS, COUNT, 3, 3), generator=draw)
         self.mass = 0.5 + torch.rand((ROWS, COUNT), generator=draw)
-        room = segments(box)
-        self.order, cells, numbers, arrived = (self.zeros(COUNT) for _ in range(4))
-        counts, places = self.zeros(room * SEGMENT), self.zeros(room * SEGMENT, wp.vec2i)
-        used, sizes, ranks, self.planes = (self.zeros(count) for count in (2, SIZES, room, room))
-        unsorted, self.segments = self.zeros(room, wp.vec4i), self.zeros(room, wp.vec4i)
-        self.full, kernels = wp.zeros(ROWS, dtype=wp.int32), cell_kernels("float32")
+        self.listing = Listing(emulate, "float32", self.lattice, box, self.x)
         for _ in range(2):  # the second time it begins where the first has ended
-            emulate(kernels.count, (ROWS, COUNT), [self.lattice, self.array(self.x), cells, numbers, counts])
-            inputs = [self.lattice, counts, used, sizes, places, unsorted, ranks, self.planes]
-            emulate(kernels.place_segments, (ROWS, warps(box)), inputs)
-            inputs = [cells, numbers, places, used, sizes, unsorted, ranks, arrived, self.full, self.segments]
-            emulate(kernels.place, (ROWS, COUNT), inputs)
-            emulate(kernels.tidy, (ROWS, COUNT), [cells, places, arrived, used, sizes, self.order])
+            self.listing.run()
 
     def walk(self, kernel, inputs):
         """Return what nodes add up of what warps leave, [row, node, 4]."""
         parts = wp.array(torch.full((ROWS, segments(self.box) * PARTS, 4), torch.nan).numpy(), dtype=wp.vec4)
-        lists = [self.lattice, self.order, self.full, self.segments]
-        emulate(kernel, (ROWS, GPU_TEAM.threads(self.box)), [*lists, *inputs, parts])
+        lists = self.listing.lists
+        walked = [self.lattice, lists.order, lists.full, lists.segments, *inputs, parts]
+        emulate(kernel, (ROWS, GPU_TEAM.threads(self.box)), walked)
         momentum, velocity = self.zeros(self.box.cells, wp.vec4), self.zeros(self.box.cells, wp.vec4)
         numbers = [0.0, 0.0, -1.0, 0, 0.0, 0.0]  # no gravity, and no node is empty
         tools, sums = wp.zeros((ROWS, 1, 1), dtype=wp.vec3), wp.zeros((1, 1), dtype=wp.int64)
         given = [self.lattice, Open().data("float32", "cpu"), *numbers, tools, sums, momentum, velocity]
         kernel = velocity_on("cuda", "float32", Open(), columns=True)
-        emulate(kernel, (ROWS, self.box.cells), [*given, self.planes, parts])
+        emulate(kernel, (ROWS, self.box.cells), [*given, lists.planes, parts])
         return to_torch(momentum).clone()
 
     def transfer(self, mass, q, A):

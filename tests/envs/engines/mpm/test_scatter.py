@@ -7,11 +7,12 @@ import pytest
 import torch
 import warp as wp
 
-from gradscape.envs.engines.mpm.cells import SEGMENT, SIZES, STEP, cell_kernels, segments, warps
+from gradscape.envs.engines.mpm.cells import SEGMENT, SIZES, STEP, segments
 from gradscape.envs.engines.mpm.model import Body, Box, place_grid
 from gradscape.envs.engines.runtime import to_torch
 
 from .bodies import kneaded, kneading, stirred, weights
+from .listing import Listing
 
 
 def assert_equal_but_for_rounding(got, wanted):
@@ -58,8 +59,10 @@ def test_particles_are_listed_by_cell_and_then_as_they_lie(first):
     x[:, :, 1] += 0.4
     cell = ((x - torch.tensor(model.origin)) / model.dx - 0.5).floor().long()
     depth = segments(box) // (box.nodes[0] * box.nodes[1])
+    listing = Listing(wp.launch, "float64", place_grid(model, box), box, x)
     for _ in range(2):  # the second time it begins where the first has ended
-        order, full, segments_found, planes = listed(model, box, x)
+        listing.run()
+        order, full, segments_found, planes = (to_torch(array).clone() for array in listing.lists.arrays())
         for row in range(2):
             keys = sorted((i, j, k // SEGMENT, k % SEGMENT, p) for p, (i, j, k) in enumerate(cell[row].tolist()))
             found = {}
@@ -75,23 +78,3 @@ def test_particles_are_listed_by_cell_and_then_as_they_lie(first):
                 where: ([key[-1] for key in group], (group[-1][3] + 3, group[0][3])) for where, group in wanted.items()
             }
             assert int((planes[row] > 0).sum()) == full[row]
-
-
-def listed(model, box, x):
-    """Return the order of particles, and the number of full segments, these, and the planes of all, all [row, *]."""
-    kernels, lattice, (batch, count) = cell_kernels("float64"), place_grid(model, box), x.shape[:2]
-    at, room = wp.array(x.numpy(), dtype=wp.vec3d), segments(box)
-    cells, numbers, arrived, order = (wp.zeros((batch, count), dtype=wp.int32) for _ in range(4))
-    counts = wp.zeros((batch, room * SEGMENT), dtype=wp.int32)
-    places = wp.zeros((batch, room * SEGMENT), dtype=wp.vec2i)
-    used, sizes, ranks, span = (wp.zeros((batch, size), dtype=wp.int32) for size in (2, SIZES, room, room))
-    unsorted, found = (wp.zeros((batch, room), dtype=wp.vec4i) for _ in range(2))
-    full = wp.zeros(batch, dtype=wp.int32)
-    wp.launch(kernels.count, (batch, count), [lattice, at, cells, numbers, counts])
-    inputs = [lattice, counts, used, sizes, places, unsorted, ranks, span]
-    wp.launch(kernels.place_segments, (batch, warps(box)), inputs)
-    inputs = [cells, numbers, places, used, sizes, unsorted, ranks, arrived, full, found]
-    wp.launch(kernels.place, (batch, count), inputs)
-    wp.launch(kernels.tidy, (batch, count), [cells, places, arrived, used, sizes, order])
-    assert not any(to_torch(array).any() for array in (counts, used, sizes))
-    return [to_torch(array).clone() for array in (order, full, found, span)]
