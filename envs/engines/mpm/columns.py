@@ -19,7 +19,7 @@ from .cells import segments
 from .layout import layout
 from .model import Box
 from .stencil import lattice
-from .walk import PARTS, fill, walker
+from .walk import PARTS, fill, lane_numbers, walker
 
 
 @dataclass(frozen=True)
@@ -71,11 +71,11 @@ ADD_UP = """
 @no_type_check
 def segment_taker(team: Team):
     """Return the function that says of a thread's segment (number, first place, count, span), none if it has none."""
-    lanes, groups, size = team.lanes, team.groups, team.size
+    lanes, groups, group_of = team.lanes, team.groups, lane_numbers().group
 
     @wp.func(module=f"gradscape.columns.{lanes}")
     def take_segment(e: int, t: int, full: wp.array[wp.int32], segments: wp.array2d[wp.vec4i]):
-        group = t % lanes / size
+        group = group_of(t % lanes)
         i = t / lanes * groups + group
         mine = segments[e, wp.min(i, segments.shape[1] - 1)]  # does not wait for how many there are
         if group >= groups or i >= full[e]:
@@ -112,7 +112,7 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
     module = f"gradscape.columns.{name}.{team.lanes}"
     take_segment, most = segment_taker(team), steps.most
     at_nodes, open_segment, walk, close_segment = steps.at_nodes, steps.open, steps.walk, steps.close
-    lanes, groups, size = team.lanes, team.groups, team.size
+    lanes, groups, size, row_of = team.lanes, team.groups, team.size, lane_numbers().row
     lies = layout(name)
     read_number, read_vector, read_matrix = lies.read_number, lies.read_vector, lies.read_matrix
 
@@ -168,11 +168,10 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
         at, begin, count, span = mine[0] * PARTS, mine[1], mine[2], mine[3]
         state = open_segment(parts, e, at, span)
         last = begin + wp.max(count - 1, 0)
-        place = begin + t % lanes % size
-        for i in range(0, most(count), 2 * size):
-            first = momentum(lattice, mass, x, v, A, e, order[e, wp.min(place + i, last)])
-            second = momentum(lattice, mass, x, v, A, e, order[e, wp.min(place + i + size, last)])
-            state = walk(parts, e, at, wp.min(2 * size, count - i), first, second, state)
+        place = begin + row_of(t % lanes)
+        for i in range(0, most(count), size):
+            given = momentum(lattice, mass, x, v, A, e, order[e, wp.min(place + i, last)])
+            state = walk(parts, e, at, wp.min(size, count - i), given, state)
         close_segment(parts, e, at, span, state)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False, launch_bounds=blocks(name))
@@ -196,15 +195,12 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
         at, begin, count, span = mine[0] * PARTS, mine[1], mine[2], mine[3]
         state = open_segment(parts, e, at, span)
         last = begin + wp.max(count - 1, 0)
-        place = begin + t % lanes % size
-        for i in range(0, most(count), 2 * size):
-            first = velocity_adjoint(
+        place = begin + row_of(t % lanes)
+        for i in range(0, most(count), size):
+            given = velocity_adjoint(
                 lattice, dt, x, adj_x_new, adj_v_new, adj_C_new, e, order[e, wp.min(place + i, last)]
             )
-            second = velocity_adjoint(
-                lattice, dt, x, adj_x_new, adj_v_new, adj_C_new, e, order[e, wp.min(place + i + size, last)]
-            )
-            state = walk(parts, e, at, wp.min(2 * size, count - i), first, second, state)
+            state = walk(parts, e, at, wp.min(size, count - i), given, state)
         close_segment(parts, e, at, span, state)
 
     return SimpleNamespace(p2g=p2g, adjoint_g2p=adjoint_g2p)

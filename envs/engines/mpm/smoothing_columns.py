@@ -14,7 +14,7 @@ from .columns import Team, node_sum, segment_taker
 from .gathers import gatherers
 from .layout import layout
 from .stencil import lattice, stencil
-from .walk import PARTS, walker
+from .walk import PARTS, lane_numbers, walker
 
 
 @cache
@@ -31,7 +31,7 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
     from_base = gatherers(name).from_base
     take_segment, most = segment_taker(team), steps.most
     at_nodes, open_segment, walk, close_segment = steps.at_nodes, steps.open, steps.walk, steps.close
-    lanes, groups, size = team.lanes, team.groups, team.size
+    lanes, groups, size, row_of = team.lanes, team.groups, team.size, lane_numbers().row
     add_up_node, module = node_sum(name), f"gradscape.smoothing.{name}.columns.{team.lanes}"
     lies, gather, mat33 = layout(name), gatherers(name).gather, types.mat33
     read_number, read_vector, read_node, write_node = (
@@ -94,11 +94,10 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         at, begin, count, span = mine[0] * PARTS, mine[1], mine[2], mine[3]
         state = open_segment(parts, e, at, span)
         last = begin + wp.max(count - 1, 0)
-        place = begin + t % lanes % size
-        for i in range(0, most(count), 2 * size):
-            first = given_volume(lattice, body, slope, volume, x, J, e, order[e, wp.min(place + i, last)])
-            second = given_volume(lattice, body, slope, volume, x, J, e, order[e, wp.min(place + i + size, last)])
-            state = walk(parts, e, at, wp.min(2 * size, count - i), first, second, state)
+        place = begin + row_of(t % lanes)
+        for i in range(0, most(count), size):
+            given = given_volume(lattice, body, slope, volume, x, J, e, order[e, wp.min(place + i, last)])
+            state = walk(parts, e, at, wp.min(size, count - i), given, state)
         close_segment(parts, e, at, span, state)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
@@ -148,11 +147,10 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         at, begin, count, span = mine[0] * PARTS, mine[1], mine[2], mine[3]
         state = open_segment(parts, e, at, span)
         last = begin + wp.max(count - 1, 0)
-        place = begin + t % lanes % size
-        for i in range(0, most(count), 2 * size):
-            first = given_adjoint(lattice, body, share, x, adj_log, e, order[e, wp.min(place + i, last)])
-            second = given_adjoint(lattice, body, share, x, adj_log, e, order[e, wp.min(place + i + size, last)])
-            state = walk(parts, e, at, wp.min(2 * size, count - i), first, second, state)
+        place = begin + row_of(t % lanes)
+        for i in range(0, most(count), size):
+            given = given_adjoint(lattice, body, share, x, adj_log, e, order[e, wp.min(place + i, last)])
+            state = walk(parts, e, at, wp.min(size, count - i), given, state)
         close_segment(parts, e, at, span, state)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)

@@ -3,6 +3,10 @@
 Nine lanes take the particles of a segment one after the other. Each holds the sums of three of the 27 nodes around the
 present cell, a row along z. Where the next cell begins, the lowest nine are written down, beside each other, since a
 cache takes whole sectors much faster than parts of them, and the others become lower by one.
+
+A lane works out what one particle gives to all nine rows, and puts it into memory that the warp shares, where each lane
+reads what concerns its own row, since reading there is what limits a scatter. No more than nine particles of a segment
+are there at once: the cache has what shared memory leaves of the same storage.
 """
 
 from functools import cache, partial
@@ -20,7 +24,8 @@ from .stencil import lattice, stencil
 PLANES = SEGMENT + 2  # of nodes that the cells of a segment touch
 PARTS = 9 * PLANES  # numbers of four parts that a segment leaves
 
-
+# A lane's group and row. Eight lanes read shared memory at once, and of one particle by this numbering.
+GROUP, ROW = "(lane < 24 ? lane / 8 : lane - 24)", "(lane < 24 ? lane % 8 : 8)"
 EMIT = """
         {
             out[9 * now++] = low;
@@ -36,36 +41,43 @@ OPEN = """
     return state;
 """
 WALK = """
+    REAL w[3][3];
+#pragma unroll
+    for (int axis = 0; axis < 3; ++axis) {
+        const REAL f = p.f[axis], half = REAL(0.5), one = REAL(1.0), more = REAL(1.5);
+        w[axis][0] = half * (f - more) * (f - more);
+        w[axis][1] = REAL(0.75) - (f - one) * (f - one);
+        w[axis][2] = half * (f - half) * (f - half);
+    }
 #if defined(__CUDA_ARCH__)
     FOUR
+    struct alignas(2 * sizeof(REAL)) Two { REAL a, b; };
     struct alignas(16) Weights { REAL low, middle, high; int cell; };
-    struct Particle { STAGED Weights weights; };
-    __shared__ Particle stage[WARPS][3 * ROUND];
-    const int lane = threadIdx.x & 31, row = lane % 9, i = row / 3, j = row % 3;
-    const REAL oi = REAL(i), oj = REAL(j), half = REAL(0.5), one = REAL(1.0), more = REAL(1.5), three = REAL(0.75);
-    const auto pack = [&](const auto &p) {
-        const REAL u = p.f[2] - more, v = p.f[2] - one, w = p.f[2] - half;
-        return Particle{PACKED {half * u * u, three - v * v, half * w * w, p.cell}};
-    };
-    Particle *staged = stage[threadIdx.x >> 5] + lane / 9 * ROUND;
+    struct Particle { KIND rows[9]; STAGED Weights weights; };
+    __shared__ Particle stage[WARPS][3][9];
+    const int lane = threadIdx.x & 31, group = GROUP, row = ROW;
+    Particle *staged = stage[threadIdx.x >> 5][lane < 27 ? group : 0];
     __syncwarp();
-    if (lane < 27) staged[row] = pack(first), staged[row + 9] = pack(second);
+    if (lane < 27) {
+        Particle &to = staged[row];
+#pragma unroll
+        for (int i = 0; i < 3; ++i)
+#pragma unroll
+            for (int j = 0; j < 3; ++j) to.rows[3 * i + j] = GIVEN;
+        PACKED
+        to.weights = {w[2][0], w[2][1], w[2][2], p.cell};
+    }
     __syncwarp();
-    const REAL ui = i == 1 ? three : REAL(0.0), si = i == 1 ? -one : half, mi = more - half * oi;
-    const REAL uj = j == 1 ? three : REAL(0.0), sj = j == 1 ? -one : half, mj = more - half * oj;
     Four low{state[0], state[1], state[2], state[3]};
     Four middle{state[4], state[5], state[6], state[7]};
     Four high{state[8], state[9], state[10], state[11]};
     Four *out = (Four *)&wp::index(parts, e, at) + row;
     int now = (int)state[12];
     for (int t = 0; t < count; ++t) {
-        const Particle given = staged[t];
-        const Weights w = given.weights;
+        const KIND b = staged[t].rows[row];
+        const Weights z = staged[t].weights;
 #pragma unroll 1
-        while (now < w.cell) EMIT
-        const REAL tx = FIRST - mi, ty = SECOND - mj;
-        const REAL wij = (ui + si * tx * tx) * (uj + sj * ty * ty);
-        const REAL w0 = wij * w.low, w1 = wij * w.middle, w2 = wij * w.high;
+        while (now < z.cell) EMIT
         ADDED
     }
     wp::vec_t<13, REAL> left;
@@ -75,66 +87,55 @@ WALK = """
     left[12] = REAL(now);
     return left;
 #else
-    for (int n = 0; n < count; ++n) {
-        const auto &p = n ? second : first;
-        REAL w[3][3];
-        for (int axis = 0; axis < 3; ++axis) {
-            const REAL g = p.f[axis], half = REAL(0.5);
-            w[axis][0] = half * (g - REAL(1.5)) * (g - REAL(1.5));
-            w[axis][1] = REAL(0.75) - (g - REAL(1.0)) * (g - REAL(1.0));
-            w[axis][2] = half * (g - half) * (g - half);
-        }
-        for (int i = 0; i < 3; ++i)
-            for (int j = 0; j < 3; ++j)
-                for (int k = 0; k < 3; ++k) {
-                    const REAL weight = w[0][i] * w[1][j] * w[2][k];
-                    wp::vec_t<4, REAL> &sum = wp::index(parts, e, at + 9 * (p.cell + k) + 3 * i + j);
-                    for (int d = 0; d < 3; ++d) {
-                        const REAL *a = p.a.data[d], move = REAL(i) * a[0] + REAL(j) * a[1] + REAL(k) * a[2];
-                        sum[d] += weight * (p.q[d] + move);
-                    }
-                    sum[3] += weight * p.mass;
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j)
+            for (int k = 0; k < 3; ++k) {
+                const REAL weight = w[0][i] * w[1][j] * w[2][k];
+                wp::vec_t<4, REAL> &sum = wp::index(parts, e, at + 9 * (p.cell + k) + 3 * i + j);
+                for (int d = 0; d < 3; ++d) {
+                    const REAL *a = p.a.data[d], move = REAL(i) * a[0] + REAL(j) * a[1] + REAL(k) * a[2];
+                    sum[d] += weight * (p.q[d] + move);
                 }
-    }
+                sum[3] += weight * p.mass;
+            }
     return state;
 #endif
 """
 # What is staged of a particle whose gift to nodes has a slope and mass, and of one without.
 SLOPING = {
-    "STAGED": "Four q, x, y, z;",
-    "PACKED": """
-            {p.q[0], p.q[1], p.q[2], p.mass},
-            {p.a.data[0][0], p.a.data[1][0], p.a.data[2][0], p.f[0]},
-            {p.a.data[0][1], p.a.data[1][1], p.a.data[2][1], p.f[1]},
-            {p.a.data[0][2], p.a.data[1][2], p.a.data[2][2], REAL(0.0)},
-""",
-    "FIRST": "given.x.d",
-    "SECOND": "given.y.d",
+    "KIND": "Four",
+    "STAGED": "Four slope;",
+    "GIVEN": """Four{
+                p.q[0] + REAL(i) * p.a.data[0][0] + REAL(j) * p.a.data[0][1],
+                p.q[1] + REAL(i) * p.a.data[1][0] + REAL(j) * p.a.data[1][1],
+                p.q[2] + REAL(i) * p.a.data[2][0] + REAL(j) * p.a.data[2][1], w[0][i] * w[1][j]}""",
+    "PACKED": "to.slope = {p.a.data[0][2], p.a.data[1][2], p.a.data[2][2], p.mass};",
     "ADDED": """
-        const Four b = given.q, x = given.x, y = given.y, z = given.z;
-        REAL qa = b.a + oi * x.a + oj * y.a, qb = b.b + oi * x.b + oj * y.b, qc = b.c + oi * x.c + oj * y.c;
-        low.a += w0 * qa, low.b += w0 * qb, low.c += w0 * qc, low.d += w0 * b.d;
-        qa += z.a, qb += z.b, qc += z.c;
-        middle.a += w1 * qa, middle.b += w1 * qb, middle.c += w1 * qc, middle.d += w1 * b.d;
-        qa += z.a, qb += z.b, qc += z.c;
-        high.a += w2 * qa, high.b += w2 * qb, high.c += w2 * qc, high.d += w2 * b.d;
+        const Four a = staged[t].slope;
+        const REAL w0 = b.d * z.low, w1 = b.d * z.middle, w2 = b.d * z.high;
+        REAL qa = b.a, qb = b.b, qc = b.c;
+        low.a += w0 * qa, low.b += w0 * qb, low.c += w0 * qc, low.d += w0 * a.d;
+        qa += a.a, qb += a.b, qc += a.c;
+        middle.a += w1 * qa, middle.b += w1 * qb, middle.c += w1 * qc, middle.d += w1 * a.d;
+        qa += a.a, qb += a.b, qc += a.c;
+        high.a += w2 * qa, high.b += w2 * qb, high.c += w2 * qc, high.d += w2 * a.d;
 """,
 }
 LEVEL = {
-    "STAGED": "Four q;",
-    "PACKED": "{p.q[0], p.q[1], p.f[0], p.f[1]},",
-    "FIRST": "given.q.c",
-    "SECOND": "given.q.d",
+    "KIND": "Two",
+    "STAGED": "",
+    "GIVEN": "Two{w[0][i] * w[1][j] * p.q[0], w[0][i] * w[1][j] * p.q[1]}",
+    "PACKED": "",
     "ADDED": """
-        low.a += w0 * given.q.a, low.b += w0 * given.q.b;
-        middle.a += w1 * given.q.a, middle.b += w1 * given.q.b;
-        high.a += w2 * given.q.a, high.b += w2 * given.q.b;
+        low.a += z.low * b.a, low.b += z.low * b.b;
+        middle.a += z.middle * b.a, middle.b += z.middle * b.b;
+        high.a += z.high * b.a, high.b += z.high * b.b;
 """,
 }
 CLOSE = """
 #if defined(__CUDA_ARCH__)
     FOUR
-    const int row = (threadIdx.x & 31) % 9;
+    const int lane = threadIdx.x & 31, row = ROW;
     Four low{state[0], state[1], state[2], state[3]};
     Four middle{state[4], state[5], state[6], state[7]};
     Four high{state[8], state[9], state[10], state[11]};
@@ -163,11 +164,26 @@ def fill(code: str, name: str, **more: str) -> str:
         "PARTS": PARTS,
         "SEGMENT": SEGMENT,
         "WARPS": BLOCK // 32,
-        "ROUND": 18,
+        "GROUP": GROUP,
+        "ROW": ROW,
     }
     for word, value in words.items():
         code = code.replace(word, str(value))
     return in_precision(code, name)
+
+
+@cache
+@no_type_check
+def lane_numbers() -> SimpleNamespace:
+    """Return the functions `group` and `row` of a lane of a warp: its segment, none from three on, and its nodes."""
+
+    @wp.func_native(f"return {GROUP};")
+    def group(lane: int) -> int: ...
+
+    @wp.func_native(f"return {ROW};")
+    def row(lane: int) -> int: ...
+
+    return SimpleNamespace(group=group, row=row)
 
 
 @cache
@@ -178,7 +194,7 @@ def walker(name: str, *, sloping: bool = True) -> SimpleNamespace:
     `at_nodes` says what a particle gives to its nodes, as a `Given`, whose a, mass and third q must be 0 unless it is
     `sloping`. A warp's lanes call the others together: `most` for the greatest of their counts, `open` before their
     segment, whose parts begin at `at`, `close` after it. `walk` adds the next `count` particles of each group to its
-    parts. A lane knows two of them, as far apart in the list as a group has lanes.
+    parts, of which a lane knows that of its row.
     """
     types = precision(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
@@ -205,9 +221,7 @@ def walker(name: str, *, sloping: bool = True) -> SimpleNamespace:
     def open_segment(parts: wp.array2d[vec4], e: int, at: int, span: int) -> State: ...
 
     @wp.func_native(fill(WALK, name, **(SLOPING if sloping else LEVEL)))
-    def walk(
-        parts: wp.array2d[vec4], e: int, at: int, count: int, first: Given, second: Given, state: State
-    ) -> State: ...
+    def walk(parts: wp.array2d[vec4], e: int, at: int, count: int, p: Given, state: State) -> State: ...
 
     @wp.func_native(fill(CLOSE, name))
     def close_segment(parts: wp.array2d[vec4], e: int, at: int, span: int, state: State): ...
