@@ -17,7 +17,7 @@ import numpy as np
 
 from ...runtime import precision
 from . import elastic, fluid, fluid_cpu, plasticine, plasticine_cpu
-from .after_p2g import after_p2g
+from .adjoints import after_p2g
 
 
 @dataclass(frozen=True)
@@ -130,4 +130,4 @@ Material = Fluid | Elastic | Plasticine
 
 
 def _choose(name: str, update: Any, adjoint: Any, turn_back: Any, *, columns: bool, blocks: int = 4) -> tuple[Any, Any]:
-    return update, after_p2g(name, adjoint, turn_back, blocks) if columns else adjoint
+    return update, after_p2g(name, turn_back, blocks) if columns else adjoint

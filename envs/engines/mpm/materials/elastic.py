@@ -7,6 +7,7 @@ import warp as wp
 
 from ...runtime import precision
 from ..layout import layout
+from .adjoints import alone
 
 
 @cache
@@ -74,24 +75,4 @@ def kernels(name: str) -> tuple[Any, Any, Any]:
         write_matrix(adj_F, e, p, wp.transpose(advance) * adj_f)
         write_matrix(adj_C, e, first + p, mass[e, first + p] * adj_a + dt * adj_f * wp.transpose(before))
 
-    @wp.kernel(module=module, enable_backward=False)
-    def adjoint(
-        first: int,
-        dt: real,
-        scale: real,
-        mu: real,
-        lam: real,
-        mass: wp.array2d[real],
-        volume: wp.array2d[real],
-        F: wp.array2d[mat33],
-        C: wp.array2d[mat33],
-        adj_F_new: wp.array2d[mat33],
-        adj_A: wp.array2d[mat33],
-        adj_F: wp.array2d[mat33],
-        adj_C: wp.array2d[mat33],
-    ):
-        e, p = wp.tid()
-        adj_a = read_matrix(adj_A, e, first + p)
-        turn_back(first, dt, scale, mu, lam, mass, volume, F, C, adj_F_new, adj_a, adj_F, adj_C, e, p)
-
-    return update, adjoint, turn_back
+    return update, alone(name, turn_back), turn_back

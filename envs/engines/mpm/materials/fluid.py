@@ -7,6 +7,7 @@ import warp as wp
 
 from ...runtime import precision
 from ..layout import layout
+from .adjoints import alone
 
 TORN = 1.04  # volume ratio at which a fluid tears
 
@@ -77,24 +78,4 @@ def kernels(name: str) -> tuple[Any, Any, Any]:
         dilation = dt * j * adj_j * wp.identity(n=3, dtype=real)
         write_matrix(adj_C, e, first + p, mass[e, first + p] * adj_a + j * viscosity * shear(g) + dilation)
 
-    @wp.kernel(module=module, enable_backward=False)
-    def adjoint(
-        first: int,
-        dt: real,
-        scale: real,
-        bulk: real,
-        viscosity: real,
-        mass: wp.array2d[real],
-        volume: wp.array2d[real],
-        J: wp.array2d[real],
-        C: wp.array2d[mat33],
-        adj_J_new: wp.array2d[real],
-        adj_A: wp.array2d[mat33],
-        adj_J: wp.array2d[real],
-        adj_C: wp.array2d[mat33],
-    ):
-        e, p = wp.tid()
-        adj_a = read_matrix(adj_A, e, first + p)
-        turn_back(first, dt, scale, bulk, viscosity, mass, volume, J, C, adj_J_new, adj_a, adj_J, adj_C, e, p)
-
-    return update, adjoint, turn_back
+    return update, alone(name, turn_back), turn_back

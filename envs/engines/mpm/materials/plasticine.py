@@ -18,6 +18,7 @@ import warp as wp
 
 from ...runtime import precision
 from ..layout import layout
+from .adjoints import alone
 from .decomposition import svd
 
 SMALLEST = 0.05  # singular values below count as this; what is pressed flatter has lost its shape
@@ -175,25 +176,4 @@ def kernels(name: str) -> tuple[Any, Any, Any]:
         adj_c = mass[n, first + p] * adj_a + dt * adj_trial * wp.transpose(before)
         write_matrix(adj_C, n, first + p, adj_c)
 
-    @wp.kernel(module=module, enable_backward=False)
-    def adjoint(
-        first: int,
-        dt: real,
-        scale: real,
-        mu: real,
-        lam: real,
-        kappa: real,
-        mass: wp.array2d[real],
-        volume: wp.array2d[real],
-        F: wp.array2d[mat33],
-        C: wp.array2d[mat33],
-        adj_F_new: wp.array2d[mat33],
-        adj_A: wp.array2d[mat33],
-        adj_F: wp.array2d[mat33],
-        adj_C: wp.array2d[mat33],
-    ):
-        n, p = wp.tid()
-        adj_a = read_matrix(adj_A, n, first + p)
-        turn_back(first, dt, scale, mu, lam, kappa, mass, volume, F, C, adj_F_new, adj_a, adj_F, adj_C, n, p)
-
-    return update, adjoint, turn_back
+    return update, alone(name, turn_back), turn_back
