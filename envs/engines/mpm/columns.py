@@ -70,7 +70,11 @@ ADD_UP = """
 @cache
 @no_type_check
 def segment_taker(team: Team):
-    """Return the function that says of a thread's segment (number, first place, count, span), none if it has none."""
+    """Return the functions `take_segment, listed` of a team.
+
+    The first says of a thread's segment (number, first place, count, span), none if it has none; the second which
+    particle has a place in the list, or the `last` one of a segment.
+    """
     lanes, groups, group_of = team.lanes, team.groups, lane_numbers().group
 
     @wp.func(module=f"gradscape.columns.{lanes}")
@@ -82,7 +86,11 @@ def segment_taker(team: Team):
             return wp.vec4i(0, 0, 0, 0)
         return mine
 
-    return take_segment
+    @wp.func(module=f"gradscape.columns.{lanes}")
+    def listed(order: wp.array2d[wp.int32], e: int, place: int, last: int):
+        return order[e, wp.min(place, last)]
+
+    return take_segment, listed
 
 
 @cache
@@ -110,7 +118,7 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
     Lattice, steps = lattice(name), walker(name)
     module = f"gradscape.columns.{name}.{team.lanes}"
-    take_segment, most = segment_taker(team), steps.most
+    (take_segment, listed), most = segment_taker(team), steps.most
     at_nodes, open_segment, walk, close_segment = steps.at_nodes, steps.open, steps.walk, steps.close
     lanes, groups, size, row_of = team.lanes, team.groups, team.size, lane_numbers().row
     lies = layout(name)
@@ -169,8 +177,10 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
         state = open_segment(parts, e, at, span)
         last = begin + wp.max(count - 1, 0)
         place = begin + row_of(t % lanes)
+        p = listed(order, e, place, last)
         for i in range(0, most(count), size):
-            given = momentum(lattice, mass, x, v, A, e, order[e, wp.min(place + i, last)])
+            given = momentum(lattice, mass, x, v, A, e, p)
+            p = listed(order, e, place + i + size, last)  # asked for before the present ones are walked
             state = walk(parts, e, at, wp.min(size, count - i), given, state)
         close_segment(parts, e, at, span, state)
 
@@ -196,10 +206,10 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
         state = open_segment(parts, e, at, span)
         last = begin + wp.max(count - 1, 0)
         place = begin + row_of(t % lanes)
+        p = listed(order, e, place, last)
         for i in range(0, most(count), size):
-            given = velocity_adjoint(
-                lattice, dt, x, adj_x_new, adj_v_new, adj_C_new, e, order[e, wp.min(place + i, last)]
-            )
+            given = velocity_adjoint(lattice, dt, x, adj_x_new, adj_v_new, adj_C_new, e, p)
+            p = listed(order, e, place + i + size, last)  # asked for before the present ones are walked
             state = walk(parts, e, at, wp.min(size, count - i), given, state)
         close_segment(parts, e, at, span, state)
 

@@ -29,7 +29,7 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
     real, vec3, vec4 = types.real, types.vec3, types.vec4
     Lattice, base_node, steps = lattice(name), stencil(name).base_node, walker(name, sloping=False)
     from_base = gatherers(name).from_base
-    take_segment, most = segment_taker(team), steps.most
+    (take_segment, listed), most = segment_taker(team), steps.most
     at_nodes, open_segment, walk, close_segment = steps.at_nodes, steps.open, steps.walk, steps.close
     lanes, groups, size, row_of = team.lanes, team.groups, team.size, lane_numbers().row
     add_up_node, module = node_sum(name), f"gradscape.smoothing.{name}.columns.{team.lanes}"
@@ -95,8 +95,10 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         state = open_segment(parts, e, at, span)
         last = begin + wp.max(count - 1, 0)
         place = begin + row_of(t % lanes)
+        p = listed(order, e, place, last)
         for i in range(0, most(count), size):
-            given = given_volume(lattice, body, slope, volume, x, J, e, order[e, wp.min(place + i, last)])
+            given = given_volume(lattice, body, slope, volume, x, J, e, p)
+            p = listed(order, e, place + i + size, last)  # asked for before the present ones are walked
             state = walk(parts, e, at, wp.min(size, count - i), given, state)
         close_segment(parts, e, at, span, state)
 
@@ -148,8 +150,10 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         state = open_segment(parts, e, at, span)
         last = begin + wp.max(count - 1, 0)
         place = begin + row_of(t % lanes)
+        p = listed(order, e, place, last)
         for i in range(0, most(count), size):
-            given = given_adjoint(lattice, body, share, x, adj_log, e, order[e, wp.min(place + i, last)])
+            given = given_adjoint(lattice, body, share, x, adj_log, e, p)
+            p = listed(order, e, place + i + size, last)  # asked for before the present ones are walked
             state = walk(parts, e, at, wp.min(size, count - i), given, state)
         close_segment(parts, e, at, span, state)
 
