@@ -65,7 +65,11 @@ class Allocator:
 
     def grid(self, cells: int) -> Grid:
         """Return a grid of zeros."""
-        return Grid(*(self.array(self.types.vec4, cells) for _ in range(2)))
+        return Grid(self.nodes(cells), self.nodes(cells))
+
+    def nodes(self, cells: int) -> wp.array:
+        """Return zeros for four numbers of each node, [environment, node]."""
+        return self.array(self.types.vec4, cells)
 
     def affine_momentum(self) -> wp.array:
         """Return zeros for A, [environment, particle]."""
@@ -101,7 +105,8 @@ class Cycle(list[T]):
 class Tape:
     """Hold one control step whole: frames between its ends, A and grids of its substeps, and where the grids lie.
 
-    Of a step in `pieces` it holds the frames at which these begin; for all else pieces share the room of one.
+    Of what is smoothed before it the state is there, and, of sums by columns, the `means` that nodes hold. Of a step in
+    `pieces` it holds the frames at which these begin; for all else pieces share the room of one.
     """
 
     def __init__(self, allocator: Allocator, cells: int = 1, pieces: int = 1) -> None:
@@ -111,6 +116,7 @@ class Tape:
         inner = [allocator.frame() for _ in range(held - 1)]
         self.frames = [inner[s % held - 1] if s % held else allocator.frame() for s in range(1, model.substeps)]
         self.smoothed = allocator.smoothed()
+        self.means = {b: allocator.nodes(cells) for b in self.smoothed if allocator.columns}
         self.A: Cycle[wp.array] = Cycle(allocator.affine_momentum() for _ in range(held))
         self.grids: Cycle[Grid] = Cycle(allocator.grid(cells) for _ in range(held))
         self.lists: Cycle[Lists] = Cycle(allocator.lists(1) for _ in range(held if allocator.columns else 0))
@@ -120,10 +126,9 @@ class Tape:
     @property
     def bytes(self) -> int:
         """What its arrays take."""
-        grids = [array for grid in self.grids for array in (grid.m, grid.v)]
         frames = [array for frame in set(self.frames) for array in frame.arrays()]
         lists = [array for one in self.lists for array in one.arrays()]
-        return sum(array.capacity for array in (*frames, *self.smoothed.values(), *self.A, *grids, *lists))
+        return sum(array.capacity for array in (*frames, *self.smoothed.values(), *self.A, *self._nodes, *lists))
 
     def growth(self, box: Box) -> int:
         """Return the bytes that a box of nodes takes beyond those that are there, 0 where these suffice."""
@@ -153,6 +158,9 @@ class Tape:
             for substep in range(len(self.grids)):
                 self.grids[substep] = self._allocator.grid(0)  # the old one goes first
                 self.grids[substep] = self._allocator.grid(self.room(box))
+            for body in self.means:
+                self.means[body] = self._allocator.nodes(0)
+                self.means[body] = self._allocator.nodes(self.room(box))
         if self.lists and self._segments < segments(box):
             self.lists = Cycle(self._allocator.lists(segments(box) * 5 // 4) for _ in self.lists)
         self.step, self.box, self.lattice = step, box, place_grid(self._allocator.model, box)
@@ -160,7 +168,12 @@ class Tape:
     @property
     def _cells(self) -> int:
         """How many nodes all its grids have room for."""
-        return min(int(grid.v.shape[1]) for grid in self.grids)
+        return min(int(array.shape[1]) for array in self._nodes)
+
+    @property
+    def _nodes(self) -> list[wp.array]:
+        """Every array of nodes."""
+        return [*(array for grid in self.grids for array in (grid.m, grid.v)), *self.means.values()]
 
     @property
     def _segments(self) -> int:
@@ -174,4 +187,5 @@ class Tape:
     def _bytes_of(self, cells: int, segments: int) -> int:
         """Return the bytes of so many nodes of all its grids, and segments of all its lists."""
         size = int(wp.types.type_size_in_bytes(self._allocator.types.vec4))
-        return (2 * size * cells + 4 * 5 * segments) * len(self.grids) * self._allocator.capacity
+        each = size * cells * len(self._nodes) + 4 * 5 * segments * len(self.grids)
+        return each * self._allocator.capacity

@@ -90,8 +90,9 @@ class Model:
         numbers = (self.steps + 3 + tapes * (pieces - 1)) * frame + (stored + 1) * substep
         if not columns:
             return self.real_bytes * numbers
+        means = 4 * tapes * sum(body.material.smoothing > 0 for body in self.bodies)
         integers = (stored + 3) * (self.particles + nodes)
-        return self.real_bytes * (numbers + 45 * nodes) + 4 * integers
+        return self.real_bytes * (numbers + (45 + means) * nodes) + 4 * integers
 
     @property
     def corners(self) -> tuple[np.ndarray, np.ndarray]:

@@ -37,8 +37,9 @@ class Smoother:
         """Fill the tape's first state from the checkpoint's."""
         self._spread(solver, step, batch)
         tape = solver.tape(step)
-        inputs = [tape.lattice, self.first, self.slope, self.share, *self._particles(solver, step), *self.nodes[:2]]
-        solver.launch(self.kernels.collect, self.size, batch, [*inputs, tape.smoothed[self.body]])
+        inputs = [tape.lattice, self.first, self.slope, self.share, *self._particles(solver, step)]
+        inputs += [*self._sums(solver, step), tape.smoothed[self.body]]
+        solver.launch(self.kernels.collect, self.size, batch, inputs)
 
     def run_back(self, solver: Any, step: int, batch: int, adjoint: Any) -> None:
         """Turn the adjoint of the tape's first state into that of the checkpoint's, and add to that of x."""
@@ -51,6 +52,10 @@ class Smoother:
         solver.launch(self.kernels.adjoint_collect, self.size, batch, [*inputs, adj_J, adj_x, adj_mean])
         inputs = [tape.lattice, self.first, self.slope, self.share, solver.orders[step].volume, x, J, *self.nodes]
         solver.launch(self.kernels.adjoint_spread, self.size, batch, [*inputs, adj_J, adj_x])
+
+    def _sums(self, solver: Any, step: int) -> list[Any]:
+        """Return what `_spread` fills."""
+        return self.nodes[:2]
 
     def _spread(self, solver: Any, step: int, batch: int) -> None:
         """Fill `amount` and `weight`."""
@@ -66,29 +71,35 @@ class Smoother:
 
 
 class ColumnSmoother(Smoother):
-    """Do the same with sums by columns of cells, after the lists of the control step's first substep."""
+    """Do the same with sums by columns of cells, after the lists of the control step's first substep.
+
+    The tape keeps what nodes hold, so that the way back need not add it up again.
+    """
 
     def __init__(self, solver: Any, body: int) -> None:
         super().__init__(solver, body)
         self.kernels = smoothing_columns(solver.model.precision, solver.scatter.team)
-        self.nodes = [solver.allocator.array(solver.types.vec4, solver.model.cells)]
+        self.nodes = []
 
     def run_back(self, solver: Any, step: int, batch: int, adjoint: Any) -> None:
         """Turn the adjoint of the tape's first state into that of the checkpoint's, and add to that of x."""
-        tape, (x, J) = solver.tape(step), self._particles(solver, step)
+        tape, (x, J), nodes = solver.tape(step), self._particles(solver, step), self._sums(solver, step)
         adj_J, adj_x = adjoint.S[self.body], adjoint.x
-        self._spread(solver, step, batch)
-        inputs = [tape.lattice, self.first, self.share, x, tape.smoothed[self.body], *self.nodes, adj_J, adj_x]
+        inputs = [tape.lattice, self.first, self.share, x, tape.smoothed[self.body], *nodes, adj_J, adj_x]
         solver.launch(self.kernels.adjoint_collect, self.size, batch, inputs)
         solver.scatter.walk(self.kernels.spread_adjoint, step, 0, batch, [self.first, self.share, x, adj_J])
-        solver.scatter.add_up(self.kernels.add_up_adjoint, step, 0, batch, self.nodes)
-        inputs = [tape.lattice, self.first, self.slope, self.share, solver.orders[step].volume, x, J, *self.nodes]
+        solver.scatter.add_up(self.kernels.add_up_adjoint, step, 0, batch, nodes)
+        inputs = [tape.lattice, self.first, self.slope, self.share, solver.orders[step].volume, x, J, *nodes]
         solver.launch(self.kernels.adjoint_spread, self.size, batch, [*inputs, adj_J, adj_x])
+
+    def _sums(self, solver: Any, step: int) -> list[Any]:
+        """Return what nodes hold of the body."""
+        return [solver.tape(step).means[self.body]]
 
     def _spread(self, solver: Any, step: int, batch: int) -> None:
         inputs = [self.first, self.slope, solver.orders[step].volume, *self._particles(solver, step)]
         solver.scatter.walk(self.kernels.spread, step, 0, batch, inputs)
-        solver.scatter.add_up(self.kernels.add_up, step, 0, batch, self.nodes)
+        solver.scatter.add_up(self.kernels.add_up, step, 0, batch, self._sums(solver, step))
 
 
 def hydrostatic_slope(model: Model, body: int) -> float:
