@@ -93,13 +93,17 @@ class Adjoint:
         """Launch the adjoint of p2g, and those of the materials after it or as its continuation."""
         solver, old = self.solver, self.old
         lattice, mass = solver.tape(step).lattice, solver.orders[step].mass
-        given = [lattice, frame.x, frame.v, A, self.grid.m, old.x, old.v]
+        given = self.grid.m, old.x, old.v
         if not solver.columns:
-            inputs = [lattice, mass, *given[1:], self.A]
+            inputs = [lattice, mass, frame.x, frame.v, A, *given, self.A]
             solver.launch(solver.kernels.adjoint_p2g, solver.model.particles, batch, inputs)
         for b, (_, adjoint) in enumerate(solver.materials):
             inputs = [*solver.material_inputs(b, step, frame), self.new.S[b]]
-            inputs = [*given, *inputs] if solver.columns else [*inputs, self.A]
+            if solver.columns:
+                kept = [A] if solver.model.bodies[b].material.keeps_affine_momentum else []
+                inputs = [*kept, lattice, frame.x, frame.v, *given, *inputs]
+            else:
+                inputs += [self.A]
             with solver.beside_others(b):
                 solver.launch(adjoint, solver.size(b), batch, [*inputs, old.S[b], old.C])
         solver.launches.join()

@@ -103,10 +103,11 @@ class Cycle(list[T]):
 
 
 class Tape:
-    """Hold one control step whole: frames between its ends, A and grids of its substeps, and where the grids lie.
+    """Hold one control step whole: frames between its ends, grids of its substeps, and where they lie.
 
-    Of what is smoothed before it the state is there, and, of sums by columns, the `means` that nodes hold. Of a step in
-    `pieces` it holds the frames at which these begin; for all else pieces share the room of one.
+    A is that of every substep, or of the latest where no material keeps it. Of what is smoothed before the step the
+    state is there, and, of sums by columns, the `means` that nodes hold. Of a step in `pieces` it holds the frames at
+    which these begin; for all else pieces share the room of one.
     """
 
     def __init__(self, allocator: Allocator, cells: int = 1, pieces: int = 1) -> None:
@@ -117,7 +118,8 @@ class Tape:
         self.frames = [inner[s % held - 1] if s % held else allocator.frame() for s in range(1, model.substeps)]
         self.smoothed = allocator.smoothed()
         self.means = {b: allocator.nodes(cells) for b in self.smoothed if allocator.columns}
-        self.A: Cycle[wp.array] = Cycle(allocator.affine_momentum() for _ in range(held))
+        kept = held if model.keeps_affine_momentum or not allocator.columns else 1
+        self.A: Cycle[wp.array] = Cycle(allocator.affine_momentum() for _ in range(kept))
         self.grids: Cycle[Grid] = Cycle(allocator.grid(cells) for _ in range(held))
         self.lists: Cycle[Lists] = Cycle(allocator.lists(1) for _ in range(held if allocator.columns else 0))
         self.box, self.lattice = NOWHERE, place_grid(model)

@@ -106,12 +106,15 @@ def gatherers(name: str) -> SimpleNamespace:
 @cache
 @no_type_check
 def adjoint_gatherer(name: str):
-    """Return the function that gathers the adjoints of p2g: it adds to adj_x, sets adj_v, and returns adj_A."""
+    """Return the function that gathers the adjoints of p2g: it adds to adj_x, sets adj_v, and returns adj_A.
+
+    It takes a particle's affine `momentum` A as a matrix.
+    """
     types, lies, sums_of = precision(name), layout(name), gatherers(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
     Lattice, base_node = lattice(name), stencil(name).base_node
     gather_with_mass, from_base = sums_of.gather_with_mass, sums_of.from_base
-    read_number, read_vector, read_matrix = lies.read_number, lies.read_vector, lies.read_matrix
+    read_number, read_vector = lies.read_number, lies.read_vector
 
     @wp.func(module=f"gradscape.gathers.{name}")
     def gather_back(
@@ -119,7 +122,7 @@ def adjoint_gatherer(name: str):
         mass: wp.array2d[real],
         x: wp.array2d[vec3],
         v: wp.array2d[vec3],
-        A: wp.array2d[mat33],
+        momentum: mat33,
         adj_grid_m: wp.array2d[vec4],
         adj_x: wp.array2d[vec3],
         adj_v: wp.array2d[vec3],
@@ -131,13 +134,12 @@ def adjoint_gatherer(name: str):
         f = from_base(here, base, lattice)
         m = read_number(mass, e, p)
         dx = real(1.0) / lattice.inv_dx
-        momentum = read_matrix(A, e, p)
         a = momentum * dx
         q = m * read_vector(v, e, p) - a * f
         sums = gather_with_mass(lattice, adj_grid_m, e, base - lattice.first, f, q, a, m)
         h = sums[0]
         adj_v[e, p] = m * h
-        adj_x[e, p] = read_vector(adj_x, e, p) + lattice.inv_dx * sums[4] - wp.transpose(momentum) * h
+        adj_x[e, p] = read_vector(adj_x, e, p) + lattice.inv_dx * (sums[4] - wp.transpose(a) * h)
         return dx * wp.matrix_from_cols(sums[1] - f[0] * h, sums[2] - f[1] * h, sums[3] - f[2] * h)
 
     return gather_back

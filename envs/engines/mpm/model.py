@@ -85,7 +85,7 @@ class Model:
         state = sum(len(body.x) * (1 if isinstance(body.material, Fluid) else 9) for body in self.bodies)
         frame = 15 * self.particles + state  # x, v, C and each material's own
         nodes = min(self.cells, nodes_around(self, *self.corners, BOX_MARGIN).cells * 2)
-        substep = frame + 9 * self.particles + 8 * nodes
+        substep = frame + 8 * nodes + (9 * self.particles if self.keeps_affine_momentum or not columns else 0)
         stored = tapes * self.piece(pieces)
         numbers = (self.steps + 3 + tapes * (pieces - 1)) * frame + (stored + 1) * substep
         if not columns:
@@ -93,6 +93,11 @@ class Model:
         means = 4 * tapes * sum(body.material.smoothing > 0 for body in self.bodies)
         integers = (stored + 3) * (self.particles + nodes)
         return self.real_bytes * (numbers + (45 + means) * nodes) + 4 * integers
+
+    @property
+    def keeps_affine_momentum(self) -> bool:
+        """Whether A of every substep is kept for the gradient, where sums are made by columns."""
+        return any(body.material.keeps_affine_momentum for body in self.bodies)
 
     @property
     def corners(self) -> tuple[np.ndarray, np.ndarray]:

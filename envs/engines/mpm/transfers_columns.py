@@ -77,7 +77,8 @@ def transfers_of_columns(name: str) -> SimpleNamespace:
     ):
         """Gather the adjoints of p2g: add to adj_x, set adj_v and adj_A."""
         e, p = wp.tid()
-        write_matrix(adj_A, e, p, gather_back(lattice, mass, x, v, A, adj_grid_m, adj_x, adj_v, e, p))
+        a = read_matrix(A, e, p)
+        write_matrix(adj_A, e, p, gather_back(lattice, mass, x, v, a, adj_grid_m, adj_x, adj_v, e, p))
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def adjoint_g2p(

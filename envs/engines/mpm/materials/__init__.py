@@ -6,7 +6,8 @@ has two kernels: `update` advances the state by the affine velocity C and fills 
     S' = deform(S, C),    A = -dt V 4/dx^2 tau(S', C) + m C,
 
 and `adjoint` turns the adjoints of S' and A into those of S and C. Both are written by hand; the tests hold the second
-against differences of the first. On a GPU the adjoint gathers that of A first (`gathers`). tau is the Kirchhoff stress
+against differences of the first. On a GPU the adjoint gathers that of A first (`gathers`), and computes A again
+where that is little, so that no substep keeps it. tau is the Kirchhoff stress
 J sigma [Pa].
 """
 
@@ -34,6 +35,7 @@ class Fluid:
     bulk: float
     viscosity: float
     smoothing: float = 0.0
+    keeps_affine_momentum: ClassVar[bool] = False
 
     def volume_ratio(self, pressure: np.ndarray) -> np.ndarray:
         """Return J at which the fluid bears `pressure` [Pa], counted on its reference volume."""
@@ -43,7 +45,7 @@ class Fluid:
         """Return (update, adjoint) for one precision: those whose threads have `rows`, in float32, or for `columns`."""
         if rows and name == "float32":
             return fluid_cpu.kernels_in_rows()
-        return _choose(name, *fluid.kernels(name), columns=columns, blocks=5)
+        return _choose(name, fluid.kernels(name), columns=columns, blocks=5)
 
     def constants(self) -> tuple[float, ...]:
         """Return what the kernels take besides state and motion."""
@@ -94,6 +96,8 @@ class _Solid:
 class Elastic(_Solid):
     """A compressible neo-Hookean solid."""
 
+    keeps_affine_momentum: ClassVar[bool] = False
+
     @classmethod
     def with_wave_speed(cls, density: float, speed: float, *, poisson: float) -> "Elastic":
         """Return the solid in which pressure waves travel at `speed` [m/s]."""
@@ -102,7 +106,7 @@ class Elastic(_Solid):
 
     def kernels(self, name: str, *, rows: bool = False, columns: bool = False) -> tuple[Any, Any]:
         """Return (update, adjoint) for one precision, or for `columns`; there are none whose threads have rows."""
-        return _choose(name, *elastic.kernels(name), columns=columns)
+        return _choose(name, elastic.kernels(name), columns=columns)
 
     def constants(self) -> tuple[float, ...]:
         """Return what the kernels take besides state and motion."""
@@ -114,12 +118,13 @@ class Plasticine(_Solid):
     """A fixed-corotated solid that yields by von Mises at `yield_stress` [Pa]: its shape flows, its volume returns."""
 
     yield_stress: float
+    keeps_affine_momentum: ClassVar[bool] = True
 
     def kernels(self, name: str, *, rows: bool = False, columns: bool = False) -> tuple[Any, Any]:
         """Return (update, adjoint) for one precision: those whose threads have `rows`, in float32, or for `columns`."""
         if rows and name == "float32":
             return plasticine_cpu.kernels_in_rows()
-        return _choose(name, *plasticine.kernels(name), columns=columns)
+        return _choose(name, plasticine.kernels(name), columns=columns)
 
     def constants(self) -> tuple[float, ...]:
         """Return what the kernels take besides state and motion; the last is the largest deviatoric log strain."""
@@ -129,5 +134,6 @@ class Plasticine(_Solid):
 Material = Fluid | Elastic | Plasticine
 
 
-def _choose(name: str, update: Any, adjoint: Any, turn_back: Any, *, columns: bool, blocks: int = 4) -> tuple[Any, Any]:
-    return update, after_p2g(name, turn_back, blocks) if columns else adjoint
+def _choose(name: str, found: tuple[Any, Any, Any, Any], *, columns: bool, blocks: int = 4) -> tuple[Any, Any]:
+    update, adjoint, turn_back, affine_momentum = found
+    return update, after_p2g(name, turn_back, affine_momentum, blocks) if columns else adjoint

@@ -17,7 +17,7 @@ from ...runtime import precision
 from ..gathers import adjoint_gatherer
 from ..layout import layout
 
-GATHERED = "lattice, mass, x, v, A, adj_grid_m, adj_x, adj_v"
+GATHERED = "lattice, mass, x, v, a, adj_grid_m, adj_x, adj_v"
 
 
 @cache
@@ -34,28 +34,33 @@ def alone(name: str, turn_back: Any) -> Any:
 
 
 @cache
-def after_p2g(name: str, turn_back: Any, count: int) -> Any:
+def after_p2g(name: str, turn_back: Any, affine_momentum: Any | None, count: int) -> Any:
     """Return the kernel that gathers a particle's adjoints of p2g first.
 
-    It takes the lattice, x, v, A, adj_grid_m, adj_x and adj_v, and then what the other does, but for adj_A. So many
-    blocks as `count` are to find registers at once.
+    It takes A, unless `affine_momentum` computes it again, the lattice, x, v, adj_grid_m, adj_x and adj_v, and then
+    what the other does, but for adj_A. So many blocks as `count` are to find registers at once.
     """
-    gather_back, found = adjoint_gatherer(name), blocks(name, count)
+    gather_back, read_matrix, found = adjoint_gatherer(name), layout(name).read_matrix, blocks(name, count)
+    mat33 = precision(name).mat33
     gathered = dict(zip(GATHERED.split(", "), gather_back.input_types.values(), strict=False))
+    del gathered["a"]
     own = {key: kind for key, kind in _taken(turn_back).items() if key != "adj_a"}
-    kinds = {key: kind for key, kind in gathered.items() if key not in own} | own
+    a, kept = "read_matrix(A, e, first + p)", {"A": wp.array2d[mat33]}
+    if affine_momentum:
+        a, kept = f"affine_momentum({', '.join(_taken(affine_momentum))}, e, p)", {}
+    kinds = {key: kind for key, kind in (kept | gathered).items() if key not in own} | own
 
     def kernel() -> Any:
-        return gather_back, turn_back  # which Warp finds here by their names
+        return gather_back, turn_back, affine_momentum, read_matrix  # which Warp finds here by their names
 
     bounds = {"grid_stride": False} | ({"launch_bounds": found} if found else {})
-    adj_a = f"gather_back({GATHERED}, e, first + p)"
+    adj_a = f"gather_back({GATHERED.replace(' a,', f' {a},')}, e, first + p)"
     return _kernel(kernel, kinds, adj_a, turn_back, called="_after_p2g", module=".columns", **bounds)
 
 
-def _taken(turn_back: Any) -> dict[str, Any]:
-    """Return the arguments of `turn_back` and their kinds, but for the environment and the particle."""
-    return dict(list(turn_back.input_types.items())[:-2])
+def _taken(function: Any) -> dict[str, Any]:
+    """Return the arguments of a function and their kinds, but for the environment and the particle."""
+    return dict(list(function.input_types.items())[:-2])
 
 
 def _kernel(

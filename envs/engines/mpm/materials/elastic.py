@@ -12,8 +12,8 @@ from .adjoints import alone
 
 @cache
 @no_type_check
-def kernels(name: str) -> tuple[Any, Any, Any]:
-    """Return the kernels (update, adjoint), and what the second does with the adjoint of A of a particle.
+def kernels(name: str) -> tuple[Any, Any, Any, Any]:
+    """Return the kernels (update, adjoint), what the second does with a particle's adjoint of A, and a particle's A.
 
     F' = (I + dt C) F, tau = mu (F' F'^T - I) + lam log(det F') I.
     """
@@ -21,6 +21,30 @@ def kernels(name: str) -> tuple[Any, Any, Any]:
     real, mat33 = types.real, types.mat33
     module = f"gradscape.elastic.{name}"
     read_matrix, write_matrix = layout(name).read_matrix, layout(name).write_matrix
+
+    @wp.func(module=module)
+    def stretch(dt: real, F: mat33, C: mat33) -> mat33:
+        return F + dt * C * F
+
+    @wp.func(module=module)
+    def affine_momentum(
+        first: int,
+        dt: real,
+        scale: real,
+        mu: real,
+        lam: real,
+        mass: wp.array2d[real],
+        volume: wp.array2d[real],
+        F: wp.array2d[mat33],
+        C: wp.array2d[mat33],
+        e: int,
+        p: int,
+    ) -> mat33:
+        c = read_matrix(C, e, first + p)
+        f = stretch(dt, read_matrix(F, e, p), c)
+        identity = wp.identity(n=3, dtype=real)
+        tau = mu * (f * wp.transpose(f) - identity) + lam * wp.log(wp.determinant(f)) * identity
+        return scale * volume[e, first + p] * tau + mass[e, first + p] * c
 
     @wp.kernel(module=module, enable_backward=False)
     def update(
@@ -37,12 +61,9 @@ def kernels(name: str) -> tuple[Any, Any, Any]:
         A: wp.array2d[mat33],
     ):
         e, p = wp.tid()
-        c, before = read_matrix(C, e, first + p), read_matrix(F, e, p)
-        f = before + dt * c * before
-        identity = wp.identity(n=3, dtype=real)
-        tau = mu * (f * wp.transpose(f) - identity) + lam * wp.log(wp.determinant(f)) * identity
-        write_matrix(F_new, e, p, f)
-        write_matrix(A, e, first + p, scale * volume[e, first + p] * tau + mass[e, first + p] * c)
+        a = affine_momentum(first, dt, scale, mu, lam, mass, volume, F, C, e, p)
+        write_matrix(F_new, e, p, stretch(dt, read_matrix(F, e, p), read_matrix(C, e, first + p)))
+        write_matrix(A, e, first + p, a)
 
     @wp.func(module=module)
     def turn_back(
@@ -75,4 +96,4 @@ def kernels(name: str) -> tuple[Any, Any, Any]:
         write_matrix(adj_F, e, p, wp.transpose(advance) * adj_f)
         write_matrix(adj_C, e, first + p, mass[e, first + p] * adj_a + dt * adj_f * wp.transpose(before))
 
-    return update, alone(name, turn_back), turn_back
+    return update, alone(name, turn_back), turn_back, affine_momentum

@@ -14,8 +14,8 @@ TORN = 1.04  # volume ratio at which a fluid tears
 
 @cache
 @no_type_check
-def kernels(name: str) -> tuple[Any, Any, Any]:
-    """Return the kernels (update, adjoint), and what the second does with the adjoint of A of a particle.
+def kernels(name: str) -> tuple[Any, Any, Any, Any]:
+    """Return the kernels (update, adjoint), what the second does with a particle's adjoint of A, and a particle's A.
 
     J' = min(exp(dt tr C) J, TORN), tau = K log J' I + J' mu (C + C^T - 2/3 tr C I).
     """
@@ -27,6 +27,29 @@ def kernels(name: str) -> tuple[Any, Any, Any]:
     @wp.func(module=module)
     def shear(C: mat33) -> mat33:
         return C + wp.transpose(C) - (real(2.0) / real(3.0)) * wp.trace(C) * wp.identity(n=3, dtype=real)
+
+    @wp.func(module=module)
+    def grow(dt: real, J: real, C: mat33) -> real:
+        return wp.min(wp.exp(dt * wp.trace(C)) * J, real(TORN))
+
+    @wp.func(module=module)
+    def affine_momentum(
+        first: int,
+        dt: real,
+        scale: real,
+        bulk: real,
+        viscosity: real,
+        mass: wp.array2d[real],
+        volume: wp.array2d[real],
+        J: wp.array2d[real],
+        C: wp.array2d[mat33],
+        e: int,
+        p: int,
+    ) -> mat33:
+        c = read_matrix(C, e, first + p)
+        j = grow(dt, J[e, p], c)
+        tau = bulk * wp.log(j) * wp.identity(n=3, dtype=real) + j * viscosity * shear(c)
+        return scale * volume[e, first + p] * tau + mass[e, first + p] * c
 
     @wp.kernel(module=module, enable_backward=False)
     def update(
@@ -43,11 +66,9 @@ def kernels(name: str) -> tuple[Any, Any, Any]:
         A: wp.array2d[mat33],
     ):
         e, p = wp.tid()
-        c = read_matrix(C, e, first + p)
-        j = wp.min(wp.exp(dt * wp.trace(c)) * J[e, p], real(TORN))
-        tau = bulk * wp.log(j) * wp.identity(n=3, dtype=real) + j * viscosity * shear(c)
-        J_new[e, p] = j
-        write_matrix(A, e, first + p, scale * volume[e, first + p] * tau + mass[e, first + p] * c)
+        a = affine_momentum(first, dt, scale, bulk, viscosity, mass, volume, J, C, e, p)
+        J_new[e, p] = grow(dt, J[e, p], read_matrix(C, e, first + p))
+        write_matrix(A, e, first + p, a)
 
     @wp.func(module=module)
     def turn_back(
@@ -78,4 +99,4 @@ def kernels(name: str) -> tuple[Any, Any, Any]:
         dilation = dt * j * adj_j * wp.identity(n=3, dtype=real)
         write_matrix(adj_C, e, first + p, mass[e, first + p] * adj_a + j * viscosity * shear(g) + dilation)
 
-    return update, alone(name, turn_back), turn_back
+    return update, alone(name, turn_back), turn_back, affine_momentum

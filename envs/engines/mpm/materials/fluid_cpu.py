@@ -73,5 +73,5 @@ ADJOINT = (
 @cache
 def kernels_in_rows() -> tuple[Any, Any]:
     """Return (update, adjoint), each of whose threads has the row of an environment."""
-    (update, adjoint, _), module = kernels("float32"), "gradscape.fluid.rows"
+    (update, adjoint, *_), module = kernels("float32"), "gradscape.fluid.rows"
     return kernel_in_rows(update, UPDATE, "J", module), kernel_in_rows(adjoint, ADJOINT, "J", module)

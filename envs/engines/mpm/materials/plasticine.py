@@ -27,8 +27,11 @@ ROUNDED = 1e-8  # added to |d|^2, so that an undeformed body has a gradient
 
 @cache
 @no_type_check
-def kernels(name: str) -> tuple[Any, Any, Any]:
-    """Return the kernels (update, adjoint), and what the second does with the adjoint of A of a particle."""
+def kernels(name: str) -> tuple[Any, Any, Any, None]:
+    """Return the kernels (update, adjoint), what the second does with a particle's adjoint of A, and None.
+
+    A particle's A would take another decomposition, so that there is no function for it.
+    """
     types = precision(name)
     real, vec3, mat33 = types.real, types.vec3, types.mat33
     module = f"gradscape.plasticine.{name}"
@@ -176,4 +179,4 @@ def kernels(name: str) -> tuple[Any, Any, Any]:
         adj_c = mass[n, first + p] * adj_a + dt * adj_trial * wp.transpose(before)
         write_matrix(adj_C, n, first + p, adj_c)
 
-    return update, alone(name, turn_back), turn_back
+    return update, alone(name, turn_back), turn_back, None
