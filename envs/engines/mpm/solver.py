@@ -40,7 +40,7 @@ from .transfers_columns import transfers_of_columns
 from .transfers_cpu import transfers_on_cpu
 
 CROWD = 8_000  # particles that hide what a launch costs on one core
-BUSY, FULL_CARD = 400_000, 1_000_000  # particles that keep a GPU busy; more than which gain nothing
+BUSY, FULL_CARD = 400_000, 1_310_000  # particles that keep a GPU busy; more than which gain nothing
 WHOLE_EPISODE = 192e6  # bytes up to which a CPU stores an episode whole
 LAUNCHES = 200_000  # particles up to which launches cost a GPU more than what they launch
 SPARE = 0.85  # part of a GPU's free memory that control steps are kept in

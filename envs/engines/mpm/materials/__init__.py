@@ -6,9 +6,8 @@ has two kernels: `update` advances the state by the affine velocity C and fills 
     S' = deform(S, C),    A = -dt V 4/dx^2 tau(S', C) + m C,
 
 and `adjoint` turns the adjoints of S' and A into those of S and C. Both are written by hand; the tests hold the second
-against differences of the first. On a GPU the adjoint gathers that of A first (`gathers`), and computes A again
-where that is little, so that no substep keeps it. tau is the Kirchhoff stress
-J sigma [Pa].
+against differences of the first. On a GPU the adjoint gathers that of A first (`gathers`); a fluid's and
+an elastic solid's computes A again as well, so that no substep has to keep it. tau is the Kirchhoff stress J sigma [Pa].
 """
 
 from dataclasses import dataclass
