@@ -7,7 +7,7 @@ has two kernels: `update` advances the state by the affine velocity C and fills 
 
 and `adjoint` turns the adjoints of S' and A into those of S and C. Both are written by hand; the tests hold the second
 against differences of the first. On a GPU the adjoint gathers that of A first (`gathers`); a fluid's and
-an elastic solid's computes A again as well, so that no substep has to keep it. tau is the Kirchhoff stress J sigma [Pa].
+an elastic solid's computes A again, too, so that no substep has to keep it. tau is the Kirchhoff stress J sigma [Pa].
 """
 
 from dataclasses import dataclass
