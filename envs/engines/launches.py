@@ -61,12 +61,13 @@ class _Streams(dict[int, wp.Stream]):
 class _Sequence:
     """Launches in their order, as they were made for one `extent`.
 
-    `located` are those whose first argument says where that lies, `sized` those whose dimensions a function of it says.
+    `located` are those of which an argument says where that lies, with its number, `sized` those whose dimensions a
+    function of it says.
     """
 
     extent: Any
     launches: list[Any] = field(default_factory=list)
-    located: list[Any] = field(default_factory=list)
+    located: list[tuple[Any, int]] = field(default_factory=list)
     sized: list[tuple[Any, Callable[[Any], tuple[int, int]]]] = field(default_factory=list)
 
     def run(self) -> None:
@@ -108,8 +109,8 @@ class _Sequence:
         """Make the launches run over another extent."""
         if extent != self.extent:
             self.extent = None  # of launches of which only some were moved, should this be interrupted
-            for command in self.located:
-                command.set_param_at_index(0, place)
+            for command, argument in self.located:
+                command.set_param_at_index(argument, place)
             for command, dim in self.sized:
                 command.set_dim(dim(extent))
             self.extent = extent
@@ -132,7 +133,7 @@ class Launches:
         self.streams = _Streams(device)
 
     def run(self, key: Hashable, extent: Hashable, work: Callable[[], None], *, place: Any = None, small: bool) -> None:
-        """Do `work` over an extent, and say to launches that ask for it by their first argument which `place` that is.
+        """Do `work` over an extent, and say to launches that take it as an argument which `place` that is.
 
         Where work is `small`, a GPU records it when it comes again over the same extent.
         """
@@ -160,8 +161,9 @@ class Launches:
         size = dim(self._recording.extent) if callable(dim) else dim
         how |= {"record_tape": False, "record_cmd": True, "block_dim": BLOCK}
         command = wp.launch(kernel, size, inputs, device=self.device, **how)
-        if self._place is not None and inputs[0] is self._place:
-            self._recording.located.append(command)
+        if self._place is not None:
+            places = (number for number, argument in enumerate(inputs) if argument is self._place)
+            self._recording.located += [(command, number) for number in places]
         if callable(dim):
             self._recording.sized.append((command, dim))
         self._recording.launches.append(command)

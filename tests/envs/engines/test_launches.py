@@ -83,6 +83,22 @@ def test_launches_of_which_some_were_moved_are_all_moved_again():
     assert launched == [1, 1]
 
 
+def test_launches_are_told_where_their_work_lies_by_whichever_argument_asks_for_it():
+    @wp.kernel
+    def note(found: wp.array[int], where: int, when: int):
+        found[wp.tid()] = 10 * where + when
+
+    launches, found, first, when = Launches("cpu"), wp.zeros(1, dtype=int, device="cpu"), wp.int32(300), wp.int32(5)
+
+    def work():
+        launches.launch(note, (1, 1), [found, first, when])
+
+    launches.run("key", 1, work, place=first, small=True)
+    assert found.numpy().tolist() == [3005]
+    launches.run("key", 2, work, place=wp.int32(400), small=True)
+    assert found.numpy().tolist() == [4005]
+
+
 @pytest.mark.parametrize("small", [True, False])
 def test_a_gpu_runs_beside_each_other_what_does_not_wait_for_each_other(monkeypatch, small):
     class Stream:
