@@ -1,6 +1,7 @@
 """What MLS-MPM stores of an episode: the particles of an instant, the grids of a substep, a control step whole."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, TypeVar
 
 import warp as wp
@@ -43,6 +44,7 @@ class Allocator:
     def __init__(self, model: Model, capacity: int, device: str, *, columns: bool = False) -> None:
         self.model, self.capacity, self.device, self.columns = model, capacity, device, columns
         self.types = precision(model.precision)
+        self.keeps_affine_momentum = model.keeps_affine_momentum or not columns
 
     def array(self, dtype: Any, size: int) -> wp.array:
         """Return zeros [environment, element]."""
@@ -75,6 +77,11 @@ class Allocator:
         """Return zeros for A, [environment, particle]."""
         return self.array(self.types.mat33, self.model.particles)
 
+    @cached_property
+    def latest_affine_momentum(self) -> wp.array:
+        """A of the latest substep, for all tapes together, where no material keeps it."""
+        return self.affine_momentum()
+
     def lists(self, segments: int) -> Lists:
         """Return lists of no particles."""
         full: wp.array = wp.zeros(self.capacity, dtype=wp.int32, device=self.device)
@@ -94,6 +101,11 @@ class Allocator:
         return wp.zeros((self.capacity * LANES, count), dtype=wp.int64, device=self.device)
 
 
+def segment_room(box: Box) -> int:
+    """Return how many segments to make room for where a box is needed."""
+    return segments(box) * 5 // 4
+
+
 class Cycle(list[T]):
     """A list that begins again behind its end."""
 
@@ -105,9 +117,9 @@ class Cycle(list[T]):
 class Tape:
     """Hold one control step whole: frames between its ends, grids of its substeps, and where they lie.
 
-    A is that of every substep, or of the latest where no material keeps it. Of what is smoothed before the step the
-    state is there, and, of sums by columns, the `means` that nodes hold. Of a step in `pieces` it holds the frames at
-    which these begin; for all else pieces share the room of one.
+    A is that of every substep where a material keeps it. Of what is smoothed before the step the state is there, and,
+    of sums by columns, the `means` that nodes hold. Of a step in `pieces` it holds the frames at which these begin; for
+    all else pieces share the room of one.
     """
 
     def __init__(self, allocator: Allocator, cells: int = 1, pieces: int = 1) -> None:
@@ -118,8 +130,8 @@ class Tape:
         self.frames = [inner[s % held - 1] if s % held else allocator.frame() for s in range(1, model.substeps)]
         self.smoothed = allocator.smoothed()
         self.means = {b: allocator.nodes(cells) for b in self.smoothed if allocator.columns}
-        kept = held if model.keeps_affine_momentum or not allocator.columns else 1
-        self.A: Cycle[wp.array] = Cycle(allocator.affine_momentum() for _ in range(kept))
+        self._kept = [allocator.affine_momentum() for _ in range(held if allocator.keeps_affine_momentum else 0)]
+        self.A: Cycle[wp.array] = Cycle(self._kept or [allocator.latest_affine_momentum])
         self.grids: Cycle[Grid] = Cycle(allocator.grid(cells) for _ in range(held))
         self.lists: Cycle[Lists] = Cycle(allocator.lists(1) for _ in range(held if allocator.columns else 0))
         self.box, self.lattice = NOWHERE, place_grid(model)
@@ -130,21 +142,20 @@ class Tape:
         """What its arrays take."""
         frames = [array for frame in set(self.frames) for array in frame.arrays()]
         lists = [array for one in self.lists for array in one.arrays()]
-        return sum(array.capacity for array in (*frames, *self.smoothed.values(), *self.A, *self._nodes, *lists))
+        return sum(array.capacity for array in (*frames, *self.smoothed.values(), *self._kept, *self._nodes, *lists))
 
     def growth(self, box: Box) -> int:
         """Return the bytes that a box of nodes takes beyond those that are there, 0 where these suffice."""
         if box == self.box:
             return 0
         more_cells = self.room(box) - self._cells if self._cells < box.cells else 0
-        more_segments = segments(box) * 5 // 4 - self._segments if self.lists and self._segments < segments(box) else 0
+        more_segments = segment_room(box) - self._segments if self.lists and self._segments < segments(box) else 0
         return self._bytes_of(more_cells, more_segments)
 
     def bytes_on(self, box: Box) -> int:
         """Return the bytes that a tape like this takes that is made for a box of nodes."""
-        if not self.lists:
-            return self.bytes + self._bytes_of(self.room(box) - self._cells, 0)
-        return self.bytes + self._bytes_of(self.room(box) - self._cells, segments(box) * 5 // 4 - self._segments)
+        more_segments = segment_room(box) - self._segments if self.lists else 0
+        return self.bytes + self._bytes_of(self.room(box) - self._cells, more_segments)
 
     def start(self, checkpoint: Frame) -> Frame:
         """Return the frame that the control step starts from: the checkpoint, with the states that are smoothed."""
@@ -164,7 +175,7 @@ class Tape:
                 self.means[body] = self._allocator.nodes(0)
                 self.means[body] = self._allocator.nodes(self.room(box))
         if self.lists and self._segments < segments(box):
-            self.lists = Cycle(self._allocator.lists(segments(box) * 5 // 4) for _ in self.lists)
+            self.lists = Cycle(self._allocator.lists(segment_room(box)) for _ in self.lists)
         self.step, self.box, self.lattice = step, box, place_grid(self._allocator.model, box)
 
     @property

@@ -85,9 +85,11 @@ class Model:
         state = sum(len(body.x) * (1 if isinstance(body.material, Fluid) else 9) for body in self.bodies)
         frame = 15 * self.particles + state  # x, v, C and each material's own
         nodes = min(self.cells, nodes_around(self, *self.corners, BOX_MARGIN).cells * 2)
-        substep = frame + 8 * nodes + (9 * self.particles if self.keeps_affine_momentum or not columns else 0)
+        kept = self.keeps_affine_momentum or not columns
+        substep = frame + 8 * nodes + 9 * self.particles * kept
         stored = tapes * self.piece(pieces)
         numbers = (self.steps + 3 + tapes * (pieces - 1)) * frame + (stored + 1) * substep
+        numbers += 9 * self.particles * (not kept)
         if not columns:
             return self.real_bytes * numbers
         means = 4 * tapes * sum(body.material.smoothing > 0 for body in self.bodies)

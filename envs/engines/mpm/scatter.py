@@ -9,7 +9,7 @@ import warp as wp
 
 from ..runtime import load
 from .cells import SEGMENT, SIZES, Lists, cell_kernels, segments, warps
-from .checkpoints import Frame
+from .checkpoints import Frame, segment_room
 from .columns import CPU_TEAM, GPU_TEAM, column_kernels
 from .model import Box
 from .walk import PARTS
@@ -103,11 +103,10 @@ class ByColumns:
 
     def make_room(self, box: Box) -> bool:
         """Make room for a box of nodes, and say whether arrays were replaced."""
-        wanted = segments(box)
-        if wanted * PARTS <= self.parts.shape[1]:
+        if segments(box) * PARTS <= self.parts.shape[1]:
             return False
         self._allocate(0)  # the old ones go first
-        self._allocate(wanted * 5 // 4)
+        self._allocate(segment_room(box))
         return True
 
     def begin(self) -> None:

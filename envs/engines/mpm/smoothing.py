@@ -29,9 +29,7 @@ class Smoother:
         model, material = solver.model, solver.model.bodies[body].material
         self.body, self.first, self.size = body, solver.first[body], solver.size(body)
         self.slope, self.share = hydrostatic_slope(model, body), material.smoothing
-        self.kernels: Any = smoothing_on_cpu(model.precision)
-        room = model.cells + 1  # a CPU reads and writes four numbers where three are meant
-        self.nodes = [solver.allocator.array(solver.types.real, room) for _ in range(3)]  # amount, weight, adj_mean
+        self._prepare(solver)
 
     def run(self, solver: Any, step: int, batch: int) -> None:
         """Fill the tape's first state from the checkpoint's."""
@@ -53,16 +51,22 @@ class Smoother:
         inputs = [tape.lattice, self.first, self.slope, self.share, solver.orders[step].volume, x, J, *self.nodes]
         solver.launch(self.kernels.adjoint_spread, self.size, batch, [*inputs, adj_J, adj_x])
 
+    def _prepare(self, solver: Any) -> None:
+        self.kernels: Any = smoothing_on_cpu(solver.model.precision)
+        room = solver.model.cells + 1  # a CPU reads and writes four numbers where three are meant
+        self.nodes = [solver.allocator.array(solver.types.real, room) for _ in range(3)]  # amount, weight, adj_mean
+
     def _sums(self, solver: Any, step: int) -> list[Any]:
         """Return what `_spread` fills."""
         return self.nodes[:2]
 
     def _spread(self, solver: Any, step: int, batch: int) -> None:
         """Fill `amount` and `weight`."""
-        for values in self.nodes[:2]:
+        sums = self._sums(solver, step)
+        for values in sums:
             solver.launch_on_box(self.kernels.clear, nodes, batch, [values])
         inputs = [solver.tape(step).lattice, self.first, self.slope, solver.orders[step].volume]
-        inputs += [*self._particles(solver, step), *self.nodes[:2]]
+        inputs += [*self._particles(solver, step), *sums]
         solver.launch(self.kernels.spread, self.size, batch, inputs)
 
     def _particles(self, solver: Any, step: int) -> tuple[Any, Any]:
@@ -76,11 +80,6 @@ class ColumnSmoother(Smoother):
     The tape keeps what nodes hold, so that the way back need not add it up again.
     """
 
-    def __init__(self, solver: Any, body: int) -> None:
-        super().__init__(solver, body)
-        self.kernels = smoothing_columns(solver.model.precision, solver.scatter.team)
-        self.nodes = []
-
     def run_back(self, solver: Any, step: int, batch: int, adjoint: Any) -> None:
         """Turn the adjoint of the tape's first state into that of the checkpoint's, and add to that of x."""
         tape, (x, J), nodes = solver.tape(step), self._particles(solver, step), self._sums(solver, step)
@@ -91,6 +90,9 @@ class ColumnSmoother(Smoother):
         solver.scatter.add_up(self.kernels.add_up_adjoint, step, 0, batch, nodes)
         inputs = [tape.lattice, self.first, self.slope, self.share, solver.orders[step].volume, x, J, *nodes]
         solver.launch(self.kernels.adjoint_spread, self.size, batch, [*inputs, adj_J, adj_x])
+
+    def _prepare(self, solver: Any) -> None:
+        self.kernels = smoothing_columns(solver.model.precision, solver.scatter.team)
 
     def _sums(self, solver: Any, step: int) -> list[Any]:
         """Return what nodes hold of the body."""

@@ -97,6 +97,11 @@ def masses(model):
     return torch.cat([torch.from_numpy(body.mass) for body in model.bodies])
 
 
+def lumps(*materials):
+    """Return two lumps on a floor."""
+    return tuple(block(each, (x, 0.1, 0.0), count=3) for each, x in zip(materials, (-0.12, 0.09), strict=True))
+
+
 def kneading(**changes):
     """Return a model of two lumps of clay on a floor, with a ball and a roller, and paths that press and drag them."""
     room = ToolsInRoom(
@@ -107,9 +112,9 @@ def kneading(**changes):
         friction=0.5,
         softness=60.0,
     )
-    lumps = tuple(block(replace(CLAY, yield_stress=50.0), (x, 0.1, 0.0), count=3) for x in (-0.12, 0.09))
+    clay = replace(CLAY, yield_stress=50.0)
     model = free_model(
-        bodies=lumps, boundary=room, origin=(-0.7, 0.0, -0.4), nodes=(29, 16, 17), gravity=GRAVITY, steps=4
+        bodies=lumps(clay, clay), boundary=room, origin=(-0.7, 0.0, -0.4), nodes=(29, 16, 17), gravity=GRAVITY, steps=4
     )
     model = replace(model, **changes)
     generator = torch.Generator().manual_seed(5)

@@ -15,7 +15,7 @@ from gradscape.envs.engines.mpm.solver import Solver
 from gradscape.envs.engines.runtime import cuda_available, to_torch
 from gradscape.envs.mpm.fluid import Fluid
 
-from .bodies import CLAY, SPONGE, SYRUP, block, free_model, kneaded, kneading, over_time, solved, stirred, weights
+from .bodies import CLAY, SPONGE, SYRUP, free_model, kneaded, kneading, lumps, over_time, solved, stirred, weights
 
 GPU = pytest.mark.skipif(not cuda_available(), reason="no CUDA device")
 
@@ -63,8 +63,7 @@ def test_an_episode_kept_whole_and_one_repeated_step_by_step_give_the_same_bits(
 @pytest.mark.parametrize("materials", [(CLAY, CLAY), (SYRUP, SPONGE), (SYRUP, CLAY)])
 def test_an_episode_is_the_same_after_one_elsewhere(materials, columns):
     """The second is run by the launches of the first, on other nodes."""
-    bodies = tuple(block(each, (x, 0.1, 0.0), count=3) for each, x in zip(materials, (-0.12, 0.09), strict=True))
-    model, paths = kneading(bodies=bodies)
+    model, paths = kneading(bodies=lumps(*materials))
     adj_x = {2: weights(model, 3, 5), model.steps: weights(model, 3, 6)}
     fresh = kneaded(model, paths, adj_x, columns=columns)
     solver = Solver(model, capacity=3, device="cpu", columns=columns)

@@ -11,7 +11,7 @@ from gradscape.envs.engines.mpm.cells import SEGMENT, SIZES, STEP, segments
 from gradscape.envs.engines.mpm.model import Body, Box, place_grid
 from gradscape.envs.engines.runtime import to_torch
 
-from .bodies import CLAY, SPONGE, SYRUP, block, kneaded, kneading, stirred, weights
+from .bodies import CLAY, SPONGE, SYRUP, kneaded, kneading, lumps, stirred, weights
 from .listing import Listing
 
 
@@ -31,8 +31,7 @@ def test_clay_under_tools_moves_as_in_place():
 @pytest.mark.parametrize("materials", [(SYRUP, SPONGE), (SPONGE, CLAY)])
 def test_bodies_of_all_materials_move_as_in_place(materials):
     """Of a fluid and an elastic solid the way back computes A again; a substep keeps it if another body needs it."""
-    bodies = tuple(block(each, (x, 0.1, 0.0), count=3) for each, x in zip(materials, (-0.12, 0.09), strict=True))
-    model, paths = kneading(bodies=bodies)
+    model, paths = kneading(bodies=lumps(*materials))
     adj_x = {model.steps: weights(model, 3, 6)}
     wanted, got = (kneaded(model, paths, adj_x, columns=columns) for columns in (False, True))
     assert len(wanted[0].tapes[0].A) == model.substeps
