@@ -130,13 +130,13 @@ class Fluid(MpmScene):
         """Return where the cube's centre is at the end of the episode [m]."""
         with self._solvers.lend() as stage:
             parts = torch.split(self._check_points(x), self._capacity)
-            return torch.cat([self._center(stage.solver.run(self.tools(part)).double().cpu()) for part in parts])
+            return torch.cat([self._center(stage.solver.run(self.tools(part))) for part in parts])
 
     def _model(self) -> Model:
         return _model(self.fidelity, self.options)
 
     def _losses(self, stage: Stage, step: int, end: Tensor, paths: Tensor) -> Float[Tensor, " batch"]:
-        return self._loss(self._center(end.double().cpu()), paths[:, step, 0].cpu())
+        return self._loss(self._center(end), paths[:, step, 0].cpu())
 
     def _length_scale(self, tools: Float[Tensor, "batch step_plus_1 1 3"], points: int) -> float:
         return TANK_WIDTH / 2
@@ -162,7 +162,8 @@ class Fluid(MpmScene):
         )
 
     def _center(self, end: Float[Tensor, "batch particle 3"]) -> Float[Tensor, "batch 3"]:
-        return end[:, len(self.model.bodies[0].x) :].mean(dim=1)
+        """Return the cube's centre, on a CPU, where sums have one order: of a GPU's particles few are its own."""
+        return end[:, len(self.model.bodies[0].x) :].cpu().double().mean(dim=1)
 
     def _loss(self, cube: Float[Tensor, "batch 3"], ladle: Float[Tensor, "batch 3"]) -> Float[Tensor, " batch"]:
         depth = TANK_HEIGHT - cube[:, 1] if self.options.goal == "high" else cube[:, 1] - TANK_HEIGHT

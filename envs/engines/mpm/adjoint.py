@@ -72,13 +72,11 @@ class Adjoint:
             solver.launch(self.settle, 6 * solver.model.boundary.slots, batch, [step, solver.sums, self.tools_by_axis])
 
     def _substeps_back(self, step: int, batch: int, substeps: range) -> None:
-        solver = self.solver
-        tape, frames = solver.tape(step), solver.frames(step)
+        solver, frames = self.solver, self.solver.frames(step)
         for s in reversed(substeps):
             solver.scatter.adjoint_g2p(step, s, frames[s], self.new, self.grid.v, self.old.x, batch)
             self._adjoint_velocity(step, s, batch)
-            solver.launches.join()
-            self._adjoint_p2g(step, frames[s], tape.A[s], batch)
+            self._adjoint_p2g(step, s, frames[s], batch)
             self.new, self.old = self.old, self.new
 
     def _adjoint_velocity(self, step: int, substep: int, batch: int) -> None:
@@ -89,19 +87,19 @@ class Adjoint:
         how = {"adj_inputs": adjoints, "adj_outputs": [], "adjoint": True}
         solver.launch_on_box(solver.velocity, nodes, batch, inputs, **how)
 
-    def _adjoint_p2g(self, step: int, frame: Frame, A: wp.array, batch: int) -> None:
+    def _adjoint_p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
         """Launch the adjoint of p2g, and those of the materials after it or as its continuation."""
-        solver, old = self.solver, self.old
-        lattice, mass = solver.tape(step).lattice, solver.orders[step].mass
-        given = self.grid.m, old.x, old.v
+        solver, tape, old, new = self.solver, self.solver.tape(step), self.old, self.new
+        A, given = tape.A[substep], [self.grid.m, old.x, old.v]
         if not solver.columns:
-            inputs = [lattice, mass, frame.x, frame.v, A, *given, self.A]
+            inputs = [tape.lattice, solver.orders[step].mass, frame.x, frame.v, A, *given, self.A]
             solver.launch(solver.kernels.adjoint_p2g, solver.model.particles, batch, inputs)
         for b, (_, adjoint) in enumerate(solver.materials):
-            inputs = [*solver.material_inputs(b, step, frame), self.new.S[b]]
+            inputs = [*solver.material_inputs(b, step, frame), new.S[b]]
             if solver.columns:
                 kept = [A] if solver.model.bodies[b].material.keeps_affine_momentum else []
-                inputs = [*kept, lattice, frame.x, frame.v, *given, *inputs]
+                moved = tape.grids[substep].v, new.x, new.v, new.C
+                inputs = [*kept, tape.lattice, frame.x, frame.v, *given, *moved, *inputs]
             else:
                 inputs += [self.A]
             with solver.beside_others(b):

@@ -5,6 +5,8 @@ lists its particles by cell, and those of a cell as they lie in memory. SEGMENT 
 SEGMENT on, make a segment, whose particles come one after the other in the list. Where in the list they are, chance
 may decide: nothing depends on it. Segments themselves are listed from those with most particles to those with fewest,
 by steps of STEP, so that threads that work on neighbours in the list have as much to do.
+
+A particle whose place is not finite is listed nowhere. Were all such in one cell, each would be held against all.
 """
 
 from dataclasses import dataclass
@@ -152,8 +154,11 @@ def counter(name: str):
         depth = (lattice.first[2] + lattice.nz - 1) / SEGMENT - bottom + 1
         column = (base[0] - lattice.first[0]) * lattice.ny + base[1] - lattice.first[1]
         cell = (column * depth - bottom) * SEGMENT + base[2]
-        cells[e, p] = cell
-        numbers[e, p] = take_number(counts, e, cell)
+        if wp.isfinite(x):
+            cells[e, p] = cell
+            numbers[e, p] = take_number(counts, e, cell)
+        else:
+            cells[e, p] = -1
 
     return count_in_cell
 
@@ -253,7 +258,9 @@ def cell_kernels(name: str) -> SimpleNamespace:
         e, p = wp.tid()
         if p == 0:
             full[e] = used[e, 1]
-        arrived[e, places[e, cells[e, p]][0] + numbers[e, p]] = p
+        cell = cells[e, p]
+        if cell >= 0:
+            arrived[e, places[e, cell][0] + numbers[e, p]] = p
         if p < used[e, 1]:
             segment = found[e, p]
             at = numbers_of_segments[e, p]
@@ -277,7 +284,9 @@ def cell_kernels(name: str) -> SimpleNamespace:
             used[e, 1] = 0
         for i in range(p, SIZES, cells.shape[1]):
             sizes[e, i] = 0
-        mine = places[e, cells[e, p]]
-        order[e, mine[0] + count_before(arrived, e, mine, p)] = p
+        cell = cells[e, p]
+        if cell >= 0:
+            mine = places[e, cell]
+            order[e, mine[0] + count_before(arrived, e, mine, p)] = p
 
     return SimpleNamespace(count=count, place_segments=place_segments, place=place, tidy=tidy)

@@ -9,11 +9,12 @@ nodes, nor on chance.
 from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
-from typing import no_type_check
+from typing import Any, no_type_check
 
 import warp as wp
 
 from ..launches import blocks
+from ..rows import with_arguments
 from ..runtime import precision
 from .cells import segments
 from .layout import layout
@@ -36,6 +37,27 @@ class Team:
 
 
 GPU_TEAM, CPU_TEAM = Team(32, 3, 9), Team(1, 1, 1)  # on a CPU a thread has a segment
+
+# Threads go through the rows of a batch from the last one on. Kernels before and after go from the first one on, and a
+# GPU's cache still has what was written last.
+WALK = """
+def kernel(lattice, rows, order, full, segments, OWN, parts):
+    k, t = wp.tid()
+    e = rows - 1 - k
+    mine = take_segment(e, t, full, segments)
+    if t / lanes * groups >= full[e]:
+        return
+    at, begin, count, span = mine[0] * PARTS, mine[1], mine[2], mine[3]
+    state = open_segment(parts, e, at, span)
+    last = begin + wp.max(count - 1, 0)
+    place = begin + row_of(t % lanes)
+    p = listed(order, e, place, last)
+    for i in range(0, most(count), size):
+        what = given(lattice, OWN, e, p)
+        p = listed(order, e, place + i + size, last)  # asked for before the present ones are walked
+        state = walk(parts, e, at, wp.min(size, count - i), what, state)
+    close_segment(parts, e, at, span, state)
+"""
 
 ADD_UP = """
     FOUR
@@ -93,6 +115,34 @@ def segment_taker(team: Team):
     return take_segment, listed
 
 
+def walking_kernel(key: str, name: str, team: Team, given: Any, *, sloping: bool) -> Any:
+    """Return the kernel that leaves parts of sums at nodes, to which a particle gives what the function `given` says.
+
+    It runs over [environment, thread of a `team`], and takes what WALK says, OWN being what `given` takes besides the
+    lattice, an environment and a particle. What particles give is `sloping`, or not, as the `walker` has it.
+    """
+    steps, row_of, (take_segment, listed) = walker(name, sloping=sloping), lane_numbers().row, segment_taker(team)
+    most, open_segment, walk, close_segment = steps.most, steps.open, steps.walk, steps.close
+    lanes, groups, size = team.lanes, team.groups, team.size
+
+    def kernel() -> Any:  # which Warp finds here by their names
+        functions = given, take_segment, listed, row_of, most, open_segment, walk, close_segment
+        return functions, lanes, groups, size, PARTS
+
+    own = {label: kind for label, kind in given.input_types.items() if label not in ("lattice", "e", "p")}
+    vec4 = precision(name).vec4
+    kinds = {"lattice": lattice(name), "rows": int, "order": wp.array2d[wp.int32], "full": wp.array[wp.int32]}
+    kinds |= {"segments": wp.array2d[wp.vec4i]} | own | {"parts": wp.array2d[vec4]}
+    bounds = {"grid_stride": False} | ({"launch_bounds": blocks(name)} if blocks(name) else {})
+    return wp.Kernel(
+        with_arguments(kernel, kinds),
+        key=key.replace(".", "__locals__"),
+        module=wp.get_module(given.module.name),
+        options={"enable_backward": False} | bounds,
+        source=WALK.replace("OWN", ", ".join(own)),
+    )
+
+
 @cache
 @no_type_check
 def node_sum(name: str):
@@ -114,14 +164,9 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
 
     They are the scatters of `transfers`, up to the parts of sums that nodes then add up (`grid`).
     """
-    types = precision(name)
-    real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
-    Lattice, steps = lattice(name), walker(name)
-    module = f"gradscape.columns.{name}.{team.lanes}"
-    (take_segment, listed), most = segment_taker(team), steps.most
-    at_nodes, open_segment, walk, close_segment = steps.at_nodes, steps.open, steps.walk, steps.close
-    lanes, groups, size, row_of = team.lanes, team.groups, team.size, lane_numbers().row
-    lies = layout(name)
+    types, at_nodes, lies = precision(name), walker(name, sloping=True).at_nodes, layout(name)
+    real, vec3, mat33 = types.real, types.vec3, types.mat33
+    Lattice, module = lattice(name), f"gradscape.columns.{name}.{team.lanes}"
     read_number, read_vector, read_matrix = lies.read_number, lies.read_vector, lies.read_matrix
 
     @wp.func(module=module)
@@ -156,61 +201,7 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
         given.q = read_vector(adj_v_new, e, p) + dt * read_vector(adj_x_new, e, p) - given.a * given.f
         return given
 
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False, launch_bounds=blocks(name))
-    def p2g(
-        lattice: Lattice,
-        order: wp.array2d[wp.int32],
-        full: wp.array[wp.int32],
-        segments: wp.array2d[wp.vec4i],
-        mass: wp.array2d[real],
-        x: wp.array2d[vec3],
-        v: wp.array2d[vec3],
-        A: wp.array2d[mat33],
-        parts: wp.array2d[vec4],
-    ):
-        """Scatter momentum m v + A (x_i - x) and mass."""
-        e, t = wp.tid()
-        mine = take_segment(e, t, full, segments)
-        if t / lanes * groups >= full[e]:
-            return
-        at, begin, count, span = mine[0] * PARTS, mine[1], mine[2], mine[3]
-        state = open_segment(parts, e, at, span)
-        last = begin + wp.max(count - 1, 0)
-        place = begin + row_of(t % lanes)
-        p = listed(order, e, place, last)
-        for i in range(0, most(count), size):
-            given = momentum(lattice, mass, x, v, A, e, p)
-            p = listed(order, e, place + i + size, last)  # asked for before the present ones are walked
-            state = walk(parts, e, at, wp.min(size, count - i), given, state)
-        close_segment(parts, e, at, span, state)
-
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False, launch_bounds=blocks(name))
-    def adjoint_g2p(
-        lattice: Lattice,
-        order: wp.array2d[wp.int32],
-        full: wp.array[wp.int32],
-        segments: wp.array2d[wp.vec4i],
-        dt: real,
-        x: wp.array2d[vec3],
-        adj_x_new: wp.array2d[vec3],
-        adj_v_new: wp.array2d[vec3],
-        adj_C_new: wp.array2d[mat33],
-        parts: wp.array2d[vec4],
-    ):
-        """Scatter the adjoints of the velocities that g2p gathered."""
-        e, t = wp.tid()
-        mine = take_segment(e, t, full, segments)
-        if t / lanes * groups >= full[e]:
-            return
-        at, begin, count, span = mine[0] * PARTS, mine[1], mine[2], mine[3]
-        state = open_segment(parts, e, at, span)
-        last = begin + wp.max(count - 1, 0)
-        place = begin + row_of(t % lanes)
-        p = listed(order, e, place, last)
-        for i in range(0, most(count), size):
-            given = velocity_adjoint(lattice, dt, x, adj_x_new, adj_v_new, adj_C_new, e, p)
-            p = listed(order, e, place + i + size, last)  # asked for before the present ones are walked
-            state = walk(parts, e, at, wp.min(size, count - i), given, state)
-        close_segment(parts, e, at, span, state)
-
-    return SimpleNamespace(p2g=p2g, adjoint_g2p=adjoint_g2p)
+    return SimpleNamespace(
+        p2g=walking_kernel("column_kernels.p2g", name, team, momentum, sloping=True),
+        adjoint_g2p=walking_kernel("column_kernels.adjoint_g2p", name, team, velocity_adjoint, sloping=True),
+    )

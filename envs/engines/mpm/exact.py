@@ -57,6 +57,15 @@ ADJOINT_READ = """
     wp::adj_atomic_add(&wp::index(adj_tools, e, step + after, slot), adj_ret);
 #endif
 """
+TAKE = """
+    long long *first = (long long *)&wp::index(sums, e * LANES, at), total = 0;
+    const int across = sums.shape[1];
+#pragma unroll
+    for (int lane = 0; lane < LANES; ++lane) total += first[lane * across];
+#pragma unroll
+    for (int lane = 0; lane < LANES; ++lane) first[lane * across] = 0;
+    return total;
+"""
 WEIGH = "return ldexp((double)sum, BITS * range - LOWEST);"
 LOWEST = {"float32": 149, "float64": 1074}  # 2^-LOWEST is the least number
 
@@ -99,6 +108,9 @@ def settle_kernel(name: str):
     @wp.func_native(WEIGH.replace("BITS", str(BITS)).replace("LOWEST", str(LOWEST[name])))
     def weigh(sum: wp.int64, range: int) -> wp.float64: ...
 
+    @wp.func_native(TAKE.replace("LANES", str(LANES)))
+    def take_sum(sums: wp.array2d[wp.int64], e: int, at: int) -> wp.int64: ...
+
     @wp.func_native("return NAN;")
     def no_number() -> wp.float64: ...
 
@@ -107,11 +119,7 @@ def settle_kernel(name: str):
         e, place = wp.tid()
         value = wp.float64(0.0)
         for i in range(count):
-            at = place * count + count - 1 - i
-            total = wp.int64(0)
-            for lane in range(LANES):
-                total += sums[e * LANES + lane, at]
-                sums[e * LANES + lane, at] = wp.int64(0)
+            total = take_sum(sums, e, place * count + count - 1 - i)
             if i == 0 and total > wp.int64(0):
                 value = no_number()
             elif i > 0:

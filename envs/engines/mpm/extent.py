@@ -11,18 +11,44 @@ from ..launches import Launches
 from ..runtime import load, precision
 from .checkpoints import Allocator
 
-SHARES, LANES = 1024, 256  # of a GPU
+SHARES, LANES = 2048, 256  # of a GPU
+WARP = 32  # threads of a GPU that find out together
+
+OF_WARP = """
+#if defined(__CUDA_ARCH__)
+    for (int step = 16; step > 0; step /= 2)
+        for (int axis = 0; axis < 3; ++axis)
+            x[axis] = LEAST(x[axis], __shfl_xor_sync(0xffffffffu, x[axis], step));
+#endif
+    return x;
+"""
 
 
 @cache
 @no_type_check
 def extent_kernels(name: str) -> SimpleNamespace:
-    """Return the kernels `look`, at particles, and `gather` what was found; of each the first has the corners."""
+    """Return the kernels `look`, at particles, and `gather` what was found; of each the first has the corners.
+
+    Of threads that are `together`, a warp of a GPU or one, one writes down what all have found.
+    """
     types = precision(name)
     real, vec3, module = types.real, types.vec3, f"gradscape.extent.{name}"
 
+    @wp.func_native(OF_WARP.replace("LEAST", "min"))
+    def least(x: vec3) -> vec3: ...
+
+    @wp.func_native(OF_WARP.replace("LEAST", "max"))
+    def greatest(x: vec3) -> vec3: ...
+
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def look(x: wp.array2d[vec3], shares: int, low: wp.array[vec3], high: wp.array[vec3]):
+    def look(
+        x: wp.array2d[vec3],
+        shares: int,
+        together: int,
+        low: wp.array[vec3],
+        high: wp.array[vec3],
+        left: wp.array[wp.int32],
+    ):
         e, share = wp.tid()
         lowest, highest = vec3(real(wp.inf)), vec3(real(-wp.inf))
         for p in range(share, x.shape[1], shares):
@@ -30,8 +56,12 @@ def extent_kernels(name: str) -> SimpleNamespace:
             lowest, highest = wp.min(lowest, here), wp.max(highest, here)
             if not wp.isfinite(here):  # a minimum passes over what is not a number
                 lowest = vec3(real(-wp.inf))
-        low[e * shares + share] = lowest
-        high[e * shares + share] = highest
+                left[e] = 1
+        lowest, highest = least(lowest), greatest(highest)
+        if share % together == 0:
+            at = (e * shares + share) / together
+            low[at] = lowest
+            high[at] = highest
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def gather(
@@ -59,8 +89,8 @@ def extent_kernels(name: str) -> SimpleNamespace:
 class Extent:
     """Find the corners of the particles of a batch, and whether one has left its box of nodes.
 
-    Threads take one of `shares` of an environment's particles each; then `lanes`, few enough to be read back, take all
-    that was found. By default both are one on a CPU.
+    Threads take one of `shares` of an environment's particles each, and one of a GPU's warp writes down what all of it
+    have found; then `lanes`, few enough to be read back, take all of that. By default both are one on a CPU.
     """
 
     def __init__(
@@ -71,14 +101,18 @@ class Extent:
         self.kernels = extent_kernels(model.precision)
         load([self.kernels.look], device)
         self.shares, lanes = shares or (1 if device == "cpu" else SHARES), lanes or (1 if device == "cpu" else LANES)
-        size = allocator.capacity * self.shares
+        self.together = 1 if device == "cpu" else WARP
+        size = allocator.capacity * self.shares // self.together
         self.low, self.high = (wp.zeros(size, dtype=types.vec3, device=device) for _ in range(2))
         self.found: wp.array = wp.zeros((lanes, 7), dtype=types.real, device=device)
         self.event: Any = None if device == "cpu" else wp.Event(device)
         self.host: wp.array = wp.zeros((lanes, 7), dtype=types.real, device="cpu", pinned=device != "cpu")
 
     def find(self, x: wp.array, left: wp.array, batch: int, *, small: bool) -> None:
-        """Begin to find the corners of `x` [environment, particle], and whether any row has `left`."""
+        """Begin to find the corners of `x` [environment, particle], and whether any row has `left`.
+
+        A row has where a particle's coordinates are not finite, too: a loss need not tell, if it looks at others only.
+        """
         self.launches.run(("extent", batch), None, lambda: self._launch(x, left, batch), small=small)
         if self.device != "cpu":
             wp.record_event(self.event)
@@ -91,7 +125,8 @@ class Extent:
         return found[:, :3].min(axis=0), found[:, 3:6].max(axis=0), bool(found[:, 6].any())
 
     def _launch(self, x: wp.array, left: wp.array, batch: int) -> None:
-        self.launches.launch(self.kernels.look, (batch, self.shares), [x, self.shares, self.low, self.high])
-        inputs = [batch, self.shares, self.low, self.high, left, self.found]
+        inputs = [x, self.shares, self.together, self.low, self.high, left]
+        self.launches.launch(self.kernels.look, (batch, self.shares), inputs)
+        inputs = [batch, self.shares // self.together, self.low, self.high, left, self.found]
         self.launches.launch(self.kernels.gather, (1, self.found.shape[0]), inputs)
         self.launches.call(partial(wp.copy, self.host, self.found))  # which holds nothing that holds the launches

@@ -105,25 +105,48 @@ def gatherers(name: str) -> SimpleNamespace:
 
 @cache
 @no_type_check
-def adjoint_gatherer(name: str):
-    """Return the function that gathers the adjoints of p2g: it adds to adj_x, sets adj_v, and returns adj_A.
+def adjoint_gatherers(name: str) -> SimpleNamespace:
+    """Return the functions that gather adjoints: `g2p` returns that of x, `p2g` that of A.
 
-    It takes a particle's affine `momentum` A as a matrix.
+    `p2g` takes a particle's affine `momentum` A as a matrix, and sets adj_v, and adj_x to its own and `adj_x_moved`,
+    which is that of g2p.
     """
     types, lies, sums_of = precision(name), layout(name), gatherers(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
-    Lattice, base_node = lattice(name), stencil(name).base_node
-    gather_with_mass, from_base = sums_of.gather_with_mass, sums_of.from_base
-    read_number, read_vector = lies.read_number, lies.read_vector
+    Lattice, base_node, module = lattice(name), stencil(name).base_node, f"gradscape.gathers.{name}"
+    gather, gather_with_mass, from_base = sums_of.gather, sums_of.gather_with_mass, sums_of.from_base
+    read_number, read_vector, read_matrix = lies.read_number, lies.read_vector, lies.read_matrix
 
-    @wp.func(module=f"gradscape.gathers.{name}")
-    def gather_back(
+    @wp.func(module=module)
+    def g2p(
+        lattice: Lattice,
+        dt: real,
+        x: wp.array2d[vec3],
+        grid_v: wp.array2d[vec4],
+        adj_x_new: wp.array2d[vec3],
+        adj_v_new: wp.array2d[vec3],
+        adj_C_new: wp.array2d[mat33],
+        e: int,
+        p: int,
+    ):
+        here = read_vector(x, e, p)
+        base = base_node((here - lattice.origin) * lattice.inv_dx, lattice)
+        f = from_base(here, base, lattice)
+        a = (real(4.0) * lattice.inv_dx) * read_matrix(adj_C_new, e, p)
+        adj = read_vector(adj_x_new, e, p)
+        q = read_vector(adj_v_new, e, p) + dt * adj - a * f
+        sums = gather(lattice, grid_v, e, base - lattice.first, f, q, a)
+        return adj + lattice.inv_dx * (sums[4] - wp.transpose(a) * sums[0])
+
+    @wp.func(module=module)
+    def p2g(
         lattice: Lattice,
         mass: wp.array2d[real],
         x: wp.array2d[vec3],
         v: wp.array2d[vec3],
         momentum: mat33,
         adj_grid_m: wp.array2d[vec4],
+        adj_x_moved: vec3,
         adj_x: wp.array2d[vec3],
         adj_v: wp.array2d[vec3],
         e: int,
@@ -139,7 +162,7 @@ def adjoint_gatherer(name: str):
         sums = gather_with_mass(lattice, adj_grid_m, e, base - lattice.first, f, q, a, m)
         h = sums[0]
         adj_v[e, p] = m * h
-        adj_x[e, p] = read_vector(adj_x, e, p) + lattice.inv_dx * (sums[4] - wp.transpose(a) * h)
+        adj_x[e, p] = adj_x_moved + lattice.inv_dx * (sums[4] - wp.transpose(a) * h)
         return dx * wp.matrix_from_cols(sums[1] - f[0] * h, sums[2] - f[1] * h, sums[3] - f[2] * h)
 
-    return gather_back
+    return SimpleNamespace(g2p=g2p, p2g=p2g)

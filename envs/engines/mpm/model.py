@@ -13,6 +13,7 @@ from .materials import Fluid, Material
 from .stencil import lattice
 
 BOX_MARGIN = 1  # cells around the particles that a control step begins with
+TRAVEL = 5  # cells that bodies move beyond where they were at rest, as far as memory is estimated
 EMPTY = 1e-8  # nodes lighter than this part of the lightest particle carry no velocity
 
 
@@ -78,13 +79,13 @@ class Model:
     def bytes_per_environment(self, tapes: int, *, columns: bool = False, pieces: int = 1) -> int:
         """Return about what an environment takes of a solver that stores so many control steps whole, with adjoints.
 
-        Grids are counted as large as they are around the bodies at rest, and as large again. Sums by `columns` take 45
-        numbers a node, and lists of particles an integer a particle in each substep. Of a step in `pieces` one is
-        stored, and a frame for each of the others.
+        Grids are counted as large as around the bodies at rest and TRAVEL cells farther on all sides. Sums by `columns`
+        take 45 numbers a node, and lists of particles an integer a particle in each substep. Of a step in `pieces` one
+        is stored, and a frame for each of the others.
         """
         state = sum(len(body.x) * (1 if isinstance(body.material, Fluid) else 9) for body in self.bodies)
         frame = 15 * self.particles + state  # x, v, C and each material's own
-        nodes = min(self.cells, nodes_around(self, *self.corners, BOX_MARGIN).cells * 2)
+        nodes = nodes_around(self, *self.corners, BOX_MARGIN + TRAVEL).cells
         kept = self.keeps_affine_momentum or not columns
         substep = frame + 8 * nodes + 9 * self.particles * kept
         stored = tapes * self.piece(pieces)

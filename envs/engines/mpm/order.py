@@ -22,11 +22,11 @@ from .stencil import lattice
 
 @cache
 @no_type_check
-def sorting_kernels(name: str) -> SimpleNamespace:
-    """Return the kernels `label, take, give`, and `take_state, give_state` by a state's type."""
+def sorting_kernels(name: str, key: Any) -> SimpleNamespace:
+    """Return the kernels `label`, with keys of a type, `take, give`, and `take_state, give_state` by a state's type."""
     types = precision(name)
     real, vec3, mat33 = types.real, types.vec3, types.mat33
-    Lattice, module = lattice(name), f"gradscape.order.{name}"
+    Lattice, module = lattice(name), f"gradscape.order.{name}.{key.__name__}"
     read_matrix, write_matrix = layout(name).read_matrix, layout(name).write_matrix
 
     @wp.kernel(module=module, enable_backward=False)
@@ -35,7 +35,7 @@ def sorting_kernels(name: str) -> SimpleNamespace:
         bodies: int,
         body: wp.array[wp.int32],
         x: wp.array2d[vec3],
-        keys: wp.array[wp.int64],
+        keys: wp.array[key],
         places: wp.array[wp.int32],
     ):
         """Give each particle a key by environment, body and cell."""
@@ -44,9 +44,9 @@ def sorting_kernels(name: str) -> SimpleNamespace:
         i = wp.clamp(int(s[0] - real(0.5)), 0, grid.nx - 1)
         j = wp.clamp(int(s[1] - real(0.5)), 0, grid.ny - 1)
         k = wp.clamp(int(s[2] - real(0.5)), 0, grid.nz - 1)
-        group = wp.int64(e * bodies + body[p])
+        group = key(e * bodies + body[p])
         at = e * x.shape[1] + p
-        keys[at] = group * wp.int64(grid.nx * grid.ny * grid.nz) + wp.int64((i * grid.ny + j) * grid.nz + k)
+        keys[at] = group * key(grid.nx * grid.ny * grid.nz) + key((i * grid.ny + j) * grid.nz + k)
         places[at] = p
 
     @wp.kernel(module=module, enable_backward=False)
@@ -158,9 +158,10 @@ class Sorter:
         sizes = [len(body.x) for body in model.bodies]
         self.body: wp.array = wp.array(np.repeat(np.arange(len(sizes), dtype=np.int32), sizes), device=device)
         room = 2 * capacity * model.particles
-        self.keys, self.places = (wp.zeros(room, dtype=kind, device=device) for kind in (wp.int64, wp.int32))
         self.bits = int(capacity * len(sizes) * model.cells).bit_length()
-        self.kernels = sorting_kernels(model.precision)
+        key = wp.int32 if self.bits < 32 else wp.int64
+        self.keys, self.places = (wp.zeros(room, dtype=kind, device=device) for kind in (key, wp.int32))
+        self.kernels = sorting_kernels(model.precision, key)
         states = (self.kernels.states[body.material.state(model.precision)] for body in model.bodies)
         load([self.kernels.label, *chain.from_iterable(states)], device)
         self.first = np.cumsum([0, *sizes])[:-1].tolist()

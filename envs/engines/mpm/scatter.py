@@ -36,7 +36,10 @@ class Scatter(Protocol):
     def adjoint_g2p(
         self, step: int, substep: int, frame: Frame, new: Frame, grid_v: wp.array, adj_x: wp.array, batch: int
     ) -> None:
-        """Fill the adjoint of the grid's velocity likewise, and set that of x, from those of the frame `new`."""
+        """Fill the adjoint of the grid's velocity likewise, from those of the frame `new`.
+
+        In place, it sets that of x; by columns, what gathers the adjoint of p2g does so.
+        """
 
     def to_add_up(self, step: int, substep: int) -> list[wp.array]:
         """Return what nodes add up themselves, as their kernel takes it."""
@@ -74,8 +77,10 @@ class InPlace:
         self, step: int, substep: int, frame: Frame, new: Frame, grid_v: wp.array, adj_x: wp.array, batch: int
     ) -> None:
         """Fill the adjoint of the grid's velocity, and set that of x, from those of the frame `new`."""
+        solver, tape = self.solver, self.solver.tape(step)
         self._clear(grid_v, step, batch)
-        launch_adjoint_g2p(self.solver, step, substep, frame, new, [grid_v, adj_x], batch)
+        inputs = [tape.lattice, solver.model.dt, frame.x, tape.grids[substep].v, new.x, new.v, new.C, grid_v, adj_x]
+        solver.launch(solver.kernels.adjoint_g2p, solver.model.particles, batch, inputs)
 
     def to_add_up(self, step: int, substep: int) -> list[wp.array]:
         """Return what nodes add up themselves, as their kernel takes it."""
@@ -141,9 +146,7 @@ class ByColumns:
     def adjoint_g2p(
         self, step: int, substep: int, frame: Frame, new: Frame, grid_v: wp.array, adj_x: wp.array, batch: int
     ) -> None:
-        """Make parts of the adjoint of the grid's velocity, and set that of x, from those of the frame `new`."""
-        with self.solver.launches.beside(1):
-            launch_adjoint_g2p(self.solver, step, substep, frame, new, [adj_x], batch)
+        """Make parts of the adjoint of the grid's velocity, from those of the frame `new`."""
         inputs = [self.solver.model.dt, frame.x, new.x, new.v, new.C]
         self.walk(self.kernels.adjoint_g2p, step, substep, batch, inputs)
 
@@ -151,7 +154,7 @@ class ByColumns:
         """Launch a kernel that leaves parts of sums at nodes, after the substep's lists."""
         tape = self.solver.tape(step)
         lists: Lists = tape.lists[substep]
-        given = [tape.lattice, lists.order, lists.full, lists.segments, *inputs, self.parts]
+        given = [tape.lattice, batch, lists.order, lists.full, lists.segments, *inputs, self.parts]
         self.solver.launch_on_box(kernel, self.team.threads, batch, given)
 
     def add_up(self, kernel: Any, step: int, substep: int, batch: int, grids: list[wp.array]) -> None:
@@ -176,12 +179,3 @@ class ByColumns:
 def nodes(box: Box) -> int:
     """Return the number of nodes of a box."""
     return box.cells
-
-
-def launch_adjoint_g2p(
-    solver: Any, step: int, substep: int, frame: Frame, new: Frame, adjoints: list[wp.array], batch: int
-) -> None:
-    """Launch the transfers' adjoint of g2p, which adds to the first of the adjoints or sets them."""
-    tape = solver.tape(step)
-    inputs = [tape.lattice, solver.model.dt, frame.x, tape.grids[substep].v, new.x, new.v, new.C, *adjoints]
-    solver.launch(solver.kernels.adjoint_g2p, solver.model.particles, batch, inputs)

@@ -10,11 +10,11 @@ from typing import no_type_check
 import warp as wp
 
 from ..runtime import precision
-from .columns import Team, node_sum, segment_taker
+from .columns import Team, node_sum, walking_kernel
 from .gathers import gatherers
 from .layout import layout
 from .stencil import lattice, stencil
-from .walk import PARTS, lane_numbers, walker
+from .walk import walker
 
 
 @cache
@@ -27,11 +27,8 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
     """
     types = precision(name)
     real, vec3, vec4 = types.real, types.vec3, types.vec4
-    Lattice, base_node, steps = lattice(name), stencil(name).base_node, walker(name, sloping=False)
+    Lattice, base_node, at_nodes = lattice(name), stencil(name).base_node, walker(name, sloping=False).at_nodes
     from_base = gatherers(name).from_base
-    (take_segment, listed), most = segment_taker(team), steps.most
-    at_nodes, open_segment, walk, close_segment = steps.at_nodes, steps.open, steps.walk, steps.close
-    lanes, groups, size, row_of = team.lanes, team.groups, team.size, lane_numbers().row
     add_up_node, module = node_sum(name), f"gradscape.smoothing.{name}.columns.{team.lanes}"
     lies, gather, mat33 = layout(name), gatherers(name).gather, types.mat33
     read_number, read_vector, read_node, write_node = (
@@ -48,7 +45,7 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         return gather(lattice, nodes, e, base - lattice.first, from_base(x, base, lattice), q, mat33())
 
     @wp.func(module=module)
-    def given_volume(
+    def given_volume(  # V s and V
         lattice: Lattice,
         body: int,
         slope: real,
@@ -72,35 +69,6 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         if p >= body and p < body + adj_log.shape[1]:
             given.q = vec3(share * read_number(adj_log, e, p - body), real(0.0), real(0.0))
         return given
-
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def spread(
-        lattice: Lattice,
-        order: wp.array2d[wp.int32],
-        full: wp.array[wp.int32],
-        segments: wp.array2d[wp.vec4i],
-        body: int,
-        slope: real,
-        volume: wp.array2d[real],
-        x: wp.array2d[vec3],
-        J: wp.array2d[real],
-        parts: wp.array2d[vec4],
-    ):
-        """Scatter V s and V."""
-        e, t = wp.tid()
-        mine = take_segment(e, t, full, segments)
-        if t / lanes * groups >= full[e]:
-            return
-        at, begin, count, span = mine[0] * PARTS, mine[1], mine[2], mine[3]
-        state = open_segment(parts, e, at, span)
-        last = begin + wp.max(count - 1, 0)
-        place = begin + row_of(t % lanes)
-        p = listed(order, e, place, last)
-        for i in range(0, most(count), size):
-            given = given_volume(lattice, body, slope, volume, x, J, e, p)
-            p = listed(order, e, place + i + size, last)  # asked for before the present ones are walked
-            state = walk(parts, e, at, wp.min(size, count - i), given, state)
-        close_segment(parts, e, at, span, state)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def add_up(lattice: Lattice, planes: wp.array2d[wp.int32], parts: wp.array2d[vec4], nodes: wp.array2d[vec4]):
@@ -128,34 +96,6 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         sums = at(lattice, nodes, e, there, vec3())
         here = wp.log(read_number(J, e, p))
         J_new[e, p] = wp.exp(here + share * (sums[0][0] - (here - slope * there[1])))
-
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def spread_adjoint(
-        lattice: Lattice,
-        order: wp.array2d[wp.int32],
-        full: wp.array[wp.int32],
-        segments: wp.array2d[wp.vec4i],
-        body: int,
-        share: real,
-        x: wp.array2d[vec3],
-        adj_log: wp.array2d[real],
-        parts: wp.array2d[vec4],
-    ):
-        """Scatter the adjoints of the nodes' means, from those of log J'."""
-        e, t = wp.tid()
-        mine = take_segment(e, t, full, segments)
-        if t / lanes * groups >= full[e]:
-            return
-        at, begin, count, span = mine[0] * PARTS, mine[1], mine[2], mine[3]
-        state = open_segment(parts, e, at, span)
-        last = begin + wp.max(count - 1, 0)
-        place = begin + row_of(t % lanes)
-        p = listed(order, e, place, last)
-        for i in range(0, most(count), size):
-            given = given_adjoint(lattice, body, share, x, adj_log, e, p)
-            p = listed(order, e, place + i + size, last)  # asked for before the present ones are walked
-            state = walk(parts, e, at, wp.min(size, count - i), given, state)
-        close_segment(parts, e, at, span, state)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def adjoint_collect(
@@ -211,11 +151,11 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         adj_J[e, p] = (g + adj_s) / ratio
 
     return SimpleNamespace(
-        spread=spread,
+        spread=walking_kernel("smoothing_columns.spread", name, team, given_volume, sloping=False),
         add_up=add_up,
         collect=collect,
         adjoint_collect=adjoint_collect,
-        spread_adjoint=spread_adjoint,
+        spread_adjoint=walking_kernel("smoothing_columns.spread_adjoint", name, team, given_adjoint, sloping=False),
         add_up_adjoint=add_up_adjoint,
         adjoint_spread=adjoint_spread,
     )

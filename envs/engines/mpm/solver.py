@@ -40,10 +40,10 @@ from .transfers_columns import transfers_of_columns
 from .transfers_cpu import transfers_on_cpu
 
 CROWD = 8_000  # particles that hide what a launch costs on one core
-BUSY, FULL_CARD = 400_000, 1_310_000  # particles that keep a GPU busy; more than which gain nothing
-WHOLE_EPISODE = 192e6  # bytes up to which a CPU stores an episode whole
+BUSY, FULL_CARD = 400_000, 1_750_000  # particles that keep a GPU busy; more than which gain nothing
+WHOLE_EPISODE = 300e6  # bytes up to which a CPU stores an episode whole
 LAUNCHES = 200_000  # particles up to which launches cost a GPU more than what they launch
-SPARE = 0.85  # part of a GPU's free memory that control steps are kept in
+LEFT = 0.15, 6e9  # part of a GPU's free memory, and bytes of it, that control steps leave, whichever is less
 GRAIN = 4  # nodes to which the boxes of so few are rounded, so that the same ones come again
 
 
@@ -51,7 +51,7 @@ def capacity(model: Model, device: str) -> int:
     """Return how many environments of a model a solver should take at once."""
     if device == "cpu":
         return max(1, min(4, CROWD // model.particles))  # few enough for the cache
-    free, whole = free_memory() * 3 // 4, model.bytes_per_environment(model.steps, columns=True)
+    free, whole = free_memory() * 7 // 8, model.bytes_per_environment(model.steps, columns=True)
     fitting = free // memory(model, device)
     return max(1, min(1024, FULL_CARD // model.particles, fitting, max(free // whole, BUSY // model.particles)))
 
@@ -68,7 +68,7 @@ def pieces_that_fit(model: Model, device: str) -> int:
     """Return into how many pieces a control step has to be cut so that one of them fits into memory."""
     if device == "cpu":
         return 1
-    free, count = free_memory() * 3 // 4, 1
+    free, count = free_memory() * 7 // 8, 1
     while count < model.substeps and model.bytes_per_environment(1, columns=True, pieces=count) > free:
         count += 1
     return count
@@ -144,7 +144,8 @@ class Solver:
 
     def _add_tapes(self) -> None:
         """Store more control steps whole from the next run on, in most of a GPU's memory that is free after a first."""
-        self.spare_used, first, spare = True, self.tapes[0], int(SPARE * free_memory())
+        self.spare_used, first, free = True, self.tapes[0], free_memory()
+        spare = free - min(LEFT[0] * free, LEFT[1])
         for count in range(self.model.steps, 0, -1):
             boxes = [max(self.boxes[i::count], key=lambda box: box.cells) for i in range(1, count)]
             if sum(map(first.bytes_on, boxes)) <= spare:

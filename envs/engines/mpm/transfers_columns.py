@@ -1,7 +1,4 @@
-"""Transfers for a GPU, but for their scatters: g2p, and of both adjoints what particles gather.
-
-`columns` has the scatters.
-"""
+"""Transfers for a GPU, but for their scatters, which `columns` has: g2p, and the adjoint of p2g without a material."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -11,7 +8,7 @@ import warp as wp
 
 from ..runtime import precision
 from .cells import counter
-from .gathers import adjoint_gatherer, gatherers
+from .gathers import adjoint_gatherers, gatherers
 from .layout import layout
 from .stencil import lattice, stencil
 
@@ -19,16 +16,15 @@ from .stencil import lattice, stencil
 @cache
 @no_type_check
 def transfers_of_columns(name: str) -> SimpleNamespace:
-    """Return the kernels `g2p, adjoint_p2g, adjoint_g2p` of one precision, all over [environment, particle].
+    """Return the kernels `g2p, adjoint_p2g` of one precision, both over [environment, particle].
 
-    They take what those of `transfers` do, but adjoint_g2p takes no adjoint of the grid, and g2p counts particles by
-    cell, where they are then, if it is told to.
+    They take what those of `transfers` do, but g2p counts particles by cell, where they are then, if it is told to.
     """
     types, sums_of = precision(name), gatherers(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
     module, lies = f"gradscape.transfers.{name}.columns", layout(name)
     Lattice, base_node, count_in_cell = lattice(name), stencil(name).base_node, counter(name)
-    gather, from_base, gather_back = sums_of.gather, sums_of.from_base, adjoint_gatherer(name)
+    gather, from_base, gather_back = sums_of.gather, sums_of.from_base, adjoint_gatherers(name).p2g
     read_vector, read_matrix, write_matrix = lies.read_vector, lies.read_matrix, lies.write_matrix
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
@@ -77,29 +73,7 @@ def transfers_of_columns(name: str) -> SimpleNamespace:
     ):
         """Gather the adjoints of p2g: add to adj_x, set adj_v and adj_A."""
         e, p = wp.tid()
-        a = read_matrix(A, e, p)
-        write_matrix(adj_A, e, p, gather_back(lattice, mass, x, v, a, adj_grid_m, adj_x, adj_v, e, p))
+        a, moved = read_matrix(A, e, p), read_vector(adj_x, e, p)
+        write_matrix(adj_A, e, p, gather_back(lattice, mass, x, v, a, adj_grid_m, moved, adj_x, adj_v, e, p))
 
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def adjoint_g2p(
-        lattice: Lattice,
-        dt: real,
-        x: wp.array2d[vec3],
-        grid_v: wp.array2d[vec4],
-        adj_x_new: wp.array2d[vec3],
-        adj_v_new: wp.array2d[vec3],
-        adj_C_new: wp.array2d[mat33],
-        adj_x: wp.array2d[vec3],
-    ):
-        """Gather the adjoints of g2p: set adj_x."""
-        e, p = wp.tid()
-        here = read_vector(x, e, p)
-        base = base_node((here - lattice.origin) * lattice.inv_dx, lattice)
-        f = from_base(here, base, lattice)
-        a = (real(4.0) * lattice.inv_dx) * read_matrix(adj_C_new, e, p)
-        adj = read_vector(adj_x_new, e, p)
-        q = read_vector(adj_v_new, e, p) + dt * adj - a * f
-        sums = gather(lattice, grid_v, e, base - lattice.first, f, q, a)
-        adj_x[e, p] = adj + lattice.inv_dx * (sums[4] - wp.transpose(a) * sums[0])
-
-    return SimpleNamespace(g2p=g2p, adjoint_p2g=adjoint_p2g, adjoint_g2p=adjoint_g2p)
+    return SimpleNamespace(g2p=g2p, adjoint_p2g=adjoint_p2g)

@@ -188,7 +188,7 @@ def lane_numbers() -> SimpleNamespace:
 
 @cache
 @no_type_check
-def walker(name: str, *, sloping: bool = True) -> SimpleNamespace:
+def walker(name: str, *, sloping: bool) -> SimpleNamespace:
     """Return the functions `at_nodes, most, open, walk, close` of one precision.
 
     `at_nodes` says what a particle gives to its nodes, as a `Given`, whose a, mass and third q must be 0 unless it is

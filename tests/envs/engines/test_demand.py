@@ -126,7 +126,7 @@ def test_of_partial_sums_no_more_is_counted_than_is_told():
     segments = [wp.zeros(BATCH, dtype=wp.int32), wp.zeros((BATCH, 4), dtype=wp.vec4i)]
     order = wp.zeros((BATCH, count), dtype=wp.int32)
     particles = [wp.zeros((BATCH, count), dtype=kind) for kind in (wp.float32, wp.vec3, wp.vec3, wp.mat33)]
-    given = [kernels.p2g.adj.args[0].type(), order, *segments, *particles]
+    given = [kernels.p2g.adj.args[0].type(), BATCH, order, *segments, *particles]
     found = [demand(kernels.p2g, (BATCH, 64), [*given, wp.zeros((BATCH, room), dtype=wp.vec4)]) for room in (90, 9000)]
     assert found[0] == found[1]
     assert found[0].bytes == BATCH * (count * 4 * (1 + 1 + 3 + 3 + 9) + 4 * (1 + 4 * 4))

@@ -1,12 +1,14 @@
 """The adjoint kernels of a material, made of what it does with the adjoint of A of a particle: `turn_back`.
 
-Alone, a kernel reads that from memory; on a GPU it follows on the adjoint of p2g in one kernel, and needs no memory.
+Alone, a kernel reads that from memory; on a GPU it follows on what particles gather of the adjoints of g2p and p2g, in
+one kernel, and needs no memory.
 `turn_back` takes what both take, but the matrix `adj_a` in the place of the array `adj_A`, and the environment and the
 particle last.
 """
 
 from collections.abc import Mapping
 from functools import cache
+from types import MappingProxyType
 from typing import Any
 
 import warp as wp
@@ -14,10 +16,8 @@ import warp as wp
 from ...launches import blocks
 from ...rows import with_arguments
 from ...runtime import precision
-from ..gathers import adjoint_gatherer
+from ..gathers import adjoint_gatherers
 from ..layout import layout
-
-GATHERED = "lattice, mass, x, v, a, adj_grid_m, adj_x, adj_v"
 
 
 @cache
@@ -35,27 +35,34 @@ def alone(name: str, turn_back: Any) -> Any:
 
 @cache
 def after_p2g(name: str, turn_back: Any, affine_momentum: Any | None, count: int) -> Any:
-    """Return the kernel that gathers a particle's adjoints of p2g first.
+    """Return the kernel that gathers a particle's adjoints of g2p and p2g first.
 
-    It takes A, unless `affine_momentum` computes it again, the lattice, x, v, adj_grid_m, adj_x and adj_v, and then
-    what the other does, but for adj_A. So many blocks as `count` are to find registers at once.
+    It takes A, unless `affine_momentum` computes it again, the lattice, x, v, adj_grid_m, adj_x, adj_v, grid_v, and the
+    adjoints of the new x, v and C, and then what the other does, but for adj_A. So many blocks as `count` are to find
+    registers at once.
     """
-    gather_back, read_matrix, found = adjoint_gatherer(name), layout(name).read_matrix, blocks(name, count)
+    gather, read_matrix, found = adjoint_gatherers(name), layout(name).read_matrix, blocks(name, count)
+    adjoint_g2p, adjoint_p2g = gather.g2p, gather.p2g
+    given = {"momentum": "read_matrix(A, e, first + p)", "adj_x_moved": _call("adjoint_g2p", adjoint_g2p, "first + p")}
     mat33 = precision(name).mat33
-    gathered = dict(zip(GATHERED.split(", "), gather_back.input_types.values(), strict=False))
-    del gathered["a"]
-    own = {key: kind for key, kind in _taken(turn_back).items() if key != "adj_a"}
-    a, kept = "read_matrix(A, e, first + p)", {"A": wp.array2d[mat33]}
+    kept = {"A": wp.array2d[mat33]}
     if affine_momentum:
-        a, kept = f"affine_momentum({', '.join(_taken(affine_momentum))}, e, p)", {}
-    kinds = {key: kind for key, kind in (kept | gathered).items() if key not in own} | own
+        given["momentum"], kept = _call("affine_momentum", affine_momentum, "p"), {}
+    own = {key: kind for key, kind in _taken(turn_back).items() if key != "adj_a"}
+    others = kept | _taken(adjoint_p2g) | _taken(adjoint_g2p)
+    kinds = {key: kind for key, kind in others.items() if key not in own | given} | own
 
     def kernel() -> Any:
-        return gather_back, turn_back, affine_momentum, read_matrix  # which Warp finds here by their names
+        return adjoint_g2p, adjoint_p2g, turn_back, affine_momentum, read_matrix  # which Warp finds by their names
 
     bounds = {"grid_stride": False} | ({"launch_bounds": found} if found else {})
-    adj_a = f"gather_back({GATHERED.replace(' a,', f' {a},')}, e, first + p)"
+    adj_a = _call("adjoint_p2g", adjoint_p2g, "first + p", given)
     return _kernel(kernel, kinds, adj_a, turn_back, called="_after_p2g", module=".columns", **bounds)
+
+
+def _call(name: str, function: Any, particle: str, given: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Return the call of a function for a particle, with its arguments' names where nothing else is `given` for one."""
+    return f"{name}({', '.join(given.get(key, key) for key in _taken(function))}, e, {particle})"
 
 
 def _taken(function: Any) -> dict[str, Any]:

@@ -111,7 +111,7 @@ def test_a_control_step_is_cut_into_as_few_pieces_as_fit(monkeypatch):
     sizes = [model.bytes_per_environment(1, columns=True, pieces=count) for count in (1, 2, 3)]
     assert sizes == sorted(sizes, reverse=True)
     for count, size in enumerate(sizes, start=1):
-        monkeypatch.setattr(mpm, "free_memory", lambda size=size: -(-size * 4 // 3))
+        monkeypatch.setattr(mpm, "free_memory", lambda size=size: -(-size * 8 // 7))
         assert mpm.pieces_that_fit(model, "cuda") == count
     assert mpm.pieces_that_fit(model, "cpu") == 1
 
@@ -159,7 +159,7 @@ def test_as_many_control_steps_are_kept_as_fit_on_their_own_boxes(monkeypatch):
     sizes = [tape.bytes for tape in whole.tapes]
     assert len(sizes) == model.steps
     assert max(sizes) > min(sizes)
-    enough = int(sum(sizes[1:]) / mpm.SPARE) + 1
+    enough = int(sum(sizes[1:]) / (1 - mpm.LEFT[0])) + 1
     for free, kept in ((enough, model.steps), (int(0.99 * enough), model.steps - 1), (0, 1)):
         solver, *again = keep(free)
         assert len(solver.tapes) == kept

@@ -43,7 +43,7 @@ class Scattering:
         """Return what nodes add up of what warps leave, [row, node, 4]."""
         parts = wp.array(torch.full((ROWS, segments(self.box) * PARTS, 4), torch.nan).numpy(), dtype=wp.vec4)
         lists = self.listing.lists
-        walked = [self.lattice, lists.order, lists.full, lists.segments, *inputs, parts]
+        walked = [self.lattice, ROWS, lists.order, lists.full, lists.segments, *inputs, parts]
         emulate(kernel, (ROWS, GPU_TEAM.threads(self.box)), walked)
         momentum, velocity = self.zeros(self.box.cells, wp.vec4), self.zeros(self.box.cells, wp.vec4)
         numbers = [0.0, 0.0, -1.0, 0, 0.0, 0.0]  # no gravity, and no node is empty

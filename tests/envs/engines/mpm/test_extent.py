@@ -54,5 +54,7 @@ def test_corners_are_not_finite_where_a_particle_is_not(parts, value):
     def explode(x, left):
         x[2, -1, 1] = value
 
-    _, low, high, _ = found(parts, explode)
+    _, low, high, left = found(parts, explode)
     assert not torch.tensor([*low, *high]).isfinite().all()
+    assert left
+    assert not found(parts, explode, batch=2)[3]

@@ -9,6 +9,7 @@ import warp as wp
 
 from gradscape.envs.engines.mpm.cells import SEGMENT, SIZES, STEP, segments
 from gradscape.envs.engines.mpm.model import Body, Box, place_grid
+from gradscape.envs.engines.mpm.solver import Solver
 from gradscape.envs.engines.runtime import to_torch
 
 from .bodies import CLAY, SPONGE, SYRUP, kneaded, kneading, lumps, stirred, weights
@@ -91,3 +92,30 @@ def test_particles_are_listed_by_cell_and_then_as_they_lie(first):
                 where: ([key[-1] for key in group], (group[-1][3] + 3, group[0][3])) for where, group in wanted.items()
             }
             assert int((planes[row] > 0).sum()) == full[row]
+
+
+def test_particles_that_are_nowhere_are_not_listed():
+    model, _ = kneading()
+    box = Box((0, 0, 0), model.nodes)
+    x = torch.rand((2, 500, 3), generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 0.4 - 0.2
+    x[0, ::3, 1], x[0, 1, 2], x[1] = torch.nan, torch.inf, -torch.inf
+    listing = Listing(wp.launch, "float64", place_grid(model, box), box, x)
+    for _ in range(2):  # the second time it begins where the first has ended
+        listing.run()
+        order, full, segments_found, _ = (to_torch(array).clone() for array in listing.lists.arrays())
+        listed = torch.cat([order[0, begin : begin + count] for _, begin, count, _ in segments_found[0, : full[0]]])
+        assert sorted(listed.tolist()) == [p for p in range(500) if p % 3 and p != 1]
+        assert full[1] == 0
+
+
+def test_an_environment_that_has_blown_up_changes_no_other():
+    model, paths = kneading()
+    adj_x = {model.steps: weights(model, 3, 5)}
+    lone = kneaded(model, paths, adj_x, columns=True)
+    solver = Solver(model, capacity=3, device="cpu", columns=True)
+    to_torch(solver.checkpoints[0].x)[1] = torch.nan
+    end, gradient = solver.run(paths), solver.gradient(adj_x)
+    assert end[1].isnan().all()
+    for row in (0, 2):
+        assert torch.equal(end[row], lone[1][row])
+        assert torch.equal(gradient[row], lone[2][row])
