@@ -90,16 +90,17 @@ class Adjoint:
     def _adjoint_p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
         """Launch the adjoint of p2g, and those of the materials after it or as its continuation."""
         solver, tape, old, new = self.solver, self.solver.tape(step), self.old, self.new
-        A, given = tape.A[substep], [self.grid.m, old.x, old.v]
+        A = tape.A[substep]
         if not solver.columns:
-            inputs = [tape.lattice, solver.orders[step].mass, frame.x, frame.v, A, *given, self.A]
+            given = [tape.lattice, solver.orders[step].mass, frame.x, frame.v, A]
+            inputs = [*given, self.grid.m, old.x, old.v, self.A]
             solver.launch(solver.kernels.adjoint_p2g, solver.model.particles, batch, inputs)
         for b, (_, adjoint) in enumerate(solver.materials):
             inputs = [*solver.material_inputs(b, step, frame), new.S[b]]
             if solver.columns:
                 kept = [A] if solver.model.bodies[b].material.keeps_affine_momentum else []
-                moved = tape.grids[substep].v, new.x, new.v, new.C
-                inputs = [*kept, tape.lattice, frame.x, frame.v, *given, *moved, *inputs]
+                given = [tape.lattice, frame.x, frame.v, self.grid.m, old.v, tape.grids[substep].v, new.x, new.v, new.C]
+                inputs = [*kept, *given, old.x, *inputs]
             else:
                 inputs += [self.A]
             with solver.beside_others(b):

@@ -106,10 +106,9 @@ def gatherers(name: str) -> SimpleNamespace:
 @cache
 @no_type_check
 def adjoint_gatherers(name: str) -> SimpleNamespace:
-    """Return the functions that gather adjoints: `g2p` returns that of x, `p2g` that of A.
+    """Return the functions that gather adjoints: `g2p` returns that of x, `p2g` those of A and x, and sets that of v.
 
-    `p2g` takes a particle's affine `momentum` A as a matrix, and sets adj_v, and adj_x to its own and `adj_x_moved`,
-    which is that of g2p.
+    `p2g` takes a particle's affine `momentum` A as a matrix. The adjoint of x is the sum of both.
     """
     types, lies, sums_of = precision(name), layout(name), gatherers(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
@@ -146,8 +145,6 @@ def adjoint_gatherers(name: str) -> SimpleNamespace:
         v: wp.array2d[vec3],
         momentum: mat33,
         adj_grid_m: wp.array2d[vec4],
-        adj_x_moved: vec3,
-        adj_x: wp.array2d[vec3],
         adj_v: wp.array2d[vec3],
         e: int,
         p: int,
@@ -162,7 +159,7 @@ def adjoint_gatherers(name: str) -> SimpleNamespace:
         sums = gather_with_mass(lattice, adj_grid_m, e, base - lattice.first, f, q, a, m)
         h = sums[0]
         adj_v[e, p] = m * h
-        adj_x[e, p] = adj_x_moved + lattice.inv_dx * (sums[4] - wp.transpose(a) * h)
-        return dx * wp.matrix_from_cols(sums[1] - f[0] * h, sums[2] - f[1] * h, sums[3] - f[2] * h)
+        adj_A = dx * wp.matrix_from_cols(sums[1] - f[0] * h, sums[2] - f[1] * h, sums[3] - f[2] * h)
+        return adj_A, lattice.inv_dx * (sums[4] - wp.transpose(a) * h)
 
     return SimpleNamespace(g2p=g2p, p2g=p2g)

@@ -84,12 +84,11 @@ class ColumnSmoother(Smoother):
         """Turn the adjoint of the tape's first state into that of the checkpoint's, and add to that of x."""
         tape, (x, J), nodes = solver.tape(step), self._particles(solver, step), self._sums(solver, step)
         adj_J, adj_x = adjoint.S[self.body], adjoint.x
-        inputs = [tape.lattice, self.first, self.share, x, tape.smoothed[self.body], *nodes, adj_J, adj_x]
-        solver.launch(self.kernels.adjoint_collect, self.size, batch, inputs)
-        solver.scatter.walk(self.kernels.spread_adjoint, step, 0, batch, [self.first, self.share, x, adj_J])
+        J_new = tape.smoothed[self.body]
+        solver.scatter.walk(self.kernels.spread_adjoint, step, 0, batch, [self.first, self.share, x, J_new, adj_J])
         solver.scatter.add_up(self.kernels.add_up_adjoint, step, 0, batch, nodes)
-        inputs = [tape.lattice, self.first, self.slope, self.share, solver.orders[step].volume, x, J, *nodes]
-        solver.launch(self.kernels.adjoint_spread, self.size, batch, [*inputs, adj_J, adj_x])
+        inputs = [tape.lattice, self.first, self.slope, self.share, solver.orders[step].volume, x, J, J_new, *nodes]
+        solver.launch(self.kernels.adjoint_gather, self.size, batch, [*inputs, adj_J, adj_x])
 
     def _prepare(self, solver: Any) -> None:
         self.kernels = smoothing_columns(solver.model.precision, solver.scatter.team)

@@ -20,10 +20,10 @@ from .walk import walker
 @cache
 @no_type_check
 def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
-    """Return `spread, add_up, collect, spread_adjoint, adjoint_collect, add_up_adjoint, adjoint_spread`, kernels.
+    """Return `spread, add_up, collect, spread_adjoint, add_up_adjoint, adjoint_gather`, kernels.
 
     Those that spread take threads in a `team`; particles of other bodies in the same cells give nothing. `collect` and
-    the last but one and two of that order are over [environment, particle of the body].
+    `adjoint_gather` are over [environment, particle of the body].
     """
     types = precision(name)
     real, vec3, vec4 = types.real, types.vec3, types.vec4
@@ -63,11 +63,19 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
 
     @wp.func(module=module)
     def given_adjoint(
-        lattice: Lattice, body: int, share: real, x: wp.array2d[vec3], adj_log: wp.array2d[real], e: int, p: int
+        lattice: Lattice,
+        body: int,
+        share: real,
+        x: wp.array2d[vec3],
+        J_new: wp.array2d[real],
+        adj_J_new: wp.array2d[real],
+        e: int,
+        p: int,
     ):
         given = at_nodes(lattice, read_vector(x, e, p))
-        if p >= body and p < body + adj_log.shape[1]:
-            given.q = vec3(share * read_number(adj_log, e, p - body), real(0.0), real(0.0))
+        if p >= body and p < body + J_new.shape[1]:
+            adj_log = read_number(adj_J_new, e, p - body) * read_number(J_new, e, p - body)
+            given.q = vec3(share * adj_log, real(0.0), real(0.0))
         return given
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
@@ -98,24 +106,6 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         J_new[e, p] = wp.exp(here + share * (sums[0][0] - (here - slope * there[1])))
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def adjoint_collect(
-        lattice: Lattice,
-        body: int,
-        share: real,
-        x: wp.array2d[vec3],
-        J_new: wp.array2d[real],
-        nodes: wp.array2d[vec4],
-        adj_J: wp.array2d[real],
-        adj_x: wp.array2d[vec3],
-    ):
-        """Add to adj_x; turn adj_J from that of J' into that of log J'."""
-        e, p = wp.tid()
-        sums = at(lattice, nodes, e, read_vector(x, e, body + p), vec3(real(1.0), real(0.0), real(0.0)))
-        g = read_number(adj_J, e, p) * read_number(J_new, e, p)
-        adj_x[e, body + p] = read_vector(adj_x, e, body + p) + (share * g * lattice.inv_dx) * sums[4]
-        adj_J[e, p] = g
-
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def add_up_adjoint(
         lattice: Lattice, planes: wp.array2d[wp.int32], parts: wp.array2d[vec4], nodes: wp.array2d[vec4]
     ):
@@ -126,7 +116,7 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         write_node(nodes, e, i, vec4(node[0], a, a * node[0], node[3]))
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def adjoint_spread(
+    def adjoint_gather(
         lattice: Lattice,
         body: int,
         slope: real,
@@ -134,19 +124,20 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         volume: wp.array2d[real],
         x: wp.array2d[vec3],
         J: wp.array2d[real],
+        J_new: wp.array2d[real],
         nodes: wp.array2d[vec4],
         adj_J: wp.array2d[real],
         adj_x: wp.array2d[vec3],
     ):
-        """Gather the adjoint of s; add to adj_x, turn adj_J from that of log J' into that of J."""
+        """Gather the nodes' means and the adjoint of s; add to adj_x, turn adj_J from that of J' into that of J."""
         e, p = wp.tid()
         there = read_vector(x, e, body + p)
         ratio, V = read_number(J, e, p), read_number(volume, e, body + p)
         beyond = wp.log(ratio) - slope * there[1]
-        sums = at(lattice, nodes, e, there, vec3(real(0.0), beyond, real(-1.0)))
-        g = read_number(adj_J, e, p)
+        g = read_number(adj_J, e, p) * read_number(J_new, e, p)
+        sums = at(lattice, nodes, e, there, vec3(share * g, V * beyond, -V))
         adj_s = V * sums[0][1] - share * g
-        change = (V * lattice.inv_dx) * sums[4] - vec3(real(0.0), slope * adj_s, real(0.0))
+        change = lattice.inv_dx * sums[4] - vec3(real(0.0), slope * adj_s, real(0.0))
         adj_x[e, body + p] = read_vector(adj_x, e, body + p) + change
         adj_J[e, p] = (g + adj_s) / ratio
 
@@ -154,8 +145,7 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         spread=walking_kernel("smoothing_columns.spread", name, team, given_volume, sloping=False),
         add_up=add_up,
         collect=collect,
-        adjoint_collect=adjoint_collect,
         spread_adjoint=walking_kernel("smoothing_columns.spread_adjoint", name, team, given_adjoint, sloping=False),
         add_up_adjoint=add_up_adjoint,
-        adjoint_spread=adjoint_spread,
+        adjoint_gather=adjoint_gather,
     )

@@ -73,7 +73,8 @@ def transfers_of_columns(name: str) -> SimpleNamespace:
     ):
         """Gather the adjoints of p2g: add to adj_x, set adj_v and adj_A."""
         e, p = wp.tid()
-        a, moved = read_matrix(A, e, p), read_vector(adj_x, e, p)
-        write_matrix(adj_A, e, p, gather_back(lattice, mass, x, v, a, adj_grid_m, moved, adj_x, adj_v, e, p))
+        adj_a, own = gather_back(lattice, mass, x, v, read_matrix(A, e, p), adj_grid_m, adj_v, e, p)
+        write_matrix(adj_A, e, p, adj_a)
+        adj_x[e, p] = read_vector(adj_x, e, p) + own
 
     return SimpleNamespace(g2p=g2p, adjoint_p2g=adjoint_p2g)
