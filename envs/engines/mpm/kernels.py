@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import warp as wp
+
 from ..runtime import load
 from .cells import cell_kernels
 from .columns import GPU_TEAM, column_kernels
@@ -34,7 +36,7 @@ def kernels(model: Model, device: str) -> Iterator[Any]:
     for body in model.bodies:
         yield from body.material.kernels(name, rows=device == "cpu", columns=device != "cpu")
     yield extent_kernels(name).look
-    sorting = sorting_kernels(name)
+    sorting = sorting_kernels(name, wp.int32)  # with which all but huge batches are sorted
     yield sorting.label
     for body in model.bodies:
         yield from sorting.states[body.material.state(name)]

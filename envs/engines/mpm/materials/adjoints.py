@@ -37,8 +37,8 @@ def alone(name: str, turn_back: Any) -> Any:
 def after_p2g(name: str, turn_back: Any, affine_momentum: Any | None, count: int) -> Any:
     """Return the kernel that gathers a particle's adjoints of g2p and p2g first.
 
-    It takes A, unless `affine_momentum` computes it again, the lattice, x, v, adj_grid_m, adj_v, grid_v, the adjoints of
-    the new x, v and C, adj_x, and then what the other does, but for adj_A. So many blocks as `count` are to find
+    It takes A, unless `affine_momentum` computes it again, the lattice, x, v, adj_grid_m, adj_v, grid_v, the adjoints
+    of the new x, v and C, adj_x, and then what the other does, but for adj_A. So many blocks as `count` are to find
     registers at once.
     """
     gather, read_matrix, found = adjoint_gatherers(name), layout(name).read_matrix, blocks(name, count)

@@ -1,5 +1,7 @@
 """Sorting particles between control steps: neighbours on the grid become neighbours, and nothing gets lost."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 import warp as wp
@@ -16,8 +18,11 @@ BATCH = 2
 
 @pytest.fixture(scope="module")
 def sorted_once():
-    """Return a model, a frame of scattered particles, and that frame sorted, with its order."""
-    model = free_model()
+    """Return a model, a frame of scattered particles, and that frame sorted, with its order, and what sorted it."""
+    return sort_scattered(free_model())
+
+
+def sort_scattered(model, **changes):
     solver = Solver(model, capacity=BATCH, device="cpu")
     old, new = solver.allocator.frame(), solver.allocator.frame()
     generator = torch.Generator().manual_seed(0)
@@ -27,7 +32,7 @@ def sorted_once():
     room = model.dx * (torch.tensor(model.nodes) - 1)
     to_torch(old.x)[:] = torch.tensor(model.origin, dtype=torch.float64) + to_torch(old.x) * room
     before, order, launches = Order(model, BATCH, "cpu"), Order(model, BATCH, "cpu"), Launches("cpu")
-    sorter = Sorter(model, BATCH, "cpu", launches)
+    sorter = Sorter(replace(model, **changes), BATCH, "cpu", launches)
     launches.run("sort", BATCH, lambda: sorter.sort(old, new, before, order, BATCH), small=False)
     return model, old, new, order, sorter
 
@@ -61,3 +66,11 @@ def test_masses_and_volumes_lie_in_the_same_order(sorted_once):
     model, _, _, order, _ = sorted_once
     for array, values in ((order.mass, model.mass), (order.volume, model.volume)):
         assert torch.equal(order.to_model(to_torch(array)), torch.from_numpy(values).expand(BATCH, -1))
+
+
+def test_a_grid_of_more_cells_than_an_integer_counts_is_sorted_alike(sorted_once):
+    model, _, new, order, sorter = sorted_once
+    _, _, again, other, large = sort_scattered(model, nodes=(1200, 1200, 1200))
+    assert (sorter.keys.dtype, large.keys.dtype) == (wp.int32, wp.int64)
+    assert torch.equal(to_torch(other.name), to_torch(order.name))
+    assert torch.equal(to_torch(again.x), to_torch(new.x))
