@@ -26,7 +26,7 @@ from ..engines.mpm.tools import Kind
 from .plasticine_look import parts, view
 from .plasticine_model import SPAN, PhysicsOptions, Scene, fidelities, model, target
 from .scene import SEGMENTS, STEPS, MpmScene, Stage
-from .targets import Target, contact, load_or_make
+from .targets import Target, compare, contact, load_or_make
 
 DEMONSTRATION = "demonstration"  # the example that solves a scene
 TERMS = ("density", "sdf", "contact")
@@ -171,11 +171,9 @@ class Plasticine(MpmScene):
         self, stage: JudgedStage, end: Float[Tensor, "batch particle 3"], tools: Float[Tensor, "batch slot 3"]
     ) -> Float[Tensor, "batch term"]:
         """Return the loss's terms where particles and tools are."""
-        rows = stage.raster(end).double().unbind(0)  # one by one: a batched sum rounds as its batch is large
-        density = torch.stack([(row - self._target.mass).abs().sum() for row in rows])
-        distance = torch.stack([(row * self._target.distance).sum() for row in rows])
+        shape = compare(stage.raster(end).double(), self._target)
         touch = contact(end.double(), tools, [anchor.tool for anchor in self.scene.anchors])
-        return torch.stack([density, distance, touch], dim=1)
+        return torch.cat([shape, touch[:, None]], dim=1)
 
     def _length_scale(self, tools: Float[Tensor, "batch step_plus_1 slot 3"], points: int) -> Float[Tensor, "point 1"]:
         """Return tenths of a metre; radians for a roller's angles."""

@@ -9,7 +9,7 @@ from gradscape.envs.mpm import targets
 from gradscape.envs.mpm.plasticine import Fidelity
 from gradscape.envs.mpm.plasticine_model import SPAN, model
 from gradscape.envs.mpm.plasticine_scenes import Torus
-from gradscape.envs.mpm.targets import Target, contact, distance_outside, load_or_make
+from gradscape.envs.mpm.targets import Target, compare, contact, distance_outside, load_or_make
 
 PEN = Tool(Kind.CAPSULE, (0.03, 0.02), 0.0)
 BALL = Tool(Kind.SPHERE, (0.05,), 0.9)
@@ -55,6 +55,20 @@ def test_the_contacts_gradient_is_the_closest_particles_only():
         near = {int(to_sphere.argmin()), int(to_pen.argmin())}
         assert set(x.grad[row].abs().sum(dim=1).nonzero().flatten().tolist()) == near
     assert torch.autograd.gradcheck(lambda x, tools: contact(x, tools, movable), (x, tools))
+
+
+def test_shapes_are_compared_row_by_row_with_the_gradient_of_their_sums():
+    draw = torch.Generator().manual_seed(0)
+    mass, field, distance, weight = (torch.rand(n, generator=draw).double() for n in ((5, 30), 30, 30, (5, 2)))
+    mass[0, :4] = field[:4]  # where a mass is the target's the slope is 0
+    found = []
+    for function in (compare, lambda m, t: torch.stack([(m - t.mass).abs().sum(1), (m * t.distance).sum(1)], dim=1)):
+        x = mass.clone().requires_grad_()
+        terms = function(x, Target(field, distance))
+        found.append((terms.detach(), *torch.autograd.grad((terms * weight).sum(), x)))
+    for got, wanted in zip(*found, strict=True):
+        torch.testing.assert_close(got, wanted)
+    assert torch.equal(compare(mass[2:3], Target(field, distance))[0], found[0][0][2])
 
 
 def test_what_touches_costs_no_contact():
