@@ -179,6 +179,7 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
         e: int,
         p: int,
     ):
+        """Return what a particle gives to its nodes of momentum m v + A (x_i - x) and mass."""
         given = at_nodes(lattice, read_vector(x, e, p))
         given.mass = read_number(mass, e, p)
         given.a = read_matrix(A, e, p) * (real(1.0) / lattice.inv_dx)
@@ -196,6 +197,7 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
         e: int,
         p: int,
     ):
+        """Return what a particle gives to its nodes of the adjoints of the velocities that g2p gathered."""
         given = at_nodes(lattice, read_vector(x, e, p))
         given.a = (real(4.0) * lattice.inv_dx) * read_matrix(adj_C_new, e, p)
         given.q = read_vector(adj_v_new, e, p) + dt * read_vector(adj_x_new, e, p) - given.a * given.f

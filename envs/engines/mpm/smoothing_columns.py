@@ -45,7 +45,7 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         return gather(lattice, nodes, e, base - lattice.first, from_base(x, base, lattice), q, mat33())
 
     @wp.func(module=module)
-    def given_volume(  # V s and V
+    def given_volume(
         lattice: Lattice,
         body: int,
         slope: real,
@@ -55,6 +55,7 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         e: int,
         p: int,
     ):
+        """Return what a particle gives to its nodes of V s and V."""
         given = at_nodes(lattice, read_vector(x, e, p))
         if p >= body and p < body + J.shape[1]:
             V = read_number(volume, e, p)
@@ -72,6 +73,7 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         e: int,
         p: int,
     ):
+        """Return what a particle gives to its nodes of the adjoints of their means, from that of J'."""
         given = at_nodes(lattice, read_vector(x, e, p))
         if p >= body and p < body + J_new.shape[1]:
             adj_log = read_number(adj_J_new, e, p - body) * read_number(J_new, e, p - body)

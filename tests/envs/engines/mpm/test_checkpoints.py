@@ -164,6 +164,11 @@ def test_as_many_control_steps_are_kept_as_fit_on_their_own_boxes(monkeypatch):
         solver, *again = keep(free)
         assert len(solver.tapes) == kept
         found += again
+    monkeypatch.setattr(mpm, "LEFT", (1.0, 1e6))  # so many bytes are less than all that is free
+    assert [len(keep(sum(sizes[1:]) + free)[0].tapes) for free in (1_000_000, 999_999)] == [
+        model.steps,
+        model.steps - 1,
+    ]
     for end, gradient in found[1:]:
         assert torch.equal(end, found[0][0])
         assert torch.equal(gradient, found[0][1])
