@@ -26,6 +26,8 @@ def build(scene: Chain, asked: argparse.Namespace) -> Simulation:
     import jax
     import jax.numpy as jnp
 
+    jax.config.update("jax_default_matmul_precision", "highest")  # a GPU's products would have the digits of TF32
+
     each = make_loss(jax, jnp, scene)
     forward, both = jax.jit(each), jax.jit(jax.value_and_grad(lambda torques: jnp.mean(each(torques))))
 

@@ -26,7 +26,7 @@ def build(scene: Cube, asked: argparse.Namespace) -> Simulation:
     model = make_model(scene)
     solver = Solver(model, capacity=1, device=asked.device)
     tools = torch.full((1, model.steps + 1, 1, 3), AWAY, dtype=torch.float64)
-    adjoint = torch.zeros(1, scene.particles, 3, dtype=torch.float64)
+    adjoint = torch.zeros(1, scene.particles, 3, device=asked.device)
     adjoint[..., 0] = -1 / scene.particles
 
     def loss(parameters: Array) -> float:
@@ -38,7 +38,7 @@ def build(scene: Cube, asked: argparse.Namespace) -> Simulation:
         loss(parameters)
         solver.gradient({model.steps: adjoint})
         found = solver.orders[0].to_model(to_torch(solver.adjoint.new.v))[0]
-        return scene.pull_back(found.double().cpu().numpy())
+        return scene.pull_back(found.cpu().double().numpy())
 
     return Simulation(
         version=f"gradscape {gradscape.__version__}",

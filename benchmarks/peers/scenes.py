@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +67,7 @@ class Cube:
         """Number of particles times that of substeps."""
         return self.particles * self.substeps
 
-    @property
+    @cached_property
     def x(self) -> Array:
         """Places at first [m], shape (particle, 3): the cube's face is two cells before the wall."""
         side = round(self.particles ** (1 / 3))
@@ -81,12 +82,13 @@ class Cube:
 
     def velocities(self, parameters: Array) -> Array:
         """Return the velocities that parameters, shape (12,), ask for [m/s], shape (particle, 3)."""
-        return self._basis() @ np.concatenate([parameters[None, :3], parameters[3:].reshape(3, 3)])
+        return self._basis @ np.concatenate([parameters[None, :3], parameters[3:].reshape(3, 3)])
 
     def pull_back(self, adjoint: Array) -> Array:
         """Return the adjoint of the parameters, shape (12,), from that of the velocities, shape (particle, 3)."""
-        return (self._basis().T @ adjoint).reshape(-1)
+        return (self._basis.T @ adjoint).reshape(-1)
 
+    @cached_property
     def _basis(self) -> Array:
         place = self.x - self.x.mean(axis=0)
         return np.concatenate([np.ones((len(place), 1)), place / np.abs(place).max()], axis=1)
