@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from functools import cache, partial
 from importlib.metadata import version
 from typing import Any
@@ -25,6 +26,8 @@ DIFFERS = (
 
 def build(scene: Cube, asked: argparse.Namespace) -> Simulation:
     """Return Genesis's simulation of a scene: one of its scenes to go forward, and one that is differentiable."""
+    os.environ.setdefault("PYGLET_HEADLESS", "true")  # it draws nothing, and asks for a display when it is imported
+    os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
     import genesis as gs
     import torch
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -102,7 +103,7 @@ class Model:
         """Whether A of every substep is kept for the gradient, where sums are made by columns."""
         return any(body.material.keeps_affine_momentum for body in self.bodies)
 
-    @property
+    @cached_property
     def corners(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and highest coordinates of particles at rest [m], each of shape (3,)."""
         x = np.concatenate([body.x for body in self.bodies])

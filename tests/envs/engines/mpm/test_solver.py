@@ -114,6 +114,22 @@ def test_a_run_forgets_the_one_before():
     assert [left for _, left in ends] == [[False, False], [True, True], [False, False]]
 
 
+class Untouched(np.ndarray):
+    """Say so where NumPy calculates with it, as it does with all particles then; how many there are may be asked."""
+
+    def __array_function__(self, function, *_):
+        raise AssertionError(f"{function.__name__} goes through all particles")
+
+
+def test_a_second_run_does_not_go_through_particles_at_rest_on_the_processor():
+    model = free_model()
+    solver = Solver(model, capacity=1, device="cpu")
+    first = solver.run(parked(model, 1)).clone()
+    for body in model.bodies:
+        object.__setattr__(body, "x", body.x.view(Untouched))
+    assert torch.equal(solver.run(parked(model, 1)), first)
+
+
 @pytest.fixture(scope="module")
 def resting():
     """Return what half a second does to a tank at rest: (centre's drift [m], fastest and last mean speed [m/s])."""
