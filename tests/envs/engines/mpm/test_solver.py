@@ -115,7 +115,9 @@ def test_a_run_forgets_the_one_before():
 
 
 class Untouched(np.ndarray):
-    """Say so where NumPy calculates with it, as it does with all particles then; how many there are may be asked."""
+    """Fail where NumPy calculates with it, as it does with all particles then; how many there are may be asked."""
+
+    __array_ufunc__ = None
 
     def __array_function__(self, function, *_):
         raise AssertionError(f"{function.__name__} goes through all particles")
