@@ -105,9 +105,7 @@ class JaxObjective(FunctionObjective):
             both = jax.value_and_grad if self.mode == "reverse" else _value_and_tangents
             at: Callable[[Any], Any] = both(self._one) if grad else self._one
             whole = jax.vmap(at) if self.batch == "vmap" else lambda x: jax.lax.map(at, x)
-            points = jax.ShapeDtypeStruct((size, self.space.dim), self.precision)
-            forget_other_precision(self.precision)
-            self._compiled[grad, size] = jax.jit(whole).lower(points).compile()
+            self._compiled[grad, size] = compiled(whole, (size, self.space.dim), self.precision)
         return self._compiled[grad, size]
 
     def _one(self, x: Any) -> Any:
@@ -177,7 +175,25 @@ def computing_in(name: str) -> Iterator[None]:
         yield
 
 
-def forget_other_precision(name: str) -> None:
+def compiled(fn: Callable[[Any], Any], shape: tuple[int, ...], precision: str) -> Callable[[Any], Any]:
+    """Return the compiled function of an array of one shape, in the precision that JAX computes in now.
+
+    XLA's newer emitters of code for CPUs take twice as long to compile a simulator's many small operations, which are
+    no faster then.
+    """
+    import jax
+
+    _forget_other_precision(precision)
+    lowered = jax.jit(fn).lower(jax.ShapeDtypeStruct(shape, precision))
+    try:
+        return lowered.compile({"xla_cpu_use_fusion_emitters": False})
+    except jax.errors.JaxRuntimeError as error:
+        if "No such compile option" not in str(error):
+            raise
+        return lowered.compile()  # another version of XLA
+
+
+def _forget_other_precision(name: str) -> None:
     """Let JAX forget what it has traced, where that was last for another precision; what is compiled stays.
 
     It finds traces of functions of NumPy arrays again in the other precision, where they do not fit: compiling

@@ -1,6 +1,7 @@
 """MuJoCo's scenes: against our own chain and closed forms, what parameters set, what a model without sense is told."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import torch
 from scipy.stats import spearmanr
 
 import gradscape as gs
+from gradscape.envs.engines.jax_functions import compiled, computing_in
 from gradscape.envs.mjx.scene import MjxScene, Parameter
 from gradscape.envs.mjx.scenes import Drop, Push
 from gradscape.envs.registry import entries
@@ -111,6 +113,41 @@ def test_the_chain_of_another_hand_swings_as_ours():
     assert spearmanr(theirs, mine).statistic > 0.99
     at = other.episode(x[0])
     assert float((at.points["capsule 3"][0, 0] - at.points["capsule 1"][0, 0]).norm()) == pytest.approx(2.0)
+
+
+PENDULUM = """
+<mujoco>
+  <option timestep="0.05" integrator="RK4"/>
+  <worldbody>
+    <body>
+      <joint name="hinge" type="{joint}" damping="0.3"/>
+      <geom type="capsule" fromto="0 0 0 0.3 0 -1" size="0.05" contype="0" conaffinity="0"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_a_step_by_runge_and_kutta_is_that_of_mjx(monkeypatch):
+    """Of what turns about one axis; about any axis it is MJX's own."""
+    mjx = pytest.importorskip("mujoco.mjx")
+    from gradscape.envs.engines.mjx import rollout
+
+    with computing_in("float64"):
+        host = rollout.load(PENDULUM.format(joint="hinge"), "pendulum")
+        model, state = mjx.put_model(host), mjx.make_data(host)
+        state = state.replace(qpos=state.qpos + 0.4, qvel=state.qvel - 1.5)
+
+        def moved(to, qpos):
+            end = to(model, state.replace(qpos=qpos))
+            return end.qpos, end.qvel, end.time, end.qacc_warmstart
+
+        ours, theirs = (compiled(partial(moved, to), (1,), "float64") for to in (rollout.step, mjx.step))
+        for got, wanted in zip(ours(state.qpos), theirs(state.qpos), strict=True):
+            np.testing.assert_allclose(got, wanted, rtol=1e-14, atol=0)
+        ball = mjx.put_model(rollout.load(PENDULUM.format(joint="ball"), "ball"))
+        monkeypatch.setattr(mjx, "step", lambda model, state: "its own")
+        assert rollout.step(ball, None) == "its own"
 
 
 def test_the_ball_falls_as_galileo_says_until_it_touches():

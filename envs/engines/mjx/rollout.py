@@ -16,7 +16,7 @@ from mujoco import mjx
 from numpy.typing import NDArray
 from platformdirs import user_cache_dir
 
-from ..jax_functions import computing_in, forget_other_precision
+from ..jax_functions import compiled, computing_in
 from ..jax_functions import from_jax as from_jax
 
 if jax.config.values.get("jax_compilation_cache_dir") is None:  # a scene takes long to compile
@@ -29,6 +29,7 @@ NAMED = {"body": mujoco.mjtObj.mjOBJ_BODY, "geom": mujoco.mjtObj.mjOBJ_GEOM, "jn
 NAMED |= {"actuator": mujoco.mjtObj.mjOBJ_ACTUATOR, "ctrl": mujoco.mjtObj.mjOBJ_ACTUATOR}
 JOINTED = {"qpos": "jnt_qposadr", "qvel": "jnt_dofadr", "dof": "jnt_dofadr"}  # rows of these go by the names of joints
 SOLVERS = {"newton": mujoco.mjtSolver.mjSOL_NEWTON, "cg": mujoco.mjtSolver.mjSOL_CG}
+STAGES = np.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]])  # of Runge and Kutta: part, share
 
 Place = tuple[str, tuple[int, ...]]  # a field, and which of its numbers
 Act = Callable[[Any, Any, Any], Any]  # act(model, state, controls): the state with these controls
@@ -123,9 +124,9 @@ class Rollout:
 
         Shapes (frame, geom, 3) and (frame, geom, 3, 3).
         """
-        forget_other_precision(self.precision)
         with computing_in(self.precision):
-            at, turn = jax.jit(partial(self._frames, course=course))(jnp.asarray(x, dtype=self.precision))
+            frames = compiled(partial(self._frames, course=course), x.shape, self.precision)
+            at, turn = frames(jnp.asarray(x, dtype=self.precision))
         return np.asarray(at, dtype=np.float64), np.asarray(turn, dtype=np.float64)
 
     def _frames(self, x: Any, course: Course) -> Any:
@@ -145,7 +146,7 @@ class Rollout:
 
         def hold(state: Any, control: Any) -> Any:
             state = course.act(model, state, control)
-            return jax.lax.scan(lambda now, _: (mjx.step(model, now), look(model, now)), state, length=course.steps)
+            return jax.lax.scan(lambda now, _: (step(model, now), look(model, now)), state, length=course.steps)
 
         state, seen = jax.lax.scan(hold, start, self._controls(x, course))
         return model, state, seen
@@ -158,7 +159,7 @@ class Rollout:
             home, source = (of_state, self.start) if field in AT_FIRST else (of_model, self.model)
             home[field] = home.get(field, getattr(source, field)).at[at].set(x[number])
         model = self.model.replace(**of_model) if of_model else self.model
-        return model, self.start.replace(**of_state)
+        return model, _on_parameters(self.start.replace(**of_state), x)
 
     def _controls(self, x: Any, course: Course) -> Any:
         """Return the controls of every segment, shape (segment, actuator); those that no parameter sets are zero."""
@@ -187,9 +188,46 @@ def load(mjcf: str, name: str) -> Any:
         raise ValueError(f"{name} has a model that MuJoCo cannot read: {' '.join(str(error).split())}") from error
 
 
+def step(model: Any, state: Any) -> Any:
+    """Return the state a time step later, as `mjx.step` does.
+
+    That writes Runge and Kutta's four calls of `mjx.forward` one after another, and each is traced and compiled for
+    itself. Here they are one loop, where positions are numbers that velocities add to: without joints that turn about
+    any axis, and without actuators that have a state of their own.
+    """
+    if model.opt.integrator == mjx.IntegratorType.RK4 and model.nq == model.nv and not model.na:
+        return runge_kutta(model, state)
+    return mjx.step(model, state)
+
+
+def runge_kutta(model: Any, start: Any) -> Any:
+    """Return the state a time step later, by the classical method of Runge and Kutta."""
+    dt, none = model.opt.timestep, jnp.zeros_like(start.qvel)
+
+    def stage(carry: Any, numbers: Any) -> Any:
+        now, speed, push = carry
+        part, share = numbers
+        qpos, qvel = start.qpos + dt * (part * now.qvel), start.qvel + dt * (part * now.qacc)
+        now = mjx.forward(model, now.replace(qpos=qpos, qvel=qvel, time=start.time + part * dt))
+        return (now, speed + share * now.qvel, push + share * now.qacc), None
+
+    (last, speed, push), _ = jax.lax.scan(stage, (start, none, none), STAGES)
+    qpos, qvel = start.qpos + dt * speed, start.qvel + dt * push
+    return last.replace(qpos=qpos, qvel=qvel, time=start.time + dt, qacc_warmstart=last.qacc)
+
+
+def _on_parameters(state: Any, x: Any) -> Any:
+    """Return the same numbers, as numbers that depend on parameters.
+
+    Most come to depend on them in the course of an episode, and JAX traces each loop anew until it knows which.
+    """
+    none = 0.0 * x[0]
+    return jax.tree.map(lambda leaf: leaf + none if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, state)
+
+
 def kick(model: Any, state: Any, dof: int, speed: Any) -> Any:
     """Return the state whose degree of freedom `dof` has a speed at once, as an impulse on it alone would make it."""
-    state = mjx.forward(model, state)
+    state = mjx.crb(model, mjx.com_pos(model, mjx.kinematics(model, state)))  # all that masses depend on
     unit = jnp.zeros_like(state.qvel).at[dof].set(1.0)
     answer = jnp.linalg.solve(mjx.full_m(model, state), unit)
     return state.replace(qvel=state.qvel + answer * (speed - state.qvel[dof]) / answer[dof])
