@@ -128,8 +128,8 @@ class Launches:
     def __init__(self, device: str) -> None:
         self.device = device
         self.sequences: dict[Hashable, _Sequence] = {}
-        self.seen: set[Hashable] = set()
-        self.graphs: dict[Hashable, Any] = {}
+        self.seen: set[tuple[Hashable, Hashable]] = set()
+        self.graphs: dict[tuple[Hashable, Hashable], Any] = {}
         self.streams = _Streams(device)
 
     def run(self, key: Hashable, extent: Hashable, work: Callable[[], None], *, place: Any = None, small: bool) -> None:
@@ -185,11 +185,11 @@ class Launches:
         """Let what follows wait for what was launched `beside`."""
         self._recording.launches.append(_Mark(None))
 
-    def clear(self) -> None:
-        """Drop all that is stored."""
-        self.sequences.clear()
-        self.seen.clear()
-        self.graphs.clear()
+    def clear(self, concerned: Callable[[Any], bool] = lambda key: True) -> None:
+        """Drop what is stored under keys that are `concerned`, by default all."""
+        self.sequences = {key: stored for key, stored in self.sequences.items() if not concerned(key)}
+        self.seen = {(key, extent) for key, extent in self.seen if not concerned(key)}
+        self.graphs = {(key, extent): graph for (key, extent), graph in self.graphs.items() if not concerned(key)}
 
     def _run_graph(self, key: tuple[Hashable, Hashable], known: _Sequence, place: Any) -> None:
         if key not in self.graphs:

@@ -21,7 +21,7 @@ class Adjoint:
         self.solver = weakref.proxy(solver)  # which holds this: a cycle would keep a GPU's memory until it is collected
         self.new, self.old = solver.allocator.frame(), solver.allocator.frame()
         self.A = None if solver.columns else solver.allocator.affine_momentum()
-        self.grid = solver.allocator.grid(max(box.cells for box in solver.boxes))
+        self.grid = solver.allocator.grid(max(solver.tapes[0].room(box) for box in solver.boxes))
         self.tools = solver.allocator.paths()
         self.tools_by_axis: Any = wp.from_torch(to_torch(self.tools), requires_grad=False)
         self.settle = settle_kernel(solver.model.precision)  # of a GPU, where nodes do not add to the adjoint itself
@@ -47,8 +47,8 @@ class Adjoint:
     def _retreat(self, step: int, batch: int) -> None:
         solver = self.solver
         if self.grid.m.shape[1] < solver.boxes[step].cells:
-            self.grid = solver.allocator.grid(solver.boxes[step].cells)
-            solver.launches.clear()
+            self.grid = solver.allocator.grid(solver.tape(step).room(solver.boxes[step]))
+            solver.launches.clear(lambda key: key[0] == "backward")
         ends = (self.new, self.old) if solver.model.substeps % 2 else (self.old, self.new)  # as often exchanged
         key = "backward", step, batch, id(self.new)
         solver.launch_again(key, step, batch, lambda: self._substeps(step, batch))

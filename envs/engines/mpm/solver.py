@@ -44,6 +44,7 @@ BUSY, FULL_CARD = 400_000, 1_750_000  # particles that keep a GPU busy; more tha
 WHOLE_EPISODE = 300e6  # bytes up to which a CPU stores an episode whole
 LAUNCHES = 200_000  # particles up to which launches cost a GPU more than what they launch
 LEFT = 0.15, 6e9  # part of a GPU's free memory, and bytes of it, that control steps leave, whichever is less
+STEPWISE = ("forward", "backward")  # launches that work on what a control step stores, whose keys name it second
 GRAIN = 4  # nodes to which the boxes of so few are rounded, so that the same ones come again
 
 
@@ -143,15 +144,16 @@ class Solver:
         return self.read_positions(steps, batch)
 
     def _add_tapes(self) -> None:
-        """Store more control steps whole from the next run on, in most of a GPU's memory that is free after a first."""
+        """Store more control steps whole from the next run on, in most of a GPU's memory that is free after a first.
+
+        The place of the first run, which has room for every step, is then that of the last steps.
+        """
         self.spare_used, first, free = True, self.tapes[0], free_memory()
         spare = free - min(LEFT[0] * free, LEFT[1])
-        for count in range(self.model.steps, 0, -1):
-            boxes = [max(self.boxes[i::count], key=lambda box: box.cells) for i in range(1, count)]
-            if sum(map(first.bytes_on, boxes)) <= spare:
+        for kept in range(self.model.steps - 1, -1, -1):
+            if sum(map(first.bytes_on, self.boxes[:kept])) <= spare:
                 break
-        self.tapes += [Tape(self.allocator, first.room(box), self.pieces) for box in boxes]
-        first.step = -1  # it keeps other steps now
+        self.tapes = [*(Tape(self.allocator, first.room(box), self.pieces) for box in self.boxes[:kept]), first]
         self.launches.clear()
 
     def read_positions(self, step: int, batch: int) -> torch.Tensor:
@@ -179,8 +181,8 @@ class Solver:
         return [tape.start(self.checkpoints[step]), *tape.frames, self.end]
 
     def tape(self, step: int) -> Tape:
-        """Return where a control step is stored whole, or another one at the moment."""
-        return self.tapes[step % len(self.tapes)]
+        """Return where a control step is stored whole: in the last place all that have none of their own, in turn."""
+        return self.tapes[min(step, len(self.tapes) - 1)]
 
     def _advance_on_box(
         self, step: int, batch: int, low: np.ndarray, high: np.ndarray
@@ -227,15 +229,17 @@ class Solver:
     def _make_room(self, step: int) -> None:
         """Make room for a control step, at the cost of others where memory runs out."""
         while len(self.tapes) > 1 and not self._fits(step):
-            self._drop_tapes()
-        if self.tape(step).growth(self.boxes[step]) + self.scatter.make_room(self.boxes[step]):
+            self._drop_tape()
+        if self.scatter.make_room(self.boxes[step]):
             self.launches.clear()
+        if self.tape(step).growth(self.boxes[step]):
+            self._forget_launches(step)
         try:
             self.tape(step).make_room(step, self.boxes[step])
         except RuntimeError:  # what is free need not be of one piece
             if len(self.tapes) == 1:
                 raise
-            self._drop_tapes()
+            self._drop_tape()
             self._make_room(step)
 
     def _fits(self, step: int) -> bool:
@@ -248,9 +252,16 @@ class Solver:
         growth = self.tape(step).growth(self.boxes[step])
         return not growth or growth <= free_memory() // 2
 
-    def _drop_tapes(self) -> None:
-        self.launches.clear()
-        del self.tapes[len(self.tapes) // 2 :]
+    def _drop_tape(self) -> None:
+        """Store one control step fewer, the last that has a place of its own."""
+        self._forget_launches(len(self.tapes) - 2)
+        del self.tapes[-2]
+        wp.synchronize_device(self.device)  # what is given back counts as free after that
+
+    def _forget_launches(self, step: int) -> None:
+        """Forget the launches of all control steps that are stored where this one is, whose arrays are replaced."""
+        place = self.tape(step)
+        self.launches.clear(lambda key: key[0] in STEPWISE and self.tape(key[1]) is place)
 
     def launch_again(self, key: tuple[Any, ...], step: int, batch: int, work: Callable[[], None]) -> None:
         """Do a control step's work, by the launches kept from the last time if there was one."""

@@ -159,19 +159,58 @@ def test_as_many_control_steps_are_kept_as_fit_on_their_own_boxes(monkeypatch):
     sizes = [tape.bytes for tape in whole.tapes]
     assert len(sizes) == model.steps
     assert max(sizes) > min(sizes)
-    enough = int(sum(sizes[1:]) / (1 - mpm.LEFT[0])) + 1
+    enough = int(sum(sizes[:-1]) / (1 - mpm.LEFT[0])) + 1
     for free, kept in ((enough, model.steps), (int(0.99 * enough), model.steps - 1), (0, 1)):
         solver, *again = keep(free)
         assert len(solver.tapes) == kept
         found += again
     monkeypatch.setattr(mpm, "LEFT", (1.0, 1e6))  # so many bytes are less than all that is free
-    assert [len(keep(sum(sizes[1:]) + free)[0].tapes) for free in (1_000_000, 999_999)] == [
+    assert [len(keep(sum(sizes[:-1]) + free)[0].tapes) for free in (1_000_000, 999_999)] == [
         model.steps,
         model.steps - 1,
     ]
     for end, gradient in found[1:]:
         assert torch.equal(end, found[0][0])
         assert torch.equal(gradient, found[0][1])
+
+
+@pytest.mark.parametrize("columns", [False, True])
+def test_a_control_step_that_needs_more_nodes_is_launched_anew_and_no_other(columns):
+    """Launches are stored with the arrays they work on; each run of other parameters has steps that need more."""
+    model, paths = kneading()
+    adj_x = {2: weights(model, 3, 5), model.steps: weights(model, 3, 6)}
+    solver = Solver(model, capacity=3, device="cpu", columns=columns)
+    solver.margins[2] += 5  # what all control steps share has room for the largest
+    for _ in range(2):
+        end, gradient = solver.run(paths).clone(), solver.gradient(adj_x)
+    before, room = dict(solver.launches.sequences), solver.tapes[1].bytes
+    solver.margins[1] += 2
+    again, slopes = solver.run(paths), solver.gradient(adj_x)
+    assert solver.tapes[1].bytes > room
+    anew = {key for key, sequence in solver.launches.sequences.items() if before.get(key) is not sequence}
+    assert {key[:2] for key in anew} == {("forward", 1), ("backward", 1)}
+    assert torch.equal(again, end)
+    assert torch.equal(slopes, gradient)
+
+
+@pytest.mark.parametrize("columns", [False, True])
+@pytest.mark.parametrize("kept", [1, 2, 3])
+def test_control_steps_given_up_one_by_one_change_no_bit(kept, columns):
+    """Between two runs, and before the way back, where they are computed again."""
+    model, paths = kneading()
+    assert model.steps > kept
+    adj_x = {2: weights(model, 3, 5), model.steps: weights(model, 3, 6)}
+    solver = Solver(model, capacity=3, device="cpu", columns=columns)
+    end, gradient = solver.run(paths).clone(), solver.gradient(adj_x)
+    for when in ("before", "between"):
+        while when == "before" and len(solver.tapes) > kept + 1:
+            solver._drop_tape()
+        again = solver.run(paths)
+        while when == "between" and len(solver.tapes) > kept:
+            solver._drop_tape()
+        assert torch.equal(again, end)
+        assert torch.equal(solver.gradient(adj_x), gradient)
+    assert len(solver.tapes) == kept
 
 
 @pytest.mark.parametrize("warned", [True, False])
