@@ -55,7 +55,7 @@ def made(name: str) -> Environment:
 
 @cache
 def made_once(name: str) -> Environment:
-    """Return one such scene for all tests of a process: JAX takes up to a minute to trace one, and four to compile it.
+    """Return one such scene for all tests of a process: JAX takes up to 20 s to trace one, and a minute to compile it.
 
     The contract's fixture is another one.
     """

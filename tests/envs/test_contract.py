@@ -104,7 +104,7 @@ def test_the_same_point_gives_the_same_bits(env, points, result):
     other = made_once(env.name)
     assert other is not env
     if isinstance(env, MjxScene) and not isinstance(env, Drop):
-        # Tracing a gradient again takes up to half a minute: Drop's stands for all of that class, in reverse a dart's.
+        # Tracing a gradient again takes up to 15 s: Drop's stands for all of that class, in reverse a dart's.
         assert torch.equal(other.evaluate(points, grad=False).loss, result.loss)
     else:
         assert_same_bits(other.evaluate(points), result)
@@ -137,7 +137,7 @@ def test_parameters_of_any_precision_get_gradients_of_their_own(env, points):
 
 
 def test_whatever_is_called_ok_at_corners_and_beyond_is_finite_and_was_simulated_there(env):
-    """And where no float32 goes; `benchmarks/corners.py` asks more. JAX takes up to a minute to trace another scene."""
+    """And where no float32 goes; `benchmarks/corners.py` asks more. JAX takes up to 20 s to trace another scene."""
     asked = env if isinstance(env, MjxScene) else small(env.name)
     found = list(answers(asked, outward=(0.0, 0.1, 1e39), most=2))
     assert not [answer for answer in found if answer.outcome not in GOOD]
