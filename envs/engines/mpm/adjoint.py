@@ -98,7 +98,8 @@ class Adjoint:
         for b, (_, adjoint) in enumerate(solver.materials):
             inputs = [*solver.material_inputs(b, step, frame), new.S[b]]
             if solver.columns:
-                kept = [A] if solver.model.bodies[b].material.keeps_affine_momentum else []
+                material = solver.model.bodies[b].material
+                kept = [A] if material.keeps_affine_momentum(solver.model.precision) else []
                 given = [tape.lattice, frame.x, frame.v, self.grid.m, old.v, tape.grids[substep].v, new.x, new.v, new.C]
                 inputs = [*kept, *given, old.x, *inputs]
             else:

@@ -101,7 +101,7 @@ class Model:
     @property
     def keeps_affine_momentum(self) -> bool:
         """Whether A of every substep is kept for the gradient, where sums are made by columns."""
-        return any(body.material.keeps_affine_momentum for body in self.bodies)
+        return any(body.material.keeps_affine_momentum(self.precision) for body in self.bodies)
 
     @cached_property
     def corners(self) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ...runtime import precision
-from . import elastic, fluid, fluid_cpu, plasticine, plasticine_cpu
+from . import elastic, fluid, fluid_cpu, plasticine, plasticine_cpu, plasticine_series
 from .adjoints import after_p2g
 
 
@@ -34,7 +34,10 @@ class Fluid:
     bulk: float
     viscosity: float
     smoothing: float = 0.0
-    keeps_affine_momentum: ClassVar[bool] = False
+
+    def keeps_affine_momentum(self, name: str) -> bool:
+        """Say whether the gradient of one precision needs A of every substep, where sums are made by columns."""
+        return False
 
     def volume_ratio(self, pressure: np.ndarray) -> np.ndarray:
         """Return J at which the fluid bears `pressure` [Pa], counted on its reference volume."""
@@ -78,6 +81,10 @@ class _Solid:
         """First Lame parameter [Pa]."""
         return self.young * self.poisson / ((1.0 + self.poisson) * (1.0 - 2.0 * self.poisson))
 
+    def keeps_affine_momentum(self, name: str) -> bool:
+        """Say whether the gradient of one precision needs A of every substep, where sums are made by columns."""
+        return False
+
     def volume_ratio(self, pressure: np.ndarray) -> np.ndarray:
         """Return J at which the solid bears `pressure` [Pa], to first order."""
         return 1.0 - pressure / (self.lam + 2.0 * self.mu / 3.0)
@@ -95,7 +102,6 @@ class _Solid:
 class Elastic(_Solid):
     """A compressible neo-Hookean solid."""
 
-    keeps_affine_momentum: ClassVar[bool] = False
 
     @classmethod
     def with_wave_speed(cls, density: float, speed: float, *, poisson: float) -> "Elastic":
@@ -117,13 +123,17 @@ class Plasticine(_Solid):
     """A fixed-corotated solid that yields by von Mises at `yield_stress` [Pa]: its shape flows, its volume returns."""
 
     yield_stress: float
-    keeps_affine_momentum: ClassVar[bool] = True
+
+    def keeps_affine_momentum(self, name: str) -> bool:
+        """Say so of float64, where it would take another decomposition to compute A again."""
+        return name == "float64"
 
     def kernels(self, name: str, *, rows: bool = False, columns: bool = False) -> tuple[Any, Any]:
         """Return (update, adjoint) for one precision: those whose threads have `rows`, in float32, or for `columns`."""
         if rows and name == "float32":
             return plasticine_cpu.kernels_in_rows()
-        return _choose(name, plasticine.kernels(name), columns=columns)
+        near = columns and not self.keeps_affine_momentum(name)
+        return _choose(name, (plasticine_series if near else plasticine).kernels(name), columns=columns)
 
     def constants(self) -> tuple[float, ...]:
         """Return what the kernels take besides state and motion; the last is the largest deviatoric log strain."""

@@ -12,6 +12,7 @@ clamp its 1/(s_i^2 - s_j^2) get the gradient of undeformed and of symmetrically 
 """
 
 from functools import cache
+from types import SimpleNamespace
 from typing import Any, no_type_check
 
 import warp as wp
@@ -27,16 +28,16 @@ ROUNDED = 1e-8  # added to |d|^2, so that an undeformed body has a gradient
 
 @cache
 @no_type_check
-def kernels(name: str) -> tuple[Any, Any, Any, None]:
-    """Return the kernels (update, adjoint), what the second does with a particle's adjoint of A, and None.
+def responses(name: str) -> SimpleNamespace:
+    """Return the functions `respond, turn_back` of one precision.
 
-    A particle's A would take another decomposition, so that there is no function for it.
+    `respond` takes a trial deformation gradient, mu, lam and kappa, and returns F' and tau; `turn_back` takes those, the
+    adjoint of F', a weight and the matrix that times it is the adjoint of tau, and returns the adjoint of the trial.
     """
     types = precision(name)
     real, vec3, mat33 = types.real, types.vec3, types.mat33
     module = f"gradscape.plasticine.{name}"
     decompose = svd(name)
-    read_matrix, write_matrix = layout(name).read_matrix, layout(name).write_matrix
     one = wp.constant(vec3(1.0, 1.0, 1.0))
     tiny = wp.constant(real(1e-12))
 
@@ -98,6 +99,86 @@ def kernels(name: str) -> tuple[Any, Any, Any, None]:
         even, odd = real(0.5) * (a + b), real(0.5) * (a - b)
         return even * G[i, j] + odd * G[j, i] + bend * s[j], even * G[j, i] + odd * G[i, j] + bend * s[i]
 
+    @wp.func(module=module)
+    def respond(trial: mat33, mu: real, lam: real, kappa: real):
+        U, s, V = decompose(trial)
+        f = map_to_yield(s, kappa)
+        J = f[0] * f[1] * f[2]
+        t = real(2.0) * mu * wp.cw_mul(f, f - one) + lam * J * (J - real(1.0)) * one
+        return U * wp.diag(f) * wp.transpose(V), U * wp.diag(t) * wp.transpose(U)
+
+    @wp.func(module=module)
+    def turn_back(trial: mat33, mu: real, lam: real, kappa: real, adj_F_new: mat33, weight: real, adj_a: mat33) -> mat33:
+        U, s, V = decompose(trial)
+        e = log_strain(s)
+        d = e - mean(e)
+        length = size(d)
+        f = s
+        a = one  # divided differences of f over s: 01, 02, 12
+        c = real(1.0)
+        if length > kappa:
+            c = kappa / length
+            k = mean(e) + c * d
+            f = vec3(wp.exp(k[0]), wp.exp(k[1]), wp.exp(k[2]))
+            a01 = c * shrink(k[0], k[1]) * slope(s[0], s[1], e[0], e[1])
+            a02 = c * shrink(k[0], k[2]) * slope(s[0], s[2], e[0], e[2])
+            a12 = c * shrink(k[1], k[2]) * slope(s[1], s[2], e[1], e[2])
+            a = vec3(a01, a02, a12)
+        J = f[0] * f[1] * f[2]
+        G = wp.transpose(U) * adj_F_new * V
+        T = weight * (wp.transpose(U) * adj_a * U)
+        g = vec3(G[0, 0], G[1, 1], G[2, 2])  # the adjoint of f
+        g += real(2.0) * mu * wp.cw_mul(vec3(T[0, 0], T[1, 1], T[2, 2]), f + f - one)
+        g += lam * (J + J - real(1.0)) * wp.trace(T) * vec3(f[1] * f[2], f[0] * f[2], f[0] * f[1])
+        if length > kappa:
+            h = wp.cw_mul(g, f)  # the adjoint of log f, then of e
+            h = mean(h) + c * (h - mean(h)) - (c * wp.dot(d, h) / (length * length)) * d
+            g = vec3(h[0] * steep(s[0]), h[1] * steep(s[1]), h[2] * steep(s[2]))
+        p01, p10 = pair(G, T, a[0], mu, f, s, 0, 1)
+        p02, p20 = pair(G, T, a[1], mu, f, s, 0, 2)
+        p12, p21 = pair(G, T, a[2], mu, f, s, 1, 2)
+        P = mat33(g[0], p01, p02, p10, g[1], p12, p20, p21, g[2])
+        return U * P * wp.transpose(V)
+
+    return SimpleNamespace(respond=respond, turn_back=turn_back)
+
+
+@cache
+def kernels(name: str) -> tuple[Any, Any, Any, None]:
+    """Return the kernels (update, adjoint), what the second does with a particle's adjoint of A, and None.
+
+    A particle's A would take another decomposition, so that there is no function for it.
+    """
+    return *kernels_of(name, responses(name), f"gradscape.plasticine.{name}")[:3], None
+
+
+@no_type_check
+def kernels_of(name: str, found: Any, module: str) -> tuple[Any, Any, Any, Any]:
+    """Return what `kernels` does, of a material of these `responses`, and the function that computes A again."""
+    types = precision(name)
+    real, mat33 = types.real, types.mat33
+    respond, respond_back = found.respond, found.turn_back
+    read_matrix, write_matrix = layout(name).read_matrix, layout(name).write_matrix
+
+    @wp.func(module=module)
+    def affine_momentum(
+        first: int,
+        dt: real,
+        scale: real,
+        mu: real,
+        lam: real,
+        kappa: real,
+        mass: wp.array2d[real],
+        volume: wp.array2d[real],
+        F: wp.array2d[mat33],
+        C: wp.array2d[mat33],
+        e: int,
+        p: int,
+    ) -> mat33:
+        c, before = read_matrix(C, e, first + p), read_matrix(F, e, p)
+        _, stress = respond(before + dt * c * before, mu, lam, kappa)
+        return scale * volume[e, first + p] * stress + mass[e, first + p] * c
+
     @wp.kernel(module=module, enable_backward=False)
     def update(
         first: int,
@@ -115,13 +196,8 @@ def kernels(name: str) -> tuple[Any, Any, Any, None]:
     ):
         e, p = wp.tid()
         c, before = read_matrix(C, e, first + p), read_matrix(F, e, p)
-        trial = before + dt * c * before
-        U, s, V = decompose(trial)
-        f = map_to_yield(s, kappa)
-        J = f[0] * f[1] * f[2]
-        t = real(2.0) * mu * wp.cw_mul(f, f - one) + lam * J * (J - real(1.0)) * one
-        write_matrix(F_new, e, p, U * wp.diag(f) * wp.transpose(V))
-        stress = U * wp.diag(t) * wp.transpose(U)
+        after, stress = respond(before + dt * c * before, mu, lam, kappa)
+        write_matrix(F_new, e, p, after)
         write_matrix(A, e, first + p, scale * volume[e, first + p] * stress + mass[e, first + p] * c)
 
     @wp.func(module=module)
@@ -145,38 +221,10 @@ def kernels(name: str) -> tuple[Any, Any, Any, None]:
     ):
         advance = wp.identity(n=3, dtype=real) + dt * read_matrix(C, n, first + p)
         before = read_matrix(F, n, p)
-        U, s, V = decompose(advance * before)
-        e = log_strain(s)
-        d = e - mean(e)
-        length = size(d)
-        f = s
-        a = one  # divided differences of f over s: 01, 02, 12
-        c = real(1.0)
-        if length > kappa:
-            c = kappa / length
-            k = mean(e) + c * d
-            f = vec3(wp.exp(k[0]), wp.exp(k[1]), wp.exp(k[2]))
-            a01 = c * shrink(k[0], k[1]) * slope(s[0], s[1], e[0], e[1])
-            a02 = c * shrink(k[0], k[2]) * slope(s[0], s[2], e[0], e[2])
-            a12 = c * shrink(k[1], k[2]) * slope(s[1], s[2], e[1], e[2])
-            a = vec3(a01, a02, a12)
-        J = f[0] * f[1] * f[2]
-        G = wp.transpose(U) * read_matrix(adj_F_new, n, p) * V
-        T = (scale * volume[n, first + p]) * (wp.transpose(U) * adj_a * U)
-        g = vec3(G[0, 0], G[1, 1], G[2, 2])  # the adjoint of f
-        g += real(2.0) * mu * wp.cw_mul(vec3(T[0, 0], T[1, 1], T[2, 2]), f + f - one)
-        g += lam * (J + J - real(1.0)) * wp.trace(T) * vec3(f[1] * f[2], f[0] * f[2], f[0] * f[1])
-        if length > kappa:
-            h = wp.cw_mul(g, f)  # the adjoint of log f, then of e
-            h = mean(h) + c * (h - mean(h)) - (c * wp.dot(d, h) / (length * length)) * d
-            g = vec3(h[0] * steep(s[0]), h[1] * steep(s[1]), h[2] * steep(s[2]))
-        p01, p10 = pair(G, T, a[0], mu, f, s, 0, 1)
-        p02, p20 = pair(G, T, a[1], mu, f, s, 0, 2)
-        p12, p21 = pair(G, T, a[2], mu, f, s, 1, 2)
-        P = mat33(g[0], p01, p02, p10, g[1], p12, p20, p21, g[2])
-        adj_trial = U * P * wp.transpose(V)
+        weight, adj_after = scale * volume[n, first + p], read_matrix(adj_F_new, n, p)
+        adj_trial = respond_back(advance * before, mu, lam, kappa, adj_after, weight, adj_a)
         write_matrix(adj_F, n, p, wp.transpose(advance) * adj_trial)
         adj_c = mass[n, first + p] * adj_a + dt * adj_trial * wp.transpose(before)
         write_matrix(adj_C, n, first + p, adj_c)
 
-    return update, alone(name, turn_back), turn_back, None
+    return update, alone(name, turn_back), turn_back, affine_momentum
