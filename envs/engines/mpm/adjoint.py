@@ -10,7 +10,6 @@ import warp as wp
 from ..runtime import load, to_torch
 from .checkpoints import Frame
 from .exact import settle_kernel
-from .scatter import nodes
 from .stencil import lattice
 
 
@@ -21,7 +20,7 @@ class Adjoint:
         self.solver = weakref.proxy(solver)  # which holds this: a cycle would keep a GPU's memory until it is collected
         self.new, self.old = solver.allocator.frame(), solver.allocator.frame()
         self.A = None if solver.columns else solver.allocator.affine_momentum()
-        self.grid = solver.allocator.grid(max(solver.tapes[0].room(box) for box in solver.boxes))
+        self.grid = solver.allocator.grid(max(tape.cells for tape in solver.tapes))
         self.tools = solver.allocator.paths()
         self.tools_by_axis: Any = wp.from_torch(to_torch(self.tools), requires_grad=False)
         self.settle = settle_kernel(solver.model.precision)  # of a GPU, where nodes do not add to the adjoint itself
@@ -46,8 +45,8 @@ class Adjoint:
 
     def _retreat(self, step: int, batch: int) -> None:
         solver = self.solver
-        if self.grid.m.shape[1] < solver.boxes[step].cells:
-            self.grid = solver.allocator.grid(solver.tape(step).room(solver.boxes[step]))
+        if self.grid.m.shape[1] < solver.tape(step).cells:
+            self.grid = solver.allocator.grid(solver.tape(step).cells)
             solver.launches.clear(lambda key: key[0] == "backward")
         ends = (self.new, self.old) if solver.model.substeps % 2 else (self.old, self.new)  # as often exchanged
         key = "backward", step, batch, id(self.new)
@@ -85,7 +84,7 @@ class Adjoint:
         adjoints = [*self.structs, *[None] * 6, self.tools, None, self.grid.m, self.grid.v]
         adjoints += [None] * (len(inputs) - len(adjoints))
         how = {"adj_inputs": adjoints, "adj_outputs": [], "adjoint": True}
-        solver.launch_on_box(solver.velocity, nodes, batch, inputs, **how)
+        solver.launch_at_nodes(solver.velocity, step, batch, inputs, **how)
 
     def _adjoint_p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
         """Launch the adjoint of p2g, and those of the materials after it or as its continuation."""
@@ -100,7 +99,8 @@ class Adjoint:
             if solver.columns:
                 material = solver.model.bodies[b].material
                 kept = [A] if material.keeps_affine_momentum(solver.model.precision) else []
-                given = [tape.lattice, frame.x, frame.v, self.grid.m, old.v, tape.grids[substep].v, new.x, new.v, new.C]
+                lists = tape.lists[substep]
+                given = [tape.lattice, lists.starts, frame.x, frame.v, self.grid.m, old.v, tape.grids[substep].v, new.x, new.v, new.C]
                 inputs = [*kept, *given, old.x, *inputs]
             else:
                 inputs += [self.A]

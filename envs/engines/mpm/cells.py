@@ -82,6 +82,23 @@ WRITE_PLACES = """
         at = end;
     }
 """
+# From which node of a column to which one, along z, particles give something: those that its nine columns of cells touch.
+FIND_TOUCHED = """
+    const int bottom = lattice.first[2] / SEGMENT, depth = (lattice.first[2] + lattice.nz - 1) / SEGMENT - bottom + 1;
+    const int x = column / lattice.ny, y = column % lattice.ny, before = lattice.first[2] - bottom * SEGMENT;
+    int low = depth * SEGMENT, high = 0;
+    for (int c = 0; c < 9; ++c) {
+        if (x >= lattice.nx || x < c / 3 || y < c % 3) continue;
+        const int *row = &wp::index(planes, e, ((x - c / 3) * lattice.ny + y - c % 3) * depth);
+        for (int segment = 0; segment < depth; ++segment)
+            for (int plane = 0, bits = row[segment]; bits; ++plane, bits >>= 1)
+                if (bits & 1) {
+                    low = wp::min(low, segment * SEGMENT + plane);
+                    high = wp::max(high, segment * SEGMENT + plane + 1);
+                }
+    }
+    return high ? wp::vec_t<2, wp::int32>(low - before, high - before) : wp::vec_t<2, wp::int32>(0, 0);
+"""
 COUNT_BEFORE = """
     const int *row = &wp::index(arrived, e, 0);
     int before = 0;
@@ -98,21 +115,33 @@ class Lists:
     of each of them which one it is, the first place of its particles, how many there are, and which planes of nodes
     they touch, counted from the segment's first: the lowest, and 256 times the one beyond the highest. Those planes are
     the bits of `planes` [environment, segment], which is 0 where there are no particles.
+
+    Nodes that particles touch have places in grids, one column after the other: `touched` [environment, 2] is how many
+    nodes there are, and columns, `nodes` [environment, place] which node of the box has a place, and `starts`
+    [environment, column] the place of the column's node 0, if it had one.
     """
 
     order: wp.array
     full: wp.array
     segments: wp.array
     planes: wp.array
+    starts: wp.array
+    nodes: wp.array
+    touched: wp.array
 
     def arrays(self) -> tuple[wp.array, ...]:
         """Return every array of the lists."""
-        return (self.order, self.full, self.segments, self.planes)
+        return (self.order, self.full, self.segments, self.planes, self.starts, self.nodes, self.touched)
 
 
 def warps(box: Box) -> int:
     """Return the number of threads, in whole warps, that a box's segments take one each."""
     return -(-segments(box) // 32) * 32
+
+
+def column_warps(box: Box) -> int:
+    """Return the number of threads, in whole warps, that a box's columns of nodes take one each."""
+    return -(-box.nodes[0] * box.nodes[1] // 32) * 32
 
 
 def segments(box: Box) -> int:
@@ -166,7 +195,7 @@ def counter(name: str):
 @cache
 @no_type_check
 def cell_kernels(name: str) -> SimpleNamespace:
-    """Return the kernels `count, place_segments, place, tidy` of one precision, which make lists in this order.
+    """Return the kernels `count, place_segments, place_nodes, place, tidy` of one precision, which make lists in this order.
 
     Where g2p has counted particles, `count` need not.
     """
@@ -184,6 +213,9 @@ def cell_kernels(name: str) -> SimpleNamespace:
 
     @wp.func_native(WRITE_PLACES.replace("SEGMENT", str(SEGMENT)))
     def write_places(places: wp.array2d[wp.vec2i], e: int, segment: int, at: int, counted: Counts): ...
+
+    @wp.func_native(FIND_TOUCHED.replace("SEGMENT", str(SEGMENT)))
+    def find_touched(lattice: Lattice, planes: wp.array2d[wp.int32], e: int, column: int) -> wp.vec2i: ...
 
     @wp.func_native(COUNT_BEFORE)
     def count_before(arrived: wp.array2d[wp.int32], e: int, places: wp.vec2i, p: int) -> int: ...
@@ -214,12 +246,16 @@ def cell_kernels(name: str) -> SimpleNamespace:
         found: wp.array2d[wp.vec4i],
         numbers: wp.array2d[wp.int32],
         planes: wp.array2d[wp.int32],
+        touched: wp.array2d[wp.int32],
     ):
         """Give each segment its places in the list, each of its cells, too, and it a number among those of its size.
 
         A cell's `places` are its first in the list and the one beyond its last. `counts` are 0 again.
         """
         e, s = wp.tid()
+        if s == 0:
+            touched[e, 0] = 0
+            touched[e, 1] = 0
         bottom = lattice.first[2] / SEGMENT
         depth = (lattice.first[2] + lattice.nz - 1) / SEGMENT - bottom + 1
         there = s < lattice.nx * lattice.ny * depth
@@ -242,6 +278,28 @@ def cell_kernels(name: str) -> SimpleNamespace:
             numbers[e, segment] = take_number(sizes, e, size_of(total))
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    def place_nodes(
+        lattice: Lattice,
+        planes: wp.array2d[wp.int32],
+        touched: wp.array2d[wp.int32],
+        starts: wp.array2d[wp.int32],
+        nodes: wp.array2d[wp.int32],
+    ):
+        """Give the nodes of each column that particles touch, and those between them, places one after the other.
+
+        Where there is not room for all that are touched none of them counts, and the control step is done again.
+        """
+        e, column = wp.tid()
+        found = find_touched(lattice, planes, e, column)
+        low, count = found[0], found[1] - found[0]
+        start = take_places(touched, e, count)[0]
+        if column < lattice.nx * lattice.ny:
+            starts[e, column] = start - low
+            if start + count <= nodes.shape[1]:
+                for k in range(count):
+                    nodes[e, start + k] = column * lattice.nz + low + k
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def place(
         cells: wp.array2d[wp.int32],
         numbers: wp.array2d[wp.int32],
@@ -253,11 +311,17 @@ def cell_kernels(name: str) -> SimpleNamespace:
         arrived: wp.array2d[wp.int32],
         full: wp.array[wp.int32],
         segments: wp.array2d[wp.vec4i],
+        touched: wp.array2d[wp.int32],
+        needed: wp.array[wp.int32],
     ):
-        """List particles by cell, those of a cell as they arrived, and segments by size, the largest first."""
+        """List particles by cell, those of a cell as they arrived, and segments by size, the largest first.
+
+        `needed` is how many nodes have been touched at most.
+        """
         e, p = wp.tid()
         if p == 0:
             full[e] = used[e, 1]
+            needed[e] = wp.max(needed[e], touched[e, 0])
         cell = cells[e, p]
         if cell >= 0:
             arrived[e, places[e, cell][0] + numbers[e, p]] = p
@@ -289,4 +353,6 @@ def cell_kernels(name: str) -> SimpleNamespace:
             mine = places[e, cell]
             order[e, mine[0] + count_before(arrived, e, mine, p)] = p
 
-    return SimpleNamespace(count=count, place_segments=place_segments, place=place, tidy=tidy)
+    return SimpleNamespace(
+        count=count, place_segments=place_segments, place_nodes=place_nodes, place=place, tidy=tidy
+    )

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import warp as wp
 
@@ -82,11 +82,17 @@ class Allocator:
         """A of the latest substep, for all tapes together, where no material keeps it."""
         return self.affine_momentum()
 
-    def lists(self, segments: int) -> Lists:
+    def lists(self, room: "Room") -> Lists:
         """Return lists of no particles."""
-        full: wp.array = wp.zeros(self.capacity, dtype=wp.int32, device=self.device)
-        order = self.array(wp.int32, self.model.particles)
-        return Lists(order, full, self.array(wp.vec4i, segments), self.array(wp.int32, segments))
+        return Lists(
+            order=self.array(wp.int32, self.model.particles),
+            full=wp.zeros(self.capacity, dtype=wp.int32, device=self.device),
+            segments=self.array(wp.vec4i, room.segments),
+            planes=self.array(wp.int32, room.segments),
+            starts=self.array(wp.int32, room.columns),
+            nodes=self.array(wp.int32, room.nodes),
+            touched=self.array(wp.int32, 2),
+        )
 
     def paths(self) -> wp.array:
         """Return zeros [environment, step, slot]."""
@@ -101,9 +107,17 @@ class Allocator:
         return wp.zeros((self.capacity * LANES, count), dtype=wp.int64, device=self.device)
 
 
-def segment_room(box: Box) -> int:
-    """Return how many segments to make room for where a box is needed."""
-    return segments(box) * 5 // 4
+class Room(NamedTuple):
+    """How many nodes, columns of nodes and segments arrays have places for."""
+
+    nodes: int
+    columns: int
+    segments: int
+
+
+def spare(count: int) -> int:
+    """Return how many to make room for where so many are needed."""
+    return count * 5 // 4
 
 
 class Cycle(list[T]):
@@ -123,7 +137,8 @@ class Tape:
     """
 
     def __init__(self, allocator: Allocator, cells: int = 1, pieces: int = 1) -> None:
-        model = allocator.model
+        model, columns = allocator.model, int(allocator.columns)  # arrays of nothing are none to Warp
+        self._room = room = Room(cells, columns, columns)
         self.step = -1
         held = model.piece(pieces)
         inner = [allocator.frame() for _ in range(held - 1)]
@@ -133,7 +148,7 @@ class Tape:
         self._kept = [allocator.affine_momentum() for _ in range(held if allocator.keeps_affine_momentum else 0)]
         self.A: Cycle[wp.array] = Cycle(self._kept or [allocator.latest_affine_momentum])
         self.grids: Cycle[Grid] = Cycle(allocator.grid(cells) for _ in range(held))
-        self.lists: Cycle[Lists] = Cycle(allocator.lists(1) for _ in range(held if allocator.columns else 0))
+        self.lists: Cycle[Lists] = Cycle(allocator.lists(room) for _ in range(held if allocator.columns else 0))
         self.box, self.lattice = NOWHERE, place_grid(model)
         self._allocator = allocator
 
@@ -144,61 +159,66 @@ class Tape:
         lists = [array for one in self.lists for array in one.arrays()]
         return sum(array.capacity for array in (*frames, *self.smoothed.values(), *self._kept, *self._nodes, *lists))
 
-    def growth(self, box: Box) -> int:
-        """Return the bytes that a box of nodes takes beyond those that are there, 0 where these suffice."""
-        if box == self.box:
-            return 0
-        more_cells = self.room(box) - self._cells if self._cells < box.cells else 0
-        more_segments = segment_room(box) - self._segments if self.lists and self._segments < segments(box) else 0
-        return self._bytes_of(more_cells, more_segments)
+    def growth(self, box: Box, nodes: int) -> int:
+        """Return the bytes that so many nodes of a box take beyond those that are there, 0 where these suffice."""
+        return self._bytes_of(self._grown(box, nodes)) - self._bytes_of(self._room)
 
-    def bytes_on(self, box: Box) -> int:
-        """Return the bytes that a tape like this takes that is made for a box of nodes."""
-        more_segments = segment_room(box) - self._segments if self.lists else 0
-        return self.bytes + self._bytes_of(self.room(box) - self._cells, more_segments)
+    def bytes_on(self, box: Box, nodes: int) -> int:
+        """Return the bytes that a tape like this takes that is made for so many nodes of a box."""
+        return self.bytes + self._bytes_of(self._spare(box, nodes)) - self._bytes_of(self._room)
 
     def start(self, checkpoint: Frame) -> Frame:
         """Return the frame that the control step starts from: the checkpoint, with the states that are smoothed."""
         return replace(checkpoint, S=tuple(self.smoothed.get(b, S) for b, S in enumerate(checkpoint.S)))
 
-    def make_room(self, step: int, box: Box) -> None:
-        """Become the place of a control step that runs on a box of nodes."""
-        self.step = step
-        if box == self.box:
+    def make_room(self, step: int, box: Box, nodes: int) -> None:
+        """Become the place of a control step that runs on so many nodes of a box."""
+        grown, less = self._grown(box, nodes), self._room
+        if box == self.box and grown == less:
+            self.step = step
             return
-        self.step, self.box = -1, NOWHERE
-        if self._cells < box.cells:
+        self.step, self.box, self._room = -1, NOWHERE, Room(0, 0, 0)  # should this be interrupted
+        if grown.nodes > less.nodes:
             for substep in range(len(self.grids)):
                 self.grids[substep] = self._allocator.grid(0)  # the old one goes first
-                self.grids[substep] = self._allocator.grid(self.room(box))
+                self.grids[substep] = self._allocator.grid(grown.nodes)
             for body in self.means:
                 self.means[body] = self._allocator.nodes(0)
-                self.means[body] = self._allocator.nodes(self.room(box))
-        if self.lists and self._segments < segments(box):
-            self.lists = Cycle(self._allocator.lists(segment_room(box)) for _ in self.lists)
-        self.step, self.box, self.lattice = step, box, place_grid(self._allocator.model, box)
+                self.means[body] = self._allocator.nodes(grown.nodes)
+        if grown != less and self.lists:
+            self.lists = Cycle(self._allocator.lists(grown) for _ in self.lists)
+        self.step, self.box, self._room = step, box, grown
+        self.lattice = place_grid(self._allocator.model, box)
 
     @property
-    def _cells(self) -> int:
-        """How many nodes all its grids have room for."""
-        return min(int(array.shape[1]) for array in self._nodes)
+    def cells(self) -> int:
+        """How many nodes its grids have room for."""
+        return self._room.nodes
+
+    def room(self, nodes: int) -> int:
+        """Return how many nodes to make room for where so many are needed."""
+        return min(spare(nodes), self._allocator.model.cells)
 
     @property
     def _nodes(self) -> list[wp.array]:
         """Every array of nodes."""
         return [*(array for grid in self.grids for array in (grid.m, grid.v)), *self.means.values()]
 
-    @property
-    def _segments(self) -> int:
-        """How many segments all its lists have room for."""
-        return min(int(lists.planes.shape[1]) for lists in self.lists)
+    def _grown(self, box: Box, nodes: int) -> Room:
+        """Return what there has to be room for where so many nodes of a box are needed."""
+        more = self._spare(box, nodes)
+        needed = (nodes, box.columns, segments(box)) if self.lists else (nodes, 0, 0)
+        return Room(*(b if a < n else a for a, n, b in zip(self._room, needed, more, strict=True)))
 
-    def room(self, box: Box) -> int:
-        """Return how many nodes to make room for where a box is needed."""
-        return int(min(box.cells * 5 // 4, self._allocator.model.cells))
+    def _spare(self, box: Box, nodes: int) -> Room:
+        """Return what to make room for where so many nodes of a box are needed."""
+        if not self.lists:
+            return Room(self.room(nodes), 0, 0)
+        return Room(self.room(nodes), spare(box.columns), spare(segments(box)))
 
-    def _bytes_of(self, cells: int, segments: int) -> int:
-        """Return the bytes of so many nodes of all its grids, and segments of all its lists."""
+    def _bytes_of(self, room: Room) -> int:
+        """Return the bytes of so much room in all its grids and lists."""
         size = int(wp.types.type_size_in_bytes(self._allocator.types.vec4))
-        each = size * cells * len(self._nodes) + 4 * 5 * segments * len(self.grids)
+        integers = room.nodes + room.columns + 5 * room.segments  # of lists
+        each = size * room.nodes * len(self._nodes) + 4 * integers * len(self.lists)
         return each * self._allocator.capacity

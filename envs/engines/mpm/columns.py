@@ -61,7 +61,7 @@ def kernel(lattice, rows, order, full, segments, OWN, parts):
 
 ADD_UP = """
     FOUR
-    const int nz = lattice.nz, ny = lattice.ny, z = lattice.first[2] + i % nz, y = i / nz % ny, x = i / nz / ny;
+    const int nz = lattice.nz, ny = lattice.ny, z = lattice.first[2] + node % nz, y = node / nz % ny, x = node / nz / ny;
     const int bottom = lattice.first[2] / SEGMENT, depth = (lattice.first[2] + nz - 1) / SEGMENT - bottom + 1;
     const int segment = z / SEGMENT - bottom, plane = z % SEGMENT;
     const bool both = plane < 2 && segment > 0;
@@ -146,15 +146,31 @@ def walking_kernel(key: str, name: str, team: Team, given: Any, *, sloping: bool
 @cache
 @no_type_check
 def node_sum(name: str):
-    """Return the function (lattice, planes, parts, e, i) that adds up what the parts say of node i, in one order."""
+    """Return the function (lattice, planes, parts, e, node) that adds up what the parts say of a node, in one order."""
     Lattice, vec4 = lattice(name), precision(name).vec4
 
     @wp.func_native(fill(ADD_UP, name))
     def add_up_node(
-        lattice: Lattice, planes: wp.array2d[wp.int32], parts: wp.array2d[vec4], e: int, i: int
+        lattice: Lattice, planes: wp.array2d[wp.int32], parts: wp.array2d[vec4], e: int, node: int
     ) -> vec4: ...
 
     return add_up_node
+
+
+@cache
+@no_type_check
+def node_taker():
+    """Return the function that says which node has a place in the grid, -1 if none has."""
+
+    @wp.func(module="gradscape.columns.nodes")
+    def take_node(touched: wp.array2d[wp.int32], nodes: wp.array2d[wp.int32], e: int, place: int):
+        count = touched[e, 0]
+        node = int(-1)  # noqa: UP018, RUF046 -- what a branch changes must be a variable to Warp
+        if place < count and count <= nodes.shape[1]:
+            node = nodes[e, place]
+        return node
+
+    return take_node
 
 
 @cache

@@ -70,18 +70,22 @@ def extent_kernels(name: str) -> SimpleNamespace:
         low: wp.array[vec3],
         high: wp.array[vec3],
         left: wp.array[wp.int32],
+        needed: wp.array[wp.int32],
         found: wp.array2d[real],
     ):
         _, lane = wp.tid()
-        lowest, highest, gone = vec3(real(wp.inf)), vec3(real(-wp.inf)), wp.int32(0)
+        lowest, highest = vec3(real(wp.inf)), vec3(real(-wp.inf))
+        gone, most = wp.int32(0), wp.int32(0)
         for i in range(lane, batch * shares, found.shape[0]):
             lowest, highest = wp.min(lowest, low[i]), wp.max(highest, high[i])
         for e in range(lane, batch, found.shape[0]):
             gone = wp.max(gone, left[e])
+            most = wp.max(most, needed[e])
         for axis in range(3):
             found[lane, axis] = lowest[axis]
             found[lane, 3 + axis] = highest[axis]
         found[lane, 6] = real(gone)
+        found[lane, 7] = real(most)
 
     return SimpleNamespace(look=look, gather=gather)
 
@@ -104,29 +108,32 @@ class Extent:
         self.together = 1 if device == "cpu" else WARP
         size = allocator.capacity * self.shares // self.together
         self.low, self.high = (wp.zeros(size, dtype=types.vec3, device=device) for _ in range(2))
-        self.found: wp.array = wp.zeros((lanes, 7), dtype=types.real, device=device)
+        self.found: wp.array = wp.zeros((lanes, 8), dtype=types.real, device=device)
         self.event: Any = None if device == "cpu" else wp.Event(device)
-        self.host: wp.array = wp.zeros((lanes, 7), dtype=types.real, device="cpu", pinned=device != "cpu")
+        self.host: wp.array = wp.zeros((lanes, 8), dtype=types.real, device="cpu", pinned=device != "cpu")
 
-    def find(self, x: wp.array, left: wp.array, batch: int, *, small: bool) -> None:
-        """Begin to find the corners of `x` [environment, particle], and whether any row has `left`.
+    def find(self, x: wp.array, left: wp.array, needed: wp.array, batch: int, *, small: bool) -> None:
+        """Begin to find the corners of `x` [environment, particle], if any row has `left`, the most nodes one `needed`.
 
         A row has where a particle's coordinates are not finite, too: a loss need not tell, if it looks at others only.
         """
-        self.launches.run(("extent", batch), None, lambda: self._launch(x, left, batch), small=small)
+        self.launches.run(("extent", batch), None, lambda: self._launch(x, left, needed, batch), small=small)
         if self.device != "cpu":
             wp.record_event(self.event)
 
-    def read(self) -> tuple[np.ndarray, np.ndarray, bool]:
-        """Return the lowest and highest coordinates [m], not finite where a particle's are not, and if one left."""
+    def read(self) -> tuple[np.ndarray, np.ndarray, bool, int]:
+        """Return the lowest and highest coordinates [m], not finite where a particle's are not, if one left, and nodes.
+
+        These are the most that a row needed.
+        """
         if self.device != "cpu":
             wp.synchronize_event(self.event)
         found = self.host.numpy().astype(np.float64)
-        return found[:, :3].min(axis=0), found[:, 3:6].max(axis=0), bool(found[:, 6].any())
+        return found[:, :3].min(axis=0), found[:, 3:6].max(axis=0), bool(found[:, 6].any()), int(found[:, 7].max())
 
-    def _launch(self, x: wp.array, left: wp.array, batch: int) -> None:
+    def _launch(self, x: wp.array, left: wp.array, needed: wp.array, batch: int) -> None:
         inputs = [x, self.shares, self.together, self.low, self.high, left]
         self.launches.launch(self.kernels.look, (batch, self.shares), inputs)
-        inputs = [batch, self.shares // self.together, self.low, self.high, left, self.found]
+        inputs = [batch, self.shares // self.together, self.low, self.high, left, needed, self.found]
         self.launches.launch(self.kernels.gather, (1, self.found.shape[0]), inputs)
         self.launches.call(partial(wp.copy, self.host, self.found))  # which holds nothing that holds the launches

@@ -34,17 +34,18 @@ GATHER = """
     }
     const auto column = [&](int k) { return Vec{a.data[0][k], a.data[1][k], a.data[2][k]}; };
     const Vec ax = column(0), ay = column(1), az = column(2);
-    const int across = lattice.nz, through = lattice.ny * lattice.nz;
-    const Four *plane = (const Four *)&wp::index(grid, e, 0) + corner[0] * through + corner[1] * across + corner[2];
+    const Four *nodes = (const Four *)&wp::index(grid, e, 0);
+    const int *start = &wp::index(starts, e, corner[0] * lattice.ny + corner[1]), last = grid.shape[1] - 3;
     Vec s{}, si{}, sj{}, sk{}, slope{};
 #pragma unroll
-    for (int i = 0; i < 3; ++i, plane += through) {
+    for (int i = 0; i < 3; ++i, start += lattice.ny) {
         const REAL wi = w[0][i];
         const Vec first{q[0], q[1], q[2]}, qi = i ? first + ax * REAL(i) : first;
         Vec r{}, rj{}, rk{}, change{};
 #pragma unroll
         for (int j = 0; j < 3; ++j) {
-            const Four n0 = plane[j * across], n1 = plane[j * across + 1], n2 = plane[j * across + 2];
+            const int at = wp::min(wp::max(start[j] + corner[2], 0), last);  // a particle that is nowhere reads something
+            const Four n0 = nodes[at], n1 = nodes[at + 1], n2 = nodes[at + 2];
             const Vec v0{n0.a, n0.b, n0.c}, v1{n1.a, n1.b, n1.c}, v2{n2.a, n2.b, n2.c};
             const REAL wj = w[1][j];
             const Vec w1 = v1 * w[2][1], w2 = v2 * w[2][2], wv = v0 * w[2][0] + w1 + w2;
@@ -88,12 +89,27 @@ def gatherers(name: str) -> SimpleNamespace:
 
     @wp.func_native(in_precision(with_mass(GATHER, ""), name))
     def gather(
-        lattice: Lattice, grid: wp.array2d[vec4], e: int, corner: wp.vec3i, f: vec3, q: vec3, a: mat33
+        lattice: Lattice,
+        starts: wp.array2d[wp.int32],
+        grid: wp.array2d[vec4],
+        e: int,
+        corner: wp.vec3i,
+        f: vec3,
+        q: vec3,
+        a: mat33,
     ) -> Sums: ...
 
     @wp.func_native(in_precision(with_mass(GATHER, " + mass * nNUMBER.d"), name))
     def gather_with_mass(
-        lattice: Lattice, grid: wp.array2d[vec4], e: int, corner: wp.vec3i, f: vec3, q: vec3, a: mat33, mass: real
+        lattice: Lattice,
+        starts: wp.array2d[wp.int32],
+        grid: wp.array2d[vec4],
+        e: int,
+        corner: wp.vec3i,
+        f: vec3,
+        q: vec3,
+        a: mat33,
+        mass: real,
     ) -> Sums: ...
 
     @wp.func(module=f"gradscape.gathers.{name}")
@@ -119,6 +135,7 @@ def adjoint_gatherers(name: str) -> SimpleNamespace:
     @wp.func(module=module)
     def g2p(
         lattice: Lattice,
+        starts: wp.array2d[wp.int32],
         dt: real,
         x: wp.array2d[vec3],
         grid_v: wp.array2d[vec4],
@@ -134,12 +151,13 @@ def adjoint_gatherers(name: str) -> SimpleNamespace:
         a = (real(4.0) * lattice.inv_dx) * read_matrix(adj_C_new, e, p)
         adj = read_vector(adj_x_new, e, p)
         q = read_vector(adj_v_new, e, p) + dt * adj - a * f
-        sums = gather(lattice, grid_v, e, base - lattice.first, f, q, a)
+        sums = gather(lattice, starts, grid_v, e, base - lattice.first, f, q, a)
         return adj + lattice.inv_dx * (sums[4] - wp.transpose(a) * sums[0])
 
     @wp.func(module=module)
     def p2g(
         lattice: Lattice,
+        starts: wp.array2d[wp.int32],
         mass: wp.array2d[real],
         x: wp.array2d[vec3],
         v: wp.array2d[vec3],
@@ -156,7 +174,7 @@ def adjoint_gatherers(name: str) -> SimpleNamespace:
         dx = real(1.0) / lattice.inv_dx
         a = momentum * dx
         q = m * read_vector(v, e, p) - a * f
-        sums = gather_with_mass(lattice, adj_grid_m, e, base - lattice.first, f, q, a, m)
+        sums = gather_with_mass(lattice, starts, adj_grid_m, e, base - lattice.first, f, q, a, m)
         h = sums[0]
         adj_v[e, p] = m * h
         adj_A = dx * wp.matrix_from_cols(sums[1] - f[0] * h, sums[2] - f[1] * h, sums[3] - f[2] * h)

@@ -7,7 +7,7 @@ import warp as wp
 
 from ..launches import blocks
 from ..runtime import precision
-from .columns import ADD_UP
+from .columns import ADD_UP, node_taker
 from .exact import LANES
 from .layout import READ_NODE, WRITE_NODE, in_precision
 from .stencil import lattice
@@ -95,15 +95,24 @@ def velocity_kernel(name: str, boundary_velocity: Any, Data: Any) -> Any:
 @cache
 @no_type_check
 def velocity_of_columns(name: str, boundary_velocity: Any, Data: Any) -> Any:
-    """Return the same kernel, for sums by `columns`: it adds up a node's momentum, its adjoint that of the velocity."""
-    types = precision(name)
+    """Return the same kernel, for sums by `columns`: it adds up a node's momentum, its adjoint that of the velocity.
+
+    It runs over [environment, place in the grid].
+    """
+    types, take_node = precision(name), node_taker()
     real, vec3, vec4 = types.real, types.vec3, types.vec4
     Lattice, velocity_at_node = lattice(name), velocity_at(name, boundary_velocity, Data)
     keep = in_precision(WRITE_NODE, name)
 
     @wp.func_native(f"const auto value = [&] {{ {fill(ADD_UP, name)} }}();\n{keep}", adj_snippet="", replay_snippet="")
     def add_up(
-        lattice: Lattice, planes: wp.array2d[wp.int32], parts: wp.array2d[vec4], grid: wp.array2d[vec4], e: int, i: int
+        lattice: Lattice,
+        planes: wp.array2d[wp.int32],
+        parts: wp.array2d[vec4],
+        grid: wp.array2d[vec4],
+        e: int,
+        i: int,
+        node: int,
     ): ...
 
     @wp.func_native(in_precision(READ_NODE, name), adj_snippet=in_precision(ADJOINT_READ, name))
@@ -117,6 +126,7 @@ def velocity_of_columns(name: str, boundary_velocity: Any, Data: Any) -> Any:
         grid: wp.array2d[vec4],
         e: int,
         i: int,
+        node: int,
         value: vec4,
     ): ...
 
@@ -135,15 +145,19 @@ def velocity_of_columns(name: str, boundary_velocity: Any, Data: Any) -> Any:
         grid_m: wp.array2d[vec4],
         grid_v: wp.array2d[vec4],
         planes: wp.array2d[wp.int32],
+        touched: wp.array2d[wp.int32],
+        nodes: wp.array2d[wp.int32],
         parts: wp.array2d[vec4],
     ):
         e, i = wp.tid()
-        add_up(lattice, planes, parts, grid_m, e, i)  # its adjoint is not wanted, and finds in grid_m what it needs
-        g = read(grid_m, e, i)
-        if g[3] > empty:
-            v = velocity_at_node(lattice, boundary, dt, gravity, g, e, i, tools, sums, step, fraction, rate)
-            write(lattice, planes, parts, grid_v, e, i, vec4(v[0], v[1], v[2], real(0.0)))
-        else:
-            write(lattice, planes, parts, grid_v, e, i, vec4())
+        node = take_node(touched, nodes, e, i)
+        if node >= 0:
+            add_up(lattice, planes, parts, grid_m, e, i, node)  # its adjoint finds in grid_m what it needs
+            g = read(grid_m, e, i)
+            if g[3] > empty:
+                v = velocity_at_node(lattice, boundary, dt, gravity, g, e, node, tools, sums, step, fraction, rate)
+                write(lattice, planes, parts, grid_v, e, i, node, vec4(v[0], v[1], v[2], real(0.0)))
+            else:
+                write(lattice, planes, parts, grid_v, e, i, node, vec4())
 
     return velocity

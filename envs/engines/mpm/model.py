@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from .materials import Fluid, Material
 from .stencil import lattice
 
 BOX_MARGIN = 1  # cells around the particles that a control step begins with
+SPREAD = 1.5  # times the nodes that bodies touch at rest, for which memory is estimated, too
 TRAVEL = 5  # cells that bodies move beyond where they were at rest, as far as memory is estimated
 EMPTY = 1e-8  # nodes lighter than this part of the lightest particle carry no velocity
 
@@ -80,23 +82,24 @@ class Model:
     def bytes_per_environment(self, tapes: int, *, columns: bool = False, pieces: int = 1) -> int:
         """Return about what an environment takes of a solver that stores so many control steps whole, with adjoints.
 
-        Grids are counted as large as around the bodies at rest and TRAVEL cells farther on all sides. Sums by `columns`
-        take 45 numbers a node, and lists of particles an integer a particle in each substep. Of a step in `pieces` one
-        is stored, and a frame for each of the others.
+        Grids are counted as large as around the bodies at rest and TRAVEL cells farther on all sides; by `columns`, of
+        SPREAD times the nodes that bodies touch there. Sums then take 45 numbers a node, and each substep has an
+        integer for every particle and node. Of a step in `pieces` one is stored, and a frame for each of the others.
         """
         state = sum(len(body.x) * (1 if isinstance(body.material, Fluid) else 9) for body in self.bodies)
         frame = 15 * self.particles + state  # x, v, C and each material's own
         nodes = nodes_around(self, *self.corners, BOX_MARGIN + TRAVEL).cells
+        held = min(nodes, math.ceil(SPREAD * self.touched)) if columns else nodes
         kept = self.keeps_affine_momentum or not columns
-        substep = frame + 8 * nodes + 9 * self.particles * kept
+        substep = frame + 8 * held + 9 * self.particles * kept
         stored = tapes * self.piece(pieces)
         numbers = (self.steps + 3 + tapes * (pieces - 1)) * frame + (stored + 1) * substep
         numbers += 9 * self.particles * (not kept)
         if not columns:
             return self.real_bytes * numbers
         means = 4 * tapes * sum(body.material.smoothing > 0 for body in self.bodies)
-        integers = (stored + 3) * (self.particles + nodes)
-        return self.real_bytes * (numbers + (45 + means) * nodes) + 4 * integers
+        integers = (stored + 3) * (self.particles + nodes + held)
+        return self.real_bytes * (numbers + 45 * nodes + means * held) + 4 * integers
 
     @property
     def keeps_affine_momentum(self) -> bool:
@@ -108,6 +111,17 @@ class Model:
         """Return the lowest and highest coordinates of particles at rest [m], each of shape (3,)."""
         x = np.concatenate([body.x for body in self.bodies])
         return x.min(axis=0), x.max(axis=0)
+
+    @cached_property
+    def touched(self) -> int:
+        """Return how many nodes particles at rest touch, with those that lie between such along z."""
+        x = np.concatenate([body.x for body in self.bodies])
+        base = np.unique(np.floor((x - self.origin) / self.dx - 0.5).astype(int), axis=0)
+        low, high = {}, {}
+        for i, j, k in base.tolist():
+            for column in product(range(i, i + 3), range(j, j + 3)):
+                low[column], high[column] = min(low.get(column, k), k), max(high.get(column, k), k)
+        return sum(high[column] - low[column] + 3 for column in low)
 
     @property
     def real_bytes(self) -> int:
@@ -126,6 +140,11 @@ class Box:
     def cells(self) -> int:
         """Number of nodes."""
         return math.prod(self.nodes)
+
+    @property
+    def columns(self) -> int:
+        """Number of columns of nodes, along z."""
+        return self.nodes[0] * self.nodes[1]
 
 
 def place_grid(model: Model, box: Box | None = None) -> Any:

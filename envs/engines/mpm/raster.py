@@ -71,6 +71,8 @@ class Raster:
         particles = [wp.zeros((capacity, len(mass)), dtype=kind, device=device) for kind in kinds]
         self.particles, self.adjoints = particles[:3], particles[3:]  # x, v, A: a mass does not depend on v and A
         self.grid = wp.zeros((capacity, model.cells), dtype=types.vec4, device=device)
+        starts = np.arange(0, model.cells, model.nodes[2], dtype=np.int32)  # of columns of nodes, which have all theirs
+        self.starts = [wp.array(np.tile(starts, (capacity, 1)), device=device)] if self.counting else []
         self.units = wp.zeros((capacity, model.cells if self.counting else 0), dtype=wp.int64, device=device)
 
     @staticmethod
@@ -110,7 +112,7 @@ class Raster:
 
     def _launch(self, kernel: Any, x: torch.Tensor, adjoints: list[Any]) -> None:
         self._place(x)
-        inputs = [self.lattice, self.mass, *self.particles, self.grid, *adjoints]
+        inputs = [self.lattice, *self.starts, self.mass, *self.particles, self.grid, *adjoints]
         dim = len(x), threads(kernel, self.mass.shape[1])
         wp.launch(kernel, dim, inputs, device=self.device, record_tape=False)
 

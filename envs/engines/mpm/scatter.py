@@ -8,8 +8,8 @@ from typing import Any, Protocol
 import warp as wp
 
 from ..runtime import load
-from .cells import SEGMENT, SIZES, Lists, cell_kernels, segments, warps
-from .checkpoints import Frame, segment_room
+from .cells import SEGMENT, SIZES, Lists, cell_kernels, column_warps, segments, warps
+from .checkpoints import Frame, spare
 from .columns import CPU_TEAM, GPU_TEAM, column_kernels
 from .model import Box
 from .walk import PARTS
@@ -29,6 +29,9 @@ class Scatter(Protocol):
 
     def counting(self, counted: bool) -> list[Any]:
         """Return what g2p takes so as to count particles where it moves them to."""
+
+    def where(self, step: int, substep: int) -> list[Any]:
+        """Return what says where nodes are in grids, as g2p takes it."""
 
     def p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
         """Fill the substep's grid with momentum and mass, but for what nodes have to add up themselves."""
@@ -64,6 +67,10 @@ class InPlace:
     def counting(self, counted: bool) -> list[Any]:
         """Return what g2p takes so as to count particles where it moves them to."""
         return []
+
+    def where(self, step: int, substep: int) -> list[Any]:
+        """Return what says where nodes are in grids, as g2p takes it."""
+        return [self.solver.tape(step).lattice]
 
     def p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
         """Fill the substep's grid with momentum and mass."""
@@ -111,7 +118,7 @@ class ByColumns:
         if segments(box) * PARTS <= self.parts.shape[1]:
             return False
         self._allocate(0)  # the old ones go first
-        self._allocate(segment_room(box))
+        self._allocate(spare(segments(box)))
         return True
 
     def begin(self) -> None:
@@ -128,15 +135,22 @@ class ByColumns:
             inputs = [tape.lattice, frame.x, self.cells, self.numbers, self.counts]
             solver.launch(kernels.count, count, batch, inputs)
         inputs = [tape.lattice, self.counts, self.used, self.sizes, self.places, *self.found, lists.planes]
-        solver.launch_on_box(kernels.place_segments, warps, batch, inputs)
+        solver.launch_on_box(kernels.place_segments, warps, batch, [*inputs, lists.touched])
+        inputs = [tape.lattice, lists.planes, lists.touched, lists.starts, lists.nodes]
+        solver.launch_on_box(kernels.place_nodes, column_warps, batch, inputs)
         inputs = [self.cells, self.numbers, self.places, self.used, self.sizes, *self.found, self.arrived]
-        solver.launch(kernels.place, count, batch, [*inputs, lists.full, lists.segments])
+        solver.launch(kernels.place, count, batch, [*inputs, lists.full, lists.segments, lists.touched, solver.needed])
         inputs = [self.cells, self.places, self.arrived, self.used, self.sizes, lists.order]
         solver.launch(kernels.tidy, count, batch, inputs)
 
     def counting(self, counted: bool) -> list[Any]:
         """Return what g2p takes so as to count particles where it moves them to."""
         return [int(counted), self.cells, self.numbers, self.counts]
+
+    def where(self, step: int, substep: int) -> list[Any]:
+        """Return what says where nodes are in grids, as g2p takes it."""
+        tape = self.solver.tape(step)
+        return [tape.lattice, tape.lists[substep].starts]
 
     def p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
         """Make parts of what nodes get of momentum and mass."""
@@ -159,13 +173,13 @@ class ByColumns:
 
     def add_up(self, kernel: Any, step: int, substep: int, batch: int, grids: list[wp.array]) -> None:
         """Launch a kernel that adds up the parts at nodes."""
-        tape = self.solver.tape(step)
-        inputs = [tape.lattice, tape.lists[substep].planes, self.parts, *grids]
-        self.solver.launch_on_box(kernel, nodes, batch, inputs)
+        inputs = [self.solver.tape(step).lattice, *self.to_add_up(step, substep), *grids]
+        self.solver.launch_at_nodes(kernel, step, batch, inputs)
 
     def to_add_up(self, step: int, substep: int) -> list[wp.array]:
         """Return what nodes add up themselves, as their kernel takes it."""
-        return [self.solver.tape(step).lists[substep].planes, self.parts]
+        lists: Lists = self.solver.tape(step).lists[substep]
+        return [lists.planes, lists.touched, lists.nodes, self.parts]
 
     def _allocate(self, count: int) -> None:
         """Allocate what so many segments take."""

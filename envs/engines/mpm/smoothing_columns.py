@@ -10,7 +10,7 @@ from typing import no_type_check
 import warp as wp
 
 from ..runtime import precision
-from .columns import Team, node_sum, walking_kernel
+from .columns import Team, node_sum, node_taker, walking_kernel
 from .gathers import gatherers
 from .layout import layout
 from .stencil import lattice, stencil
@@ -29,7 +29,7 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
     real, vec3, vec4 = types.real, types.vec3, types.vec4
     Lattice, base_node, at_nodes = lattice(name), stencil(name).base_node, walker(name, sloping=False).at_nodes
     from_base = gatherers(name).from_base
-    add_up_node, module = node_sum(name), f"gradscape.smoothing.{name}.columns.{team.lanes}"
+    add_up_node, take_node, module = node_sum(name), node_taker(), f"gradscape.smoothing.{name}.columns.{team.lanes}"
     lies, gather, mat33 = layout(name), gatherers(name).gather, types.mat33
     read_number, read_vector, read_node, write_node = (
         lies.read_number,
@@ -39,10 +39,10 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
     )
 
     @wp.func(module=module)
-    def at(lattice: Lattice, nodes: wp.array2d[vec4], e: int, x: vec3, q: vec3):
+    def at(lattice: Lattice, starts: wp.array2d[wp.int32], nodes: wp.array2d[vec4], e: int, x: vec3, q: vec3):
         """Return the sums of `gathers` at x, of what nodes hold, and of the slopes of w times its product with q."""
         base = base_node((x - lattice.origin) * lattice.inv_dx, lattice)
-        return gather(lattice, nodes, e, base - lattice.first, from_base(x, base, lattice), q, mat33())
+        return gather(lattice, starts, nodes, e, base - lattice.first, from_base(x, base, lattice), q, mat33())
 
     @wp.func(module=module)
     def given_volume(
@@ -81,10 +81,20 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         return given
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def add_up(lattice: Lattice, planes: wp.array2d[wp.int32], parts: wp.array2d[vec4], nodes: wp.array2d[vec4]):
+    def add_up(
+        lattice: Lattice,
+        planes: wp.array2d[wp.int32],
+        touched: wp.array2d[wp.int32],
+        named: wp.array2d[wp.int32],
+        parts: wp.array2d[vec4],
+        nodes: wp.array2d[vec4],
+    ):
         """Set the nodes' means, and what these are shared by."""
         e, i = wp.tid()
-        total = add_up_node(lattice, planes, parts, e, i)
+        node = take_node(touched, named, e, i)
+        if node < 0:
+            return
+        total = add_up_node(lattice, planes, parts, e, node)
         # A particle in the middle of a cell gives the farthest of its nodes nothing, and others may not meet these.
         inverse = wp.where(total[1] > real(0.0), real(1.0) / total[1], real(0.0))
         write_node(nodes, e, i, vec4(total[0] * inverse, real(0.0), real(0.0), inverse))
@@ -92,6 +102,7 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def collect(
         lattice: Lattice,
+        starts: wp.array2d[wp.int32],
         body: int,
         slope: real,
         share: real,
@@ -103,23 +114,32 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         """Gather the nodes' means and take J so far towards them."""
         e, p = wp.tid()
         there = read_vector(x, e, body + p)
-        sums = at(lattice, nodes, e, there, vec3())
+        sums = at(lattice, starts, nodes, e, there, vec3())
         here = wp.log(read_number(J, e, p))
         J_new[e, p] = wp.exp(here + share * (sums[0][0] - (here - slope * there[1])))
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def add_up_adjoint(
-        lattice: Lattice, planes: wp.array2d[wp.int32], parts: wp.array2d[vec4], nodes: wp.array2d[vec4]
+        lattice: Lattice,
+        planes: wp.array2d[wp.int32],
+        touched: wp.array2d[wp.int32],
+        named: wp.array2d[wp.int32],
+        parts: wp.array2d[vec4],
+        nodes: wp.array2d[vec4],
     ):
         """Set the nodes' parts of the adjoint of s."""
         e, i = wp.tid()
-        node = read_node(nodes, e, i)
-        a = add_up_node(lattice, planes, parts, e, i)[0] * node[3]
-        write_node(nodes, e, i, vec4(node[0], a, a * node[0], node[3]))
+        node = take_node(touched, named, e, i)
+        if node < 0:
+            return
+        held = read_node(nodes, e, i)
+        a = add_up_node(lattice, planes, parts, e, node)[0] * held[3]
+        write_node(nodes, e, i, vec4(held[0], a, a * held[0], held[3]))
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def adjoint_gather(
         lattice: Lattice,
+        starts: wp.array2d[wp.int32],
         body: int,
         slope: real,
         share: real,
@@ -137,7 +157,7 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         ratio, V = read_number(J, e, p), read_number(volume, e, body + p)
         beyond = wp.log(ratio) - slope * there[1]
         g = read_number(adj_J, e, p) * read_number(J_new, e, p)
-        sums = at(lattice, nodes, e, there, vec3(share * g, V * beyond, -V))
+        sums = at(lattice, starts, nodes, e, there, vec3(share * g, V * beyond, -V))
         adj_s = V * sums[0][1] - share * g
         change = lattice.inv_dx * sums[4] - vec3(real(0.0), slope * adj_s, real(0.0))
         adj_x[e, body + p] = read_vector(adj_x, e, body + p) + change

@@ -114,6 +114,7 @@ class Solver:
         self.smoothers = [(ColumnSmoother if columns else Smoother)(self, b) for b in smooth]
         self.boxes = [Box((0, 0, 0), model.nodes)] * model.steps
         self.margins = [BOX_MARGIN] * model.steps  # cells around the particles, as each step has needed so far
+        self.touched = [model.touched] * model.steps  # nodes of which grids hold no others, by columns, likewise
         self.checkpoints = [self.allocator.frame() for _ in range(model.steps + 1)]
         self.orders = [Order(model, capacity, device) for _ in self.checkpoints]
         self.end = self.allocator.frame()  # of a control step, before its particles are sorted
@@ -126,7 +127,9 @@ class Solver:
         self.tools = self.allocator.paths()
         self.sums = self.allocator.sums()
         self.listed = [self.allocator.array(wp.int32, model.cells + 1)] if has_rows(self.velocity) else []
-        self.left_box, self.escaped = (wp.zeros(capacity, dtype=wp.int32, device=device) for _ in range(2))
+        self.left_box, self.needed, self.escaped = (
+            wp.zeros(capacity, dtype=wp.int32, device=device) for _ in range(3)
+        )
         self.adjoint: Adjoint | None = None
         self._start()
 
@@ -151,9 +154,10 @@ class Solver:
         self.spare_used, first, free = True, self.tapes[0], free_memory()
         spare = free - min(LEFT[0] * free, LEFT[1])
         for kept in range(self.model.steps - 1, -1, -1):
-            if sum(map(first.bytes_on, self.boxes[:kept])) <= spare:
+            counts = [self.nodes(step) for step in range(kept)]
+            if sum(map(first.bytes_on, self.boxes, counts)) <= spare:
                 break
-        self.tapes = [*(Tape(self.allocator, first.room(box), self.pieces) for box in self.boxes[:kept]), first]
+        self.tapes = [*(Tape(self.allocator, first.room(count), self.pieces) for count in counts), first]
         self.launches.clear()
 
     def read_positions(self, step: int, batch: int) -> torch.Tensor:
@@ -184,6 +188,11 @@ class Solver:
         """Return where a control step is stored whole: in the last place all that have none of their own, in turn."""
         return self.tapes[min(step, len(self.tapes) - 1)]
 
+    def nodes(self, step: int) -> int:
+        """Return how many nodes of its box a control step needs, as far as is known."""
+        cells = self.boxes[step].cells
+        return min(self.touched[step], cells) if self.columns else cells
+
     def _advance_on_box(
         self, step: int, batch: int, low: np.ndarray, high: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -196,9 +205,12 @@ class Solver:
         while True:
             self.boxes[step] = nodes_around(self.model, low, high, self.margins[step], grain)
             self.advance(step, batch)
-            self.extent.find(self.end.x, self.left_box, batch, small=self._small(batch))
+            self.extent.find(self.end.x, self.left_box, self.needed, batch, small=self._small(batch))
             self._sort(step, batch)  # which a GPU does while corners are read, whether or not the step holds
-            *corners, left = self.extent.read()
+            *corners, left, needed = self.extent.read()
+            self.touched[step] = max(self.touched[step], needed)
+            if needed > self.tape(step).cells:
+                continue
             if self.boxes[step] == whole or not left:
                 break
             self.margins[step] *= 2
@@ -224,6 +236,7 @@ class Solver:
 
     def _launch_step(self, step: int, batch: int) -> None:
         self.launches.call(self.left_box.zero_)
+        self.launches.call(self.needed.zero_)
         self.substeps(step, batch, range(self.model.substeps))
 
     def _make_room(self, step: int) -> None:
@@ -232,10 +245,10 @@ class Solver:
             self._drop_tape()
         if self.scatter.make_room(self.boxes[step]):
             self.launches.clear()
-        if self.tape(step).growth(self.boxes[step]):
+        if self.tape(step).growth(self.boxes[step], self.nodes(step)):
             self._forget_launches(step)
         try:
-            self.tape(step).make_room(step, self.boxes[step])
+            self.tape(step).make_room(step, self.boxes[step], self.nodes(step))
         except RuntimeError:  # what is free need not be of one piece
             if len(self.tapes) == 1:
                 raise
@@ -249,7 +262,7 @@ class Solver:
         """
         if self.device == "cpu":
             return True
-        growth = self.tape(step).growth(self.boxes[step])
+        growth = self.tape(step).growth(self.boxes[step], self.nodes(step))
         return not growth or growth <= free_memory() // 2
 
     def _drop_tape(self) -> None:
@@ -294,12 +307,11 @@ class Solver:
     def _fill_grid(self, frame: Frame, step: int, substep: int, batch: int) -> None:
         """Fill the substep's grid: momentum and mass from particles, then velocity."""
         self.scatter.p2g(step, substep, frame, batch)
-        self.launch_on_box(self.velocity, nodes, batch, self.velocity_inputs(step, substep))
+        self.launch_at_nodes(self.velocity, step, batch, self.velocity_inputs(step, substep))
 
     def _move_particles(self, frame: Frame, new: Frame, step: int, substep: int, batch: int, *, followed: bool) -> None:
-        tape = self.tape(step)
-        grid_v = tape.grids[substep].v
-        inputs = [tape.lattice, self.model.dt, frame.x, grid_v, new.x, new.v, new.C, self.left_box]
+        grid_v, where = self.tape(step).grids[substep].v, self.scatter.where(step, substep)
+        inputs = [*where, self.model.dt, frame.x, grid_v, new.x, new.v, new.C, self.left_box]
         inputs += self.scatter.counting(followed)
         self.launch(self.kernels.g2p, self.model.particles, batch, inputs)
 
@@ -341,6 +353,13 @@ class Solver:
     def launch(self, kernel: Any, size: int, batch: int, inputs: list[Any]) -> None:
         """Launch a kernel over [environment, element], or over environments where it takes their rows."""
         self.launches.launch(kernel, (batch, threads(kernel, size)), inputs)
+
+    def launch_at_nodes(self, kernel: Any, step: int, batch: int, inputs: list[Any], **how: Any) -> None:
+        """Launch a kernel over [environment, node] of the grids of a control step."""
+        if self.columns:
+            self.launches.launch(kernel, (batch, self.tape(step).cells), inputs, **how)
+        else:
+            self.launch_on_box(kernel, nodes, batch, inputs, **how)
 
     def launch_on_box(self, kernel: Any, size: Callable[[Box], int], batch: int, inputs: list[Any], **how: Any) -> None:
         """Launch a kernel over [environment, whatever `size` counts of the box of the control step under way]."""

@@ -30,6 +30,7 @@ def transfers_of_columns(name: str) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def g2p(
         lattice: Lattice,
+        starts: wp.array2d[wp.int32],
         dt: real,
         x: wp.array2d[vec3],
         grid_v: wp.array2d[vec4],
@@ -47,7 +48,7 @@ def transfers_of_columns(name: str) -> SimpleNamespace:
         here = read_vector(x, e, p)
         base = base_node((here - lattice.origin) * lattice.inv_dx, lattice)
         f = from_base(here, base, lattice)
-        sums = gather(lattice, grid_v, e, base - lattice.first, f, vec3(), mat33())
+        sums = gather(lattice, starts, grid_v, e, base - lattice.first, f, vec3(), mat33())
         v = sums[0]
         C = wp.matrix_from_cols(sums[1] - f[0] * v, sums[2] - f[1] * v, sums[3] - f[2] * v)
         write_matrix(C_new, e, p, (real(4.0) * lattice.inv_dx) * C)
@@ -62,6 +63,7 @@ def transfers_of_columns(name: str) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def adjoint_p2g(
         lattice: Lattice,
+        starts: wp.array2d[wp.int32],
         mass: wp.array2d[real],
         x: wp.array2d[vec3],
         v: wp.array2d[vec3],
@@ -73,7 +75,7 @@ def transfers_of_columns(name: str) -> SimpleNamespace:
     ):
         """Gather the adjoints of p2g: add to adj_x, set adj_v and adj_A."""
         e, p = wp.tid()
-        adj_a, own = gather_back(lattice, mass, x, v, read_matrix(A, e, p), adj_grid_m, adj_v, e, p)
+        adj_a, own = gather_back(lattice, starts, mass, x, v, read_matrix(A, e, p), adj_grid_m, adj_v, e, p)
         write_matrix(adj_A, e, p, adj_a)
         adj_x[e, p] = read_vector(adj_x, e, p) + own
 

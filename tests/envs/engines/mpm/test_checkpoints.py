@@ -139,10 +139,10 @@ def test_a_tape_grows_by_the_bytes_it_says(columns):
     tape = Tape(solver.allocator)
     for margin in (0, 3):  # the second time it has something to lose
         box = solver.boxes[0] = nodes_around(model, *model.corners, mpm.BOX_MARGIN + margin)
-        before, growth = tape.bytes, tape.growth(box)
-        tape.make_room(0, box)
+        before, growth = tape.bytes, tape.growth(box, solver.nodes(0))
+        tape.make_room(0, box, solver.nodes(0))
         assert tape.bytes - before == growth > 0
-    assert tape.growth(box) == 0
+    assert tape.growth(box, solver.nodes(0)) == 0
 
 
 def test_as_many_control_steps_are_kept_as_fit_on_their_own_boxes(monkeypatch):

@@ -50,8 +50,11 @@ class Scattering:
         tools, sums = wp.zeros((ROWS, 1, 1), dtype=wp.vec3), wp.zeros((1, 1), dtype=wp.int64)
         given = [self.lattice, Open().data("float32", "cpu"), *numbers, tools, sums, momentum, velocity]
         kernel = velocity_on("cuda", "float32", Open(), columns=True)
-        emulate(kernel, (ROWS, self.box.cells), [*given, lists.planes, parts])
-        return to_torch(momentum).clone()
+        emulate(kernel, (ROWS, self.box.cells), [*given, lists.planes, lists.touched, lists.nodes, parts])
+        found = torch.zeros(ROWS, self.box.cells, 4)
+        for row, (count, _) in enumerate(to_torch(lists.touched).tolist()):
+            found[row, to_torch(lists.nodes)[row, :count].long()] = to_torch(momentum)[row, :count]
+        return found
 
     def transfer(self, mass, q, A):
         """Return what `transfers` scatter of particles of momentum q and affine momentum A."""

@@ -26,17 +26,19 @@ def found(parts, change=lambda x, left: None, batch=BATCH):
     x[:] = torch.randn(x.shape, generator=torch.Generator().manual_seed(1), dtype=x.dtype)
     change(x, to_torch(left))
     one = Extent(allocator, Launches("cpu"), shares=parts[0], lanes=parts[1])
-    one.find(frame.x, left, batch, small=False)
+    needed = wp.array([5, 7, 6], dtype=wp.int32, device="cpu")
+    one.find(frame.x, left, needed, batch, small=False)
     return x, *one.read()
 
 
 @parts
 @pytest.mark.parametrize("batch", [1, BATCH])
 def test_corners_are_those_of_all_particles_of_the_batch(parts, batch):
-    x, low, high, left = found(parts, batch=batch)
+    x, low, high, left, needed = found(parts, batch=batch)
     assert (low == x[:batch].amin(dim=(0, 1)).numpy()).all()
     assert (high == x[:batch].amax(dim=(0, 1)).numpy()).all()
     assert not left
+    assert needed == (7 if batch == BATCH else 5)
 
 
 @parts
@@ -54,7 +56,7 @@ def test_corners_are_not_finite_where_a_particle_is_not(parts, value):
     def explode(x, left):
         x[2, -1, 1] = value
 
-    _, low, high, left = found(parts, explode)
+    _, low, high, left, _ = found(parts, explode)
     assert not torch.tensor([*low, *high]).isfinite().all()
     assert left
     assert not found(parts, explode, batch=2)[3]

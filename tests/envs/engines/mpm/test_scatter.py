@@ -76,7 +76,7 @@ def test_particles_are_listed_by_cell_and_then_as_they_lie(first):
     listing = Listing(wp.launch, "float64", place_grid(model, box), box, x)
     for _ in range(2):  # the second time it begins where the first has ended
         listing.run()
-        order, full, segments_found, planes = (to_torch(array).clone() for array in listing.lists.arrays())
+        order, full, segments_found, planes, *_ = (to_torch(array).clone() for array in listing.lists.arrays())
         for row in range(2):
             keys = sorted((i, j, k // SEGMENT, k % SEGMENT, p) for p, (i, j, k) in enumerate(cell[row].tolist()))
             found = {}
@@ -102,7 +102,7 @@ def test_particles_that_are_nowhere_are_not_listed():
     listing = Listing(wp.launch, "float64", place_grid(model, box), box, x)
     for _ in range(2):  # the second time it begins where the first has ended
         listing.run()
-        order, full, segments_found, _ = (to_torch(array).clone() for array in listing.lists.arrays())
+        order, full, segments_found, *_ = (to_torch(array).clone() for array in listing.lists.arrays())
         listed = torch.cat([order[0, begin : begin + count] for _, begin, count, _ in segments_found[0, : full[0]]])
         assert sorted(listed.tolist()) == [p for p in range(500) if p % 3 and p != 1]
         assert full[1] == 0
