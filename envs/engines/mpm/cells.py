@@ -21,6 +21,7 @@ from .model import Box
 from .stencil import lattice, stencil
 
 SEGMENT = 8  # cells
+HIGHEST = 1 << 30  # beyond all planes of nodes
 STEP, SIZES = 4, 32  # segments are of one size up to so many particles apart, and the largest of so many sizes
 
 # Neighbours in memory are mostly of one cell: on a GPU one of them counts for all of a warp.
@@ -38,39 +39,40 @@ TAKE_NUMBER = """
 """
 
 
+# The next `count` places of an environment, and the next `parts` of another kind: a warp's lanes take theirs together.
 TAKE_PLACES = """
 #if defined(__CUDA_ARCH__)
     const unsigned all = 0xffffffffu;
+    if (!__ballot_sync(all, count > 0)) return wp::vec_t<2, wp::int32>(0, 0);
     const int lane = threadIdx.x & 31;
-    const unsigned full = __ballot_sync(all, total > 0);
-    int sum = total;
+    int before = count, more = parts;
     for (int step = 1; step < 32; step *= 2) {
-        const int other = __shfl_up_sync(all, sum, step);
-        if (lane >= step) sum += other;
+        const int other = __shfl_up_sync(all, before, step), others = __shfl_up_sync(all, more, step);
+        if (lane >= step) before += other, more += others;
     }
-    int place = 0, segment = 0;
-    if (lane == 31 && full) {
-        place = atomicAdd(&wp::index(used, e, 0), sum);
-        segment = atomicAdd(&wp::index(used, e, 1), __popc(full));
+    int place = 0, part = 0;
+    if (lane == 31) {
+        place = atomicAdd(&wp::index(used, e, 0), before);
+        part = atomicAdd(&wp::index(used, e, 1), more);
     }
-    place = __shfl_sync(all, place, 31) + sum - total;
-    segment = __shfl_sync(all, segment, 31) + __popc(full & ((1u << lane) - 1u));
+    place = __shfl_sync(all, place, 31) + before - count;
+    part = __shfl_sync(all, part, 31) + more - parts;
 #else
-    const int place = wp::index(used, e, 0), segment = wp::index(used, e, 1);
-    wp::index(used, e, 0) += total;
-    wp::index(used, e, 1) += total > 0;
+    const int place = wp::index(used, e, 0), part = wp::index(used, e, 1);
+    wp::index(used, e, 0) += count;
+    wp::index(used, e, 1) += parts;
 #endif
-    return wp::vec_t<2, wp::int32>(place, segment);
+    return wp::vec_t<2, wp::int32>(place, part);
 """
-
 # The eight numbers of a segment are read and written as two times four.
 TAKE_COUNTS = """
     struct alignas(16) Four { int n[4]; };
     Four *four = (Four *)&wp::index(counts, e, segment * SEGMENT);
     const Four given[2] = {four[0], four[1]};
     wp::vec_t<SEGMENT, wp::int32> found;
-    for (int k = 0; k < SEGMENT; ++k) found[k] = given[k / 4].n[k % 4];
-    four[0] = four[1] = Four{};
+    int any = 0;
+    for (int k = 0; k < SEGMENT; ++k) any |= found[k] = given[k / 4].n[k % 4];
+    if (any) four[0] = four[1] = Four{};
     return found;
 """
 WRITE_PLACES = """
@@ -82,22 +84,39 @@ WRITE_PLACES = """
         at = end;
     }
 """
-# From which node of a column to which one, along z, particles give something: those that its nine columns of cells touch.
+# From which node of a column to which one, along z, particles of its nine columns of cells touch.
 FIND_TOUCHED = """
-    const int bottom = lattice.first[2] / SEGMENT, depth = (lattice.first[2] + lattice.nz - 1) / SEGMENT - bottom + 1;
-    const int x = column / lattice.ny, y = column % lattice.ny, before = lattice.first[2] - bottom * SEGMENT;
-    int low = depth * SEGMENT, high = 0;
+    struct alignas(8) Two { int above, high; };
+    const Two *span = (const Two *)&wp::index(spans, e, 0);
+    const int x = column / lattice.ny, y = column % lattice.ny, before = lattice.first[2] % SEGMENT;
+    int above = 0, high = 0;
     for (int c = 0; c < 9; ++c) {
         if (x >= lattice.nx || x < c / 3 || y < c % 3) continue;
-        const int *row = &wp::index(planes, e, ((x - c / 3) * lattice.ny + y - c % 3) * depth);
-        for (int segment = 0; segment < depth; ++segment)
-            for (int plane = 0, bits = row[segment]; bits; ++plane, bits >>= 1)
-                if (bits & 1) {
-                    low = wp::min(low, segment * SEGMENT + plane);
-                    high = wp::max(high, segment * SEGMENT + plane + 1);
-                }
+        const Two found = span[(x - c / 3) * lattice.ny + y - c % 3];
+        above = wp::max(above, found.above);
+        high = wp::max(high, found.high);
     }
-    return high ? wp::vec_t<2, wp::int32>(low - before, high - before) : wp::vec_t<2, wp::int32>(0, 0);
+    return high ? wp::vec_t<2, wp::int32>(HIGHEST - above - before, high - before) : wp::vec_t<2, wp::int32>(0, 0);
+"""
+# The lanes of a warp have columns beside each other, whose nodes have places one after the other: they write all of them
+# together, of which each lane finds out whose node has a place.
+NAME_NODES = """
+    const int room = nodes.shape[1], first = column * depth + low;
+    int *row = &wp::index(nodes, e, 0);
+#if defined(__CUDA_ARCH__)
+    const unsigned all = 0xffffffffu;
+    const int lane = threadIdx.x & 31, begin = __shfl_sync(all, start, 0), end = __shfl_sync(all, start + count, 31);
+    for (int from = begin; from < end; from += 32) {
+        const int place = from + lane;
+        int owner = 0;
+        for (int step = 16; step > 0; step /= 2)
+            if (__shfl_sync(all, start, owner + step) <= place) owner += step;
+        const int node = __shfl_sync(all, first - start, owner) + place;
+        if (place < wp::min(end, room)) row[place] = node;
+    }
+#else
+    for (int place = start; place < wp::min(start + count, room); ++place) row[place] = first + place - start;
+#endif
 """
 COUNT_BEFORE = """
     const int *row = &wp::index(arrived, e, 0);
@@ -140,7 +159,7 @@ def warps(box: Box) -> int:
 
 
 def column_warps(box: Box) -> int:
-    """Return the number of threads, in whole warps, that a box's columns of nodes take one each."""
+    """Return the number of threads, in whole warps, that a box's columns take one each."""
     return -(-box.nodes[0] * box.nodes[1] // 32) * 32
 
 
@@ -204,7 +223,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
     take_number = number_taker()
 
     @wp.func_native(TAKE_PLACES)
-    def take_places(used: wp.array2d[wp.int32], e: int, total: int) -> wp.vec2i: ...
+    def take_places(used: wp.array2d[wp.int32], e: int, count: int, parts: int) -> wp.vec2i: ...
 
     Counts = wp.types.vector(SEGMENT, wp.int32)
 
@@ -214,8 +233,13 @@ def cell_kernels(name: str) -> SimpleNamespace:
     @wp.func_native(WRITE_PLACES.replace("SEGMENT", str(SEGMENT)))
     def write_places(places: wp.array2d[wp.vec2i], e: int, segment: int, at: int, counted: Counts): ...
 
-    @wp.func_native(FIND_TOUCHED.replace("SEGMENT", str(SEGMENT)))
-    def find_touched(lattice: Lattice, planes: wp.array2d[wp.int32], e: int, column: int) -> wp.vec2i: ...
+    @wp.func_native(FIND_TOUCHED.replace("SEGMENT", str(SEGMENT)).replace("HIGHEST", str(HIGHEST)))
+    def find_touched(lattice: Lattice, spans: wp.array2d[wp.int32], e: int, column: int) -> wp.vec2i: ...
+
+    @wp.func_native(NAME_NODES)
+    def name_nodes(
+        nodes: wp.array2d[wp.int32], e: int, column: int, depth: int, low: int, count: int, start: int
+    ): ...
 
     @wp.func_native(COUNT_BEFORE)
     def count_before(arrived: wp.array2d[wp.int32], e: int, places: wp.vec2i, p: int) -> int: ...
@@ -246,11 +270,14 @@ def cell_kernels(name: str) -> SimpleNamespace:
         found: wp.array2d[wp.vec4i],
         numbers: wp.array2d[wp.int32],
         planes: wp.array2d[wp.int32],
+        spans: wp.array2d[wp.int32],
         touched: wp.array2d[wp.int32],
     ):
         """Give each segment its places in the list, each of its cells, too, and it a number among those of its size.
 
-        A cell's `places` are its first in the list and the one beyond its last. `counts` are 0 again.
+        A cell's `places` are its first in the list and the one beyond its last. `spans` has of each column of cells by
+        how much the lowest plane of nodes that is touched is below HIGHEST, and the one beyond the highest. `counts`
+        are 0 again.
         """
         e, s = wp.tid()
         if s == 0:
@@ -270,17 +297,19 @@ def cell_kernels(name: str) -> SimpleNamespace:
                     high = k + 3
                 total += counted[k]
             planes[e, s] = (1 << high) - (1 << low)
-        taken = take_places(used, e, total)
+        taken = take_places(used, e, total, wp.min(total, 1))
         if total > 0:
-            at, segment = taken[0], taken[1]
+            at, segment, column, first = taken[0], taken[1], s / depth, s % depth * SEGMENT
             write_places(places, e, s, at, counted)
             found[e, segment] = wp.vec4i(s, at, total, low + 256 * high)
             numbers[e, segment] = take_number(sizes, e, size_of(total))
+            wp.atomic_max(spans, e, 2 * column, HIGHEST - first - low)
+            wp.atomic_max(spans, e, 2 * column + 1, first + high)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def place_nodes(
         lattice: Lattice,
-        planes: wp.array2d[wp.int32],
+        spans: wp.array2d[wp.int32],
         touched: wp.array2d[wp.int32],
         starts: wp.array2d[wp.int32],
         nodes: wp.array2d[wp.int32],
@@ -290,14 +319,12 @@ def cell_kernels(name: str) -> SimpleNamespace:
         Where there is not room for all that are touched none of them counts, and the control step is done again.
         """
         e, column = wp.tid()
-        found = find_touched(lattice, planes, e, column)
+        found = find_touched(lattice, spans, e, column)
         low, count = found[0], found[1] - found[0]
-        start = take_places(touched, e, count)[0]
+        start = take_places(touched, e, count, wp.min(count, 1))[0]
         if column < lattice.nx * lattice.ny:
             starts[e, column] = start - low
-            if start + count <= nodes.shape[1]:
-                for k in range(count):
-                    nodes[e, start + k] = column * lattice.nz + low + k
+        name_nodes(nodes, e, column, lattice.nz, low, count, start)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def place(
@@ -316,7 +343,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
     ):
         """List particles by cell, those of a cell as they arrived, and segments by size, the largest first.
 
-        `needed` is how many nodes have been touched at most.
+        Note how many nodes an environment has `needed` at most.
         """
         e, p = wp.tid()
         if p == 0:
@@ -330,15 +357,18 @@ def cell_kernels(name: str) -> SimpleNamespace:
             at = numbers_of_segments[e, p]
             for larger in range(size_of(segment[2]) + 1, SIZES):
                 at += sizes[e, larger]
-            segments[e, at] = segment
+            if at < segments.shape[1]:
+                segments[e, at] = segment
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def tidy(
+        lattice: Lattice,
         cells: wp.array2d[wp.int32],
         places: wp.array2d[wp.vec2i],
         arrived: wp.array2d[wp.int32],
         used: wp.array2d[wp.int32],
         sizes: wp.array2d[wp.int32],
+        spans: wp.array2d[wp.int32],
         order: wp.array2d[wp.int32],
     ):
         """List them by cell, those of a cell as they lie in memory; count segments from 0 again."""
@@ -348,6 +378,8 @@ def cell_kernels(name: str) -> SimpleNamespace:
             used[e, 1] = 0
         for i in range(p, SIZES, cells.shape[1]):
             sizes[e, i] = 0
+        for i in range(p, 2 * lattice.nx * lattice.ny, cells.shape[1]):
+            spans[e, i] = 0
         cell = cells[e, p]
         if cell >= 0:
             mine = places[e, cell]

@@ -87,7 +87,7 @@ class Allocator:
         return Lists(
             order=self.array(wp.int32, self.model.particles),
             full=wp.zeros(self.capacity, dtype=wp.int32, device=self.device),
-            segments=self.array(wp.vec4i, room.segments),
+            segments=self.array(wp.vec4i, 1 + room.nodes // 2),  # one with particles has two nodes at least
             planes=self.array(wp.int32, room.segments),
             starts=self.array(wp.int32, room.columns),
             nodes=self.array(wp.int32, room.nodes),
@@ -108,7 +108,7 @@ class Allocator:
 
 
 class Room(NamedTuple):
-    """How many nodes, columns of nodes and segments arrays have places for."""
+    """How many nodes, and by columns of cells how many columns and segments, arrays have places for."""
 
     nodes: int
     columns: int
@@ -159,21 +159,21 @@ class Tape:
         lists = [array for one in self.lists for array in one.arrays()]
         return sum(array.capacity for array in (*frames, *self.smoothed.values(), *self._kept, *self._nodes, *lists))
 
-    def growth(self, box: Box, nodes: int) -> int:
-        """Return the bytes that so many nodes of a box take beyond those that are there, 0 where these suffice."""
-        return self._bytes_of(self._grown(box, nodes)) - self._bytes_of(self._room)
+    def growth(self, needed: Room) -> int:
+        """Return the bytes that what is needed takes beyond what is there, 0 where that suffices."""
+        return self._bytes_of(self._grown(needed)) - self._bytes_of(self._room)
 
-    def bytes_on(self, box: Box, nodes: int) -> int:
-        """Return the bytes that a tape like this takes that is made for so many nodes of a box."""
-        return self.bytes + self._bytes_of(self._spare(box, nodes)) - self._bytes_of(self._room)
+    def bytes_on(self, needed: Room) -> int:
+        """Return the bytes that a tape like this takes that is made for what is needed."""
+        return self.bytes + self._bytes_of(self._spare(needed)) - self._bytes_of(self._room)
 
     def start(self, checkpoint: Frame) -> Frame:
         """Return the frame that the control step starts from: the checkpoint, with the states that are smoothed."""
         return replace(checkpoint, S=tuple(self.smoothed.get(b, S) for b, S in enumerate(checkpoint.S)))
 
-    def make_room(self, step: int, box: Box, nodes: int) -> None:
-        """Become the place of a control step that runs on so many nodes of a box."""
-        grown, less = self._grown(box, nodes), self._room
+    def make_room(self, step: int, box: Box, needed: Room) -> None:
+        """Become the place of a control step that runs on a box of nodes, and needs so much room for it."""
+        grown, less = self._grown(needed), self._room
         if box == self.box and grown == less:
             self.step = step
             return
@@ -204,21 +204,18 @@ class Tape:
         """Every array of nodes."""
         return [*(array for grid in self.grids for array in (grid.m, grid.v)), *self.means.values()]
 
-    def _grown(self, box: Box, nodes: int) -> Room:
-        """Return what there has to be room for where so many nodes of a box are needed."""
-        more = self._spare(box, nodes)
-        needed = (nodes, box.columns, segments(box)) if self.lists else (nodes, 0, 0)
-        return Room(*(b if a < n else a for a, n, b in zip(self._room, needed, more, strict=True)))
+    def _grown(self, needed: Room) -> Room:
+        """Return what there has to be room for, of which what is there may be enough."""
+        each = zip(self._room, needed, self._spare(needed), strict=True)
+        return Room(*(more if less < enough else less for less, enough, more in each))
 
-    def _spare(self, box: Box, nodes: int) -> Room:
-        """Return what to make room for where so many nodes of a box are needed."""
-        if not self.lists:
-            return Room(self.room(nodes), 0, 0)
-        return Room(self.room(nodes), spare(box.columns), spare(segments(box)))
+    def _spare(self, needed: Room) -> Room:
+        """Return how much room to make where so much is needed."""
+        return Room(self.room(needed.nodes), needed.columns * 3 // 2, needed.segments * 3 // 2)
 
     def _bytes_of(self, room: Room) -> int:
         """Return the bytes of so much room in all its grids and lists."""
         size = int(wp.types.type_size_in_bytes(self._allocator.types.vec4))
-        integers = room.nodes + room.columns + 5 * room.segments  # of lists
+        integers = room.nodes + room.columns + room.segments + 4 * (1 + room.nodes // 2)
         each = size * room.nodes * len(self._nodes) + 4 * integers * len(self.lists)
         return each * self._allocator.capacity

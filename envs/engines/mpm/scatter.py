@@ -27,11 +27,11 @@ class Scatter(Protocol):
     def list_particles(self, step: int, substep: int, frame: Frame, batch: int, *, counted: bool) -> None:
         """Find out where particles are, before a substep; g2p may have `counted` them already."""
 
-    def counting(self, counted: bool) -> list[Any]:
-        """Return what g2p takes so as to count particles where it moves them to."""
-
     def where(self, step: int, substep: int) -> list[Any]:
         """Return what says where nodes are in grids, as g2p takes it."""
+
+    def counting(self, counted: bool) -> list[Any]:
+        """Return what g2p takes so as to count particles where it moves them to."""
 
     def p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
         """Fill the substep's grid with momentum and mass, but for what nodes have to add up themselves."""
@@ -64,13 +64,13 @@ class InPlace:
     def list_particles(self, step: int, substep: int, frame: Frame, batch: int, *, counted: bool) -> None:
         """Find out where particles are, before a substep; g2p may have `counted` them already."""
 
-    def counting(self, counted: bool) -> list[Any]:
-        """Return what g2p takes so as to count particles where it moves them to."""
-        return []
-
     def where(self, step: int, substep: int) -> list[Any]:
         """Return what says where nodes are in grids, as g2p takes it."""
         return [self.solver.tape(step).lattice]
+
+    def counting(self, counted: bool) -> list[Any]:
+        """Return what g2p takes so as to count particles where it moves them to."""
+        return []
 
     def p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
         """Fill the substep's grid with momentum and mass."""
@@ -123,7 +123,7 @@ class ByColumns:
 
     def begin(self) -> None:
         """Forget what a run that was interrupted has left."""
-        for array in (self.counts, self.used, self.sizes):
+        for array in (self.counts, self.used, self.sizes, self.spans):
             array.zero_()
 
     def list_particles(self, step: int, substep: int, frame: Frame, batch: int, *, counted: bool) -> None:
@@ -135,22 +135,22 @@ class ByColumns:
             inputs = [tape.lattice, frame.x, self.cells, self.numbers, self.counts]
             solver.launch(kernels.count, count, batch, inputs)
         inputs = [tape.lattice, self.counts, self.used, self.sizes, self.places, *self.found, lists.planes]
-        solver.launch_on_box(kernels.place_segments, warps, batch, [*inputs, lists.touched])
-        inputs = [tape.lattice, lists.planes, lists.touched, lists.starts, lists.nodes]
+        solver.launch_on_box(kernels.place_segments, warps, batch, [*inputs, self.spans, lists.touched])
+        inputs = [tape.lattice, self.spans, lists.touched, lists.starts, lists.nodes]
         solver.launch_on_box(kernels.place_nodes, column_warps, batch, inputs)
         inputs = [self.cells, self.numbers, self.places, self.used, self.sizes, *self.found, self.arrived]
         solver.launch(kernels.place, count, batch, [*inputs, lists.full, lists.segments, lists.touched, solver.needed])
-        inputs = [self.cells, self.places, self.arrived, self.used, self.sizes, lists.order]
+        inputs = [tape.lattice, self.cells, self.places, self.arrived, self.used, self.sizes, self.spans, lists.order]
         solver.launch(kernels.tidy, count, batch, inputs)
-
-    def counting(self, counted: bool) -> list[Any]:
-        """Return what g2p takes so as to count particles where it moves them to."""
-        return [int(counted), self.cells, self.numbers, self.counts]
 
     def where(self, step: int, substep: int) -> list[Any]:
         """Return what says where nodes are in grids, as g2p takes it."""
         tape = self.solver.tape(step)
         return [tape.lattice, tape.lists[substep].starts]
+
+    def counting(self, counted: bool) -> list[Any]:
+        """Return what g2p takes so as to count particles where it moves them to."""
+        return [int(counted), self.cells, self.numbers, self.counts]
 
     def p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
         """Make parts of what nodes get of momentum and mass."""
@@ -188,6 +188,7 @@ class ByColumns:
         self.counts: wp.array = allocator.array(wp.int32, count * SEGMENT)
         self.places: wp.array = allocator.array(wp.vec2i, count * SEGMENT)
         self.found = allocator.array(wp.vec4i, count), allocator.array(wp.int32, count)
+        self.spans: wp.array = allocator.array(wp.int32, count * 2)  # of columns, of which there are no more
 
 
 def nodes(box: Box) -> int:

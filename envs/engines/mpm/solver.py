@@ -27,7 +27,8 @@ import warp as wp
 from ..launches import Launches
 from ..runtime import free_memory, has_rows, load, threads, to_torch
 from .adjoint import Adjoint
-from .checkpoints import Allocator, Frame, Tape
+from .cells import segments
+from .checkpoints import Allocator, Frame, Room, Tape
 from .extent import Extent
 from .grid_cpu import velocity_on
 from .kernels import compile_all as compile_all
@@ -115,6 +116,7 @@ class Solver:
         self.boxes = [Box((0, 0, 0), model.nodes)] * model.steps
         self.margins = [BOX_MARGIN] * model.steps  # cells around the particles, as each step has needed so far
         self.touched = [model.touched] * model.steps  # nodes of which grids hold no others, by columns, likewise
+        self.most = Room(0, 0, 0)  # columns and segments of any step: boxes differ more than what is in them
         self.checkpoints = [self.allocator.frame() for _ in range(model.steps + 1)]
         self.orders = [Order(model, capacity, device) for _ in self.checkpoints]
         self.end = self.allocator.frame()  # of a control step, before its particles are sorted
@@ -154,10 +156,10 @@ class Solver:
         self.spare_used, first, free = True, self.tapes[0], free_memory()
         spare = free - min(LEFT[0] * free, LEFT[1])
         for kept in range(self.model.steps - 1, -1, -1):
-            counts = [self.nodes(step) for step in range(kept)]
-            if sum(map(first.bytes_on, self.boxes, counts)) <= spare:
+            needed = [self.room(step) for step in range(kept)]
+            if sum(map(first.bytes_on, needed)) <= spare:
                 break
-        self.tapes = [*(Tape(self.allocator, first.room(count), self.pieces) for count in counts), first]
+        self.tapes = [*(Tape(self.allocator, first.room(one.nodes), self.pieces) for one in needed), first]
         self.launches.clear()
 
     def read_positions(self, step: int, batch: int) -> torch.Tensor:
@@ -188,10 +190,13 @@ class Solver:
         """Return where a control step is stored whole: in the last place all that have none of their own, in turn."""
         return self.tapes[min(step, len(self.tapes) - 1)]
 
-    def nodes(self, step: int) -> int:
-        """Return how many nodes of its box a control step needs, as far as is known."""
-        cells = self.boxes[step].cells
-        return min(self.touched[step], cells) if self.columns else cells
+    def room(self, step: int) -> Room:
+        """Return the room that a control step needs on its box, as far as is known."""
+        box = self.boxes[step]
+        if not self.columns:
+            return Room(box.cells, 0, 0)
+        self.most = Room(0, max(self.most.columns, box.columns), max(self.most.segments, segments(box)))
+        return self.most._replace(nodes=min(self.touched[step], box.cells))
 
     def _advance_on_box(
         self, step: int, batch: int, low: np.ndarray, high: np.ndarray
@@ -245,10 +250,10 @@ class Solver:
             self._drop_tape()
         if self.scatter.make_room(self.boxes[step]):
             self.launches.clear()
-        if self.tape(step).growth(self.boxes[step], self.nodes(step)):
+        if self.tape(step).growth(self.room(step)):
             self._forget_launches(step)
         try:
-            self.tape(step).make_room(step, self.boxes[step], self.nodes(step))
+            self.tape(step).make_room(step, self.boxes[step], self.room(step))
         except RuntimeError:  # what is free need not be of one piece
             if len(self.tapes) == 1:
                 raise
@@ -262,7 +267,7 @@ class Solver:
         """
         if self.device == "cpu":
             return True
-        growth = self.tape(step).growth(self.boxes[step], self.nodes(step))
+        growth = self.tape(step).growth(self.room(step))
         return not growth or growth <= free_memory() // 2
 
     def _drop_tape(self) -> None:

@@ -19,19 +19,21 @@ class Listing:
         self.used, self.sizes, ranks, planes = (wp.zeros((rows, n), dtype=wp.int32) for n in (2, SIZES, room, room))
         unsorted, found = (wp.zeros((rows, room), dtype=wp.vec4i) for _ in range(2))
         self.found = [unsorted, ranks]
-        full, self.needed = (wp.zeros(rows, dtype=wp.int32) for _ in range(2))
-        starts, nodes, touched = (wp.zeros((rows, n), dtype=wp.int32) for n in (box.columns, box.cells, 2))
-        self.lists = Lists(order, full, found, planes, starts, nodes, touched)
+        self.needed = wp.zeros(rows, dtype=wp.int32)
+        counts = 2 * box.columns, box.columns, box.cells, 2
+        self.spans, starts, nodes, touched = (wp.zeros((rows, count), dtype=wp.int32) for count in counts)
+        self.lists = Lists(order, wp.zeros(rows, dtype=wp.int32), found, planes, starts, nodes, touched)
 
     def run(self):
         """Make the lists, and begin where the last run has ended: at zeros."""
         lists, counts = self.lists, [self.used, self.sizes]
         self.launch(self.kernels.count, self.shape, [self.lattice, self.x, self.cells, self.numbers, self.counts])
         inputs = [self.lattice, self.counts, *counts, self.places, *self.found, lists.planes]
-        self.launch(self.kernels.place_segments, (self.shape[0], warps(self.box)), [*inputs, lists.touched])
-        inputs = [self.lattice, lists.planes, lists.touched, lists.starts, lists.nodes]
+        self.launch(self.kernels.place_segments, (self.shape[0], warps(self.box)), [*inputs, self.spans, lists.touched])
+        inputs = [self.lattice, self.spans, lists.touched, lists.starts, lists.nodes]
         self.launch(self.kernels.place_nodes, (self.shape[0], column_warps(self.box)), inputs)
         inputs = [self.cells, self.numbers, self.places, *counts, *self.found, self.arrived, lists.full, lists.segments]
         self.launch(self.kernels.place, self.shape, [*inputs, lists.touched, self.needed])
-        self.launch(self.kernels.tidy, self.shape, [self.cells, self.places, self.arrived, *counts, lists.order])
-        assert not any(to_torch(array).any() for array in (self.counts, *counts))
+        inputs = [self.lattice, self.cells, self.places, self.arrived, *counts, self.spans, lists.order]
+        self.launch(self.kernels.tidy, self.shape, inputs)
+        assert not any(to_torch(array).any() for array in (self.counts, *counts, self.spans))

@@ -139,10 +139,33 @@ def test_a_tape_grows_by_the_bytes_it_says(columns):
     tape = Tape(solver.allocator)
     for margin in (0, 3):  # the second time it has something to lose
         box = solver.boxes[0] = nodes_around(model, *model.corners, mpm.BOX_MARGIN + margin)
-        before, growth = tape.bytes, tape.growth(box, solver.nodes(0))
-        tape.make_room(0, box, solver.nodes(0))
+        before, growth = tape.bytes, tape.growth(solver.room(0))
+        tape.make_room(0, box, solver.room(0))
         assert tape.bytes - before == growth > 0
-    assert tape.growth(box, solver.nodes(0)) == 0
+    assert tape.growth(solver.room(0)) == 0
+
+
+@pytest.mark.parametrize("few", [3, 150])
+def test_where_more_nodes_are_touched_than_there_is_room_for_the_step_is_done_again(few):
+    model, paths = kneading()
+    adj_x = {model.steps: weights(model, 3, 6)}
+    wanted = kneaded(model, paths, adj_x, columns=True)
+    solver = Solver(model, capacity=3, device="cpu", columns=True)
+    solver.touched = [few] * model.steps
+    end, gradient = solver.run(paths), solver.gradient(adj_x)
+    assert torch.equal(end, wanted[1])
+    assert torch.equal(gradient, wanted[2])
+    for step, touched in enumerate(solver.touched):
+        nodes = max(int(to_torch(one.touched)[:, 0].max()) for one in solver.tape(step).lists)
+        assert few < nodes <= touched <= solver.tape(step).cells < solver.boxes[step].cells
+
+
+def test_nodes_at_rest_are_counted():
+    """By columns, from the lowest node that a particle touches to the highest: of two lumps above each other, say."""
+    model, paths = kneading()
+    solver = Solver(model, capacity=3, device="cpu", columns=True)
+    solver.run(paths)
+    assert model.touched == int(to_torch(solver.tape(0).lists[0].touched)[0, 0])
 
 
 def test_as_many_control_steps_are_kept_as_fit_on_their_own_boxes(monkeypatch):
@@ -181,10 +204,14 @@ def test_a_control_step_that_needs_more_nodes_is_launched_anew_and_no_other(colu
     adj_x = {2: weights(model, 3, 5), model.steps: weights(model, 3, 6)}
     solver = Solver(model, capacity=3, device="cpu", columns=columns)
     solver.margins[2] += 5  # what all control steps share has room for the largest
+    solver.touched[2] *= 3
     for _ in range(2):
         end, gradient = solver.run(paths).clone(), solver.gradient(adj_x)
     before, room = dict(solver.launches.sequences), solver.tapes[1].bytes
-    solver.margins[1] += 2
+    if columns:
+        solver.touched[1] *= 2  # all steps have room for the largest box
+    else:
+        solver.margins[1] += 2
     again, slopes = solver.run(paths), solver.gradient(adj_x)
     assert solver.tapes[1].bytes > room
     anew = {key for key, sequence in solver.launches.sequences.items() if before.get(key) is not sequence}

@@ -78,7 +78,7 @@ class Kernels:
         solver = self.solver
         to_torch(solver.checkpoints[0].x)[:, self.first :] = x
         to_torch(solver.checkpoints[0].S[1])[:] = J
-        solver.tape(0).make_room(0, solver.boxes[0], solver.nodes(0))
+        solver.tape(0).make_room(0, solver.boxes[0], solver.room(0))
         solver.launch_again(("smooth",), 0, self.batch, lambda: self.smoother.run(solver, 0, self.batch))
         return to_torch(solver.tape(0).smoothed[1]).clone()
 
