@@ -97,10 +97,21 @@ class Adjoint:
         for b, (_, adjoint) in enumerate(solver.materials):
             inputs = [*solver.material_inputs(b, step, frame), new.S[b]]
             if solver.columns:
-                material = solver.model.bodies[b].material
+                material = solver.model.groups[b].material
                 kept = [A] if material.keeps_affine_momentum(solver.model.precision) else []
                 lists = tape.lists[substep]
-                given = [tape.lattice, lists.starts, frame.x, frame.v, self.grid.m, old.v, tape.grids[substep].v, new.x, new.v, new.C]
+                given = [
+                    tape.lattice,
+                    lists.starts,
+                    frame.x,
+                    frame.v,
+                    self.grid.m,
+                    old.v,
+                    tape.grids[substep].v,
+                    new.x,
+                    new.v,
+                    new.C,
+                ]
                 inputs = [*kept, *given, old.x, *inputs]
             else:
                 inputs += [self.A]

@@ -98,8 +98,8 @@ FIND_TOUCHED = """
     }
     return high ? wp::vec_t<2, wp::int32>(HIGHEST - above - before, high - before) : wp::vec_t<2, wp::int32>(0, 0);
 """
-# The lanes of a warp have columns beside each other, whose nodes have places one after the other: they write all of them
-# together, of which each lane finds out whose node has a place.
+# Lanes of a warp have columns beside each other, whose nodes have places one after the other. They write all of these
+# together, a place each, and find out to whose column it belongs.
 NAME_NODES = """
     const int room = nodes.shape[1], first = column * depth + low;
     int *row = &wp::index(nodes, e, 0);
@@ -214,7 +214,7 @@ def counter(name: str):
 @cache
 @no_type_check
 def cell_kernels(name: str) -> SimpleNamespace:
-    """Return the kernels `count, place_segments, place_nodes, place, tidy` of one precision, which make lists in this order.
+    """Return the kernels `count, place_segments, place_nodes, place, tidy` of one precision, which list in this order.
 
     Where g2p has counted particles, `count` need not.
     """
@@ -237,9 +237,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
     def find_touched(lattice: Lattice, spans: wp.array2d[wp.int32], e: int, column: int) -> wp.vec2i: ...
 
     @wp.func_native(NAME_NODES)
-    def name_nodes(
-        nodes: wp.array2d[wp.int32], e: int, column: int, depth: int, low: int, count: int, start: int
-    ): ...
+    def name_nodes(nodes: wp.array2d[wp.int32], e: int, column: int, depth: int, low: int, count: int, start: int): ...
 
     @wp.func_native(COUNT_BEFORE)
     def count_before(arrived: wp.array2d[wp.int32], e: int, places: wp.vec2i, p: int) -> int: ...
@@ -385,6 +383,4 @@ def cell_kernels(name: str) -> SimpleNamespace:
             mine = places[e, cell]
             order[e, mine[0] + count_before(arrived, e, mine, p)] = p
 
-    return SimpleNamespace(
-        count=count, place_segments=place_segments, place_nodes=place_nodes, place=place, tidy=tidy
-    )
+    return SimpleNamespace(count=count, place_segments=place_segments, place_nodes=place_nodes, place=place, tidy=tidy)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, TypeVar
 import warp as wp
 
 from ..runtime import precision
-from .cells import Lists, segments
+from .cells import Lists
 from .exact import LANES, SUMS
 from .model import Box, Model, place_grid
 
@@ -54,14 +54,14 @@ class Allocator:
         """Return a frame of zeros."""
         types, count = self.types, self.model.particles
         x, v, C = (self.array(kind, count) for kind in (types.vec3, types.vec3, types.mat33))
-        states = (self.array(b.material.state(self.model.precision), len(b.x)) for b in self.model.bodies)
+        states = (self.array(b.material.state(self.model.precision), len(b.x)) for b in self.model.groups)
         return Frame(x, v, C, tuple(states))
 
     def smoothed(self) -> dict[int, wp.array]:
         """Return zeros for the state of each body whose state is smoothed before a control step, by its number."""
         return {
             b: self.array(body.material.state(self.model.precision), len(body.x))
-            for b, body in enumerate(self.model.bodies)
+            for b, body in enumerate(self.model.groups)
             if body.material.smoothing
         }
 

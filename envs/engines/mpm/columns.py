@@ -61,7 +61,8 @@ def kernel(lattice, rows, order, full, segments, OWN, parts):
 
 ADD_UP = """
     FOUR
-    const int nz = lattice.nz, ny = lattice.ny, z = lattice.first[2] + node % nz, y = node / nz % ny, x = node / nz / ny;
+    const int nz = lattice.nz, ny = lattice.ny, column = node / nz;
+    const int x = column / ny, y = column % ny, z = lattice.first[2] + node % nz;
     const int bottom = lattice.first[2] / SEGMENT, depth = (lattice.first[2] + nz - 1) / SEGMENT - bottom + 1;
     const int segment = z / SEGMENT - bottom, plane = z % SEGMENT;
     const bool both = plane < 2 && segment > 0;

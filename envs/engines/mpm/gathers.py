@@ -44,7 +44,7 @@ GATHER = """
         Vec r{}, rj{}, rk{}, change{};
 #pragma unroll
         for (int j = 0; j < 3; ++j) {
-            const int at = wp::min(wp::max(start[j] + corner[2], 0), last);  // a particle that is nowhere reads something
+            const int at = wp::min(wp::max(start[j] + corner[2], 0), last);  // of a particle that is nowhere, too
             const Four n0 = nodes[at], n1 = nodes[at + 1], n2 = nodes[at + 2];
             const Vec v0{n0.a, n0.b, n0.c}, v1{n1.a, n1.b, n1.c}, v2{n2.a, n2.b, n2.c};
             const REAL wj = w[1][j];

@@ -31,14 +31,14 @@ def compile_all(model: Model, device: str) -> None:
 def kernels(model: Model, device: str) -> Iterator[Any]:
     """Yield a kernel or more of each module, those first that take longest to compile."""
     name = model.precision
-    yield from (_of_cpu if device == "cpu" else _of_gpu)(name, any(body.material.smoothing for body in model.bodies))
+    yield from (_of_cpu if device == "cpu" else _of_gpu)(name, any(body.material.smoothing for body in model.groups))
     yield velocity_on(device, name, model.boundary, columns=device != "cpu")
-    for body in model.bodies:
+    for body in model.groups:
         yield from body.material.kernels(name, rows=device == "cpu", columns=device != "cpu")
     yield extent_kernels(name).look
     sorting = sorting_kernels(name, wp.int32)  # with which all but huge batches are sorted
     yield sorting.label
-    for body in model.bodies:
+    for body in model.groups:
         yield from sorting.states[body.material.state(name)]
 
 

@@ -34,6 +34,11 @@ class Body:
         """Mass of each particle [kg]."""
         return self.material.density * self.volume
 
+    def joined(self, other: "Body") -> "Body":
+        """Return one body that is both of these, of one material."""
+        pairs = ((getattr(self, key), getattr(other, key)) for key in ("x", "volume", "ratio"))
+        return Body(self.material, *map(np.concatenate, pairs))
+
 
 @dataclass(frozen=True, eq=False)
 class Model:
@@ -49,6 +54,16 @@ class Model:
     substeps: int
     steps: int
     gravity: float = 9.81
+
+    @cached_property
+    def groups(self) -> tuple[Body, ...]:
+        """Return the bodies as they are simulated: neighbours of one material as one, unless it is smoothed by body."""
+        groups: list[Body] = []
+        for body in self.bodies:
+            if groups and body.material == groups[-1].material and not body.material.smoothing:
+                body = groups.pop().joined(body)
+            groups.append(body)
+        return tuple(groups)
 
     @property
     def particles(self) -> int:
@@ -83,8 +98,8 @@ class Model:
         """Return about what an environment takes of a solver that stores so many control steps whole, with adjoints.
 
         Grids are counted as large as around the bodies at rest and TRAVEL cells farther on all sides; by `columns`, of
-        SPREAD times the nodes that bodies touch there. Sums then take 45 numbers a node, and each substep has an
-        integer for every particle and node. Of a step in `pieces` one is stored, and a frame for each of the others.
+        SPREAD times the nodes that bodies touch there. Sums then take 45 numbers a node, and each substep has lists of
+        integers. Of a step in `pieces` one is stored, and a frame for each of the others.
         """
         state = sum(len(body.x) * (1 if isinstance(body.material, Fluid) else 9) for body in self.bodies)
         frame = 15 * self.particles + state  # x, v, C and each material's own
@@ -98,7 +113,7 @@ class Model:
         if not columns:
             return self.real_bytes * numbers
         means = 4 * tapes * sum(body.material.smoothing > 0 for body in self.bodies)
-        integers = (stored + 3) * (self.particles + nodes + held)
+        integers = (stored + 3) * (self.particles + nodes // 4 + 3 * held)
         return self.real_bytes * (numbers + 45 * nodes + means * held) + 4 * integers
 
     @property
@@ -117,11 +132,13 @@ class Model:
         """Return how many nodes particles at rest touch, with those that lie between such along z."""
         x = np.concatenate([body.x for body in self.bodies])
         base = np.unique(np.floor((x - self.origin) / self.dx - 0.5).astype(int), axis=0)
-        low, high = {}, {}
-        for i, j, k in base.tolist():
-            for column in product(range(i, i + 3), range(j, j + 3)):
-                low[column], high[column] = min(low.get(column, k), k), max(high.get(column, k), k)
-        return sum(high[column] - low[column] + 3 for column in low)
+        base = np.clip(base, 0, np.array(self.nodes) - 3)
+        low, high = np.full(self.nodes[:2], self.nodes[2]), np.zeros(self.nodes[:2], dtype=int)
+        for i, j in product(range(3), repeat=2):
+            columns = base[:, 0] + i, base[:, 1] + j
+            np.minimum.at(low, columns, base[:, 2])
+            np.maximum.at(high, columns, base[:, 2] + 3)
+        return int((high - low).clip(0).sum())
 
     @property
     def real_bytes(self) -> int:

@@ -162,9 +162,9 @@ class Sorter:
         key = wp.int32 if self.bits < 32 else wp.int64
         self.keys, self.places = (wp.zeros(room, dtype=kind, device=device) for kind in (key, wp.int32))
         self.kernels = sorting_kernels(model.precision, key)
-        states = (self.kernels.states[body.material.state(model.precision)] for body in model.bodies)
+        states = (self.kernels.states[group.material.state(model.precision)] for group in model.groups)
         load([self.kernels.label, *chain.from_iterable(states)], device)
-        self.first = np.cumsum([0, *sizes])[:-1].tolist()
+        self.first = np.cumsum([0, *(len(group.x) for group in model.groups)])[:-1].tolist()
 
     def sort(self, old: Any, new: Any, before: Order, order: Order, batch: int) -> None:
         """Launch what fills `order` and the frame `new` from the frame `old`, which lies in the order `before`."""

@@ -72,7 +72,7 @@ class Raster:
         self.particles, self.adjoints = particles[:3], particles[3:]  # x, v, A: a mass does not depend on v and A
         self.grid = wp.zeros((capacity, model.cells), dtype=types.vec4, device=device)
         starts = np.arange(0, model.cells, model.nodes[2], dtype=np.int32)  # of columns of nodes, which have all theirs
-        self.starts = [wp.array(np.tile(starts, (capacity, 1)), device=device)] if self.counting else []
+        self.starts: list[wp.array] = [wp.array(np.tile(starts, (capacity, 1)), device=device)] if self.counting else []
         self.units = wp.zeros((capacity, model.cells if self.counting else 0), dtype=wp.int64, device=device)
 
     @staticmethod

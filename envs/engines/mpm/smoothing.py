@@ -26,7 +26,7 @@ class Smoother:
     """Smooth one body's volume ratios before a control step, and bring adjoints back."""
 
     def __init__(self, solver: Any, body: int) -> None:
-        model, material = solver.model, solver.model.bodies[body].material
+        model, material = solver.model, solver.model.groups[body].material
         self.body, self.first, self.size = body, solver.first[body], solver.size(body)
         self.slope, self.share = hydrostatic_slope(model, body), material.smoothing
         self._prepare(solver)
@@ -91,8 +91,8 @@ class ColumnSmoother(Smoother):
         J_new = tape.smoothed[self.body]
         solver.scatter.walk(self.kernels.spread_adjoint, step, 0, batch, [self.first, self.share, x, J_new, adj_J])
         solver.scatter.add_up(self.kernels.add_up_adjoint, step, 0, batch, nodes)
-        inputs = [*self._place(tape), self.first, self.slope, self.share, solver.orders[step].volume, x, J, J_new, *nodes]
-        solver.launch(self.kernels.adjoint_gather, self.size, batch, [*inputs, adj_J, adj_x])
+        inputs = [*self._place(tape), self.first, self.slope, self.share, solver.orders[step].volume]
+        solver.launch(self.kernels.adjoint_gather, self.size, batch, [*inputs, x, J, J_new, *nodes, adj_J, adj_x])
 
     def _prepare(self, solver: Any) -> None:
         self.kernels = smoothing_columns(solver.model.precision, solver.scatter.team)
@@ -113,7 +113,7 @@ class ColumnSmoother(Smoother):
 
 def hydrostatic_slope(model: Model, body: int) -> float:
     """Return by how much log J of a fluid at rest grows with height [1/m]."""
-    material: Any = model.bodies[body].material
+    material: Any = model.groups[body].material
     return float(material.density * model.gravity / material.bulk)
 
 
@@ -124,8 +124,8 @@ def smooth_volume_ratios(
 
     This is what the kernels do, written in torch, which differentiates it by x and J.
     """
-    slope, share = hydrostatic_slope(model, body), model.bodies[body].material.smoothing
-    volume = torch.from_numpy(model.bodies[body].volume).to(x)
+    slope, share = hydrostatic_slope(model, body), model.groups[body].material.smoothing
+    volume = torch.from_numpy(model.groups[body].volume).to(x)
     node, weight = _stencil(model, x)
     beyond = J.log() - slope * x[:, :, 1]
     total = _sum_at_nodes(model, node, weight * volume[:, None])

@@ -104,14 +104,14 @@ class Solver:
         self.velocity = velocity_on(device, model.precision, model.boundary, columns=columns)
         self.boundary = model.boundary.data(model.precision, device)
         self.materials = [
-            body.material.kernels(model.precision, rows=device == "cpu" and not columns, columns=columns)
-            for body in model.bodies
+            group.material.kernels(model.precision, rows=device == "cpu" and not columns, columns=columns)
+            for group in model.groups
         ]
         load([*vars(self.kernels).values(), self.velocity, *chain.from_iterable(self.materials)], device)
-        self.first = np.concatenate([[0], np.cumsum([len(body.x) for body in model.bodies])]).tolist()
+        self.first = np.concatenate([[0], np.cumsum([len(group.x) for group in model.groups])]).tolist()
         self.empty = EMPTY * float(model.mass.min())
         self.scatter: Scatter = ByColumns(self) if columns else InPlace(self)
-        smooth = [b for b, body in enumerate(model.bodies) if body.material.smoothing]
+        smooth = [b for b, group in enumerate(model.groups) if group.material.smoothing]
         self.smoothers = [(ColumnSmoother if columns else Smoother)(self, b) for b in smooth]
         self.boxes = [Box((0, 0, 0), model.nodes)] * model.steps
         self.margins = [BOX_MARGIN] * model.steps  # cells around the particles, as each step has needed so far
@@ -129,9 +129,7 @@ class Solver:
         self.tools = self.allocator.paths()
         self.sums = self.allocator.sums()
         self.listed = [self.allocator.array(wp.int32, model.cells + 1)] if has_rows(self.velocity) else []
-        self.left_box, self.needed, self.escaped = (
-            wp.zeros(capacity, dtype=wp.int32, device=device) for _ in range(3)
-        )
+        self.left_box, self.needed, self.escaped = (wp.zeros(capacity, dtype=wp.int32, device=device) for _ in range(3))
         self.adjoint: Adjoint | None = None
         self._start()
 
@@ -323,7 +321,7 @@ class Solver:
     def material_inputs(self, b: int, step: int, frame: Frame) -> list[Any]:
         """Return what both kernels of a material take."""
         dt, scale = self.model.dt, -self.model.dt * 4.0 / self.model.dx**2
-        constants = self.model.bodies[b].material.constants()
+        constants = self.model.groups[b].material.constants()
         order = self.orders[step]
         return [self.first[b], dt, scale, *constants, order.mass, order.volume, frame.S[b], frame.C]
 
@@ -352,8 +350,8 @@ class Solver:
         return self.launches.beside(2 + b) if b < len(self.materials) - 1 else nullcontext()
 
     def size(self, b: int) -> int:
-        """Return the number of particles of body b."""
-        return len(self.model.bodies[b].x)
+        """Return the number of particles of group b."""
+        return len(self.model.groups[b].x)
 
     def launch(self, kernel: Any, size: int, batch: int, inputs: list[Any]) -> None:
         """Launch a kernel over [environment, element], or over environments where it takes their rows."""
@@ -373,5 +371,5 @@ class Solver:
     def _start(self) -> None:
         first = self.checkpoints[0]
         to_torch(first.x)[:] = torch.from_numpy(np.concatenate([body.x for body in self.model.bodies]))
-        for body, state in zip(self.model.bodies, first.S, strict=True):
-            to_torch(state)[:] = to_rows(torch.from_numpy(body.material.initial(body.ratio)), self.device)
+        for group, state in zip(self.model.groups, first.S, strict=True):
+            to_torch(state)[:] = to_rows(torch.from_numpy(group.material.initial(group.ratio)), self.device)

@@ -9,12 +9,13 @@ import torch
 
 from gradscape.envs.base import Fidelity
 from gradscape.envs.engines.mpm.materials import Plasticine as Clay
+from gradscape.envs.engines.mpm.materials.plasticine_series import NEAR
 from gradscape.envs.engines.mpm.model import Body, Model
 from gradscape.envs.engines.mpm.raster import Raster
 from gradscape.envs.engines.mpm.solver import Solver
 from gradscape.envs.engines.mpm.tools import Kind, Tool, ToolsInRoom
 from gradscape.envs.mpm.plasticine import DEMONSTRATION, Plasticine
-from gradscape.envs.mpm.plasticine_model import SPAN
+from gradscape.envs.mpm.plasticine_model import SPAN, YOUNG
 from gradscape.envs.mpm.plasticine_scenes import Assembly, Pinch, Table, Torus, TripleMove, Writer
 from gradscape.envs.mpm.scene import SEGMENTS
 from gradscape.envs.mpm.shapes import Ball, fill
@@ -192,3 +193,12 @@ def test_shorter_steps_do_not_harden_a_tools_shell():
     converging, drifting = ([float((a - b).norm(dim=1).mean()) for a, b in pairwise(ends)] for ends in (rate, share))
     assert sum(converging) < 0.5 * sum(drifting), (converging, drifting)
     assert converging[-1] < 0.5 * converging[0]
+
+
+def test_what_yields_in_a_scene_is_strained_by_so_little_that_series_are_exact():
+    """On a GPU a decomposition is for what a substep strains by half as much again, or does not yield."""
+    scenes = [kind.scene for kind in Plasticine.__subclasses__()]
+    assert len(scenes) >= 8
+    for scene in scenes:
+        *_, kappa = Clay(1.0, YOUNG, scene.poisson, scene.yield_stress).constants()
+        assert 1.5 * np.expm1(2 * kappa) < NEAR

@@ -6,8 +6,9 @@ has two kernels: `update` advances the state by the affine velocity C and fills 
     S' = deform(S, C),    A = -dt V 4/dx^2 tau(S', C) + m C,
 
 and `adjoint` turns the adjoints of S' and A into those of S and C. Both are written by hand; the tests hold the second
-against differences of the first. On a GPU the adjoint gathers that of A first (`gathers`); a fluid's and
-an elastic solid's computes A again, too, so that no substep has to keep it. tau is the Kirchhoff stress J sigma [Pa].
+against differences of the first. On a GPU the adjoint gathers that of A first (`gathers`), and computes A again, so
+that no substep has to keep it: plasticine's in float32 only, where series take a decomposition's place. tau is the
+Kirchhoff stress J sigma [Pa].
 """
 
 from dataclasses import dataclass
@@ -102,7 +103,6 @@ class _Solid:
 class Elastic(_Solid):
     """A compressible neo-Hookean solid."""
 
-
     @classmethod
     def with_wave_speed(cls, density: float, speed: float, *, poisson: float) -> "Elastic":
         """Return the solid in which pressure waves travel at `speed` [m/s]."""
@@ -132,8 +132,8 @@ class Plasticine(_Solid):
         """Return (update, adjoint) for one precision: those whose threads have `rows`, in float32, or for `columns`."""
         if rows and name == "float32":
             return plasticine_cpu.kernels_in_rows()
-        near = columns and not self.keeps_affine_momentum(name)
-        return _choose(name, (plasticine_series if near else plasticine).kernels(name), columns=columns)
+        found = plasticine_series if columns and name == "float32" else plasticine
+        return _choose(name, found.kernels(name), columns=columns)
 
     def constants(self) -> tuple[float, ...]:
         """Return what the kernels take besides state and motion; the last is the largest deviatoric log strain."""

@@ -31,8 +31,8 @@ ROUNDED = 1e-8  # added to |d|^2, so that an undeformed body has a gradient
 def responses(name: str) -> SimpleNamespace:
     """Return the functions `respond, turn_back` of one precision.
 
-    `respond` takes a trial deformation gradient, mu, lam and kappa, and returns F' and tau; `turn_back` takes those, the
-    adjoint of F', a weight and the matrix that times it is the adjoint of tau, and returns the adjoint of the trial.
+    `respond` takes a trial deformation gradient, mu, lam and kappa, and returns F' and tau. `turn_back` takes them, the
+    adjoint of F', and a weight and a matrix whose product is the adjoint of tau; it returns the trial's.
     """
     types = precision(name)
     real, vec3, mat33 = types.real, types.vec3, types.mat33
@@ -108,7 +108,9 @@ def responses(name: str) -> SimpleNamespace:
         return U * wp.diag(f) * wp.transpose(V), U * wp.diag(t) * wp.transpose(U)
 
     @wp.func(module=module)
-    def turn_back(trial: mat33, mu: real, lam: real, kappa: real, adj_F_new: mat33, weight: real, adj_a: mat33) -> mat33:
+    def turn_back(
+        trial: mat33, mu: real, lam: real, kappa: real, adj_F_new: mat33, weight: real, adj_a: mat33
+    ) -> mat33:
         U, s, V = decompose(trial)
         e = log_strain(s)
         d = e - mean(e)

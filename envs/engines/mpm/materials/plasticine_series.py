@@ -1,17 +1,19 @@
 """Kernels of `plasticine` in float32 for a GPU: by series in its strain, without a decomposition where that is small.
 
-With J = det F, s = J^(1/3) and V = exp(d) the stretch that changes shape alone, F F^T = s^2 exp(2 d), and
+With J = det F, s = J^(1/3) and exp(d) the stretch that changes shape alone, so that F F^T = s^2 exp(2 d),
 
     d = atanh(z),  z = X (X + 2)^-1,  X = F F^T / s^2 - 1,  |d| = sqrt(d:d + 1e-8),  c = min(1, kappa / |d|),
     F' = exp((c - 1) d) F,  tau = 2 mu (W^2 - W) + lam J (J - 1),  W = s exp(c d).
 
-As d has no trace, d^3 = q d + r with q = d:d / 2 and r = det d, so that exp(t d) is a sum of 1, d and d^2, whose factors
-are series in q and r. The differential of d is that of a logarithm,
+As d has no trace, d^3 = q d + r with q = d:d / 2 and r = det d. So exp(t d) is a sum of 1, d and d^2, whose factors are
+series in q and r. The differential of d is that of a logarithm,
 
-    dd = 1/2 (ad / sinh ad)[exp(-d) d(F F^T / s^2) exp(-d)],  ad[Y] = d Y - Y d,  x / sinh x = 1 - x^2/6 + 7 x^4/360 - ...
+    dd = 1/2 (ad / sinh ad)[exp(-d) d(F F^T / s^2) exp(-d)],  ad[Y] = d Y - Y d,
+    x / sinh x = 1 - x^2 / 6 + 7 x^4 / 360 - ...
 
-Plasticine that yields is never far from its yield surface, where strains are 0.05 at most. Where X is larger than
-NEAR the kernels decompose F as `plasticine` does.
+(Higham 2008, Functions of matrices, chapters 10 and 11.) Nothing here is divided by differences of singular values.
+Plasticine that yields is never far from its yield surface, where strains are 0.05 at most. Where X is larger than NEAR,
+or F almost flat, the kernels decompose F as `plasticine` does.
 """
 
 from functools import cache
@@ -29,7 +31,8 @@ NEAR = 0.2  # Frobenius norm of X up to which series are as exact as float32 is
 @cache
 def kernels(name: str) -> tuple[Any, Any, Any, Any]:
     """Return the kernels (update, adjoint), what the second does with a particle's adjoint of A, and A's function."""
-    return kernels_of(name, series(name), f"gradscape.plasticine.series.{name}")
+    found: tuple[Any, Any, Any, Any] = kernels_of(name, series(name), f"gradscape.plasticine.series.{name}")
+    return found
 
 
 @cache
@@ -161,7 +164,9 @@ def series(name: str) -> SimpleNamespace:
         return even(d2 * Y) - real(2.0) * mixed(d * Y, d)
 
     @wp.func(module=module)
-    def turn_back(trial: mat33, mu: real, lam: real, kappa: real, adj_F_new: mat33, weight: real, adj_a: mat33) -> mat33:
+    def turn_back(
+        trial: mat33, mu: real, lam: real, kappa: real, adj_F_new: mat33, weight: real, adj_a: mat33
+    ) -> mat33:
         d, s, near = strain(trial)
         if not near:
             return turn_back_far(trial, mu, lam, kappa, adj_F_new, weight, adj_a)

@@ -1,12 +1,14 @@
 """Plasticine against its own definition: no stress from turning, Hooke's law, von Mises' bound, and true adjoints."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gradscape.envs.engines.mpm.materials import Plasticine
+from gradscape.envs.engines.mpm.materials import Plasticine, plasticine_series
 from gradscape.envs.engines.mpm.materials.plasticine import ROUNDED, SMALLEST
 
 from ..bench import IDENTITY, NAMES, MaterialBench, assert_rows_have_the_same_bits, draw, rotations
@@ -156,3 +158,39 @@ def test_rows_of_a_cpu_have_the_same_bits():
     F = torch.cat([torch.stack(odd).double(), IDENTITY + sizes * draw(125, 3, 3, seed=30)])
     C, adj_F, adj_A = (scale * draw(len(F), 3, 3, seed=31 + k) for k, scale in enumerate((30.0, 1.0, 1.0)))
     assert_rows_have_the_same_bits(CLAY, F, C, adj_F, adj_A)
+
+
+def by_series(material, name):
+    """Return a bench of the kernels that do without a decomposition, as a GPU has them in float32."""
+    bench = MaterialBench(material, name)
+    bench.kernels = plasticine_series.kernels(name)[:2]
+    return bench
+
+
+@pytest.mark.parametrize("yields_at", [50.0, 200.0, 5e6])
+@pytest.mark.parametrize("size", [0.0, 1e-3, 0.02, 0.1, 0.2, 0.4])
+@pytest.mark.parametrize(("name", "bound"), [("float32", 4e-6), ("float64", 3e-7)])
+def test_series_do_what_decompositions_do(name, bound, size, yields_at):
+    """Series end where float32 does; beyond them, and where a particle is flat, a decomposition takes over."""
+    count, clay = 200, replace(CLAY, yield_stress=yields_at)
+    swollen = (0.5 * draw(count, 1, 1, seed=40)).exp()
+    F = swollen * (rotations(count, 41) @ (IDENTITY + size * draw(count, 3, 3, seed=42)) @ rotations(count, 43))
+    odd = [CASES[case][:1] for case in ("flat", "flatter", "flat both ways", "inverted", "undeformed", "swollen")]
+    F = torch.cat([F, *odd])
+    C, adj_F, adj_A = (scale * draw(len(F), 3, 3, seed=44 + k) for k, scale in enumerate((3.0, 1.0, 1.0)))
+    series, reference = by_series(clay, name), MaterialBench(clay)
+    for got, wanted in (
+        *zip(series.update(F, C), reference.update(F, C), strict=True),
+        *zip(series.adjoint(F, C, adj_F, adj_A), reference.adjoint(F, C, adj_F, adj_A), strict=True),
+    ):
+        for part in (slice(count), slice(count, None)):
+            largest = float(wanted[part].abs().max())
+            torch.testing.assert_close(got[part], wanted[part], rtol=0, atol=bound * largest)
+
+
+@pytest.mark.parametrize("case", ["elastic", "yielding", "undeformed", "swollen", "two equal, squeezed"])
+def test_adjoints_of_series_are_slopes(case):
+    F, bench = CASES[case].expand(8, 3, 3), by_series(CLAY, "float64")
+    weights = [draw(8, 3, 3, seed=16), draw(8, 3, 3, seed=17)]
+    for got, wanted in bench.slopes(F, draw(8, 3, 3, seed=18), *weights, 1e-3, step=3e-6):
+        torch.testing.assert_close(got, wanted, rtol=0, atol=1e-6 * float(wanted.abs().max()))

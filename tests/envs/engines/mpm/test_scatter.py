@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from gradscape.envs.engines.mpm.cells import SEGMENT, SIZES, STEP, segments
-from gradscape.envs.engines.mpm.model import Body, Box, place_grid
+from gradscape.envs.engines.mpm.model import Body, Box, Model, place_grid
 from gradscape.envs.engines.mpm.solver import Solver
 from gradscape.envs.engines.runtime import to_torch
 
@@ -40,6 +40,21 @@ def test_bodies_of_all_materials_move_as_in_place(materials):
     assert_equal_but_for_rounding(got[1], wanted[1])
     assert_equal_but_for_rounding(got[2], wanted[2])
     assert wanted[2].abs().max() > 0
+
+
+@pytest.mark.parametrize("columns", [False, True])
+def test_bodies_of_one_material_are_simulated_together_and_no_bit_changes(monkeypatch, columns):
+    model, paths = kneading(bodies=lumps(CLAY, CLAY))
+    adj_x = {model.steps: weights(model, 3, 6)}
+    (group,) = model.groups
+    assert len(group.x) == model.particles
+    together = kneaded(model, paths, adj_x, columns=columns)
+    assert len(together[0].materials) == 1
+    monkeypatch.setattr(Model, "groups", property(lambda model: model.bodies))
+    apart = kneaded(model, paths, adj_x, columns=columns)
+    assert len(apart[0].materials) == 2
+    assert torch.equal(together[1], apart[1])
+    assert torch.equal(together[2], apart[2])
 
 
 def test_a_lone_particle_moves_as_in_place():
