@@ -99,20 +99,8 @@ class Adjoint:
             if solver.columns:
                 material = solver.model.groups[b].material
                 kept = [A] if material.keeps_affine_momentum(solver.model.precision) else []
-                lists = tape.lists[substep]
-                given = [
-                    tape.lattice,
-                    lists.starts,
-                    frame.x,
-                    frame.v,
-                    self.grid.m,
-                    old.v,
-                    tape.grids[substep].v,
-                    new.x,
-                    new.v,
-                    new.C,
-                ]
-                inputs = [*kept, *given, old.x, *inputs]
+                given = [frame.x, frame.v, self.grid.m, old.v, tape.grids[substep].v, new.x, new.v, new.C, old.x]
+                inputs = [*kept, *solver.scatter.where(step, substep), *given, *inputs]
             else:
                 inputs += [self.A]
             with solver.beside_others(b):

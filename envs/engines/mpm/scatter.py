@@ -28,7 +28,7 @@ class Scatter(Protocol):
         """Find out where particles are, before a substep; g2p may have `counted` them already."""
 
     def where(self, step: int, substep: int) -> list[Any]:
-        """Return what says where nodes are in grids, as g2p takes it."""
+        """Return what says where nodes are in grids, as kernels that gather take it."""
 
     def counting(self, counted: bool) -> list[Any]:
         """Return what g2p takes so as to count particles where it moves them to."""
@@ -65,7 +65,7 @@ class InPlace:
         """Find out where particles are, before a substep; g2p may have `counted` them already."""
 
     def where(self, step: int, substep: int) -> list[Any]:
-        """Return what says where nodes are in grids, as g2p takes it."""
+        """Return what says where nodes are in grids, as kernels that gather take it."""
         return [self.solver.tape(step).lattice]
 
     def counting(self, counted: bool) -> list[Any]:
@@ -144,7 +144,7 @@ class ByColumns:
         solver.launch(kernels.tidy, count, batch, inputs)
 
     def where(self, step: int, substep: int) -> list[Any]:
-        """Return what says where nodes are in grids, as g2p takes it."""
+        """Return what says where nodes are in grids, as kernels that gather take it."""
         tape = self.solver.tape(step)
         return [tape.lattice, tape.lists[substep].starts]
 

@@ -34,9 +34,8 @@ class Smoother:
     def run(self, solver: Any, step: int, batch: int) -> None:
         """Fill the tape's first state from the checkpoint's."""
         self._spread(solver, step, batch)
-        tape = solver.tape(step)
-        inputs = [*self._place(tape), self.first, self.slope, self.share, *self._particles(solver, step)]
-        inputs += [*self._sums(solver, step), tape.smoothed[self.body]]
+        inputs = [*solver.scatter.where(step, 0), self.first, self.slope, self.share, *self._particles(solver, step)]
+        inputs += [*self._sums(solver, step), solver.tape(step).smoothed[self.body]]
         solver.launch(self.kernels.collect, self.size, batch, inputs)
 
     def run_back(self, solver: Any, step: int, batch: int, adjoint: Any) -> None:
@@ -55,10 +54,6 @@ class Smoother:
         self.kernels: Any = smoothing_on_cpu(solver.model.precision)
         room = solver.model.cells + 1  # a CPU reads and writes four numbers where three are meant
         self.nodes = [solver.allocator.array(solver.types.real, room) for _ in range(3)]  # amount, weight, adj_mean
-
-    def _place(self, tape: Any) -> list[Any]:
-        """Return what says where nodes are."""
-        return [tape.lattice]
 
     def _sums(self, solver: Any, step: int) -> list[Any]:
         """Return what `_spread` fills."""
@@ -91,15 +86,11 @@ class ColumnSmoother(Smoother):
         J_new = tape.smoothed[self.body]
         solver.scatter.walk(self.kernels.spread_adjoint, step, 0, batch, [self.first, self.share, x, J_new, adj_J])
         solver.scatter.add_up(self.kernels.add_up_adjoint, step, 0, batch, nodes)
-        inputs = [*self._place(tape), self.first, self.slope, self.share, solver.orders[step].volume]
+        inputs = [*solver.scatter.where(step, 0), self.first, self.slope, self.share, solver.orders[step].volume]
         solver.launch(self.kernels.adjoint_gather, self.size, batch, [*inputs, x, J, J_new, *nodes, adj_J, adj_x])
 
     def _prepare(self, solver: Any) -> None:
         self.kernels = smoothing_columns(solver.model.precision, solver.scatter.team)
-
-    def _place(self, tape: Any) -> list[Any]:
-        """Return what says where nodes are."""
-        return [tape.lattice, tape.lists[0].starts]
 
     def _sums(self, solver: Any, step: int) -> list[Any]:
         """Return what nodes hold of the body."""

@@ -244,29 +244,27 @@ class Solver:
 
     def _make_room(self, step: int) -> None:
         """Make room for a control step, at the cost of others where memory runs out."""
-        while len(self.tapes) > 1 and not self._fits(step):
+        needed = self.room(step)
+        while len(self.tapes) > 1 and not self._fits(self.tape(step).growth(needed)):
             self._drop_tape()
         if self.scatter.make_room(self.boxes[step]):
             self.launches.clear()
-        if self.tape(step).growth(self.room(step)):
+        if self.tape(step).growth(needed):
             self._forget_launches(step)
         try:
-            self.tape(step).make_room(step, self.boxes[step], self.room(step))
+            self.tape(step).make_room(step, self.boxes[step], needed)
         except RuntimeError:  # what is free need not be of one piece
             if len(self.tapes) == 1:
                 raise
             self._drop_tape()
             self._make_room(step)
 
-    def _fits(self, step: int) -> bool:
-        """Say whether a tape can grow to what a control step needs and leave a GPU as much memory as it takes.
+    def _fits(self, growth: int) -> bool:
+        """Say whether a tape can grow by so many bytes and leave a GPU as much memory as it takes.
 
         Torch, and Warp's sorting, want some, and of an allocation that fails Warp says so on standard error.
         """
-        if self.device == "cpu":
-            return True
-        growth = self.tape(step).growth(self.room(step))
-        return not growth or growth <= free_memory() // 2
+        return self.device == "cpu" or not growth or growth <= free_memory() // 2
 
     def _drop_tape(self) -> None:
         """Store one control step fewer, the last that has a place of its own."""
