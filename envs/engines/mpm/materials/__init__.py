@@ -18,7 +18,7 @@ import numpy as np
 
 from ...runtime import precision
 from . import elastic, fluid, fluid_cpu, plasticine, plasticine_cpu, plasticine_series
-from .adjoints import after_p2g
+from .adjoints import MaterialKernels, after_p2g
 
 
 @dataclass(frozen=True)
@@ -143,6 +143,5 @@ class Plasticine(_Solid):
 Material = Fluid | Elastic | Plasticine
 
 
-def _choose(name: str, found: tuple[Any, Any, Any, Any], *, columns: bool, blocks: int = 4) -> tuple[Any, Any]:
-    update, adjoint, turn_back, affine_momentum = found
-    return update, after_p2g(name, turn_back, affine_momentum, blocks) if columns else adjoint
+def _choose(name: str, found: MaterialKernels, *, columns: bool, blocks: int = 4) -> tuple[Any, Any]:
+    return found.update, after_p2g(name, found, blocks) if columns else found.adjoint

@@ -2,13 +2,13 @@
 
 Alone, a kernel reads that from memory; on a GPU it follows on what particles gather of the adjoints of g2p and p2g, in
 one kernel, and needs no memory.
-`turn_back` takes what both take, but the matrix `adj_a` in the place of the array `adj_A`, and the environment and the
-particle last.
+`turn_back` takes what both take, but the matrix `adj_a` in the place of the array `adj_A`, the particle's `strain` if
+the material knows one, and the environment and the particle last.
 """
 
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -19,22 +19,36 @@ from ..gathers import adjoint_gatherers
 from ..layout import layout
 
 
+class MaterialKernels(NamedTuple):
+    """What a material does: the kernels `update, adjoint`, and functions of which a GPU makes one kernel.
+
+    `turn_back` makes of a particle's adjoint of A those of its state and C; `affine_momentum` computes A again, if that
+    is quick; `strain` is what these two would both compute, if that is slow.
+    """
+
+    update: Any
+    adjoint: Any
+    turn_back: Any
+    affine_momentum: Any | None
+    strain: Any | None = None
+
+
 @cache
-def alone(name: str, turn_back: Any) -> Any:
+def alone(name: str, turn_back: Any, strain: Any | None = None) -> Any:
     """Return the kernel that reads `adj_A`."""
     read_matrix, mat33 = layout(name).read_matrix, precision(name).mat33
     kinds = {"adj_A" if key == "adj_a" else key: kind for key, kind in _taken(turn_back).items()}
     kinds["adj_A"] = wp.array2d[mat33]
 
     def kernel() -> Any:
-        return read_matrix, turn_back  # which Warp finds here by their names
+        return read_matrix, turn_back, strain  # which Warp finds here by their names
 
-    lines = ["adj_a = read_matrix(adj_A, e, first + p)", _call("turn_back", turn_back, "p")]
+    lines = ["adj_a = read_matrix(adj_A, e, first + p)", *_known(strain), _call("turn_back", turn_back, "p")]
     return _kernel(kernel, kinds, lines, turn_back)
 
 
 @cache
-def after_p2g(name: str, turn_back: Any, affine_momentum: Any | None, count: int) -> Any:
+def after_p2g(name: str, material: MaterialKernels, count: int) -> Any:
     """Return the kernel that gathers a particle's adjoints of g2p and p2g first.
 
     It takes A, unless `affine_momentum` computes it again, the lattice, x, v, adj_grid_m, adj_v, grid_v, the adjoints
@@ -43,6 +57,7 @@ def after_p2g(name: str, turn_back: Any, affine_momentum: Any | None, count: int
     """
     gather, read_matrix, found = adjoint_gatherers(name), layout(name).read_matrix, blocks(name, count)
     adjoint_g2p, adjoint_p2g = gather.g2p, gather.p2g
+    turn_back, affine_momentum, strain = material.turn_back, material.affine_momentum, material.strain
     vec3, mat33 = precision(name).vec3, precision(name).mat33
     momentum, kept = "read_matrix(A, e, first + p)", {"A": wp.array2d[mat33]}
     if affine_momentum:
@@ -52,10 +67,12 @@ def after_p2g(name: str, turn_back: Any, affine_momentum: Any | None, count: int
     kinds = {key: kind for key, kind in others.items() if key not in {*own, "momentum"}} | own
 
     def kernel() -> Any:
-        return adjoint_g2p, adjoint_p2g, turn_back, affine_momentum, read_matrix  # which Warp finds by their names
+        functions = adjoint_g2p, adjoint_p2g, turn_back, affine_momentum, strain
+        return functions, read_matrix  # which Warp finds by their names
 
     bounds = {"grid_stride": False} | ({"launch_bounds": found} if found else {})
     lines = [
+        *_known(strain),
         f"momentum = {momentum}",
         f"adj_a, adj_x_at_nodes = {_call('adjoint_p2g', adjoint_p2g, 'first + p')}",
         _call("turn_back", turn_back, "p"),
@@ -66,12 +83,17 @@ def after_p2g(name: str, turn_back: Any, affine_momentum: Any | None, count: int
 
 def _call(name: str, function: Any, particle: str) -> str:
     """Return the call of a function for a particle, with what has its arguments' names."""
-    return f"{name}({', '.join(_taken(function))}, e, {particle})"
+    return f"{name}({', '.join(list(function.input_types)[:-2])}, e, {particle})"
+
+
+def _known(strain: Any | None) -> list[str]:
+    """Return the line that finds out a particle's strain, if there is a function for it."""
+    return [f"strain = {_call('strain', strain, 'p')}"] if strain else []
 
 
 def _taken(function: Any) -> dict[str, Any]:
-    """Return the arguments of a function and their kinds, but for the environment and the particle."""
-    return dict(list(function.input_types.items())[:-2])
+    """Return the arguments of a function that a kernel takes, and their kinds."""
+    return {key: kind for key, kind in list(function.input_types.items())[:-2] if key != "strain"}
 
 
 def _kernel(

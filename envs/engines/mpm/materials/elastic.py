@@ -1,19 +1,19 @@
 """Kernels of a compressible neo-Hookean solid, which carries its deformation gradient F."""
 
 from functools import cache
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import warp as wp
 
 from ...runtime import precision
 from ..layout import layout
-from .adjoints import alone
+from .adjoints import MaterialKernels, alone
 
 
 @cache
 @no_type_check
-def kernels(name: str) -> tuple[Any, Any, Any, Any]:
-    """Return the kernels (update, adjoint), what the second does with a particle's adjoint of A, and a particle's A.
+def kernels(name: str) -> MaterialKernels:
+    """Return the kernels.
 
     F' = (I + dt C) F, tau = mu (F' F'^T - I) + lam log(det F') I.
     """
@@ -96,4 +96,4 @@ def kernels(name: str) -> tuple[Any, Any, Any, Any]:
         write_matrix(adj_F, e, p, wp.transpose(advance) * adj_f)
         write_matrix(adj_C, e, first + p, mass[e, first + p] * adj_a + dt * adj_f * wp.transpose(before))
 
-    return update, alone(name, turn_back), turn_back, affine_momentum
+    return MaterialKernels(update, alone(name, turn_back), turn_back, affine_momentum)

@@ -1,21 +1,21 @@
 """Kernels of a viscous, weakly compressible fluid, which carries its volume ratio J."""
 
 from functools import cache
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import warp as wp
 
 from ...runtime import precision
 from ..layout import layout
-from .adjoints import alone
+from .adjoints import MaterialKernels, alone
 
 TORN = 1.04  # volume ratio at which a fluid tears
 
 
 @cache
 @no_type_check
-def kernels(name: str) -> tuple[Any, Any, Any, Any]:
-    """Return the kernels (update, adjoint), what the second does with a particle's adjoint of A, and a particle's A.
+def kernels(name: str) -> MaterialKernels:
+    """Return the kernels.
 
     J' = min(exp(dt tr C) J, TORN), tau = K log J' I + J' mu (C + C^T - 2/3 tr C I).
     """
@@ -99,4 +99,4 @@ def kernels(name: str) -> tuple[Any, Any, Any, Any]:
         dilation = dt * j * adj_j * wp.identity(n=3, dtype=real)
         write_matrix(adj_C, e, first + p, mass[e, first + p] * adj_a + j * viscosity * shear(g) + dilation)
 
-    return update, alone(name, turn_back), turn_back, affine_momentum
+    return MaterialKernels(update, alone(name, turn_back), turn_back, affine_momentum)

@@ -11,7 +11,7 @@ are equal, as they are in every undeformed body. (The differential of the SVD it
 clamp its 1/(s_i^2 - s_j^2) get the gradient of undeformed and of symmetrically yielding bodies wrong.)
 """
 
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
 from typing import Any, no_type_check
 
@@ -19,7 +19,7 @@ import warp as wp
 
 from ...runtime import precision
 from ..layout import layout
-from .adjoints import alone
+from .adjoints import MaterialKernels, alone
 from .decomposition import svd
 
 SMALLEST = 0.05  # singular values below count as this; what is pressed flatter has lost its shape
@@ -29,10 +29,11 @@ ROUNDED = 1e-8  # added to |d|^2, so that an undeformed body has a gradient
 @cache
 @no_type_check
 def responses(name: str) -> SimpleNamespace:
-    """Return the functions `respond, turn_back` of one precision.
+    """Return the functions `strain, respond, turn_back` of one precision.
 
-    `respond` takes a trial deformation gradient, mu, lam and kappa, and returns F' and tau. `turn_back` takes them, the
-    adjoint of F', and a weight and a matrix whose product is the adjoint of tau; it returns the trial's.
+    `strain` says of a trial deformation gradient what the others take of it besides. `respond` takes the trial, its
+    strain, mu, lam and kappa, and returns F' and tau. `turn_back` takes them, the adjoint of F', and a weight and a
+    matrix whose product is the adjoint of tau; it returns the trial's.
     """
     types = precision(name)
     real, vec3, mat33 = types.real, types.vec3, types.mat33
@@ -40,6 +41,23 @@ def responses(name: str) -> SimpleNamespace:
     decompose = svd(name)
     one = wp.constant(vec3(1.0, 1.0, 1.0))
     tiny = wp.constant(real(1e-12))
+
+    @partial(wp.struct, module=module)
+    class Decomposed:
+        """A trial U diag(s) V^T."""
+
+        U: mat33
+        s: vec3
+        V: mat33
+
+    @wp.func(module=module)
+    def strain(trial: mat33):
+        found = Decomposed()
+        U, s, V = decompose(trial)
+        found.U = U
+        found.s = s
+        found.V = V
+        return found
 
     @wp.func(module=module)
     def log_strain(s: vec3) -> vec3:
@@ -100,8 +118,8 @@ def responses(name: str) -> SimpleNamespace:
         return even * G[i, j] + odd * G[j, i] + bend * s[j], even * G[j, i] + odd * G[i, j] + bend * s[i]
 
     @wp.func(module=module)
-    def respond(trial: mat33, mu: real, lam: real, kappa: real):
-        U, s, V = decompose(trial)
+    def respond(trial: mat33, strain: Decomposed, mu: real, lam: real, kappa: real):
+        U, s, V = strain.U, strain.s, strain.V
         f = map_to_yield(s, kappa)
         J = f[0] * f[1] * f[2]
         t = real(2.0) * mu * wp.cw_mul(f, f - one) + lam * J * (J - real(1.0)) * one
@@ -109,9 +127,16 @@ def responses(name: str) -> SimpleNamespace:
 
     @wp.func(module=module)
     def turn_back(
-        trial: mat33, mu: real, lam: real, kappa: real, adj_F_new: mat33, weight: real, adj_a: mat33
+        trial: mat33,
+        strain: Decomposed,
+        mu: real,
+        lam: real,
+        kappa: real,
+        adj_F_new: mat33,
+        weight: real,
+        adj_a: mat33,
     ) -> mat33:
-        U, s, V = decompose(trial)
+        U, s, V = strain.U, strain.s, strain.V
         e = log_strain(s)
         d = e - mean(e)
         length = size(d)
@@ -142,25 +167,27 @@ def responses(name: str) -> SimpleNamespace:
         P = mat33(g[0], p01, p02, p10, g[1], p12, p20, p21, g[2])
         return U * P * wp.transpose(V)
 
-    return SimpleNamespace(respond=respond, turn_back=turn_back)
+    return SimpleNamespace(strain=strain, Strain=Decomposed, respond=respond, turn_back=turn_back)
 
 
 @cache
-def kernels(name: str) -> tuple[Any, Any, Any, None]:
-    """Return the kernels (update, adjoint), what the second does with a particle's adjoint of A, and None.
-
-    A particle's A would take another decomposition, so that there is no function for it.
-    """
-    return *kernels_of(name, responses(name), f"gradscape.plasticine.{name}")[:3], None
+def kernels(name: str) -> MaterialKernels:
+    """Return the kernels, without A's function: that would take another decomposition."""
+    found: MaterialKernels = kernels_of(name, responses(name), f"gradscape.plasticine.{name}")
+    return found._replace(affine_momentum=None)
 
 
 @no_type_check
-def kernels_of(name: str, found: Any, module: str) -> tuple[Any, Any, Any, Any]:
-    """Return what `kernels` does, of a material of these `responses`, and the function that computes A again."""
+def kernels_of(name: str, found: Any, module: str) -> MaterialKernels:
+    """Return the kernels of a material of these `responses`."""
     types = precision(name)
     real, mat33 = types.real, types.mat33
-    respond, respond_back = found.respond, found.turn_back
+    Strain, strain_of, respond, respond_back = found.Strain, found.strain, found.respond, found.turn_back
     read_matrix, write_matrix = layout(name).read_matrix, layout(name).write_matrix
+
+    @wp.func(module=module)
+    def strain(first: int, dt: real, F: wp.array2d[mat33], C: wp.array2d[mat33], n: int, p: int):
+        return strain_of((wp.identity(n=3, dtype=real) + dt * read_matrix(C, n, first + p)) * read_matrix(F, n, p))
 
     @wp.func(module=module)
     def affine_momentum(
@@ -174,12 +201,14 @@ def kernels_of(name: str, found: Any, module: str) -> tuple[Any, Any, Any, Any]:
         volume: wp.array2d[real],
         F: wp.array2d[mat33],
         C: wp.array2d[mat33],
-        e: int,
+        strain: Strain,
+        n: int,
         p: int,
     ) -> mat33:
-        c, before = read_matrix(C, e, first + p), read_matrix(F, e, p)
-        _, stress = respond(before + dt * c * before, mu, lam, kappa)
-        return scale * volume[e, first + p] * stress + mass[e, first + p] * c
+        c = read_matrix(C, n, first + p)
+        advance = wp.identity(n=3, dtype=real) + dt * c
+        _, stress = respond(advance * read_matrix(F, n, p), strain, mu, lam, kappa)
+        return scale * volume[n, first + p] * stress + mass[n, first + p] * c
 
     @wp.kernel(module=module, enable_backward=False)
     def update(
@@ -198,7 +227,8 @@ def kernels_of(name: str, found: Any, module: str) -> tuple[Any, Any, Any, Any]:
     ):
         e, p = wp.tid()
         c, before = read_matrix(C, e, first + p), read_matrix(F, e, p)
-        after, stress = respond(before + dt * c * before, mu, lam, kappa)
+        trial = before + dt * c * before
+        after, stress = respond(trial, strain_of(trial), mu, lam, kappa)
         write_matrix(F_new, e, p, after)
         write_matrix(A, e, first + p, scale * volume[e, first + p] * stress + mass[e, first + p] * c)
 
@@ -214,6 +244,7 @@ def kernels_of(name: str, found: Any, module: str) -> tuple[Any, Any, Any, Any]:
         volume: wp.array2d[real],
         F: wp.array2d[mat33],
         C: wp.array2d[mat33],
+        strain: Strain,
         adj_F_new: wp.array2d[mat33],
         adj_a: mat33,
         adj_F: wp.array2d[mat33],
@@ -224,9 +255,9 @@ def kernels_of(name: str, found: Any, module: str) -> tuple[Any, Any, Any, Any]:
         advance = wp.identity(n=3, dtype=real) + dt * read_matrix(C, n, first + p)
         before = read_matrix(F, n, p)
         weight, adj_after = scale * volume[n, first + p], read_matrix(adj_F_new, n, p)
-        adj_trial = respond_back(advance * before, mu, lam, kappa, adj_after, weight, adj_a)
+        adj_trial = respond_back(advance * before, strain, mu, lam, kappa, adj_after, weight, adj_a)
         write_matrix(adj_F, n, p, wp.transpose(advance) * adj_trial)
         adj_c = mass[n, first + p] * adj_a + dt * adj_trial * wp.transpose(before)
         write_matrix(adj_C, n, first + p, adj_c)
 
-    return update, alone(name, turn_back), turn_back, affine_momentum
+    return MaterialKernels(update, alone(name, turn_back, strain), turn_back, affine_momentum, strain)

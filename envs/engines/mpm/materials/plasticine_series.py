@@ -16,33 +16,42 @@ Plasticine that yields is never far from its yield surface, where strains are 0.
 or F almost flat, the kernels decompose F as `plasticine` does.
 """
 
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import warp as wp
 
 from ...runtime import precision
+from .adjoints import MaterialKernels
 from .plasticine import ROUNDED, SMALLEST, kernels_of, responses
 
 NEAR = 0.2  # Frobenius norm of X up to which series are as exact as float32 is
 
 
 @cache
-def kernels(name: str) -> tuple[Any, Any, Any, Any]:
-    """Return the kernels (update, adjoint), what the second does with a particle's adjoint of A, and A's function."""
-    found: tuple[Any, Any, Any, Any] = kernels_of(name, series(name), f"gradscape.plasticine.series.{name}")
+def kernels(name: str) -> MaterialKernels:
+    """Return the kernels."""
+    found: MaterialKernels = kernels_of(name, series(name), f"gradscape.plasticine.series.{name}")
     return found
 
 
 @cache
 @no_type_check
 def series(name: str) -> SimpleNamespace:
-    """Return the functions `respond, turn_back` of one precision, as `plasticine.responses` does."""
+    """Return the functions `strain, respond, turn_back` of one precision, as `plasticine.responses` does."""
     types, decomposed = precision(name), responses(name)
     real, vec3, mat33 = types.real, types.vec3, types.mat33
-    respond_far, turn_back_far = decomposed.respond, decomposed.turn_back
+    decompose, respond_far, turn_back_far = decomposed.strain, decomposed.respond, decomposed.turn_back
     module = f"gradscape.plasticine.series.{name}"
+
+    @partial(wp.struct, module=module)
+    class Strain:
+        """What changes a trial's shape, d, and its size, s, and whether series are exact."""
+
+        d: mat33
+        s: real
+        near: bool
 
     @wp.func(module=module)
     def symmetric(xx: real, yy: real, zz: real, xy: real, xz: real, yz: real) -> mat33:
@@ -95,15 +104,17 @@ def series(name: str) -> SimpleNamespace:
 
     @wp.func(module=module)
     def strain(F: mat33):
-        """Return (d, s, whether series are exact)."""
+        found = Strain()
         J = wp.determinant(F)
         s = wp.cbrt(J)
         X = (real(1.0) / (s * s)) * mixed(F, F) - unit(real(1.0))
-        near = s > real(2.0 * SMALLEST) and wp.ddot(X, X) < real(NEAR * NEAR)
+        found.s = s
+        found.near = s > real(2.0 * SMALLEST) and wp.ddot(X, X) < real(NEAR * NEAR)
         z = mixed(X, inverse(X + unit(real(2.0))))
         w = mixed(z, z)
         rest = unit(real(1.0 / 3.0)) + mixed(w, unit(real(0.2)) + real(1.0 / 7.0) * w)
-        return z + mixed(z, mixed(w, rest)), s, near
+        found.d = z + mixed(z, mixed(w, rest))
+        return found
 
     @wp.func(module=module)
     def exponential(t: real, q: real, r: real) -> vec3:
@@ -141,15 +152,15 @@ def series(name: str) -> SimpleNamespace:
 
     @wp.func(module=module)
     def yielded(q: real, kappa: real):
-        """Return (|d|, c)."""
-        n = wp.sqrt(q + q + real(ROUNDED))
-        return n, wp.where(n <= kappa, real(1.0), kappa / n)
+        """Return (1 / |d|, c)."""
+        short = real(1.0) / wp.sqrt(q + q + real(ROUNDED))
+        return short, wp.min(real(1.0), kappa * short)
 
     @wp.func(module=module)
-    def respond(trial: mat33, mu: real, lam: real, kappa: real):
-        d, s, near = strain(trial)
-        if not near:
-            return respond_far(trial, mu, lam, kappa)
+    def respond(trial: mat33, strain: Strain, mu: real, lam: real, kappa: real):
+        d, s = strain.d, strain.s
+        if not strain.near:
+            return respond_far(trial, decompose(trial), mu, lam, kappa)
         d2 = mixed(d, d)
         q, r = real(0.5) * wp.trace(d2), wp.determinant(d)
         _, c = yielded(q, kappa)
@@ -159,20 +170,32 @@ def series(name: str) -> SimpleNamespace:
         return fill(exponential(c - real(1.0), q, r), d, d2) * trial, stress
 
     @wp.func(module=module)
-    def twice(d: mat33, d2: mat33, Y: mat33) -> mat33:
-        """Return ad ad Y."""
-        return even(d2 * Y) - real(2.0) * mixed(d * Y, d)
+    def twice(d: mat33, Y: mat33) -> mat33:
+        """Return ad ad Y. ad Y has the three entries k above its diagonal, and their opposites below it."""
+        x, y, z = d[1, 1] - d[2, 2], d[0, 0] - d[2, 2], d[0, 0] - d[1, 1]
+        k01 = z * Y[0, 1] - d[0, 1] * (Y[0, 0] - Y[1, 1]) + d[0, 2] * Y[1, 2] - d[1, 2] * Y[0, 2]
+        k02 = y * Y[0, 2] - d[0, 2] * (Y[0, 0] - Y[2, 2]) + d[0, 1] * Y[1, 2] - d[1, 2] * Y[0, 1]
+        k12 = x * Y[1, 2] - d[1, 2] * (Y[1, 1] - Y[2, 2]) + d[0, 1] * Y[0, 2] - d[0, 2] * Y[0, 1]
+        xy, xz, yz = d[0, 1] * k01, d[0, 2] * k02, d[1, 2] * k12
+        return symmetric(
+            real(-2.0) * (xy + xz),
+            real(2.0) * (xy - yz),
+            real(2.0) * (xz + yz),
+            z * k01 - d[0, 2] * k12 - d[1, 2] * k02,
+            y * k02 + d[0, 1] * k12 - d[1, 2] * k01,
+            x * k12 + d[0, 1] * k02 + d[0, 2] * k01,
+        )
 
     @wp.func(module=module)
     def turn_back(
-        trial: mat33, mu: real, lam: real, kappa: real, adj_F_new: mat33, weight: real, adj_a: mat33
+        trial: mat33, strain: Strain, mu: real, lam: real, kappa: real, adj_F_new: mat33, weight: real, adj_a: mat33
     ) -> mat33:
-        d, s, near = strain(trial)
-        if not near:
-            return turn_back_far(trial, mu, lam, kappa, adj_F_new, weight, adj_a)
+        d, s = strain.d, strain.s
+        if not strain.near:
+            return turn_back_far(trial, decompose(trial), mu, lam, kappa, adj_F_new, weight, adj_a)
         d2 = mixed(d, d)
         q, r = real(0.5) * wp.trace(d2), wp.determinant(d)
-        n, c = yielded(q, kappa)
+        short, c = yielded(q, kappa)
         J, shear = s * s * s, real(2.0) * mu * s
         T = (real(0.5) * weight) * even(adj_a)
         G = real(0.5) * even(adj_F_new * wp.transpose(trial))  # the adjoint of exp((c - 1) d)
@@ -182,17 +205,17 @@ def series(name: str) -> SimpleNamespace:
         factors = shear * (s * W2 - W)
         adj_q = shear * (s * over_q(c + c, q, r, at_T) - over_q(c, q, r, at_T)) + over_q(c - real(1.0), q, r, at_G)
         adj_r = shear * (s * over_r(c + c, q, at_T) - over_r(c, q, at_T)) + over_r(c - real(1.0), q, at_G)
-        if n > kappa:
+        if c < real(1.0):
             adj_c = shear * (real(2.0) * s * over_t(W2, q, r, at_T) - over_t(W, q, r, at_T)) + over_t(M, q, r, at_G)
-            adj_q -= adj_c * c / (n * n)
+            adj_q -= adj_c * c * short * short
         adj_d = factors[1] * T + M[1] * G + adj_q * d + adj_r * (d2 - unit(q))
         adj_d += even(d * (factors[2] * T + M[2] * G))
-        adj_d -= unit(wp.trace(adj_d) / real(3.0))
-        adj_d -= real(1.0 / 6.0) * twice(d, d2, adj_d - real(7.0 / 60.0) * twice(d, d2, adj_d))
+        adj_d -= unit(wp.trace(adj_d) * real(1.0 / 3.0))
+        adj_d -= real(1.0 / 6.0) * twice(d, adj_d - real(7.0 / 60.0) * twice(d, adj_d))
         volume = lam * (J + J - real(1.0)) * J * at_T[0]  # the adjoint of log J
-        volume += shear * (real(2.0) * s * wp.dot(at_T, W2) - wp.dot(at_T, W)) / real(3.0)
+        volume += shear * (real(2.0) * s * wp.dot(at_T, W2) - wp.dot(at_T, W)) * real(1.0 / 3.0)
         N = fill(exponential(real(-1.0), q, r), d, d2)
         shape = real(1.0) / (s * s) * mixed(N * (adj_d + unit(volume)), N)
         return fill(M, d, d2) * adj_F_new + shape * trial
 
-    return SimpleNamespace(respond=respond, turn_back=turn_back)
+    return SimpleNamespace(strain=strain, Strain=Strain, respond=respond, turn_back=turn_back)
