@@ -18,10 +18,10 @@ import warp as wp
 
 from ..runtime import precision
 from .model import Box
+from .nodes import HIGHEST, node_placer, place_taker
 from .stencil import lattice, stencil
 
 SEGMENT = 8  # cells
-HIGHEST = 1 << 30  # beyond all planes of nodes
 STEP, SIZES = 4, 32  # segments are of one size up to so many particles apart, and the largest of so many sizes
 
 # Neighbours in memory are mostly of one cell: on a GPU one of them counts for all of a warp.
@@ -39,40 +39,17 @@ TAKE_NUMBER = """
 """
 
 
-# The next `count` places of an environment, and the next `parts` of another kind: a warp's lanes take theirs together.
-TAKE_PLACES = """
-#if defined(__CUDA_ARCH__)
-    const unsigned all = 0xffffffffu;
-    if (!__ballot_sync(all, count > 0)) return wp::vec_t<2, wp::int32>(0, 0);
-    const int lane = threadIdx.x & 31;
-    int before = count, more = parts;
-    for (int step = 1; step < 32; step *= 2) {
-        const int other = __shfl_up_sync(all, before, step), others = __shfl_up_sync(all, more, step);
-        if (lane >= step) before += other, more += others;
-    }
-    int place = 0, part = 0;
-    if (lane == 31) {
-        place = atomicAdd(&wp::index(used, e, 0), before);
-        part = atomicAdd(&wp::index(used, e, 1), more);
-    }
-    place = __shfl_sync(all, place, 31) + before - count;
-    part = __shfl_sync(all, part, 31) + more - parts;
-#else
-    const int place = wp::index(used, e, 0), part = wp::index(used, e, 1);
-    wp::index(used, e, 0) += count;
-    wp::index(used, e, 1) += parts;
-#endif
-    return wp::vec_t<2, wp::int32>(place, part);
-"""
-# The eight numbers of a segment are read and written as two times four.
+# The numbers of a segment are read and written by fours.
 TAKE_COUNTS = """
     struct alignas(16) Four { int n[4]; };
     Four *four = (Four *)&wp::index(counts, e, segment * SEGMENT);
-    const Four given[2] = {four[0], four[1]};
     wp::vec_t<SEGMENT, wp::int32> found;
     int any = 0;
-    for (int k = 0; k < SEGMENT; ++k) any |= found[k] = given[k / 4].n[k % 4];
-    if (any) four[0] = four[1] = Four{};
+    for (int k = 0; k < SEGMENT; k += 4) {
+        const Four given = four[k / 4];
+        for (int l = 0; l < 4; ++l) any |= found[k + l] = given.n[l];
+    }
+    for (int k = 0; any && k < SEGMENT / 4; ++k) four[k] = Four{};
     return found;
 """
 WRITE_PLACES = """
@@ -83,40 +60,6 @@ WRITE_PLACES = """
         two[k / 2] = Two{at, middle, middle, end};
         at = end;
     }
-"""
-# From which node of a column to which one, along z, particles of its nine columns of cells touch.
-FIND_TOUCHED = """
-    struct alignas(8) Two { int above, high; };
-    const Two *span = (const Two *)&wp::index(spans, e, 0);
-    const int x = column / lattice.ny, y = column % lattice.ny, before = lattice.first[2] % SEGMENT;
-    int above = 0, high = 0;
-    for (int c = 0; c < 9; ++c) {
-        if (x >= lattice.nx || x < c / 3 || y < c % 3) continue;
-        const Two found = span[(x - c / 3) * lattice.ny + y - c % 3];
-        above = wp::max(above, found.above);
-        high = wp::max(high, found.high);
-    }
-    return high ? wp::vec_t<2, wp::int32>(HIGHEST - above - before, high - before) : wp::vec_t<2, wp::int32>(0, 0);
-"""
-# Lanes of a warp have columns beside each other, whose nodes have places one after the other. They write all of these
-# together, a place each, and find out to whose column it belongs.
-NAME_NODES = """
-    const int room = nodes.shape[1], first = column * depth + low;
-    int *row = &wp::index(nodes, e, 0);
-#if defined(__CUDA_ARCH__)
-    const unsigned all = 0xffffffffu;
-    const int lane = threadIdx.x & 31, begin = __shfl_sync(all, start, 0), end = __shfl_sync(all, start + count, 31);
-    for (int from = begin; from < end; from += 32) {
-        const int place = from + lane;
-        int owner = 0;
-        for (int step = 16; step > 0; step /= 2)
-            if (__shfl_sync(all, start, owner + step) <= place) owner += step;
-        const int node = __shfl_sync(all, first - start, owner) + place;
-        if (place < wp::min(end, room)) row[place] = node;
-    }
-#else
-    for (int place = start; place < wp::min(start + count, room); ++place) row[place] = first + place - start;
-#endif
 """
 COUNT_BEFORE = """
     const int *row = &wp::index(arrived, e, 0);
@@ -158,9 +101,9 @@ def warps(box: Box) -> int:
     return -(-segments(box) // 32) * 32
 
 
-def column_warps(box: Box) -> int:
-    """Return the number of threads, in whole warps, that a box's columns take one each."""
-    return -(-box.nodes[0] * box.nodes[1] // 32) * 32
+def placing_warps(particles: int, box: Box) -> int:
+    """Return the number of threads, in whole warps, that so many particles take one each, and a box's columns."""
+    return -(-max(particles, box.nodes[0] * box.nodes[1]) // 32) * 32
 
 
 def segments(box: Box) -> int:
@@ -214,16 +157,13 @@ def counter(name: str):
 @cache
 @no_type_check
 def cell_kernels(name: str) -> SimpleNamespace:
-    """Return the kernels `count, place_segments, place_nodes, place, tidy` of one precision, which list in this order.
+    """Return the kernels `count, place_segments, place, tidy` of one precision, which list in this order.
 
     Where g2p has counted particles, `count` need not.
     """
     vec3 = precision(name).vec3
     Lattice, count_in_cell, module = lattice(name), counter(name), f"gradscape.cells.{name}"
-    take_number = number_taker()
-
-    @wp.func_native(TAKE_PLACES)
-    def take_places(used: wp.array2d[wp.int32], e: int, count: int, parts: int) -> wp.vec2i: ...
+    take_number, take_places, place_nodes = number_taker(), place_taker(), node_placer(name)
 
     Counts = wp.types.vector(SEGMENT, wp.int32)
 
@@ -232,12 +172,6 @@ def cell_kernels(name: str) -> SimpleNamespace:
 
     @wp.func_native(WRITE_PLACES.replace("SEGMENT", str(SEGMENT)))
     def write_places(places: wp.array2d[wp.vec2i], e: int, segment: int, at: int, counted: Counts): ...
-
-    @wp.func_native(FIND_TOUCHED.replace("SEGMENT", str(SEGMENT)).replace("HIGHEST", str(HIGHEST)))
-    def find_touched(lattice: Lattice, spans: wp.array2d[wp.int32], e: int, column: int) -> wp.vec2i: ...
-
-    @wp.func_native(NAME_NODES)
-    def name_nodes(nodes: wp.array2d[wp.int32], e: int, column: int, depth: int, low: int, count: int, start: int): ...
 
     @wp.func_native(COUNT_BEFORE)
     def count_before(arrived: wp.array2d[wp.int32], e: int, places: wp.vec2i, p: int) -> int: ...
@@ -274,8 +208,8 @@ def cell_kernels(name: str) -> SimpleNamespace:
         """Give each segment its places in the list, each of its cells, too, and it a number among those of its size.
 
         A cell's `places` are its first in the list and the one beyond its last. `spans` has of each column of cells by
-        how much the lowest plane of nodes that is touched is below HIGHEST, and the one beyond the highest. `counts`
-        are 0 again.
+        how much the lowest plane of nodes that is touched is below HIGHEST, counted from the box's first, and the one
+        beyond the highest. `counts` are 0 again.
         """
         e, s = wp.tid()
         if s == 0:
@@ -301,31 +235,30 @@ def cell_kernels(name: str) -> SimpleNamespace:
             write_places(places, e, s, at, counted)
             found[e, segment] = wp.vec4i(s, at, total, low + 256 * high)
             numbers[e, segment] = take_number(sizes, e, size_of(total))
+            first -= lattice.first[2] % SEGMENT
             wp.atomic_max(spans, e, 2 * column, HIGHEST - first - low)
             wp.atomic_max(spans, e, 2 * column + 1, first + high)
 
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def place_nodes(
-        lattice: Lattice,
-        spans: wp.array2d[wp.int32],
-        touched: wp.array2d[wp.int32],
-        starts: wp.array2d[wp.int32],
-        nodes: wp.array2d[wp.int32],
+    @wp.func(module=module)
+    def place_segment(
+        used: wp.array2d[wp.int32],
+        sizes: wp.array2d[wp.int32],
+        found: wp.array2d[wp.vec4i],
+        numbers: wp.array2d[wp.int32],
+        segments: wp.array2d[wp.vec4i],
+        e: int,
+        i: int,
     ):
-        """Give the nodes of each column that particles touch, and those between them, places one after the other.
-
-        Where there is not room for all that are touched none of them counts, and the control step is done again.
-        """
-        e, column = wp.tid()
-        found = find_touched(lattice, spans, e, column)
-        low, count = found[0], found[1] - found[0]
-        start = take_places(touched, e, count, wp.min(count, 1))[0]
-        if column < lattice.nx * lattice.ny:
-            starts[e, column] = start - low
-        name_nodes(nodes, e, column, lattice.nz, low, count, start)
+        segment = found[e, i]
+        at = numbers[e, i]
+        for larger in range(size_of(segment[2]) + 1, SIZES):
+            at += sizes[e, larger]
+        if at < segments.shape[1]:
+            segments[e, at] = segment
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def place(
+        lattice: Lattice,
         cells: wp.array2d[wp.int32],
         numbers: wp.array2d[wp.int32],
         places: wp.array2d[wp.vec2i],
@@ -336,27 +269,27 @@ def cell_kernels(name: str) -> SimpleNamespace:
         arrived: wp.array2d[wp.int32],
         full: wp.array[wp.int32],
         segments: wp.array2d[wp.vec4i],
+        spans: wp.array2d[wp.int32],
         touched: wp.array2d[wp.int32],
-        needed: wp.array[wp.int32],
+        starts: wp.array2d[wp.int32],
+        nodes: wp.array2d[wp.int32],
     ):
         """List particles by cell, those of a cell as they arrived, and segments by size, the largest first.
 
-        Note how many nodes an environment has `needed` at most.
+        Give the nodes of each column that particles touch, and those between them, places one after the other. Where
+        there is not room for all that are touched none of them counts, and the control step is done again.
         """
-        e, p = wp.tid()
-        if p == 0:
+        e, i = wp.tid()
+        if i - i % 32 < lattice.nx * lattice.ny:  # a whole warp, whose lanes take places together
+            place_nodes(lattice, spans, touched, starts, nodes, e, i)
+        if i == 0:
             full[e] = used[e, 1]
-            needed[e] = wp.max(needed[e], touched[e, 0])
-        cell = cells[e, p]
-        if cell >= 0:
-            arrived[e, places[e, cell][0] + numbers[e, p]] = p
-        if p < used[e, 1]:
-            segment = found[e, p]
-            at = numbers_of_segments[e, p]
-            for larger in range(size_of(segment[2]) + 1, SIZES):
-                at += sizes[e, larger]
-            if at < segments.shape[1]:
-                segments[e, at] = segment
+        if i < cells.shape[1]:
+            cell = cells[e, i]
+            if cell >= 0:
+                arrived[e, places[e, cell][0] + numbers[e, i]] = i
+        if i < used[e, 1]:
+            place_segment(used, sizes, found, numbers_of_segments, segments, e, i)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def tidy(
@@ -368,12 +301,18 @@ def cell_kernels(name: str) -> SimpleNamespace:
         sizes: wp.array2d[wp.int32],
         spans: wp.array2d[wp.int32],
         order: wp.array2d[wp.int32],
+        touched: wp.array2d[wp.int32],
+        needed: wp.array[wp.int32],
     ):
-        """List them by cell, those of a cell as they lie in memory; count segments from 0 again."""
+        """List them by cell, those of a cell as they lie in memory; count segments from 0 again.
+
+        Note how many nodes an environment has `needed` at most.
+        """
         e, p = wp.tid()
         if p == 0:
             used[e, 0] = 0
             used[e, 1] = 0
+            needed[e] = wp.max(needed[e], touched[e, 0])
         for i in range(p, SIZES, cells.shape[1]):
             sizes[e, i] = 0
         for i in range(p, 2 * lattice.nx * lattice.ny, cells.shape[1]):
@@ -383,4 +322,4 @@ def cell_kernels(name: str) -> SimpleNamespace:
             mine = places[e, cell]
             order[e, mine[0] + count_before(arrived, e, mine, p)] = p
 
-    return SimpleNamespace(count=count, place_segments=place_segments, place_nodes=place_nodes, place=place, tidy=tidy)
+    return SimpleNamespace(count=count, place_segments=place_segments, place=place, tidy=tidy)

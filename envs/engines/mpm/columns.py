@@ -160,22 +160,6 @@ def node_sum(name: str):
 
 @cache
 @no_type_check
-def node_taker():
-    """Return the function that says which node has a place in the grid, -1 if none has."""
-
-    @wp.func(module="gradscape.columns.nodes")
-    def take_node(touched: wp.array2d[wp.int32], nodes: wp.array2d[wp.int32], e: int, place: int):
-        count = touched[e, 0]
-        node = int(-1)  # noqa: UP018, RUF046 -- what a branch changes must be a variable to Warp
-        if place < count and count <= nodes.shape[1]:
-            node = nodes[e, place]
-        return node
-
-    return take_node
-
-
-@cache
-@no_type_check
 def column_kernels(name: str, team: Team) -> SimpleNamespace:
     """Return the kernels `p2g, adjoint_g2p` of one precision, over [environment, thread of a `team`].
 

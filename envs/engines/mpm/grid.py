@@ -7,9 +7,10 @@ import warp as wp
 
 from ..launches import blocks
 from ..runtime import precision
-from .columns import ADD_UP, node_taker
+from .columns import ADD_UP
 from .exact import LANES
 from .layout import READ_NODE, WRITE_NODE, in_precision
+from .nodes import node_taker
 from .stencil import lattice
 from .walk import fill
 
@@ -42,9 +43,9 @@ def velocity_at(name: str, boundary_velocity: Any, Data: Any) -> Any:
         rate: real,
     ) -> vec3:
         first = lattice.first
-        k = i % lattice.nz
-        j = (i / lattice.nz) % lattice.ny
-        node = vec3(real(i / (lattice.nz * lattice.ny) + first[0]), real(j + first[1]), real(k + first[2]))
+        column, k = i / lattice.nz, i % lattice.nz
+        j = column % lattice.ny
+        node = vec3(real(column / lattice.ny + first[0]), real(j + first[1]), real(k + first[2]))
         p = lattice.origin + node * (real(1.0) / lattice.inv_dx)
         v = vec3(g[0], g[1], g[2]) / g[3] - vec3(real(0.0), dt * gravity, real(0.0))
         return boundary_velocity(boundary, p, v, e, i % LANES, tools, sums, step, fraction, rate)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import weakref
+from functools import partial
 from typing import Any, Protocol
 
 import warp as wp
 
 from ..runtime import load
-from .cells import SEGMENT, SIZES, Lists, cell_kernels, column_warps, segments, warps
+from .cells import SEGMENT, SIZES, Lists, cell_kernels, placing_warps, segments, warps
 from .checkpoints import Frame, spare
 from .columns import CPU_TEAM, GPU_TEAM, column_kernels
 from .model import Box
@@ -136,12 +137,11 @@ class ByColumns:
             solver.launch(kernels.count, count, batch, inputs)
         inputs = [tape.lattice, self.counts, self.used, self.sizes, self.places, *self.found, lists.planes]
         solver.launch_on_box(kernels.place_segments, warps, batch, [*inputs, self.spans, lists.touched])
-        inputs = [tape.lattice, self.spans, lists.touched, lists.starts, lists.nodes]
-        solver.launch_on_box(kernels.place_nodes, column_warps, batch, inputs)
-        inputs = [self.cells, self.numbers, self.places, self.used, self.sizes, *self.found, self.arrived]
-        solver.launch(kernels.place, count, batch, [*inputs, lists.full, lists.segments, lists.touched, solver.needed])
+        inputs = [tape.lattice, self.cells, self.numbers, self.places, self.used, self.sizes, *self.found, self.arrived]
+        inputs += [lists.full, lists.segments, self.spans, lists.touched, lists.starts, lists.nodes]
+        solver.launch_on_box(kernels.place, partial(placing_warps, count), batch, inputs)
         inputs = [tape.lattice, self.cells, self.places, self.arrived, self.used, self.sizes, self.spans, lists.order]
-        solver.launch(kernels.tidy, count, batch, inputs)
+        solver.launch(kernels.tidy, count, batch, [*inputs, lists.touched, solver.needed])
 
     def where(self, step: int, substep: int) -> list[Any]:
         """Return what says where nodes are in grids, as kernels that gather take it."""

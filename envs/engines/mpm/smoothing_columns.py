@@ -10,9 +10,10 @@ from typing import no_type_check
 import warp as wp
 
 from ..runtime import precision
-from .columns import Team, node_sum, node_taker, walking_kernel
+from .columns import Team, node_sum, walking_kernel
 from .gathers import gatherers
 from .layout import layout
+from .nodes import node_taker
 from .stencil import lattice, stencil
 from .walk import walker
 

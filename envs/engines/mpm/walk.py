@@ -28,7 +28,8 @@ PARTS = 9 * PLANES  # numbers of four parts that a segment leaves
 GROUP, ROW = "(lane < 24 ? lane / 8 : lane - 24)", "(lane < 24 ? lane % 8 : 8)"
 EMIT = """
         {
-            out[9 * now++] = low;
+            *out = low;
+            out += 9, ++now;
             low = middle, middle = high, high = Four{};
         }
 """
@@ -71,8 +72,8 @@ WALK = """
     Four low{state[0], state[1], state[2], state[3]};
     Four middle{state[4], state[5], state[6], state[7]};
     Four high{state[8], state[9], state[10], state[11]};
-    Four *out = (Four *)&wp::index(parts, e, at) + row;
     int now = (int)state[12];
+    Four *out = (Four *)&wp::index(parts, e, at + 9 * now) + row;
     for (int t = 0; t < count; ++t) {
         const KIND b = staged[t].rows[row];
         const Weights z = staged[t].weights;
@@ -139,8 +140,8 @@ CLOSE = """
     Four low{state[0], state[1], state[2], state[3]};
     Four middle{state[4], state[5], state[6], state[7]};
     Four high{state[8], state[9], state[10], state[11]};
-    Four *out = (Four *)&wp::index(parts, e, at) + row;
     int now = (int)state[12];
+    Four *out = (Four *)&wp::index(parts, e, at + 9 * now) + row;
 #pragma unroll 1
     while (now < span >> 8) EMIT
 #endif

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from gradscape.envs.engines.mpm.cells import SEGMENT, SIZES, Lists, cell_kernels, column_warps, segments, warps
+from gradscape.envs.engines.mpm.cells import SEGMENT, SIZES, Lists, cell_kernels, placing_warps, segments, warps
 from gradscape.envs.engines.runtime import precision, to_torch
 
 
@@ -30,10 +30,9 @@ class Listing:
         self.launch(self.kernels.count, self.shape, [self.lattice, self.x, self.cells, self.numbers, self.counts])
         inputs = [self.lattice, self.counts, *counts, self.places, *self.found, lists.planes]
         self.launch(self.kernels.place_segments, (self.shape[0], warps(self.box)), [*inputs, self.spans, lists.touched])
-        inputs = [self.lattice, self.spans, lists.touched, lists.starts, lists.nodes]
-        self.launch(self.kernels.place_nodes, (self.shape[0], column_warps(self.box)), inputs)
-        inputs = [self.cells, self.numbers, self.places, *counts, *self.found, self.arrived, lists.full, lists.segments]
-        self.launch(self.kernels.place, self.shape, [*inputs, lists.touched, self.needed])
+        inputs = [self.lattice, self.cells, self.numbers, self.places, *counts, *self.found, self.arrived, lists.full]
+        inputs += [lists.segments, self.spans, lists.touched, lists.starts, lists.nodes]
+        self.launch(self.kernels.place, (self.shape[0], placing_warps(self.shape[1], self.box)), inputs)
         inputs = [self.lattice, self.cells, self.places, self.arrived, *counts, self.spans, lists.order]
-        self.launch(self.kernels.tidy, self.shape, inputs)
+        self.launch(self.kernels.tidy, self.shape, [*inputs, lists.touched, self.needed])
         assert not any(to_torch(array).any() for array in (self.counts, *counts, self.spans))
