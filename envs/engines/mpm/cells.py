@@ -21,7 +21,7 @@ from .model import Box
 from .nodes import HIGHEST, node_placer, place_taker
 from .stencil import lattice, stencil
 
-SEGMENT = 8  # cells
+SEGMENT = 16  # cells
 STEP, SIZES = 4, 32  # segments are of one size up to so many particles apart, and the largest of so many sizes
 
 # Neighbours in memory are mostly of one cell: on a GPU one of them counts for all of a warp.

@@ -190,11 +190,8 @@ class Solver:
 
     def room(self, step: int) -> Room:
         """Return the room that a control step needs on its box, as far as is known."""
-        box = self.boxes[step]
-        if not self.columns:
-            return Room(box.cells, 0, 0)
-        self.most = Room(0, max(self.most.columns, box.columns), max(self.most.segments, segments(box)))
-        return self.most._replace(nodes=min(self.touched[step], box.cells))
+        cells = self.boxes[step].cells
+        return self.most._replace(nodes=min(self.touched[step], cells) if self.columns else cells)
 
     def _advance_on_box(
         self, step: int, batch: int, low: np.ndarray, high: np.ndarray
@@ -206,7 +203,9 @@ class Solver:
         whole = Box((0, 0, 0), self.model.nodes)
         grain = GRAIN if self.device != "cpu" and self._small(batch) else 1
         while True:
-            self.boxes[step] = nodes_around(self.model, low, high, self.margins[step], grain)
+            self.boxes[step] = box = nodes_around(self.model, low, high, self.margins[step], grain)
+            if self.columns:
+                self.most = Room(0, max(self.most.columns, box.columns), max(self.most.segments, segments(box)))
             self.advance(step, batch)
             self.extent.find(self.end.x, self.left_box, self.needed, batch, small=self._small(batch))
             self._sort(step, batch)  # which a GPU does while corners are read, whether or not the step holds
@@ -214,7 +213,7 @@ class Solver:
             self.touched[step] = max(self.touched[step], needed)
             if needed > self.tape(step).cells:
                 continue
-            if self.boxes[step] == whole or not left:
+            if box == whole or not left:
                 break
             self.margins[step] *= 2
         if left:
