@@ -24,7 +24,7 @@ from gradscape.envs.engines.profiling import time_kernels
 from gradscape.envs.mpm.fluid import SPAN
 from gradscape.envs.registry import make
 
-ON_GRID = ("velocity_", "cell_kernels.place_segments", "cell_kernels.place_nodes")
+ON_GRID = ("velocity_", "cell_kernels.place_segments")
 UNIT = {"substeps": "episode"}
 SERIES: dict[str, list[Fidelity]] = {
     "particles": [Fidelity("", SPAN / 8, resolution=16, sampling=1.25 * 2 ** (k / 3)) for k in range(5)],
