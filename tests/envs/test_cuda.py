@@ -1,10 +1,12 @@
 """On a GPU the same kernels give the same losses and gradients; skipped where there is none."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 
+from gradscape.envs.engines.mpm import solver
 from gradscape.envs.engines.runtime import cuda_available
 from gradscape.envs.registry import entries, environment_class, make
 
@@ -20,7 +22,12 @@ pytestmark = pytest.mark.skipif(not cuda_available(), reason="no CUDA device")
 
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize(("precision", "loss", "grad"), [("float64", 1e-12, 1e-10), ("float32", 1e-4, 1e-3)])
-def test_cuda_agrees_with_the_cpu(name: str, precision: str, loss: float, grad: float) -> None:
+def test_cuda_agrees_with_the_cpu(
+    name: str, precision: str, loss: float, grad: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In float32 a CPU launches what a GPU does: its own kernels of plasticine round otherwise, by up to 2e-3."""
+    if precision == "float32":
+        monkeypatch.setattr(solver, "Solver", partial(solver.Solver, columns=True))
     fidelity = replace(environment_class(name).fidelities["draft"], precision=precision)
     one, other = (make(name, fidelity=fidelity, device=device) for device in ("cpu", "cuda"))
     x = one.space.uniform(5, seed=1)

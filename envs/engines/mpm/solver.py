@@ -193,6 +193,12 @@ class Solver:
         cells = self.boxes[step].cells
         return self.most._replace(nodes=min(self.touched[step], cells) if self.columns else cells)
 
+    def set_box(self, step: int, box: Box) -> None:
+        """Let a control step run on a box of nodes, and note how wide the widest is."""
+        self.boxes[step] = box
+        if self.columns:
+            self.most = Room(0, max(self.most.columns, box.columns), max(self.most.segments, segments(box)))
+
     def _advance_on_box(
         self, step: int, batch: int, low: np.ndarray, high: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -203,9 +209,8 @@ class Solver:
         whole = Box((0, 0, 0), self.model.nodes)
         grain = GRAIN if self.device != "cpu" and self._small(batch) else 1
         while True:
-            self.boxes[step] = box = nodes_around(self.model, low, high, self.margins[step], grain)
-            if self.columns:
-                self.most = Room(0, max(self.most.columns, box.columns), max(self.most.segments, segments(box)))
+            box = nodes_around(self.model, low, high, self.margins[step], grain)
+            self.set_box(step, box)
             self.advance(step, batch)
             self.extent.find(self.end.x, self.left_box, self.needed, batch, small=self._small(batch))
             self._sort(step, batch)  # which a GPU does while corners are read, whether or not the step holds
@@ -253,10 +258,12 @@ class Solver:
         try:
             self.tape(step).make_room(step, self.boxes[step], needed)
         except RuntimeError:  # what is free need not be of one piece
-            if len(self.tapes) == 1:
+            if len(self.tapes) == 1 and (self.capacity > 1 or self.model.piece(self.pieces) == 1):
                 raise
-            self._drop_tape()
-            self._make_room(step)
+        else:
+            return
+        (self._drop_tape if len(self.tapes) > 1 else self._cut_smaller)()
+        self._make_room(step)
 
     def _fits(self, growth: int) -> bool:
         """Say whether a tape can grow by so many bytes and leave a GPU as much memory as it takes.
@@ -270,6 +277,14 @@ class Solver:
         self._forget_launches(len(self.tapes) - 2)
         del self.tapes[-2]
         wp.synchronize_device(self.device)  # what is given back counts as free after that
+
+    def _cut_smaller(self) -> None:
+        """Keep a piece of half as many substeps, in arrays that are made anew."""
+        self.pieces *= 2
+        self.launches.clear()
+        self.tapes.clear()
+        wp.synchronize_device(self.device)
+        self.tapes.append(Tape(self.allocator, pieces=self.pieces))
 
     def _forget_launches(self, step: int) -> None:
         """Forget the launches of all control steps that are stored where this one is, whose arrays are replaced."""

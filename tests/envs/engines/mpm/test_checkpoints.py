@@ -135,10 +135,9 @@ def test_the_grid_grows_where_a_particle_leaves_its_part(monkeypatch, speed):
 def test_a_tape_grows_by_the_bytes_it_says(columns):
     model, paths = kneading()
     solver = Solver(model, capacity=len(paths), device="cpu", columns=columns)
-    solver.boxes[0] = nodes_around(model, *model.corners, mpm.BOX_MARGIN)
     tape = Tape(solver.allocator)
     for margin in (0, 3):  # the second time it has something to lose
-        box = solver.boxes[0] = nodes_around(model, *model.corners, mpm.BOX_MARGIN + margin)
+        solver.set_box(0, box := nodes_around(model, *model.corners, mpm.BOX_MARGIN + margin))
         before, growth = tape.bytes, tape.growth(solver.room(0))
         tape.make_room(0, box, solver.room(0))
         assert tape.bytes - before == growth > 0
@@ -269,6 +268,31 @@ def test_control_steps_are_given_up_for_memory_and_no_bit_is_lost(monkeypatch, w
     assert (len(kept[0].tapes), len(fewer[0].tapes)) == (model.steps, 2)
     assert torch.equal(kept[1], fewer[1])
     assert torch.equal(kept[2], fewer[2])
+
+
+@pytest.mark.parametrize("columns", [False, True])
+def test_a_control_step_that_does_not_fit_is_cut_and_no_bit_is_lost(monkeypatch, columns):
+    """Only of a single environment: a batch is to be halved first."""
+    model, paths = kneading()
+    adj_x = {2: weights(model, 1, 5), model.steps: weights(model, 1, 6)}
+    kept = kneaded(model, paths[:1], adj_x, columns=columns)
+    grid = Allocator.grid
+
+    def scarce(allocator, cells):
+        if cells > 1 and solver.pieces < 4:
+            raise RuntimeError("Failed to allocate 1 bytes on device 'cuda:0'")
+        return grid(allocator, cells)
+
+    monkeypatch.setattr(Allocator, "grid", scarce)
+    solver = Solver(model, capacity=1, device="cpu", columns=columns, pieces=1)
+    solver.tapes = solver.tapes[:1]
+    assert torch.equal(solver.run(paths[:1]), kept[1])
+    assert torch.equal(solver.gradient(adj_x), kept[2])
+    assert solver.pieces == 4
+    solver = Solver(model, capacity=len(paths), device="cpu", columns=columns, pieces=1)
+    solver.tapes = solver.tapes[:1]
+    with pytest.raises(RuntimeError, match="allocate"):
+        solver.run(paths)
 
 
 @pytest.mark.parametrize("columns", [False, True])
