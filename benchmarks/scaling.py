@@ -23,13 +23,14 @@ from gradscape.envs.base import Environment, Fidelity
 from gradscape.envs.engines.profiling import time_kernels
 from gradscape.envs.mpm.fluid import SPAN
 from gradscape.envs.registry import make
+from gradscape.landscapes.objective import Status
 
 ON_GRID = ("velocity_", "cell_kernels.place_segments")
 UNIT = {"substeps": "episode"}
 SERIES: dict[str, list[Fidelity]] = {
     "particles": [Fidelity("", SPAN / 8, resolution=16, sampling=1.25 * 2 ** (k / 3)) for k in range(5)],
     "substeps": [Fidelity("", SPAN / n, resolution=12, sampling=1.4) for n in (4, 8, 16, 32)],
-    "grid points": [Fidelity("", SPAN / 20, resolution=n, sampling=16 / n) for n in (32, 40, 50, 63)],
+    "grid points": [Fidelity("", SPAN / 32, resolution=n, sampling=16 / n) for n in (32, 40, 50, 63)],
 }
 
 
@@ -41,11 +42,11 @@ def measured(what: str, fidelity: Fidelity, device: str, batch: int) -> tuple[fl
 
 
 def size(what: str, env: Environment) -> float:
-    """Return how much of `what` an episode has: grid points are those it runs over, near its particles."""
+    """Return how much of `what` an episode has: grid points are those in grids, which on a GPU particles touch."""
     model = env.model  # type: ignore[attr-defined]
     if what == "grid points":
         with env._solvers.lend() as stage:  # type: ignore[union-attr]
-            return float(np.mean([box.cells for box in stage.solver.boxes]))
+            return float(np.mean([stage.solver.room(step).nodes for step in range(model.steps)]))
     return {"particles": model.particles, "substeps": model.steps * model.substeps}[what]
 
 
@@ -53,7 +54,8 @@ def cost(what: str, env: Environment, batch: int) -> float:
     """Return the seconds of an episode, or of one launch of each kernel, that depend on it: the best of three."""
     rows = min(batch, env.preferred_batch)
     x = env.space.uniform(rows, seed=0)
-    env.evaluate(x)
+    if (env.evaluate(x).status != Status.OK).any():
+        raise ValueError(f"episodes of {env.fidelity} fail, so that their cost says nothing")
     return min(once(what, env, lambda: env.evaluate(x)) for _ in range(3)) / rows
 
 
