@@ -5,6 +5,7 @@ from functools import cache
 
 import pytest
 import torch
+import warp as wp
 
 import gradscape as gs
 from gradscape.envs.newton.scene import BUDGET
@@ -66,6 +67,19 @@ def test_check_says_which_solver_has_true_gradients(run, tmp_path):
     assert wrong.returncode == 1
     failed = {line[10:36].strip() for line in wrong.stdout.splitlines() if line.startswith("fail ")}
     assert {"finite differences", "growth over horizons"} <= failed
+
+
+def test_what_finds_contacts_is_compiled_without_adjoints_and_has_them_again_afterwards():
+    """Newton's modules that launch something before any tape: where they are is its own to change."""
+    from gradscape.envs.engines.newton.rollout import FINDS_CONTACTS, without_adjoints
+
+    scene("newton-ball", fidelity="draft").evaluate(torch.zeros(1, 3))
+    modules = wp._src.context.user_modules
+    finders = [module for name, module in modules.items() if name.startswith(FINDS_CONTACTS) and module.execs]
+    assert len(finders) > 3
+    with without_adjoints():
+        assert not any(module.options["enable_backward"] for module in finders)
+    assert all(module.options["enable_backward"] for module in finders)
 
 
 def test_without_damping_newtons_ball_is_ours():

@@ -6,9 +6,11 @@ Nothing of the engine is changed or left out: a gradient is what the tape makes 
 from __future__ import annotations
 
 import math
+import sys
 import threading
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +24,7 @@ from ..runtime import to_torch
 
 TAPE = threading.Lock()  # Warp records on one tape at a time
 ROOM = 1e3  # how far from the ground contact is looked for, once [m]: wherever a thing starts
+FINDS_CONTACTS = "newton._src.geometry", "newton._src.sim.collide", "newton._src.utils.mesh"  # begin these modules
 SOLVERS: dict[str, Callable[[Any], Any]] = {
     "semi-implicit": lambda model: newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False),
     "featherstone": newton.solvers.SolverFeatherstone,
@@ -131,6 +134,19 @@ class Settings:
     rows: int
 
 
+@contextmanager
+def without_adjoints() -> Iterator[None]:
+    """Compile what finds contacts without adjoints: they are found before any tape, and those take most of the time."""
+    names = [name for name in sys.modules if name.startswith(FINDS_CONTACTS)]
+    try:
+        for name in names:
+            wp.set_module_options({"enable_backward": False}, module=name)
+        yield
+    finally:
+        for name in names:
+            wp.set_module_options({"enable_backward": True}, module=name)
+
+
 class Rollout:
     """Hold a model with a world for each row, the states of an episode, and where its points are at the end."""
 
@@ -142,7 +158,8 @@ class Rollout:
         if ground is not None:
             ground.add(whole)
         whole.replicate(one, settings.rows)
-        self.model: Any = whole.finalize(device="cpu", requires_grad=True)
+        with without_adjoints():
+            self.model: Any = whole.finalize(device="cpu", requires_grad=True)
         self.model.particle_grid, self.model.particle_max_radius = None, 0.0  # particles, of any row, do not touch
         self.model.particle_max_velocity = math.inf  # what flies apart is to be seen as such, not held back
         if ground is not None:
@@ -150,8 +167,11 @@ class Rollout:
         self.solver: Any = SOLVERS[settings.solver](self.model)
         self.states: list[Any] = [self.model.state() for _ in range(settings.steps + 1)]
         self.control = self.model.control()
-        self.contacts = None if ground is None else self._contacts()
-        self._step(0)  # compiles the kernels, or fetches them from Warp's cache
+        self.contacts = None
+        if ground is None:
+            self._step(0)  # compiles the kernels, or fetches them from Warp's cache
+        else:
+            self._find_contacts()
         faces: Any = self.model.tri_indices
         self.faces = to_torch(faces)[: one.tri_count] if one.tri_count else None
 
@@ -181,14 +201,20 @@ class Rollout:
             finally:
                 tape.zero()
 
-    def _contacts(self) -> Any:
-        """Find once what touches the ground: a plane's points and normals are the same wherever a thing is."""
+    def _find_contacts(self) -> None:
+        """Find once what touches the ground: a plane's points and normals are the same wherever a thing is.
+
+        A step with no contacts yet compiles the solver's kernels meanwhile.
+        """
         pipeline = newton.CollisionPipeline(
             self.model, broad_phase="explicit", soft_contact_gap=ROOM, requires_grad=True
         )
-        contacts = pipeline.contacts()
-        pipeline.collide(self.states[0], contacts)
-        return contacts
+        self.contacts, found = pipeline.contacts(), pipeline.contacts()
+        with without_adjoints(), ThreadPoolExecutor(1) as beside:
+            finding = beside.submit(pipeline.collide, self.states[0], found)
+            self._step(0)
+            finding.result()
+        self.contacts = found
 
     def _play(self, velocity: Float[Tensor, "row 3"], tape: Any = None) -> None:
         self._begin(velocity)
