@@ -37,7 +37,9 @@ class Roof:
 def measure_roof(device: str, precision: str) -> Roof:
     """Measure a device's roof by copying an array and by multiplying two matrices of a precision, the best of some."""
     with one_torch_thread():
-        roof = Roof(_copy(device), _multiply(device, getattr(torch, precision)))
+        flops = _multiply(device, getattr(torch, precision))  # first: what cuBLAS keeps would lie in the large arrays
+        free_memory()
+        roof = Roof(_copy(device), flops)
     free_memory()
     return roof
 
