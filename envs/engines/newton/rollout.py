@@ -167,7 +167,7 @@ class Rollout:
         self.solver: Any = SOLVERS[settings.solver](self.model)
         self.states: list[Any] = [self.model.state() for _ in range(settings.steps + 1)]
         self.control = self.model.control()
-        self.contacts = None
+        self.contacts: Any = None
         if ground is None:
             self._step(0)  # compiles the kernels, or fetches them from Warp's cache
         else:
