@@ -96,14 +96,19 @@ class Lists:
         return (self.order, self.full, self.segments, self.planes, self.starts, self.nodes, self.touched)
 
 
+def whole_warps(threads: int) -> int:
+    """Return the number of threads of the warps that so many threads need."""
+    return -(-threads // 32) * 32
+
+
 def warps(box: Box) -> int:
     """Return the number of threads, in whole warps, that a box's segments take one each."""
-    return -(-segments(box) // 32) * 32
+    return whole_warps(segments(box))
 
 
 def placing_warps(particles: int, box: Box) -> int:
     """Return the number of threads, in whole warps, that so many particles take one each, and a box's columns."""
-    return -(-max(particles, box.nodes[0] * box.nodes[1]) // 32) * 32
+    return whole_warps(max(particles, box.columns))
 
 
 def segments(box: Box) -> int:
