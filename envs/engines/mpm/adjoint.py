@@ -89,18 +89,15 @@ class Adjoint:
     def _adjoint_p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
         """Launch the adjoint of p2g, and those of the materials after it or as its continuation."""
         solver, tape, old, new = self.solver, self.solver.tape(step), self.old, self.new
-        A = tape.A[substep]
         if not solver.columns:
-            given = [tape.lattice, solver.orders[step].mass, frame.x, frame.v, A]
+            given = [tape.lattice, solver.orders[step].mass, frame.x, frame.v, tape.A[substep]]
             inputs = [*given, self.grid.m, old.x, old.v, self.A]
             solver.launch(solver.kernels.adjoint_p2g, solver.model.particles, batch, inputs)
         for b, (_, adjoint) in enumerate(solver.materials):
             inputs = [*solver.material_inputs(b, step, frame), new.S[b]]
             if solver.columns:
-                material = solver.model.groups[b].material
-                kept = [A] if material.keeps_affine_momentum(solver.model.precision) else []
                 given = [frame.x, frame.v, self.grid.m, old.v, tape.grids[substep].v, new.x, new.v, new.C, old.x]
-                inputs = [*kept, *solver.scatter.where(step, substep), *given, *inputs]
+                inputs = [*solver.scatter.where(step, substep), *given, *inputs]
             else:
                 inputs += [self.A]
             with solver.beside_others(b):

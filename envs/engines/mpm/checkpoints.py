@@ -44,7 +44,6 @@ class Allocator:
     def __init__(self, model: Model, capacity: int, device: str, *, columns: bool = False) -> None:
         self.model, self.capacity, self.device, self.columns = model, capacity, device, columns
         self.types = precision(model.precision)
-        self.keeps_affine_momentum = model.keeps_affine_momentum or not columns
 
     def array(self, dtype: Any, size: int) -> wp.array:
         """Return zeros [environment, element]."""
@@ -79,7 +78,7 @@ class Allocator:
 
     @cached_property
     def latest_affine_momentum(self) -> wp.array:
-        """A of the latest substep, for all tapes together, where no material keeps it."""
+        """A of the latest substep, for all tapes together, where sums are made by columns."""
         return self.affine_momentum()
 
     def lists(self, room: "Room") -> Lists:
@@ -131,9 +130,9 @@ class Cycle(list[T]):
 class Tape:
     """Hold one control step whole: frames between its ends, grids of its substeps, and where they lie.
 
-    A is that of every substep where a material keeps it. Of what is smoothed before the step the state is there, and,
-    of sums by columns, the `means` that nodes hold. Of a step in `pieces` it holds the frames at which these begin; for
-    all else pieces share the room of one.
+    A is that of every substep, by columns of the latest alone. Of what is smoothed before the step the state is there,
+    and, of sums by columns, the `means` that nodes hold. Of a step in `pieces` it holds the frames at which these
+    begin; for all else pieces share the room of one.
     """
 
     def __init__(self, allocator: Allocator, cells: int = 1, pieces: int = 1) -> None:
@@ -145,7 +144,7 @@ class Tape:
         self.frames = [inner[s % held - 1] if s % held else allocator.frame() for s in range(1, model.substeps)]
         self.smoothed = allocator.smoothed()
         self.means = {b: allocator.nodes(cells) for b in self.smoothed if allocator.columns}
-        self._kept = [allocator.affine_momentum() for _ in range(held if allocator.keeps_affine_momentum else 0)]
+        self._kept = [allocator.affine_momentum() for _ in range(0 if allocator.columns else held)]
         self.A: Cycle[wp.array] = Cycle(self._kept or [allocator.latest_affine_momentum])
         self.grids: Cycle[Grid] = Cycle(allocator.grid(cells) for _ in range(held))
         self.lists: Cycle[Lists] = Cycle(allocator.lists(room) for _ in range(held if allocator.columns else 0))

@@ -105,21 +105,14 @@ class Model:
         frame = 15 * self.particles + state  # x, v, C and each material's own
         nodes = nodes_around(self, *self.corners, BOX_MARGIN + TRAVEL).cells
         held = min(nodes, math.ceil(SPREAD * self.touched)) if columns else nodes
-        kept = self.keeps_affine_momentum or not columns
-        substep = frame + 8 * held + 9 * self.particles * kept
         stored = tapes * self.piece(pieces)
-        numbers = (self.steps + 3 + tapes * (pieces - 1)) * frame + (stored + 1) * substep
-        numbers += 9 * self.particles * (not kept)
+        numbers = (self.steps + 3 + tapes * (pieces - 1)) * frame + (stored + 1) * (frame + 8 * held)
+        numbers += 9 * self.particles * (1 if columns else stored + 1)  # A
         if not columns:
             return self.real_bytes * numbers
         means = 4 * tapes * sum(body.material.smoothing > 0 for body in self.bodies)
         integers = (stored + 3) * (self.particles + nodes // 4 + 3 * held)
         return self.real_bytes * (numbers + 45 * nodes + means * held) + 4 * integers
-
-    @property
-    def keeps_affine_momentum(self) -> bool:
-        """Whether A of every substep is kept for the gradient, where sums are made by columns."""
-        return any(body.material.keeps_affine_momentum(self.precision) for body in self.bodies)
 
     @cached_property
     def corners(self) -> tuple[np.ndarray, np.ndarray]:

@@ -7,8 +7,7 @@ has two kernels: `update` advances the state by the affine velocity C and fills 
 
 and `adjoint` turns the adjoints of S' and A into those of S and C. Both are written by hand; the tests hold the second
 against differences of the first. On a GPU the adjoint gathers that of A first (`gathers`), and computes A again, so
-that no substep has to keep it: plasticine's in float32 only, where series take a decomposition's place. tau is the
-Kirchhoff stress J sigma [Pa].
+that no substep has to keep it. tau is the Kirchhoff stress J sigma [Pa].
 """
 
 from dataclasses import dataclass
@@ -35,10 +34,6 @@ class Fluid:
     bulk: float
     viscosity: float
     smoothing: float = 0.0
-
-    def keeps_affine_momentum(self, name: str) -> bool:
-        """Say whether the gradient of one precision needs A of every substep, where sums are made by columns."""
-        return False
 
     def volume_ratio(self, pressure: np.ndarray) -> np.ndarray:
         """Return J at which the fluid bears `pressure` [Pa], counted on its reference volume."""
@@ -82,10 +77,6 @@ class _Solid:
         """First Lame parameter [Pa]."""
         return self.young * self.poisson / ((1.0 + self.poisson) * (1.0 - 2.0 * self.poisson))
 
-    def keeps_affine_momentum(self, name: str) -> bool:
-        """Say whether the gradient of one precision needs A of every substep, where sums are made by columns."""
-        return False
-
     def volume_ratio(self, pressure: np.ndarray) -> np.ndarray:
         """Return J at which the solid bears `pressure` [Pa], to first order."""
         return 1.0 - pressure / (self.lam + 2.0 * self.mu / 3.0)
@@ -123,10 +114,6 @@ class Plasticine(_Solid):
     """A fixed-corotated solid that yields by von Mises at `yield_stress` [Pa]: its shape flows, its volume returns."""
 
     yield_stress: float
-
-    def keeps_affine_momentum(self, name: str) -> bool:
-        """Say so of float64, where it would take another decomposition to compute A again."""
-        return name == "float64"
 
     def kernels(self, name: str, *, rows: bool = False, columns: bool = False) -> tuple[Any, Any]:
         """Return (update, adjoint) for one precision: those whose threads have `rows`, in float32, or for `columns`."""

@@ -22,14 +22,14 @@ from ..layout import layout
 class MaterialKernels(NamedTuple):
     """What a material does: the kernels `update, adjoint`, and functions of which a GPU makes one kernel.
 
-    `turn_back` makes of a particle's adjoint of A those of its state and C; `affine_momentum` computes A again, if that
-    is quick; `strain` is what these two would both compute, if that is slow.
+    `turn_back` makes of a particle's adjoint of A those of its state and C; `affine_momentum` computes A again;
+    `strain` is what these two would both compute, if that is slow.
     """
 
     update: Any
     adjoint: Any
     turn_back: Any
-    affine_momentum: Any | None
+    affine_momentum: Any
     strain: Any | None = None
 
 
@@ -51,29 +51,23 @@ def alone(name: str, turn_back: Any, strain: Any | None = None) -> Any:
 def after_p2g(name: str, material: MaterialKernels, count: int) -> Any:
     """Return the kernel that gathers a particle's adjoints of g2p and p2g first.
 
-    It takes A, unless `affine_momentum` computes it again, the lattice, x, v, adj_grid_m, adj_v, grid_v, the adjoints
-    of the new x, v and C, adj_x, and then what the other does, but for adj_A. So many blocks as `count` are to find
-    registers at once.
+    It takes the lattice, x, v, adj_grid_m, adj_v, grid_v, the adjoints of the new x, v and C, adj_x, and then what the
+    other does, but for adj_A. So many blocks as `count` are to find registers at once.
     """
-    gather, read_matrix, found = adjoint_gatherers(name), layout(name).read_matrix, blocks(name, count)
+    gather, found = adjoint_gatherers(name), blocks(name, count)
     adjoint_g2p, adjoint_p2g = gather.g2p, gather.p2g
     turn_back, affine_momentum, strain = material.turn_back, material.affine_momentum, material.strain
-    vec3, mat33 = precision(name).vec3, precision(name).mat33
-    momentum, kept = "read_matrix(A, e, first + p)", {"A": wp.array2d[mat33]}
-    if affine_momentum:
-        momentum, kept = _call("affine_momentum", affine_momentum, "p"), {}
     own = {key: kind for key, kind in _taken(turn_back).items() if key != "adj_a"}
-    others = kept | _taken(adjoint_p2g) | _taken(adjoint_g2p) | {"adj_x": wp.array2d[vec3]}
+    others = _taken(adjoint_p2g) | _taken(adjoint_g2p) | {"adj_x": wp.array2d[precision(name).vec3]}
     kinds = {key: kind for key, kind in others.items() if key not in {*own, "momentum"}} | own
 
     def kernel() -> Any:
-        functions = adjoint_g2p, adjoint_p2g, turn_back, affine_momentum, strain
-        return functions, read_matrix  # which Warp finds by their names
+        return adjoint_g2p, adjoint_p2g, turn_back, affine_momentum, strain  # which Warp finds by their names
 
     bounds = {"grid_stride": False} | ({"launch_bounds": found} if found else {})
     lines = [
         *_known(strain),
-        f"momentum = {momentum}",
+        f"momentum = {_call('affine_momentum', affine_momentum, 'p')}",
         f"adj_a, adj_x_at_nodes = {_call('adjoint_p2g', adjoint_p2g, 'first + p')}",
         _call("turn_back", turn_back, "p"),
         f"adj_x[e, first + p] = {_call('adjoint_g2p', adjoint_g2p, 'first + p')} + adj_x_at_nodes",

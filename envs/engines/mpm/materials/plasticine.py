@@ -172,9 +172,9 @@ def responses(name: str) -> SimpleNamespace:
 
 @cache
 def kernels(name: str) -> MaterialKernels:
-    """Return the kernels, without A's function: A is kept, as `Plasticine.keeps_affine_momentum` says."""
+    """Return the kernels."""
     found: MaterialKernels = kernels_of(name, responses(name), f"gradscape.plasticine.{name}")
-    return found._replace(affine_momentum=None)
+    return found
 
 
 @no_type_check
