@@ -3,8 +3,14 @@
 Between control steps particles lie in memory by body and cell (`order`), but they move on in between. So each substep
 lists its particles by cell, and those of a cell as they lie in memory. SEGMENT cells along z, from a multiple of
 SEGMENT on, make a segment, whose particles come one after the other in the list. Where in the list they are, chance
-may decide: nothing depends on it. Segments themselves are listed from those with most particles to those with fewest,
-by steps of STEP, so that threads that work on neighbours in the list have as much to do.
+may decide: nothing depends on it.
+
+A team of threads walks along a segment, and leaves its planes of nodes one after the other; or several teams do, each
+of which leaves a `stretch` of so many planes. These get their sums from the same particles in the same order, so that
+no bit depends on it. Stretches cost more, since each begins with the particles of the two cells before it, but a lone
+environment, which does not keep a GPU busy, need not wait for the longest segment. Walks are listed from those with
+most particles to those with fewest, by steps of STEP, so that threads that work on neighbours in the list have as much
+to do.
 
 A particle whose place is not finite is listed nowhere. Were all such in one cell, each would be held against all.
 """
@@ -22,7 +28,8 @@ from .nodes import HIGHEST, node_placer, place_taker
 from .stencil import lattice, stencil
 
 SEGMENT = 16  # cells
-STEP, SIZES = 4, 32  # segments are of one size up to so many particles apart, and the largest of so many sizes
+STRETCH = 4  # planes of nodes that a walk of a small batch leaves, and the last along a segment up to two more
+STEP, SIZES = 4, 32  # walks are of one size up to so many particles apart, and the largest of so many sizes
 
 # Neighbours in memory are mostly of one cell: on a GPU one of them counts for all of a warp.
 TAKE_NUMBER = """
@@ -71,12 +78,12 @@ COUNT_BEFORE = """
 
 @dataclass(frozen=True, eq=False)
 class Lists:
-    """The particles by cell: `order` [environment, place], and its segments.
+    """The particles by cell: `order` [environment, place], and the walks along its segments.
 
-    Those with particles are `full` [environment] in number, and `segments` [environment, segment with particles] says
-    of each of them which one it is, the first place of its particles, how many there are, and which planes of nodes
-    they touch, counted from the segment's first: the lowest, and 256 times the one beyond the highest. Those planes are
-    the bits of `planes` [environment, segment], which is 0 where there are no particles.
+    There are `full` [environment] of them, and `walks` [environment, walk] says of each which segment it goes along,
+    the first place of the particles it takes, how many they are, and, counted from the segment's first, which planes of
+    nodes it leaves and where it begins: the lowest plane, 256 times the one beyond the highest, and 65536 times the
+    cell. The planes that a segment's particles touch are the bits of `planes` [environment, segment].
 
     Nodes that particles touch have places in grids, one column after the other: `touched` [environment, 2] is how many
     nodes there are, and columns, `nodes` [environment, place] which node of the box has a place, and `starts`
@@ -85,7 +92,7 @@ class Lists:
 
     order: wp.array
     full: wp.array
-    segments: wp.array
+    walks: wp.array
     planes: wp.array
     starts: wp.array
     nodes: wp.array
@@ -93,7 +100,7 @@ class Lists:
 
     def arrays(self) -> tuple[wp.array, ...]:
         """Return every array of the lists."""
-        return (self.order, self.full, self.segments, self.planes, self.starts, self.nodes, self.touched)
+        return (self.order, self.full, self.walks, self.planes, self.starts, self.nodes, self.touched)
 
 
 def whole_warps(threads: int) -> int:
@@ -115,6 +122,11 @@ def segments(box: Box) -> int:
     """Return the number of segments of a box of nodes."""
     first, count = box.first[2], box.nodes[2]
     return box.nodes[0] * box.nodes[1] * ((first + count - 1) // SEGMENT - first // SEGMENT + 1)
+
+
+def most_walks(box: Box, stretch: int) -> int:
+    """Return the number of walks, at most, where all but the last of a segment leave so many planes."""
+    return segments(box) * -(-SEGMENT // stretch)
 
 
 @cache
@@ -209,8 +221,9 @@ def cell_kernels(name: str) -> SimpleNamespace:
         planes: wp.array2d[wp.int32],
         spans: wp.array2d[wp.int32],
         touched: wp.array2d[wp.int32],
+        stretch: int,
     ):
-        """Give each segment its places in the list, each of its cells, too, and it a number among those of its size.
+        """Give each segment its places in the list, each of its cells, too, and walks a number among those of a size.
 
         A cell's `places` are its first in the list and the one beyond its last. `spans` has of each column of cells by
         how much the lowest plane of nodes that is touched is below HIGHEST, counted from the box's first, and the one
@@ -234,32 +247,41 @@ def cell_kernels(name: str) -> SimpleNamespace:
                     high = k + 3
                 total += counted[k]
             planes[e, s] = (1 << high) - (1 << low)
-        taken = take_places(used, e, total, wp.min(total, 1))
+        walks = wp.where(total > 0, (high - low - 3) / stretch + 1, 0)
+        taken = take_places(used, e, total, walks)
         if total > 0:
-            at, segment, column, first = taken[0], taken[1], s / depth, s % depth * SEGMENT
+            at, column, first = taken[0], s / depth, s % depth * SEGMENT
             write_places(places, e, s, at, counted)
-            found[e, segment] = wp.vec4i(s, at, total, low + 256 * high)
-            numbers[e, segment] = take_number(sizes, e, size_of(total))
+            for w in range(walks):
+                lowest = low + w * stretch
+                beyond = wp.where(w < walks - 1, lowest + stretch, high)
+                begin = wp.max(low, lowest - 2)  # whose particles touch the lowest plane
+                before, count = wp.int32(0), wp.int32(0)
+                for k in range(SEGMENT):
+                    before += wp.where(k < begin, counted[k], 0)
+                    count += wp.where(k >= begin and k < beyond, counted[k], 0)
+                place = at + wp.min(before, total - 1)  # one of the list, should there be no particles
+                found[e, taken[1] + w] = wp.vec4i(s, place, count, lowest + 256 * beyond + 65536 * begin)
+                numbers[e, taken[1] + w] = take_number(sizes, e, size_of(count))
             first -= lattice.first[2] % SEGMENT
             wp.atomic_max(spans, e, 2 * column, HIGHEST - first - low)
             wp.atomic_max(spans, e, 2 * column + 1, first + high)
 
     @wp.func(module=module)
-    def place_segment(
-        used: wp.array2d[wp.int32],
+    def place_walk(
         sizes: wp.array2d[wp.int32],
         found: wp.array2d[wp.vec4i],
         numbers: wp.array2d[wp.int32],
-        segments: wp.array2d[wp.vec4i],
+        walks: wp.array2d[wp.vec4i],
         e: int,
         i: int,
     ):
-        segment = found[e, i]
+        walk = found[e, i]
         at = numbers[e, i]
-        for larger in range(size_of(segment[2]) + 1, SIZES):
+        for larger in range(size_of(walk[2]) + 1, SIZES):
             at += sizes[e, larger]
-        if at < segments.shape[1]:
-            segments[e, at] = segment
+        if at < walks.shape[1]:
+            walks[e, at] = walk
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def place(
@@ -270,16 +292,16 @@ def cell_kernels(name: str) -> SimpleNamespace:
         used: wp.array2d[wp.int32],
         sizes: wp.array2d[wp.int32],
         found: wp.array2d[wp.vec4i],
-        numbers_of_segments: wp.array2d[wp.int32],
+        numbers_of_walks: wp.array2d[wp.int32],
         arrived: wp.array2d[wp.int32],
         full: wp.array[wp.int32],
-        segments: wp.array2d[wp.vec4i],
+        walks: wp.array2d[wp.vec4i],
         spans: wp.array2d[wp.int32],
         touched: wp.array2d[wp.int32],
         starts: wp.array2d[wp.int32],
         nodes: wp.array2d[wp.int32],
     ):
-        """List particles by cell, those of a cell as they arrived, and segments by size, the largest first.
+        """List particles by cell, those of a cell as they arrived, and walks by size, the largest first.
 
         Give the nodes of each column that particles touch, and those between them, places one after the other. Where
         there is not room for all that are touched none of them counts, and the control step is done again.
@@ -293,8 +315,8 @@ def cell_kernels(name: str) -> SimpleNamespace:
             cell = cells[e, i]
             if cell >= 0:
                 arrived[e, places[e, cell][0] + numbers[e, i]] = i
-        if i < used[e, 1]:
-            place_segment(used, sizes, found, numbers_of_segments, segments, e, i)
+            for w in range(i, used[e, 1], cells.shape[1]):
+                place_walk(sizes, found, numbers_of_walks, walks, e, w)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def tidy(
@@ -309,7 +331,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
         touched: wp.array2d[wp.int32],
         needed: wp.array[wp.int32],
     ):
-        """List them by cell, those of a cell as they lie in memory; count segments from 0 again.
+        """List them by cell, those of a cell as they lie in memory; count walks from 0 again.
 
         Note how many nodes an environment has `needed` at most.
         """

@@ -86,7 +86,7 @@ class Allocator:
         return Lists(
             order=self.array(wp.int32, self.model.particles),
             full=wp.zeros(self.capacity, dtype=wp.int32, device=self.device),
-            segments=self.array(wp.vec4i, 1 + room.nodes // 2),  # one with particles has two nodes at least
+            walks=self.array(wp.vec4i, 1 + room.nodes // 2),  # each has two nodes at least
             planes=self.array(wp.int32, room.segments),
             starts=self.array(wp.int32, room.columns),
             nodes=self.array(wp.int32, room.nodes),

@@ -16,7 +16,7 @@ import warp as wp
 from ..launches import blocks
 from ..rows import with_arguments
 from ..runtime import precision
-from .cells import segments
+from .cells import SEGMENT, most_walks
 from .layout import layout
 from .model import Box
 from .stencil import lattice
@@ -25,26 +25,26 @@ from .walk import PARTS, fill, lane_numbers, walker
 
 @dataclass(frozen=True)
 class Team:
-    """How threads share segments: `groups` of them, a segment each, of `size` lanes, in a warp of so many `lanes`."""
+    """How threads share walks: `groups` of them, a walk each, of `size` lanes, in a warp of so many `lanes`."""
 
     lanes: int
     groups: int
     size: int
 
-    def threads(self, box: Box) -> int:
-        """Return how many threads a box of nodes takes."""
-        return -(-segments(box) // self.groups) * self.lanes
+    def threads(self, box: Box, stretch: int = SEGMENT) -> int:
+        """Return how many threads a box of nodes takes whose walks leave stretches of so many planes."""
+        return -(-most_walks(box, stretch) // self.groups) * self.lanes
 
 
-GPU_TEAM, CPU_TEAM = Team(32, 3, 9), Team(1, 1, 1)  # on a CPU a thread has a segment
+GPU_TEAM, CPU_TEAM = Team(32, 3, 9), Team(1, 1, 1)  # on a CPU a thread has a walk
 
 # Threads go through the rows of a batch from the last one on. Kernels before and after go from the first one on, and a
 # GPU's cache still has what was written last.
 WALK = """
-def kernel(lattice, rows, order, full, segments, OWN, parts):
+def kernel(lattice, rows, order, full, walks, OWN, parts):
     k, t = wp.tid()
     e = rows - 1 - k
-    mine = take_segment(e, t, full, segments)
+    mine = take_walk(e, t, full, walks)
     if t / lanes * groups >= full[e]:
         return
     at, begin, count, span = mine[0] * PARTS, mine[1], mine[2], mine[3]
@@ -55,7 +55,7 @@ def kernel(lattice, rows, order, full, segments, OWN, parts):
     for i in range(0, most(count), size):
         what = given(lattice, OWN, e, p)
         p = listed(order, e, place + i + size, last)  # asked for before the present ones are walked
-        state = walk(parts, e, at, wp.min(size, count - i), what, state)
+        state = walk(parts, e, at, span, wp.min(size, count - i), what, state)
     close_segment(parts, e, at, span, state)
 """
 
@@ -92,19 +92,19 @@ ADD_UP = """
 
 @cache
 @no_type_check
-def segment_taker(team: Team):
-    """Return the functions `take_segment, listed` of a team.
+def walk_taker(team: Team):
+    """Return the functions `take_walk, listed` of a team.
 
-    The first says of a thread's segment (number, first place, count, span), none if it has none; the second which
-    particle has a place in the list, or the `last` one of a segment.
+    The first says of a thread's walk (segment, first place, count, span), none if it has none; the second which
+    particle has a place in the list, or the `last` one of a walk.
     """
     lanes, groups, group_of = team.lanes, team.groups, lane_numbers().group
 
     @wp.func(module=f"gradscape.columns.{lanes}")
-    def take_segment(e: int, t: int, full: wp.array[wp.int32], segments: wp.array2d[wp.vec4i]):
+    def take_walk(e: int, t: int, full: wp.array[wp.int32], walks: wp.array2d[wp.vec4i]):
         group = group_of(t % lanes)
         i = t / lanes * groups + group
-        mine = segments[e, wp.min(i, segments.shape[1] - 1)]  # does not wait for how many there are
+        mine = walks[e, wp.min(i, walks.shape[1] - 1)]  # does not wait for how many there are
         if group >= groups or i >= full[e]:
             return wp.vec4i(0, 0, 0, 0)
         return mine
@@ -113,7 +113,7 @@ def segment_taker(team: Team):
     def listed(order: wp.array2d[wp.int32], e: int, place: int, last: int):
         return order[e, wp.min(place, last)]
 
-    return take_segment, listed
+    return take_walk, listed
 
 
 def walking_kernel(key: str, name: str, team: Team, given: Any, *, sloping: bool) -> Any:
@@ -122,18 +122,18 @@ def walking_kernel(key: str, name: str, team: Team, given: Any, *, sloping: bool
     It runs over [environment, thread of a `team`], and takes what WALK says, OWN being what `given` takes besides the
     lattice, an environment and a particle. What particles give is `sloping`, or not, as the `walker` has it.
     """
-    steps, row_of, (take_segment, listed) = walker(name, sloping=sloping), lane_numbers().row, segment_taker(team)
+    steps, row_of, (take_walk, listed) = walker(name, sloping=sloping), lane_numbers().row, walk_taker(team)
     most, open_segment, walk, close_segment = steps.most, steps.open, steps.walk, steps.close
     lanes, groups, size = team.lanes, team.groups, team.size
 
     def kernel() -> Any:  # which Warp finds here by their names
-        functions = given, take_segment, listed, row_of, most, open_segment, walk, close_segment
+        functions = given, take_walk, listed, row_of, most, open_segment, walk, close_segment
         return functions, lanes, groups, size, PARTS
 
     own = {label: kind for label, kind in given.input_types.items() if label not in ("lattice", "e", "p")}
     vec4 = precision(name).vec4
     kinds = {"lattice": lattice(name), "rows": int, "order": wp.array2d[wp.int32], "full": wp.array[wp.int32]}
-    kinds |= {"segments": wp.array2d[wp.vec4i]} | own | {"parts": wp.array2d[vec4]}
+    kinds |= {"walks": wp.array2d[wp.vec4i]} | own | {"parts": wp.array2d[vec4]}
     bounds = {"grid_stride": False} | ({"launch_bounds": blocks(name)} if blocks(name) else {})
     return wp.Kernel(
         with_arguments(kernel, kinds),

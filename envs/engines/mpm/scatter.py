@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import warp as wp
 
 from ..runtime import load
-from .cells import SEGMENT, SIZES, Lists, cell_kernels, placing_warps, segments, warps
+from .cells import SEGMENT, SIZES, STRETCH, Lists, cell_kernels, placing_warps, segments, warps
 from .checkpoints import Frame, spare
 from .columns import CPU_TEAM, GPU_TEAM, column_kernels
 from .model import Box
@@ -136,9 +136,10 @@ class ByColumns:
             inputs = [tape.lattice, frame.x, self.cells, self.numbers, self.counts]
             solver.launch(kernels.count, count, batch, inputs)
         inputs = [tape.lattice, self.counts, self.used, self.sizes, self.places, *self.found, lists.planes]
-        solver.launch_on_box(kernels.place_segments, warps, batch, [*inputs, self.spans, lists.touched])
+        inputs += [self.spans, lists.touched, self.stretch(batch)]
+        solver.launch_on_box(kernels.place_segments, warps, batch, inputs)
         inputs = [tape.lattice, self.cells, self.numbers, self.places, self.used, self.sizes, *self.found, self.arrived]
-        inputs += [lists.full, lists.segments, self.spans, lists.touched, lists.starts, lists.nodes]
+        inputs += [lists.full, lists.walks, self.spans, lists.touched, lists.starts, lists.nodes]
         solver.launch_on_box(kernels.place, partial(placing_warps, count), batch, inputs)
         inputs = [tape.lattice, self.cells, self.places, self.arrived, self.used, self.sizes, self.spans, lists.order]
         solver.launch(kernels.tidy, count, batch, [*inputs, lists.touched, solver.needed])
@@ -168,8 +169,12 @@ class ByColumns:
         """Launch a kernel that leaves parts of sums at nodes, after the substep's lists."""
         tape = self.solver.tape(step)
         lists: Lists = tape.lists[substep]
-        given = [tape.lattice, batch, lists.order, lists.full, lists.segments, *inputs, self.parts]
-        self.solver.launch_on_box(kernel, self.team.threads, batch, given)
+        given = [tape.lattice, batch, lists.order, lists.full, lists.walks, *inputs, self.parts]
+        self.solver.launch_on_box(kernel, partial(self.team.threads, stretch=self.stretch(batch)), batch, given)
+
+    def stretch(self, batch: int) -> int:
+        """Return how many planes a walk leaves."""
+        return STRETCH if self.solver.small(batch) else SEGMENT
 
     def add_up(self, kernel: Any, step: int, substep: int, batch: int, grids: list[wp.array]) -> None:
         """Launch a kernel that adds up the parts at nodes."""
@@ -187,7 +192,8 @@ class ByColumns:
         self.parts: wp.array = allocator.array(allocator.types.vec4, count * PARTS)
         self.counts: wp.array = allocator.array(wp.int32, count * SEGMENT)
         self.places: wp.array = allocator.array(wp.vec2i, count * SEGMENT)
-        self.found = allocator.array(wp.vec4i, count), allocator.array(wp.int32, count)
+        walks = count * (SEGMENT // STRETCH)
+        self.found = allocator.array(wp.vec4i, walks), allocator.array(wp.int32, walks)
         self.spans: wp.array = allocator.array(wp.int32, count * 2)  # of columns, of which there are no more
 
 

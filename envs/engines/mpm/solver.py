@@ -207,12 +207,12 @@ class Solver:
         Take the corners between which they are at its beginning [m], shape (3,), and return those of its end.
         """
         whole = Box((0, 0, 0), self.model.nodes)
-        grain = GRAIN if self.device != "cpu" and self._small(batch) else 1
+        grain = GRAIN if self.device != "cpu" and self.small(batch) else 1
         while True:
             box = nodes_around(self.model, low, high, self.margins[step], grain)
             self.set_box(step, box)
             self.advance(step, batch)
-            self.extent.find(self.end.x, self.left_box, self.needed, batch, small=self._small(batch))
+            self.extent.find(self.end.x, self.left_box, self.needed, batch, small=self.small(batch))
             self._sort(step, batch)  # which a GPU does while corners are read, whether or not the step holds
             *corners, left, needed = self.extent.read()
             self.touched[step] = max(self.touched[step], needed)
@@ -229,7 +229,7 @@ class Solver:
         """Bring the particles at a control step's end into the order of the next one."""
         orders, after = (self.orders[step], self.orders[step + 1]), self.checkpoints[step + 1]
         work = partial(self.sorter.sort, self.end, after, *orders, batch)
-        self.launches.run(("sort", step, batch), None, work, small=self._small(batch))
+        self.launches.run(("sort", step, batch), None, work, small=self.small(batch))
 
     def advance(self, step: int, batch: int) -> None:
         """Simulate a control step on the nodes that it has been given, and keep it whole, or its last piece.
@@ -294,9 +294,10 @@ class Solver:
     def launch_again(self, key: tuple[Any, ...], step: int, batch: int, work: Callable[[], None]) -> None:
         """Do a control step's work, by the launches kept from the last time if there was one."""
         place = self.tape(step).lattice
-        self.launches.run(key, self.boxes[step], work, place=place, small=self._small(batch))
+        self.launches.run(key, self.boxes[step], work, place=place, small=self.small(batch))
 
-    def _small(self, batch: int) -> bool:
+    def small(self, batch: int) -> bool:
+        """Say whether so few environments do not keep a GPU busy."""
         return batch * self.model.particles <= LAUNCHES
 
     def substeps(self, step: int, batch: int, substeps: range) -> None:

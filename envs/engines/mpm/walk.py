@@ -2,7 +2,8 @@
 
 Nine lanes take the particles of a segment one after the other. Each holds the sums of three of the 27 nodes around the
 present cell, a row along z. Where the next cell begins, the lowest nine are written down, beside each other, since a
-cache takes whole sectors much faster than parts of them, and the others become lower by one.
+cache takes whole sectors much faster than parts of them, and the others become lower by one. Planes below those of a
+stretch, which another walk leaves, are not written.
 
 A lane works out what one particle gives to all nine rows, and puts it into memory that the warp shares, where each lane
 reads what concerns its own row, since reading there is what limits a scatter. No more than nine particles of a segment
@@ -28,17 +29,17 @@ PARTS = 9 * PLANES  # numbers of four parts that a segment leaves
 GROUP, ROW = "(lane < 24 ? lane / 8 : lane - 24)", "(lane < 24 ? lane % 8 : 8)"
 EMIT = """
         {
-            *out = low;
+            if (now >= (span & 255)) *out = low;
             out += 9, ++now;
             low = middle, middle = high, high = Four{};
         }
 """
 OPEN = """
 #if !defined(__CUDA_ARCH__)
-    for (int i = 0; i < PARTS; ++i) wp::index(parts, e, at + i) = wp::vec_t<4, REAL>();
+    for (int i = 9 * (span & 255); i < 9 * (span >> 8 & 255); ++i) wp::index(parts, e, at + i) = wp::vec_t<4, REAL>();
 #endif
     wp::vec_t<13, REAL> state;
-    state[12] = REAL(span & 255);
+    state[12] = REAL(span >> 16);
     return state;
 """
 WALK = """
@@ -91,6 +92,7 @@ WALK = """
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j)
             for (int k = 0; k < 3; ++k) {
+                if (p.cell + k < (span & 255) || p.cell + k >= (span >> 8 & 255)) continue;
                 const REAL weight = w[0][i] * w[1][j] * w[2][k];
                 wp::vec_t<4, REAL> &sum = wp::index(parts, e, at + 9 * (p.cell + k) + 3 * i + j);
                 for (int d = 0; d < 3; ++d) {
@@ -143,7 +145,7 @@ CLOSE = """
     int now = (int)state[12];
     Four *out = (Four *)&wp::index(parts, e, at + 9 * now) + row;
 #pragma unroll 1
-    while (now < span >> 8) EMIT
+    while (now < (span >> 8 & 255)) EMIT
 #endif
 """
 MOST = """
@@ -193,9 +195,9 @@ def walker(name: str, *, sloping: bool) -> SimpleNamespace:
     """Return the functions `at_nodes, most, open, walk, close` of one precision.
 
     `at_nodes` says what a particle gives to its nodes, as a `Given`, whose a, mass and third q must be 0 unless it is
-    `sloping`. A warp's lanes call the others together: `most` for the greatest of their counts, `open` before their
-    segment, whose parts begin at `at`, `close` after it. `walk` adds the next `count` particles of each group to its
-    parts, of which a lane knows that of its row.
+    `sloping`. A warp's lanes call the others together: `most` for the greatest of their counts, `open` before they walk
+    along their segment, whose parts begin at `at`, `close` after it. `walk` adds the next `count` particles of each
+    group to its parts, of which a lane knows that of its row. `span` is what `Lists` has of planes and the first cell.
     """
     types = precision(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
@@ -222,7 +224,7 @@ def walker(name: str, *, sloping: bool) -> SimpleNamespace:
     def open_segment(parts: wp.array2d[vec4], e: int, at: int, span: int) -> State: ...
 
     @wp.func_native(fill(WALK, name, **(SLOPING if sloping else LEVEL)))
-    def walk(parts: wp.array2d[vec4], e: int, at: int, count: int, p: Given, state: State) -> State: ...
+    def walk(parts: wp.array2d[vec4], e: int, at: int, span: int, count: int, p: Given, state: State) -> State: ...
 
     @wp.func_native(fill(CLOSE, name))
     def close_segment(parts: wp.array2d[vec4], e: int, at: int, span: int, state: State): ...

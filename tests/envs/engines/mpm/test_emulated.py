@@ -7,7 +7,7 @@ import torch
 import warp as wp
 
 from gradscape.envs.engines.mpm.boundaries import Open
-from gradscape.envs.engines.mpm.cells import segments
+from gradscape.envs.engines.mpm.cells import SEGMENT, STRETCH, segments
 from gradscape.envs.engines.mpm.columns import GPU_TEAM, column_kernels
 from gradscape.envs.engines.mpm.grid_cpu import velocity_on
 from gradscape.envs.engines.mpm.model import Box, place_grid
@@ -26,16 +26,16 @@ ROWS, COUNT, BODY = 2, 300, slice(40, 270)
 class Scattering:
     """Particles listed by cell in emulation, and nodes that add up what warps leave."""
 
-    def __init__(self, box, spread):
+    def __init__(self, box, spread, stretch):
         model = replace(kneading()[0], precision="float32")
-        self.box, self.lattice = box, place_grid(model, box)
+        self.box, self.lattice, self.stretch = box, place_grid(model, box), stretch
         lowest = torch.tensor([0.6 + first for first in box.first])
         reach = spread * torch.tensor([nodes - 3.2 for nodes in box.nodes])
         draw = torch.Generator().manual_seed(5)
         self.x = torch.tensor(model.origin) + model.dx * (lowest + reach * torch.rand((ROWS, COUNT, 3), generator=draw))
         self.v, self.A = torch.randn((ROWS, COUNT, 3), generator=draw), torch.randn((ROWS, COUNT, 3, 3), generator=draw)
         self.mass = 0.5 + torch.rand((ROWS, COUNT), generator=draw)
-        self.listing = Listing(emulate, "float32", self.lattice, box, self.x)
+        self.listing = Listing(emulate, "float32", self.lattice, box, self.x, stretch)
         for _ in range(2):  # the second time it begins where the first has ended
             self.listing.run()
 
@@ -43,8 +43,8 @@ class Scattering:
         """Return what nodes add up of what warps leave, [row, node, 4]."""
         parts = wp.array(torch.full((ROWS, segments(self.box) * PARTS, 4), torch.nan).numpy(), dtype=wp.vec4)
         lists = self.listing.lists
-        walked = [self.lattice, ROWS, lists.order, lists.full, lists.segments, *inputs, parts]
-        emulate(kernel, (ROWS, GPU_TEAM.threads(self.box)), walked)
+        walked = [self.lattice, ROWS, lists.order, lists.full, lists.walks, *inputs, parts]
+        emulate(kernel, (ROWS, GPU_TEAM.threads(self.box, self.stretch)), walked)
         momentum, velocity = self.zeros(self.box.cells, wp.vec4), self.zeros(self.box.cells, wp.vec4)
         numbers = [0.0, 0.0, -1.0, 0, 0.0, 0.0]  # no gravity, and no node is empty
         tools, sums = wp.zeros((ROWS, 1, 1), dtype=wp.vec3), wp.zeros((1, 1), dtype=wp.int64)
@@ -78,7 +78,10 @@ class Scattering:
 @pytest.fixture(scope="module", params=[(0, 1.0), (3, 1.0), (5, 0.05)])
 def scattering(request):
     first, spread = request.param
-    return Scattering(Box((1, 0, first), (8, 7, 17 - first)), spread)
+    box = Box((1, 0, first), (8, 7, 17 - first))
+    whole, *others = (Scattering(box, spread, stretch) for stretch in (SEGMENT, STRETCH, 1))
+    whole.others = others
+    return whole
 
 
 def assert_close(got, wanted):
@@ -86,9 +89,12 @@ def assert_close(got, wanted):
 
 
 def test_warps_scatter_momentum_and_mass(scattering):
+    """In stretches of any length they give the same bits."""
     s = scattering
     inputs = [*map(s.array, (s.mass, s.x, s.v)), s.side_by_side(s.A)]
     got = s.walk(column_kernels("float32", GPU_TEAM).p2g, inputs)
+    for other in s.others:
+        assert torch.equal(other.walk(column_kernels("float32", GPU_TEAM).p2g, inputs), got)
     assert_close(got, s.transfer(s.mass, s.mass[:, :, None] * s.v, s.A))
 
 

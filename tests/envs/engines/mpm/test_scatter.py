@@ -7,7 +7,7 @@ import pytest
 import torch
 import warp as wp
 
-from gradscape.envs.engines.mpm.cells import SEGMENT, SIZES, STEP, segments
+from gradscape.envs.engines.mpm.cells import SEGMENT, SIZES, STEP, STRETCH, segments
 from gradscape.envs.engines.mpm.model import Body, Box, Model, place_grid
 from gradscape.envs.engines.mpm.solver import Solver
 from gradscape.envs.engines.runtime import to_torch
@@ -80,33 +80,48 @@ def test_a_stirred_fluid_is_smoothed_and_moves_as_in_place():
     assert ends[0][1].abs().max() > 0
 
 
+@pytest.mark.parametrize("stretch", [SEGMENT, STRETCH, 1])
 @pytest.mark.parametrize("first", [0, 3])
-def test_particles_are_listed_by_cell_and_then_as_they_lie(first):
+def test_particles_are_listed_by_cell_and_then_as_they_lie(first, stretch):
+    """A walk has the particles that touch its planes, and the walks along a segment have its planes between them."""
     model, _ = kneading()
     box = Box((0, 0, first), (*model.nodes[:2], model.nodes[2] - first))
     x = torch.rand((2, 500, 3), generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 0.4 - 0.2
     x[:, :, 1] += 0.4
     cell = ((x - torch.tensor(model.origin)) / model.dx - 0.5).floor().long()
     depth = segments(box) // (box.nodes[0] * box.nodes[1])
-    listing = Listing(wp.launch, "float64", place_grid(model, box), box, x)
+    listing = Listing(wp.launch, "float64", place_grid(model, box), box, x, stretch)
     for _ in range(2):  # the second time it begins where the first has ended
         listing.run()
-        order, full, segments_found, planes, *_ = (to_torch(array).clone() for array in listing.lists.arrays())
+        order, full, walks, planes, *_ = (to_torch(array).clone() for array in listing.lists.arrays())
         for row in range(2):
             keys = sorted((i, j, k // SEGMENT, k % SEGMENT, p) for p, (i, j, k) in enumerate(cell[row].tolist()))
             found = {}
-            sizes = [min(count // STEP, SIZES - 1) for count in segments_found[row, : full[row], 2].tolist()]
+            sizes = [min(count // STEP, SIZES - 1) for count in walks[row, : full[row], 2].tolist()]
             assert sizes == sorted(sizes, reverse=True)
-            for s, begin, count, span in segments_found[row, : full[row]].tolist():
+            for s, begin, count, span in walks[row, : full[row]].tolist():
                 column, layer = divmod(s, depth)
                 place = *divmod(column, box.nodes[1]), layer + first // SEGMENT
-                found[place] = (order[row, begin : begin + count].tolist(), divmod(span, 256))
-                assert planes[row, s] == sum(1 << plane for plane in range(span % 256, span // 256))
+                walk = span % 256, span // 256 % 256, span // 65536, order[row, begin : begin + count].tolist()
+                found.setdefault(place, []).append(walk)
             wanted = {where: list(group) for where, group in groupby(keys, key=lambda key: key[:3])}
-            assert found == {
-                where: ([key[-1] for key in group], (group[-1][3] + 3, group[0][3])) for where, group in wanted.items()
-            }
-            assert int((planes[row] > 0).sum()) == full[row]
+            assert found.keys() == wanted.keys()
+            for place, group in wanted.items():
+                spans = [(lowest, beyond) for lowest, beyond, *_ in sorted(found[place])]
+                ends = [group[0][3], *(beyond for _, beyond in spans)]
+                assert ends[-1] == group[-1][3] + 3
+                assert [lowest for lowest, _ in spans] == ends[:-1]
+                *others, last = [beyond - lowest for lowest, beyond in spans]
+                assert others == [stretch] * len(others)
+                assert 3 <= last <= stretch + 2
+                for lowest, beyond, start, listed in found[place]:
+                    assert start == max(ends[0], lowest - 2)
+                    assert listed == [key[-1] for key in group if lowest - 2 <= key[3] < beyond]
+                s = (place[0] * box.nodes[1] + place[1]) * depth + place[2] - first // SEGMENT
+                assert planes[row, s] == sum(1 << plane for plane in range(ends[0], ends[-1]))
+            assert int((planes[row] > 0).sum()) == len(wanted)
+            assert full[row] >= len(wanted)
+            assert (full[row] == len(wanted)) == (stretch == SEGMENT)
 
 
 def test_particles_that_are_nowhere_are_not_listed():
@@ -134,3 +149,15 @@ def test_an_environment_that_has_blown_up_changes_no_other():
     for row in (0, 2):
         assert torch.equal(end[row], lone[1][row])
         assert torch.equal(gradient[row], lone[2][row])
+
+
+def test_a_batch_that_keeps_a_gpu_busy_walks_whole_segments_and_gives_the_same_bits(monkeypatch):
+    model, paths = kneading()
+    adj_x = {model.steps: weights(model, 3, 6)}
+    monkeypatch.setattr("gradscape.envs.engines.mpm.scatter.STRETCH", 1)
+    short, *results = kneaded(model, paths, adj_x, columns=True)
+    monkeypatch.setattr("gradscape.envs.engines.mpm.solver.LAUNCHES", 0)
+    whole, *others = kneaded(model, paths, adj_x, columns=True)
+    walks, longer = (to_torch(solver.tapes[0].lists[0].full).sum() for solver in (short, whole))
+    assert walks > longer
+    assert all(map(torch.equal, results, others))
