@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from docs.pages import commands, interface, package, provenance, reproduction, scenes, wall
+from docs.pages import commands, interface, package, pictures, provenance, reproduction, scenes, wall
 from docs.pages.kept import NOT_MEASURED, Kept, KeptFigure
 from docs.pages.text import prose
 from docs.pages.walked import write_pages
@@ -43,6 +43,16 @@ def kept() -> Kept:
     return Kept.read()
 
 
+@pytest.fixture(scope="module")
+def api() -> dict[str, str]:
+    return interface.pages()
+
+
+@pytest.fixture(scope="module")
+def verb_pages() -> dict[str, str]:
+    return commands.pages()
+
+
 @pytest.fixture
 def nothing(tmp_path: Path) -> Kept:
     """What there is to show where nothing was measured."""
@@ -56,8 +66,8 @@ def shown(text: str) -> str:
 
 
 @pytest.mark.parametrize("name", VERBS)
-def test_every_command_has_a_page_with_all_its_options(name: str) -> None:
-    text = commands.pages()[f"commands/{name.replace(' ', '-')}.md"]
+def test_every_command_has_a_page_with_all_its_options(verb_pages: dict[str, str], name: str) -> None:
+    text = verb_pages[f"commands/{name.replace(' ', '-')}.md"]
     verb = VERBS[name]
     assert [
         one for param in verb.params if not param.hidden for one in param.opts if one[0] == "-" and one not in text
@@ -66,36 +76,37 @@ def test_every_command_has_a_page_with_all_its_options(name: str) -> None:
     assert f"$ landscape {name}" in text
 
 
-def test_the_page_of_commands_lists_them_and_nothing_else() -> None:
-    files = set(commands.pages()) - {"commands/index.md"}
+def test_the_page_of_commands_lists_them_and_nothing_else(verb_pages: dict[str, str]) -> None:
+    files = set(verb_pages) - {"commands/index.md"}
     assert files == {f"commands/{name.replace(' ', '-')}.md" for name in VERBS}
-    assert all(f"({Path(file).name})" in commands.pages()["commands/index.md"] for file in files)
+    assert all(f"({Path(file).name})" in verb_pages["commands/index.md"] for file in files)
 
 
 @pytest.mark.parametrize("name", PUBLIC)
-def test_every_public_name_has_a_page_and_a_line(name: str) -> None:
+def test_every_public_name_has_a_page_and_a_line(api: dict[str, str], name: str) -> None:
     kind = "classes" if inspect.isclass(PUBLIC[name]) else "functions"
-    pages = interface.pages()
     directive = "autoclass" if kind == "classes" else "autofunction"
-    assert f".. {directive}:: gradscape.{name}\n" in pages[f"api/{kind}/{name}.md"]
+    assert f".. {directive}:: gradscape.{name}\n" in api[f"api/{kind}/{name}.md"]
     first = " ".join((inspect.getdoc(PUBLIC[name]) or "").split("\n\n")[0].split()).replace("`", "")
-    assert first in shown(pages["api/index.md"])
+    assert first in shown(api["api/index.md"])
 
 
-def test_what_functions_return_is_documented_though_it_is_not_public() -> None:
-    pages = interface.pages()
-    assert {f"api/records/{name}.md" for name in ("Report", "Census", "Tradeoff", "League")} <= set(pages)
-    assert not any("|" in line and "_MISSING" in line for text in pages.values() for line in text.splitlines())
+def test_what_functions_return_is_documented_though_it_is_not_public(api: dict[str, str]) -> None:
+    assert {f"api/records/{name}.md" for name in ("Report", "Census", "Tradeoff", "League")} <= set(api)
+    assert not any("|" in line and "_MISSING" in line for text in api.values() for line in text.splitlines())
 
 
-def test_keywords_of_a_scene_are_told_with_types_and_defaults() -> None:
-    text = interface.pages()["api/functions/slice.md"]
+def test_keywords_of_a_scene_are_told_with_types_and_defaults(api: dict[str, str]) -> None:
+    text = api["api/functions/slice.md"]
     assert "| `device` | `str` | `'auto'` |" in text
     assert "| `fidelity` | `str \\| Fidelity \\| None` | `None` |" in text
-    assert "keyword" not in interface.pages()["api/functions/open_slice.md"]
+    assert "keyword" not in api["api/functions/open_slice.md"]
 
 
-def test_every_scene_has_a_page_with_what_it_says_and_where_it_is_bounded(kept: Kept, tmp_path: Path) -> None:
+def test_every_scene_has_a_page_with_what_it_says_and_where_it_is_bounded(
+    kept: Kept, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pictures, "FUNCTION_RESOLUTION", 3)
     pages = scenes.pages(kept, tmp_path)
     assert set(pages) == {"scenes/index.md", *(f"scenes/{one.name}.md" for one in BUILTIN)}
     for entry in BUILTIN:
