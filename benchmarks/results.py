@@ -152,8 +152,7 @@ def leave_blank(put: Callable[[object, str, Any], object]) -> None:
             save(Figure(figsize=(0.1, 0.1)), where, **how)
 
     put(Figure, "savefig", leave)
-    put(page, "_write_png", lambda figure, where: leave(figure, where, format="png"))
-    put(page, "settle", lambda picture: picture.set_layout_engine("none"))
+    put(page, "settle", lambda picture: None)
 
 
 def small() -> None:

@@ -36,10 +36,13 @@ _settings = threading.Lock()  # matplotlib's, which are of the whole process
 
 
 class Picture(Figure):
-    """A figure that knows its sheet, draws without a window or any global state, and shows in a notebook."""
+    """A figure that knows its sheet, draws without a window or any global state, and shows in a notebook.
+
+    `settle` lays it out, once. It has no layout engine: `savefig` draws a figure that has one twice.
+    """
 
     def __init__(self, sheet: style.Sheet, height: float) -> None:
-        super().__init__(figsize=(sheet.width, height), layout="constrained")
+        super().__init__(figsize=(sheet.width, height), layout="none")  # type: ignore[arg-type] # missing in its stub
         self.sheet = sheet
         self.fitted: dict[
             Text, tuple[str, Callable[[], float]]
@@ -49,7 +52,7 @@ class Picture(Figure):
     def _repr_png_(self) -> bytes:
         """Return the picture as a notebook shows it."""
         with io.BytesIO() as raw:
-            _write_png(self, raw)
+            self.savefig(raw, format="png", dpi=style.DPI)
             return raw.getvalue()
 
 
@@ -191,23 +194,8 @@ def save(figure: Figure, path: str | Path) -> None:
     if kind not in DATED:
         raise ValueError(f"a picture is saved as .png, .pdf or .svg; got {path.name!r}")
     with replacing(path) as partial, _settings, rc_context(EMBEDDED):
-        if kind == "png":
-            _write_png(figure, partial)
-        else:
-            figure.savefig(partial, metadata=DATED[kind], format=kind, dpi=style.PRINT_DPI)
-
-
-def _write_png(figure: Figure, file: str | Path | io.BytesIO) -> None:
-    """Write a figure as PNG, drawn once: `savefig` draws one with a layout twice."""
-    canvas, dpi = figure.canvas, figure.get_dpi()
-    if not isinstance(canvas, FigureCanvasAgg):
-        figure.savefig(file, format="png", dpi=style.DPI)
-        return
-    figure.set_dpi(style.DPI)
-    try:
-        canvas.print_png(file)  # type: ignore[no-untyped-call]
-    finally:
-        figure.set_dpi(dpi)
+        dpi = style.DPI if kind == "png" else style.PRINT_DPI
+        figure.savefig(partial, metadata=DATED[kind], format=kind, dpi=dpi)
 
 
 def save_prints(draw: Callable[[float], Figure], path: Path, widths: Sequence[float]) -> list[str]:

@@ -91,8 +91,11 @@ def colour_bar(
 ) -> Colorbar:
     """Put a colour bar beside a panel, or several, with plain numbers where the scale is logarithmic."""
     sheet = sheet_of(ax)
-    place: dict[str, Any] = {"fraction": 0.05, "pad": 0.02, "extend": scale.extend if scale else "neither"} | how
-    bar = ax.figure.colorbar(drawn, ax=[*beside] or ax, **place)
+    place: dict[str, Any] = {
+        "fraction": 0.05, "pad": 0.02, "extend": scale.extend if scale else "neither",
+        "use_gridspec": False,  # the panel keeps its place in the grid, from which the page is laid out
+    }  # fmt: skip
+    bar = ax.figure.colorbar(drawn, ax=[*beside] or ax, **place | how)
     lying = bar.orientation == "horizontal"
     _name(ax, bar.long_axis, label, (lambda: title_room(ax)) if lying else (lambda: side_room(ax)))
     bar.ax.tick_params(which="both", **_ticks(sheet))

@@ -119,7 +119,6 @@ def frame_figure(sweep: Sweep, number: int, scales: Scales, *, width: float | No
         sheet, panels, 2 + len({one.get_hatch() for slice_ in sweep.slices for one in page.failure_key(slice_)})
     )
     picture = page.Picture(sheet, layout.height)
-    picture.set_layout_engine("none")
     axes = [picture.add_axes(layout.panel(place)) for place in range(panels)]
     entries = contour.loss_panel(axes[0], dataset, scales.loss)
     if scales.slope:

@@ -17,7 +17,6 @@ def thumbnail_figure(dataset: xr.Dataset, *, width: float | None = None) -> Pict
     """Draw the losses of a slice over the whole of a small page; what is not OK is left grey."""
     sheet = style.Sheet.of(width, pitch=WIDTH)
     picture = Picture(sheet, SHAPE * sheet.width)
-    picture.set_layout_engine("none")
     ax = picture.add_axes((0, 0, 1, 1))
     ax.set_axis_off()
     picture.set_facecolor(style.UNSAMPLED)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from itertools import product
+from typing import TYPE_CHECKING, Any
 
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.font_manager import FontProperties
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.textpath import text_to_path
 
 from .. import style
@@ -43,7 +47,6 @@ def settle(picture: Picture) -> None:
     for ax, shape in shapes.items():
         ax.set_box_aspect(shape)
         ax.apply_aspect()
-    picture.set_layout_engine("none")
 
 
 def _set_height(picture: Picture, height: float) -> None:
@@ -52,9 +55,34 @@ def _set_height(picture: Picture, height: float) -> None:
 
 
 def _lay_out(picture: Picture) -> None:
-    engine = picture.get_layout_engine()
-    assert engine is not None  # as it is made
-    engine.execute(picture)
+    """Place the panels, by matplotlib's constrained layout.
+
+    It measures a panel, most of its work, several times in one place, a shared colour bar once for each of its panels;
+    each time it asks either axis for its ticks and their boxes up to eight times.
+    """
+    with ExitStack() as kept:
+        for ax in picture.axes:
+            _ask_once(ax, "get_tightbbox", ax, kept)
+            for axis, name in product((ax.xaxis, ax.yaxis), ("_update_ticks", "_get_ticklabel_bboxes")):
+                _ask_once(axis, name, ax, kept)
+        ConstrainedLayoutEngine().execute(picture)
+
+
+def _ask_once(artist: Artist, name: str, ax: Axes, kept: ExitStack) -> None:
+    """Let a method of a panel, or of its axis, be run anew only where the panel has moved, until `kept` is closed."""
+    ask: Callable[..., Any] | None = getattr(artist, name, None)
+    if ask is None:  # a matplotlib that has no such method is only slower
+        return
+    known: dict[str, Any] = {}
+
+    def answer(*about: Any, **how: Any) -> Any:
+        if known.get("place") != ax.bbox.bounds:
+            known["answer"] = ask(*about, **how)
+            known["place"] = ax.bbox.bounds  # afterwards: measuring a panel gives it its proportions
+        return known["answer"]
+
+    setattr(artist, name, answer)
+    kept.callback(delattr, artist, name)
 
 
 def _missing_height(picture: Picture, shapes: Mapping[Axes, float]) -> float:

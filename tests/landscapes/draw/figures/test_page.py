@@ -164,6 +164,21 @@ def test_every_figure_function_is_held_to_this() -> None:
     assert found == set(FIGURES)
 
 
+@pytest.mark.parametrize("kind", ["png", "pdf", "svg"])
+def test_a_picture_is_drawn_once_where_it_is_saved(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    picture, drawn, draw_ = landscape_figure(PLANE), [], page.Picture.draw
+    monkeypatch.setattr(page.Picture, "draw", lambda self, renderer: drawn.append(draw_(self, renderer)))
+    page.save(picture, tmp_path / f"picture.{kind}")
+    assert len(drawn) == 1
+
+
+def test_a_settled_panel_is_measured_anew() -> None:
+    ax = profile_figure(LONG).axes[0]
+    before = ax.get_tightbbox().width
+    ax.set_yticks([0.0], ["a much longer name than any number"])
+    assert ax.get_tightbbox().width > before + 10
+
+
 def test_a_notebook_shows_a_picture() -> None:
     assert thumbnail_figure(DATASET)._repr_png_().startswith(b"\x89PNG")
 

@@ -69,7 +69,6 @@ def test_cosines_are_as_wide_as_gradients_are_apart() -> None:
 
 def panel(*, side: float = 4.0):
     picture = Picture(style.Sheet.of(None, pitch=side), side)
-    picture.set_layout_engine("none")
     ax = picture.add_axes((0.1, 0.1, 0.8, 0.8))
     ax.set(xlim=(0, 1), ylim=(0, 1))
     return ax
