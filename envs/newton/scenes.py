@@ -38,7 +38,7 @@ class Flight(NewtonScene):
     space = speeds(5.0)
 
     def _thing(self) -> Any:
-        return self._engine("rollout").Sphere((0.0, 1.0, 0.0), 1.0, 1.0)
+        return self._engine("rollout").Sphere((0.0, 1.0, 0.0), 1.0, 1.0, joined=self.options.solver == "featherstone")
 
 
 @dataclass(frozen=True)

@@ -69,17 +69,32 @@ def test_check_says_which_solver_has_true_gradients(run, tmp_path):
     assert {"finite differences", "growth over horizons"} <= failed
 
 
-def test_what_finds_contacts_is_compiled_without_adjoints_and_has_them_again_afterwards():
-    """Newton's modules that launch something before any tape: where they are is its own to change."""
-    from gradscape.envs.engines.newton.rollout import FINDS_CONTACTS, without_adjoints
+@pytest.mark.parametrize("name", ["newton-ball", "newton-cloth"])
+def test_contacts_are_those_that_newtons_own_pipeline_finds_to_the_bit(name):
+    from gradscape.envs.engines.newton.compiling import forward, newton
 
-    scene("newton-ball", fidelity="draft").evaluate(torch.zeros(1, 3))
+    with scene(name, fidelity="draft")._solvers.lend() as rollout:
+        pipeline = newton.CollisionPipeline(rollout.model, broad_phase="explicit", soft_contact_gap=1e3)
+        theirs, ours = pipeline.contacts(), rollout.contacts
+        with forward("newton._src.geometry.kernels"):
+            pipeline.collide(rollout.model.state(), theirs)
+    assert theirs.soft_contact_count.numpy() == rollout.model.particle_count
+    for field in ("count", "particle", "shape", "body_pos", "body_vel", "normal"):
+        one, two = (getattr(contacts, f"soft_contact_{field}").numpy() for contacts in (theirs, ours))
+        assert (one == two).all(), field
+
+
+def test_of_a_solver_only_what_runs_is_compiled_and_elsewhere_adjoints_are_to_be_had_again():
+    """Where Newton has its kernels is its own to change."""
+    from gradscape.envs.engines.newton.compiling import ADJACENCY, SOLVERS
+
+    scene("newton-cloth", fidelity="draft").evaluate(torch.zeros(1, 3))
     modules = wp._src.context.user_modules
-    finders = [module for name, module in modules.items() if name.startswith(FINDS_CONTACTS) and module.execs]
-    assert len(finders) > 3
-    with without_adjoints():
-        assert not any(module.options["enable_backward"] for module in finders)
-    assert all(module.options["enable_backward"] for module in finders)
+    compiled = [module for name, module in modules.items() if name.startswith(SOLVERS) and module.execs]
+    assert len(compiled) > 2
+    assert {len(module.kernels) for module in compiled} == {1}
+    assert modules[ADJACENCY].execs
+    assert modules[ADJACENCY].options["enable_backward"]
 
 
 def test_without_damping_newtons_ball_is_ours():

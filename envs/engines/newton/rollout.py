@@ -1,50 +1,53 @@
 """Episodes of Newton's models: speeds at first in, places at the end out, differentiated by Warp's tape.
 
-Nothing of the engine is changed or left out: a gradient is what the tape makes of the launches of Newton's own steps.
+A gradient is what the tape makes of the launches of Newton's own steps, of which nothing is changed. Left out is what
+would do nothing: a cloth's limp triangles, a free body's joint, the search for contacts with a plane.
 """
 
 from __future__ import annotations
 
 import math
-import sys
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
-import newton
 import torch
 import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
 from ..runtime import to_torch
+from .compiling import finalize, newton, split_solvers
 
 TAPE = threading.Lock()  # Warp records on one tape at a time
-ROOM = 1e3  # how far from the ground contact is looked for, once [m]: wherever a thing starts
-FINDS_CONTACTS = "newton._src.geometry", "newton._src.sim.collide", "newton._src.utils.mesh"  # begin these modules
-SOLVERS: dict[str, Callable[[Any], Any]] = {
-    "semi-implicit": lambda model: newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False),
-    "featherstone": newton.solvers.SolverFeatherstone,
-    "xpbd": lambda model: newton.solvers.SolverXPBD(model, enable_restitution=True),
+SOLVERS: dict[str, tuple[str, dict[str, Any]]] = {  # of Newton, which imports those that are asked for
+    "semi-implicit": ("SolverSemiImplicit", {"enable_tri_contact": False}),
+    "featherstone": ("SolverFeatherstone", {}),
+    "xpbd": ("SolverXPBD", {"enable_restitution": True}),
 }
 
 
 @dataclass(frozen=True)
 class Sphere:
-    """A solid ball that is a rigid body and touches nothing: where it starts [m], its radius [m] and mass [kg]."""
+    """A solid ball that is a rigid body and touches nothing: where it starts [m], its radius [m] and mass [kg].
+
+    It is `joined` to the world by a joint that leaves it free where a solver has the coordinates of joints; others need
+    none, and their kernels for joints take longer to compile than all else.
+    """
 
     place: tuple[float, float, float]
     radius: float
     mass: float
+    joined: bool
 
     def add(self, builder: Any) -> None:
         """Add it to the model of one row."""
         inertia = 0.4 * self.mass * self.radius**2
         turned = wp.mat33(inertia, 0.0, 0.0, 0.0, inertia, 0.0, 0.0, 0.0, inertia)
-        builder.add_body(xform=wp.transform(self.place, wp.quat_identity()), mass=self.mass, inertia=turned)
+        add = builder.add_body if self.joined else builder.add_link
+        add(xform=wp.transform(self.place, wp.quat_identity()), mass=self.mass, inertia=turned)
 
 
 @dataclass(frozen=True)
@@ -134,17 +137,23 @@ class Settings:
     rows: int
 
 
-@contextmanager
-def without_adjoints() -> Iterator[None]:
-    """Compile what finds contacts without adjoints: they are found before any tape, and those take most of the time."""
-    names = [name for name in sys.modules if name.startswith(FINDS_CONTACTS)]
-    try:
-        for name in names:
-            wp.set_module_options({"enable_backward": False}, module=name)
-        yield
-    finally:
-        for name in names:
-            wp.set_module_options({"enable_backward": True}, module=name)
+def touch(model: Any) -> Any:
+    """Return contacts of all particles with the plane that is the only shape, once for all.
+
+    They hold points of the plane and its normal, which serve wherever the particles are: those under where they start.
+    It is what Newton's own pipeline finds, to the bit, whose kernels take as long to compile as all else.
+    """
+    contacts = newton.Contacts(0, model.particle_count, requires_grad=True, device="cpu")
+    plane: Any = wp.transform(*model.shape_transform.numpy()[0].tolist())
+    up: Any = wp.vec3(0.0, 0.0, 1.0)
+    places = [wp.vec3(*place) for place in model.particle_q.numpy().tolist()]
+    local = [wp.transform_point(wp.transform_inverse(plane), place) for place in places]
+    contacts.soft_contact_count.fill_(model.particle_count)
+    contacts.soft_contact_particle.assign(range(model.particle_count))
+    contacts.soft_contact_shape.zero_()
+    contacts.soft_contact_body_pos.assign([wp.transform_point(plane, at - up * wp.dot(up, at)) for at in local])
+    contacts.soft_contact_normal.fill_(wp.transform_vector(plane, up))
+    return contacts
 
 
 class Rollout:
@@ -158,20 +167,22 @@ class Rollout:
         if ground is not None:
             ground.add(whole)
         whole.replicate(one, settings.rows)
-        with without_adjoints():
-            self.model: Any = whole.finalize(device="cpu", requires_grad=True)
+        name, how = SOLVERS[settings.solver]
+        solver = getattr(newton.solvers, name)
+        with TAPE:
+            split_solvers()
+            self.model: Any = finalize(whole)
         self.model.particle_grid, self.model.particle_max_radius = None, 0.0  # particles, of any row, do not touch
         self.model.particle_max_velocity = math.inf  # what flies apart is to be seen as such, not held back
         if ground is not None:
             ground.tell(self.model)
-        self.solver: Any = SOLVERS[settings.solver](self.model)
+        self.model.tri_count = self.model.edge_count = 0  # of a cloth, limp: springs alone pull
+        self.solver: Any = solver(self.model, **how)
         self.states: list[Any] = [self.model.state() for _ in range(settings.steps + 1)]
         self.control = self.model.control()
-        self.contacts: Any = None
-        if ground is None:
+        self.contacts: Any = None if ground is None else touch(self.model)
+        with TAPE:
             self._step(0)  # compiles the kernels, or fetches them from Warp's cache
-        else:
-            self._find_contacts()
         faces: Any = self.model.tri_indices
         self.faces = to_torch(faces)[: one.tri_count] if one.tri_count else None
 
@@ -201,21 +212,6 @@ class Rollout:
             finally:
                 tape.zero()
 
-    def _find_contacts(self) -> None:
-        """Find once what touches the ground: a plane's points and normals are the same wherever a thing is.
-
-        A step with no contacts yet compiles the solver's kernels meanwhile.
-        """
-        pipeline = newton.CollisionPipeline(
-            self.model, broad_phase="explicit", soft_contact_gap=ROOM, requires_grad=True
-        )
-        self.contacts, found = pipeline.contacts(), pipeline.contacts()
-        with without_adjoints(), ThreadPoolExecutor(1) as beside:
-            finding = beside.submit(pipeline.collide, self.states[0], found)
-            self._step(0)
-            finding.result()
-        self.contacts = found
-
     def _play(self, velocity: Float[Tensor, "row 3"], tape: Any = None) -> None:
         self._begin(velocity)
         with tape or nullcontext():
@@ -237,10 +233,15 @@ class Rollout:
             to_torch(first.particle_qd).view(rows, -1, 3).copy_(given[:, None])
             return
         wp.copy(first.body_q, self.model.body_q)
-        wp.copy(first.joint_q, self.model.joint_q)
-        for speeds in (first.body_qd, first.joint_qd):  # maximal and generalised coordinates: a solver reads its own
+        if self.model.joint_count:
+            wp.copy(first.joint_q, self.model.joint_q)
+        for speeds in self._speeds(first):
             to_torch(speeds).view(rows, 6)[:, :3].copy_(given)
             to_torch(speeds).view(rows, 6)[:, 3:].zero_()
+
+    def _speeds(self, state: Any) -> list[Any]:
+        """Return the speeds of bodies in maximal and, where there are joints, generalised coordinates."""
+        return [state.body_qd, state.joint_qd] if self.model.joint_count else [state.body_qd]
 
     def _moving(self, state: Any) -> Any:
         """Return the array of places in a state: of particles, or of bodies with how they are turned."""
@@ -264,5 +265,5 @@ class Rollout:
         first, whole = self.states[0], self.settings.rows
         if self.model.particle_count:
             return to_torch(first.particle_qd.grad).view(whole, -1, 3).double().sum(dim=1)[:rows]
-        body, joint = (to_torch(one.grad).view(whole, 6)[:rows, :3].double() for one in (first.body_qd, first.joint_qd))
-        return body + joint
+        slopes = [to_torch(one.grad).view(whole, 6)[:rows, :3].double() for one in self._speeds(first)]
+        return torch.stack(slopes).sum(dim=0)
