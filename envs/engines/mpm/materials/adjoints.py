@@ -57,8 +57,9 @@ def after_p2g(name: str, material: MaterialKernels, count: int) -> Any:
     gather, found = adjoint_gatherers(name), blocks(name, count)
     adjoint_g2p, adjoint_p2g = gather.g2p, gather.p2g
     turn_back, affine_momentum, strain = material.turn_back, material.affine_momentum, material.strain
+    vec3 = precision(name).vec3
     own = {key: kind for key, kind in _taken(turn_back).items() if key != "adj_a"}
-    others = _taken(adjoint_p2g) | _taken(adjoint_g2p) | {"adj_x": wp.array2d[precision(name).vec3]}
+    others = _taken(adjoint_p2g) | _taken(adjoint_g2p) | {"adj_x": wp.array2d[vec3]}
     kinds = {key: kind for key, kind in others.items() if key not in {*own, "momentum"}} | own
 
     def kernel() -> Any:
