@@ -25,7 +25,10 @@ def nothing():  # type: ignore[no-untyped-def]
 
 
 def import_newton() -> Any:
-    """Import Newton, which takes 2 s too, while this thread reads the headers; not where Warp has compiled before."""
+    """Import Newton, which takes 2 s too, in another thread, while this one reads the headers.
+
+    Where Warp's cache has the kernel `nothing`, they are not read.
+    """
     wp.init()
     with ThreadPoolExecutor(1) as beside:
         importing = beside.submit(import_module, "newton")
