@@ -162,9 +162,10 @@ class SliceStore:
         grad: bool = True,
     ) -> SliceStore:
         """Go on with the store at `path`, or make it; a store made by other settings raises `StoreMismatchError`."""
-        with contextlib.suppress(StoreExistsError):
-            cls.create(path, plane, space, identity=identity, provenance=provenance, grad=grad)
-        store = cls.open(path)
+        try:
+            return cls.create(path, plane, space, identity=identity, provenance=provenance, grad=grad)
+        except StoreExistsError:
+            store = cls.open(path)
         check_identity(store.path, wanted=full_identity(identity, plane, space, grad=grad), found=store.identity)
         if store.ascending and store.path:
             remove(filling_path(store.path), FILES)  # left by a process that was killed when it had finished the slice
