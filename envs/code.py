@@ -18,7 +18,7 @@ from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 
-from ..landscapes.code import bare, file_of, tree_of
+from ..landscapes.code import bare, file_of
 from .engines import find_engine
 
 COMPUTES_LOSSES = False  # of this file too
@@ -81,7 +81,7 @@ def computes_losses(file: Path) -> bool:
         and any(isinstance(target, ast.Name) and target.id == "COMPUTES_LOSSES" for target in node.targets)
         and isinstance(node.value, ast.Constant)
         and node.value.value is False
-        for node in tree_of(file).body
+        for node in ast.parse(file.read_text()).body
     )
 
 
@@ -89,7 +89,7 @@ def computes_losses(file: Path) -> bool:
 def find_imports(file: Path, folder: Path, engine: str) -> tuple[Path, ...]:
     """Return the files of a folder that one of them imports while it runs."""
     found = []
-    for node in _walk_running(tree_of(file)):
+    for node in _walk_running(ast.parse(file.read_text())):
         if isinstance(node, ast.ImportFrom) and node.level:
             package = [file, *file.parents][node.level]
             home = package.joinpath(*node.module.split(".")) if node.module else package

@@ -13,12 +13,6 @@ from types import ModuleType
 
 
 @cache
-def tree_of(file: Path) -> ast.Module:
-    """Return the syntax tree of a file."""
-    return ast.parse(file.read_text())
-
-
-@cache
 def bare(file: Path, skipped: Collection[str] = frozenset()) -> str:
     """Return the code of a file line by line, without comments, docstrings, imports and what is `skipped`.
 
@@ -30,7 +24,7 @@ def bare(file: Path, skipped: Collection[str] = frozenset()) -> str:
         if token.type == tokenize.COMMENT:
             row, column = token.start
             lines[row - 1] = lines[row - 1][:column]
-    for node in ast.walk(tree_of(file)):
+    for node in ast.walk(ast.parse(text)):
         for silent in _silent(node, skipped):
             lines[silent.lineno - 1 : silent.end_lineno] = [""] * ((silent.end_lineno or 0) - silent.lineno + 1)
     return "\n".join(line.rstrip() for line in lines if line.strip())
@@ -42,10 +36,7 @@ def _silent(node: ast.AST, skipped: Collection[str]) -> Iterator[ast.stmt]:
         yield node
     if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.target.id in skipped:
         yield node
-    if (
-        isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
-        and ast.get_docstring(node, clean=False) is not None
-    ):
+    if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
         yield node.body[0]
 
 

@@ -12,7 +12,7 @@ from gradscape.envs.base import Environment
 from gradscape.envs.code import code_digest, computes_losses, find_files
 from gradscape.envs.mpm.plasticine import Plasticine
 from gradscape.envs.registry import BUILTIN, environment_class, make
-from gradscape.landscapes.code import bare, tree_of
+from gradscape.landscapes.code import bare
 
 SCENES = [entry.name for entry in BUILTIN]
 SOFT = {name for name in SCENES if issubclass(environment_class(name), Plasticine)}
@@ -31,7 +31,6 @@ def arm(folder: Path, text: str) -> type[Environment]:
     """Import the arm anew from a changed file."""
     (folder / "gradscape_code_arm.py").write_text(text)
     bare.cache_clear()
-    tree_of.cache_clear()
     importlib.invalidate_caches()
     found: type[Environment] = importlib.reload(importlib.import_module("gradscape_code_arm")).Arm
     return found

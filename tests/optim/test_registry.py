@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from gradscape.landscapes.code import bare, tree_of
+from gradscape.landscapes.code import bare
 from gradscape.optim.registry import BUILTIN, GROUP, code_digest, methods, optimizer_class
 
 OPTIMIZER = '''
@@ -119,7 +119,6 @@ def test_a_digest_changes_with_the_code_and_not_with_its_words(package, old, new
     before = code_digest(optimizer_class("corners"))
     sys.modules.pop("gradscape_test_corners")
     bare.cache_clear()
-    tree_of.cache_clear()
     assert old in OPTIMIZER
     package({"corners": "gradscape_test_corners:Corners"}, OPTIMIZER.replace(old, new))
     assert (code_digest(optimizer_class("corners")) == before) is same
