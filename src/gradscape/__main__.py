@@ -26,8 +26,8 @@ def main() -> Any:
 
 def _look_closer(_phase: str, _about: dict[str, int]) -> None:
     """Look for garbage more often once the first look begins."""
-    gc.callbacks.remove(_look_closer)
-    gc.set_threshold(YOUNG)
+    if gc.get_threshold()[0] == IMPORTED:
+        gc.set_threshold(YOUNG)
 
 
 if __name__ == "__main__":

@@ -326,14 +326,13 @@ def impact_kernels(name: str) -> Kernels:
             u = wp.dot(arriving, n)
             if u < -data.crawl:
                 hits[i + 1, e] = hits[i, e] + 1
-            after = real(0.0)
-            away = pull(data, surface, n, arriving)
-            back = rebound(data, wp.max(-u, real(0.0)))
+            after = rebound(data, wp.max(-u, real(0.0)))
+            rubbed, _ = deflect(data, n, arriving, turning, after)
+            away = pull(data, surface, n, rubbed)
             support[i + 1, e] = FREE
-            if away < real(0.0) and back < real(-0.5) * away * real(LINGER):
+            if away < real(0.0) and after < real(-0.5) * away * real(LINGER):
                 support[i + 1, e] = surface
-            else:
-                after = back
+                after = real(0.0)
             leaving, turned = deflect(data, n, arriving, turning, after)
             v[i + 1, e] = leaving
             spin[i + 1, e] = turned

@@ -207,23 +207,34 @@ def flights(board, dt, seed, rows=16, duration=2.0, name="float64", contacts="im
     half_length=st.sampled_from([0.6, 1.2]),
     seed=st.integers(0, 2**31),
 )
-@example(dt=0.125, restitution=0.0, friction=1.0, gravity=9.81, half_length=1.2, seed=28387)  # 5e-6 inside a round end
-@example(dt=0.125, restitution=0.0, friction=0.2, gravity=9.81, half_length=1.2, seed=2046)  # 8e-7 J more
+@example(dt=1 / 6, restitution=0.0, friction=0.0, gravity=9.81, half_length=1.2, seed=1446276515)  # 3e-5 m deep
+@example(dt=0.125, restitution=0.0, friction=0.2, gravity=9.81, half_length=1.2, seed=1280340127)  # rubbed too fast
 def test_at_any_step_nothing_is_tunnelled_and_energy_never_grows(dt, restitution, friction, gravity, half_length, seed):
     board = replace(CROWDED, restitution=restitution, friction=friction, gravity=gravity, half_length=half_length)
     thrown, angle, used = flights(board, dt, seed, duration=min(2.0, 120 * dt))
     x, v, spin = (thrown.flight.tensor(f)[: len(used)] for f in ("x", "v", "spin"))
-    clear = clearance(board, angle, x)
+    clear, turns = clearance(board, angle, x), rolls_round(board, thrown)[: len(used)]
     rolled = torch.zeros_like(used)
-    rolled[1:] = rolls_round(board, thrown)[: len(used) - 1]
-    assert float(clear[used & ~rolled].min()) > -1e-9
-    assert float(clear[used].min()) > -1e-5  # around round ends paths have fifth-order errors of 1/240 s
-    flown = used[1:] & ~rolls_round(board, thrown)[: len(used) - 1]
+    rolled[1:] = turns[:-1]
+    assert float(clear[used & ~rolled].min()) > -1e-8  # where two surfaces jam a ball, it is 1e-9 m deep
+    assert float(clear[used].min()) > -1e-4  # a ball that turns back within 1/240 s has been g/2 (1/240 s)^2 deep
+    flown = used[1:] & ~turns[:-1]
     for between in on_parabolas(thrown, used, x, v):
-        assert float(clearance(board, angle, between)[flown].min()) > -1e-9
+        assert float(clearance(board, angle, between)[flown].min()) > -1e-8
     gain = energy(board, x, v, spin).diff(dim=0)
-    assert float(gain[flown].max()) < 1e-11
-    assert float(gain[used[1:]].max()) < 1e-5  # of 100 J; around round ends a path may be 1e-5 m too high
+    assert float(gain[flown].max()) < 1e-8  # of 100 J; 1e-11 but where two surfaces jam a ball
+    assert float(gain[used[1:]].max()) < 1e-7  # of 100 J; around round ends: fifth-order errors of 1/240 s
+    assert all(press > -1e-9 for press in pressing(board, thrown, angle, used & turns))
+
+
+def pressing(board, thrown, angle, carried):
+    """Return by what force by mass [m/s^2] round ends push the balls that they carry."""
+    step, row = carried.nonzero(as_tuple=True)
+    x, v, support = (thrown.flight.tensor(f)[step, row] for f in ("x", "v", "support"))
+    turned = angle[row, support // 4]
+    tip = board.half_length * torch.stack([turned.cos(), turned.sin()], dim=1) * (1 - 2 * (support % 2))[:, None]
+    n = x - torch.tensor(board.pivots, dtype=torch.float64)[support // 4] - tip
+    return board.gravity * n[:, 1] / n.norm(dim=1) - v.square().sum(dim=1) / (board.ball_radius + board.bar_radius)
 
 
 def rolls_round(board, thrown):
