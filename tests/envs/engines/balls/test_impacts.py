@@ -216,13 +216,18 @@ def test_at_any_step_nothing_is_tunnelled_and_energy_never_grows(dt, restitution
     clear, turns = clearance(board, angle, x), rolls_round(board, thrown)[: len(used)]
     rolled = torch.zeros_like(used)
     rolled[1:] = turns[:-1]
-    assert float(clear[used & ~rolled].min()) > -1e-8  # where two surfaces jam a ball, it is 1e-9 m deep
+    free = thrown.flight.tensor("impacts").amax(dim=0) < JAM - 1  # two surfaces jam the others, by rounding
+    assert float(clear[used & ~rolled & free].min()) > -1e-9
+    assert float(clear[used & ~rolled].min()) > -1e-8
     assert float(clear[used].min()) > -1e-4  # a ball that turns back within 1/240 s has been g/2 (1/240 s)^2 deep
     flown = used[1:] & ~turns[:-1]
     for between in on_parabolas(thrown, used, x, v):
-        assert float(clearance(board, angle, between)[flown].min()) > -1e-8
+        left = clearance(board, angle, between)
+        assert float(left[flown & free].min()) > -1e-9
+        assert float(left[flown].min()) > -1e-8
     gain = energy(board, x, v, spin).diff(dim=0)
-    assert float(gain[flown].max()) < 1e-8  # of 100 J; 1e-11 but where two surfaces jam a ball
+    assert float(gain[flown & free].max()) < 1e-11
+    assert float(gain[flown].max()) < 1e-8
     assert float(gain[used[1:]].max()) < 1e-7  # of 100 J; around round ends: fifth-order errors of 1/240 s
     assert bool((pressing(board, thrown, angle, used & turns) > -1e-9).all())
 
