@@ -30,7 +30,11 @@ Dims = Annotated[
 ]
 SomeDims = Annotated[
     list[str] | None,
-    typer.Option("--dims", metavar="DIM [DIM]", help="The one or two parameters to vary, by number or by name."),
+    typer.Option(
+        "--dims",
+        metavar="DIM [DIM]",
+        help="The one or two parameters to vary, by number or by name; all where there are no more.",
+    ),
 ]
 Along = Annotated[
     str | None,
@@ -77,7 +81,9 @@ OutOfStudy = Annotated[
 ForceStudy = Annotated[bool, typer.Option("--force", help="Begin anew where a study exists already.")]
 Extent = Annotated[
     str | None,
-    typer.Option(help="What to cover: a fraction of the box around the point, or LOW:HIGH; the whole box by default."),
+    typer.Option(
+        help="What to cover: a fraction of the box around the point, or the values LOW:HIGH; the whole box by default."
+    ),
 ]
 Through = Annotated[
     str,

@@ -20,6 +20,7 @@ from ..landscapes.measures.slice_comparison_record import SliceComparison
 from ..landscapes.objective import Objective
 from ..landscapes.plain import plain_json
 from ..landscapes.slice import Slice
+from ..landscapes.space import scaled_labels
 from ..landscapes.storage.files import tidy, visible_files
 from ..landscapes.storage.paths import slice_exists
 from ..landscapes.storage.records import read_json, reading, write_record
@@ -78,7 +79,8 @@ class CompareJob:
             identity = {"a": slice.identity, "b": other.identity}
         else:
             unit = getattr(other, "loss_unit", "")
-            check_landscapes(parameters(ours), other.space.names, loss_unit(ours), unit)
+            theirs = scaled_labels(other.space.names, other.space.scales)
+            check_landscapes(parameters(ours), theirs, loss_unit(ours), unit)
             check_finished(ours)
             identity = {"a": slice.identity, "b": identity_of(other)}
         names = [str(one.get("objective", "slice")) for one in identity.values()]

@@ -125,17 +125,22 @@ class EpisodeJob:
         outcome = f"no loss: {FAILURES[status]}" if failed else f"loss {number(loss)} {env.loss_unit}".rstrip()
         values = {
             name: f"{number(value)} {unit}".rstrip()
-            for name, value, unit in zip(env.space.names, self.x.tolist(), env.space.units, strict=True)
+            for name, value, unit in zip(env.space.names, self._values(), env.space.units, strict=True)
         }
         about = provenance(env, self.command)
         said = [f"gradscape {__version__}", env.device, str(about["created"]), str(about["command"])]
         return Caption(f"{env.name} · {env.fidelity.name}", outcome, self.source, values, RECORD, " · ".join(said))
 
+    def _values(self) -> list[float]:
+        """Return the parameters' values."""
+        values: list[float] = self.env.space.to_values(self.x).tolist()
+        return values
+
     def _record(self, loss: float, status: Status) -> EpisodeRecord:
         return EpisodeRecord(
             identity=self.env.identity(),
             provenance=provenance(self.env, self.command),
-            parameters=dict(zip(self.env.space.names, self.x.tolist(), strict=True)),
+            parameters=dict(zip(self.env.space.names, self._values(), strict=True)),
             loss=loss if status == Status.OK else None,
             status=status.name,
         )

@@ -214,7 +214,8 @@ class SweepJob:
             slices = [self._sample(number, count) for number in range(len(self.stores))]
         from ..landscapes.draw.figures.sweep import Sweep
 
-        return Sweep(self.motion.label, self.motion.values, self.motion.slices(slices))
+        moved = self.motion
+        return Sweep(moved.label, moved.values, moved.slices(slices), moved.logarithmic)
 
     def say_kept(self) -> str:
         """Say how much of it is on disk."""

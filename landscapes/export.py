@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 import xarray as xr
 
-from .identity import plane_of
+from .identity import plane_of, stored_scales
+from .space import LINEAR, scaled_labels, to_values
 from .storage.arrays import parameters_of
 from .storage.files import replacing
 
@@ -39,8 +41,9 @@ def save_as(dataset: xr.Dataset, path: Path, kind: str) -> None:
 def frame(dataset: xr.Dataset) -> pd.DataFrame:
     """Return a slice, a row for each sample, or a run, a row for each episode, columns named with their units.
 
-    A slice's rows begin with the plane's coordinates, a run's with the parameters; then come the loss, in words how the
-    evaluation ended and, where they were asked for, the gradient's components.
+    A slice's rows begin with the values along the plane's axes, a run's with those of the parameters; then come the
+    loss, in words how the evaluation ended and, where they were asked for, the gradient's components: of a logarithmic
+    parameter "gradient by log10 k", per decade.
     """
     import pandas as pd
 
@@ -55,22 +58,22 @@ def frame(dataset: xr.Dataset) -> pd.DataFrame:
             columns[_label(name, str(dataset[name].attrs.get("units", "")))] = dataset[name].to_numpy()
     if "grad" in dataset:
         grad = dataset["grad"].to_numpy().reshape(-1, dataset.sizes["dim"])
-        for (name, by), slope in zip(parameters_of(dataset), grad.T, strict=True):
-            per = f"{unit or '1'}/({by})" if by else unit
-            columns[_label(f"gradient by {name}", per)] = slope
+        for (name, by), scale, slope in zip(parameters_of(dataset), stored_scales(dataset), grad.T, strict=True):
+            per = f"{unit or '1'}/({by})" if by and scale == LINEAR else unit
+            columns[_label(f"gradient by {scaled_labels([name], [scale])[0]}", per)] = slope
     return pd.DataFrame(columns)
 
 
 def _places(dataset: xr.Dataset) -> dict[str, np.ndarray]:
-    """Return the plane's coordinates of every sample, u varying fastest."""
-    axes = [dataset[name].to_numpy() for name in dataset["loss"].dims]
-    grid = np.meshgrid(*axes, indexing="ij")[::-1]
-    return {label: axis.ravel() for label, axis in zip(plane_of(dataset).labels, grid, strict=True)}
+    """Return the values along the plane's axes at every sample, u varying fastest."""
+    axes, plane = [dataset[name].to_numpy() for name in dataset["loss"].dims], plane_of(dataset)
+    grid = np.stack(np.meshgrid(*axes, indexing="ij")[::-1], axis=-1).reshape(-1, plane.rank)
+    return dict(zip(plane.labels, plane.to_values(torch.from_numpy(grid)).numpy().T, strict=True))
 
 
 def _points(run: xr.Dataset) -> dict[str, np.ndarray]:
     """Return number and parameters of every episode."""
-    values = run["x"].to_numpy().T
+    values = to_values(torch.from_numpy(run["x"].to_numpy()), stored_scales(run)).numpy().T
     named = {_label(*one): column for one, column in zip(parameters_of(run), values, strict=True)}
     return {"episode": run["episodes"].to_numpy(), **named}
 

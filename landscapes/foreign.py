@@ -70,7 +70,7 @@ def table_point(space: ParameterSpace, text: str) -> Tensor | None:
     at = int(row) - 1 if row else _best_row(frame, path)
     if not 0 <= at < len(frame):
         raise ValueError(f"{path} has {len(frame)} rows of points, counted from 1; got row {row or 1}")
-    return torch.from_numpy(_parameters(frame.iloc[[at]], space, str(path))[0])
+    return space.from_values(torch.from_numpy(_parameters(frame.iloc[[at]], space, str(path))[0]))
 
 
 def _best_row(frame: pd.DataFrame, path: Path) -> int:
@@ -144,7 +144,8 @@ def points_table(frame: pd.DataFrame, dataset: xr.Dataset, space: ParameterSpace
     Raises ValueError where a column is missing or holds no numbers, and where there is no point.
     """
     unit = str(dataset["loss"].attrs.get("units", ""))
-    x, loss = _parameters(frame, space, name), _column(frame, LOSS, f"{LOSS} [{unit}]", name=name, gaps=True)
+    x = space.from_values(torch.from_numpy(_parameters(frame, space, name))).numpy()
+    loss = _column(frame, LOSS, f"{LOSS} [{unit}]", name=name, gaps=True)
     if not len(x):
         raise ValueError(f"{name} holds no point")
     ended = np.where(np.isfinite(loss), Status.OK, Status.NONFINITE).astype(np.int8)

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 from .. import __version__
 from .plain import plain_json
 from .plane import Plane
-from .space import ParameterSpace
+from .space import LINEAR, ParameterSpace
 
 if TYPE_CHECKING:
     import xarray as xr
 
 EVERY = "gradients_every"  # of a slice's identity; not there where its gradients are at every sample
+SCALES = "scales"  # of the parameters in an identity; not there where all are linear
 ABSENT = "none"  # in the place of a setting's value
 LISTED_SETTINGS = 6  # settings that differ, in the refusal of a store
 
@@ -46,10 +47,20 @@ def full_identity(identity: Mapping[str, Any], plane: Plane, space: ParameterSpa
 
     Raises ValueError where the settings hold a name of the slice's own, or are not plain JSON.
     """
-    own = {"plane": plane.record(), "parameters": space.names, "gradients": grad, "gradscape": __version__}
+    own = {"plane": plane.record(), **record_parameters(space), "gradients": grad, "gradscape": __version__}
     if clash := own.keys() & identity.keys():
         raise ValueError(f"a slice's identity gets {', '.join(sorted(clash))} from the slice; leave them out")
     return plain_json({**identity, **own}, "a slice's identity")
+
+
+def record_parameters(space: ParameterSpace) -> dict[str, Any]:
+    """Return what an identity says of the parameters: their names, and their scales unless all are linear."""
+    return {"parameters": list(space.names), **({} if space.is_linear else {SCALES: list(space.scales)})}
+
+
+def stored_scales(dataset: xr.Dataset) -> tuple[str, ...]:
+    """Return the scales that the parameters of a slice or a run are on: of points `x` and of gradients."""
+    return tuple(stored_identity(dataset).get(SCALES, [LINEAR] * dataset.sizes["dim"]))
 
 
 def with_stride(identity: Mapping[str, Any], gradients: int) -> dict[str, Any]:

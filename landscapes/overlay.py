@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .identity import plane_of
+from .identity import plane_of, stored_scales
 from .lattice import own_cells
 from .plane import Plane
 
@@ -51,6 +51,11 @@ def lay(dataset: xr.Dataset, table: xr.Dataset, label: str) -> xr.Dataset:
             f"{label} searched {table.sizes['dim']} parameters ({_list_parameters(table)}), the slice has "
             f"{len(parameters)} ({_list_parameters(dataset)}); lay runs over slices of the same environment"
         )
+    if stored_scales(dataset) != stored_scales(table):
+        raise ValueError(
+            f"{label} searched parameters on the scales {', '.join(stored_scales(table))}, the slice has "
+            f"{', '.join(stored_scales(dataset))}; lay runs over slices of the same environment"
+        )
     half, x = _box(table)[1], _points(table)
     scaled = replace(plane, origin=plane.origin / half, basis=plane.basis / half)
     place = scaled.project(x / half)
@@ -87,7 +92,7 @@ def lowered(best: NDArray[np.float64]) -> NDArray[np.intp]:
 
 
 def best_point(tables: Sequence[xr.Dataset]) -> tuple[Float[Tensor, " dim"], float]:
-    """Return the point of least loss among all the runs, and its loss.
+    """Return the point of least loss among all the runs, as `evaluate` takes it, and its loss.
 
     Raises ValueError where no episode succeeded.
     """

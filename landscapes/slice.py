@@ -37,8 +37,9 @@ class Slice:
     """Hold the samples of a slice.
 
     `data` is an xarray dataset of loss(v, u), grad(v, u, dim) unless sampled without, and status(v, u); a line has no
-    v. `folder` is where its files are, None for one in memory. `remake` makes the objective again that it was sampled
-    from, for what has to be evaluated anew.
+    v. Along a logarithmic parameter a coordinate is the decimal logarithm of the value, and has the attribute `scale`,
+    "log10"; gradients are by it. `folder` is where its files are, None for one in memory. `remake` makes the objective
+    again that it was sampled from, for what has to be evaluated anew.
     """
 
     data: xr.Dataset
@@ -74,9 +75,9 @@ class Slice:
     def minima(self, depth: float = 0.01) -> pd.DataFrame:
         """Return the local minima deeper than a share of the range of the losses, deepest first, a row each.
 
-        The columns are the plane's coordinates, the loss there, and the depth: how far one must climb to get to a lower
-        minimum (persistence). The depth of the lowest is the range of the losses. Of a refined slice its finest lattice
-        that is sampled everywhere counts.
+        The columns are the values along the plane's axes, the loss there, and the depth: how far one must climb to get
+        to a lower minimum (persistence). The depth of the lowest is the range of the losses. Of a refined slice its
+        finest lattice that is sampled everywhere counts.
         """
         import pandas as pd
 
@@ -88,8 +89,9 @@ class Slice:
         found = minima(loss)
         deep = found.depth > depth * span(loss)
         places = np.unravel_index(found.sample[deep], loss.shape)[::-1]  # u first
-        axes = (axis.numpy()[at] for axis, at in zip(plane_of(data).axes(), places, strict=True))
-        columns = dict(zip(self.plane.labels, axes, strict=True))
+        axes = [axis[torch.from_numpy(at)] for axis, at in zip(plane_of(data).axes(), places, strict=True)]
+        values = self.plane.to_values(torch.stack(axes, dim=-1))
+        columns = dict(zip(self.plane.labels, values.numpy().T, strict=True))
         return pd.DataFrame({**columns, "loss": loss.ravel()[found.sample[deep]], "depth": found.depth[deep]})
 
     def plot(self, runs: Sequence[HasData] = (), *, width: float | None = None) -> Picture:

@@ -184,7 +184,7 @@ def thin_out(whole: xr.Dataset) -> xr.Dataset:
     ]
     ends = [low + 2 * step * (count - 1) for low, step, count in zip(plane.lower, steps, shape, strict=True)]
     return _dataset(
-        Plane(plane.origin, plane.basis, plane.lower, torch.stack(ends), shape, plane.labels),
+        Plane(plane.origin, plane.basis, plane.lower, torch.stack(ends), shape, plane.labels, plane.scales),
         thin["loss"].to_numpy(),
         thin["grad"].to_numpy(),
     )

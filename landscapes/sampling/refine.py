@@ -23,7 +23,7 @@ import torch
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..identity import DamagedError, check_identity
+from ..identity import DamagedError, check_identity, record_parameters
 from ..objective import Objective, Status, evaluate
 from ..plane import Plane
 from ..storage.checkpoint import Checkpoint
@@ -138,7 +138,7 @@ def refine(
     Raises StoreMismatchError where the store was made by other settings, ValueError for a budget that does not cover
     the coarsest lattice, DamagedError where a finished one is damaged, and what `sample` does.
     """
-    wanted = {"plane": plane.record(), "parameters": list(objective.space.names)}
+    wanted = {"plane": plane.record(), **record_parameters(objective.space)}
     check_identity(store.path, wanted=wanted, found={name: store.identity[name] for name in wanted})
     refinement.check(plane)
     if store.ascending:

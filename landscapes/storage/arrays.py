@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..capacity import BLOCK, Need, require
 from ..objective import Status
 from ..plane import Plane
-from ..space import ParameterSpace
+from ..space import LOG10, ParameterSpace
 from .checksums import SUMS, lay_out_sums, text_sum, write_sums
 from .layout import CODECS, COMPACT_CODECS, analysis_chunks, consolidate, create_array, flags
 from .ownership import store_files
@@ -128,6 +128,7 @@ def parameters_of(dataset: xr.Dataset) -> list[tuple[str, str]]:
 
 def _axis(plane: Plane, number: int) -> dict[str, str]:
     about = {"label": plane.labels[number], "long_name": plane.names[number]}
+    about |= {"scale": LOG10} if plane.scales[number] == LOG10 else {}
     return about | ({"units": plane.units[number]} if plane.units[number] else {})
 
 

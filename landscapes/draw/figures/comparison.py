@@ -133,7 +133,7 @@ def _draw_lines(found: SliceComparison, width: float | None) -> tuple[page.Pictu
         _curves(axes[2], found, [box_slopes(one)[:, 0] for one in found.data])
         panel.name_axes(axes[2], y=f"slope [{found.loss_unit or 'loss'} per side]")
     for ax in axes:
-        panel.dress(ax)
+        panel.dress(ax, plane)
         ax.set_box_aspect(height / (sheet.width - ROOM * sheet.type))
         ax.set_xlim(float(plane.lower[0]), float(plane.upper[0]))
     for ax in axes[1:]:

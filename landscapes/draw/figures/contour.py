@@ -58,7 +58,7 @@ def landscape_figure(dataset: xr.Dataset, *, width: float | None = None) -> page
 
 def frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
     """Give a panel over a slice its limits, its ticks and its failures."""
-    panel.dress(ax)
+    panel.dress(ax, plane)
     ax.set_box_aspect(1)
     ax.set_xlim(*_limits(plane, 0))
     ax.set_ylim(*_limits(plane, 1))
@@ -168,9 +168,9 @@ def magnitude(slope: Grid, plane: Plane, loss_unit: str) -> tuple[Grid, str]:
     Where both axes have the same unit it is the gradient's projection on the plane. Otherwise lengths along them cannot
     be added, and it is taken per width of the box instead.
     """
-    if len(set(plane.units)) == 1:
+    if len(set(plane.coordinate_units)) == 1:
         along: Grid = slope @ torch.linalg.pinv(plane.basis).T.numpy()
-        unit = plane.units[0]
+        unit = plane.coordinate_units[0]
         unit = f"{loss_unit or '1'}/({unit})" if "/" in unit else f"{loss_unit or '1'}/{unit}" if unit else loss_unit
     else:
         along = slope * (plane.upper - plane.lower).numpy()

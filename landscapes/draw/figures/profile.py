@@ -112,13 +112,13 @@ def _differences(u: NDArray[np.float64], loss: NDArray[np.float64]) -> NDArray[n
 
 
 def _slope_label(plane: Plane, loss_unit: str) -> str:
-    unit = plane.units[0]
+    unit = plane.coordinate_units[0]
     per = f"({unit})" if "/" in unit else unit
     return f"slope of the loss [{loss_unit or '1'}/{per}]" if unit else "slope of the loss"
 
 
 def _frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
-    panel.dress(ax)
+    panel.dress(ax, plane)
     ax.set_xlim(float(plane.lower[0]), float(plane.upper[0]))
     u, status = dataset["u"].to_numpy(), dataset["status"].to_numpy()
     edges = np.concatenate([u[:1], (u[1:] + u[:-1]) / 2, u[-1:]])

@@ -143,7 +143,7 @@ def log_axes(stream: rr.RecordingStream, scene: Scene, dataset: xr.Dataset) -> N
         ticks, share = scene.body.ticks(axis)
         places = [scene.stand.beside(axis, part, TICKS) for part in share]
         places.append(scene.stand.beside(axis, 0.5, NAMES) if axis < 2 else scene.stand.beside(axis, OVER, TICKS))
-        labels = [*map(style.number, ticks.tolist()), name]
+        labels = [*(scene.body.write(axis, tick) for tick in ticks.tolist()), name]
         points = rr.Points3D(places, labels=labels, show_labels=True, colors=rgba(style.MID_GREY), radii=DOT)
         _log(stream, f"landscape/axes/{'uvz'[axis]}", points)
 

@@ -199,12 +199,11 @@ def _label(ax: Axes, dataset: xr.Dataset, shown: Shown) -> None:
     room = sheet.type / sheet.zoom  # that type takes up of the scene
     for axis, name in enumerate((*body.plane.labels, page.loss_name(dataset))):
         ticks, share = body.ticks(axis)
-        logarithmic = axis == 2 and body.scale.logarithmic
         spots = shown.on_picture(np.array([shown.stand.beside(axis, part, room * AWAY[axis]) for part in share]))
         look: dict[str, Any] = {"size": sheet.tick, "color": style.INK, "va": "center"}
         look["ha"] = "left" if axis == 2 else "center"
         for tick, (x, y) in zip(ticks.tolist(), spots, strict=True):
-            ax.text(x, y, style.power(tick) if logarithmic else style.number(tick), **look)
+            ax.text(x, y, body.write(axis, tick), **look)
         _name(ax, shown, axis, name, room * OUT[axis])
 
 
