@@ -42,7 +42,7 @@ def _slopes(dataset: xr.Dataset) -> dict[str, np.ndarray[Any, Any]]:
     plane = plane_of(dataset)
     grad = dataset["grad"].to_numpy().reshape(dataset["loss"].size, -1)
     along = plane.slope(torch.from_numpy(grad)).numpy().T
-    slopes = {f"slope along {label}": column for label, column in zip(plane.labels, along, strict=True)}
+    slopes = {f"slope along {label}": column for label, column in zip(plane.scaled_labels, along, strict=True)}
     return {**slopes, "length of the gradient in all dimensions": np.linalg.norm(grad, axis=1)}
 
 

@@ -13,19 +13,21 @@ from . import style
 
 WIDE = 6  # ticks in a panel with room for them
 PLAIN = 3  # digits of values that are written without a power of ten
+NEAR = 1e-9  # what rounding may change of a logarithm
 DENSE = (range(1, 10), (1, 2, 5))  # multiples of powers of ten, from the densest on
 
 
 def decades(low: float, high: float, most: int = WIDE) -> list[float]:
     """Return the logarithms of about so many round values whose logarithms lie between two ends, ascending."""
-    whole = range(math.ceil(low), math.floor(high) + 1)
+    whole = range(math.ceil(low - NEAR), math.floor(high + NEAR) + 1)
     if len(whole) >= max(2, most // 2):
         every = -(-len(whole) // most)
         return [float(power) for power in whole if power % every == 0]
     for factors in reversed(DENSE):
         if len(found := _multiples(low, high, factors)) >= max(2, most // 2):
             return found
-    return [math.log10(value) for value in style.round_values(10.0**low, 10.0**high) if value > 0]
+    values = style.round_values(10.0**low * (1 - NEAR), 10.0**high * (1 + NEAR))
+    return [min(max(math.log10(value), low), high) for value in values]
 
 
 def between_decades(low: float, high: float, most: int = WIDE) -> list[float]:
@@ -36,12 +38,12 @@ def between_decades(low: float, high: float, most: int = WIDE) -> list[float]:
 def _multiples(low: float, high: float, factors: Sequence[int]) -> list[float]:
     powers = range(math.floor(low), math.ceil(high) + 1)
     places = [power + math.log10(factor) for power in powers for factor in factors]
-    return [place for place in places if low - 1e-9 <= place <= high + 1e-9]
+    return [place for place in places if low - NEAR <= place <= high + NEAR]
 
 
 def write_power(place: float) -> str:
     """Write the value whose logarithm this is: a multiple of a power of ten, or else a plain number."""
-    factor = 10.0 ** (place - math.floor(place + 1e-9))
+    factor = 10.0 ** (place - math.floor(place + NEAR))
     return style.power(10.0**place, PLAIN) if abs(factor - round(factor)) < 1e-6 else style.number(10.0**place)
 
 
