@@ -223,4 +223,6 @@ def read_extent(text: str | None) -> float | tuple[float, float] | None:
     try:
         return (float(low), float(high)) if colon else float(low)
     except ValueError:
-        raise ValueError(f"--extent takes a fraction or LOW:HIGH in the parameters' unit; got {text!r}") from None
+        raise ValueError(
+            f"--extent takes a fraction or values LOW:HIGH in the parameters' unit; got {text!r}"
+        ) from None

@@ -59,8 +59,9 @@ def record_parameters(space: ParameterSpace) -> dict[str, Any]:
 
 
 def stored_scales(dataset: xr.Dataset) -> tuple[str, ...]:
-    """Return the scales that the parameters of a slice or a run are on: of points `x` and of gradients."""
-    return tuple(stored_identity(dataset).get(SCALES, [LINEAR] * dataset.sizes["dim"]))
+    """Return the scales that the parameters of a slice or a run are on, linear where nothing else is said."""
+    about = stored_identity(dataset) if "identity" in dataset.attrs else {}
+    return tuple(about.get(SCALES, [LINEAR] * dataset.sizes["dim"]))
 
 
 def with_stride(identity: Mapping[str, Any], gradients: int) -> dict[str, Any]:
