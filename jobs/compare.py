@@ -79,12 +79,12 @@ class CompareJob:
             identity = {"a": slice.identity, "b": other.identity}
         else:
             unit = getattr(other, "loss_unit", "")
-            theirs = scaled_labels(other.space.names, other.space.scales)
-            check_landscapes(parameters(ours), theirs, loss_unit(ours), unit)
+            names = scaled_labels(other.space.names, other.space.scales)
+            check_landscapes(parameters(ours), names, loss_unit(ours), unit)
             check_finished(ours)
             identity = {"a": slice.identity, "b": identity_of(other)}
-        names = [str(one.get("objective", "slice")) for one in identity.values()]
-        folder = out or folder_named(["compare", *dict.fromkeys(names)], identity)
+        named = [str(one.get("objective", "slice")) for one in identity.values()]
+        folder = out or folder_named(["compare", *dict.fromkeys(named)], identity)
         COMPARISON.check(folder, allowed=[file for file in visible_files(folder) if slice_exists(file / SLICE_STORE)])
         if not force:
             _refuse_another(folder / RECORD, identity)

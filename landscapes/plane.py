@@ -95,10 +95,7 @@ class Plane:
         if origin.shape != (space.dim,):
             raise ValueError(f"a slice goes through a point of shape ({space.dim},); got shape {tuple(origin.shape)}")
         scales = tuple(space.scales[number] for number in numbers)
-        if _is_sequence(extent):
-            lower, upper = (_scaled(end, scales) for end in _ends(extent, len(numbers)))
-        else:
-            lower, upper = _bounds(space.lower[numbers], space.upper[numbers], origin[numbers], extent)
+        lower, upper = _bounds(space.lower[numbers], space.upper[numbers], origin[numbers], extent, scales)
         start = origin.clone()
         start[numbers] = 0
         basis = torch.eye(space.dim, dtype=torch.float64)[numbers]
@@ -289,10 +286,14 @@ def _bounds(
     lower: Float[Tensor, " rank"],
     upper: Float[Tensor, " rank"],
     center: Float[Tensor, " rank"],
-    extent: float | None,
+    extent: float | tuple[Bound, Bound] | None,
+    scales: tuple[str, ...],
 ) -> tuple[Float[Tensor, " rank"], Float[Tensor, " rank"]]:
     if extent is None:
         return lower.clone(), upper.clone()
+    if _is_sequence(extent):
+        start, end = _ends(extent, len(lower))
+        return _scaled(start, scales), _scaled(end, scales)
     fraction = float(as_tensor(extent, "extent"))
     if not 0 < fraction < np.inf:
         raise ValueError(f"extent as a fraction of the bounds must be positive and finite; got {fraction}")

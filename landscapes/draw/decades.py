@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import numpy as np
 from matplotlib.axis import Axis
 from matplotlib.ticker import FuncFormatter, Locator
 
@@ -60,8 +59,8 @@ class DecadeLocator(Locator):
 
     def tick_values(self, vmin: float, vmax: float) -> Sequence[float]:
         """Return where ticks are between two ends."""
-        find = between_decades if self.minor else decades
-        return np.array(find(*sorted((vmin, vmax)), self.most))
+        low, high = sorted((vmin, vmax))
+        return between_decades(low, high, self.most) if self.minor else decades(low, high, self.most)
 
 
 def mark_decades(axis: Axis, most: int = WIDE) -> None:

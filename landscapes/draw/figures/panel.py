@@ -42,9 +42,9 @@ def dress(ax: Axes, plane: Plane | None = None) -> None:
     ax.spines[:].set(color=style.QUIET, linewidth=max(0.4, 0.6 * sheet.weight))
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_locator(MaxNLocator(5 if sheet.pitch > NARROW else 3))
-    for axis, scale in zip((ax.xaxis, ax.yaxis), plane.scales if plane else (), strict=False):
+    for number, scale in enumerate(plane.scales if plane else ()):
         if scale == LOG10:
-            mark_decades(axis, DECADES[sheet.pitch > NARROW])
+            mark_decades((ax.xaxis, ax.yaxis)[number], DECADES[sheet.pitch > NARROW])
 
 
 def log_axis(axis: Axis) -> None:

@@ -179,8 +179,8 @@ def _draw_range(picture: page.Picture, layout: Layout, sweep: Sweep, value: floa
     ax.plot([low, here], [0, 0], color=style.LOSS_LINE, **bar)
     ax.plot([here], [0], marker="o", color=style.LOSS_LINE, **sheet.look({"markersize": 8, "clip_on": False}))
     plain: dict[str, Any] = {"textcoords": "offset points", "parse_math": False, "annotation_clip": False}
-    for end, place, at in zip(ends, (low, high), ("left", "right"), strict=True):
+    for end, spot, at in zip(ends, (low, high), ("left", "right"), strict=True):
         look: dict[str, Any] = {"size": sheet.tick, "color": style.QUIET, "ha": at, "va": "top"}
-        ax.annotate(sweep.write_value(end), (place, 0), (0, -7 * sheet.type), **look, **plain)
+        ax.annotate(sweep.write_value(end), (spot, 0), (0, -7 * sheet.type), **look, **plain)
     said, look = f"{sweep.name} = {sweep.write_value(value)}", {"size": sheet.label + 1, "color": style.INK}
     ax.annotate(said, (low, 0), (0, 8 * sheet.type), weight="bold", **look, **plain)
