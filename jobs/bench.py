@@ -329,17 +329,17 @@ def _time_adapter(env: Environment, seconds: float) -> AdapterShare | None:
     return AdapterShare(len(points), **shares)
 
 
-class _Clocked:
+class _Clocked(ObjectiveWrapper):
     """An environment that adds up the seconds spent in `evaluate`."""
 
     def __init__(self, env: Environment) -> None:
-        self.name, self.space, self.preferred_batch = env.name, env.space, env.preferred_batch
-        self._env, self.seconds = env, 0.0
+        super().__init__(env)
+        self.seconds = 0.0
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
         """Evaluate, and note how long it took."""
         began = time.perf_counter()
-        result = self._env.evaluate(x, grad=grad)
+        result = self.objective.evaluate(x, grad=grad)
         self.seconds += time.perf_counter() - began
         return result
 

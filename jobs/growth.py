@@ -9,9 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..landscapes.adapters import within_box
 from ..landscapes.identity import plane_of, stored_identity
-from ..landscapes.objective import evaluate
+from ..landscapes.objective import BoxedObjective, evaluate
 from .motion import HORIZON
 from .scene import SceneSpec
 from .watch import Watch
@@ -51,7 +50,7 @@ def measure_growth_of(env: Environment, dataset: xr.Dataset, watch: Watch) -> di
     with watch.progress(effort(env), "gradients of shorter episodes") as advance:
         for share in SHARES:
             other = spec.make(horizon=share * env.options.horizon)
-            found = evaluate(within_box(other) if boxed else other, x, grad=True)
+            found = evaluate(BoxedObjective(other) if boxed else other, x, grad=True)
             assert found.grad is not None
             norms.append((found.grad * width).norm(dim=1))
             advance(len(norms) * len(x))

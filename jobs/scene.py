@@ -83,7 +83,7 @@ def provenance(objective: Objective, command: str) -> dict[str, Any]:
         "command": command,
         "created": datetime.now(UTC).strftime("%Y-%m-%d"),
         "versions": {package: _version(package) for package in _packages(objective)},
-        "loss_unit": getattr(objective, "loss_unit", ""),
+        "loss_unit": objective.loss_unit,
     }
 
 

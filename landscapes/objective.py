@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import abc
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -103,19 +105,134 @@ class Evaluation:
         return cls.from_results(loss, loss.new_zeros(0, dim) if grad else None)
 
 
-@runtime_checkable
-class Objective(Protocol):
+class Objective(abc.ABC):
     """Anything with a parameter space that can be evaluated at a batch of points.
 
-    It is never asked beyond its bounds unless it invites that by an attribute `beyond_box` that is true.
+    Needed are `space` and `evaluate`. What only some can do has a default, so that nobody has to ask. An objective is
+    evaluated inside its bounds only, unless `beyond_box` allows more.
     """
 
+    name: str  # by default the class's own in lower case
+    space: ParameterSpace  # the parameters and their box
+    loss_unit: str = ""
+    beyond_box: bool = False  # whether parameters beyond their bounds mean something and may be tried
+    device: str = "cpu"
+    threads: int = 1  # that a batch is spread over
+    preferred_batch: int = 1  # points worth evaluating at once
+    whole_batches: bool = False  # whether a part of a batch takes as long as all of it
+    decisions: int = 1  # how often controls are chosen in an episode: dim / decisions of them, time first
+    _named: bool = False
+
+    def __init_subclass__(cls, **how: Any) -> None:
+        super().__init_subclass__(**how)
+        if "name" in vars(cls):
+            cls._named = True
+        elif not cls._named:
+            cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", cls.__name__).lower().lstrip("_")
+
+    @abc.abstractmethod
+    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
+        """Return losses, and gradients if asked, at points `x` of the space."""
+
     @property
-    def space(self) -> ParameterSpace:
-        """The parameters and their box."""
+    def precision(self) -> str:
+        """float32 or float64: what losses are computed in."""
+        return "float64"
+
+    def identity(self) -> dict[str, Any]:
+        """Return what decides the numbers, as plain JSON."""
+        return {"objective": self.name}
+
+    def prepare(self) -> None:  # noqa: B027 -- most have nothing to prepare
+        """Do what the first evaluation would do beside evaluating."""
+
+    def shrink(self, rows: int) -> None:  # noqa: B027 -- most hold no memory between evaluations
+        """Take at most `rows` points at once from now on."""
+
+    def memory(self) -> int:
+        """Estimate the bytes that the evaluation of one point takes."""
+        return 0
+
+    def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Int[Tensor, " batch"]]:
+        """Count what happens at each point, name -> shape (batch,); where a count changes, losses may jump."""
+        return {}
+
+    def energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"] | None:
+        """Return the mechanical energy [J] over time of a motion that nothing drives; None where there is none."""
+        return None
+
+    def noise(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"] | None:
+        """Return the standard error of the loss at each point [loss unit]; None where repeats have to tell."""
+        return None
+
+    def observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
+        """Return what a policy sees before a decision. Raises ValueError where nothing is decided step by step."""
+        raise ValueError(f"{self.name} decides once in an episode, so there is nothing to see before a decision")
+
+
+class ObjectiveWrapper(Objective):
+    """An objective around another one, which has all that the other one has."""
+
+    def __init__(self, objective: Objective) -> None:
+        self.objective = objective
+        self.name, self.space, self.loss_unit = objective.name, objective.space, objective.loss_unit
+        self.beyond_box, self.device, self.decisions = objective.beyond_box, objective.device, objective.decisions
+        self.threads, self.whole_batches = objective.threads, objective.whole_batches
+        self.preferred_batch = objective.preferred_batch
+
+    @property
+    def precision(self) -> str:
+        """float32 or float64: what losses are computed in."""
+        return self.objective.precision
+
+    def identity(self) -> dict[str, Any]:
+        """Return what decides the numbers, as plain JSON."""
+        return self.objective.identity()
+
+    def prepare(self) -> None:
+        """Do what the first evaluation would do beside evaluating."""
+        self.objective.prepare()
+
+    def shrink(self, rows: int) -> None:
+        """Take at most `rows` points at once from now on."""
+        self.objective.shrink(rows)
+        self.preferred_batch = self.objective.preferred_batch
+
+    def memory(self) -> int:
+        """Estimate the bytes that the evaluation of one point takes."""
+        return self.objective.memory()
+
+    def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Int[Tensor, " batch"]]:
+        """Count what happens at each point."""
+        return self.objective.events(x)
+
+    def energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"] | None:
+        """Return the mechanical energy [J] over time."""
+        return self.objective.energy(x)
+
+    def noise(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"] | None:
+        """Return the standard error of the loss at each point."""
+        return self.objective.noise(x)
+
+    def observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
+        """Return what a policy sees before a decision."""
+        return self.objective.observe(x, decision)
+
+
+class BoxedObjective(ObjectiveWrapper):
+    """Evaluate an objective inside its box only, though it allows points beyond: these have status ESCAPED."""
+
+    def __init__(self, objective: Objective) -> None:
+        super().__init__(objective)
+        self.beyond_box = False
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
-        """Return losses, and gradients if asked, at points `x` in the parameters' own units."""
+        """Return losses, and gradients if asked, at points `x` of the space."""
+        return evaluate_inside(self.objective, check_points(x, self.space, self.name), grad=grad)
+
+
+class ContractError(ValueError):
+    """What a simulator returned is not what it has to return; no status of a single point can say that."""
 
 
 def evaluate(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
@@ -125,8 +242,7 @@ def evaluate(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool)
 
     Raises ValueError where the objective's answer is not what the protocol says, and what it raises itself.
     """
-    invited = getattr(objective, "beyond_box", False)
-    raw = _ask(objective, x, grad=grad) if invited else evaluate_inside(objective, x, grad=grad)
+    raw = _ask(objective, x, grad=grad) if objective.beyond_box else evaluate_inside(objective, x, grad=grad)
     loss, status = (tensor.detach().cpu() for tensor in (raw.loss, raw.status))
     gradient = raw.grad.detach().cpu().double() if grad and raw.grad is not None else None
     return Evaluation.from_results(loss.double(), gradient, status)
@@ -156,9 +272,9 @@ def evaluate_inside(objective: Objective, x: Float[Tensor, "batch dim"], *, grad
 
 def _ask(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
     """Return what an objective says of points, held against the protocol."""
-    found, who = objective.evaluate(x, grad=grad), name_of(objective)
+    found, who = objective.evaluate(x, grad=grad), objective.name
     if not isinstance(found, Evaluation):
-        raise ValueError(f"{who} must return an Evaluation; got {type(found).__name__}")
+        raise ContractError(f"{who} must return an Evaluation; got {type(found).__name__}")
     count = len(x)
     wanted: dict[str, tuple[Tensor, tuple[int, ...]]] = {
         "loss": (found.loss, (count,)),
@@ -168,12 +284,12 @@ def _ask(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> 
         wanted["grad"] = (_require_gradient(found.grad, who), tuple(x.shape))
     for field, (tensor, shape) in wanted.items():
         if tuple(tensor.shape) != shape:
-            raise ValueError(
+            raise ContractError(
                 f"{who} must return {field} of shape {shape} for x of shape {tuple(x.shape)}; got {tuple(tensor.shape)}"
             )
     for status in NOT_EVALUATED:
         if bool((found.status == status).any()):
-            raise ValueError(f"{who} must say how every point ended; got status {status.name}")
+            raise ContractError(f"{who} must say how every point ended; got status {status.name}")
     return found
 
 
@@ -187,9 +303,14 @@ def _clamp(space: ParameterSpace, x: Float[Tensor, "batch dim"]) -> Float[Tensor
     return torch.clamp(x, space.lower, space.upper)
 
 
-def name_of(objective: Objective) -> str:
-    """Return what an objective is called."""
-    return str(getattr(objective, "name", type(objective).__name__))
+def check_points(x: object, space: ParameterSpace, name: str) -> Float[Tensor, "batch dim"]:
+    """Return points as a tensor. Raises ValueError where they are no points of the space."""
+    points = as_tensor(x, name)
+    if points.ndim != 2 or points.shape[1] != space.dim:
+        raise ValueError(
+            f"{name} takes {space.dim} parameters, x of shape (batch, {space.dim}); got x of shape {tuple(points.shape)}"
+        )
+    return points
 
 
 def _real(values: object, what: str) -> Tensor:
@@ -211,7 +332,7 @@ def _check_codes(status: object) -> Tensor:
 
 def _require_gradient(grad: Tensor | None, who: str) -> Tensor:
     if grad is None:
-        raise ValueError(
+        raise ContractError(
             f"{who} was asked for gradients and returned none; sample with gradients=0 (--no-gradients), "
             "or search with a method that needs none"
         )

@@ -108,7 +108,7 @@ def _check_at(
 
 
 def _check_beyond(name: str, objective: Objective, x: Float[Tensor, "batch dim"]) -> Finding:
-    if not getattr(objective, "beyond_box", False):
+    if not objective.beyond_box:
         return Finding(name, SKIP, "not asked", "it does not invite points beyond its box (beyond_box = True does)")
     return _check_at(name, objective, x, may_refuse=True)
 
@@ -138,7 +138,7 @@ def _check_energy(subject: Subject, name: str) -> Finding:
 
     `energy(x)` returns it over time, shape (batch, step), counted from rest at the lowest place, or None.
     """
-    offered = getattr(subject.objective, "energy", None)
+    offered = subject.objective.energy
     found = None if offered is None else offered(subject.x[:ROWS])
     if found is None:
         return Finding(name, SKIP, "n/a", "the objective offers no energy")

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..objective import Evaluation, Objective, Status, evaluate
+from ..objective import Evaluation, Objective, ObjectiveWrapper, Status, evaluate
 from ..sampling.memory import ADVICE, is_out_of_memory
 from . import extremes
 from . import gradients as gradient_checks
@@ -168,12 +168,12 @@ def _check_shapes(objective: Objective, x: Float[Tensor, "batch dim"]) -> Findin
     return verdict("shapes", not wrong, shape, "; ".join(dict.fromkeys(wrong)))
 
 
-class _Given:
+class _Given(ObjectiveWrapper):
     """An objective whose evaluation is there already."""
 
     def __init__(self, objective: Objective, evaluation: Evaluation) -> None:
-        self.name = getattr(objective, "name", type(objective).__name__)
-        self.space, self._evaluation = objective.space, evaluation
+        super().__init__(objective)
+        self._evaluation = evaluation
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
         return self._evaluation
