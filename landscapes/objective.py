@@ -7,13 +7,18 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import TYPE_CHECKING, Any, overload
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .space import ParameterSpace, as_tensor
+
+if TYPE_CHECKING:
+    import numpy as np
+    import xarray as xr
+    from numpy.typing import NDArray
 
 ROUNDING = 1e-9  # of the box; points that are no farther beyond it are moved back
 
@@ -22,6 +27,7 @@ class Status(IntEnum):
     """Say how the evaluation of one point ended; a NaN result is not a missing one.
 
     INTERPOLATED is a point of a refined slice that was not evaluated, as those around it explain it: its loss is NaN.
+    NO_GRADIENT has a finite loss, which is kept, and a gradient that is not finite and therefore NaN.
     """
 
     MISSING = 0
@@ -30,9 +36,45 @@ class Status(IntEnum):
     ESCAPED = 3
     ERROR = 4
     INTERPOLATED = 5
+    NO_GRADIENT = 6
 
 
 NOT_EVALUATED = (Status.MISSING, Status.INTERPOLATED)
+HAS_LOSS = (Status.OK, Status.NO_GRADIENT)
+FAILED = (Status.NONFINITE, Status.ESCAPED, Status.ERROR)
+
+
+@overload
+def has_loss(status: Tensor) -> Tensor: ...
+@overload
+def has_loss(status: xr.DataArray) -> xr.DataArray: ...
+@overload
+def has_loss(status: NDArray[Any]) -> NDArray[np.bool_]: ...
+@overload
+def has_loss(status: int) -> bool: ...
+def has_loss(status: Any) -> Any:
+    """Say which points have a finite loss; `status` is a tensor, an array or one Status."""
+    return _is_any(status, HAS_LOSS)
+
+
+@overload
+def failed(status: Tensor) -> Tensor: ...
+@overload
+def failed(status: xr.DataArray) -> xr.DataArray: ...
+@overload
+def failed(status: NDArray[Any]) -> NDArray[np.bool_]: ...
+@overload
+def failed(status: int) -> bool: ...
+def failed(status: Any) -> Any:
+    """Say which points were evaluated and have no loss; `status` is a tensor, an array or one Status."""
+    return _is_any(status, FAILED)
+
+
+def _is_any(status: Any, kinds: tuple[Status, ...]) -> Any:
+    found = status == kinds[0]
+    for kind in kinds[1:]:
+        found = found | (status == kind)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,18 +82,35 @@ class Evaluation:
     """Hold the result of evaluating a batch of points.
 
     `loss` [objective's unit], float64, shape (batch,); `grad` [loss unit / parameter unit], float64, shape
-    (batch, dim), or None where it was not asked for; `status`, int8, shape (batch,). Where the status is not OK, loss
-    and gradient are NaN. Arrays become tensors; raises ValueError for what is no real number, or no Status.
+    (batch, dim), or None where it was not asked for; `status`, int8, shape (batch,). Where the status is not OK, the
+    gradient is NaN, and so is the loss unless the status is NO_GRADIENT. `error` is what the first of the points with
+    status ERROR raised. Arrays become tensors; raises ValueError for what is no real number, or no Status.
     """
 
     loss: Float[Tensor, " batch"]
     grad: Float[Tensor, "batch dim"] | None
     status: Int[Tensor, " batch"]
+    error: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "loss", _real(self.loss, "a loss"))
         object.__setattr__(self, "grad", None if self.grad is None else _real(self.grad, "a gradient"))
         object.__setattr__(self, "status", _check_codes(self.status))
+
+    @property
+    def has_loss(self) -> Bool[Tensor, " batch"]:
+        """Which points have a finite loss."""
+        return has_loss(self.status)
+
+    @property
+    def has_gradient(self) -> Bool[Tensor, " batch"]:
+        """Which points have a finite gradient; none where gradients were not asked for."""
+        return (self.status == Status.OK) & (self.grad is not None)
+
+    @property
+    def failed(self) -> Bool[Tensor, " batch"]:
+        """Which points have no loss."""
+        return failed(self.status)
 
     @classmethod
     def from_results(
@@ -59,10 +118,12 @@ class Evaluation:
         loss: Float[Tensor, " batch"],
         grad: Float[Tensor, "batch dim"] | None,
         failed: Int[Tensor, " batch"] | None = None,
+        error: str = "",
     ) -> Evaluation:
-        """Make an evaluation from raw results: mark non-finite rows, keep what `failed` says, blank every failure.
+        """Make an evaluation from raw results: mark non-finite rows, keep what `failed` says, blank what is missing.
 
-        `failed` holds a Status per row, OK where nothing is known to have gone wrong.
+        `failed` holds a Status per row, OK where nothing is known to have gone wrong. A row whose loss alone is finite
+        keeps it and has status NO_GRADIENT; without gradients, none is missing, and its status is OK.
 
         Raises ValueError where results are no real numbers, or codes in `failed` mean no Status.
         """
@@ -70,12 +131,14 @@ class Evaluation:
         status = torch.full(loss.shape, Status.OK, dtype=torch.int8)
         if failed is not None:
             status = _check_codes(failed).to(torch.int8).clone()
-        finite = loss.isfinite() if grad is None else loss.isfinite() & grad.isfinite().all(dim=1)
-        status[(status == Status.OK) & ~finite] = Status.NONFINITE
-        blank = status != Status.OK
-        loss = loss.masked_fill(blank, torch.nan)
-        grad = None if grad is None else grad.masked_fill(blank[:, None], torch.nan)
-        return cls(loss, grad, status)
+        there = has_loss(status)
+        status[there & ~loss.isfinite()] = Status.NONFINITE
+        loss = loss.masked_fill(~has_loss(status), torch.nan)
+        if grad is None:
+            status[status == Status.NO_GRADIENT] = Status.OK
+            return cls(loss, None, status, error)
+        status[(status == Status.OK) & ~grad.isfinite().all(dim=1)] = Status.NO_GRADIENT
+        return cls(loss, grad.masked_fill((status != Status.OK)[:, None], torch.nan), status, error)
 
     judged = from_results  # its first name, which environments of others call it by
 
@@ -92,17 +155,20 @@ class Evaluation:
         if grad and len(slopes) < len(parts):
             raise ValueError(f"{len(parts) - len(slopes)} of {len(parts)} evaluations to join have no gradients")
         loss, status = torch.cat([part.loss for part in parts]), torch.cat([part.status for part in parts])
-        return cls(loss, torch.cat(slopes) if grad else None, status)
+        error = next((part.error for part in parts if part.error), "")
+        return cls(loss, torch.cat(slopes) if grad else None, status, error)
 
     def rows(self, rows: slice | Int[Tensor, " some"]) -> Evaluation:
-        """Return the evaluation of some of the points."""
-        return Evaluation(self.loss[rows], None if self.grad is None else self.grad[rows], self.status[rows])
+        """Return the evaluation of some of the points; the error message stays with those that raised."""
+        status = self.status[rows]
+        error = self.error if bool((status == Status.ERROR).any()) else ""
+        return Evaluation(self.loss[rows], None if self.grad is None else self.grad[rows], status, error)
 
     @classmethod
-    def empty(cls, dim: int, *, grad: bool) -> Evaluation:
+    def empty(cls, dim: int, *, grad: bool, error: str = "") -> Evaluation:
         """Return the evaluation of no points at all."""
         loss = torch.zeros(0, dtype=torch.float64)
-        return cls.from_results(loss, loss.new_zeros(0, dim) if grad else None)
+        return cls.from_results(loss, loss.new_zeros(0, dim) if grad else None, error=error)
 
 
 class Objective(abc.ABC):
@@ -245,7 +311,7 @@ def evaluate(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool)
     raw = _ask(objective, x, grad=grad) if objective.beyond_box else evaluate_inside(objective, x, grad=grad)
     loss, status = (tensor.detach().cpu() for tensor in (raw.loss, raw.status))
     gradient = raw.grad.detach().cpu().double() if grad and raw.grad is not None else None
-    return Evaluation.from_results(loss.double(), gradient, status)
+    return Evaluation.from_results(loss.double(), gradient, status, raw.error)
 
 
 def evaluate_inside(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
@@ -261,13 +327,14 @@ def evaluate_inside(objective: Objective, x: Float[Tensor, "batch dim"], *, grad
     if bool(inside.all()):
         return _ask(objective, _clamp(objective.space, x), grad=grad)
     loss, slope = x.new_full((len(x),), torch.nan), torch.full_like(x, torch.nan) if grad else None
-    status = torch.full((len(x),), Status.ESCAPED, dtype=torch.int8)
+    status, error = torch.full((len(x),), Status.ESCAPED, dtype=torch.int8), ""
     if bool(inside.any()):
         found = _ask(objective, _clamp(objective.space, x[inside]), grad=grad)
+        error = found.error
         loss[inside], status[inside] = found.loss.detach().to(loss), found.status.to(status)
         if slope is not None and found.grad is not None:
             slope[inside] = found.grad.detach().to(slope)
-    return Evaluation(loss, slope, status)
+    return Evaluation(loss, slope, status, error)
 
 
 def _ask(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
