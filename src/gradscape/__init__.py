@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from .landscapes.plane import Plane
     from .landscapes.sampling.fill import sample
     from .landscapes.slice import Slice
-    from .landscapes.space import ParameterSpace
+    from .landscapes.space import ParameterSpace, log
     from .optim.race import Race
     from .optim.runs.run import Run
 
@@ -54,6 +54,7 @@ _HOMES = {
     "from_warp": "envs.engines.warp_functions",
     "league": "api.league",
     "list_envs": "api.environments",
+    "log": "landscapes.space",
     "make": "envs.registry",
     "open_run": "api.search",
     "open_slice": "api.slice",
@@ -95,6 +96,7 @@ __all__ = [
     "from_warp",
     "league",
     "list_envs",
+    "log",
     "make",
     "open_run",
     "open_slice",
