@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Unpack
 
-from ..jobs.scene import SceneSpec
 from ..jobs.watch import Watch
 from .progress import default_watch
-from .scene import SceneKeywords, environment, say_call, spec_of
+from .scene import Scene, SceneKeywords, environment, say_call, spec_of
 
 if TYPE_CHECKING:
-    from ..envs.base import Environment
     from ..jobs.check import CheckReport
     from ..jobs.pairs import PairRanking
     from ..jobs.report import ReportedSlice
@@ -22,14 +20,13 @@ if TYPE_CHECKING:
     from ..landscapes.measures.extremes import Extremes
     from ..landscapes.slice import Slice
 
-    Scene = str | type[Environment] | Environment | SceneSpec
-
 
 def report(
     what: Slice | Path | Scene,
     *,
     points: int = 6,
     seed: int = 0,
+    env: Scene = None,
     out: str | Path | None = None,
     **keywords: Unpack[SceneKeywords],
 ) -> Report:
@@ -37,7 +34,7 @@ def report(
 
     `what` is a slice, a slice's folder, or a scene, of which a slice over its first two parameters is sampled first.
     Gradients are tested by new evaluations at `points` places along each axis; of the `keywords`, those but `device`
-    are for a scene alone. The report's files lie in `out`, by default a folder under out/ named after it: the same call
+    are for a scene alone; `env` is the simulator of a slice, where it is not registered by its name. The report's files lie in `out`, by default a folder under out/ named after it: the same call
     reads them again.
 
     Raises ValueError for a slice without gradients or on no disk, for what the scene does not have, and where the
@@ -49,7 +46,7 @@ def report(
     subject = _subject(what, points, watch, keywords)
     job = ReportJob.open(
         [subject], what=subject.name, single=True, out=_path(out), points=points, seed=seed,
-        device=keywords.get("device", "auto"), command=command,
+        device=keywords.get("device", "auto"), env=env, command=command,
     )  # fmt: skip
     return job.run(watch).reports[0]
 

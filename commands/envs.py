@@ -57,7 +57,7 @@ def _describe(name: str) -> None:
         bounded.add_row(str(number), label, f"{lower:g}", f"{upper:g}", unit)
     console.print(bounded)
     for fidelity in env.fidelities.values():
-        console.print(f"fidelity {asdict(fidelity)}")
+        console.print(f"fidelity {fidelity.record()}")
     console.print(f"engines: {', '.join(env.engines)}")
     for said in say_margins(env) if any(one.dt for one in env.fidelities.values()) else ():
         console.print(said)

@@ -315,13 +315,13 @@ def alternate(calls: Mapping[K, Callable[[], object]], seconds: float) -> dict[K
 
 def _time_adapter(env: Environment, seconds: float) -> AdapterShare | None:
     """Time some 256 episodes against the engine's program alone, in turn; None where the program is our own."""
-    engine_call = getattr(env, "engine_call", None)
-    if engine_call is None:
-        return None
     points = _points(env, -(-ADAPTED // env.preferred_batch) * env.preferred_batch)
     shares = {}
     for way, grad in WAYS.items():
-        calls = {"ours": partial(env.evaluate, points, grad=grad), "engine": engine_call(points, grad=grad)}
+        engine = env.engine_call(points, grad=grad)
+        if engine is None:
+            return None
+        calls = {"ours": partial(env.evaluate, points, grad=grad), "engine": engine}
         for call in calls.values():
             call()
         times = alternate(calls, seconds)

@@ -148,8 +148,7 @@ class ModelJob:
 
     def _changed(self, part: ModelPart) -> Environment:
         """Make the model with a part changed; raises ValueError where that is the full model, or the scene refuses."""
-        full = SceneSpec.of(self.env)
-        env = replace(full, options={**full.options, **part.options}).make()
+        env = self.env.remake(**part.options)
         if env.options == self.env.options:
             raise ValueError(f"the full model's options are those of {part.change!r} already")
         return env

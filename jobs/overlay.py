@@ -19,6 +19,7 @@ from ..landscapes.storage.files import tidy, visible_files
 from ..landscapes.storage.paths import slice_exists
 from ..landscapes.storage.store import open_slice
 from .folder import OVERLAY, ROOT, SLICE_STORE, folder_named, run_tables
+from ..envs.registry import as_environment
 from .scene import environment_of, named_point
 from .slice import SliceJob
 from .watch import Watch, resumable
@@ -196,9 +197,8 @@ class OverlayJob:
 
     def _objective(self) -> Objective:
         """Return what the slice was sampled from."""
-        if self.device == "auto" and self.slice.remake:
-            return self.slice.remake()
-        return environment_of(self.slice.data, self.device)
+        found = self.slice.remake() if self.slice.remake else environment_of(self.slice.data, self.device)
+        return found if self.device == "auto" else as_environment(found).remake(device=self.device)
 
     def _write(self, drawn: Overlay) -> Overlay:
         from ..landscapes.draw.figures.page import save, save_prints

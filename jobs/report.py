@@ -90,6 +90,7 @@ class ReportJob:
     paper: Mapping[str, Quoted] = field(default_factory=dict)
     prints: Sequence[float] = ()
     command: str = ""
+    env: Any = None  # of the slices, where it is not registered by their name for it
 
     @classmethod
     def open(
@@ -161,7 +162,7 @@ class ReportJob:
         One that is to be drawn for print is not taken from beside the slice without what it is drawn from.
         """
         dataset = _open(subject)
-        env = environment_of(dataset, self.device)
+        env = environment_of(dataset, self.device, self.env)
         key: ReportKey = {"points": self.points, "seed": self.seed, "slice": digest_of(dataset), "code": env.code}
         beside = subject.store.parent
         if not self.prints or (beside / ARRAYS).exists():

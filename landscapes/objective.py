@@ -165,6 +165,14 @@ class Evaluation:
         return Evaluation(self.loss[rows], None if self.grad is None else self.grad[rows], status, error)
 
     @classmethod
+    def raised(cls, error: Exception, *, dim: int, grad: bool) -> Evaluation:
+        """Return the evaluation of one point at which the simulation raised."""
+        loss = torch.full((1,), torch.nan, dtype=torch.float64)
+        slope = loss.expand(1, dim).clone() if grad else None
+        status = torch.full((1,), Status.ERROR, dtype=torch.int8)
+        return cls(loss, slope, status, f"{type(error).__name__}: {first_line(error)}")
+
+    @classmethod
     def empty(cls, dim: int, *, grad: bool, error: str = "") -> Evaluation:
         """Return the evaluation of no points at all."""
         loss = torch.zeros(0, dtype=torch.float64)
@@ -205,6 +213,11 @@ class Objective(abc.ABC):
         """float32 or float64: what losses are computed in."""
         return "float64"
 
+    @property
+    def packages(self) -> tuple[str, ...]:
+        """Packages that losses depend on, beside those that all depend on."""
+        return ()
+
     def identity(self) -> dict[str, Any]:
         """Return what decides the numbers, as plain JSON."""
         return {"objective": self.name}
@@ -232,8 +245,8 @@ class Objective(abc.ABC):
         return None
 
     def observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
-        """Return what a policy sees before a decision. Raises ValueError where nothing is decided step by step."""
-        raise ValueError(f"{self.name} decides once in an episode, so there is nothing to see before a decision")
+        """Return what a policy sees before a decision: here no more than that nothing has happened yet."""
+        return x.new_zeros(len(x), 1)
 
 
 class ObjectiveWrapper(Objective):
@@ -250,6 +263,11 @@ class ObjectiveWrapper(Objective):
     def precision(self) -> str:
         """float32 or float64: what losses are computed in."""
         return self.objective.precision
+
+    @property
+    def packages(self) -> tuple[str, ...]:
+        """Packages that losses depend on, beside those that all depend on."""
+        return self.objective.packages
 
     def identity(self) -> dict[str, Any]:
         """Return what decides the numbers, as plain JSON."""
@@ -378,6 +396,11 @@ def check_points(x: object, space: ParameterSpace, name: str) -> Float[Tensor, "
             f"{name} takes {space.dim} parameters, x of shape (batch, {space.dim}); got x of shape {tuple(points.shape)}"
         )
     return points
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of what an error says: others' messages may go on for pages."""
+    return (str(error).strip().splitlines() or ["it says nothing"])[0].rstrip(":")
 
 
 def _real(values: object, what: str) -> Tensor:
