@@ -66,9 +66,7 @@ def _slice(given: str | Path | Slice) -> Slice:
     return open_slice(given) if isinstance(given, str | Path) else given
 
 
-def _second(
-    given: str | Path | Slice | Scene, keywords: SceneKeywords, watch: Watch
-) -> Slice | Environment:
+def _second(given: str | Path | Slice | Scene, keywords: SceneKeywords, watch: Watch) -> Slice | Environment:
     """Return a slice that is there, and else the objective to sample. Raises ValueError for keywords beside a slice."""
     from ..landscapes.slice import Slice
 

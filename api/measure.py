@@ -43,7 +43,7 @@ def report(
     from ..jobs.report import ReportJob
 
     watch, command = default_watch(), say_call("report", what, points=points, seed=seed, **keywords)
-    subject = _subject(what, points, watch, keywords)
+    subject, env = _subject(what, env, points, watch, keywords)
     job = ReportJob.open(
         [subject], what=subject.name, single=True, out=_path(out), points=points, seed=seed,
         device=keywords.get("device", "auto"), env=env, command=command,
@@ -189,18 +189,21 @@ def census(
     return CensusJob.open(spec.resolve(watch), **how, out=_path(out), force=force, command=command).run(watch)
 
 
-def _subject(what: Slice | Path | Scene, points: int, watch: Watch, keywords: SceneKeywords) -> ReportedSlice:
+def _subject(
+    what: Slice | Path | Scene, env: Scene, points: int, watch: Watch, keywords: SceneKeywords
+) -> tuple[ReportedSlice, Scene]:
+    """Return the slice to report on, which is sampled now where a simulator is given, and its simulator if known."""
     from ..jobs.report import ReportedSlice, sample_subject
     from ..landscapes.slice import Slice
 
     if isinstance(what, Slice):
         if what.folder is None:
             raise ValueError("report takes a slice on disk; this one is in memory alone, so use its own report()")
-        return ReportedSlice.of(what.folder)
+        return ReportedSlice.of(what.folder), env or (what.remake() if what.remake else None)
     if isinstance(what, Path) or (isinstance(what, str) and Path(what).exists()):
-        return ReportedSlice.of(Path(what))
+        return ReportedSlice.of(Path(what)), env
     env = environment(what, keywords, watch)
-    return sample_subject(env, points, say_call("report", what, **keywords), watch)
+    return sample_subject(env, points, say_call("report", what, **keywords), watch), env
 
 
 def _path(out: str | Path | None) -> Path | None:

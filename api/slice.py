@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 from ..jobs.cut import cut, describe_cut
-from ..jobs.scene import SceneSpec, environment_of, with_policy
+from ..jobs.scene import environment_of, with_policy
 from ..jobs.watch import Watch
 from ..landscapes.objective import BoxedObjective
 from ..landscapes.space import as_stride
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-    from ..envs.base import Environment
     from ..landscapes.objective import Objective
     from ..landscapes.plane import Plane
     from ..landscapes.sampling.refine import Refinement

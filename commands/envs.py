@@ -40,8 +40,6 @@ def _list() -> None:
 
 def _describe(name: str) -> None:
     """Print all there is to know about one environment."""
-    from dataclasses import asdict
-
     from ..envs.registry import make
     from ..gallery.paper import read_paper
     from ..jobs.margins import say_margins

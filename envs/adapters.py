@@ -164,9 +164,7 @@ def from_step(
 
     size = _action_size(step, space)
     named: FunctionKeywords = {"name": "episode", **said}
-    return from_numpy(
-        lambda x: total(x.reshape(-1, size)), space, differences=differences, vectorized=False, **named
-    )
+    return from_numpy(lambda x: total(x.reshape(-1, size)), space, differences=differences, vectorized=False, **named)
 
 
 def _action_size(step: Callable[[Any], Any], space: ParameterSpace) -> int:

@@ -56,7 +56,9 @@ class Environment(Objective):
     devices: ClassVar[tuple[str, ...]] = ("cpu",)
     engines: ClassVar[tuple[str, ...]] = ("warp",)
     model_version: ClassVar[int] = 1  # raised by hand whenever numbers change; 0 of what nothing is known to change
-    horizon_option: ClassVar[str] = "horizon"  # the setting that says how long an episode is, where there is one of this name
+    horizon_option: ClassVar[str] = (
+        "horizon"  # the setting that says how long an episode is, where there is one of this name
+    )
     control_step: ClassVar[float] = 0.0  # how long a control is held [s], in whole time steps; 0 where any step does
     known_failures: ClassVar[Mapping[str, Mapping[str, str]]] = {}  # fidelity -> check of `landscape check` -> reason
     contact_stiffness: ClassVar[str] = ""  # the option that says how stiff contact is, where it is by penalty
@@ -387,13 +389,13 @@ class Environment(Objective):
             return found
         return replace(found, grad=self.space.chain(values, found.grad.detach().to(values)))
 
-    def _setup(self) -> None:  # noqa: B027 -- a scene that shares nothing needs none
+    def _setup(self) -> None:
         """Prepare what all evaluations share; sets `space` unless the class does."""
 
-    def _compile_ahead(self) -> None:  # noqa: B027 -- a solver compiles what it needs, but one part after the other
+    def _compile_ahead(self) -> None:
         """Compile all kernels beside each other."""
 
-    def _prepare(self) -> None:  # noqa: B027 -- nothing, for most scenes
+    def _prepare(self) -> None:
         """Make what else a first evaluation would make."""
 
     @final

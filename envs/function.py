@@ -18,6 +18,7 @@ from .base import Environment, Fidelity
 
 DEFAULT = "default"  # the fidelity of a function that names none
 NAMELESS = "function"  # what a lambda is called
+SAME_TIME = 0.01  # relative difference of what counts as the same time
 SEED_ARGUMENTS = ("key", "seed")  # of a function that draws random numbers
 FIDELITY_FIELDS = ("dt", "resolution", "sampling", "particles")  # that a function and a `Fidelity` call the same
 KINDS = (bool, int, float, str)  # of options
@@ -105,7 +106,9 @@ class Function:
         seeds = as_whole(said.get("seeds", 1), f"from_{backend.engine}'s seeds", least=1)
         seed_argument = next((one for one in SEED_ARGUMENTS if one in known and one not in own | found), "")
         if seeds > 1 and not seed_argument:
-            raise ValueError(f"seeds={seeds} averages over random numbers, and {name} takes no {' or '.join(SEED_ARGUMENTS)}")
+            raise ValueError(
+                f"seeds={seeds} averages over random numbers, and {name} takes no {' or '.join(SEED_ARGUMENTS)}"
+            )
         if seed_argument:
             found["seed"] = 0
         return cls(
@@ -119,6 +122,17 @@ class Function:
         declared = [(name, type(value), field(default=value)) for name, value in self.options.items()]
         return make_dataclass("Options", declared, frozen=True)
 
+    @cached_property
+    def counts_steps(self) -> bool:
+        """Whether the horizon counts time steps: times dt, it is the same time in every fidelity."""
+        if not {self.horizon, "dt"} <= set(self.fidelity_arguments):
+            return False
+        steps = [one.settings.get(self.horizon) for one in self.fidelities.values()]
+        if not all(isinstance(count, int) for count in steps):
+            return False
+        times = [count * one.dt for count, one in zip(steps, self.fidelities.values(), strict=True)]
+        return max(times) - min(times) <= SAME_TIME * max(times)
+
     def settings_of(self, options: Any, fidelity: Fidelity) -> dict[str, Any]:
         """Return the function's keyword arguments, but for its random numbers, with these options at a fidelity."""
         found = {one.name: getattr(options, one.name) for one in fields(options)}
@@ -127,6 +141,9 @@ class Function:
         for argument in self.fidelity_arguments:
             known = argument in FIDELITY_FIELDS
             found[argument] = getattr(fidelity, argument) if known else fidelity.settings.get(argument)
+        of = next((one for one in self.fidelities.values() if one.settings == fidelity.settings), fidelity)
+        if self.counts_steps and of.dt != fidelity.dt:  # a variant of a fidelity, of the same time
+            found[self.horizon] = max(1, round(found[self.horizon] * of.dt / fidelity.dt))
         return {name: value for name, value in found.items() if value is not None}
 
 
@@ -165,7 +182,7 @@ class FunctionEnvironment(Environment):
     @property
     def horizon(self) -> float | None:
         """How long an episode is, in the unit of the keyword that says so; None where none does."""
-        value = self._settings.get(self.horizon_option)
+        value = {**vars(self.options), **self.fidelity.settings}.get(self.horizon_option)
         return float(value) if isinstance(value, int | float) else None
 
     def with_horizon(self, horizon: float) -> Environment:
@@ -175,15 +192,16 @@ class FunctionEnvironment(Environment):
         """
         if self.horizon is None or self.horizon_option not in self.function.fidelity_arguments:
             return super().with_horizon(horizon)
-        whole = isinstance(self._settings[self.horizon_option], int)
-        value: float = max(1, round(horizon)) if whole else horizon
+        now = self._settings[self.horizon_option]  # other than the fidelity's in a variant with another time step
+        value = now * horizon / self.horizon
+        value = max(1, round(value)) if isinstance(now, int) else value
         settings = {**self.fidelity.settings, self.horizon_option: value}
         named = f"{self.fidelity.name}-{self.horizon_option}-{value:g}"
         return self.remake(fidelity=replace(self.fidelity, name=named, settings=settings))
 
     def length(self) -> float:
-        """Return what is proportional to the time that an episode simulates: nobody says how long it is."""
-        return 1.0
+        """Return what is proportional to the time that an episode simulates: 1 where nobody says how long it is."""
+        return self._settings[self.horizon_option] * self.fidelity.dt if self.function.counts_steps else 1.0
 
     def about(self) -> str:  # type: ignore[override] # a function's documentation is its own, not the class's
         """Return what the function says of itself."""
@@ -287,7 +305,9 @@ def _check_arguments(
     """Raise ValueError for settings that are no keyword arguments of the function, or that are said twice."""
     for option, value in options.items():
         if not isinstance(value, KINDS):
-            raise ValueError(f"{name}'s option {option} needs a number, a text or a truth value as default; got {value!r}")
+            raise ValueError(
+                f"{name}'s option {option} needs a number, a text or a truth value as default; got {value!r}"
+            )
     if twice := options.keys() & own.keys():
         raise ValueError(f"{name} has {', '.join(sorted(twice))} in options and in fidelities; leave it in one of them")
     if horizon and horizon not in options.keys() | own.keys():

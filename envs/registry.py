@@ -197,9 +197,7 @@ def register(what: Kind) -> Kind:
         raise ValueError(f"register takes an environment, or a class derived from Environment; got {what!r}")
     taken = entries().get(what.name)
     if taken and (isinstance(taken.target, str) or _origin(taken.target) != _origin(what)):
-        raise ValueError(
-            f"an environment called {what.name!r} exists already ({taken.model}); give it another name"
-        )
+        raise ValueError(f"an environment called {what.name!r} exists already ({taken.model}); give it another name")
     entries()[what.name] = Entry(what.name, what, model="registered by this program")
     return what
 
@@ -334,7 +332,7 @@ def _named(found: type[Environment] | Environment, attribute: str) -> type[Envir
 
 
 def _is_offered(name: str, value: object, module: str) -> bool:
-    """Say whether a file offers a value as a simulator: an environment, a class of it, or an object that is like one."""
+    """Say whether a value of a file is a simulator: an environment, a class of one, or an object like one."""
     from .base import Environment
 
     if isinstance(value, type):

@@ -21,7 +21,7 @@ from ..envs.engines.profiling import count_compiled_modules
 from ..envs.engines.runtime import cores, device_names, free_memory
 from ..landscapes.capacity import Need, require
 from ..landscapes.cost import duration
-from ..landscapes.objective import Evaluation, Status
+from ..landscapes.objective import Evaluation, ObjectiveWrapper, Status
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.fill import sample
 from ..landscapes.storage.store import SliceStore

@@ -250,7 +250,6 @@ class ConvergenceJob:
         return spread or None, Scale(whole, sum_up(far, whole, self.seed)[1], self.seed)
 
     def _ladders(self, values: dict[str, Values]) -> list[Ladder]:
-        from dataclasses import asdict
 
         from ..landscapes.measures.convergence_record import Level
         from ..landscapes.measures.self_convergence import Ladder

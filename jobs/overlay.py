@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
+from ..envs.registry import as_environment
 from ..landscapes.identity import plane_of, stored_identity
 from ..landscapes.objective import Objective, Status
 from ..landscapes.overlay import best_point, overlay, principal_plane
@@ -19,7 +20,6 @@ from ..landscapes.storage.files import tidy, visible_files
 from ..landscapes.storage.paths import slice_exists
 from ..landscapes.storage.store import open_slice
 from .folder import OVERLAY, ROOT, SLICE_STORE, folder_named, run_tables
-from ..envs.registry import as_environment
 from .scene import environment_of, named_point
 from .slice import SliceJob
 from .watch import Watch, resumable

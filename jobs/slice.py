@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import torch
 import xarray as xr
@@ -307,9 +307,7 @@ def picture_of(objective: Objective, plane: Plane) -> Draw:
         from ..landscapes.draw.figures.profile import profile_figure
 
         u = torch.tensor(dataset["u"].to_numpy())
-        return profile_figure(
-            dataset, events=objective.events(plane.lift(u[:, None])), width=width
-        )
+        return profile_figure(dataset, events=objective.events(plane.lift(u[:, None])), width=width)
 
     return surface if plane.rank == 2 else profile
 

@@ -16,12 +16,11 @@ from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
-from ..landscapes.objective import BoxedObjective
 from ..landscapes.capacity import size
 from ..landscapes.cost import duration
 from ..landscapes.identity import with_stride
 from ..landscapes.lattice import check_gradients
-from ..landscapes.objective import Objective, Status
+from ..landscapes.objective import BoxedObjective, Objective, Status
 from ..landscapes.plain import plain_name
 from ..landscapes.sampling.fill import Progress, sample
 from ..landscapes.storage.files import discard, tidy, visible_files, write_json

@@ -393,7 +393,8 @@ def check_points(x: object, space: ParameterSpace, name: str) -> Float[Tensor, "
     points = as_tensor(x, name)
     if points.ndim != 2 or points.shape[1] != space.dim:
         raise ValueError(
-            f"{name} takes {space.dim} parameters, x of shape (batch, {space.dim}); got x of shape {tuple(points.shape)}"
+            f"{name} takes {space.dim} parameters, x of shape (batch, {space.dim}); got x of shape "
+            f"{tuple(points.shape)}"
         )
     return points
 

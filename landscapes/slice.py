@@ -117,9 +117,9 @@ class Slice:
         `points` x `points` places of the slice are evaluated anew, with points near them. Raises ValueError for a slice
         without gradients, for one that is not finished, and for one whose objective cannot be made again.
         """
-        from .objective import BoxedObjective
         from .lattice import sampled_lattice
         from .measures.profile import PRECISION, measure_profile
+        from .objective import BoxedObjective
 
         if missing := int((self.data["status"] == Status.MISSING).sum()):
             raise ValueError(f"{missing} samples of this slice are missing; let what samples it go on first")

@@ -7,14 +7,13 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..landscapes.objective import Evaluation, Objective
+from ..landscapes.objective import Evaluation, Objective, ObjectiveWrapper
 from .base import Optimizer
 from .processes import seconds_computed
 from .runs.store import RunStore

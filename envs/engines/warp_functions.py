@@ -40,7 +40,9 @@ class WarpBackend:
         wanted = self.device if device == "auto" else device
         found = ("cuda" if cuda_available() else "cpu") if wanted == "auto" else wanted
         if found not in self.devices or (found == "cuda" and not cuda_available()):
-            raise ValueError(f"from_warp runs on auto, cpu, or cuda where there is a CUDA device; got device {wanted!r}")
+            raise ValueError(
+                f"from_warp runs on auto, cpu, or cuda where there is a CUDA device; got device {wanted!r}"
+            )
         return found
 
     def bind(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> Compute:
@@ -108,7 +110,9 @@ class WarpFunction:
                 "its losses, or sample with gradients=0 (--no-gradients)"
             )
         if not losses.requires_grad:
-            raise ContractError(f"{self.name} returned losses that carry no gradient; make them with requires_grad=True")
+            raise ContractError(
+                f"{self.name} returned losses that carry no gradient; make them with requires_grad=True"
+            )
         tape.backward(grads={losses: wp.ones_like(losses, requires_grad=False)})
         if points not in tape.gradients:
             raise ContractError(f"{self.name} launched no kernel that reads its points, so its losses have no gradient")

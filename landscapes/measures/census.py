@@ -19,7 +19,7 @@ from torch import Tensor
 from ..directions import orthonormal
 from ..identity import plane_of
 from ..lattice import count_gradients
-from ..objective import Objective
+from ..objective import Objective, ObjectiveWrapper
 from ..plane import Plane
 from ..sampling.fill import sample
 from ..space import ParameterSpace

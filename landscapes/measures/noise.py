@@ -68,7 +68,9 @@ def noise(
     moved = torch.stack([evaluate(objective, x + move * reach, grad=False).loss for move in moves])
     known = objective.noise(x)
     if known is not None:  # of random numbers that are the same in repeats
-        return Noise(float(known.square().mean().sqrt()), _deviation(first, shuffled[None]), _deviation(first, moved), len(x))
+        return Noise(
+            float(known.square().mean().sqrt()), _deviation(first, shuffled[None]), _deviation(first, moved), len(x)
+        )
     return Noise(_deviation(first, again), _deviation(first, shuffled[None]), _deviation(first, moved), len(x))
 
 

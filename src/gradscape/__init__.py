@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from .api.slice import open_slice, sample, slice
     from .api.sweep import sweep
     from .api.tradeoff import tradeoff
-    from .envs.base import Environment, Fidelity
     from .envs.adapters import from_jax, from_numpy, from_step, from_torch, from_warp
+    from .envs.base import Environment, Fidelity
     from .envs.registry import as_environment, make, register
     from .jobs.scene import SceneSpec
     from .landscapes.episode import Episode

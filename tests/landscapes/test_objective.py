@@ -5,20 +5,19 @@ import pytest
 import torch
 
 from gradscape import Evaluation, ParameterSpace, Plane, Status, from_numpy, sample
-from gradscape.landscapes.adapters import within_box
 from gradscape.landscapes.conformance.suite import check
 from gradscape.landscapes.measures.fidelity import measure
 from gradscape.landscapes.measures.gradient_quality import compare_differences, subgrid
 from gradscape.landscapes.measures.profile import measure_profile, named_measures
 from gradscape.landscapes.measures.sensitivity import Design, explore
-from gradscape.landscapes.objective import evaluate, failed, has_loss
+from gradscape.landscapes.objective import BoxedObjective, Objective, evaluate, failed, has_loss
 from gradscape.landscapes.storage.checkpoint import Checkpoint
 
 BOUNDS = torch.tensor([[-1.0, 0.1, -3.0], [2.0, 0.7, 3.0]], dtype=torch.float64)
 SPACE = ParameterSpace(("a", "b", "c"), *BOUNDS, ("", "m", "s"))
 
 
-class Strict:
+class Strict(Objective):
     """A bowl that refuses whatever lies beyond its bounds, by as little as one part in 10^12, as many functions do."""
 
     space, name = SPACE, "strict"
@@ -53,7 +52,7 @@ def test_points_beyond_have_left_the_domain_and_the_others_their_losses():
     assert bool(found.loss[3:].isnan().all() & found.grad[3:].isnan().all())
     assert evaluate(Strict(), x[3:], grad=False).status.tolist() == [Status.ESCAPED] * 2
     assert evaluate(Inviting(), x, grad=True).status.tolist() == [Status.OK] * 5
-    assert evaluate(within_box(Inviting()), x, grad=True).status.tolist() == found.status.tolist()
+    assert evaluate(BoxedObjective(Inviting()), x, grad=True).status.tolist() == found.status.tolist()
 
 
 def test_a_window_beyond_the_box_shows_what_lies_in_it():

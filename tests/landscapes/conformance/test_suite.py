@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
-from gradscape.landscapes.adapters import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.conformance.extremes import CORNERS, ExtremeCase, corners
 from gradscape.landscapes.conformance.suite import check
-from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.space import ParameterSpace
 
 SPACE = ParameterSpace.box(["a", "b", "c"], -1.0, 2.0)
@@ -27,7 +27,7 @@ def failures(objective, **settings):
     return {name for name, found in outcomes(objective, **settings).items() if found.bad}
 
 
-class Sound:
+class Sound(Objective):
     """A smooth objective that keeps every promise; a defect overrides one part of it."""
 
     name = "sound"
