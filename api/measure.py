@@ -34,8 +34,8 @@ def report(
 
     `what` is a slice, a slice's folder, or a scene, of which a slice over its first two parameters is sampled first.
     Gradients are tested by new evaluations at `points` places along each axis; of the `keywords`, those but `device`
-    are for a scene alone; `env` is the simulator of a slice, where it is not registered by its name. The report's files lie in `out`, by default a folder under out/ named after it: the same call
-    reads them again.
+    are for a scene alone; `env` is the simulator of a slice, where it is not registered by its name. The report's files
+    lie in `out`, by default a folder under out/ named after it: the same call reads them again.
 
     Raises ValueError for a slice without gradients or on no disk, for what the scene does not have, and where the
     folder holds something else or another report; Stopped where it is interrupted.

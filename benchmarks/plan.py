@@ -1,5 +1,3 @@
-from gradscape.landscapes.objective import Objective
-
 """Hold what `landscape plan` predicts against what jobs then take, everything in a process of its own.
 
     python benchmarks/plan.py [--tries 5] [--json] [--only "race of bounce"]
@@ -82,7 +80,7 @@ def tried(find: Callable[[Path], dict[str, float]], tries: int) -> dict[str, flo
     return {name: median(one[name] for one in found) for name in found[0]}
 
 
-class Timed(Objective):
+class Timed:
     """An objective that counts the seconds in which it is asked for losses."""
 
     def __init__(self, objective: Any) -> None:

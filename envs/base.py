@@ -46,8 +46,9 @@ class Environment(Objective):
     are `space` and `_evaluate`. What only some scenes can do has a default. An environment is a torch function, too:
     `env(x)` returns losses, shape (batch,), that can be differentiated. `fidelity` is a name from `fidelities`, the
     first unless said otherwise, or a record of one's own; `device` is auto, cpu or cuda; `engine` is one of `engines`,
-    the first unless said otherwise; options are those of the class's `Options`. Two runs give the same bits, on a CPU and on a GPU, alone or in a batch,
-    but for an engine that cannot promise that; `deterministic` refuses such an engine.
+    the first unless said otherwise; options are those of the class's `Options`. Two runs give the same bits, on a CPU
+    and on a GPU, alone or in a batch, but for an engine that cannot promise that; `deterministic` refuses such an
+    engine.
     """
 
     fidelities: ClassVar[Mapping[str, Fidelity]] = {"default": Fidelity("default", dt=0.0, precision="float64")}

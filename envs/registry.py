@@ -5,7 +5,8 @@ Another package registers its own by an entry point of the group `gradscape.envi
     [project.entry-points."gradscape.environments"]
     my-arm = "my_package.arm:Arm"
 
-A program or a notebook registers a class by `register`, and the command takes whatever simulator a file holds as `FILE.py:NAME`.
+A program or a notebook registers a class by `register`, and the command takes whatever simulator a file holds as
+`FILE.py:NAME`.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ SCENE = ("draft", "standard", "reference")
 class Entry:
     """Say what an environment is without importing it.
 
-    `target` is "module:Class", "FILE.py:NAME", a class or an environment. What another package's entry point cannot say is
-    empty; `complete_entry` asks the class. An environment whose engine is not always installed comes with an `extra`
+    `target` is "module:Class", "FILE.py:NAME", a class or an environment. What another package's entry point cannot say
+    is empty; `complete_entry` asks the class. An environment whose engine is not always installed comes with an `extra`
     of this package.
     """
 

@@ -32,9 +32,9 @@ class SceneSpec:
     """Say which scene is simulated, and how.
 
     `name` is a registered name, FILE.py:NAME, an environment's class, or an environment. `fidelity` is a name or a
-    record, by default the cheapest; `tolerance` chooses it by measured loss errors instead ("5%" of the losses' spread, or "0.05" in their
-    unit). `device` is auto, cpu or cuda, `engine` one of the scene's, by default its first, and `options` are
-    the scene's own.
+    record, by default the cheapest; `tolerance` chooses it by measured loss errors instead ("5%" of the losses' spread,
+    or "0.05" in their unit). `device` is auto, cpu or cuda, `engine` one of the scene's, by default its first, and
+    `options` are the scene's own.
     """
 
     name: str | type[Environment] | Environment
