@@ -78,9 +78,8 @@ class CompareJob:
             check_finished(ours, theirs)
             identity = {"a": slice.identity, "b": other.identity}
         else:
-            unit = getattr(other, "loss_unit", "")
             names = scaled_labels(other.space.names, other.space.scales)
-            check_landscapes(parameters(ours), names, loss_unit(ours), unit)
+            check_landscapes(parameters(ours), names, loss_unit(ours), other.loss_unit)
             check_finished(ours)
             identity = {"a": slice.identity, "b": identity_of(other)}
         named = [str(one.get("objective", "slice")) for one in identity.values()]
