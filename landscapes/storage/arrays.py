@@ -25,6 +25,7 @@ from .tiles import coarse_to_fine, tile_side
 FORMAT = 2
 AXES = ("u", "v")
 CF = "CF-1.11"
+ERROR = "error"  # the attribute of a slice or a run with what the first point that raised said
 INTERPOLATED = "interpolated"  # the array of a refined slice that has what was not sampled
 FILES = store_files(("loss", "grad", "status", INTERPOLATED, SUMS, *AXES, "dim", "unit"))  # of a slice on disk
 DRAWN = 150  # bytes that a picture takes for each sample
