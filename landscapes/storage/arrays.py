@@ -14,7 +14,7 @@ import zarr
 from numpy.typing import NDArray
 
 from ..capacity import BLOCK, Need, require
-from ..objective import Status
+from ..objective import Status, describe_errors
 from ..plane import Plane
 from ..space import ParameterSpace
 from .checksums import SUMS, lay_out_sums, text_sum, write_sums
@@ -125,6 +125,11 @@ def parameters_of(dataset: xr.Dataset) -> list[tuple[str, str]]:
     """Return the name and the unit of every parameter of a slice."""
     names, units = (map(str, dataset[name].to_numpy()) for name in ("dim", "unit"))
     return list(zip(names, units, strict=True))
+
+
+def errors_of(dataset: xr.Dataset) -> str:
+    """Say how many points of a slice or a run raised and what the first of them said; nothing where none did."""
+    return describe_errors(int((dataset["status"] == Status.ERROR).sum()), str(dataset.attrs.get(ERROR, "")))
 
 
 def _axis(plane: Plane, number: int) -> dict[str, str]:

@@ -25,9 +25,9 @@ SAID = "RuntimeError: too much work"
 
 
 class Wave:
-    """A smooth wave that is not finite in one corner, escapes in another and raises in a third; it counts what it is asked.
+    """A smooth wave that escapes in one corner and raises in another, and has no gradients in the middle.
 
-    In the middle it has losses, and no gradients.
+    It counts what it is asked.
     """
 
     space = SPACE
