@@ -160,7 +160,10 @@ def named_measures(record: ProfileRecord) -> dict[str, str]:
     losses, jumps = record["losses"], record["jumps"]
     near, smooth = record["differences_of_samples"][0], record["smoothing"]
     fewest, most = losses["minima_halved"]
+    lacking = losses.get("missing")
     named = {
+        "Samples that failed": _percent(losses["failed"] / losses["samples"]) if losses["failed"] else "",
+        "Gradients missing beside a loss": _shares(lacking) if lacking and lacking["value"] else "",
         "Local minima above the noise": f"{losses['minima']} ({fewest} to {most} at half the resolution)",
         "Local minima deeper than 1 % of the range": str(losses["notable"]),
         "Basin of the lowest sample": _percent(losses["lowest_basin"]),

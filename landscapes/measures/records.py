@@ -22,6 +22,7 @@ class LossesRecord(TypedDict):
     lowest_basin: float | None
     zero: EstimateRecord | None
     flat: EstimateRecord | None
+    missing: NotRequired[EstimateRecord | None]  # nor this
     level: EstimateRecord
     correlation_length: list[EstimateRecord]
     holder: NotRequired[list[EstimateRecord]]  # reports of early versions do not have it
