@@ -144,4 +144,5 @@ class ProfileRecord(TypedDict):
     beyond_the_box: NotRequired[BeyondRecord]
     unresolved: NotRequired[UnresolvedRecord | None]
     at_twice: NotRequired[TwiceRecord | None]
+    errors: NotRequired[str]
     growth: NotRequired[dict[str, Any] | None]  # what `lyapunov.GradientGrowth` holds

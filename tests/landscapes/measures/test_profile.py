@@ -77,7 +77,8 @@ class Partly:
         u = self.space.to_unit(x)
         failed = torch.where(u[:, 1] < self.failing, Status.ERROR, Status.OK)
         slope = (2 * x).masked_fill(u[:, :1] < self.missing, torch.nan)
-        return Evaluation.from_results(x.square().sum(dim=1), slope if grad else None, failed)
+        said = "RuntimeError: too much work" if bool((failed == Status.ERROR).any()) else ""
+        return Evaluation.from_results(x.square().sum(dim=1), slope if grad else None, failed, said)
 
     def profile(self) -> Profile:
         dataset = sample(self, Plane.through(self.space, self.space.center, (0, 1), resolution=16))
@@ -108,7 +109,9 @@ def test_a_slice_that_mostly_failed_is_called_nothing_else() -> None:
     found = Partly(0.0, 0.6).profile()
     share = f"{found.losses.failed / found.losses.samples:.0%}"
     assert found.verdict.reasons == {"mostly failed": f"no loss at {share} of the samples"}
-    assert named_measures(found.record())["Samples that failed"].startswith(share[:2])
+    named = named_measures(found.record())
+    assert named["Samples that failed"].startswith(share[:2])
+    assert named["Points that raised"] == f"{found.losses.failed} points raised: first 'RuntimeError: too much work'"
     assert Partly(0.0, 1.1).profile().words == ("mostly failed",)
 
 
