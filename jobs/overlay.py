@@ -12,7 +12,7 @@ import xarray as xr
 
 from ..envs.registry import as_environment
 from ..landscapes.identity import plane_of, stored_identity
-from ..landscapes.objective import Objective, Status
+from ..landscapes.objective import Objective, failed
 from ..landscapes.overlay import best_point, overlay, principal_plane
 from ..landscapes.plane import Plane
 from ..landscapes.slice import Slice
@@ -120,7 +120,7 @@ class Overlay:
             runs=len(self.runs),
             points=sum(run.sizes["evaluation"] for run in self.runs),
             outside=sum(int(run["outside"].sum()) for run in self.runs),
-            failed=sum(int((run["status"] != Status.OK).sum()) for run in self.runs),
+            failed=sum(int(failed(run["status"]).sum()) for run in self.runs),
             farthest=max(float(run["distance"].max().round(9)) for run in self.runs),
             files=self.files,
         )

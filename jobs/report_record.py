@@ -81,7 +81,8 @@ class Report:
         with reading(path, "delete it, and the same command measures the slice anew"):
             report = replace(cls.of_record(read_json(path)), folder=path.parent)
             report.measures, slices_markdown([report]), by_environment([report])
-            for said in (report.name, report.env, report.device, report.key["code"], *report.verdict_lines()):
+            own = report.name, report.env, report.device, report.key["code"], report.profile.get("errors", "")
+            for said in (*own, *report.verdict_lines()):
                 text(said)
         return report
 

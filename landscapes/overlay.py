@@ -15,6 +15,7 @@ from torch import Tensor
 
 from .identity import plane_of, stored_scales
 from .lattice import own_cells
+from .objective import Status
 from .plane import Plane
 
 IMPROVEMENTS_OF = "improvements_of"  # attribute of a run of which only improvements are laid: how many episodes it has
@@ -138,7 +139,8 @@ def _previous(table: xr.Dataset) -> NDArray[np.intp]:
     z, slope = (table["x"].to_numpy() - center) / half, -table["grad"].to_numpy() * half
     found = np.full(len(z), -1)
     free = np.isfinite(slope).all(axis=1) & (slope != 0).any(axis=1)  # may be followed, once
-    for row in np.flatnonzero(np.isfinite(slope).all(axis=1) | np.isnan(table["loss"].to_numpy())):
+    lacking = table["status"].to_numpy() == Status.NO_GRADIENT
+    for row in np.flatnonzero(np.isfinite(slope).all(axis=1) | np.isnan(table["loss"].to_numpy()) | lacking):
         first = max(0, int(row) - RECENT)
         earlier = first + np.flatnonzero(free[first:row])
         if len(earlier) and (near := _is_aligned(z[row] - z[earlier], slope[earlier], np.abs(z[row]) < 1 - 1e-9)).any():

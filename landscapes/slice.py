@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from .identity import plane_of, stored_identity, stored_provenance
 from .objective import Objective, Status
 from .plane import Plane
+from .storage.arrays import errors_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -71,6 +72,11 @@ class Slice:
             raise ValueError("this slice was sampled without gradients; sample it again with gradients=True")
         found: NDArray[np.float64] = self.plane.slope(torch.from_numpy(self.data["grad"].to_numpy())).numpy()
         return found
+
+    @property
+    def errors(self) -> str:
+        """How many points raised and what the first of them said, in a line; empty where none did."""
+        return errors_of(self.data)
 
     def minima(self, depth: float = 0.01) -> pd.DataFrame:
         """Return the local minima deeper than a share of the range of the losses, deepest first, a row each.
@@ -143,7 +149,9 @@ class Slice:
         low, high = float(loss.min()), float(loss.max())
         finite = f"losses from {low:.4g} to {high:.4g}" if low <= high else "no finite loss"
         where = f" in {self.folder}" if self.folder else ""
-        return f"<Slice of {' · '.join(about)} over {', '.join(self.plane.labels)}: {points} points, {finite}{where}>"
+        raised = f"; {self.errors}" if self.errors else ""
+        over = ", ".join(self.plane.labels)
+        return f"<Slice of {' · '.join(about)} over {over}: {points} points, {finite}{raised}{where}>"
 
     def _events(self) -> dict[str, Any]:
         """Count what happens in the episodes along a line, where an environment says what does."""

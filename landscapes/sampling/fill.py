@@ -102,6 +102,7 @@ def sample(
         for filled in tiles:
             for note in filled.notes:
                 warnings.warn(note, RuntimeWarning, stacklevel=2)
+            store.keep_error(filled.error)
             counts.update(filled.statuses)
             left -= Counter([filled.tile.level])  # none is kept at zero
             report()

@@ -344,6 +344,7 @@ class Refining:
         if found.grad is not None and self.store.grad:
             arrays["grad"] = found.grad.numpy()
         self.samples.take(at, arrays["loss"], arrays["status"], arrays.get("grad"))
+        self.store.keep_error(found.error)
         if self.pieces is not None:
             self.pieces.save("-".join(map(str, [len(at), *at[0]])), at=at, **arrays)
         self._report()

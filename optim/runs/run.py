@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ...landscapes.identity import stored_identity, stored_provenance, stored_scales
 from ...landscapes.space import to_values
+from ...landscapes.storage.arrays import errors_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -76,6 +77,11 @@ class Run:
         x = to_values(torch.from_numpy(self.data["x"].to_numpy()[row].copy()), stored_scales(self.data))
         return BestEpisode(x, float(loss[row]), row + 1)
 
+    @property
+    def errors(self) -> str:
+        """How many episodes raised and what the first of them said, in a line; empty where none did."""
+        return errors_of(self.data)
+
     def table(self) -> pd.DataFrame:
         """Return a row for each episode: number, parameters, loss, status, kind, costs and gradient.
 
@@ -102,7 +108,8 @@ class Run:
         count = self.data.sizes["evaluation"]
         found = f"best loss {self.best.loss:.6g}" if np.isfinite(self.data["loss"]).any() else "none succeeded"
         where = f", in {self.folder}" if self.folder else ""
-        return f"<Run of {self._name()}: {count} of {self.data.attrs['budget']} episodes, {found}{where}>"
+        raised = f"; {self.errors}" if self.errors else ""
+        return f"<Run of {self._name()}: {count} of {self.data.attrs['budget']} episodes, {found}{raised}{where}>"
 
     def _name(self) -> str:
         return f"{self.method} on {self.data.attrs['env']}, seed {self.seed}"

@@ -16,7 +16,7 @@ from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 
 from ...identity import plane_of
-from ...objective import Status
+from ...objective import failed
 from ...overlay import improvements
 from ...plane import Plane
 from .. import style
@@ -153,7 +153,7 @@ def _log_key(stream: rr.RecordingStream, scene: Scene, runs: Runs) -> None:
     shown = {name: style.POINT_MARKS[name]["color"] for run in runs for name, _ in by_kind(run)}
     if any(run["outside"].any() for run in runs):
         shown["outside"] = style.BEYOND
-    if any((run["status"] != Status.OK).any() for run in runs):
+    if any(failed(run["status"]).any() for run in runs):
         shown["failed"] = style.LOST
     behind, left = (np.array(scene.stand.place(turn, 1.0, -relief.FOCUS)) for turn in (180.0, -90.0))
     high = np.array([0.0, 0.0, 1.25 * HEIGHT])
@@ -168,9 +168,9 @@ def _log_run(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None:
     path, loss, outside = f"landscape/runs/{run.attrs['label']}", run["loss"].to_numpy(), run["outside"].to_numpy()
     places = scene.at(run["u"].to_numpy(), run["v"].to_numpy(), np.nan_to_num(loss, nan=-np.inf))
     radii = RADIUS * np.sqrt(style.point_areas(run["distance"].to_numpy(), scene.reach, 1) / style.MARK_AREAS[1])
-    failed = run["status"].to_numpy() != Status.OK
-    groups = [(name, here & ~outside & ~failed, style.POINT_MARKS[name]["color"]) for name, here in by_kind(run)]
-    groups += [("outside", outside & ~failed, style.BEYOND), ("failed", failed, style.LOST)]
+    lost = failed(run["status"].to_numpy())
+    groups = [(name, here & ~outside & ~lost, style.POINT_MARKS[name]["color"]) for name, here in by_kind(run)]
+    groups += [("outside", outside & ~lost, style.BEYOND), ("failed", lost, style.LOST)]
     for name, here, color in groups:
         _log_points(stream, f"{path}/{name}", np.flatnonzero(here), places, radii, color)
     rows = np.flatnonzero(run["previous"].to_numpy() >= 0)
@@ -281,10 +281,10 @@ def _about(dataset: xr.Dataset, runs: Runs, scene: Scene) -> str:
 
 
 def _row(run: xr.Dataset) -> str:
-    failed = int((run["status"] != Status.OK).sum())
+    lost = int(failed(run["status"]).sum())
     best = float(run["best"][-1]) if run.sizes["evaluation"] else float("nan")
     said = style.number(best) if np.isfinite(best) else "none"
-    return f"| {run.attrs['label']} | {run.sizes['evaluation']} | {failed} | {int(run['outside'].sum())} | {said} |"
+    return f"| {run.attrs['label']} | {run.sizes['evaluation']} | {lost} | {int(run['outside'].sum())} | {said} |"
 
 
 def _digest(dataset: xr.Dataset, runs: Runs) -> str:

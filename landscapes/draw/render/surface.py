@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ...identity import plane_of
 from ...lattice import own_cells
-from ...objective import Status
+from ...objective import has_loss
 from ...storage.files import replacing
 from .. import style
 from ..figures import page, panel
@@ -232,5 +232,5 @@ def _entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
 
 def _holes(dataset: xr.Dataset) -> list[Artist]:
     status = dataset["status"].to_numpy()
-    failed = int((status != Status.OK).sum())
-    return [Line2D([], [], linestyle="none", label=f"holes: {failed} of {status.size} samples")] if failed else []
+    holes = int((~has_loss(status)).sum())
+    return [Line2D([], [], linestyle="none", label=f"holes: {holes} of {status.size} samples")] if holes else []
