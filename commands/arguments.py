@@ -89,7 +89,8 @@ Through = Annotated[
     str,
     typer.Option(
         help="The point it goes through: center, random:SEED, example:NAME, best, best:RUN, a file of numbers, or a "
-        "row of a table, TABLE.csv:ROW, by default the one of the least loss; slice and sweep take several, "
+        "row of a table, TABLE.csv:ROW (row 1 is its heading), by default the one of the least loss; slice and "
+        "sweep take several, "
         "A,B."
     ),
 ]

@@ -93,11 +93,13 @@ class OverlaySummary:
     failed: int
     farthest: float
     files: list[str]
+    skipped: int = 0  # rows of tables that hold no point
 
     def outcome(self) -> str:
         """Say it in a line."""
         counted = f"{self.runs} run{'s' if self.runs > 1 else ''}, {self.points} points"
-        where = f"{self.outside} beyond the map, {self.failed} failed"
+        skipped = f", {self.skipped} row{'s' if self.skipped > 1 else ''} skipped" if self.skipped else ""
+        where = f"{self.outside} beyond the map, {self.failed} failed{skipped}"
         return f"{counted}: {where}; the farthest is {self.farthest:.2g} half-widths of the box off the plane"
 
 
@@ -123,6 +125,7 @@ class Overlay:
             failed=sum(int(failed(run["status"]).sum()) for run in self.runs),
             farthest=max(float(run["distance"].max().round(9)) for run in self.runs),
             files=self.files,
+            skipped=sum(int(run.attrs.get("skipped", 0)) for run in self.runs),
         )
 
     def plot(self, *, width: float | None = None) -> Picture:

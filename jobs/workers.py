@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..envs.registry import make, source_of
 from ..landscapes.draw.loopback import LOOPBACK
+from ..landscapes.plain import printable
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
@@ -66,7 +67,7 @@ def workers(scheduler: str | None, device: str) -> Iterator[Executor | None]:
         except (OSError, ValueError) as error:
             raise ConnectionError(f"no Dask scheduler answers at {scheduler}: {error}") from error
         if not client.nthreads():
-            print(f"waiting for a first worker of {scheduler}", file=sys.stderr)
+            print(f"waiting for a first worker of {printable(scheduler)}", file=sys.stderr)
             client.wait_for_workers(1)
         try:
             yield client.get_executor(pure=False)
@@ -102,7 +103,7 @@ def _greet(address: str) -> None:
         raise ConnectionError(f"no Dask scheduler answers at {address}: {said}") from error
     if not closed:
         print(
-            f"warning: {address} is without TLS, so whoever reaches it runs code on its workers and here; "
+            f"warning: {printable(address)} is without TLS, so whoever reaches it runs code on its workers and here; "
             "docs/clusters.md says how a cluster is closed",
             file=sys.stderr,
         )

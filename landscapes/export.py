@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -17,6 +17,8 @@ from .storage.files import replacing
 if TYPE_CHECKING:
     import pandas as pd
 
+BLANK = ("\t", "\r", "\n")
+FORMULA = ("=", "+", "-", "@", *BLANK)  # what a spreadsheet may take for the beginning of one
 SUFFIXES = {"csv": ".csv", "parquet": ".parquet", "netcdf": ".nc"}
 
 
@@ -33,9 +35,36 @@ def save_as(dataset: xr.Dataset, path: Path, kind: str) -> None:
         if kind == "netcdf":
             dataset.to_netcdf(partial)
         elif kind == "csv":
-            frame(dataset).to_csv(partial, index=False)
+            save_csv(frame(dataset), partial)
         else:
             frame(dataset).to_parquet(partial, index=False)
+
+
+def save_csv(table: pd.DataFrame, path: Path) -> None:
+    """Write a table as CSV in which no cell is a formula to a spreadsheet: headings and words are `quoted`."""
+    words = table.select_dtypes(exclude=["number", "bool"]).columns
+    table = table.assign(**{name: table[name].map(quoted) for name in words})
+    table.rename(columns=quoted).to_csv(path, index=False)
+
+
+def quoted(cell: Any) -> Any:
+    """Return a cell, after an apostrophe where a spreadsheet would take it for a formula."""
+    return f"'{cell}" if isinstance(cell, str) and _is_formula(cell) else cell
+
+
+def unquoted(cell: str) -> str:
+    """Return a cell without the apostrophe that `quoted` has put before it."""
+    return cell[1:] if cell.startswith("'") and _is_formula(cell[1:]) else cell
+
+
+def _is_formula(cell: str) -> bool:
+    if not cell.startswith(FORMULA):
+        return False
+    try:
+        float(cell)  # such as -1.5
+    except ValueError:
+        return True
+    return cell.startswith(BLANK)
 
 
 def frame(dataset: xr.Dataset) -> pd.DataFrame:

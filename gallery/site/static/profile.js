@@ -181,7 +181,8 @@ document.getElementById("profile-up").addEventListener("click", () => {
 document.getElementById("profile-drop").addEventListener("click", dropProfile);
 
 function profileTable() {
-  const quoted = (text) => `"${text.replaceAll('"', '""')}"`;
+  const plain = (text) => (/^[=+\-@\t\r\n]/.test(text) ? "'" : "") + text; // no formula to a spreadsheet
+  const quoted = (text) => `"${plain(text).replaceAll('"', '""')}"`;
   const head = [across.label, up.label, lossLabel, "status"].map(quoted).join(",");
   const row = (index) => [valueOf(across, across.values[at(index)[0]]), valueOf(up, up.values[at(index)[1]]), losses[index] === losses[index] ? losses[index] : "", statusOf(index)].join(",");
   return [head, ...nodesAlong(profile).map(row), ""].join("\n");

@@ -165,7 +165,7 @@ def _log_key(stream: rr.RecordingStream, scene: Scene, runs: Runs) -> None:
 
 
 def _log_run(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None:
-    path, loss, outside = f"landscape/runs/{run.attrs['label']}", run["loss"].to_numpy(), run["outside"].to_numpy()
+    path, loss, outside = f"landscape/runs/{_path_of(run)}", run["loss"].to_numpy(), run["outside"].to_numpy()
     places = scene.at(run["u"].to_numpy(), run["v"].to_numpy(), np.nan_to_num(loss, nan=-np.inf))
     radii = RADIUS * np.sqrt(style.point_areas(run["distance"].to_numpy(), scene.reach, 1) / style.MARK_AREAS[1])
     lost = failed(run["status"].to_numpy())
@@ -194,14 +194,22 @@ def _log_best(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None
     known = np.flatnonzero(np.isfinite(best))
     if not len(known):
         return
-    curve = np.log10(best[known]) if scene.scale.logarithmic else best[known]
-    _log(stream, f"best/{label}", rr.SeriesLines(colors=rgba(color), names=label, widths=1.5))
-    stream.send_columns(f"best/{label}", _times(known), rr.Scalars.columns(scalars=curve), strict=True)
+    with np.errstate(divide="ignore", invalid="ignore"):  # a run may go below the losses of a slice, and below zero
+        curve = np.log10(best[known]) if scene.scale.logarithmic else best[known]
+    _log(stream, f"best/{_path_of(run)}", rr.SeriesLines(colors=rgba(color), names=label, widths=1.5))
+    stream.send_columns(f"best/{_path_of(run)}", _times(known), rr.Scalars.columns(scalars=curve), strict=True)
     lowered = improvements(run)
     places = scene.at(*(run[name].to_numpy()[lowered] for name in ("u", "v", "loss")))
     spread = np.empty((run.sizes["evaluation"], 3))
     spread[lowered] = places
-    _log_points(stream, f"landscape/runs/{label}/best", lowered, spread, np.full(len(spread), 1.6 * RADIUS), color)
+    _log_points(
+        stream, f"landscape/runs/{_path_of(run)}/best", lowered, spread, np.full(len(spread), 1.6 * RADIUS), color
+    )
+
+
+def _path_of(run: xr.Dataset) -> str:
+    """Return a run's label as a part of a path, which has no spaces or brackets."""
+    return str(rr.escape_entity_path_part(run.attrs["label"]))
 
 
 def _log_points(
