@@ -6,15 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
-from ..jobs.scene import SceneSpec
 from .progress import default_watch
-from .scene import SceneKeywords, spec_of
+from .scene import Scene, SceneKeywords, spec_of
 
 if TYPE_CHECKING:
-    from ..envs.base import Environment
+    from ..jobs.scene import SceneSpec
     from ..optim.league import League
-
-    Scene = str | type[Environment] | Environment | SceneSpec
 
 
 def league(

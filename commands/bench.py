@@ -39,10 +39,10 @@ def bench(
 
     Example: landscape bench fluid --against taichi
     """
-    from ..envs.registry import environment_class
+    from ..envs.registry import find_environment
 
     if isinstance(scene.name, str):
-        environment_class(scene.name)  # a name that does not exist is refused before what measures is loaded
+        find_environment(scene.name)  # a name that does not exist is refused before what measures is loaded
     from ..jobs.bench import BenchJob
     from .terminal import Bars, Console, command_line, print_json
 

@@ -40,8 +40,6 @@ def _list() -> None:
 
 def _describe(name: str) -> None:
     """Print all there is to know about one environment."""
-    from dataclasses import asdict
-
     from ..envs.registry import make
     from ..gallery.paper import read_paper
     from ..jobs.margins import say_margins
@@ -57,7 +55,7 @@ def _describe(name: str) -> None:
         bounded.add_row(str(number), label, f"{lower:g}", f"{upper:g}", unit)
     console.print(bounded)
     for fidelity in env.fidelities.values():
-        console.print(f"fidelity {asdict(fidelity)}")
+        console.print(f"fidelity {fidelity.record()}")
     console.print(f"engines: {', '.join(env.engines)}")
     for said in say_margins(env) if any(one.dt for one in env.fidelities.values()) else ():
         console.print(said)

@@ -47,17 +47,14 @@ def overlay(
     Example: landscape overlay out/fluid-6-8 out/race-fluid --through best
     """
     from ..api.slice import open_slice
-    from ..envs.registry import environment_class
     from ..jobs.foreign import tables_over
     from ..jobs.overlay import STREAM, Cut, OverlayJob
     from .terminal import Bars, command_line
     from .view import check_display, show_recording
 
-    if env:
-        environment_class(env)  # which registers it
     bars, cut = Bars(), Cut.of(through, plane, resolution)
     how: dict[str, Any] = {"out": Path(out) if out else None, "prints": print_ or [], "watch": bars, "device": device}
-    beneath = open_slice(slice_)
+    beneath = open_slice(slice_, env=env)
     job = OverlayJob.of(beneath, tables_over(beneath, runs), command=command_line(), cut=cut, **how)
     recording = job.folder / STREAM
     if spawn and not serve:

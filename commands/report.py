@@ -50,12 +50,11 @@ def report_(
     from .terminal import Bars, command_line
 
     _refuse_both(what, everything)
-    _register(env)
     bars, root = Bars(), data_folder(data)
     subjects = _figures(root) if what is None else _subjects(what, root, fidelity, device, points, bars)
     single = what is not None and len(subjects) == 1
     how: dict[str, Any] = {"points": points, "seed": seed, "out": Path(out) if out else None, "device": device}
-    how |= {"prints": print_ or [], "paper": read_paper().words, "command": command_line()}
+    how |= {"prints": print_ or [], "paper": read_paper().words, "command": command_line(), "env": env}
     job = ReportJob.open(subjects, what=Path(what or "all").name, single=single, **how)
     found = job.run(bars)
     if single:
@@ -68,14 +67,6 @@ def _refuse_both(what: str | None, everything: bool) -> None:
     """Raise ValueError unless it is said what to report on, once."""
     if (what is None) != everything:
         raise ValueError("report takes a slice's folder, an environment, or --all for every figure of the gallery")
-
-
-def _register(source: str | None) -> None:
-    """Register the class of a file, which the slice's environment may be."""
-    from ..envs.registry import environment_class
-
-    if source:
-        environment_class(source)
 
 
 def _figures(root: Path) -> list[ReportedSlice]:
@@ -91,14 +82,14 @@ def _figures(root: Path) -> list[ReportedSlice]:
 
 def _subjects(what: str, root: Path, fidelity: str | None, device: str, points: int, bars: Bars) -> list[ReportedSlice]:
     """Return a slice, or an environment's figures, or a slice sampled now for want of any."""
-    from ..envs.registry import environment_class, make
+    from ..envs.registry import find_environment, make
     from ..gallery.figures import read_figures
     from ..jobs.report import ReportedSlice, sample_subject
     from .terminal import command_line
 
     if Path(what).exists():
         return [ReportedSlice.of(Path(what))]
-    environment_class(what)  # refuses a name that does not exist, with those that come close
+    find_environment(what)  # refuses a name that does not exist, with those that come close
     figures = [figure for figure in read_figures() if figure.env == what and fidelity in (None, figure.fidelity)]
     if found := [ReportedSlice.of(root / figure.id) for figure in figures if _is_finished(root / figure.id)]:
         return found

@@ -72,15 +72,15 @@ class Bounce(Environment):
     2022), appendix B.1; contact constants of NVIDIA Warp's bounce example.
     """
 
-    name: ClassVar[str] = "bounce"
+    name = "bounce"
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
-    beyond_box: ClassVar[bool] = True
+    beyond_box = True
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=1 / 320),
         "standard": Fidelity("standard", dt=1 / 480),
         "reference": Fidelity("reference", dt=1 / 7680, precision="float64"),
     }
-    loss_unit: ClassVar[str] = "m²"
+    loss_unit = "m²"
     model_parts: ClassVar[tuple[ModelPart, ...]] = (
         ModelPart("friction", {"mu": 0.0, "kf": 0.0}, "a smooth ground"),
         ModelPart("damping", {"kd": 0.0}, "an elastic ground"),

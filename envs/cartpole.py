@@ -71,16 +71,16 @@ class Cartpole(Environment):
     controls satisfy all three. Masses, torques, times and target are ours.
     """
 
-    name: ClassVar[str] = "cartpole"
+    name = "cartpole"
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
-    beyond_box: ClassVar[bool] = True
+    beyond_box = True
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=SPAN),
         "standard": Fidelity("standard", dt=SPAN / 2),
         "reference": Fidelity("reference", dt=SPAN / 8, precision="float64"),
     }
-    loss_unit: ClassVar[str] = "m"
-    decisions: ClassVar[int] = CONTROLS
+    loss_unit = "m"
+    decisions = CONTROLS
     control_step: ClassVar[float] = SPAN
     designed_order: ClassVar[dict[str, float]] = {"dt": 4.0}  # classical Runge-Kutta; controls change between steps
     model_parts: ClassVar[tuple[ModelPart, ...]] = (

@@ -77,7 +77,7 @@ class CompareJob:
             check_finished(ours, theirs)
             identity = {"a": slice.identity, "b": other.identity}
         else:
-            unit = getattr(other, "loss_unit", "")
+            unit = other.loss_unit
             check_landscapes(parameters(ours), other.space.names, loss_unit(ours), unit)
             check_finished(ours)
             identity = {"a": slice.identity, "b": identity_of(other)}

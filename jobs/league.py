@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..envs.registry import entries, environment_class
+from ..envs.registry import entries
 from ..landscapes.cost import duration, episode_cost
 from ..landscapes.space import as_whole
 from ..landscapes.storage.disk import full, is_full
@@ -263,7 +263,7 @@ def _known_fidelities(scene: SceneSpec) -> tuple[str, tuple[str, ...]]:
     entry = entries().get(scene.name) if isinstance(scene.name, str) else None
     if entry and (entry.fidelities or entry.extra):
         return entry.name, entry.fidelities
-    kind = environment_class(scene.name) if isinstance(scene.name, str) else scene.name
+    kind = scene.kind
     return kind.name, tuple(kind.fidelities)
 
 

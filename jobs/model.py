@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -148,8 +148,7 @@ class ModelJob:
 
     def _changed(self, part: ModelPart) -> Environment:
         """Make the model with a part changed; raises ValueError where that is the full model, or the scene refuses."""
-        full = SceneSpec.of(self.env)
-        env = replace(full, options={**full.options, **part.options}).make()
+        env = self.env.remake(**part.options)
         if env.options == self.env.options:
             raise ValueError(f"the full model's options are those of {part.change!r} already")
         return env

@@ -12,7 +12,6 @@ import numpy as np
 
 from ..landscapes.capacity import BLOCK, Need, require
 from .folder import SWEEP
-from .scene import SceneSpec
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -100,14 +99,20 @@ def _parameter(name: int | str, env: Environment, plane: Plane, frames: int) -> 
 
 def _horizon(env: Environment, plane: Plane, frames: int) -> Motion:
     """End the episode later and later, up to the scene's own end."""
-    if not hasattr(env.options, HORIZON):
-        raise ValueError(f"{env.name} has no {HORIZON} to sweep over; sweep a third parameter or {SMOOTHING}")
-    if env.options.horizon != 1:
+    whole = env.horizon
+    if whole is None:
+        raise ValueError(
+            f"{env.name} has no {HORIZON} to sweep over: no setting says how long an episode is (horizon= of a "
+            f"function names one); sweep a third parameter or {SMOOTHING}"
+        )
+    if env.horizon_option == HORIZON and whole != 1 and env.model_version:
         raise ValueError(f"--over {HORIZON} moves that option itself; leave out --set {HORIZON}=...")
     shares = [(frame + 1) / frames for frame in range(frames)]
-    label, scene = "share of the scene's duration [%]", SceneSpec.of(env)
     values = tuple(100 * share for share in shares)
-    return Motion(label, values, (plane,) * frames, lambda number: scene.make(horizon=shares[number]))
+    return Motion(
+        "share of the scene's duration [%]", values, (plane,) * frames,
+        lambda number: env.with_horizon(shares[number] * whole),
+    )  # fmt: skip
 
 
 def _smoothing(env: Environment, plane: Plane, frames: int) -> Motion:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
+from ..envs.registry import as_environment
 from ..landscapes.identity import plane_of, stored_identity
 from ..landscapes.objective import Objective, Status
 from ..landscapes.overlay import best_point, overlay, principal_plane
@@ -196,9 +197,8 @@ class OverlayJob:
 
     def _objective(self) -> Objective:
         """Return what the slice was sampled from."""
-        if self.device == "auto" and self.slice.remake:
-            return self.slice.remake()
-        return environment_of(self.slice.data, self.device)
+        found = self.slice.remake() if self.slice.remake else environment_of(self.slice.data, self.device)
+        return found if self.device == "auto" else as_environment(found).remake(device=self.device)
 
     def _write(self, drawn: Overlay) -> Overlay:
         from ..landscapes.draw.figures.page import save, save_prints

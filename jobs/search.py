@@ -228,7 +228,7 @@ def make_optimizer(
 
     kind = optimizer_class(method)
     chosen = read_options(method, kind.Options, options or {})
-    require_method(kind, chosen, SearchSize(objective.space.dim, getattr(objective, "decisions", 1)))
+    require_method(kind, chosen, SearchSize(objective.space.dim, objective.decisions))
     return kind.on(objective, seed=seed, options=chosen)
 
 

@@ -17,7 +17,7 @@ from ..landscapes.directions import barrier
 from ..landscapes.identity import plane_of, stored_identity
 from ..landscapes.measures.records import UnresolvedRecord
 from ..landscapes.measures.unresolved import attribute_of, find_unresolved, say_unresolved
-from ..landscapes.objective import Objective, Status, name_of
+from ..landscapes.objective import Objective, Status
 from ..landscapes.sampling.refine import Refined
 
 JOINED = "joined"  # in the identity of a slice that was cut between points: their names
@@ -77,7 +77,7 @@ def look_between(objective: Objective, dataset: xr.Dataset) -> dict[str, Any]:
     except (OSError, MemoryError):  # lost workers, a full disk: the slice is finished once they are there again
         raise
     except Exception as error:
-        said = f"{name_of(objective)} raised between the samples, so what they hide is not known: {error}"
+        said = f"{objective.name} raised between the samples, so what they hide is not known: {error}"
         warnings.warn(said, RuntimeWarning, stacklevel=2)
         return {}
 

@@ -16,12 +16,11 @@ from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
-from ..landscapes.adapters import within_box
 from ..landscapes.capacity import size
 from ..landscapes.cost import duration
 from ..landscapes.identity import with_stride
 from ..landscapes.lattice import check_gradients
-from ..landscapes.objective import Objective, Status
+from ..landscapes.objective import BoxedObjective, Objective, Status
 from ..landscapes.plain import plain_name
 from ..landscapes.sampling.fill import Progress, sample
 from ..landscapes.storage.files import discard, tidy, visible_files, write_json
@@ -244,7 +243,7 @@ class SweepJob:
     def _sampled(self, number: int) -> tuple[Objective, Callable[[], Objective] | None]:
         """Return what is sampled on a plane, and how workers make it, None where they are sent it."""
         env = self.motion.env_at(number)
-        return (within_box(env), None) if self.boxed else (env, recipe(env))
+        return (BoxedObjective(env), None) if self.boxed else (env, recipe(env))
 
     def _film(self, drawn: Sweep) -> None:
         from ..landscapes.draw.figures.sweep import save_films

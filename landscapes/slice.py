@@ -117,9 +117,9 @@ class Slice:
         `points` x `points` places of the slice are evaluated anew, with points near them. Raises ValueError for a slice
         without gradients, for one that is not finished, and for one whose objective cannot be made again.
         """
-        from .adapters import within_box
         from .lattice import sampled_lattice
         from .measures.profile import PRECISION, measure_profile
+        from .objective import BoxedObjective
 
         if missing := int((self.data["status"] == Status.MISSING).sum()):
             raise ValueError(f"{missing} samples of this slice are missing; let what samples it go on first")
@@ -129,8 +129,8 @@ class Slice:
         objective = self.remake()
         rounding = PRECISION[self.identity.get("settings", {}).get("precision", "float64")]
         return measure_profile(
-            within_box(objective) if self.identity.get("boxed") else objective, sampled_lattice(self.data),
-            rounding=rounding, points=points, seed=seed, events=getattr(objective, "events", None),
+            BoxedObjective(objective) if self.identity.get("boxed") else objective, sampled_lattice(self.data),
+            rounding=rounding, points=points, seed=seed, events=objective.events,
         )  # fmt: skip
 
     def __repr__(self) -> str:
@@ -145,6 +145,6 @@ class Slice:
 
     def _events(self) -> dict[str, Any]:
         """Count what happens in the episodes along a line, where an environment says what does."""
-        env: Any = self.remake() if self.remake else None
-        counts = getattr(env, "events", None)
-        return dict(counts(self.plane.lift(self.plane.axes()[0][:, None]))) if counts else {}
+        if self.remake is None:
+            return {}
+        return dict(self.remake().events(self.plane.lift(self.plane.axes()[0][:, None])))

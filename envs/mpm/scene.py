@@ -33,9 +33,9 @@ class Stage:
 
 class MpmScene(Environment):  # noqa: D101 -- `about` prints the docstrings of a scene's family, each for its readers
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
-    beyond_box: ClassVar[bool] = True
+    beyond_box = True
     engines: ClassVar[tuple[str, ...]] = ("warp", "taichi")
-    decisions: ClassVar[int] = SEGMENTS
+    decisions = SEGMENTS
     designed_order: ClassVar[dict[str, float]] = {"dt": 1.0, "resolution": 2.0, "joint": 1.0}  # Euler; splines
     model: Model
     _solvers: Pool[Any]

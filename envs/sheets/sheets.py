@@ -60,9 +60,9 @@ class SheetScene(Environment):
     """
 
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
-    beyond_box: ClassVar[bool] = True
+    beyond_box = True
     engines: ClassVar[tuple[str, ...]] = ("warp", "taichi")
-    loss_unit: ClassVar[str] = "m"
+    loss_unit = "m"
     designed_order: ClassVar[dict[str, float]] = {"dt": 1.0, "resolution": 2.0, "joint": 1.0}  # Euler; springs
     Options: ClassVar[type[Any]] = SheetOptions
     duration: ClassVar[float]  # of an episode of horizon 1 [s]

@@ -178,7 +178,7 @@ class SwingVelocity(Swing):
     Parameters: initial velocity x, y, z [m/s] of all vertices that are not held. Stiffness is 10 N/m throughout.
     """
 
-    name: ClassVar[str] = "swing-velocity"
+    name = "swing-velocity"
     examples: ClassVar[dict[str, tuple[float, ...]]] = {"target": (1.0, -0.5, 0.3)}
     space = ParameterSpace.box([f"velocity {axis}" for axis in "xyz"], -2.0, 2.0, "m/s")
 
@@ -194,7 +194,7 @@ class SwingStiffness(Swing):
     (1, -0.5, 0) m/s.
     """
 
-    name: ClassVar[str] = "swing-stiffness"
+    name = "swing-stiffness"
     examples: ClassVar[dict[str, tuple[float, ...]]] = {
         "target": (12.0, 6.0, 7.0, 13.0, 5.0, 9.0, 11.0, 4.0, 8.0, 3.0, 4.0, 9.0, 10.0, 12.0, 6.0, 7.0)
     }

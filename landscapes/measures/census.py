@@ -19,7 +19,7 @@ from torch import Tensor
 from ..directions import orthonormal
 from ..identity import plane_of
 from ..lattice import count_gradients
-from ..objective import Objective
+from ..objective import Objective, ObjectiveWrapper
 from ..plane import Plane
 from ..sampling.fill import sample
 from ..space import ParameterSpace
@@ -235,14 +235,12 @@ def _values(found: Ruggedness, jumps: float, cosine: Array) -> Array:
     )
 
 
-class _Counted:
+class _Counted(ObjectiveWrapper):
     """Count how many points within its box an objective is asked."""
 
     def __init__(self, objective: Objective) -> None:
-        self.objective, self.space, self.asked = objective, objective.space, 0
-        self.beyond_box = getattr(objective, "beyond_box", False)
-        if batch := getattr(objective, "preferred_batch", None):
-            self.preferred_batch = batch
+        super().__init__(objective)
+        self.asked = 0
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Any:
         self.asked += len(x)

@@ -110,9 +110,9 @@ def measure(
     at most `patience` [s] beyond one evaluation, where that is given.
     """
     repetition, largest = (REPETITION, LARGEST) if patience is None else (patience, patience)
-    at_once = getattr(objective, "preferred_batch", 1)
+    at_once = objective.preferred_batch
     full = min(at_once, len(x))
-    getattr(objective, "prepare", lambda: None)()
+    objective.prepare()
     began = time.perf_counter()
     evaluate(objective, x[:1], grad=True)  # what is made at first use is made now, a batch's threads too if quick
     if (time.perf_counter() - began) * full < repetition:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..capacity import Need
 from ..identity import plane_of
-from ..objective import Evaluation, Objective, evaluate, in_box, name_of
+from ..objective import Evaluation, Objective, ObjectiveWrapper, evaluate, in_box
 from ..statistics import EstimateRecord
 from . import gradient_quality as gradients
 from .classify import Verdict, classify, thresholds
@@ -139,18 +139,17 @@ def measure_profile(
     return Profile(found, fuzz, jumps, steps, samples, smooth, words, *asked, between, twice)
 
 
-class _Within:
+class _Within(ObjectiveWrapper):
     """Evaluate an objective where it may be asked, and count the points where it may not."""
 
-    beyond_box = True  # those are left out here
-
     def __init__(self, objective: Objective) -> None:
-        self.objective, self.space, self.name = objective, objective.space, name_of(objective)
+        super().__init__(objective)
+        self.beyond_box = True  # those are left out here
         self.asked = self.cut = 0
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
         self.asked += len(x)
-        if not getattr(self.objective, "beyond_box", False):
+        if not self.objective.beyond_box:
             self.cut += int((~in_box(self.space, x)).sum())
         return evaluate(self.objective, x, grad=grad)
 

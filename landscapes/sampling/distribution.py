@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..identity import StoreError, check_identity
-from ..objective import Evaluation, Objective, Status, name_of
+from ..objective import Evaluation, Objective, ObjectiveWrapper, Status
 from ..storage.paths import place_of
 from ..storage.store import SliceStore
 from ..storage.tiles import Tile
@@ -78,7 +78,7 @@ class Site:
                 return
 
     def __reduce__(self) -> tuple[Any, ...]:
-        who = name_of(self.objective)
+        who = self.objective.name
         if self.store.path is None:
             raise ValueError(f"{who} is sampled by other processes, which share no memory; give sample a store on disk")
         try:
@@ -204,12 +204,11 @@ class ReadBack:
         return self._values
 
 
-class Distributed:
+class Distributed(ObjectiveWrapper):
     """An objective whose points an executor's workers evaluate, each an equal part of a batch."""
 
     def __init__(self, site: Site, executor: Executor) -> None:
-        self.objective, self.space, self.name = site.objective, site.objective.space, site.objective.name
-        self.beyond_box = getattr(site.objective.objective, "beyond_box", False)
+        super().__init__(site.objective)
         self._site, self._executor = site, executor
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:

@@ -14,7 +14,7 @@ from typing import Any
 import xarray as xr
 
 from ..identity import check_identity, with_stride
-from ..objective import Objective, Status, name_of
+from ..objective import Objective, Status
 from ..plane import Plane
 from ..space import as_stride, as_whole
 from ..storage.disk import full, is_full
@@ -80,7 +80,7 @@ def sample(
         about["identity"] = with_stride(about["identity"], gradients)
         store = SliceStore.in_memory(plane, objective.space, **about, grad=gradients > 0)
     _check_store(store, objective, plane, grad=gradients > 0)
-    batch = as_whole(getattr(objective, "preferred_batch", 1) if batch is None else batch, "sample's batch", least=1)
+    batch = as_whole(objective.preferred_batch if batch is None else batch, "sample's batch", least=1)
     status = store.status()
     counts: Counter[Status] = Counter({kind: int((status == kind).sum()) for kind in Status if kind != Status.MISSING})
     resumed, pending = counts.total(), store.pending(status)
@@ -117,8 +117,7 @@ def sample(
 
 def describe(objective: Objective) -> dict[str, dict[str, Any]]:
     """Return what an objective says of itself: an environment its fidelity and options, any its name and unit."""
-    about: Callable[[], dict[str, Any]] = getattr(objective, "identity", lambda: {"objective": name_of(objective)})
-    return {"identity": about(), "provenance": {"loss_unit": getattr(objective, "loss_unit", "")}}
+    return {"identity": objective.identity(), "provenance": {"loss_unit": objective.loss_unit}}
 
 
 def _fill(

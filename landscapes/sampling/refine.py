@@ -146,7 +146,7 @@ def refine(
             raise DamagedError.of(store.path, "samples are lost", "restore it, or begin anew with --force")
         dataset = store.dataset()
     else:
-        batch = max(LEAST_BATCH, getattr(objective, "preferred_batch", 1))
+        batch = max(LEAST_BATCH, objective.preferred_batch)
         batch *= workers_of(executor) if executor else 1
         run = Refining(
             evaluator(objective, store, executor, made), batch, plane, store, refinement, pieces, progress, seed

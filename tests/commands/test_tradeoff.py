@@ -35,7 +35,7 @@ class Converging(Environment):
     Refuses dt of 0.4 or more, diverges at 0.2 where x0 is large.
     """
 
-    name: ClassVar[str] = "converging"
+    name = "converging"
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=0.1),
         "standard": Fidelity("standard", dt=0.05),

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 import gradscape as gs
+from gradscape.envs.adapters import from_torch
 from gradscape.jobs.cut import points_in
 from gradscape.jobs.scene import named_point
-from gradscape.landscapes.adapters import from_torch
 from gradscape.landscapes.space import ParameterSpace
 
 SPACE = ParameterSpace({"mass": (0.0, 4.0, "kg"), "speed": (-1.0, 1.0, "m/s")})

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from gradscape.landscapes.adapters import from_torch
-from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.envs.adapters import from_torch
+from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
 from gradscape.optim.methods.descent import Descent, DescentOptions, Descents, DescentsOptions
@@ -111,7 +111,7 @@ def test_descents_go_on_bit_for_bit_from_its_state():
 
 
 def test_descents_go_on_past_failures():
-    class Cliff:
+    class Cliff(Objective):
         space = SPACE
 
         def evaluate(self, x, *, grad=True):

@@ -10,7 +10,7 @@ from matplotlib.text import Text
 from scipy.stats import spearmanr
 from torch import Tensor
 
-from gradscape.landscapes.adapters import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.draw.figures.page import save
 from gradscape.landscapes.draw.figures.tradeoff import short_name, tradeoff_figure
 from gradscape.landscapes.measures import fidelity as tradeoff
@@ -23,7 +23,7 @@ from gradscape.landscapes.measures.fidelity import (
     gradient_error,
     pareto_front,
 )
-from gradscape.landscapes.objective import Status
+from gradscape.landscapes.objective import Objective, Status
 from gradscape.landscapes.space import ParameterSpace
 
 
@@ -132,7 +132,7 @@ def test_seconds_are_those_of_an_episode_in_a_batch(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(tradeoff.time, "perf_counter", lambda: clock[0])
     space = ParameterSpace.box(["a"], 0.0, 1.0)
 
-    class Slow:
+    class Slow(Objective):
         preferred_batch = 4
         space = ParameterSpace.box(["a"], 0.0, 1.0)
 

@@ -16,7 +16,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gradscape.landscapes.adapters import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.identity import StoreError
 from gradscape.landscapes.objective import Objective
 from gradscape.landscapes.plane import Plane

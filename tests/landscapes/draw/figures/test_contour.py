@@ -14,7 +14,7 @@ from gradscape.landscapes.draw import style
 from gradscape.landscapes.draw.figures import page
 from gradscape.landscapes.draw.figures.contour import landscape_figure
 from gradscape.landscapes.draw.figures.profile import profile_figure
-from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
@@ -28,7 +28,7 @@ SPACE = ParameterSpace(
 )
 
 
-class Bowl:
+class Bowl(Objective):
     """A bowl with a flat corner, a corner that is not finite and one that escapes."""
 
     space = SPACE
@@ -110,7 +110,7 @@ def test_colour_is_the_projected_gradient_in_its_unit_when_units_agree():
         torch.ones(2).double(), (4, 4), ("p [m/s]", "q [m/s]"),
     )  # fmt: skip
 
-    class Ramp:
+    class Ramp(Objective):
         def __init__(self):
             self.space = space
 
