@@ -63,7 +63,7 @@ def environment(
 
 
 def is_environment(objective: Objective) -> TypeGuard[Environment]:
-    """Whether an objective is an environment: it knows its fidelity, its options and its code."""
+    """Whether an objective is an environment: it knows its fidelity, its options and its version."""
     from ..envs.base import Environment
 
     return isinstance(objective, Environment)

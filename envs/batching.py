@@ -9,8 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from typing import Generic, TypeVar
 
-COMPUTES_LOSSES = False  # for `code`
-
 T = TypeVar("T")
 Part = TypeVar("Part")
 Result = TypeVar("Result")
