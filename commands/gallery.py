@@ -51,7 +51,7 @@ def compute(
     if failed:
         bars.note(
             f"{len(failed)} of {len(figures)} figures failed: {', '.join(failed)}\n"
-            f"to sample one anew where other settings or other code began it, delete its folder in {root}"
+            f"to sample one anew where other settings or another model began it, delete its folder in {root}"
         )
         raise typer.Exit(1)
 

@@ -13,8 +13,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-COMPUTES_LOSSES = False  # for `code`
-
 T = TypeVar("T")
 Part = TypeVar("Part")
 Result = TypeVar("Result")

@@ -72,6 +72,7 @@ class Bounce(Environment):
     2022), appendix B.1; contact constants of NVIDIA Warp's bounce example.
     """
 
+    model_version = 1
     name = "bounce"
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
     beyond_box = True

@@ -71,6 +71,7 @@ class Cartpole(Environment):
     controls satisfy all three. Masses, torques, times and target are ours.
     """
 
+    model_version = 1
     name = "cartpole"
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
     beyond_box = True

@@ -25,8 +25,6 @@ from .installed import install_line, is_installed
 if TYPE_CHECKING:
     from .base import Environment, Fidelity
 
-COMPUTES_LOSSES = False  # for `code`
-
 Kind = TypeVar("Kind", bound="type[Environment] | Environment")
 GROUP = "gradscape.environments"
 EXTRAS = {"mjx": ("mujoco", "mujoco-mjx", "jax"), "newton": ("newton",)}  # of this package, and what each brings

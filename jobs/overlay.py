@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import xarray as xr
 
 from ..envs.registry import as_environment
-from ..landscapes.identity import plane_of, stored_identity
+from ..landscapes.identity import MODEL_VERSION, plane_of, stored_identity
 from ..landscapes.objective import Objective, failed
 from ..landscapes.overlay import best_point, overlay, principal_plane
 from ..landscapes.plane import Plane
@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 
 PICTURE, STREAM = OVERLAY.files
 PCA, BEST = "pca", "best"
-MUST, SHOULD = ("objective", "options"), ("fidelity", "settings", "engine", "code")  # agree between slice and runs
+MUST = ("objective", "options")  # agree between slice and runs
+SHOULD = ("fidelity", "settings", "engine", MODEL_VERSION)  # as well
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
 from ..landscapes.cost import duration, episode_cost
+from ..landscapes.identity import METHOD_VERSION
 from ..landscapes.objective import FAILED, Objective, Status, describe_errors
 from ..landscapes.space import as_whole
 from ..landscapes.storage.files import clear, tidy, write_json
 from ..landscapes.threads import one_torch_thread
 from ..optim.base import Kind
 from ..optim.memory import SearchSize, require_method, require_runs
-from ..optim.registry import code_digest, optimizer_class
+from ..optim.registry import optimizer_class
 from ..optim.runs.arrays import FORWARD_EQUIVALENTS, stored_record
 from ..optim.runs.run import Run
 from ..optim.runs.store import RunStore
@@ -261,7 +262,7 @@ def run_identity(env: Environment, optimizer: Optimizer) -> dict[str, Any]:
         **env.identity(),
         "method": optimizer.name,
         "method_options": asdict(optimizer.options),
-        "method_code": code_digest(type(optimizer)),
+        METHOD_VERSION: optimizer.method_version,
         "seed": optimizer.seed,
     }
 

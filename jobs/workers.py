@@ -110,7 +110,7 @@ def _greet(address: str) -> None:
 
 
 def recipe(objective: Objective) -> partial[Environment] | None:
-    """Return what makes an environment in another process, and refuses to make one of other code.
+    """Return what makes an environment in another process, and refuses to make one of another model.
 
     Any other objective has none, and is sent as it is.
     """
@@ -120,13 +120,16 @@ def recipe(objective: Objective) -> partial[Environment] | None:
         return None
     env = objective
     how = {"fidelity": env.fidelity, "device": env.device, "engine": env.engine, "deterministic": env.deterministic}
-    return partial(_make_checked, source_of(env), env.code, how | asdict(env.options))
+    return partial(_make_checked, source_of(env), env.version_on(env.engine), how | asdict(env.options))
 
 
-def _make_checked(source: str | type[Environment], code: str, settings: dict[str, Any]) -> Environment:
+def _make_checked(source: str | type[Environment], model: int, settings: dict[str, Any]) -> Environment:
     env = make(source, **settings)
-    if env.code != code:
-        raise ValueError(f"worker {platform.node()} has other code of {env.name}; install the same version of it there")
+    if (theirs := env.version_on(env.engine)) != model:
+        raise ValueError(
+            f"worker {platform.node()} has {env.name} model {theirs}; here it is model {model}: install the same "
+            "version of it there"
+        )
     return env
 
 

@@ -57,6 +57,7 @@ class Optimizer(abc.ABC):
     """
 
     name: ClassVar[str]
+    method_version: ClassVar[int] = 1  # raised by hand when other points are asked for of the same seed
     Options: ClassVar[type[Any]]  # a frozen dataclass: every unstated choice with its default
     needs_grad: ClassVar[bool] = False
 

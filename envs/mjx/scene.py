@@ -65,6 +65,7 @@ class MjxScene(Environment):
     finite has failed. Loss and gradient come from two programs, so that losses are the same with gradients and without.
     """
 
+    model_version = 1
     mjcf: ClassVar[str]
     parameters: ClassVar[tuple[Parameter, ...]]
     duration: ClassVar[float]

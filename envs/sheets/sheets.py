@@ -59,6 +59,7 @@ class SheetScene(Environment):
     restitution nor, unless an option says so, friction. Sheets pass through themselves.
     """
 
+    model_version = 1
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
     beyond_box = True
     engines: ClassVar[tuple[str, ...]] = ("warp", "taichi")

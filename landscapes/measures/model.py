@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..identity import current_identity
 from ..objective import has_loss
 from ..plain import number, optional, text
 from .fidelity import Bootstrap, Comparison, Sample, Seconds, compare
@@ -151,7 +152,7 @@ class ModelStudy:
             Noise.of_record(record["noise"]),
             tuple(map(MeasuredPart.of_record, record["parts"])),
             tuple(RefusedVariant(text(one["name"]), text(one["why"])) for one in record["refused"]),
-            dict(record["identity"]),
+            current_identity(record["identity"]),
             dict(record["provenance"]),
             text(record["command"]),
         )

@@ -14,6 +14,7 @@ import zarr
 from numpy.typing import NDArray
 
 from ..capacity import BLOCK, Need, require
+from ..identity import PACKAGE, VERSIONS, with_package
 from ..objective import Status, describe_errors
 from ..plane import Plane
 from ..space import LOG10, ParameterSpace
@@ -80,7 +81,7 @@ def lay_out(
     names = AXES[: plane.rank][::-1]
     shape = tuple(len(axes[name]) for name in names)
     side = tuple(tile_side(points) for points in shape)
-    group.attrs.update({**_about(identity, provenance), **COORDINATES})
+    group.attrs.update({**_about(identity, with_package(provenance)), **COORDINATES})
     unit = str(provenance.get("loss_unit", ""))
     create_array(group, "loss", shape, side, names, "float64", long_name="loss", **({"units": unit} if unit else {}))
     if grad:
@@ -156,7 +157,7 @@ def _about(identity: Mapping[str, Any], provenance: Mapping[str, Any]) -> dict[s
         "gradscape_slice": FORMAT,
         "Conventions": CF,
         "title": f"{identity.get('objective', 'loss')} over {over}",
-        "source": f"gradscape {identity['gradscape']}",
+        "source": f"{PACKAGE} {provenance[VERSIONS][PACKAGE]}",
         **({"history": made} if made else {}),
         "identity": json.dumps(identity),
         "provenance": json.dumps(provenance),

@@ -32,7 +32,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 from zarr.storage import MemoryStore
 
-from ..identity import StoreError, StoreExistsError, check_identity, full_identity, gradient_stride
+from ..identity import (
+    StoreError,
+    StoreExistsError,
+    check_identity,
+    current_identity,
+    current_provenance,
+    full_identity,
+    gradient_stride,
+)
 from ..objective import Evaluation, Status
 from ..plain import plain_json
 from ..plane import Plane
@@ -77,8 +85,9 @@ class SliceStore:
         self.path, self.place = path, place
         self._inode = place.stat().st_ino if place else None
         self._about = attributes_of(group)
-        self.identity: dict[str, Any] = json.loads(str(self._about["identity"]))
-        self.provenance: dict[str, Any] = json.loads(str(self._about["provenance"]))
+        stored = json.loads(str(self._about["identity"]))
+        self.identity = current_identity(stored)
+        self.provenance = current_provenance(json.loads(str(self._about["provenance"])), stored)
         self.plane = Plane.from_record(self.identity["plane"])
         self.dims = AXES[: self.plane.rank][::-1]
         self._coordinates = {name: np.asarray(arrays[name][:]) for name in self.dims}
@@ -108,8 +117,8 @@ class SliceStore:
     ) -> SliceStore:
         """Make an empty store at a path where there is none, all at once.
 
-        `identity` holds what decides the numbers (objective, options, fidelity, device); plane, parameters, gradients
-        and version are added here. `provenance` is anything else worth keeping. Both must be plain JSON. `overwrite`
+        `identity` holds what decides the numbers (objective, options, fidelity, device); plane, parameters and
+        gradients are added here. `provenance` is anything else worth keeping. Both must be plain JSON. `overwrite`
         replaces a slice store with nothing else in it, and refuses to replace anything else.
 
         Raises StoreExistsError where the path is taken, StoreError where what is there is not replaced, and

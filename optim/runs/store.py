@@ -30,7 +30,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...landscapes.identity import StoreError, StoreExistsError, check_identity
+from ...landscapes.identity import StoreError, StoreExistsError, check_identity, current_identity
 from ...landscapes.objective import Evaluation, failed
 from ...landscapes.space import ParameterSpace
 from ...landscapes.storage.arrays import ERROR
@@ -152,8 +152,7 @@ class RunStore:
     @property
     def identity(self) -> dict[str, Any]:
         """What decides the run's numbers."""
-        found: dict[str, Any] = self.attributes["identity"]
-        return found
+        return current_identity(self.attributes["identity"])
 
     @property
     def dim(self) -> int:

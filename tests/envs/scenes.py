@@ -47,6 +47,7 @@ SETTINGS = {name: {"fidelity": cheap(environment_class(name))} for name in SIMUL
 SOFT = of_family(Plasticine)
 # Of these two fifths of an episode, in which every tool works: `test_plasticine` holds whole ones against slopes.
 SHORT = {name: {"horizon": 0.4} for name in SOFT}
+TAICHI = [*of_family(Fluid, SheetScene), "rolling-pin"]  # of plasticine one scene, with the tool that rolls
 # Where vertices strike a surface their losses jump, by little but often: differences need a step between the jumps.
 SMALL_STEPS = dict.fromkeys(of_family(SheetScene), 1e-8)
 SMALL_STEPS["pinball-16"] = 1e-8  # many impacts amplify: at a slope of 5e5 m/rad, differences over 1e-6 rad err by 2 %

@@ -11,9 +11,10 @@ from gradscape.envs.mjx.scenes import Drop
 from gradscape.envs.registry import entries, environment_class, make
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 
+from .numbers import POINTS, moved, points_of
 from .scenes import SETTINGS, SHORT, SIMULATED, SMALL_STEPS, assert_returns_stay, made, made_once
 
-ROWS = 5
+ROWS = POINTS["tiny"][0]
 
 
 @pytest.fixture(scope="module", params=sorted(entries()))
@@ -23,7 +24,7 @@ def env(request):
 
 @pytest.fixture(scope="module")
 def points(env):
-    return env.space.uniform(ROWS, seed=1)
+    return points_of(env, "tiny")
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +48,10 @@ def test_it_is_an_objective(env, points, result):
     assert result.loss.isfinite().all()
     assert result.grad.isfinite().all()
     assert not result.loss.requires_grad
+
+
+def test_numbers_are_those_of_the_model_version(env, result):
+    assert not moved(env, "tiny", result)
 
 
 def test_the_loss_is_the_same_bits_without_its_gradient(env, points, result):

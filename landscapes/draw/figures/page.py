@@ -19,7 +19,7 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Patch
 from matplotlib.text import Text
 
-from ...identity import stored_identity, stored_provenance
+from ...identity import PACKAGE, VERSIONS, stored_identity, stored_provenance
 from ...lattice import with_gradients
 from ...measures.unresolved import say_unresolved, stored_unresolved
 from ...objective import Status
@@ -119,7 +119,8 @@ def title(dataset: xr.Dataset) -> str:
 def provenance(dataset: xr.Dataset) -> str:
     """Return version, device, date and command, as far as they are known."""
     known = {**stored_provenance(dataset), **stored_identity(dataset)}
-    said = [f"gradscape {known['gradscape']}"]
+    version = known.get(VERSIONS, {}).get(PACKAGE)
+    said = [f"{PACKAGE} {version}"] if version else []
     said += [str(known[key]) for key in ("device", "created", "command") if known.get(key)]
     return " · ".join(said)
 
