@@ -206,7 +206,7 @@ class Environment(Objective):
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return the frames of the episode at one point. Raises ValueError where a scene has nothing to draw."""
-        raise ValueError(f"{self.name} has no episode to draw")
+        raise ValueError(f"{self.name} has no episode to draw; a class with a method `episode` has")
 
     def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Int[Tensor, " batch"]]:
         """Count what happens in each episode, name -> shape (batch,); where a count changes, losses may jump."""
