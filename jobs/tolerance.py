@@ -13,6 +13,7 @@ from platformdirs import user_data_path
 
 from ..envs.registry import make
 from ..landscapes.cost import episode_cost
+from ..landscapes.storage.disk import moved_by
 from .folder import digest
 from .variants import expected_work
 
@@ -33,7 +34,8 @@ def keep(found: Tradeoff) -> Path:
     from ..landscapes.storage.records import write_record
 
     path = _place(found.env, found.identity["options"], found.identity["device"])
-    write_record(path, found.record())
+    with moved_by("XDG_DATA_HOME", "what was measured"):
+        write_record(path, found.record())
     return path
 
 
@@ -42,7 +44,8 @@ def keep_convergence(found: Convergence) -> Path:
     from ..landscapes.storage.records import write_record
 
     path = _place(found.env, found.identity["options"], found.identity["device"]).with_suffix(CONVERGED)
-    write_record(path, found.record())
+    with moved_by("XDG_DATA_HOME", "what was measured"):
+        write_record(path, found.record())
     return path
 
 
