@@ -15,6 +15,7 @@ from .. import __version__
 from ..envs.registry import make
 from ..landscapes.cost import episode_cost
 from ..landscapes.identity import MODEL_VERSION
+from ..landscapes.storage.disk import moved_by
 from .folder import digest
 from .variants import expected_work
 
@@ -40,7 +41,8 @@ def keep(found: Tradeoff) -> Path | None:
     if not found.identity.get("model_version"):
         return None
     path = _place(found.env, found.identity["options"], found.identity["device"])
-    write_record(path, found.record())
+    with moved_by("XDG_DATA_HOME", "what was measured"):
+        write_record(path, found.record())
     return path
 
 
@@ -51,7 +53,8 @@ def keep_convergence(found: Convergence) -> Path | None:
     if not found.identity.get("model_version"):
         return None
     path = _place(found.env, found.identity["options"], found.identity["device"]).with_suffix(CONVERGED)
-    write_record(path, found.record())
+    with moved_by("XDG_DATA_HOME", "what was measured"):
+        write_record(path, found.record())
     return path
 
 

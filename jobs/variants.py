@@ -88,8 +88,8 @@ def refuse_single(env: Environment) -> None:
     if len(env.fidelities) < 2:
         raise ValueError(
             f"{env.name} has one fidelity, {', '.join(env.fidelities)}, so there is nothing to hold against the other; "
-            "name several: a function takes fidelities={'draft': {'dt': 0.02}, 'reference': {'dt': 0.001}}, and a class "
-            "has `fidelities`"
+            "name several: a function takes fidelities={'draft': {'dt': 0.02}, 'reference': {'dt': 0.001}}, and a "
+            "class has `fidelities`"
         )
 
 

@@ -256,9 +256,8 @@ class _Look:
         if not len(at):
             return np.zeros(0)
         self.episodes += len(at)
-        return cast(
-            "Values", evaluate(self.objective, lift_between(self.plane, at), grad=False).loss.numpy() / self.unit
-        )
+        losses: Values = evaluate(self.objective, lift_between(self.plane, at), grad=False).loss.numpy() / self.unit
+        return losses
 
     def middles(self, cells: Cells) -> Values:
         """Look at the middles of cells, against all their corners."""
