@@ -136,7 +136,7 @@ def _stop(stop: BaseException) -> int:
         return 0
     again = shlex.join(["landscape", *sys.argv[1:]])
     then = "goes on from there" if stop.kept else "begins again"
-    typer.echo(f"stopped: {stop}; the same command {then}: {again}", err=True)
+    _say(f"stopped: {stop}; the same command {then}: {again}")
     return STOPPED
 
 
@@ -172,5 +172,12 @@ def _memory(error: Exception) -> str:
 
 
 def _fail(message: str, code: int) -> int:
-    typer.echo(f"landscape: {' '.join(message.split())}", err=True)
+    _say(f"landscape: {' '.join(message.split())}")
     return code
+
+
+def _say(line: str) -> None:
+    """Print a line on standard error; what others have put into it cannot steer the terminal."""
+    from .landscapes.plain import printable
+
+    typer.echo(printable(line), err=True)

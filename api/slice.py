@@ -45,12 +45,13 @@ def slice(
     """Sample losses and gradients of a scene over a plane through its parameter space, and return the slice.
 
     `scene` is an environment's name, FILE.py:NAME, its class or itself, as `from_torch` and its like make one of a
-    function, or an object with `space` and `evaluate`. `dims` are one or two parameters, by number or by name;
-    `through` is the point that the plane goes through, and `extent` what it covers: a fraction of the box around that
-    point, or two ends [the parameters' unit]; the whole box by default. `along` names directions instead of `dims`:
-    random:SEED, gradient, hessian, pca:RUN, a line A:B or a plane A:B:C between points; what lies off the box is left
-    out. The samples lie in the folder `out`, by default one under out/ named after the slice: the same call goes on
-    there where it stopped. A function is sampled in memory without `out`.
+    function, or an object with `space` and `evaluate`. `dims` are one or two parameters, by number or by name, by
+    default all where there are no more. `through` is the point that the plane goes through: its name, or a point as
+    `evaluate` takes it, with the decimal logarithm of a logarithmic parameter. `extent` is what it covers: a fraction
+    of the box around that point, or two values [the parameters' unit]; the whole box by default. `along` names
+    directions instead of `dims`: random:SEED, gradient, hessian, pca:RUN, a line A:B or a plane A:B:C between points;
+    what lies off the box is left out. The samples lie in the folder `out`, by default one under out/ named after the
+    slice: the same call goes on there where it stopped. A function is sampled in memory without `out`.
 
     `gradients` says whether it has any, or at every how many samples along each axis: 4 has losses at all samples, and
     gradients at a sixteenth of them.

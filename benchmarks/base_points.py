@@ -32,7 +32,6 @@ import torch
 from torch import Tensor
 
 from gradscape.envs.base import Environment
-from gradscape.envs.code import code_digest
 from gradscape.envs.registry import environment_class
 from gradscape.gallery.companions import points_beside
 from gradscape.gallery.figures import Figure, choose_figures, read_figures
@@ -127,10 +126,11 @@ def write_choice(path: Path, figure: str, found: dict[str, Any]) -> None:
 
 def _measure(figure: Figure, asked: argparse.Namespace, paper: tuple[float, float], path: Path) -> dict[str, Any]:
     """Return what was found of a figure, from the folder where it was kept with these settings."""
+    kind = environment_class(figure.env)
     settings = {
         **{"figure": figure.id, "dims": list(figure.dims), "options": dict(figure.options), "paper": list(paper)},
         **{"fidelity": asked.fidelity, "resolution": asked.resolution, "random": asked.random},
-        "code": code_digest(environment_class(figure.env)),
+        "model_version": kind.version_on(kind.engines[0]),
     }
     if path.exists() and {name: (kept := read_json(path)).get(name) for name in settings} == settings:
         print(f"{figure.id}: there already", file=sys.stderr)

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 
 import gradscape as gs
-from gradscape.envs.code import code_digest
 from gradscape.jobs.report_tables import markdown
 from gradscape.optim.comparison import LEVEL, holm, rank_test, win_probability
 from gradscape.optim.processes import processes
@@ -57,7 +56,7 @@ def measure(scene: str, seeds: int, budget: int) -> dict[str, Any]:
     for one in competitors:
         best.setdefault(one.method, []).append(float(one.run.best_loss))
     about = {"scene": scene, "fidelity": "standard", "seeds": seeds, "budget": budget, "unit": env.loss_unit}
-    return {**about, "code": code_digest(type(env)), "best": best}
+    return {**about, "model_version": env.version_on(env.engine), "best": best}
 
 
 def _competitor(env: gs.Environment, name: str, seed: int, budget: int) -> Competitor:

@@ -70,7 +70,7 @@ def censuses(data: Path = DATA) -> dict[str, Shares | str]:
         record = next((read_json(file) for file in files if file.exists()), None)
         if record is None:
             found[name] = MISSING
-        elif not is_present(name, record["identity"]["code"], record["identity"]["engine"]):
+        elif not is_present(name, record["identity"]["model_version"], record["identity"]["engine"]):
             found[name] = UNMEASURED
         else:
             found[name] = Shares.of_record(record)

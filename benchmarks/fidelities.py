@@ -38,7 +38,7 @@ HEAD = ("scene", "fidelity", "device", "rank", "cosine", "95 % error", "ms", "cl
 class Row:
     """Hold what was measured of a named fidelity of a scene: `settings` by name, and `measured` as files have it.
 
-    `code` is the digest of the scene's code, empty where it was not kept.
+    `model_version` is that of the scene, 0 where it was not kept.
     """
 
     scene: str
@@ -46,7 +46,7 @@ class Row:
     name: str
     settings: dict[str, Any]
     measured: dict[str, Any]
-    code: str = ""
+    model_version: int = 0
 
     @property
     def comparison(self) -> Comparison:
@@ -57,7 +57,7 @@ class Row:
     def present(self) -> bool:
         """Whether that is what the scene is now."""
         same = asdict(environment_class(self.scene).fidelities[self.name]) == self.settings
-        return same and is_present(self.scene, self.code)
+        return same and is_present(self.scene, self.model_version)
 
     def shortfall(self, claim: Claim) -> Shortfall:
         """Return how far it falls short of a claim."""
@@ -84,7 +84,7 @@ def _read(name: str, record: dict[str, Any]) -> Iterator[Row]:
         same = [one for one in rungs if {**one["fidelity"], "name": claim.name} == now]
         for one in (same or [one for one in rungs if one["name"] == claim.name])[:1]:
             settings, measured = {**one["fidelity"], "name": claim.name}, {key: one[key] for key in MEASURED}
-            yield Row(name, one["device"], claim.name, settings, measured, known["code"])
+            yield Row(name, one["device"], claim.name, settings, measured, known["model_version"])
 
 
 MEASURED = ("loss_error", "spearman", "gradient", "diverged", "compared", "seconds", "batch")

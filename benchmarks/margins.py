@@ -30,7 +30,9 @@ def margins(data: Path = DATA) -> dict[str, list[Mapping[str, Any]] | str]:
     for name in scenes():
         files = (data / "extremes" / f"{name}-{device}.json" for device in DEVICES)
         records = [read_json(file) for file in files if file.exists()]
-        present = [one for one in records if is_present(name, one["identity"]["code"], one["identity"]["engine"])]
+        present = [
+            one for one in records if is_present(name, one["identity"]["model_version"], one["identity"]["engine"])
+        ]
         found[name] = present or (UNMEASURED if records else MISSING)
     return found
 

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gradscape.envs.code import code_digest
 from gradscape.envs.registry import entries, environment_class
 from gradscape.gallery.files import DEVICES, TradeoffFiles
 from gradscape.jobs.report_tables import markdown
@@ -37,9 +36,9 @@ def scenes() -> list[str]:
     return [name for name in ours if len(environment_class(name).fidelities) > 1]
 
 
-def is_present(scene: str, code: str, engine: str = "warp") -> bool:
-    """Say whether the digest of a scene's code is that of the code there is now."""
-    return code == code_digest(environment_class(scene), engine)
+def is_present(scene: str, model_version: int, engine: str = "warp") -> bool:
+    """Say whether a scene's model is still of the version that was measured."""
+    return model_version == environment_class(scene).version_on(engine)
 
 
 def written(page: Path, name: str) -> str:

@@ -31,13 +31,13 @@ HEAD = ("scene", "part", "changed to", "95 % of losses move by", "rank", "cosine
 
 
 def studies(data: Path = DATA) -> dict[str, ModelStudy]:
-    """Return the kept study of each scene whose code and fidelity are still what was measured, by name."""
+    """Return the kept study of each scene whose model and fidelity are still what was measured, by name."""
     found = {}
     for name in sorted(entries()):
         for study in map(ModelStudy.of_record, records(name, TradeoffFiles.of_model, data)):
             known = study.identity
             same = asdict(environment_class(name).fidelities[study.fidelity]) == known["settings"]
-            if same and is_present(name, known["code"], known["engine"]):
+            if same and is_present(name, known["model_version"], known["engine"]):
                 found.setdefault(name, study)
     return found
 

@@ -27,7 +27,7 @@ GALLERY = f"gallery compute --resolution 6 --fidelity draft --device cpu --data 
 
 # What differs from one run to the next, or says only what was done now.
 VOLATILE = {"seconds", "provenance", "created", "command", "files", "forwards", "gradient_cost", "resumed", "batch"}
-VOLATILE |= {"folder", "wall", "versions", "code", "episodes"}
+VOLATILE |= {"folder", "wall", "versions", "episodes"}
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 Value = str | NDArray[Any]
 # What is measured in seconds, or says by whom, when and with which words a result was made.
 VOLATILE = {"seconds", "gradient_cost", "forwards", "batch"}
-VOLATILE |= {"created", "command", "versions", "code", "method_code", "gradscape", "folder", "history", "source"}
+VOLATILE |= {"created", "command", "versions", "folder", "history", "source"}
+VOLATILE |= {"code", "method_code", "gradscape", "model_version", "method_version"}  # some of before, some of now
 VOLATILE |= {"checksum", "key"}  # of a record, which are taken of the others
 TIMED = ("forward", "with_gradient", "batch")  # of the pieces of a trade-off
 SECONDS = ("seconds", "forwards")  # columns of runs

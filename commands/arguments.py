@@ -30,7 +30,11 @@ Dims = Annotated[
 ]
 SomeDims = Annotated[
     list[str] | None,
-    typer.Option("--dims", metavar="DIM [DIM]", help="The one or two parameters to vary, by number or by name."),
+    typer.Option(
+        "--dims",
+        metavar="DIM [DIM]",
+        help="The one or two parameters to vary, by number or by name; all where there are no more.",
+    ),
 ]
 Along = Annotated[
     str | None,
@@ -77,13 +81,16 @@ OutOfStudy = Annotated[
 ForceStudy = Annotated[bool, typer.Option("--force", help="Begin anew where a study exists already.")]
 Extent = Annotated[
     str | None,
-    typer.Option(help="What to cover: a fraction of the box around the point, or LOW:HIGH; the whole box by default."),
+    typer.Option(
+        help="What to cover: a fraction of the box around the point, or the values LOW:HIGH; the whole box by default."
+    ),
 ]
 Through = Annotated[
     str,
     typer.Option(
         help="The point it goes through: center, random:SEED, example:NAME, best, best:RUN, a file of numbers, or a "
-        "row of a table, TABLE.csv:ROW, by default the one of the least loss; slice and sweep take several, "
+        "row of a table, TABLE.csv:ROW (row 1 is its heading), by default the one of the least loss; slice and "
+        "sweep take several, "
         "A,B."
     ),
 ]
@@ -217,4 +224,6 @@ def read_extent(text: str | None) -> float | tuple[float, float] | None:
     try:
         return (float(low), float(high)) if colon else float(low)
     except ValueError:
-        raise ValueError(f"--extent takes a fraction or LOW:HIGH in the parameters' unit; got {text!r}") from None
+        raise ValueError(
+            f"--extent takes a fraction or values LOW:HIGH in the parameters' unit; got {text!r}"
+        ) from None

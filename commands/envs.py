@@ -44,15 +44,19 @@ def _describe(name: str) -> None:
     from ..gallery.paper import read_paper
     from ..jobs.margins import say_margins
     from ..landscapes.options import in_full
+    from ..landscapes.space import LOG10
     from .terminal import Console, table
 
     env, console = make(name, device="cpu"), Console(soft_wrap=True, highlight=False)
     about = env.about() or "It says nothing of itself: its class has no docstring."
     console.print(f"{env.name}: {env.space.dim} parameter{'s' if env.space.dim > 1 else ''}\n\n{about}\n")
     bounded = table("no.", "parameter", "lower", "upper", "unit")
-    bounds = zip(env.space.lower.tolist(), env.space.upper.tolist(), strict=True)
-    for number, (label, unit, (lower, upper)) in enumerate(zip(env.space.names, env.space.units, bounds, strict=True)):
-        bounded.add_row(str(number), label, f"{lower:g}", f"{upper:g}", unit)
+    space = env.space
+    lower, upper = (space.to_values(end).tolist() for end in (space.lower, space.upper))
+    rows = zip(space.names, space.scales, lower, upper, space.units, strict=True)
+    for number, (one, scale, low, high, unit) in enumerate(rows):
+        label = f"{one} (logarithmic)" if scale == LOG10 else one
+        bounded.add_row(str(number), label, f"{low:g}", f"{high:g}", unit)
     console.print(bounded)
     for fidelity in env.fidelities.values():
         console.print(f"fidelity {fidelity.record()}")

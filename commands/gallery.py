@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from ..landscapes.plain import printable
 from .arguments import Data, Device, Fidelity, Json, Scheduler
 
 Site = Annotated[str, typer.Option(help="Folder of the site.")]
@@ -50,7 +51,7 @@ def compute(
     if failed:
         bars.note(
             f"{len(failed)} of {len(figures)} figures failed: {', '.join(failed)}\n"
-            f"to sample one anew where other settings or other code began it, delete its folder in {root}"
+            f"to sample one anew where other settings or another model began it, delete its folder in {root}"
         )
         raise typer.Exit(1)
 
@@ -134,5 +135,5 @@ def serve(
     from ..gallery.site.server import open_server
 
     with open_server(out, port) as server, contextlib.suppress(KeyboardInterrupt):
-        print(f"{out} is at {server.address}/ until Ctrl-C", flush=True)
+        print(f"{printable(str(out))} is at {server.address}/ until Ctrl-C", flush=True)
         server.serve_forever()

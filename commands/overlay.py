@@ -17,7 +17,7 @@ def overlay(
         typer.Argument(
             metavar="RUN",
             help="Folders of runs, a race's for all of it, or CSV and Parquet files of points: a column for each "
-            "parameter, called as it is, and one called loss.",
+            "parameter, called as it is, and one called loss, or what Optuna's trials_dataframe() returns.",
         ),
     ],
     env: Of = None,
@@ -55,7 +55,7 @@ def overlay(
     bars, cut = Bars(), Cut.of(through, plane, resolution)
     how: dict[str, Any] = {"out": Path(out) if out else None, "prints": print_ or [], "watch": bars, "device": device}
     beneath = open_slice(slice_, env=env)
-    job = OverlayJob.of(beneath, tables_over(beneath, runs), command=command_line(), cut=cut, **how)
+    job = OverlayJob.of(beneath, tables_over(beneath, runs, bars), command=command_line(), cut=cut, **how)
     recording = job.folder / STREAM
     if spawn and not serve:
         check_display(recording, "leave out --spawn, or take --serve to look at it in a browser")

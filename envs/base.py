@@ -18,12 +18,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..landscapes.episode import Episode as Episode
+from ..landscapes.identity import MODEL_VERSION
 from ..landscapes.objective import ContractError, Evaluation, Objective, check_points, first_line
 from ..landscapes.options import NoOptions, read_options
 from ..landscapes.sampling.memory import free_memory, is_out_of_memory
 from ..landscapes.space import ParameterSpace, as_tensor
 from .batching import Pool, cores, map_parts
-from .code import code_digest
 from .engines import find_engine
 from .engines.engine import Engine
 from .records import Fidelity as Fidelity
@@ -31,8 +31,6 @@ from .records import MaterialRange as MaterialRange
 from .records import ModelPart as ModelPart
 from .records import Work as Work
 from .records import unknown_fidelity
-
-COMPUTES_LOSSES = False  # for `code`
 
 T = TypeVar("T")
 FLOAT32 = torch.finfo(torch.float32).max
@@ -51,6 +49,7 @@ class Environment(Objective):
     engine.
     """
 
+    model_version: ClassVar[int | Mapping[str, int]] = 1  # of all engines or by name; raised when numbers change
     fidelities: ClassVar[Mapping[str, Fidelity]] = {"default": Fidelity("default", dt=0.0, precision="float64")}
     examples: ClassVar[Mapping[str, tuple[float, ...]]] = {}
     Options: ClassVar[type[Any]] = NoOptions
@@ -100,7 +99,7 @@ class Environment(Objective):
             )
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the numbers, as plain JSON: scene, options, fidelity, device, engine and code."""
+        """Return what decides the numbers, as plain JSON: scene and its version, options, fidelity, device, engine."""
         return {
             "objective": self.name,
             "options": asdict(self.options),
@@ -109,7 +108,7 @@ class Environment(Objective):
             "device": self.device,
             "engine": self.engine,
             "deterministic": self.deterministic,
-            "code": self.code,
+            MODEL_VERSION: self.version_on(self.engine),
         }
 
     def __getstate__(self) -> dict[str, Any]:
@@ -168,10 +167,11 @@ class Environment(Objective):
         losses: Tensor = _Bridge.apply(x, self)  # type: ignore[no-untyped-call]
         return losses
 
-    @property
-    def code(self) -> str:
-        """Digest of the code that the numbers come from."""
-        return code_digest(type(self), self.engine)
+    @final
+    @classmethod
+    def version_on(cls, engine: str) -> int:
+        """Return the version of the model on an engine: results of different versions are never mixed."""
+        return cls.model_version if isinstance(cls.model_version, int) else cls.model_version.get(engine, 1)
 
     @classmethod
     def about(cls) -> str:

@@ -15,7 +15,7 @@ from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
 from .base import Environment, Episode, Fidelity, ModelPart, Work
-from .batching import Pool
+from .batching import Pool, copied
 from .controls import extend, hold
 from .engines.chain import Chain, Solver
 from .options import EpisodeOptions
@@ -71,6 +71,7 @@ class Cartpole(Environment):
     controls satisfy all three. Masses, torques, times and target are ours.
     """
 
+    model_version = 1
     name = "cartpole"
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
     beyond_box = True
@@ -124,7 +125,7 @@ class Cartpole(Environment):
         """Return the cart, and the joints of the chain with its tip."""
         controls = self._controls(self._row(x))
         with self._solvers.lend() as solver:
-            phi = _swing(solver, controls)[:, 0].cpu().double()
+            phi = copied(_swing(solver, controls)[:, 0])
         joints = _joints(self._cart(controls)[0], phi)
         joints = torch.cat([joints, torch.zeros_like(joints[..., :1])], dim=2)
         time = self.fidelity.dt * torch.arange(self.steps + 1, dtype=torch.float64)
@@ -152,7 +153,7 @@ class Cartpole(Environment):
         x = x.clone().requires_grad_(grad)
         controls = self._controls(x)
         with self._solvers.lend() as solver:
-            phi = _swing(solver, controls.detach())[-1].cpu().double().requires_grad_(grad)
+            phi = copied(_swing(solver, controls.detach())[-1]).requires_grad_(grad)
             tip = _joints(self._cart(controls)[:, -1], phi)[:, -1]
             loss = (tip - self.target).norm(dim=1)
             slope = _pull_back(solver, loss, phi, controls, x) if grad else None
@@ -174,7 +175,7 @@ class Cartpole(Environment):
         """Watch the cart and the sines and cosines of angles, and how fast cart and angles changed in the last step."""
         controls, step = self._controls(x), decision * self.steps // CONTROLS
         with self._solvers.lend() as solver:
-            phi = _swing(solver, controls).cpu().double().transpose(0, 1)
+            phi = copied(_swing(solver, controls)).transpose(0, 1)
         joints = torch.cat([self._cart(controls)[:, :, None], phi], dim=2)
         rate = (joints[:, step] - joints[:, max(0, step - 1)]) * (TEMPO / self.fidelity.dt)
         return torch.cat([joints[:, step, :1], phi[:, step].sin(), phi[:, step].cos(), rate], dim=1)

@@ -30,6 +30,7 @@ class Function(Environment):
     formula holds beyond the box too.
     """
 
+    model_version = 1
     beyond_box = True
 
     fidelities: ClassVar[dict[str, Fidelity]] = {"exact": Fidelity("exact", dt=0.0, precision="float64")}

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from importlib.metadata import PackageNotFoundError, version
 
-COMPUTES_LOSSES = False  # for `code`
-
 
 def installed_version(package: str) -> str | None:
     """Return the version of a package, without importing it; None where it is not installed."""

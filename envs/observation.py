@@ -8,8 +8,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-COMPUTES_LOSSES = False  # for `code`
-
 SEEN = 32  # points of each body
 
 

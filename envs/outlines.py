@@ -9,8 +9,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-COMPUTES_LOSSES = False  # for `code`
-
 
 def triangles(points: np.ndarray) -> Int[Tensor, "face 3"]:
     """Return the triangles between lattice points, shape (vertex, 2): two a cell, one where it has three corners."""

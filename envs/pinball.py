@@ -73,6 +73,7 @@ class Pinball(Environment):
     2022), appendix A.1.2; ball, bars, start, goal and duration are ours.
     """
 
+    model_version = 1
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
     beyond_box = True
     fidelities: ClassVar[dict[str, Fidelity]] = {

@@ -6,8 +6,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-COMPUTES_LOSSES = False  # for `code`
-
 
 @dataclass(frozen=True)
 class Fidelity:

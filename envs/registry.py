@@ -29,8 +29,6 @@ from .records import unknown_fidelity
 if TYPE_CHECKING:
     from .base import Environment, Fidelity
 
-COMPUTES_LOSSES = False  # for `code`
-
 Kind = TypeVar("Kind", bound="type[Environment] | Environment")
 GROUP = "gradscape.environments"
 EXTRAS = {"mjx": ("mujoco", "mujoco-mjx", "jax"), "newton": ("newton",)}  # of this package, and what each brings

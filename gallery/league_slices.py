@@ -9,6 +9,7 @@ import torch
 from ..jobs.folder import SUMMARY
 from ..jobs.scene import SceneSpec
 from ..jobs.watch import Watch
+from ..landscapes.identity import MODEL_VERSION
 from ..landscapes.overlay import overlay
 from ..landscapes.storage.records import read_json, write_record
 from ..optim.league import SceneStandings
@@ -99,8 +100,9 @@ class LeagueSlicePart(FigurePart):
     def _key(self, standings: SceneStandings) -> dict[str, Any]:
         """Return what decides the slice and its picture."""
         assert standings.best is not None
-        about = {"code": standings.identity["code"], "fidelity": standings.fidelity, "methods": list(standings.methods)}
-        return about | {"best": list(standings.best.x), "dims": list(self._dims), "resolution": RESOLUTION}
+        about = {MODEL_VERSION: standings.identity[MODEL_VERSION], "fidelity": standings.fidelity}
+        about |= {"methods": list(standings.methods), "best": list(standings.best.x)}
+        return about | {"dims": list(self._dims), "resolution": RESOLUTION}
 
     def _standings(self) -> SceneStandings | None:
         return read_if_sound(read_standings, LeagueFiles.of(self.root, self.figure.env).record)

@@ -152,7 +152,7 @@ class SlicePart(FigurePart):
             gradients=self.figure.gradients,
             command=self.figure.command(self.device),
             out=self.folder,
-            # nothing is lost of a store made by other code or for another device
+            # nothing is lost of a store made by another model or for another device
             force=is_slice(self.folder / STORE) and self.state().done == 0,
             executor=self.executor,
         )

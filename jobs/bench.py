@@ -21,7 +21,7 @@ from ..envs.engines.profiling import count_compiled_modules
 from ..envs.engines.runtime import cores, device_names, free_memory
 from ..landscapes.capacity import Need, require
 from ..landscapes.cost import duration
-from ..landscapes.objective import Evaluation, ObjectiveWrapper, Status
+from ..landscapes.objective import Evaluation, ObjectiveWrapper
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.fill import sample
 from ..landscapes.storage.store import SliceStore
@@ -281,7 +281,7 @@ def _points(env: Environment, count: int) -> Float[Tensor, "count dim"]:
 
 def _time_batch(envs: Mapping[str, Environment], points: Tensor, seconds: float) -> list[BatchRate]:
     """Time one batch on every engine in turn, forward and with gradient; the first engine's rate holds the ratios."""
-    failed = {name: int((env.evaluate(points).status != Status.OK).sum()) for name, env in envs.items()}  # warms up too
+    lost = {name: int(env.evaluate(points).failed.sum()) for name, env in envs.items()}  # warms up too
     calls = {
         (name, grad): partial(env.evaluate, points, grad=grad) for grad in WAYS.values() for name, env in envs.items()
     }
@@ -290,7 +290,7 @@ def _time_batch(envs: Mapping[str, Environment], points: Tensor, seconds: float)
     for name, env in envs.items():
         forward, sloped = (Rate.of(env, len(points), min(times[name, grad])) for grad in WAYS.values())
         costs = sloped.seconds / forward.seconds
-        found.append(BatchRate(name, len(points), failed[name], len(times[name, True]), forward, sloped, costs))
+        found.append(BatchRate(name, len(points), lost[name], len(times[name, True]), forward, sloped, costs))
     for other in found[1:]:
         found[0] = replace(
             found[0],

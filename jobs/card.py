@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from ..envs.code import code_digest
 from ..envs.installed import installed_version
 from ..envs.registry import EXTRAS, entries, environment_class, installs
 from ..landscapes.capacity import require
 from ..landscapes.conformance.finding import FAIL, UNEXPECTED
+from ..landscapes.identity import PACKAGE
 from ..landscapes.measures.card import Card, CardSlice, Grade, Outcome, count_outcomes, first_finding
 from ..landscapes.storage.arrays import need_of
 from ..landscapes.storage.checkpoint import Checkpoint
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 RECORD, PICTURE = CARD.files
-OURS = ("gradscape", "warp-lang")  # what our own scenes are simulated by
+OURS = (PACKAGE, "warp-lang")  # what our own scenes are simulated by
 POINTS = 3  # that are checked
 LARGEST = 400  # parameters, of a chain
 
@@ -113,8 +113,8 @@ class CardJob:
         require("resolution", resolution, lambda points: need_of((points, points), LARGEST, grad=True))
         chosen = [one for one in ENTRANTS if not scenes or one.scene in scenes]
         packages = dict.fromkeys([*OURS, *(package for extra in EXTRAS.values() for package in extra)])
-        versions = {package: installed_version(package) for package in packages}
-        identity = {"resolution": resolution, "device": device, "versions": versions, "code": _code()}
+        versions = {package: installed_version(package) for package in packages if package != PACKAGE}
+        identity = {"resolution": resolution, "device": device, "versions": versions, "model_versions": _models()}
         pieces = Checkpoint.open(
             out or folder_named(["card"], identity, root), identity, what="report card", force=force
         )
@@ -178,10 +178,10 @@ class CardJob:
         return arrays
 
 
-def _code() -> dict[str, str]:
-    """Return digests of the code of the scenes, by their names."""
+def _models() -> dict[str, int]:
+    """Return the versions of the scenes' models, by their names."""
     kinds = {one.env: environment_class(one.env) for one in ENTRANTS}
-    return {name: code_digest(kind, kind.engines[0]) for name, kind in kinds.items()}
+    return {name: kind.version_on(kind.engines[0]) for name, kind in kinds.items()}
 
 
 def _measure(one: Entrant, resolution: int, device: str) -> dict[str, NDArray[Any]]:

@@ -37,16 +37,19 @@ def cut(
 ) -> Plane:
     """Return the line or plane along parameters, or along directions that are named.
 
-    `kept` says where a slice may have been begun, as for `kept_plane`: it goes on along its own directions. Raises
-    ValueError where both or neither are given, and as `plane_through` and `plane_along` do.
+    Where there are no more than two parameters and neither is given, it varies all. `kept` says where a slice may have
+    been begun, as for `kept_plane`: it goes on along its own directions. Raises ValueError where both are given, or
+    neither with more parameters, and as `plane_through` and `plane_along` do.
     """
     if not isinstance(through, str) and any(isinstance(one, str) for one in through):
         raise ValueError(f"a slice goes through one point here; got {len(through)} names, so ask for each by itself")
-    if (dims is None or len(dims) == 0) == (along is None):
+    chosen = list(dims) if dims is not None else []
+    if not chosen and along is None and objective.space.dim <= 2:
+        chosen = list(range(objective.space.dim))
+    if bool(chosen) == (along is not None):
         raise ValueError("a slice takes --dims, one or two parameters, or --along, directions; give one of them")
     if along is None:
-        assert dims is not None  # as one of the two is given
-        return plane_through(objective, dims, through=through, extent=extent, resolution=resolution)
+        return plane_through(objective, chosen, through=through, extent=extent, resolution=resolution)
     if not isinstance(resolution, int):
         raise ValueError(f"a slice along {along} takes one resolution for its axes; got {list(resolution)}")
     where: dict[str, Any] = {"through": through, "extent": extent}

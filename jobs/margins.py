@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from platformdirs import user_data_path
 
+from ..landscapes.identity import MODEL_VERSION, current_identity
 from ..landscapes.storage.records import read_json, reading, write_record
 from .folder import digest
 
@@ -48,8 +49,8 @@ def _sentences(record: dict[str, Any], env: Environment) -> Iterator[str]:
     """Yield what a record says of the step in each precision, and where and of what settings it was measured."""
     known = record["identity"]
     of = f"{known['engine']} on {known['device']}, {record['points']} points, {record['provenance']['created']}"
-    if known["code"] != (code := _code(env, known["engine"])):
-        of += f", of another version of the code, {known['code']}, this is {code}"
+    if (theirs := known[MODEL_VERSION]) != (ours := env.version_on(known["engine"])):
+        of += f", by {env.name} model {theirs}, this is model {ours}"
     now = env.fidelities.get(record["fidelity"])
     if now is not None and (others := now.changes_from(known["settings"])):
         of += f", when {record['fidelity']} had {', '.join(f'{name} {value}' for name, (value, _) in others.items())}"
@@ -89,17 +90,11 @@ def _records(name: str) -> Iterator[tuple[Path, dict[str, Any]]]:
             if path.name.startswith((f"{name}-cpu", f"{name}-cuda")):
                 with reading(path, f"delete it, and `landscape extremes {name}` measures it anew"):
                     record = read_json(path)
-                    known = record["identity"]
+                    record["identity"] = known = current_identity(record["identity"])
                     key = digest([known["settings"], known["options"], known["engine"], known["device"]])
                 if key not in seen:
                     seen.add(key)
                     yield path, record
-
-
-def _code(env: Environment, engine: str) -> str:
-    from ..envs.code import code_digest
-
-    return code_digest(type(env), engine)
 
 
 def _folder() -> Path:

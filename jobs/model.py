@@ -242,7 +242,7 @@ class ModelJob:
         from ..landscapes.measures.fidelity import Seconds, spread
         from ..landscapes.measures.model import ModelStudy, Noise
         from ..landscapes.measures.tradeoff import RefusedVariant
-        from ..landscapes.objective import Status
+        from ..landscapes.objective import failed
 
         whole = full.sample()
         noise = Noise.of(again.sample(), full.again(REPEATS).sample(), rounding=self._rounding, seed=self.seed)
@@ -254,7 +254,7 @@ class ModelJob:
             seed=self.seed,
             loss_unit=self.env.loss_unit,
             spread=spread(whole),
-            failed=int((full.status != Status.OK).sum()),
+            failed=int(failed(full.status).sum()),
             seconds=Seconds(*(min((float(one[way]) for one in times), default=0.0) for way in (0, 1))),
             noise=noise,
             parts=tuple(self._judge(p, changes[p.name], whole, noise) for p in self.parts if p.name in changes),

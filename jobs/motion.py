@@ -31,7 +31,7 @@ FRAMES, ONLY = SWEEP.files[:2]  # the folder of a sweep's slices, and the slice 
 class Motion:
     """Say what moves: frames show `slices` of what is sampled on `planes` at the `values` of what `label` names.
 
-    `env_at` makes the environment of a plane, by its number.
+    `env_at` makes the environment of a plane, by its number. A `logarithmic` one moves by equal ratios.
     """
 
     label: str
@@ -39,6 +39,7 @@ class Motion:
     planes: tuple[Plane, ...]
     env_at: Callable[[int], Environment]
     slices: Callable[[Sequence[xr.Dataset]], Sequence[xr.Dataset]] = list
+    logarithmic: bool = False
 
     @classmethod
     def of(cls, env: Environment, plane: Plane, over: int | str, frames: int) -> Motion:
@@ -86,15 +87,19 @@ def _parameter(name: int | str, env: Environment, plane: Plane, frames: int) -> 
     """Move a parameter from one of its bounds to the other."""
     import torch
 
+    from ..landscapes.space import LOG10, to_values
+
     number = env.space.index(name)
     if _holds(plane, number):
         raise ValueError(
             f"a sweep moves a third parameter, {HORIZON} or {SMOOTHING}; got --over {name}, which the slice varies"
         )
-    low, high = float(env.space.lower[number]), float(env.space.upper[number])
-    values = tuple(torch.linspace(low, high, frames, dtype=torch.float64).tolist())
-    planes = tuple(replace(plane, origin=_with(plane.origin, number, value)) for value in values)
-    return Motion(env.space.labels[number], values, planes, lambda _: env)
+    space = env.space
+    places = torch.linspace(float(space.lower[number]), float(space.upper[number]), frames, dtype=torch.float64)
+    planes = tuple(replace(plane, origin=_with(plane.origin, number, place)) for place in places.tolist())
+    scale = space.scales[number]
+    values = tuple(to_values(places[:, None], [scale])[:, 0].tolist())
+    return Motion(space.labels[number], values, planes, lambda _: env, logarithmic=scale == LOG10)
 
 
 def _horizon(env: Environment, plane: Plane, frames: int) -> Motion:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import xarray as xr
 
 from ..envs.registry import as_environment
-from ..landscapes.identity import plane_of, stored_identity
-from ..landscapes.objective import Objective, Status
+from ..landscapes.identity import MODEL_VERSION, plane_of, stored_identity
+from ..landscapes.objective import Objective, failed
 from ..landscapes.overlay import best_point, overlay, principal_plane
 from ..landscapes.plane import Plane
 from ..landscapes.slice import Slice
@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 
 PICTURE, STREAM = OVERLAY.files
 PCA, BEST = "pca", "best"
-MUST, SHOULD = ("objective", "options"), ("fidelity", "settings", "engine", "code")  # agree between slice and runs
+MUST = ("objective", "options")  # agree between slice and runs
+SHOULD = ("fidelity", "settings", "engine", MODEL_VERSION)  # as well
 
 
 @dataclass(frozen=True)
@@ -93,11 +94,13 @@ class OverlaySummary:
     failed: int
     farthest: float
     files: list[str]
+    skipped: int = 0  # rows of tables that hold no point
 
     def outcome(self) -> str:
         """Say it in a line."""
         counted = f"{self.runs} run{'s' if self.runs > 1 else ''}, {self.points} points"
-        where = f"{self.outside} beyond the map, {self.failed} failed"
+        skipped = f", {self.skipped} row{'s' if self.skipped > 1 else ''} skipped" if self.skipped else ""
+        where = f"{self.outside} beyond the map, {self.failed} failed{skipped}"
         return f"{counted}: {where}; the farthest is {self.farthest:.2g} half-widths of the box off the plane"
 
 
@@ -120,9 +123,10 @@ class Overlay:
             runs=len(self.runs),
             points=sum(run.sizes["evaluation"] for run in self.runs),
             outside=sum(int(run["outside"].sum()) for run in self.runs),
-            failed=sum(int((run["status"] != Status.OK).sum()) for run in self.runs),
+            failed=sum(int(failed(run["status"]).sum()) for run in self.runs),
             farthest=max(float(run["distance"].max().round(9)) for run in self.runs),
             files=self.files,
+            skipped=sum(int(run.attrs.get("skipped", 0)) for run in self.runs),
         )
 
     def plot(self, *, width: float | None = None) -> Picture:

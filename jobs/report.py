@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..landscapes.capacity import Need, require, size
 from ..landscapes.cost import duration, seconds_per_episode
-from ..landscapes.identity import stored_identity
+from ..landscapes.identity import MODEL_VERSION, stored_identity
 from ..landscapes.objective import BoxedObjective, Evaluation, ObjectiveWrapper
 from ..landscapes.storage.disk import is_full
 from ..landscapes.storage.files import make_folder, other_files, replacing, tidy, write_json
@@ -163,7 +163,8 @@ class ReportJob:
         """
         dataset = _open(subject)
         env = environment_of(dataset, self.device, self.env)
-        key: ReportKey = {"points": self.points, "seed": self.seed, "slice": digest_of(dataset), "code": env.code}
+        key: ReportKey = {"points": self.points, "seed": self.seed, "slice": digest_of(dataset)}
+        key[MODEL_VERSION] = env.version_on(env.engine)
         beside = subject.store.parent
         if not self.prints or (beside / ARRAYS).exists():
             _fetch(beside, folder, key, watch)
@@ -293,7 +294,7 @@ def _open(subject: ReportedSlice) -> xr.Dataset:
 
 def _warn(subject: ReportedSlice, dataset: xr.Dataset, env: Environment, watch: Watch) -> None:
     theirs, ours = stored_identity(dataset), env.identity()
-    differ = [name for name in ("code", "device") if theirs.get(name) != ours[name]]
+    differ = [name for name in (MODEL_VERSION, "device") if theirs.get(name) != ours[name]]
     if differ:
         said = "; ".join(f"{name} {theirs.get(name)} there, {ours[name]} here" for name in differ)
         watch.note(f"warning: {subject.name} was sampled otherwise ({said}), so losses may differ")
@@ -331,7 +332,7 @@ def _leave_measures(folder: Path, report: Report) -> None:
 
 def digest_of(dataset: xr.Dataset) -> str:
     """Return what a slice is known by in its report."""
-    identity = json.dumps(stored_identity(dataset), sort_keys=True).encode()
+    identity = json.dumps(json.loads(dataset.attrs["identity"]), sort_keys=True).encode()  # as it is stored
     return hashlib.sha256(identity + dataset["loss"].to_numpy().tobytes()).hexdigest()[:12]
 
 
@@ -356,16 +357,16 @@ def _keep(folder: Path, key: ReportKey, device: str, watch: Watch) -> Report:
     _leave_measures(folder, kept)
     elsewhere = f", measured on {kept.device}" if kept.device != device else ""
     watch.note(f"{folder} is there already{elsewhere}")
-    if kept.key["code"] != key["code"]:
-        said = f"by other code of the scenes, {kept.key['code']}; this is {key['code']}"
-        watch.note(f"warning: it was measured {said}. Delete the folder to measure it anew")
+    if (theirs := kept.key[MODEL_VERSION]) != (ours := key[MODEL_VERSION]):
+        said = f"{kept.env} model {theirs}; this is model {ours}"
+        watch.note(f"warning: it was measured by {said}. Delete the folder to measure it anew")
     return kept
 
 
 def _differences(theirs: ReportKey, ours: ReportKey) -> str:
-    """Say in what two reports differ, nothing where they are of the same slice and settings, whatever the code is."""
+    """Say in what two reports differ, nothing where slice and settings are the same, whatever the model's version."""
     differ = {name: (theirs.get(name), value) for name, value in ours.items() if theirs.get(name) != value}
-    if set(differ) <= {"code"}:
+    if set(differ) <= {MODEL_VERSION}:
         return ""
     return ", ".join(f"{name} {there} there, {here} here" for name, (there, here) in differ.items())
 

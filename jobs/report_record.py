@@ -8,8 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NotRequired, Protocol, TypedDict, cast
 
+from ..landscapes.identity import MODEL_VERSION, current_identity
 from ..landscapes.measures.records import ProfileRecord, WordRecord
-from ..landscapes.plain import text
+from ..landscapes.plain import number, text
 from ..landscapes.storage.records import read_json, reading
 from .folder import REPORT
 from .report_tables import EnvironmentRecord, by_environment, slices_markdown
@@ -40,12 +41,12 @@ class PaperRecord(TypedDict):
 
 
 class ReportKey(TypedDict):
-    """What decides a report: its settings, the digest of the slice, and that of the scenes' code."""
+    """What decides a report: its settings, the digest of the slice, and the version of the scene's model."""
 
     points: int
     seed: int
     slice: str
-    code: str
+    model_version: int
     device: NotRequired[str]  # of early versions
 
 
@@ -81,16 +82,19 @@ class Report:
         with reading(path, "delete it, and the same command measures the slice anew"):
             report = replace(cls.of_record(read_json(path)), folder=path.parent)
             report.measures, slices_markdown([report]), by_environment([report])
-            for said in (report.name, report.env, report.device, report.key["code"], *report.verdict_lines()):
+            number(report.key[MODEL_VERSION])
+            own = report.name, report.env, report.device, report.profile.get("errors", "")
+            for said in (*own, *report.verdict_lines()):
                 text(said)
         return report
 
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> Report:
         """Take a report from plain JSON, by the keys of the file; raises KeyError where one is missing."""
-        own = [name for name in cls.__dataclass_fields__ if name not in ("profile", "folder", "store")]
+        own = [name for name in cls.__dataclass_fields__ if name not in ("profile", "key", "folder", "store")]
         profile = {name: record[name] for name in ProfileRecord.__annotations__ if name in record}
-        return cls(**{name: record[name] for name in own}, profile=cast("ProfileRecord", profile))
+        key = cast("ReportKey", current_identity(record["key"]))
+        return cls(**{name: record[name] for name in own}, profile=cast("ProfileRecord", profile), key=key)
 
     def record(self) -> dict[str, Any]:
         """Return it as plain JSON, by the keys of the file."""

@@ -8,8 +8,10 @@ from datetime import UTC, datetime
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+from .. import __version__
 from ..envs.installed import installed_version
 from ..envs.registry import find_environment, make, registered_environment
+from ..landscapes.identity import PACKAGE, VERSIONS
 from .watch import Watch
 
 if TYPE_CHECKING:
@@ -82,7 +84,7 @@ def provenance(objective: Objective, command: str) -> dict[str, Any]:
     return {
         "command": command,
         "created": datetime.now(UTC).strftime("%Y-%m-%d"),
-        "versions": {package: _version(package) for package in _packages(objective)},
+        VERSIONS: {PACKAGE: __version__, **{package: _version(package) for package in _packages(objective)}},
         "loss_unit": objective.loss_unit,
     }
 

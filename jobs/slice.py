@@ -22,7 +22,7 @@ from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.identity import with_stride
 from ..landscapes.lattice import check_gradients
 from ..landscapes.measures.unresolved import probes, stored_unresolved
-from ..landscapes.objective import BoxedObjective, Objective, Status
+from ..landscapes.objective import BoxedObjective, Objective, Status, failed
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.distribution import RemoteSite, Site, evaluator, run_tasks, workers_of
 from ..landscapes.sampling.fill import Progress, sample
@@ -235,8 +235,8 @@ class SliceJob:
             def follow(now: Progress) -> None:
                 nonlocal drawn, pause, computed
                 computed = now.done - now.resumed
-                failed = sum(count for status, count in now.statuses.items() if status != Status.OK)
-                advance(now.done, f"episodes, {failed} failed" if failed else "")
+                lost = sum(count for status, count in now.statuses.items() if failed(status))
+                advance(now.done, f"episodes, {lost} failed" if lost else "")
                 if now.level_complete and now.done < now.total and (began := time.monotonic()) - drawn > pause:
                     self.picture()
                     drawn = time.monotonic()
@@ -285,6 +285,7 @@ class SliceJob:
             command=self.command,
             files=files,
             barrier=barrier_of(dataset),
+            error=self.store.error,
         )
 
 

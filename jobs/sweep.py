@@ -20,7 +20,7 @@ from ..landscapes.capacity import size
 from ..landscapes.cost import duration
 from ..landscapes.identity import with_stride
 from ..landscapes.lattice import check_gradients
-from ..landscapes.objective import BoxedObjective, Objective, Status
+from ..landscapes.objective import BoxedObjective, Objective, failed
 from ..landscapes.plain import plain_name
 from ..landscapes.sampling.fill import Progress, sample
 from ..landscapes.storage.files import discard, tidy, visible_files, write_json
@@ -213,7 +213,8 @@ class SweepJob:
             slices = [self._sample(number, count) for number in range(len(self.stores))]
         from ..landscapes.draw.figures.sweep import Sweep
 
-        return Sweep(self.motion.label, self.motion.values, self.motion.slices(slices))
+        moved = self.motion
+        return Sweep(moved.label, moved.values, moved.slices(slices), moved.logarithmic)
 
     def say_kept(self) -> str:
         """Say how much of it is on disk."""
@@ -288,15 +289,15 @@ class _Count:
 
     def follow(self, now: Progress) -> None:
         """Show how far the slice under way is."""
-        failed = self.failed + now.done - now.statuses.get(Status.OK, 0)
-        said = f"slice {self.number} of {self.slices}" + (f", {failed} failed" if failed else "")
+        lost = self.failed + sum(count for status, count in now.statuses.items() if failed(status))
+        said = f"slice {self.number} of {self.slices}" + (f", {lost} failed" if lost else "")
         self.advance(self.finished + now.done, said)
 
     def add(self, dataset: xr.Dataset) -> None:
         """Count a slice that is finished."""
         self.number += 1
         self.finished += dataset["status"].size
-        self.failed += int((dataset["status"] != Status.OK).sum())
+        self.failed += int(failed(dataset["status"]).sum())
 
 
 def sweep_folder(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from platformdirs import user_data_path
 
+from .. import __version__
 from ..envs.registry import make
 from .folder import digest
 
@@ -52,10 +53,11 @@ def keep_convergence(found: Convergence) -> Path | None:
 
 
 def find_convergence(found: Tradeoff) -> Convergence | None:
-    """Return the study of convergence that is kept of a trade-off's scene, None where none is of the same code.
+    """Return the study of convergence that is kept of a trade-off's scene, None where none is of the same model.
 
     Looks among the user's own studies, then in the gallery's; raises DamagedError where one cannot be read.
     """
+    from ..landscapes.identity import MODEL_VERSION
     from ..landscapes.measures.convergence_record import Convergence
     from ..landscapes.storage.records import read_json, reading
 
@@ -69,7 +71,7 @@ def find_convergence(found: Tradeoff) -> Convergence | None:
                 file, f"delete it, and `landscape tradeoff {found.env} --ladder convergence` measures it anew"
             ):
                 study = Convergence.of_record(read_json(file))
-            if all(study.identity[key] == about[key] for key in ("code", "engine", "options")):
+            if all(study.identity[key] == about[key] for key in (MODEL_VERSION, "engine", "options")):
                 return study
     return None
 
@@ -94,6 +96,7 @@ def choose_fidelity(spec: SceneSpec, watch: Watch) -> Fidelity:
         )
     found, source, rows = _candidates(env, spec.options)
     from ..envs.base import Fidelity
+    from ..landscapes.identity import MODEL_VERSION
 
     errors = {row.name: off for row in rows if (off := row.comparison.p95(relative=relative)) is not None}
     within = [row for row in rows if errors.get(row.name, float("inf")) <= limit]
@@ -104,9 +107,9 @@ def choose_fidelity(spec: SceneSpec, watch: Watch) -> Fidelity:
             f"{_amount(errors[best], relative, found)} off at the 95th percentile"
         )
     row, known = _quickest(watch, env, within)
-    if (ours := _code(env, found)) != (theirs := found.identity["code"]):
-        said = f"measured with another version of the code of {name}, {theirs}, this is {ours}"
-        watch.note(f"warning: {said}")
+    theirs, ours = found.identity[MODEL_VERSION], env.version_on(found.identity["engine"])
+    if theirs != ours:
+        watch.note(f"warning: measured by {name} model {theirs}; this is model {ours}")
     amount = _amount(errors[row.name], relative, found)
     accuracy = f"its losses are {amount} off or less in 95 % of {row.comparison.compared} points"
     if row.name == found.reference:
@@ -153,7 +156,8 @@ def _time(env: Environment, variants: Sequence[Environment]) -> dict[str, float]
     from ..landscapes.storage.files import write_json
     from ..landscapes.storage.records import read_json, reading
 
-    path = _place(env.name, asdict(env.options), env.device).with_suffix(f".{env.engine}-{env.code}.seconds.json")
+    of = f"{env.engine}-{env.version_on(env.engine)}-{__version__}"  # another release may take another time
+    path = _place(env.name, asdict(env.options), env.device).with_suffix(f".{of}.seconds.json")
     known: dict[str, float] = {}
     if path.is_file():
         with reading(path, "delete it, and fidelities are timed anew"):
@@ -176,12 +180,6 @@ def seconds_with_gradient(env: Environment) -> float:
     from ..landscapes.cost import episode_cost
 
     return episode_cost(env).gradient * whole / env.work().count
-
-
-def _code(env: Environment, found: Tradeoff) -> str:
-    from ..envs.code import code_digest
-
-    return code_digest(type(env), found.identity["engine"])
 
 
 def find_variant(env: Environment, device: str) -> tuple[MeasuredVariant, Path]:

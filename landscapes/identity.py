@@ -10,14 +10,18 @@ from typing import TYPE_CHECKING, Any
 from .. import __version__
 from .plain import plain_json
 from .plane import Plane
-from .space import ParameterSpace
+from .space import LINEAR, ParameterSpace
 
 if TYPE_CHECKING:
     import xarray as xr
 
 EVERY = "gradients_every"  # of a slice's identity; not there where its gradients are at every sample
+SCALES = "scales"  # of the parameters in an identity; not there where all are linear
 ABSENT = "none"  # in the place of a setting's value
 LISTED_SETTINGS = 6  # settings that differ, in the refusal of a store
+MODEL_VERSION, METHOD_VERSION = "model_version", "method_version"  # in an identity
+REPLACED = {"code": MODEL_VERSION, "method_code": METHOD_VERSION}  # digests of source text, in identities of before
+VERSIONS, PACKAGE = "versions", "gradscape"  # in a provenance; the package's own was in the identity once
 
 
 class StoreError(ValueError):
@@ -46,10 +50,41 @@ def full_identity(identity: Mapping[str, Any], plane: Plane, space: ParameterSpa
 
     Raises ValueError where the settings hold a name of the slice's own, or are not plain JSON.
     """
-    own = {"plane": plane.record(), "parameters": space.names, "gradients": grad, "gradscape": __version__}
+    own = {"plane": plane.record(), **record_parameters(space), "gradients": grad}
     if clash := own.keys() & identity.keys():
         raise ValueError(f"a slice's identity gets {', '.join(sorted(clash))} from the slice; leave them out")
     return plain_json({**identity, **own}, "a slice's identity")
+
+
+def record_parameters(space: ParameterSpace) -> dict[str, Any]:
+    """Return what an identity says of the parameters: their names, and their scales unless all are linear."""
+    return {"parameters": list(space.names), **({} if space.is_linear else {SCALES: list(space.scales)})}
+
+
+def stored_scales(dataset: xr.Dataset) -> tuple[str, ...]:
+    """Return the scales that the parameters of a slice or a run are on, linear where nothing else is said."""
+    about = stored_identity(dataset) if "identity" in dataset.attrs else {}
+    return tuple(about.get(SCALES, [LINEAR] * dataset.sizes["dim"]))
+
+
+def current_identity(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a stored identity as it is written now.
+
+    Results of before there were versions hold the package's version and digests of source text instead. They count as
+    of version 1: by measurement, that is what every one in the gallery computes whose losses are of its scene today.
+    """
+    new = {name: 1 for old, name in REPLACED.items() if old in stored}
+    return {**new, **{name: value for name, value in stored.items() if name not in (*REPLACED, PACKAGE)}}
+
+
+def current_provenance(stored: Mapping[str, Any], identity: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a stored provenance with the package's version, which the identity stored beside it held before."""
+    return with_package(stored, str(identity[PACKAGE])) if PACKAGE in identity else dict(stored)
+
+
+def with_package(provenance: Mapping[str, Any], version: str = __version__) -> dict[str, Any]:
+    """Return a provenance whose versions begin with the package's."""
+    return {**provenance, VERSIONS: {PACKAGE: version, **provenance.get(VERSIONS, {})}}
 
 
 def with_stride(identity: Mapping[str, Any], gradients: int) -> dict[str, Any]:
@@ -70,7 +105,7 @@ def stored_identity(dataset: xr.Dataset) -> dict[str, Any]:
 
     Raises ValueError where the dataset is neither.
     """
-    return _decode(dataset, "identity")
+    return current_identity(_decode(dataset, "identity"))
 
 
 def stored_provenance(dataset: xr.Dataset) -> dict[str, Any]:
@@ -78,7 +113,7 @@ def stored_provenance(dataset: xr.Dataset) -> dict[str, Any]:
 
     Raises ValueError where the dataset is neither.
     """
-    return _decode(dataset, "provenance")
+    return current_provenance(_decode(dataset, "provenance"), _decode(dataset, "identity"))
 
 
 def plane_of(dataset: xr.Dataset) -> Plane:
@@ -97,12 +132,23 @@ def _decode(dataset: xr.Dataset, name: str) -> dict[str, Any]:
 
 
 def check_identity(
-    path: Path | None, *, wanted: Mapping[str, Any], found: Mapping[str, Any], what: str = "slice"
+    path: Path | None,
+    *,
+    wanted: Mapping[str, Any],
+    found: Mapping[str, Any],
+    what: str = "slice",
+    losses: str = "",
 ) -> None:
-    """Raise `StoreMismatchError`, naming each setting that differs, unless the two are equal."""
+    """Raise `StoreMismatchError`, naming each setting that differs, unless the two are equal.
+
+    `losses` is a sentence on losses that were found to differ, which the refusal of another model shows.
+    """
+    wanted, found = current_identity(wanted), current_identity(found)
     if wanted == found:
         return
     differ = differing_settings(wanted, found)
+    if differ.keys() == {MODEL_VERSION} and MODEL_VERSION in wanted and MODEL_VERSION in found:
+        raise StoreMismatchError(_other_model(path, wanted, found, what, losses))
     said = [f"{name}: wanted {ours}, found {theirs}" for name, (ours, theirs) in differ.items()][:LISTED_SETTINGS]
     if len(differ) > LISTED_SETTINGS:
         said.append(f"and {len(differ) - LISTED_SETTINGS} more")
@@ -110,6 +156,13 @@ def check_identity(
         f"{path or 'the store'} holds a {what} made by other settings ({'; '.join(said)}); "
         "write elsewhere with --out, or replace it with --force"
     )
+
+
+def _other_model(path: Path | None, wanted: Mapping[str, Any], found: Mapping[str, Any], what: str, losses: str) -> str:
+    """Say that a store is of another version of a model, and what to do."""
+    name, theirs, ours = wanted.get("objective", "its"), found[MODEL_VERSION], wanted[MODEL_VERSION]
+    said = f"the {what} in {path or 'memory'} was made by {name} model {theirs}; this is model {ours}."
+    return " ".join(filter(None, [said, losses, "Use --out, or --force to replace it."]))
 
 
 def differing_settings(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, tuple[str, str]]:

@@ -68,7 +68,7 @@ def sampled_lattice(dataset: xr.Dataset) -> xr.Dataset:
     plane, part = plane_of(dataset), dataset[_every(dataset, stride)]
     shape = tuple(part.sizes[name] for name in ("u", "v")[: plane.rank])
     upper = torch.stack([axis[stride * (count - 1)] for axis, count in zip(plane.axes(), shape, strict=True)])
-    identity = stored_identity(dataset) | {"plane": replace(plane, upper=upper, resolution=shape).record()}
+    identity = json.loads(dataset.attrs["identity"]) | {"plane": replace(plane, upper=upper, resolution=shape).record()}
     return part.drop_vars("interpolated", errors="ignore").assign_attrs(identity=json.dumps(identity))
 
 

@@ -42,6 +42,7 @@ class Status(IntEnum):
 NOT_EVALUATED = (Status.MISSING, Status.INTERPOLATED)
 HAS_LOSS = (Status.OK, Status.NO_GRADIENT)
 FAILED = (Status.NONFINITE, Status.ESCAPED, Status.ERROR)
+LONGEST_ERROR = 200  # characters of a message that are shown
 
 
 @overload
@@ -68,6 +69,15 @@ def failed(status: int) -> bool: ...
 def failed(status: Any) -> Any:
     """Say which points were evaluated and have no loss; `status` is a tensor, an array or one Status."""
     return _is_any(status, FAILED)
+
+
+def describe_errors(count: int, first: str) -> str:
+    """Say how many points raised and what the first of them said, in a line; nothing where none did."""
+    if not count:
+        return ""
+    said = " ".join(first.split())
+    shown = said if len(said) <= LONGEST_ERROR else f"{said[:LONGEST_ERROR]}..."
+    return f"{count} point{'s' if count > 1 else ''} raised" + (f": first {shown!r}" if shown else "")
 
 
 def _is_any(status: Any, kinds: tuple[Status, ...]) -> Any:

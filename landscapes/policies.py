@@ -73,9 +73,9 @@ class PolicyObjective(ObjectiveWrapper):
             )
         decided, blind = self._play(x)
         found: Evaluation = self._env.evaluate(decided, grad=False)
-        lost = blind & (found.status == Status.OK)
+        lost = blind & found.has_loss
         status = found.status.masked_fill(lost, Status.NONFINITE)
-        return Evaluation(found.loss.masked_fill(lost, torch.nan), None, status)
+        return Evaluation(found.loss.masked_fill(lost, torch.nan), None, status, found.error)
 
     def decide(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch decided"]:
         """Return the environment's parameters that policies with these weights decide on, one after another."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from .identity import plane_of, stored_identity, stored_provenance
 from .objective import Objective, Status
 from .plane import Plane
+from .storage.arrays import errors_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,8 +38,9 @@ class Slice:
     """Hold the samples of a slice.
 
     `data` is an xarray dataset of loss(v, u), grad(v, u, dim) unless sampled without, and status(v, u); a line has no
-    v. `folder` is where its files are, None for one in memory. `remake` makes the objective again that it was sampled
-    from, for what has to be evaluated anew.
+    v. Along a logarithmic parameter a coordinate is the decimal logarithm of the value, and has the attribute `scale`,
+    "log10"; gradients are by it. `folder` is where its files are, None for one in memory. `remake` makes the objective
+    again that it was sampled from, for what has to be evaluated anew.
     """
 
     data: xr.Dataset
@@ -71,12 +73,17 @@ class Slice:
         found: NDArray[np.float64] = self.plane.slope(torch.from_numpy(self.data["grad"].to_numpy())).numpy()
         return found
 
+    @property
+    def errors(self) -> str:
+        """How many points raised and what the first of them said, in a line; empty where none did."""
+        return errors_of(self.data)
+
     def minima(self, depth: float = 0.01) -> pd.DataFrame:
         """Return the local minima deeper than a share of the range of the losses, deepest first, a row each.
 
-        The columns are the plane's coordinates, the loss there, and the depth: how far one must climb to get to a lower
-        minimum (persistence). The depth of the lowest is the range of the losses. Of a refined slice its finest lattice
-        that is sampled everywhere counts.
+        The columns are the values along the plane's axes, the loss there, and the depth: how far one must climb to get
+        to a lower minimum (persistence). The depth of the lowest is the range of the losses. Of a refined slice its
+        finest lattice that is sampled everywhere counts.
         """
         import pandas as pd
 
@@ -88,8 +95,9 @@ class Slice:
         found = minima(loss)
         deep = found.depth > depth * span(loss)
         places = np.unravel_index(found.sample[deep], loss.shape)[::-1]  # u first
-        axes = (axis.numpy()[at] for axis, at in zip(plane_of(data).axes(), places, strict=True))
-        columns = dict(zip(self.plane.labels, axes, strict=True))
+        axes = [axis[torch.from_numpy(at)] for axis, at in zip(plane_of(data).axes(), places, strict=True)]
+        values = self.plane.to_values(torch.stack(axes, dim=-1))
+        columns = dict(zip(self.plane.labels, values.numpy().T, strict=True))
         return pd.DataFrame({**columns, "loss": loss.ravel()[found.sample[deep]], "depth": found.depth[deep]})
 
     def plot(self, runs: Sequence[HasData] = (), *, width: float | None = None) -> Picture:
@@ -141,7 +149,9 @@ class Slice:
         low, high = float(loss.min()), float(loss.max())
         finite = f"losses from {low:.4g} to {high:.4g}" if low <= high else "no finite loss"
         where = f" in {self.folder}" if self.folder else ""
-        return f"<Slice of {' · '.join(about)} over {', '.join(self.plane.labels)}: {points} points, {finite}{where}>"
+        raised = f"; {self.errors}" if self.errors else ""
+        over = ", ".join(self.plane.labels)
+        return f"<Slice of {' · '.join(about)} over {over}: {points} points, {finite}{raised}{where}>"
 
     def _events(self) -> dict[str, Any]:
         """Count what happens in the episodes along a line, where an environment says what does."""

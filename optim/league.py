@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from ..landscapes.identity import current_identity
 from ..landscapes.plain import finite, number, optional, or_nan, plain, text
 from .bootstrap import interval
 from .claims import ClaimFinding, Claims, check_claims
 from .comparison import Superiority
 from .targets import times_record
 
-OF_METHOD = ("method", "method_options", "method_code", "seed")  # of a run's identity, what is not of its scene
+OF_METHOD = ("method", "method_options", "method_version", "seed")  # of a run's identity, what is not of its scene
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -95,8 +96,9 @@ class Standing:
 class SceneStandings:
     """What a race in one scene says: `standings`, the best mean rank first, and how every two methods stand (`pairs`).
 
-    `identity` decides the numbers: scene, options, fidelity, device, engine, code. `goals` are some of the race's
-    targets, the hardest first, `best` is the best point that any run found. `left_out` says why methods did not run.
+    `identity` decides the numbers: scene, its version, options, fidelity, device, engine. `goals` are some of the
+    race's targets, the hardest first, `best` is the best point that any run found. `left_out` says why methods did
+    not run.
     """
 
     env: str
@@ -159,7 +161,7 @@ class SceneStandings:
         words = ("env", "fidelity", "device", "loss_unit", "command")
         return cls(
             **{name: text(record[name]) for name in words},
-            identity=dict(record["identity"]),
+            identity=current_identity(record["identity"]),
             budget=int(number(record["budget"])),
             seeds=int(number(record["seeds"])),
             goals=tuple(map(number, record["goals"])),

@@ -10,8 +10,6 @@ The class derives from `gradscape.optim.base.Optimizer`, and its `name` is that 
 
 from __future__ import annotations
 
-import hashlib
-import sys
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
@@ -19,13 +17,10 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING
 
-from ..landscapes.code import bare, file_of
-
 if TYPE_CHECKING:
     from .base import Optimizer
 
 GROUP = "gradscape.optimizers"
-NO_NUMBERS = frozenset({"memory", "inform", "_inform", "remembers"})  # functions of a method that no point depends on
 
 
 @dataclass(frozen=True)
@@ -115,21 +110,3 @@ def optimizer_class(name: str) -> type[Optimizer]:
             "give entry point and class the same name"
         )
     return kind
-
-
-def code_digest(kind: type[Optimizer]) -> str:
-    """Return a digest of the code a method's points come from: its modules, and those of this folder they draw on.
-
-    It is taken without comments, docstrings and imports, which no point depends on.
-    """
-    own = {one.__module__ for one in kind.__mro__} - {"builtins", "abc"}
-    found: set[str] = set()
-    left = list(own)
-    while left:
-        name = left.pop()
-        if name not in found and (name in own or name.startswith(f"{__package__}.")):
-            found.add(name)
-            left += [getattr(value, "__module__", None) or "" for value in vars(sys.modules[name]).values()]
-    files = sorted(file for name in found if (file := file_of(sys.modules[name])))
-    texts = [bare(file, NO_NUMBERS) for file in files] or [repr(kind)]
-    return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:12]

@@ -32,7 +32,7 @@ def test_every_scene_of_ours_has_a_row() -> None:
 def test_a_scene_that_changed_or_was_never_measured_is_said_to_be_so(tmp_path: Path) -> None:
     record = read_json(DATA / "census" / "bounce-cpu.json")
     assert isinstance(censuses.censuses()["bounce"], Shares)
-    record["identity"]["code"] = "000000000000"
+    record["identity"]["model_version"] = 0
     (tmp_path / "census").mkdir()
     write_record(tmp_path / "census" / "bounce-cpu.json", record)
     found = censuses.censuses(tmp_path)

@@ -10,7 +10,6 @@ from benchmarks import fidelities
 from benchmarks.fidelities import Row, changed, kept, short, table
 from benchmarks.pages import DATA, UNMEASURED, write, written
 
-from gradscape.envs.code import code_digest
 from gradscape.envs.registry import environment_class
 from gradscape.landscapes.measures.choice import CLAIMS
 from gradscape.landscapes.storage.records import read_json, write_record
@@ -39,7 +38,7 @@ def records(tmp_path: Path) -> dict[str, Any]:
     """Return a record of the present scene whose fidelities keep their claims, which `save` puts into a folder."""
     found: dict[str, Any] = read_json(DATA / "tradeoff" / "torus-cuda.json")
     kind = environment_class("torus")
-    found["identity"]["code"] = code_digest(kind)
+    found["identity"]["model_version"] = kind.version_on("warp")
     for rung in found["rungs"]:
         if rung["name"] in ("draft", "standard"):
             rung["fidelity"] = asdict(kind.fidelities[rung["name"]])
@@ -81,11 +80,11 @@ def test_a_variant_with_the_settings_of_a_name_counts_as_it(records: dict[str, A
     assert row.comparison.gradient.cosine.value == 0.5
 
 
-def test_a_scene_whose_code_is_another_is_named_and_its_numbers_are_not_shown(
+def test_a_scene_whose_model_is_another_is_named_and_its_numbers_are_not_shown(
     records: dict[str, Any], tmp_path: Path
 ) -> None:
     old = save(tmp_path, records)
-    records["identity"]["code"] = "000000000000"
+    records["identity"]["model_version"] = 0
     for rung in records["rungs"]:
         rung["gradient"]["cosine"]["value"] = 0.5
     new = save(tmp_path, records)

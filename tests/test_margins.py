@@ -34,7 +34,7 @@ def test_a_row_says_what_its_record_says(tmp_path: Path) -> None:
 
 def test_a_scene_that_changed_or_was_never_measured_is_said_to_be_so(tmp_path: Path) -> None:
     record = read_json(DATA / "extremes" / "bounce-cpu.json")
-    record["identity"]["code"] = "000000000000"
+    record["identity"]["model_version"] = 0
     (tmp_path / "extremes").mkdir()
     write_record(tmp_path / "extremes" / "bounce-cpu.json", record)
     found = margins.margins(tmp_path)

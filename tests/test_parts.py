@@ -33,7 +33,7 @@ def test_a_part_that_was_measured_otherwise_or_of_other_code_is_said_to_be_so(tm
     line = next(line for line in rows({"bounce": other}) if line[:2] == ["`bounce`", first.name])
     assert line[3:] == ["", "", "", "", UNMEASURED]
     record = read_json(DATA / "tradeoff" / "bounce-cpu.model.json")
-    record["identity"]["code"] = "000000000000"
+    record["identity"]["model_version"] = 0
     (tmp_path / "tradeoff").mkdir()
     write_record(tmp_path / "tradeoff" / "bounce-cpu.model.json", record)
     assert parts.studies(tmp_path) == {}

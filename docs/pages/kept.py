@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-from gradscape.envs.registry import make
+from gradscape.envs.registry import environment_class
 from gradscape.gallery.figures import Figure, read_figures
 from gradscape.gallery.files import DATA, STORE
 from gradscape.gallery.league import read_league
@@ -46,11 +46,11 @@ class KeptFigure:
 
     @cached_property
     def current(self) -> bool:
-        """Whether its samples are of the scene's code as it is now."""
+        """Whether its samples are of the scene's model as it is now."""
         if self.slice is None:
             return False
         known = self.slice.identity
-        return bool(known["code"] == make(self.figure.env, device="cpu", engine=known["engine"]).code)
+        return bool(known["model_version"] == environment_class(self.figure.env).version_on(known["engine"]))
 
     @property
     def losses(self) -> tuple[float, float] | None:

@@ -24,9 +24,9 @@ def pages(kept: Kept) -> dict[str, str]:
         f"{PROJECT['license']}. None is taken from the paper or from another project. Pictures also say on themselves "
         "by which version, where, when and by which command they were made.",
         "## The slices of the gallery",
-        "Sampled with the command; `code` is the digest of the scene's code then, and *current* says whether it is the "
-        "code's now.",
-        table(("figure", "command", "gradscape", "device", "date", "code", "current"), map(_row, kept.figures)),
+        "Sampled with the command; *model* is the version of the scene's model then, and *current* says whether it is "
+        "the one now.",
+        table(("figure", "command", "gradscape", "device", "date", "model", "current"), map(_row, kept.figures)),
         "## The pictures of these pages",
         table(("picture", "shown in", "command"), _drawn(made)),
         "## What is of others",
@@ -42,7 +42,8 @@ def _row(one: KeptFigure) -> tuple[str, ...]:
         return (f"`{one.figure.id}`", f"`{one.figure.command('auto')}`", NOT_MEASURED, "", "", "", "")
     known, made = one.slice.identity, one.slice.provenance
     command = made.get("command") or one.figure.command(known.get("device", "auto"))
-    said = (known["gradscape"], known.get("device", ""), made.get("created", ""), f"`{known.get('code', '')}`")
+    version = made.get("versions", {}).get("gradscape", "")
+    said = (version, known.get("device", ""), made.get("created", ""), known["model_version"])
     return (f"`{one.figure.id}`", f"`{command}`", *map(str, said), "yes" if one.current else "no")
 
 

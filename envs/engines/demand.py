@@ -18,8 +18,6 @@ import warp as wp
 
 from .runtime import has_rows
 
-COMPUTES_LOSSES = False
-
 ASSIGNED = re.compile(r"(?:var_(\w+) = )?(wp::)?(\w+)(?:<[^()]*>)?\((.*)\);")
 NAME = re.compile(r"\bvar_(\w+)\b")
 LOOPS = ("start_for_", "start_while_")

@@ -13,7 +13,6 @@ import warp as wp
 
 wp.config.log_level = wp.LOG_ERROR  # no banner
 
-COMPUTES_LOSSES = False  # for `code`
 MANY = ".engines.mpm."  # where solvers are whose kernels are of many modules
 
 

@@ -65,6 +65,7 @@ class MjxScene(Environment):
     finite has failed. Loss and gradient come from two programs, so that losses are the same with gradients and without.
     """
 
+    model_version = 1
     mjcf: ClassVar[str]
     parameters: ClassVar[tuple[Parameter, ...]]
     duration: ClassVar[float]
@@ -114,10 +115,10 @@ class MjxScene(Environment):
         self._rollout = solver.Rollout(self.mjcf, settings, self.fidelity.precision, name=self.name)
         first = [one for one in self.parameters if one.field != "ctrl"]
         held = [one for one in self.parameters if one.field == "ctrl"]
-        named = [(one.name, one) for one in first]
-        single = self.segments == 1
-        named += [(one.name if single else f"t{k} {one.name}", one) for k in range(self.segments) for one in held]
-        self.space = ParameterSpace({name: (one.lower, one.upper, one.unit) for name, one in named})
+        turns = [f"t{k} " for k in range(self.segments)] if self.segments > 1 else [""]
+        names = [one.name for one in first] + [f"{turn}{one.name}" for turn in turns for one in held]
+        bounds = [(one.lower, one.upper, one.unit) for one in (*first, *(held * self.segments))]
+        self.space = ParameterSpace(names, *zip(*bounds, strict=True))
         places = tuple(self._rollout.find(one.field, one.index) for one in (*first, *held))
         each = round(self.duration / self.segments / self.fidelity.dt)
         count, steps = (1, o.count_steps(each)) if self.segments == 1 else (o.count_steps(self.segments), each)

@@ -85,6 +85,7 @@ class Fluid(MpmScene):
     2022), appendix A.2.1; material and geometry where it is silent are ours.
     """
 
+    model_version = 1
     name = "fluid"
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=SPAN / 6, resolution=12, sampling=16 / 12),

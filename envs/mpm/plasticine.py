@@ -13,11 +13,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ... import __version__
 from ...landscapes.episode import Part, View
 from ...landscapes.space import ParameterSpace
 from ..base import Fidelity, ModelPart
 from ..batching import Pool
-from ..code import code_digest
 from ..controls import extend, hold, integrate_velocity, roll
 from ..engines.mpm.model import Model
 from ..engines.mpm.raster import Raster
@@ -84,6 +84,7 @@ class Plasticine(MpmScene):
     from a Global Perspective" (CoRL 2022).
     """
 
+    model_version = 1
     fidelities: ClassVar[dict[str, Fidelity]] = fidelities(draft=(48, 1500, 14), standard=(80, 10_000, 25))
     Options: ClassVar[type[Any]] = PlasticineOptions
     model_parts: ClassVar[tuple[ModelPart, ...]] = (
@@ -205,7 +206,8 @@ class Plasticine(MpmScene):
         if self.scene.target:
             return target(self.scene, self.model.particles)
         device = "cpu" if self.model.particle_substeps <= MOST_WORK else self.device
-        content = f"{self.scene} {self.fidelity} {self.examples[DEMONSTRATION]} {code_digest(type(self))}"
+        model = f"model {self.version_on(self.engines[0])}, {__version__}"
+        content = f"{self.scene} {self.fidelity} {self.examples[DEMONSTRATION]} {model}"
         content += "" if device == "cpu" else f" {device}"
         return load_or_make(f"{self.name}-{self.fidelity.name}", content, lambda: self._demonstrate(device))
 

@@ -16,8 +16,6 @@ from ..outlines import rotate_about
 from .plasticine_model import FLOOR, Scene
 from .shapes import Ball, Box, Shape
 
-COMPUTES_LOSSES = False  # for `code`
-
 SHAPES: dict[Kind, episode.Shape] = {
     Kind.SPHERE: "sphere",
     Kind.CAPSULE: "capsule",

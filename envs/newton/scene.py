@@ -40,6 +40,7 @@ class NewtonScene(Environment):
     tape supplies the gradients, whatever they are worth. A row whose end or gradient is not finite has failed.
     """
 
+    model_version = 1
     duration: ClassVar[float]
     target: ClassVar[tuple[float, float, float]]
     rows: ClassVar[int]

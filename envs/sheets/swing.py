@@ -15,6 +15,7 @@ from torch import Tensor
 from ...landscapes.episode import Part, View
 from ...landscapes.space import ParameterSpace
 from ..base import Fidelity, ModelPart
+from ..batching import copied
 from ..engines.sheets.contact import Floor
 from ..engines.sheets.springs import Sheet
 from ..outlines import triangles
@@ -113,7 +114,7 @@ class Swing(SheetScene):
         """Return kinetic energy, that of height above the floor, and that of the springs."""
         drive, sheet = self._drive(x), self.sheet
         with self._solvers.lend() as solver:
-            frames = solver.run(*drive.detach()).double().cpu()
+            frames = copied(solver.run(*drive.detach()))
         mass = torch.from_numpy(sheet.masses.copy())
         speed = (frames.diff(dim=0) / self.fidelity.dt).square().sum(dim=3)  # the step's own velocities
         ends = torch.from_numpy(sheet.pairs).T.long()

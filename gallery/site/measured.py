@@ -9,6 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from ...landscapes.identity import MODEL_VERSION, current_identity
 from ...landscapes.measures.classify import WORDS
 from ...landscapes.measures.convergence_record import Convergence
 from ...landscapes.measures.fidelity import cheapest, p95, pareto_front
@@ -106,7 +107,7 @@ def place_tradeoffs(data: Path, out: Path, envs: Sequence[str], studio: Studio) 
 
 
 def _read_convergence(files: TradeoffFiles, record: Record, table: Path) -> ConvergenceEntry | None:
-    """Return what a study of convergence says, None where there is none of the code that the trade-off is of."""
+    """Return what a study of convergence says, None where there is none of the model that the trade-off is of."""
     if not files.there():
         return None
     todo = f"delete it, and `landscape tradeoff {record['env']} --ladder convergence` measures it anew"
@@ -114,7 +115,7 @@ def _read_convergence(files: TradeoffFiles, record: Record, table: Path) -> Conv
         found = Convergence.of_record(read_json(files.record))
     moves = [{"knob": one.knob, **asdict(move)} for one in found.knobs for move in one.moves]
     save_table([*moves, *({"left of": one.name, **asdict(one)} for one in found.remainders)], table)
-    if found.identity["code"] != record["identity"].get("code"):
+    if found.identity[MODEL_VERSION] != current_identity(record["identity"]).get(MODEL_VERSION):
         return None
     knobs = ", ".join(knob.knob for knob in found.knobs)
     return ConvergenceEntry(

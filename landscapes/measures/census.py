@@ -172,7 +172,7 @@ def sample_cut(objective: Objective, plane: Plane, *, gradients: int = 1) -> xr.
     Gradients are at every so many samples along each axis, `gradients`. Raises what `sample` does.
     """
     found = sample(objective, plane, gradients=gradients)
-    return _dataset(plane, found["loss"].to_numpy(), found["grad"].to_numpy())
+    return _dataset(plane, *(found[name].to_numpy() for name in ("loss", "grad", "status")))
 
 
 def thin_out(whole: xr.Dataset) -> xr.Dataset:
@@ -184,15 +184,15 @@ def thin_out(whole: xr.Dataset) -> xr.Dataset:
     ]
     ends = [low + 2 * step * (count - 1) for low, step, count in zip(plane.lower, steps, shape, strict=True)]
     return _dataset(
-        Plane(plane.origin, plane.basis, plane.lower, torch.stack(ends), shape, plane.labels),
-        thin["loss"].to_numpy(),
-        thin["grad"].to_numpy(),
+        Plane(plane.origin, plane.basis, plane.lower, torch.stack(ends), shape, plane.labels, plane.scales),
+        *(thin[name].to_numpy() for name in ("loss", "grad", "status")),
     )
 
 
-def _dataset(plane: Plane, loss: Array, grad: Array) -> xr.Dataset:
+def _dataset(plane: Plane, loss: Array, grad: Array, status: Array) -> xr.Dataset:
     about = {"identity": json.dumps({"plane": plane.record()})}
-    return xr.Dataset({"loss": (("v", "u"), loss), "grad": (("v", "u", "dim"), grad)}, attrs=about)
+    columns = {"loss": (("v", "u"), loss), "grad": (("v", "u", "dim"), grad), "status": (("v", "u"), status)}
+    return xr.Dataset(columns, attrs=about)
 
 
 def _measure(

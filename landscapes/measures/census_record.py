@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..identity import current_identity
 from ..plain import number, optional, or_nan, plain, text
 from ..statistics import Estimate
 from .census import MEASURES, CensusDesign, SurveyedSlice, ordered
@@ -83,7 +84,7 @@ class Census:
             words={word: Estimate.of_record(one) for word, one in record["words"].items()},
             spreads={name: _spread(one) for name, one in record["spreads"].items()},
             parts={name: Parts(**{key: or_nan(one[key]) for key in _PARTS}) for name, one in record["parts"].items()},
-            identity=dict(record["identity"]),
+            identity=current_identity(record["identity"]),
             provenance=dict(record["provenance"]),
             losses=losses,
         )

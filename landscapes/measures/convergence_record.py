@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+from ..identity import MODEL_VERSION, current_identity
 from ..plain import number, optional, text
 from .convergence import UNMOVED, Shapes, Verdict
 from .distributions import Distributions
@@ -215,8 +216,9 @@ class Convergence:
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> Convergence:
         """Read it from plain JSON; raises TypeError and KeyError for what is none."""
-        identity = dict(record["identity"])
-        for said in (identity["code"], identity["engine"], identity["device"]):
+        identity = current_identity(record["identity"])
+        number(identity[MODEL_VERSION])
+        for said in (identity["engine"], identity["device"]):
             text(said)
         return cls(
             text(record["env"]),

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+from ..identity import current_identity
 from ..plain import number, optional, plain, text
 from .stability import Cell
 
@@ -162,7 +163,7 @@ class Extremes:
             limits=tuple(map(Limit.of_record, record["limits"])),
             maps=tuple(map(StabilityMap.of_record, record["maps"])),
             refused=tuple(RefusedSetting(text(one["name"]), text(one["why"])) for one in record["refused"]),
-            identity=dict(record["identity"]),
+            identity=current_identity(record["identity"]),
             provenance=dict(record["provenance"]),
             command=text(record["command"]),
         )

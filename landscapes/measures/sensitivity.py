@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..objective import Objective, Status, evaluate
+from ..objective import Objective, evaluate
 from ..plain import finite
 from ..space import ParameterSpace, sobol
 
@@ -249,7 +249,7 @@ def _evaluate_pairs(
 def _losses(objective: Objective, x: Float[Tensor, "point dim"]) -> Array:
     at_once = objective.preferred_batch
     parts = [evaluate(objective, part, grad=False) for part in torch.split(x, at_once)]
-    return np.concatenate([part.loss.masked_fill(part.status != Status.OK, torch.nan).numpy() for part in parts])
+    return np.concatenate([part.loss.numpy() for part in parts])
 
 
 def _mean(values: Array, axis: int) -> Array:

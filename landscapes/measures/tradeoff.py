@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+from ..identity import MODEL_VERSION, current_identity
 from ..plain import number, optional, text
 from .fidelity import Comparison, ConvergenceOrder, convergence_order, pareto_front
 
@@ -109,8 +110,9 @@ class Tradeoff:
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> Tradeoff:
         """Read a trade-off from plain JSON; raises TypeError and KeyError for what is none."""
-        identity = dict(record["identity"])
-        for said in (identity["code"], identity["engine"], identity["device"]):
+        identity = current_identity(record["identity"])
+        number(identity[MODEL_VERSION])
+        for said in (identity["engine"], identity["device"]):
             text(said)
         dict(identity["options"])
         return cls(

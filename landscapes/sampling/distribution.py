@@ -45,11 +45,12 @@ class WorkersLostError(OSError):
 
 @dataclass(frozen=True)
 class FilledTile:
-    """A finished tile: how its points ended, and what to warn of."""
+    """A finished tile: how its points ended, what to warn of, and what the first point that raised said."""
 
     tile: Tile
     statuses: Mapping[Status, int]
     notes: tuple[str, ...] = ()
+    error: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +74,8 @@ class Site:
         pending, finished = set(tiles if pending is None else pending), self.store.ascending
         for tile, found in evaluate_tiles(self.objective, self.store, tiles, batch, pending):
             self.store.write(tile, found)
-            yield FilledTile(tile, Counter(map(Status, found.status.tolist())), self.objective.take_notes())
+            statuses = Counter(map(Status, found.status.tolist()))
+            yield FilledTile(tile, statuses, self.objective.take_notes(), found.error)
             if self.store.ascending != finished:  # by another process, and has other tiles since
                 return
 
@@ -115,7 +117,8 @@ class RemoteSite:
         """Do what `Site.fill` does, but for tiles that a worker finished before it died."""
         site = self.here()
         found = {tile: site.store.statuses(tile) for tile in tiles}
-        yield from (FilledTile(tile, statuses) for tile, statuses in found.items() if statuses)
+        error = site.store.error
+        yield from (FilledTile(tile, statuses, error=error) for tile, statuses in found.items() if statuses)
         yield from site.fill(tiles, batch, {tile for tile, statuses in found.items() if not statuses})
 
 

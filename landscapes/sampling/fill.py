@@ -13,7 +13,7 @@ from typing import Any
 
 import xarray as xr
 
-from ..identity import check_identity, with_stride
+from ..identity import check_identity, record_parameters, with_stride
 from ..objective import Objective, Status
 from ..plane import Plane
 from ..space import as_stride, as_whole
@@ -102,6 +102,7 @@ def sample(
         for filled in tiles:
             for note in filled.notes:
                 warnings.warn(note, RuntimeWarning, stacklevel=2)
+            store.keep_error(filled.error)
             counts.update(filled.statuses)
             left -= Counter([filled.tile.level])  # none is kept at zero
             report()
@@ -152,5 +153,5 @@ def resumable(store: SliceStore, counts: Counter[Status]) -> Iterator[None]:
 
 
 def _check_store(store: SliceStore, objective: Objective, plane: Plane, *, grad: bool) -> None:
-    wanted = {"plane": plane.record(), "parameters": list(objective.space.names), "gradients": grad}
+    wanted = {"plane": plane.record(), **record_parameters(objective.space), "gradients": grad}
     check_identity(store.path, wanted=wanted, found={name: store.identity[name] for name in wanted})

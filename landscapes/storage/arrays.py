@@ -14,9 +14,10 @@ import zarr
 from numpy.typing import NDArray
 
 from ..capacity import BLOCK, Need, require
-from ..objective import Status
+from ..identity import PACKAGE, VERSIONS, with_package
+from ..objective import Status, describe_errors
 from ..plane import Plane
-from ..space import ParameterSpace
+from ..space import LOG10, ParameterSpace
 from .checksums import SUMS, lay_out_sums, text_sum, write_sums
 from .layout import CODECS, COMPACT_CODECS, analysis_chunks, consolidate, create_array, flags
 from .ownership import store_files
@@ -25,6 +26,7 @@ from .tiles import coarse_to_fine, tile_side
 FORMAT = 2
 AXES = ("u", "v")
 CF = "CF-1.11"
+ERROR = "error"  # the attribute of a slice or a run with what the first point that raised said
 INTERPOLATED = "interpolated"  # the array of a refined slice that has what was not sampled
 FILES = store_files(("loss", "grad", "status", INTERPOLATED, SUMS, *AXES, "dim", "unit"))  # of a slice on disk
 DRAWN = 150  # bytes that a picture takes for each sample
@@ -79,7 +81,7 @@ def lay_out(
     names = AXES[: plane.rank][::-1]
     shape = tuple(len(axes[name]) for name in names)
     side = tuple(tile_side(points) for points in shape)
-    group.attrs.update({**_about(identity, provenance), **COORDINATES})
+    group.attrs.update({**_about(identity, with_package(provenance)), **COORDINATES})
     unit = str(provenance.get("loss_unit", ""))
     create_array(group, "loss", shape, side, names, "float64", long_name="loss", **({"units": unit} if unit else {}))
     if grad:
@@ -126,8 +128,14 @@ def parameters_of(dataset: xr.Dataset) -> list[tuple[str, str]]:
     return list(zip(names, units, strict=True))
 
 
+def errors_of(dataset: xr.Dataset) -> str:
+    """Say how many points of a slice or a run raised and what the first of them said; nothing where none did."""
+    return describe_errors(int((dataset["status"] == Status.ERROR).sum()), str(dataset.attrs.get(ERROR, "")))
+
+
 def _axis(plane: Plane, number: int) -> dict[str, str]:
     about = {"label": plane.labels[number], "long_name": plane.names[number]}
+    about |= {"scale": LOG10} if plane.scales[number] == LOG10 else {}
     return about | ({"units": plane.units[number]} if plane.units[number] else {})
 
 
@@ -149,7 +157,7 @@ def _about(identity: Mapping[str, Any], provenance: Mapping[str, Any]) -> dict[s
         "gradscape_slice": FORMAT,
         "Conventions": CF,
         "title": f"{identity.get('objective', 'loss')} over {over}",
-        "source": f"gradscape {identity['gradscape']}",
+        "source": f"{PACKAGE} {provenance[VERSIONS][PACKAGE]}",
         **({"history": made} if made else {}),
         "identity": json.dumps(identity),
         "provenance": json.dumps(provenance),

@@ -32,12 +32,31 @@ from numpy.typing import NDArray
 from torch import Tensor
 from zarr.storage import MemoryStore
 
-from ..identity import StoreError, StoreExistsError, check_identity, full_identity, gradient_stride
+from ..identity import (
+    StoreError,
+    StoreExistsError,
+    check_identity,
+    current_identity,
+    current_provenance,
+    full_identity,
+    gradient_stride,
+)
 from ..objective import Evaluation, Status
 from ..plain import plain_json
 from ..plane import Plane
 from ..space import ParameterSpace
-from .arrays import AXES, FILES, FORMAT, INTERPOLATED, attributes_of, axes_of, lay_out, refuse_too_large, write_finished
+from .arrays import (
+    AXES,
+    ERROR,
+    FILES,
+    FORMAT,
+    INTERPOLATED,
+    attributes_of,
+    axes_of,
+    lay_out,
+    refuse_too_large,
+    write_finished,
+)
 from .checksums import text_sum
 from .files import placing, resolve
 from .integrity import check_integrity, check_layouts, damage
@@ -66,8 +85,9 @@ class SliceStore:
         self.path, self.place = path, place
         self._inode = place.stat().st_ino if place else None
         self._about = attributes_of(group)
-        self.identity: dict[str, Any] = json.loads(str(self._about["identity"]))
-        self.provenance: dict[str, Any] = json.loads(str(self._about["provenance"]))
+        stored = json.loads(str(self._about["identity"]))
+        self.identity = current_identity(stored)
+        self.provenance = current_provenance(json.loads(str(self._about["provenance"])), stored)
         self.plane = Plane.from_record(self.identity["plane"])
         self.dims = AXES[: self.plane.rank][::-1]
         self._coordinates = {name: np.asarray(arrays[name][:]) for name in self.dims}
@@ -97,8 +117,8 @@ class SliceStore:
     ) -> SliceStore:
         """Make an empty store at a path where there is none, all at once.
 
-        `identity` holds what decides the numbers (objective, options, fidelity, device); plane, parameters, gradients
-        and version are added here. `provenance` is anything else worth keeping. Both must be plain JSON. `overwrite`
+        `identity` holds what decides the numbers (objective, options, fidelity, device); plane, parameters and
+        gradients are added here. `provenance` is anything else worth keeping. Both must be plain JSON. `overwrite`
         replaces a slice store with nothing else in it, and refuses to replace anything else.
 
         Raises StoreExistsError where the path is taken, StoreError where what is there is not replaced, and
@@ -197,6 +217,11 @@ class SliceStore:
         return self.place is not None and self.place == self.path
 
     @property
+    def error(self) -> str:
+        """What the first point that raised said; empty where none did."""
+        return str(self._about.get(ERROR, ""))
+
+    @property
     def grad(self) -> bool:
         """Whether the slice holds gradients."""
         return "grad" in self._samples.arrays
@@ -265,6 +290,7 @@ class SliceStore:
         counts = zip(tile.index, self._samples.tile_counts, strict=True)
         if self._follow_finished() or any(at >= count for at, count in counts):
             return  # another process has finished the slice, which has larger and fewer tiles since
+        self.keep_error(evaluation.error)
         arrays: Arrays = {}
         for name, stored in self._samples.arrays.items():
             tensor: Tensor = getattr(evaluation, name)
@@ -274,6 +300,16 @@ class SliceStore:
         except FileNotFoundError:
             if not self._follow_finished():
                 raise
+
+    def keep_error(self, error: str) -> None:
+        """Keep what the first point that raised said, as an attribute; what later ones say is not kept."""
+        if not error or self.error:
+            return
+        self._about[ERROR] = error
+        if self.place is not None and not self.ascending:
+            with contextlib.suppress(FileNotFoundError):  # another process has finished the slice meanwhile
+                open_group(self.place, "r+").attrs.update({ERROR: error})
+                consolidate(self.place)
 
     def status(self) -> NDArray[np.int8]:
         """Return the status of every point in stored order, MISSING wherever a tile is not finished."""

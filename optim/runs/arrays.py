@@ -12,7 +12,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from ... import __version__
+from ...landscapes.identity import record_parameters, with_package
 from ...landscapes.objective import Status
 from ...landscapes.plain import plain_json
 from ...landscapes.space import ParameterSpace
@@ -88,8 +88,8 @@ def attributes_of(
     space: ParameterSpace, identity: Mapping[str, Any], provenance: Mapping[str, Any], budget: int
 ) -> dict[str, Any]:
     """Return what a run says of itself, on disk as attributes of its group."""
-    box = {"parameters": space.names, "lower": space.lower.tolist(), "upper": space.upper.tolist()}
-    whole = plain_json({**identity, **box, "gradscape": __version__}, "a run's identity")
+    box = {**record_parameters(space), "lower": space.lower.tolist(), "upper": space.upper.tolist()}
+    whole = plain_json({**identity, **box}, "a run's identity")
     return {
         "gradscape_run": FORMAT,
         "env": whole.get("objective", ""),
@@ -103,7 +103,7 @@ def attributes_of(
         "upper": whole["upper"],
         "gradient_cost": None,
         "identity": whole,
-        "provenance": plain_json(provenance, "a run's provenance"),
+        "provenance": plain_json(with_package(provenance), "a run's provenance"),
     }
 
 

@@ -30,9 +30,10 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...landscapes.identity import StoreError, StoreExistsError, check_identity
-from ...landscapes.objective import Evaluation, Status
+from ...landscapes.identity import StoreError, StoreExistsError, check_identity, current_identity
+from ...landscapes.objective import Evaluation, failed
 from ...landscapes.space import ParameterSpace
+from ...landscapes.storage.arrays import ERROR
 from ...landscapes.storage.files import placing, resolve
 from ...landscapes.storage.layout import FILL, consolidate, open_group
 from ...landscapes.storage.ownership import check_ours, clear_halves, has_lost_root
@@ -151,8 +152,7 @@ class RunStore:
     @property
     def identity(self) -> dict[str, Any]:
         """What decides the run's numbers."""
-        found: dict[str, Any] = self.attributes["identity"]
-        return found
+        return current_identity(self.attributes["identity"])
 
     @property
     def dim(self) -> int:
@@ -179,7 +179,12 @@ class RunStore:
     @property
     def failed(self) -> int:
         """Number of episodes that failed."""
-        return int((self._columns["status"][: self.count] != Status.OK).sum())
+        return int(failed(self._columns["status"][: self.count]).sum())
+
+    @property
+    def error(self) -> str:
+        """What the first episode that raised said; empty where none did."""
+        return str(self.attributes.get(ERROR, ""))
 
     def state(self) -> dict[str, Any] | None:
         """Return the optimiser's state after `told` rows, None before the first.
@@ -273,6 +278,8 @@ class RunStore:
         if rows.stop > self.budget:
             raise ValueError(f"a run of {self.budget} episodes has {self.budget - self.count} left; got {len(x)} more")
         self._make_room(rows.stop)
+        if evaluation.error and not self.error:
+            self._set(**{ERROR: evaluation.error})
         for name, values in self._rows(x, evaluation, kind, seconds).items():
             self._columns[name][rows] = values
         self.count = rows.stop

@@ -79,14 +79,14 @@ def test_a_study_leaves_a_record_a_picture_and_the_margin(run: Command, tmp_path
     assert "float64; warp on cpu, 4 points" in said
 
 
-def test_envs_says_where_a_margin_is_of_other_code_and_of_other_options_nothing(
+def test_envs_says_where_a_margin_is_of_another_model_and_of_other_options_nothing(
     run: Command, tmp_path: Path, own_data: Path
 ) -> None:
     assert run(*TURN, "--knobs", "dt", "--precisions", "float32", cwd=tmp_path).returncode == 0
     (path,) = own_data.rglob("*.json")
     record = read_json(path)
-    write_record(path, {**record, "identity": {**record["identity"], "code": "older"}})
-    assert "of another version of the code, older" in run("envs", "stepping", cwd=tmp_path).stdout
+    write_record(path, {**record, "identity": {**record["identity"], "model_version": 0}})
+    assert "by stepping model 0, this is model 1" in run("envs", "stepping", cwd=tmp_path).stdout
     write_record(path, {**record, "identity": {**record["identity"], "options": {"soft": 1.0}}})
     assert "stability: not measured" in run("envs", "stepping", cwd=tmp_path).stdout
     path.write_text("{}")

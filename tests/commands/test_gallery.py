@@ -17,7 +17,7 @@ import pytest
 from benchmarks.results import leave_blank
 
 from gradscape.cli import main
-from gradscape.envs.functions import Branin
+from gradscape.envs.functions import Branin, Function
 from gradscape.gallery import parts as gallery_parts
 from gradscape.gallery.figures import Figure
 from gradscape.gallery.paper import PaperCaption
@@ -159,17 +159,17 @@ def test_build_refuses_an_empty_folder_of_data_and_foreign_files(listed: None, d
     assert [file.name for file in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
 
 
-def test_a_figure_of_which_nothing_is_sampled_begins_anew_by_other_code(
+def test_a_figure_of_which_nothing_is_sampled_begins_anew_by_another_model(
     listed: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gradscape.envs.base.code_digest", lambda *_: "other")
+    monkeypatch.setattr(Function, "model_version", 99)
     monkeypatch.setattr(SliceJob, "run", stop)
     assert compute(tmp_path, "--only", "branin") == 1
-    assert stored_identity(open_slice(tmp_path / "branin/slice.zarr"))["code"] == "other"
+    assert stored_identity(open_slice(tmp_path / "branin/slice.zarr"))["model_version"] == 99
     monkeypatch.undo()
     monkeypatch.setattr(READ_FIGURES, lambda: list(FIGURES))
     assert compute(tmp_path, "--only", "branin") == 0
-    assert stored_identity(open_slice(tmp_path / "branin/slice.zarr"))["code"] != "other"
+    assert stored_identity(open_slice(tmp_path / "branin/slice.zarr"))["model_version"] == Function.model_version
 
 
 def stop(*_: object) -> None:

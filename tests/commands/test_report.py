@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from gradscape.envs.functions import Function
 from gradscape.gallery.paper import read_paper
 from gradscape.jobs import report as job
 from gradscape.jobs.report_record import Report
@@ -178,12 +179,12 @@ def test_a_stopped_report_says_what_is_kept(
     assert "stopped: 0 of 1 reports are kept" in done.stderr
 
 
-def test_a_slice_of_other_code_is_reported_with_a_warning(
+def test_a_slice_of_another_model_is_reported_with_a_warning(
     run: Run, cut: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gradscape.envs.base.code_digest", lambda *_: "changed")
+    monkeypatch.setattr(Function, "model_version", 99)
     done = run("report", "cut", "--points", "2", "--out", "told", cwd=tmp_path)
-    assert "warning: cut was sampled otherwise (code" in done.stderr
+    assert "warning: cut was sampled otherwise (model_version 1 there, 99 here" in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -273,7 +273,7 @@ def test_a_tolerance_that_nothing_meets_names_the_best(run: Command, tmp_path: P
     (path,) = kept
     report = read_json(path)
     report["rungs"] = [row for row in report["rungs"] if row["name"] != "reference" and "reference" not in row["name"]]
-    report["identity"]["code"] = "older"
+    report["identity"]["model_version"] = 0
     write_record(path, report)
     how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--tolerance"]
     none = run(*how, "1e-9", cwd=tmp_path)
@@ -281,7 +281,7 @@ def test_a_tolerance_that_nothing_meets_names_the_best(run: Command, tmp_path: P
     assert "the best is standard-dt-x0.5" in none.stderr
     some = run(*how, "50%", cwd=tmp_path)
     assert some.returncode == 0
-    assert "warning: measured with another version of the code of converging, older" in some.stderr
+    assert "warning: measured by converging model 0; this is model 1" in some.stderr
 
 
 def test_a_name_whose_settings_changed_since_is_not_chosen(

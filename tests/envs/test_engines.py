@@ -8,20 +8,17 @@ import torch
 from gradscape.envs.base import Environment
 from gradscape.envs.engines import ENGINES
 from gradscape.envs.engines.engine import Engine
-from gradscape.envs.mpm.fluid import Fluid
 from gradscape.envs.registry import entries, environment_class, make
-from gradscape.envs.sheets.sheets import SheetScene
 from gradscape.landscapes.objective import Status
 from gradscape.landscapes.space import ParameterSpace
 
-from .scenes import SETTINGS, SHORT, of_family
+from .numbers import moved, points_of
+from .scenes import SETTINGS, SHORT, TAICHI, assert_returns_stay
 
 pytestmark = pytest.mark.skipif(find_spec("taichi") is None, reason="Taichi has no wheel for this machine")
 
-COMPARED = [*of_family(Fluid, SheetScene), "rolling-pin"]  # of plasticine one scene, with the tool that rolls
 
-
-@pytest.fixture(scope="module", params=COMPARED)
+@pytest.fixture(scope="module", params=TAICHI)
 def both(request):
     how = {**SETTINGS[request.param], "device": "cpu", **SHORT.get(request.param, {})}
     return tuple(make(request.param, engine=engine, **how) for engine in ("warp", "taichi"))
@@ -29,8 +26,9 @@ def both(request):
 
 def test_losses_and_gradients_agree(both):
     warp, taichi = both
-    x = warp.space.uniform(3, seed=5)
+    x = points_of(warp, "compared")
     ours, theirs = (env.evaluate(x) for env in both)
+    assert not moved(taichi, "compared", theirs)
     assert (ours.status == Status.OK).all()
     assert torch.equal(ours.status, theirs.status)
     torch.testing.assert_close(theirs.loss, ours.loss, rtol=1e-9, atol=0.0)
@@ -45,6 +43,10 @@ def test_episodes_agree(both):
     assert ours.points.keys() == theirs.points.keys()
     for body, points in ours.points.items():
         torch.testing.assert_close(theirs.points[body], points, rtol=0.0, atol=1e-9)
+
+
+def test_another_call_leaves_what_was_returned_as_it_was(both):
+    assert_returns_stay(both[1])
 
 
 def test_taichi_gets_one_thread_and_the_rows_of_all(both):

@@ -1,4 +1,4 @@
-"""Optimisers of other packages: found by entry point, imported only when made, refused where names clash; digests."""
+"""Optimisers of other packages: found by entry point, imported only when made, refused where names clash."""
 
 import json
 import subprocess
@@ -6,8 +6,7 @@ import sys
 
 import pytest
 
-from gradscape.landscapes.code import bare
-from gradscape.optim.registry import BUILTIN, GROUP, code_digest, methods, optimizer_class
+from gradscape.optim.registry import BUILTIN, GROUP, methods, optimizer_class
 
 OPTIMIZER = '''
 """A search of another package."""
@@ -104,27 +103,3 @@ def test_listing_loads_no_library():
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "same"),
-    [
-        ('"""A search of another package."""', '"""A search."""', True),
-        ("import torch\n", "import math\n\nimport torch  # tensors\n", True),
-        ("self.side = -self.side", "self.side = -0.5 * self.side", False),
-    ],
-)
-def test_a_digest_changes_with_the_code_and_not_with_its_words(package, old, new, same):
-    package({"corners": "gradscape_test_corners:Corners"})
-    before = code_digest(optimizer_class("corners"))
-    sys.modules.pop("gradscape_test_corners")
-    bare.cache_clear()
-    assert old in OPTIMIZER
-    package({"corners": "gradscape_test_corners:Corners"}, OPTIMIZER.replace(old, new))
-    assert (code_digest(optimizer_class("corners")) == before) is same
-
-
-def test_every_method_has_a_digest_of_its_own_and_shares_it_with_its_module():
-    digests = {method.name: code_digest(optimizer_class(method.name)) for method in BUILTIN}
-    assert digests["bo"] == digests["bo-descents"]
-    assert len({digests[name] for name in ("random", "cma-es", "descents", "bo", "bo-leap", "ppo")}) == 6

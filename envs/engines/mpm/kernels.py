@@ -20,8 +20,6 @@ from .smoothing_cpu import smoothing_on_cpu
 from .transfers_columns import transfers_of_columns
 from .transfers_cpu import transfers_on_cpu
 
-COMPUTES_LOSSES = False  # for `code`: what is compiled here, a solver would compile itself
-
 
 def compile_all(model: Model, device: str) -> None:
     """Compile what a solver of the model launches, forward and backward, or fetch it from the cache."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...identity import plane_of
 from ...lattice import sampled_line, with_gradients
+from ...objective import Status
 from ...plane import Plane
 from .. import style
 from . import page, panel, typesetting
@@ -99,7 +101,8 @@ def _draw_slope(ax: Axes, dataset: xr.Dataset, plane: Plane) -> list[Artist]:
     for drawn, values in ((line, slope), (behind, differences)):
         if off := int(((values < low) | (values > high)).sum()):
             drawn.set_label(f"{drawn.get_label()} ({off} off scale)")
-    return [line, behind]
+    _shade(ax, dataset, Status.NO_GRADIENT, style.NO_GRADIENT_LOOK)
+    return [line, behind, *page.gradient_key(dataset)]
 
 
 def _differences(u: NDArray[np.float64], loss: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -112,19 +115,24 @@ def _differences(u: NDArray[np.float64], loss: NDArray[np.float64]) -> NDArray[n
 
 
 def _slope_label(plane: Plane, loss_unit: str) -> str:
-    unit = plane.units[0]
+    unit = plane.coordinate_units[0]
     per = f"({unit})" if "/" in unit else unit
     return f"slope of the loss [{loss_unit or '1'}/{per}]" if unit else "slope of the loss"
 
 
 def _frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
-    panel.dress(ax)
+    panel.dress(ax, plane)
     ax.set_xlim(float(plane.lower[0]), float(plane.upper[0]))
+    for kind, look in style.STATUS_LOOKS.items():
+        _shade(ax, dataset, kind, look)
+
+
+def _shade(ax: Axes, dataset: xr.Dataset, kind: Status, look: dict[str, Any]) -> None:
+    """Shade the stretches of the samples that ended in one way."""
     u, status = dataset["u"].to_numpy(), dataset["status"].to_numpy()
     edges = np.concatenate([u[:1], (u[1:] + u[:-1]) / 2, u[-1:]])
-    for kind, look in style.STATUS_LOOKS.items():
-        for start, stop in _runs(status == kind):
-            ax.axvspan(edges[start], edges[stop], **look, zorder=0.6, gid=kind.name)
+    for start, stop in _runs(status == kind):
+        ax.axvspan(edges[start], edges[stop], **look, zorder=0.6, gid=kind.name)
 
 
 def _runs(where: NDArray[np.bool_]) -> list[tuple[int, int]]:

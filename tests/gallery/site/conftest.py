@@ -83,7 +83,7 @@ def rung(name: str, ladder: str, milliseconds: float, error: float | None) -> di
 TRADEOFF = {
     "env": "fluid", "reference": "reference", "points": 64, "spread": 2.0, "loss_unit": "J", "refused": [],
     "command": "landscape tradeoff fluid",
-    "identity": {"options": {"goal": "high"}, "device": "cuda", "code": "c0de"},
+    "identity": {"options": {"goal": "high"}, "device": "cuda", "model_version": 1},
     "rungs": [
         rung("reference", "named", 400, 0), rung("draft", "named", 4, 9), rung("coarse", "dt", 2, None),
         rung("standard", "named", 40, 3), rung("slow", "dt", 50, 4),
@@ -96,7 +96,7 @@ CONVERGENCE = {
     "env": "fluid", "reference": "reference", "points": 16, "seed": 0, "loss_unit": "J", "spread": 2.0, "knobs": [],
     "rule": {"off": {**KNOWN, "value": 0.1}, "moved": KNOWN, "knob": "dt", "met": False, "failing": ["dt"]},
     "remainders": [{"name": "standard", "median": KNOWN, "p95": KNOWN}], "divergence": None, "distributions": None,
-    "refused": [], "identity": {"code": "c0de", "engine": "warp", "device": "cuda"}, "provenance": {},
+    "refused": [], "identity": {"model_version": 1, "engine": "warp", "device": "cuda"}, "provenance": {},
     "command": "landscape tradeoff fluid --ladder convergence",
 }  # fmt: skip
 

@@ -1,5 +1,7 @@
 """Errors, fronts, orders and the choice of a rung, on numbers whose answer is known."""
 
+import json
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ from gradscape.landscapes.draw.figures.tradeoff import short_name, tradeoff_figu
 from gradscape.landscapes.measures import fidelity as tradeoff
 from gradscape.landscapes.measures.fidelity import (
     Bootstrap,
+    Comparison,
     Sample,
     cheapest,
     compare,
@@ -61,6 +64,17 @@ def test_an_episode_that_failed_is_infinitely_far_off_and_a_failed_reference_is_
     assert many.diverged == pytest.approx(1 / 18)
     assert many.loss_error.p95.value is None
     assert many.loss_error.median.value == 1.0
+
+
+def test_a_loss_without_a_gradient_is_no_failure_and_the_share_of_missing_gradients_is_said() -> None:
+    reference, variant = sample([float(k) for k in range(20)]), sample([k + 1.0 for k in range(20)])
+    reference.status[:4], reference.grad[:4] = Status.NO_GRADIENT, np.nan
+    variant.status[2:8], variant.grad[2:8] = Status.NO_GRADIENT, np.nan
+    found = compare(variant, reference, seed=0)
+    assert (found.compared, found.diverged, found.loss_error.median.value) == (20, 0, 1.0)
+    assert found.missing == pytest.approx(4 / 16)
+    assert found.gradient.cosine.value == pytest.approx(1.0)
+    assert Comparison.of_record(json.loads(json.dumps(asdict(found)))).missing == found.missing
 
 
 def test_rank_correlation_is_spearmans() -> None:

@@ -198,7 +198,7 @@ def test_names_tell_the_two_apart_and_settings_that_differ_are_named() -> None:
     assert (found.a, found.b) == ("fluid · draft · goal printed", "fluid · draft · goal easy")
     finer = compare_slices(one, labelled(one, fidelity="standard", gradscape="9.9"))
     assert (finer.a, finer.b) == ("fluid · draft", "fluid · standard")
-    assert set(finer.differing) == {"fidelity", "gradscape"}
+    assert set(finer.differing) == {"fidelity", "versions.gradscape"}
     newer = other.assign_attrs(provenance=json.dumps({"versions": {"torch": "9.0"}}))
     assert compare_slices(other, newer).differing["versions.torch"][1] == "'9.0'"
 

@@ -156,6 +156,36 @@ def test_zero_gradients_are_dots_and_failures_are_neither_dots_nor_arrows():
     assert f"gradient exactly zero: {flat.sum()} of 192" in legend_of(FIGURE)
 
 
+class HalfBlind(Bowl):
+    """A bowl whose gradient is missing at negative speeds."""
+
+    name = "half blind"
+
+    def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
+        missing = x[:, 0] < 0
+        gradient = torch.stack([2 * x[:, 0] + 3, 0 * x[:, 1] + 0.01, 0 * x[:, 2]], 1)
+        gradient[missing] = torch.nan
+        return Evaluation.from_results(x[:, 0] ** 2 + 3 * x[:, 0], gradient if grad else None)
+
+
+def test_a_loss_without_a_gradient_is_drawn_as_a_value_and_dotted_among_the_arrows_alone():
+    dataset = sample(HalfBlind(), plane(16, 12))
+    figure = landscape_figure(dataset)
+    top, bottom = figure.axes[:2]
+    lacking = int((dataset["status"] == Status.NO_GRADIENT).sum())
+    assert 0 < lacking < 192
+    assert not np.ma.getmaskarray(np.ma.masked_array(mesh_of(figure).get_array())).any()
+    assert not patches_of(top)
+    assert set(patches_of(bottom)) == {"NO_GRADIENT"}
+    assert patches_of(bottom)["NO_GRADIENT"].get_path().contains_point((-0.9, 25.0))
+    assert len(quiver_of(figure).U) == 192 - lacking
+    assert f"no gradient: {lacking} of 192" in legend_of(figure)
+    line = profile_figure(sample(HalfBlind(), plane(9, dims=("speed",))))
+    said = legend_of(line)
+    assert "no gradient: 4 of 9" in said
+    assert not any("not finite" in one for one in said)
+
+
 def test_the_star_is_on_the_lowest_sample():
     (star,) = (line for line in TOP.lines if line.get_marker() == "*")
     row, column = np.unravel_index(np.nanargmin(DATASET["loss"]), DATASET["loss"].shape)
