@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
+from ..envs.registry import refuse_unknown
 from ..jobs.scene import SceneSpec
 
 Env = Annotated[
@@ -189,7 +190,24 @@ def takes_scene(*without: str, **fixed: Any) -> Callable[[Callable[..., None]], 
 
 
 def _scene(*, env: str, set_: Sequence[str] | None = None, **how: Any) -> SceneSpec:
-    return SceneSpec(env, **how, options=read_settings(set_ or []))
+    scene = SceneSpec(env, **how, options=read_settings(set_ or []))
+    refuse_words(scene)
+    return scene
+
+
+def refuse_words(scene: SceneSpec, dims: Sequence[str] | None = None, policy: str | None = None) -> None:
+    """Raise ValueError for what a scene cannot have, as far as that is known before what simulates is imported.
+
+    Parameters are numbered as its class has them; options of the scene and a `policy` may change that.
+    """
+    if not isinstance(scene.name, str) or not scene.name:
+        return
+    numbered = () if scene.options or policy else dims or ()
+    refuse_unknown(scene.name, fidelity=scene.fidelity, device=scene.device, engine=scene.engine, dims=numbered)
+    if scene.tolerance is not None:
+        from ..jobs.tolerance import tolerance_of
+
+        tolerance_of(scene)
 
 
 def read_settings(settings: Sequence[str], flag: str = "--set") -> dict[str, Any]:
@@ -204,6 +222,11 @@ def read_settings(settings: Sequence[str], flag: str = "--set") -> dict[str, Any
         if flag == "--set" and name in OWN:
             raise ValueError(f"{flag} takes a scene's own options; {name} is none, and chosen by --{name} if at all")
     return {name: value for name, _, value in pairs}
+
+
+def read_names(texts: Sequence[str] | None) -> list[str]:
+    """Return names given as a,b or repeated."""
+    return [name.strip() for text in texts or () for name in text.split(",") if name.strip()]
 
 
 def read_share(text: str | None, flag: str) -> float | None:

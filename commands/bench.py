@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ..jobs.scene import SceneSpec
-from .arguments import Json, takes_scene
+from .arguments import Json, refuse_words, takes_scene
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -39,10 +40,8 @@ def bench(
 
     Example: landscape bench fluid --against taichi
     """
-    from ..envs.registry import find_environment
-
-    if isinstance(scene.name, str):
-        find_environment(scene.name)  # a name that does not exist is refused before what measures is loaded
+    if against is not None:
+        refuse_words(replace(scene, engine=against))
     from ..jobs.bench import BenchJob
     from .terminal import Bars, Console, command_line, print_json
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..jobs.scene import SceneSpec
-from .arguments import Json, Print, takes_scene
+from .arguments import Json, Print, refuse_words, takes_scene
 
 if TYPE_CHECKING:
     from ..landscapes.measures.slice_comparison_record import SliceComparison
@@ -49,9 +49,14 @@ def compare(
 
     Example: landscape compare out/my-slice bounce --fidelity standard
     """
+    from ..landscapes.storage.paths import refuse_missing
+    from .terminal import Bars, Console, command_line, print_json
+
+    refuse_missing(slice_, "slice")
+    if not Path(other).exists():
+        refuse_words(replace(scene, name=other))
     from ..api.slice import open_slice
     from ..jobs.compare import PICTURE, RECORD, CompareJob
-    from .terminal import Bars, Console, command_line, print_json
 
     bars = Bars()
     second = _second(other, scene, bars)  # which may be refused at once

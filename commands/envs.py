@@ -40,7 +40,9 @@ def _list() -> None:
 
 def _describe(name: str) -> None:
     """Print all there is to know about one environment."""
-    from ..envs.registry import make
+    from ..envs.registry import make, refuse_unknown
+
+    refuse_unknown(name)
     from ..gallery.paper import read_paper
     from ..jobs.margins import say_margins
     from ..landscapes.options import in_full

@@ -21,6 +21,9 @@ def export(
 
     Example: landscape export out/my-run --to parquet
     """
+    from ..landscapes.storage.paths import refuse_missing
+
+    refuse_missing(what, "slice and no run")
     from ..jobs.export import export as write
     from .terminal import Bars
 

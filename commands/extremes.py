@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..jobs.scene import SceneSpec
-from .arguments import ForceStudy, Json, OutOfStudy, Print, Seed, takes_scene
+from .arguments import ForceStudy, Json, OutOfStudy, Print, Seed, read_names, takes_scene
 
 if TYPE_CHECKING:
     from ..landscapes.measures.extremes import Extremes, Limit
@@ -61,7 +61,11 @@ def extremes(
     from .terminal import Bars, Console, command_line, print_json
 
     how: dict[str, Any] = {"points": points, "seed": seed, "grid": grid, "width": width, "accuracy": accuracy}
-    how |= {"knobs": _split(knobs), "pairs": None if pairs is None else _split(pairs), "precisions": _split(precisions)}
+    how |= {
+        "knobs": read_names(knobs),
+        "pairs": None if pairs is None else read_names(pairs),
+        "precisions": read_names(precisions),
+    }
     how |= {"reference": against, "out": Path(out) if out else None, "force": force, "prints": print_ or []}
     bars, job = Bars(), ExtremesJob.open(scene, **how, command=command_line())
     found = job.run(bars)
@@ -72,10 +76,6 @@ def extremes(
     )
     if json_:
         print_json(found.record(), folder=str(job.folder))
-
-
-def _split(texts: list[str] | None) -> list[str]:
-    return [part for text in texts or [] for part in text.split(",") if part]
 
 
 def show(found: Extremes, console: Console) -> None:

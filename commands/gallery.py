@@ -40,13 +40,15 @@ def compute(
 
     Example: landscape gallery compute --only fluid --part slices --device cuda
     """
-    from ..gallery.compute import change_figures, compute_parts
     from ..gallery.figures import choose_figures, read_figures
+
+    chosen = choose_figures(read_figures(), only or [])
+    from ..gallery.compute import change_figures, compute_parts
     from ..gallery.files import data_folder
     from .terminal import Bars
 
     bars, root = Bars(), data_folder(data)
-    figures = change_figures(choose_figures(read_figures(), only or []), fidelity, resolution, root)
+    figures = change_figures(chosen, fidelity, resolution, root)
     failed = compute_parts(figures, root, bars, parts=part or [], device=device, scheduler=scheduler)
     if failed:
         bars.note(

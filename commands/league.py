@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .arguments import Budget, Deterministic, Device, Fidelity, Json, Print, Scheduler
+from .arguments import Budget, Deterministic, Device, Fidelity, Json, Print, Scheduler, read_names, refuse_words
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -59,17 +59,22 @@ def league(
 
     Example: landscape league bounce fluid@standard --methods random,cma-es,bo-leap --budget 200 --seeds 3
     """
-    from ..envs.engines.runtime import cores
-    from ..gallery.paper import read_paper
-    from ..jobs.league import PICTURE, RECORD, LeagueJob, read_scene, simulated_scenes
-    from ..jobs.scene import SceneSpec
-    from ..jobs.workers import workers as cluster
+    from ..jobs.methods import check_methods
+    from ..jobs.scene import SceneSpec, read_scene
     from .terminal import Bars, command_line, print_json
 
     if workers and scheduler:
         raise ValueError(f"--scheduler has workers of its own, so --workers is left out; got {workers}")
     bars, one = Bars(), SceneSpec("", fidelity, device=device, deterministic=deterministic)
-    chosen = [name.strip() for text in methods or [] for name in text.split(",") if name.strip()]
+    chosen = read_names(methods)
+    check_methods(chosen)
+    for text in envs or ():
+        refuse_words(read_scene(text, one))
+    from ..envs.engines.runtime import cores
+    from ..gallery.paper import read_paper
+    from ..jobs.league import PICTURE, RECORD, LeagueJob, simulated_scenes
+    from ..jobs.workers import workers as cluster
+
     how: dict[str, Any] = {"out": Path(out) if out else None, "force": force, "prints": print_ or []}
     scenes = [read_scene(text, one) for text in envs or simulated_scenes()]
     job = LeagueJob.of(scenes, chosen, budget=budget, seeds=seeds, command=command_line(), **how)

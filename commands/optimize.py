@@ -39,8 +39,10 @@ def optimize(
 
     Example: landscape optimize fluid --method bo-leap --budget 300
     """
+    from ..optim.registry import find_method
     from .terminal import Bars, command_line, print_json
 
+    find_method(method)  # a name that does not exist is refused before what searches is imported
     bars, options = Bars(), read_settings(option or [], "--option")
     env = scene.make(bars)
     from ..jobs.search import SearchJob, make_optimizer

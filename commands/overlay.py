@@ -46,6 +46,15 @@ def overlay(
 
     Example: landscape overlay out/fluid-6-8 out/race-fluid --through best
     """
+    from ..envs.registry import refuse_unknown
+    from ..landscapes.storage.paths import refuse_missing
+
+    refuse_missing(slice_, "slice")
+    for run in runs:
+        if not Path(run).suffix:  # a table is looked for by whoever reads it
+            refuse_missing(run, "run")
+    if env is not None:
+        refuse_unknown(env)
     from ..api.slice import open_slice
     from ..jobs.foreign import tables_over
     from ..jobs.overlay import STREAM, Cut, OverlayJob

@@ -11,7 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..jobs.scene import SceneSpec
-from .arguments import Along, Extent, Gradients, Json, NoGradients, SomeDims, Through, read_extent, takes_scene
+from .arguments import (
+    Along,
+    Extent,
+    Gradients,
+    Json,
+    NoGradients,
+    SomeDims,
+    Through,
+    read_extent,
+    refuse_words,
+    takes_scene,
+)
 from .plan_race import print_race_plan
 
 if TYPE_CHECKING:
@@ -67,10 +78,13 @@ def plan(
     Example: landscape plan fluid --dims 6 8 --resolution 48 --fidelity standard
     """
     began = time.perf_counter() - time.process_time()  # about when this process did
-    from ..jobs.plan import PlanJob
+    from ..jobs.cut import refuse_cut
     from .terminal import Bars, command_line, print_json
 
     bars, scene = Bars(), replace(scene, name=what)
+    if not what.endswith(".toml"):
+        refuse_words(scene, dims)
+    refuse_cut(dims, along)
     wanted = 0 if no_gradients else gradients
     cut = bool(dims or along or over or extent or resolution or wanted != 1 or through != "center")
     if methods or seeds or budget or option:
@@ -84,6 +98,8 @@ def plan(
         return
     where: dict[str, Any] = {"through": through, "extent": read_extent(extent), "gradients": wanted}
     first = dims if dims or along else ["0", "1"]
+    from ..jobs.plan import PlanJob
+
     job = PlanJob(scene, first, resolution or RESOLUTION, **where, over=over, frames=frames, along=along)
     found = job.run(bars, began=began)
     if json_:
@@ -102,12 +118,12 @@ def _refuse_more(said: bool) -> None:
 
 def _figure_jobs(path: str, resolution: int | None, scene: SceneSpec, *, grad: bool) -> list[tuple[Figure, PlanJob]]:
     """Return what there is to plan of a list of figures. Raises ValueError where there is no such list."""
+    if not Path(path).is_file():
+        raise ValueError(f"there is no list of figures at {path}; the gallery's own is gallery/figures.toml")
     from ..envs.registry import environment_class
     from ..gallery.figures import read_figures
     from ..jobs.plan import PlanJob
 
-    if not Path(path).is_file():
-        raise ValueError(f"there is no list of figures at {path}; the gallery's own is gallery/figures.toml")
     jobs = []
     for figure in read_figures(Path(path)):
         wanted = scene.fidelity or figure.fidelity

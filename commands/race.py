@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..jobs.scene import SceneSpec
-from .arguments import Budget, Json, Print, Scheduler, read_settings, takes_scene
+from .arguments import Budget, Json, Print, Scheduler, read_names, read_settings, takes_scene
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -61,18 +61,19 @@ def race(
 
     Example: landscape race fluid --methods random,bo-leap --budget 200 --seeds 3
     """
-    from ..envs.engines.runtime import cores
-    from ..gallery.paper import read_paper
     from ..jobs.methods import check_methods
-    from ..jobs.race import RaceJob
-    from ..jobs.workers import workers as cluster
     from .terminal import Bars, command_line, print_json
 
     if workers and scheduler:
         raise ValueError(f"--scheduler has workers of its own, so --workers is left out; got {workers}")
-    chosen = check_methods(read_names(methods or []))
+    chosen = check_methods(read_names(methods))
     bars, options = Bars(), read_method_options(option or [], chosen)
     env = scene.make(bars)
+    from ..envs.engines.runtime import cores
+    from ..gallery.paper import read_paper
+    from ..jobs.race import RaceJob
+    from ..jobs.workers import workers as cluster
+
     how: dict[str, Any] = {"out": Path(out) if out else None, "force": force, "prints": print_ or [], "watch": bars}
     how |= {
         "claims": read_paper().claims_about(env.name),
@@ -90,11 +91,6 @@ def race(
     else:
         _print(summary, claims=report)
     bars.note(f"{job.folder}: {', '.join(summary.files)}")
-
-
-def read_names(texts: Sequence[str]) -> list[str]:
-    """Return names given as a,b or repeated."""
-    return [name.strip() for text in texts for name in text.split(",") if name.strip()]
 
 
 def read_method_options(settings: Sequence[str], chosen: Sequence[str]) -> dict[str, dict[str, str]]:

@@ -44,12 +44,12 @@ def report_(
 
     Example: landscape report out/fluid-6-8-draft-24x24-4e5ab2
     """
+    _refuse_words(what, everything, fidelity, device, env)
     from ..gallery.files import data_folder
     from ..gallery.paper import read_paper
     from ..jobs.report import ReportJob
     from .terminal import Bars, command_line
 
-    _refuse_both(what, everything)
     bars, root = Bars(), data_folder(data)
     subjects = _figures(root) if what is None else _subjects(what, root, fidelity, device, points, bars)
     single = what is not None and len(subjects) == 1
@@ -63,10 +63,16 @@ def report_(
         _show_several(found, job.folder, bars, as_json=json_)
 
 
-def _refuse_both(what: str | None, everything: bool) -> None:
-    """Raise ValueError unless it is said what to report on, once."""
+def _refuse_words(what: str | None, everything: bool, fidelity: str | None, device: str, env: str | None) -> None:
+    """Raise ValueError unless it is said what to report on, once, and for an environment that there is not."""
+    from ..envs.registry import refuse_unknown
+
     if (what is None) != everything:
         raise ValueError("report takes a slice's folder, an environment, or --all for every figure of the gallery")
+    if what is not None and not Path(what).exists():
+        refuse_unknown(what, fidelity=fidelity, device=device)
+    if env is not None:
+        refuse_unknown(env)
 
 
 def _figures(root: Path) -> list[ReportedSlice]:
@@ -82,14 +88,13 @@ def _figures(root: Path) -> list[ReportedSlice]:
 
 def _subjects(what: str, root: Path, fidelity: str | None, device: str, points: int, bars: Bars) -> list[ReportedSlice]:
     """Return a slice, or an environment's figures, or a slice sampled now for want of any."""
-    from ..envs.registry import find_environment, make
+    from ..envs.registry import make
     from ..gallery.figures import read_figures
     from ..jobs.report import ReportedSlice, sample_subject
     from .terminal import command_line
 
     if Path(what).exists():
         return [ReportedSlice.of(Path(what))]
-    find_environment(what)  # refuses a name that does not exist, with those that come close
     figures = [figure for figure in read_figures() if figure.env == what and fidelity in (None, figure.fidelity)]
     if found := [ReportedSlice.of(root / figure.id) for figure in figures if _is_finished(root / figure.id)]:
         return found

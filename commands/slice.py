@@ -28,6 +28,7 @@ from .arguments import (
     Through,
     read_extent,
     read_share,
+    refuse_words,
     takes_scene,
 )
 
@@ -109,25 +110,27 @@ def _sample(
     policy: str | None = None,
 ) -> None:
     """Sample a slice, and say what came out."""
+    from ..jobs.cut import cut, describe_cut, folder_for, refuse_cut, split_points
     from .terminal import Bars, command_line, print_json
 
-    bars = Bars()
+    refuse_words(scene, dims, policy)
+    refuse_cut(dims, along)
+    where: dict[str, Any] = {"extent": read_extent(extent), "resolution": resolution}
+    share, bars = read_share(refine, "--refine"), Bars()
     env = scene.make(bars)
     subject = with_policy(env, policy)
-    from ..jobs.cut import cut, describe_cut, folder_for, split_points
     from ..jobs.slice import SliceJob
     from ..jobs.workers import workers
     from ..landscapes.sampling.refine import Refinement
 
     points = split_points(through)
-    where: dict[str, Any] = {"extent": read_extent(extent), "resolution": resolution}
     how: dict[str, Any] = {
         "command": command_line(),
         "gradients": gradients if policy is None else 0,
         "force": force,
         "prints": prints or [],
     }
-    how["refinement"] = Refinement.of(read_share(refine, "--refine"), budget)
+    how["refinement"] = Refinement.of(share, budget)
     folders = {point: folder_for(Path(out), point, points) if out else None for point in points}
     kept = {name: how[name] for name in ("gradients", "refinement")}
     planes = {  # all of them, or none is sampled

@@ -27,6 +27,11 @@ def surface(
 
     Example: landscape surface out/my-slice out/my-run
     """
+    from ..landscapes.storage.paths import refuse_missing
+
+    refuse_missing(slice_, "slice")
+    for run in runs or ():
+        refuse_missing(run, "run")
     from ..jobs.surface import SurfaceJob
     from .terminal import Bars
 

@@ -20,6 +20,7 @@ from .arguments import (
     SomeDims,
     Through,
     read_extent,
+    refuse_words,
     takes_scene,
 )
 
@@ -54,13 +55,16 @@ def sweep(
 
     Example: landscape sweep fluid --dims 6 8 --over 7 --frames 12
     """
-    from ..jobs.cut import cut, describe_cut, folder_for, split_points
-    from ..jobs.sweep import SweepJob
-    from ..jobs.workers import workers
+    from ..jobs.cut import cut, describe_cut, folder_for, refuse_cut, split_points
     from .terminal import Bars, command_line, print_json
 
-    bars = Bars()
-    env, points, ends = scene.make(bars), split_points(through), read_extent(extent)
+    refuse_words(scene, [*(dims or ()), over])
+    refuse_cut(dims, along)
+    bars, points, ends = Bars(), split_points(through), read_extent(extent)
+    env = scene.make(bars)
+    from ..jobs.sweep import SweepJob
+    from ..jobs.workers import workers
+
     how: dict[str, Any] = {"command": command_line(), "gradients": 0 if no_gradients else gradients, "force": force}
     planes = {point: cut(env, dims, along, through=point, extent=ends, resolution=resolution) for point in points}
     said = list[dict[str, Any]]()

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from ..jobs.scene import SceneSpec
-from .arguments import ForceStudy, Json, OutOfStudy, Print, Seed, takes_scene
+from .arguments import ForceStudy, Json, OutOfStudy, Print, Seed, read_names, takes_scene
 from .ladders import convergence, fidelity, mixed, model
 from .ladders.study import Study
 
@@ -81,7 +81,7 @@ def tradeoff(
     from ..jobs.variants import refuse_ladder
     from .terminal import command_line
 
-    settings = [part for text in variants or [] for part in text.split(",") if part]
+    settings = read_names(variants)
     refuse_ladder(ladder, LADDERS, settings)
     given = {"at_most": at_most, "budget": budget, "chaotic": chaotic or None}
     limits = {name: value for name, value in given.items() if value is not None}

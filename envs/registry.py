@@ -270,7 +270,12 @@ def as_environment(what: Any) -> Environment:
 
 
 def refuse_unknown(
-    what: str, *, fidelity: str | None = None, device: str = "auto", engine: str | None = None, dims: Sequence[str] = ()
+    what: str,
+    *,
+    fidelity: str | Fidelity | None = None,
+    device: str = "auto",
+    engine: str | None = None,
+    dims: Sequence[str] = (),
 ) -> None:
     """Raise ValueError for what cannot exist, as far as that is known without importing the scene or running its file.
 
@@ -284,7 +289,7 @@ def refuse_unknown(
     entry = _find_entry(what)
     if not entry.fidelities:
         return  # registered by others: their class knows
-    if fidelity is not None and fidelity not in entry.fidelities:
+    if isinstance(fidelity, str) and fidelity not in entry.fidelities:
         raise unknown_fidelity(what, entry.fidelities, fidelity)
     if device not in DEVICES:
         raise ValueError(f"{what} runs on {', '.join(DEVICES[:-1])} or {DEVICES[-1]}; got device {device!r}")

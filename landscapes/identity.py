@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from .. import __version__
 from .plain import plain_json
-from .plane import Plane
-from .space import LINEAR, ParameterSpace
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from .plane import Plane
+    from .space import ParameterSpace
 
 EVERY = "gradients_every"  # of a slice's identity; not there where its gradients are at every sample
 SCALES = "scales"  # of the parameters in an identity; not there where all are linear
@@ -63,6 +64,8 @@ def record_parameters(space: ParameterSpace) -> dict[str, Any]:
 
 def stored_scales(dataset: xr.Dataset) -> tuple[str, ...]:
     """Return the scales that the parameters of a slice or a run are on, linear where nothing else is said."""
+    from .space import LINEAR
+
     about = stored_identity(dataset) if "identity" in dataset.attrs else {}
     return tuple(about.get(SCALES, [LINEAR] * dataset.sizes["dim"]))
 
@@ -118,6 +121,8 @@ def stored_provenance(dataset: xr.Dataset) -> dict[str, Any]:
 
 def plane_of(dataset: xr.Dataset) -> Plane:
     """Return the plane that a slice was sampled on; raises ValueError where the dataset is no slice."""
+    from .plane import Plane
+
     return Plane.from_record(stored_identity(dataset)["plane"])
 
 
