@@ -16,6 +16,7 @@ from .arguments import (
     Extent,
     Gradients,
     Json,
+    MethodOption,
     NoGradients,
     SomeDims,
     Through,
@@ -39,12 +40,11 @@ def plan(
     what: Annotated[str, typer.Argument(metavar="ENV|FIGURES.toml", help="An environment, or a list of figures.")],
     dims: SomeDims = None,
     along: Along = None,
-    over: Annotated[
-        str | None, typer.Option(help="Plan a sweep: what moves from frame to frame, as for `landscape sweep`.")
-    ] = None,
-    frames: Annotated[int, typer.Option(min=2, help="Frames of the sweep.")] = 24,
+    over: Annotated[str | None, typer.Option(help="Plan a sweep over this, as for `landscape sweep`.")] = None,
+    frames: Annotated[int, typer.Option(min=2, help="Number of frames of the sweep.")] = 24,
     resolution: Annotated[
-        int | None, typer.Option(min=2, help="Points along each axis; 16, or what the figures say.")
+        int | None,
+        typer.Option(min=2, help="Number of points along each axis. The default is 16, or that of the figures."),
     ] = None,
     through: Through = "center",
     extent: Extent = None,
@@ -52,28 +52,30 @@ def plan(
     no_gradients: NoGradients = False,
     methods: Annotated[
         list[str] | None,
-        typer.Option(help="Plan a race of these methods, a,b or repeated, or of all, as for `landscape race`."),
+        typer.Option(help="Plan a race of these methods, a,b or repeated, or of all methods with all."),
     ] = None,
-    seeds: Annotated[int | None, typer.Option(min=1, help="Seeds of a race's methods, by default 10.")] = None,
-    budget: Annotated[int | None, typer.Option(min=1, help="Episodes of a race's runs, by default 1000.")] = None,
-    option: Annotated[
-        list[str] | None, typer.Option(help="A method's option, METHOD.NAME=VALUE; may be repeated.")
+    seeds: Annotated[
+        int | None, typer.Option(min=1, help="Number of seeds per method of a race. The default is 10.")
     ] = None,
+    budget: Annotated[
+        int | None, typer.Option(min=1, help="Number of episodes per run of a race. The default is 1000.")
+    ] = None,
+    option: MethodOption = None,
     workers: Annotated[
         int | None,
         typer.Option(
             min=1,
-            help="Workers, each with a device such as this one, by default 1; of a race, processes that compute "
-            "Gaussian processes, by default one a core.",
+            help="Number of workers, each with a device such as this one, 1 by default. For a race, number"
+            " of processes that fit Gaussian processes, one per core by default.",
         ),
     ] = None,
     json_: Json = False,
 ) -> None:
-    """Predict episodes, time, memory and disk of a slice, a sweep, the gallery's slices or a race, without making them.
+    """Predict the episodes, time, memory and disk of a slice, sweep, race or gallery before computing it.
 
-    Without --dims and --along it is of parameters 0 and 1. A few episodes, tiles and pictures are made and thrown away;
-    nothing is written. For a CUDA device that is not here, what `landscape tradeoff` kept of one counts. With --methods
-    it is of a race, and each method searches a made-up landscape a little; then --seeds and --budget count.
+    The default plane is that of parameters 0 and 1. A dry run makes a few episodes, tiles and pictures in a temporary
+    folder. For a CUDA device that is not here, it uses rates that `landscape tradeoff` stored. With --methods it plans
+    a race, to which --seeds and --budget apply; each method then searches a cheap synthetic landscape for a moment.
 
     Example: landscape plan fluid --dims 6 8 --resolution 48 --fidelity standard
     """

@@ -18,29 +18,35 @@ if TYPE_CHECKING:
 def report_(
     what: Annotated[
         str | None,
-        typer.Argument(metavar="[SLICE|ENV]", help="A slice's folder, or an environment: its figures, else one slice."),
+        typer.Argument(
+            metavar="[SLICE|ENV]",
+            help="Folder of a slice, or an environment: its figures of the gallery, else a slice that is "
+            "sampled for it.",
+        ),
     ] = None,
     env: Of = None,
-    everything: Annotated[bool, typer.Option("--all", help="Every figure of the gallery that is sampled.")] = False,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Report on every figure of the gallery that is sampled.")
+    ] = False,
     fidelity: Fidelity = None,
     device: Device = "auto",
     points: Annotated[
-        int, typer.Option(min=2, help="Points along each axis where gradients are tested by new evaluations.")
+        int, typer.Option(min=2, help="Number of points along each axis at which new evaluations test gradients.")
     ] = 6,
     seed: Seed = 0,
     data: Data = None,
     out: Annotated[
-        str | None, typer.Option(help="Folder for the results; by default one under out/ named after the report.")
+        str | None, typer.Option(help="Folder for the results. The default is named after the report, under out/.")
     ] = None,
     print_: Print = None,
     json_: Json = False,
 ) -> None:
-    """Say what a landscape is like: minima, flatness, jumps, correlation, gradient quality, and the verdict in words.
+    """Measure one landscape: minima, flatness, jumps, correlation and gradient quality, with a verdict in words.
 
-    The folder then holds report.json, measures.json, gradient-quality.png and gradient-quality.npz, which the picture
-    is drawn from; of several slices a folder each, with report.json and the table report.md beside them. Stop it at any
-    moment: the same command goes on with the next slice. With --all a slice that fails is named at the end, and the
-    exit code is 1. docs/measures.md says what each number means.
+    The folder then holds report.json, measures.json, gradient-quality.png and gradient-quality.npz (the data of the
+    picture). Several slices have a folder each, beside report.json and the table report.md. Stop at any time: the same
+    command goes on with the next slice. With --all a slice that fails is named at the end, and the exit code is 1.
+    docs/measures.md explains each number.
 
     Example: landscape report out/fluid-6-8-draft-24x24-4e5ab2
     """

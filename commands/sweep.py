@@ -30,11 +30,13 @@ def sweep(
     scene: SceneSpec,
     over: Annotated[
         str,
-        typer.Option(help="What moves from frame to frame: a third parameter over its bounds, horizon, or smoothing."),
+        typer.Option(
+            help="What changes from frame to frame: a third parameter over its bounds, horizon, or smoothing."
+        ),
     ],
     dims: SomeDims = None,
     along: Along = None,
-    frames: Annotated[int, typer.Option(min=2, help="Number of its values, both ends included.")] = 24,
+    frames: Annotated[int, typer.Option(min=2, help="Number of frames, both ends included.")] = 24,
     resolution: Resolution = 16,
     through: Through = "center",
     extent: Extent = None,
@@ -42,16 +44,16 @@ def sweep(
     no_gradients: NoGradients = False,
     scheduler: Scheduler = None,
     out: Annotated[
-        str | None, typer.Option(help="Folder for the results; by default one under out/ named after the sweep.")
+        str | None, typer.Option(help="Folder for the results. The default is named after the sweep, under out/.")
     ] = None,
     json_: Json = False,
-    force: Annotated[bool, typer.Option("--force", help="Begin anew where a sweep exists already.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace a sweep that exists already.")] = False,
 ) -> None:
-    """Sample a slice for each value of a third parameter, and film the slices on one colour scale.
+    """Sample one slice per value of a third parameter, and film them on one colour scale.
 
-    The folder then holds frames/ (the samples of each frame; slice.zarr where there is one slice only), sweep.mp4,
-    sweep.gif, sweep.rrd (a 3-D scene, which `landscape view` opens) and summary.json. Stop it at any moment: the same
-    command goes on where it stopped.
+    The folder then holds frames/ (the samples of each frame; slice.zarr if there is only one slice), sweep.mp4,
+    sweep.gif, sweep.rrd (a 3-D scene, which `landscape view` opens) and summary.json. Stop at any time: the same
+    command goes on from there.
 
     Example: landscape sweep fluid --dims 6 8 --over 7 --frames 12
     """

@@ -297,7 +297,7 @@ def refuse_unknown(
         refuse_engine(what, engine)
     for number in map(int, filter(str.isdecimal, dims)):
         if entry.dim.isdecimal() and number >= int(entry.dim):
-            raise ValueError(f"{what} numbers its parameters 0 to {int(entry.dim) - 1}; got {number}")
+            raise ValueError(f"{what} has parameters numbered 0 to {int(entry.dim) - 1}; got {number}")
 
 
 def registered_environment(name: str) -> type[Environment] | Environment:
