@@ -55,7 +55,7 @@ def league(
 
 
 def _spec(scene: Any, keywords: SceneKeywords) -> SceneSpec:
-    from ..jobs.league import read_scene
+    from ..jobs.scene import read_scene
 
     return read_scene(scene, spec_of("", keywords)) if isinstance(scene, str) else spec_of(scene, keywords)
 

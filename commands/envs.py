@@ -7,11 +7,13 @@ from typing import Annotated
 import typer
 
 
-def envs(name: Annotated[str | None, typer.Argument(help="One environment, to show it in full.")] = None) -> None:
-    """List the environments: name, dimension, parameters, model and fidelities.
+def envs(
+    name: Annotated[str | None, typer.Argument(help="Name of the environment to describe in full.")] = None,
+) -> None:
+    """List the environments, or describe one in full.
 
-    With NAME it shows one in full: what it models, bounds, fidelities, engines, options and examples, and how far its
-    step is from what is stable, where `landscape extremes` measured it. It writes no file.
+    With NAME it shows what the environment models, its bounds, fidelities, engines, options and examples, and how
+    close its time step is to the stability limit, if `landscape extremes` measured that. It writes no file.
 
     Example: landscape envs fluid
     """
@@ -40,7 +42,9 @@ def _list() -> None:
 
 def _describe(name: str) -> None:
     """Print all there is to know about one environment."""
-    from ..envs.registry import make
+    from ..envs.registry import make, refuse_unknown
+
+    refuse_unknown(name)
     from ..gallery.paper import read_paper
     from ..jobs.margins import say_margins
     from ..landscapes.options import in_full

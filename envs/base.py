@@ -26,11 +26,11 @@ from ..landscapes.space import ParameterSpace, as_tensor
 from .batching import Pool, cores, map_parts
 from .engines import find_engine
 from .engines.engine import Engine
-from .installed import install_line
 from .records import Fidelity as Fidelity
 from .records import MaterialRange as MaterialRange
 from .records import ModelPart as ModelPart
 from .records import Work as Work
+from .records import unknown_fidelity
 
 T = TypeVar("T")
 FLOAT32 = torch.finfo(torch.float32).max
@@ -411,9 +411,8 @@ class Environment(Objective):
         try:
             return import_module(f".engines.{module}", __package__)
         except ImportError as error:
-            extra = self.capabilities.extra
-            there = f"; {install_line(extra)}" if extra else ""
-            raise ValueError(f"{self.name} cannot run on engine {self.engine} here: {error}{there}") from error
+            why = self.capabilities.lacking_wheels() or self.capabilities.with_advice(str(error))
+            raise ValueError(f"{self.name} cannot run on engine {self.engine} here: {why}") from error
 
     @final
     def _limit_rows(self, capacity: int) -> int:
@@ -458,7 +457,7 @@ class Environment(Objective):
         if fidelity is None:
             return next(iter(self.fidelities.values()))
         if fidelity not in self.fidelities:
-            raise ValueError(f"{self.name} has fidelities {', '.join(self.fidelities)}; got {fidelity!r}")
+            raise unknown_fidelity(self.name, self.fidelities, fidelity)
         return self.fidelities[fidelity]
 
     def _find_device(self, device: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -65,3 +65,8 @@ class ModelPart:
     options: Mapping[str, Any]
     change: str
     missing: bool = False
+
+
+def unknown_fidelity(name: str, known: Iterable[str], given: str) -> ValueError:
+    """Return the error of a fidelity that a scene does not have."""
+    return ValueError(f"{name} has fidelities {', '.join(known)}; got {given!r}")

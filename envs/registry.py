@@ -11,16 +11,20 @@ A program or a notebook registers a class by `register`, and the command takes w
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import cache
 from importlib.metadata import entry_points
+from pathlib import Path
 from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..landscapes.storage.files import resolve
-from .importing import IN_FILE, import_named
+from .engines import refuse_engine
+from .importing import IN_FILE, import_named, refuse_absent_name
 from .installed import install_line, is_installed
+from .records import unknown_fidelity
 
 if TYPE_CHECKING:
     from .base import Environment, Fidelity
@@ -29,6 +33,7 @@ Kind = TypeVar("Kind", bound="type[Environment] | Environment")
 GROUP = "gradscape.environments"
 EXTRAS = {"mjx": ("mujoco", "mujoco-mjx", "jax"), "newton": ("newton",)}  # of this package, and what each brings
 SCENE = ("draft", "standard", "reference")
+DEVICES = ("auto", "cpu", "cuda")
 
 
 @dataclass(frozen=True)
@@ -264,20 +269,43 @@ def as_environment(what: Any) -> Environment:
     return found() if isinstance(found, type) else found
 
 
+def refuse_unknown(
+    what: str,
+    *,
+    fidelity: str | Fidelity | None = None,
+    device: str = "auto",
+    engine: str | None = None,
+    dims: Sequence[str] = (),
+) -> None:
+    """Raise ValueError for what cannot exist, as far as that is known without importing the scene or running its file.
+
+    Whoever makes the environment refuses the rest, after an import that takes seconds. `dims` are parameters, of which
+    numbers are held against how many a scene has where nothing changes that.
+    """
+    if IN_FILE.fullmatch(what):
+        file, path, name = _place_in_file(what)
+        refuse_absent_name(file, name, path)
+        return
+    entry = _find_entry(what)
+    if not entry.fidelities:
+        return  # registered by others: their class knows
+    if isinstance(fidelity, str) and fidelity not in entry.fidelities:
+        raise unknown_fidelity(what, entry.fidelities, fidelity)
+    if device not in DEVICES:
+        raise ValueError(f"{what} runs on {', '.join(DEVICES[:-1])} or {DEVICES[-1]}; got device {device!r}")
+    if engine is not None:
+        refuse_engine(what, engine)
+    for number in map(int, filter(str.isdecimal, dims)):
+        if entry.dim.isdecimal() and number >= int(entry.dim):
+            raise ValueError(f"{what} has parameters numbered 0 to {int(entry.dim) - 1}; got {number}")
+
+
 def registered_environment(name: str) -> type[Environment] | Environment:
     """Return what is registered by a name, which runs no file of anybody's.
 
     Raises ValueError where no environment has that name, or its module cannot be imported.
     """
-    known = entries()
-    if name not in known:
-        close = get_close_matches(name, known, n=1)
-        hint = f"; did you mean {close[0]}?" if close else ";"
-        raise ValueError(
-            f"no environment is called {name!r}{hint} `landscape envs` lists all {len(known)}, and one in a file of "
-            "your own is FILE.py:NAME"
-        )
-    target = known[name].target
+    target = _find_entry(name).target
     if not isinstance(target, str):
         return target
     module, _, attribute = target.rpartition(":")
@@ -286,6 +314,19 @@ def registered_environment(name: str) -> type[Environment] | Environment:
     except (ImportError, AttributeError) as error:
         raise ValueError(f"{name} is registered as {target}, which cannot be imported: {error}") from error
     return found
+
+
+def _find_entry(name: str) -> Entry:
+    """Return what is registered by a name. Raises ValueError, with a name that comes close, where nothing is."""
+    known = entries()
+    if name not in known:
+        close = get_close_matches(name, known, n=1)
+        hint = f"; did you mean {close[0]}?" if close else ";"
+        raise ValueError(
+            f"no environment is called {name!r}{hint} `landscape envs` lists all {len(known)}, and one in a file of "
+            "your own is FILE.py:NAME"
+        )
+    return known[name]
 
 
 def source_of(env: Environment) -> str | type[Environment] | Environment:
@@ -304,10 +345,7 @@ def source_of(env: Environment) -> str | type[Environment] | Environment:
 
 def _import_from_file(text: str) -> type[Environment] | Environment:
     """Return what a file calls by a name as an environment or the class of one, and register it by its own name."""
-    path, _, attribute = text.rpartition(":")
-    file = resolve(path)
-    if not file.is_file():
-        raise ValueError(f"there is no file {path} to take {attribute} from")
+    file, path, attribute = _place_in_file(text)
     module = import_named(str(file))
     if attribute not in vars(module):
         there = ", ".join(name for name, one in vars(module).items() if _is_offered(name, one, module.__name__))
@@ -321,6 +359,14 @@ def _import_from_file(text: str) -> type[Environment] | Environment:
         raise ValueError(f"{text} is called {found.name!r}, and so is {taken.target}; give it another name")
     entries()[found.name] = Entry(found.name, target, model=f"of {path}")
     return found
+
+
+def _place_in_file(text: str) -> tuple[Path, str, str]:
+    """Return the file of FILE.py:NAME, what it was called, and the name. Raises ValueError where there is no file."""
+    path, _, name = text.rpartition(":")
+    if not (file := resolve(path)).is_file():
+        raise ValueError(f"there is no file {path} to take {name} from")
+    return file, path, name
 
 
 def _named(found: type[Environment] | Environment, attribute: str) -> type[Environment] | Environment:

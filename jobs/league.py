@@ -25,7 +25,7 @@ from ..optim.runs.journal import Journal
 from .folder import LEAGUE, ROOT, RUN_STORE, folder_named
 from .methods import check_methods, divide_methods
 from .race import RaceJob, lockstep_seconds
-from .scene import SceneSpec
+from .scene import AT, SceneSpec
 from .watch import PREPARING, Stopped, Watch, resumable
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from ..optim.race import Race
 
 RECORD, PICTURE = LEAGUE.files
-AT = "@"  # between a scene and its fidelity
 
 
 @dataclass(frozen=True)
@@ -237,14 +236,6 @@ class LeagueJob:
         save_prints(lambda width: league.plot(width=width), self.folder / PICTURE, self.prints)
         tidy(self.folder)
         return league
-
-
-def read_scene(text: str, scene: SceneSpec) -> SceneSpec:
-    """Return a scene given as ENV or ENV@FIDELITY, else as `scene` has it."""
-    name, at, fidelity = text.rpartition(AT)
-    if not at or "/" in fidelity or ":" in fidelity:
-        return replace(scene, name=text)
-    return replace(scene, name=name, fidelity=fidelity)
 
 
 def simulated_scenes() -> list[str]:

@@ -26,6 +26,7 @@ PACKAGES = (
     *("numpy", "torch", "warp-lang", "taichi", "xarray", "zarr", "matplotlib"),
     *("pyvista", "rerun-sdk", "botorch", "gpytorch", "cma", "typer", "rich"),
 )
+AT = "@"  # between a scene and its fidelity
 ABSENT = "not installed"  # in the place of a version
 
 
@@ -244,3 +245,11 @@ def named_point(objective: Objective, text: str) -> Tensor:
         return objective.space.uniform(1, seed=int(seed))[0]
     forms = "center, random:SEED, a table (.csv, .parquet) or a tensor"
     raise ValueError(f"{objective.name} can be cut through {forms}; got {text!r}")
+
+
+def read_scene(text: str, scene: SceneSpec) -> SceneSpec:
+    """Return a scene given as ENV or ENV@FIDELITY, else as `scene` has it."""
+    name, at, fidelity = text.rpartition(AT)
+    if not at or "/" in fidelity or ":" in fidelity:
+        return replace(scene, name=text)
+    return replace(scene, name=name, fidelity=fidelity)

@@ -13,11 +13,9 @@ from platformdirs import user_data_path
 
 from .. import __version__
 from ..envs.registry import make
-from ..landscapes.cost import episode_cost
 from ..landscapes.identity import MODEL_VERSION
 from ..landscapes.storage.disk import moved_by
 from .folder import digest
-from .variants import expected_work
 
 if TYPE_CHECKING:
     from ..envs.base import Environment, Fidelity
@@ -90,10 +88,8 @@ def choose_fidelity(spec: SceneSpec, watch: Watch) -> Fidelity:
     Raises ValueError where the spec names a fidelity too, where its tolerance cannot be read, where nothing was
     measured of the scene with these options, and where no measured fidelity is within the tolerance.
     """
-    if spec.fidelity is not None:
-        raise ValueError(f"--tolerance chooses the fidelity; got --fidelity {spec.fidelity} too, leave out one of them")
     tolerance = str(spec.tolerance)
-    limit, relative = read_tolerance(tolerance)
+    limit, relative = tolerance_of(spec)
     env = make(spec.name, device=spec.device, engine=spec.engine, **spec.options)
     name = env.name
     if not env.model_version:
@@ -133,6 +129,8 @@ def _quickest(watch: Watch, env: Environment, rows: Sequence[MeasuredVariant]) -
         best = min(rows, key=lambda row: row.seconds)
         return best, f"{best.seconds:.3g} s an episode with gradient on {env.device}, by `landscape tradeoff`"
     made = {row.name: _make(env, row) for row in rows}
+    from .variants import expected_work
+
     work = {name: expected_work(one) for name, one in made.items()}
     likely = [row for row in rows if work[row.name] <= FARTHER * min(work.values())]
     if len(likely) == 1:
@@ -181,6 +179,8 @@ def seconds_with_gradient(env: Environment) -> float:
     whole = env.work().count
     if env.horizon and whole > ENOUGH:
         env = env.with_horizon(env.horizon * max(SHORTEST, ENOUGH / whole))
+    from ..landscapes.cost import episode_cost
+
     return episode_cost(env).gradient * whole / env.work().count
 
 
@@ -197,6 +197,13 @@ def find_variant(env: Environment, device: str) -> tuple[MeasuredVariant, Path]:
         f"there is no {device} device here, and no rate of {env.name} at {env.fidelity.name} on one is kept; "
         f"`landscape tradeoff {env.name} --device {device}` measures it where there is one"
     )
+
+
+def tolerance_of(spec: SceneSpec) -> tuple[float, bool]:
+    """Return the tolerance of a scene as `read_tolerance` does. Raises ValueError where it names a fidelity, too."""
+    if spec.fidelity is not None:
+        raise ValueError(f"--tolerance chooses the fidelity; got --fidelity {spec.fidelity} too, leave out one of them")
+    return read_tolerance(str(spec.tolerance))
 
 
 def read_tolerance(text: str) -> tuple[float, bool]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ..envs.base import Environment, Fidelity
+if TYPE_CHECKING:
+    from ..envs.base import Environment, Fidelity
 
 FIDELITY = "fidelity"  # the ladder whose variants are fidelities and what is changed of them
 CHANGING = (FIDELITY, "convergence")  # the ladders that are told what to change

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 from .. import __version__
 from .objective import Status, describe_errors
 from .plain import plain_json
-from .plane import Plane
-from .space import LINEAR, ParameterSpace
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from .plane import Plane
+    from .space import ParameterSpace
 
 EVERY = "gradients_every"  # of a slice's identity; not there where its gradients are at every sample
 ERROR = "error"  # the attribute of a slice or a run with what the first point that raised said
@@ -65,6 +66,8 @@ def record_parameters(space: ParameterSpace) -> dict[str, Any]:
 
 def stored_scales(dataset: xr.Dataset) -> tuple[str, ...]:
     """Return the scales that the parameters of a slice or a run are on, linear where nothing else is said."""
+    from .space import LINEAR
+
     about = stored_identity(dataset) if "identity" in dataset.attrs else {}
     return tuple(about.get(SCALES, [LINEAR] * dataset.sizes["dim"]))
 
@@ -125,6 +128,8 @@ def errors_of(dataset: xr.Dataset) -> str:
 
 def plane_of(dataset: xr.Dataset) -> Plane:
     """Return the plane that a slice was sampled on; raises ValueError where the dataset is no slice."""
+    from .plane import Plane
+
     return Plane.from_record(stored_identity(dataset)["plane"])
 
 

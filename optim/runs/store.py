@@ -37,6 +37,7 @@ from ...landscapes.storage.files import placing, resolve
 from ...landscapes.storage.layout import FILL, consolidate, open_group
 from ...landscapes.storage.ownership import check_ours, clear_halves, has_lost_root
 from ..base import Kind
+from . import RUN as RUN
 from .arrays import (
     COLUMNS,
     FILES,
@@ -56,7 +57,6 @@ from .state import decode, encode
 
 PAUSE = 1.0  # least seconds between two writes, so that quick episodes are not held up
 SHARE = 0.05  # most of the time that may go into writing, that of all runs that go on abreast
-RUN = "run.zarr"  # what the store of a run is called in its folder
 
 
 class RunStore:
