@@ -76,28 +76,46 @@ def from_jax(
 ) -> Environment:
     """Make an environment of a JAX function from one point, an array of shape (dim,), to its loss, of shape ().
 
-    Gradients come by reverse differentiation, or forward, which loops of unknown length need and few parameters favour.
-    `batch` says how many points are computed together: `vmap` vectorizes the function, `map` calls it point after
-    point, which functions without a batching rule and large simulations need. Batches smaller than `rows` are padded to
-    the next power of four, since the function is compiled for each size. It runs in its own precision, whatever JAX is
-    configured to. Settings are static: the function is compiled for each. The other keywords are those of
-    `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows. Raises
-    ValueError where JAX is not installed, and for other modes and batches; evaluating raises it where the function
-    returns no single number, or JAX cannot trace, differentiate or vectorize it. """ for option, value, known in
-    (("mode", mode, Mode), ("batch", batch, Batch)): if value not in get_args(known): raise ValueError(f"from_jax takes
-    {option} {' or '.join(get_args(known))}; got {value!r}") try: from .engines.jax_functions import JaxBackend except
-    ImportError as error: raise ValueError(f"from_jax needs JAX, which is not here ({error}): pip install jax") from
-    error backend = JaxBackend(mode, batch) return FunctionEnvironment(Function.of(fn, space, backend, said)) def
-    from_warp( fn: Callable[..., Any], space: ParameterSpace, *, device: str = "auto", check_overwrites: bool = True,
-    **said: Unpack[FunctionKeywords], ) -> Environment: """Make an environment of a function that launches Warp kernels,
-    from points to losses. The function takes a Warp array of points, shape (batch, dim), and returns one of losses, shape (batch,), both of
+    Gradients come by reverse differentiation, or forward, which loops of unknown length need and few parameters
+    favour. `batch` says how many points are computed together: `vmap` vectorizes the function, `map` calls it point
+    after point, which functions without a batching rule and large simulations need. Batches smaller than `rows` are
+    padded to the next power of four, since the function is compiled for each size. It runs in its own precision,
+    whatever JAX is configured to. Settings are static: the function is compiled for each. The other keywords are those
+    of `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows.
+
+    Raises ValueError where JAX is not installed, and for other modes and batches; evaluating raises it where the
+    function returns no single number, or JAX cannot trace, differentiate or vectorize it.
+    """
+    for option, value, known in (("mode", mode, Mode), ("batch", batch, Batch)):
+        if value not in get_args(known):
+            raise ValueError(f"from_jax takes {option} {' or '.join(get_args(known))}; got {value!r}")
+    try:
+        from .engines.jax_functions import JaxBackend
+    except ImportError as error:
+        raise ValueError(f"from_jax needs JAX, which is not here ({error}): pip install jax") from error
+    backend = JaxBackend(mode, batch)
+    return FunctionEnvironment(Function.of(fn, space, backend, said))
+
+
+def from_warp(
+    fn: Callable[..., Any],
+    space: ParameterSpace,
+    *,
+    device: str = "auto",
+    check_overwrites: bool = True,
+    **said: Unpack[FunctionKeywords],
+) -> Environment:
+    """Make an environment of a function that launches Warp kernels, from points to losses.
+
+    The function takes a Warp array of points, shape (batch, dim), and returns one of losses, shape (batch,), both of
     its `precision`, by default float32; each loss may depend on its own row only. What it launches is recorded on a
     tape, and the tape is played backwards for the gradients; the gradients of arrays that the function keeps are set to
-    zero after each evaluation. The losses are made with requires_grad=True. A kernel that
-    writes to an array which an earlier one has read makes gradients wrong without a word. `check_overwrites` looks for
-    that once, before the first gradient, and builds the function's kernels anew for it, which may take long; leave it
-    out for a simulator that is known to be right. The other keywords are those of `FunctionKeywords`: name, loss_unit,
-    maximize, options, fidelities, horizon, seeds, precision, rows.
+    zero after each evaluation. The losses are made with requires_grad=True.
+
+    A kernel that writes to an array which an earlier one has read makes gradients wrong without a word.
+    `check_overwrites` looks for that once, before the first gradient, and builds the function's kernels anew for it,
+    which may take long; leave it out for a simulator that is known to be right. The other keywords are those of
+    `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows.
 
     Raises ValueError for other precisions and devices; evaluating raises it where the function returns no such array,
     launches nothing, does not read its points, or writes to what was read.
