@@ -163,8 +163,12 @@ class ReportJob:
         """
         dataset = _open(subject)
         env = environment_of(dataset, self.device)
-        key: ReportKey = {"points": self.points, "seed": self.seed, "slice": digest_of(dataset)}
-        key[MODEL_VERSION] = env.version_on(env.engine)
+        key: ReportKey = {
+            "points": self.points,
+            "seed": self.seed,
+            "slice": digest_of(dataset),
+            MODEL_VERSION: env.version_on(env.engine),
+        }
         beside = subject.store.parent
         if not self.prints or (beside / ARRAYS).exists():
             _fetch(beside, folder, key, watch)
