@@ -1,10 +1,11 @@
-"""The command `landscape`: its verbs in the order of its help, and how it ends."""
+"""The command `landscape`: its verbs in the groups and the order of its help, and how it ends."""
 
 from __future__ import annotations
 
 import os
 import shlex
 import sys
+from collections.abc import Callable
 from inspect import signature
 from io import TextIOWrapper
 from typing import Annotated, Any
@@ -39,7 +40,18 @@ from .commands.tradeoff import tradeoff
 from .commands.view import view
 
 
-class Verbs(TyperGroup):
+class Listed(TyperGroup):
+    """Verbs that help lists with their first sentences in full, those of the command in groups."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the verbs of each group under its heading."""
+        groups = GROUPS if ctx.parent is None else {"Commands": tuple(self.commands)}
+        for heading, verbs in groups.items():
+            with formatter.section(heading):
+                formatter.write_dl([(name, _first_sentence(self.commands[name])) for name in map(_name, verbs)])
+
+
+class Verbs(Listed):
     """The verbs of the command, of which Ctrl-C ends as it is raised: the library would make an exit code of it."""
 
     def invoke(self, ctx: Any) -> Any:
@@ -62,26 +74,37 @@ app = typer.Typer(
 
 STOPPED = 130  # the exit code of what Ctrl-C has ended
 LONG = 200  # characters of a path that an error shows
-_VERBS = (
-    envs, info, slice_, sweep,
-    methods, optimize, race, league, overlay,
-    compare, surface, replay, export, view, bounce,
-    plan, bench, check, card, tradeoff, extremes, pairs, report_, census,
-)  # fmt: skip
+_GALLERY = "gallery"
+GROUPS: dict[str, tuple[Callable[..., None] | str, ...]] = {  # of the help: heading -> verbs
+    "Look": (slice_, bounce, sweep, replay, surface, overlay, compare, view, envs, info),
+    "Measure": (check, report_, census, pairs, tradeoff, extremes, card, bench, plan),
+    "Search": (methods, optimize, race, league),
+    "Publish": (export, _GALLERY),
+}
 
-for _verb in _VERBS:
-    _cls = TakesDims if "dims" in signature(_verb).parameters else None
-    app.command(_verb.__name__.rstrip("_"), cls=_cls)(_verb)
-_gallery = typer.Typer(help="Sample the paper's figures and ours, and build a site that shows them offline.")
+
+def _name(verb: Callable[..., None] | str) -> str:
+    """Return what is typed for a verb."""
+    return verb if isinstance(verb, str) else verb.__name__.rstrip("_")
+
+
+def _first_sentence(command: Any) -> str:
+    return " ".join(str(command.help).partition("\n\n")[0].split())
+
+
+for _verb in (one for verbs in GROUPS.values() for one in verbs):
+    if not isinstance(_verb, str):
+        app.command(_name(_verb), cls=TakesDims if "dims" in signature(_verb).parameters else None)(_verb)
+_gallery = typer.Typer(cls=Listed, help="Compute the figures of the paper, and build a site that shows them offline.")
 for _verb in (gallery.compute, gallery.list_, gallery.build, gallery.serve):
-    _gallery.command(_verb.__name__.rstrip("_"))(_verb)
-app.add_typer(_gallery, name="gallery")
+    _gallery.command(_name(_verb))(_verb)
+app.add_typer(_gallery, name=_GALLERY)
 
 
 @app.callback(invoke_without_command=True)
 def _root(
     context: typer.Context,
-    version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
 ) -> None:
     if version:
         typer.echo(f"gradscape {__version__}")
@@ -136,7 +159,7 @@ def _stop(stop: BaseException) -> int:
         return 0
     again = shlex.join(["landscape", *sys.argv[1:]])
     then = "goes on from there" if stop.kept else "begins again"
-    typer.echo(f"stopped: {stop}; the same command {then}: {again}", err=True)
+    _say(f"stopped: {stop}; the same command {then}: {again}")
     return STOPPED
 
 
@@ -172,5 +195,12 @@ def _memory(error: Exception) -> str:
 
 
 def _fail(message: str, code: int) -> int:
-    typer.echo(f"landscape: {' '.join(message.split())}", err=True)
+    _say(f"landscape: {' '.join(message.split())}")
     return code
+
+
+def _say(line: str) -> None:
+    """Print a line on standard error; what others have put into it cannot steer the terminal."""
+    from .landscapes.plain import printable
+
+    typer.echo(printable(line), err=True)

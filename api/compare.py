@@ -6,21 +6,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Unpack
 
 from .progress import default_watch
-from .scene import SceneKeywords, objective_of, say_call
+from .scene import Scene, SceneKeywords, environment, say_call
 from .slice import open_slice
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
-    from ..jobs.scene import SceneSpec
     from ..jobs.watch import Watch
     from ..landscapes.measures.slice_comparison_record import SliceComparison
-    from ..landscapes.objective import Objective
     from ..landscapes.slice import Slice
 
 
 def compare(
     a: str | Path | Slice,
-    b: str | Path | Slice | type[Environment] | Objective | SceneSpec,
+    b: str | Path | Slice | Scene,
     *,
     out: str | Path | None = None,
     force: bool = False,
@@ -51,10 +49,9 @@ def compare(
     return job.run(watch)
 
 
-def _said(given: str | Path | Slice | type[Environment] | Objective | SceneSpec) -> str:
+def _said(given: str | Path | Slice | Scene) -> str:
     """Return what stands for a slice or a scene in a call."""
     from ..jobs.scene import SceneSpec
-    from ..landscapes.objective import name_of
     from ..landscapes.slice import Slice
 
     named = given.name if isinstance(given, SceneSpec) else given
@@ -62,21 +59,19 @@ def _said(given: str | Path | Slice | type[Environment] | Objective | SceneSpec)
         return str(named.folder or named.identity["objective"])
     if isinstance(named, type):
         return named.__name__
-    return str(named) if isinstance(named, str | Path) else name_of(named)
+    return str(named) if isinstance(named, str | Path) else str(getattr(named, "name", type(named).__name__))
 
 
 def _slice(given: str | Path | Slice) -> Slice:
     return open_slice(given) if isinstance(given, str | Path) else given
 
 
-def _second(
-    given: str | Path | Slice | type[Environment] | Objective | SceneSpec, keywords: SceneKeywords, watch: Watch
-) -> Slice | Objective:
+def _second(given: str | Path | Slice | Scene, keywords: SceneKeywords, watch: Watch) -> Slice | Environment:
     """Return a slice that is there, and else the objective to sample. Raises ValueError for keywords beside a slice."""
     from ..landscapes.slice import Slice
 
     if not (isinstance(given, Slice | Path) or (isinstance(given, str) and Path(given).exists())):
-        return objective_of(given, keywords, watch)
+        return environment(given, keywords, watch)
     if keywords:
         raise ValueError(f"{', '.join(keywords)} are of an environment to sample; b is a slice that is there already")
     return _slice(given)

@@ -6,15 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
-from ..jobs.scene import SceneSpec
 from .progress import default_watch
-from .scene import SceneKeywords, spec_of
+from .scene import Scene, SceneKeywords, spec_of
 
 if TYPE_CHECKING:
-    from ..envs.base import Environment
+    from ..jobs.scene import SceneSpec
     from ..optim.league import League
-
-    Scene = str | type[Environment] | Environment | SceneSpec
 
 
 def league(
@@ -58,7 +55,7 @@ def league(
 
 
 def _spec(scene: Any, keywords: SceneKeywords) -> SceneSpec:
-    from ..jobs.league import read_scene
+    from ..jobs.scene import read_scene
 
     return read_scene(scene, spec_of("", keywords)) if isinstance(scene, str) else spec_of(scene, keywords)
 

@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Unpack
 
-from ..jobs.scene import SceneSpec
 from ..jobs.watch import Watch
 from .progress import default_watch
-from .scene import SceneKeywords, environment, say_call, spec_of
+from .scene import Scene, SceneKeywords, environment, say_call, spec_of
 
 if TYPE_CHECKING:
-    from ..envs.base import Environment
     from ..jobs.check import CheckReport
     from ..jobs.pairs import PairRanking
     from ..jobs.report import ReportedSlice
@@ -22,14 +20,13 @@ if TYPE_CHECKING:
     from ..landscapes.measures.extremes import Extremes
     from ..landscapes.slice import Slice
 
-    Scene = str | type[Environment] | Environment | SceneSpec
-
 
 def report(
     what: Slice | Path | Scene,
     *,
     points: int = 6,
     seed: int = 0,
+    env: Scene = None,
     out: str | Path | None = None,
     **keywords: Unpack[SceneKeywords],
 ) -> Report:
@@ -37,8 +34,8 @@ def report(
 
     `what` is a slice, a slice's folder, or a scene, of which a slice over its first two parameters is sampled first.
     Gradients are tested by new evaluations at `points` places along each axis; of the `keywords`, those but `device`
-    are for a scene alone. The report's files lie in `out`, by default a folder under out/ named after it: the same call
-    reads them again.
+    are for a scene alone; `env` is the simulator of a slice, where it is not registered by its name. The report's files
+    lie in `out`, by default a folder under out/ named after it: the same call reads them again.
 
     Raises ValueError for a slice without gradients or on no disk, for what the scene does not have, and where the
     folder holds something else or another report; Stopped where it is interrupted.
@@ -46,10 +43,10 @@ def report(
     from ..jobs.report import ReportJob
 
     watch, command = default_watch(), say_call("report", what, points=points, seed=seed, **keywords)
-    subject = _subject(what, points, watch, keywords)
+    subject, env = _subject(what, env, points, watch, keywords)
     job = ReportJob.open(
         [subject], what=subject.name, single=True, out=_path(out), points=points, seed=seed,
-        device=keywords.get("device", "auto"), command=command,
+        device=keywords.get("device", "auto"), env=env, command=command,
     )  # fmt: skip
     return job.run(watch).reports[0]
 
@@ -192,18 +189,21 @@ def census(
     return CensusJob.open(spec.resolve(watch), **how, out=_path(out), force=force, command=command).run(watch)
 
 
-def _subject(what: Slice | Path | Scene, points: int, watch: Watch, keywords: SceneKeywords) -> ReportedSlice:
+def _subject(
+    what: Slice | Path | Scene, env: Scene, points: int, watch: Watch, keywords: SceneKeywords
+) -> tuple[ReportedSlice, Scene]:
+    """Return the slice to report on, which is sampled now where a simulator is given, and its simulator if known."""
     from ..jobs.report import ReportedSlice, sample_subject
     from ..landscapes.slice import Slice
 
     if isinstance(what, Slice):
         if what.folder is None:
             raise ValueError("report takes a slice on disk; this one is in memory alone, so use its own report()")
-        return ReportedSlice.of(what.folder)
+        return ReportedSlice.of(what.folder), env or (what.remake() if what.remake else None)
     if isinstance(what, Path) or (isinstance(what, str) and Path(what).exists()):
-        return ReportedSlice.of(Path(what))
+        return ReportedSlice.of(Path(what)), env
     env = environment(what, keywords, watch)
-    return sample_subject(env, points, say_call("report", what, **keywords), watch)
+    return sample_subject(env, points, say_call("report", what, **keywords), watch), env
 
 
 def _path(out: str | Path | None) -> Path | None:

@@ -51,15 +51,17 @@ def overlay(
 
     Slice and runs are folders, a race's for all of its runs, or what `gradscape.slice` and `gradscape.optimize` return.
     Points that another program evaluated are a CSV or Parquet file or a pandas table, with a column for each parameter,
-    called as it is, and one called loss, which is missing where an evaluation failed; or an Optuna study; or an
-    experiment of Ax, or its client.
+    called as it is, and one called loss, which is missing where an evaluation failed; or an Optuna study, or what its
+    `trials_dataframe()` returns; or an experiment of Ax, or its client. Values of a study or an experiment that
+    maximises are negated, and its name says so. Rows without a number for each parameter are skipped and counted.
     The slice is cut anew `through` the best point of all runs (best) or of one run's folder, or any other point that
     `gradscape.slice` goes through by its name, and along the runs' two principal directions with `plane` pca, with
     `resolution` points along each axis, on `device`. The files lie in the folder `out`, by default one under out/ named
     after the overlay.
 
     Raises ValueError for runs of other landscapes than the slice's, for a slice of a line, where there is no slice or
-    run, where a table lacks a column, and where the folder holds something else; Stopped where it is interrupted.
+    run, where a table lacks a column, has one twice or holds no point, and where the folder holds something else;
+    Stopped where it is interrupted.
     """
     from ..jobs.foreign import tables_over
     from ..jobs.overlay import Cut, OverlayJob
@@ -69,7 +71,7 @@ def overlay(
     beneath = open_slice(slice) if isinstance(slice, str | Path) else slice
     job = OverlayJob.of(
         beneath,
-        tables_over(beneath, several),
+        tables_over(beneath, several, watch),
         command="gradscape.overlay(...)",
         cut=cut,
         device=device,

@@ -17,17 +17,31 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.segment import Segment
 from rich.status import Status
 from rich.text import Text
 
 from ..jobs.watch import Advance, AdvanceOne, Say, Watch
+from ..landscapes.plain import printable
 
 
 class Console(rich.Console):
-    """Print text as it is: names and paths are other people's, and may hold [brackets] and :colons:."""
+    """Print text as it is: names, paths and errors are other people's, and may hold [brackets] and :colons:.
+
+    Control characters, which a terminal would obey, are shown as their escapes.
+    """
 
     def __init__(self, **look: Any) -> None:
         super().__init__(markup=False, emoji=False, **look)
+
+    def render_str(self, text: str, **look: Any) -> Text:
+        """Lay out text, its control characters escaped before it is measured."""
+        return super().render_str(printable(text), **look)
+
+    def render(self, renderable: rich.RenderableType, options: rich.ConsoleOptions | None = None) -> Iterator[Segment]:
+        """Render what is printed; of texts that were laid out elsewhere control characters are escaped here."""
+        for part in super().render(renderable, options):
+            yield part if part.control else part._replace(text=printable(part.text))
 
     def status(self, status: rich.RenderableType, **look: Any) -> Status:
         """Say what is being done while it is; the text of a status is markup whatever the console says."""

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypedDict, TypeGuard
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from ..jobs.scene import SceneSpec
 from ..jobs.watch import Watch
-from ..landscapes.objective import name_of
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from ..envs.base import Environment, Fidelity
-    from ..landscapes.objective import Objective
+
+Scene = Any
+"""What every function takes for a simulator: the name of a scene, FILE.py:NAME, an environment (`gs.from_torch` and
+its like make one of a function) or its class, a `SceneSpec`, or an object of one's own with `space` and `evaluate`."""
 
 
 class SceneKeywords(TypedDict, total=False):
@@ -28,45 +30,28 @@ class SceneKeywords(TypedDict, total=False):
     options: Mapping[str, Any]
 
 
-def spec_of(scene: str | type[Environment] | Environment | SceneSpec, keywords: SceneKeywords) -> SceneSpec:
-    """Return the spec of a name, a class, an environment, or of itself; raises ValueError as `objective_of` does."""
-    if isinstance(scene, str | type | SceneSpec):
-        return replace(scene if isinstance(scene, SceneSpec) else SceneSpec(scene), **keywords)
-    return SceneSpec.of(environment(scene, keywords, Watch()))
+def spec_of(scene: Scene, keywords: SceneKeywords) -> SceneSpec:
+    """Return the spec of whatever names or is a simulator. Raises ValueError for what is none."""
+    if isinstance(scene, SceneSpec):
+        return replace(scene, **keywords)
+    if not isinstance(scene, str):
+        from ..envs.registry import find_environment
+
+        scene = find_environment(scene)
+    return SceneSpec(scene, **keywords)
 
 
-def objective_of(
-    scene: str | type[Environment] | Objective | SceneSpec, keywords: SceneKeywords, watch: Watch
-) -> Objective:
-    """Return the environment of a name, a class or a spec; any objective is itself.
+def environment(scene: Scene, keywords: SceneKeywords, watch: Watch) -> Environment:
+    """Return the environment that is meant, with these keywords. Raises ValueError for what it does not have."""
+    return spec_of(scene, keywords).make(watch)
 
-    Raises ValueError for a name that is not registered, for what the scene does not have, and for keywords beside an
-    objective, which is made already.
+
+def is_in_memory(env: Environment, out: object) -> bool:
+    """Say whether a slice or a run is kept in memory alone: that of a function which is given no folder.
+
+    Functions change from one call to the next, as in a notebook; a folder of results that do not fit would be refused.
     """
-    if isinstance(scene, str | type | SceneSpec):
-        return spec_of(scene, keywords).make(watch)
-    if keywords:
-        raise ValueError(f"{name_of(scene)} is made already; got {', '.join(keywords)} too, so make it with them")
-    return scene
-
-
-def environment(
-    scene: str | type[Environment] | Environment | SceneSpec, keywords: SceneKeywords, watch: Watch
-) -> Environment:
-    """Return the environment of a name, a class, a spec, or of itself; raises ValueError as `objective_of` does."""
-    found = objective_of(scene, keywords, watch)
-    if not is_environment(found):
-        raise ValueError(
-            f"an environment is wanted; got the objective {name_of(found)}, so derive one from Environment"
-        )
-    return found
-
-
-def is_environment(objective: Objective) -> TypeGuard[Environment]:
-    """Whether an objective is an environment: it knows its fidelity, its options and its version."""
-    from ..envs.base import Environment
-
-    return isinstance(objective, Environment)
+    return out is None and not env.model_version
 
 
 def say_cut(

@@ -6,21 +6,19 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
-from ..jobs.scene import SceneSpec
 from ..jobs.watch import Watch
 from .progress import default_watch
-from .scene import SceneKeywords, environment, is_environment, objective_of, say_call
+from .scene import Scene, SceneKeywords, environment, is_in_memory, say_call
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
-    from ..landscapes.objective import Objective
     from ..optim.base import Optimizer
     from ..optim.race import Race
     from ..optim.runs.run import Run
 
 
 def optimize(
-    scene: str | type[Environment] | Objective | SceneSpec,
+    scene: Scene,
     method: str,
     *,
     budget: int = 1000,
@@ -34,19 +32,18 @@ def optimize(
 
     `budget` episodes are evaluated, not one more; `seed` decides the method's random numbers, and `method_options` are
     its own. The run lies in the folder `out`, by default one under out/ named after it: the same call goes on there
-    where it stopped, and a larger budget goes on from its end. An objective that is no environment is searched in
-    memory.
+    where it stopped, and a larger budget goes on from its end. A function is searched in memory without `out`.
 
     Raises ValueError for what the scene or the method does not have, and where the folder holds something else or
     another run, which `force` replaces; Stopped where it is interrupted.
     """
     watch = default_watch()
-    env = objective_of(scene, keywords, watch)
+    env = environment(scene, keywords, watch)
     from ..jobs.search import SearchJob, make_optimizer
 
     optimizer = make_optimizer(method, env, seed=seed, options=method_options)
-    if not is_environment(env):
-        return _search_in_memory(env, optimizer, budget, out, watch)
+    if is_in_memory(env, out):
+        return _search_in_memory(env, optimizer, budget, watch)
     command = say_call("optimize", scene, method, budget=budget, seed=seed, **keywords)
     job = SearchJob.of(
         env, optimizer, budget=budget, command=command, out=Path(out) if out is not None else None, force=force
@@ -56,7 +53,7 @@ def optimize(
 
 
 def race(
-    scene: str | type[Environment] | Environment | SceneSpec,
+    scene: Scene,
     methods: str | Sequence[str] = (),
     *,
     budget: int = 1000,
@@ -110,17 +107,11 @@ def open_run(path: str | Path) -> Run:
     return RunStore.open(store_in(Path(path), RUN_STORE)).read()
 
 
-def _search_in_memory(
-    objective: Objective, optimizer: Optimizer, budget: int, out: str | Path | None, watch: Watch
-) -> Run:
-    """Search an objective of which nothing says what decides its numbers, so that no run of it can be continued."""
-    from ..landscapes.objective import name_of
+def _search_in_memory(env: Environment, optimizer: Optimizer, budget: int, watch: Watch) -> Run:
+    """Search without keeping the run on disk."""
     from ..landscapes.threads import one_torch_thread
     from ..optim.search import search
 
-    if out is not None:
-        who = name_of(objective)
-        raise ValueError(f"runs of environments are kept on disk; {who} is none, so leave out the folder")
     with one_torch_thread(), watch.progress(budget) as advance:
-        store = search(objective, optimizer, budget=budget, progress=lambda now: advance(now.done))
+        store = search(env, optimizer, budget=budget, progress=lambda now: advance(now.done))
     return store.read()

@@ -8,19 +8,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 from ..jobs.cut import cut, describe_cut
-from ..jobs.scene import SceneSpec, environment_of, with_policy
+from ..jobs.scene import environment_of, with_policy
 from ..jobs.watch import Watch
-from ..landscapes.adapters import within_box
-from ..landscapes.objective import name_of
+from ..landscapes.objective import BoxedObjective
 from ..landscapes.space import as_stride
 from .progress import default_watch
-from .scene import SceneKeywords, is_environment, objective_of, say_call, say_cut
+from .scene import Scene, SceneKeywords, environment, is_in_memory, say_call, say_cut
 
 if TYPE_CHECKING:
+    import xarray as xr
     from jaxtyping import Float
     from torch import Tensor
 
-    from ..envs.base import Environment
     from ..landscapes.objective import Objective
     from ..landscapes.plane import Plane
     from ..landscapes.sampling.refine import Refinement
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def slice(
-    scene: str | type[Environment] | Objective | SceneSpec,
+    scene: Scene,
     dims: Sequence[int | str] | None = None,
     *,
     along: str | None = None,
@@ -45,13 +44,14 @@ def slice(
 ) -> Slice:
     """Sample losses and gradients of a scene over a plane through its parameter space, and return the slice.
 
-    `scene` is an environment's name, FILE.py:Class, its class, itself, or anyone's objective (`from_torch`,
-    `from_numpy`). `dims` are one or two parameters, by number or by name; `through` is the point that the plane goes
-    through, and `extent` what it covers: a fraction of the box around that point, or two ends [the parameters' unit];
-    the whole box by default. `along` names directions instead of `dims`: random:SEED, gradient, hessian, pca:RUN, a
-    line A:B or a plane A:B:C between points; what lies off the box is left out. The samples lie in the folder `out`,
-    by default one under out/ named after the slice: the same call goes on there where it stopped. An objective that is
-    no environment is sampled in memory without `out`.
+    `scene` is an environment's name, FILE.py:NAME, its class or itself, as `from_torch` and its like make one of a
+    function, or an object with `space` and `evaluate`. `dims` are one or two parameters, by number or by name, by
+    default all where there are no more. `through` is the point that the plane goes through: its name, or a point as
+    `evaluate` takes it, with the decimal logarithm of a logarithmic parameter. `extent` is what it covers: a fraction
+    of the box around that point, or two values [the parameters' unit]; the whole box by default. `along` names
+    directions instead of `dims`: random:SEED, gradient, hessian, pca:RUN, a line A:B or a plane A:B:C between points;
+    what lies off the box is left out. The samples lie in the folder `out`, by default one under out/ named after the
+    slice: the same call goes on there where it stopped. A function is sampled in memory without `out`.
 
     `gradients` says whether it has any, or at every how many samples along each axis: 4 has losses at all samples, and
     gradients at a sixteenth of them.
@@ -67,21 +67,18 @@ def slice(
     which `force` replaces; Stopped where it is interrupted.
     """
     watch = default_watch()
-    objective = objective_of(scene, keywords, watch)
-    if policy is not None:
-        if not is_environment(objective):
-            raise ValueError(f"a policy decides in an environment; got the objective {name_of(objective)}")
-        objective, gradients = with_policy(objective, policy), 0
+    env = environment(scene, keywords, watch)
+    objective, gradients = with_policy(env, policy), gradients if policy is None else 0
     from ..landscapes.sampling.refine import Refinement
 
     fine, folder = Refinement.of(refine, budget), Path(out) if out is not None else None
-    in_memory = out is None and policy is None and not is_environment(objective)
+    in_memory = is_in_memory(env, out)
     stride = as_stride(gradients)
     begun: dict[str, Any] = {"out": folder, "gradients": stride, "refinement": fine}
     where: dict[str, Any] = {"through": through, "extent": extent, "resolution": resolution}
     plane = cut(objective, dims, along, **where, kept=None if force or in_memory else begun)
     if in_memory:
-        return _sample_in_memory(within_box(objective) if along else objective, plane, fine, watch, stride)
+        return _sample_in_memory(BoxedObjective(objective) if along else objective, plane, fine, watch, stride)
     from ..jobs.slice import SliceJob
 
     how = {"refine": refine, "budget": budget, "policy": policy}
@@ -90,24 +87,39 @@ def slice(
     named = describe_cut(along, through, extent)
     job = SliceJob.of(objective, plane, command=command, cut=named, force=force, **begun)
     job.run(watch)
-    return _open(job.folder, lambda: objective)
+    return _open(job.folder, None, lambda: objective)
 
 
-def open_slice(path: str | Path) -> Slice:
+def sample(scene: Scene, plane: Plane, *, gradients: bool | int = True) -> xr.Dataset:
+    """Evaluate a simulator on any plane, in memory, and return the samples.
+
+    `gradients` is that of `slice`. Raises ValueError for what is no simulator, and for a plane of another space.
+    """
+    from ..envs.registry import as_environment
+    from ..landscapes.sampling.fill import sample as fill
+
+    return fill(as_environment(scene), plane, gradients=as_stride(gradients))
+
+
+def open_slice(path: str | Path, *, env: Scene = None) -> Slice:
     """Open a slice: the folder that `slice` or `landscape slice` left it in, or its store.
+
+    `env` is the simulator that it was sampled from, where it is not registered by its name: a function, a class or
+    FILE.py:NAME. It is needed only for what evaluates anew, such as `report`.
 
     What is not sampled yet is NaN, with status MISSING. Raises StoreError, a ValueError, where there is no slice, and
     where it is damaged.
     """
-    return _open(Path(path), None)
+    return _open(Path(path), env, None)
 
 
-def _open(path: Path, remake: Callable[[], Objective] | None) -> Slice:
+def _open(path: Path, env: Scene, remake: Callable[[], Objective] | None) -> Slice:
     from ..landscapes.slice import Slice
     from ..landscapes.storage.store import open_slice
 
     dataset = open_slice(path)
-    return Slice(dataset, path if path.suffix != ".zarr" else None, remake or (lambda: environment_of(dataset, "auto")))
+    folder = path if path.suffix != ".zarr" else None
+    return Slice(dataset, folder, remake or (lambda: environment_of(dataset, "auto", env)))
 
 
 def _sample_in_memory(

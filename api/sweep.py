@@ -7,20 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 from ..jobs.cut import cut, describe_cut
-from ..jobs.scene import SceneSpec
 from .progress import default_watch
-from .scene import SceneKeywords, environment, say_call, say_cut
+from .scene import Scene, SceneKeywords, environment, say_call, say_cut
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-    from ..envs.base import Environment
     from ..landscapes.draw.figures.sweep import Sweep
 
 
 def sweep(
-    scene: str | type[Environment] | Environment | SceneSpec,
+    scene: Scene,
     dims: Sequence[int | str] | None = None,
     over: int | str | None = None,
     *,

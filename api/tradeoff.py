@@ -6,18 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Unpack, overload
 
-from ..jobs.scene import SceneSpec
 from .progress import default_watch
-from .scene import SceneKeywords, say_call, spec_of
+from .scene import Scene, SceneKeywords, say_call, spec_of
 
 if TYPE_CHECKING:
-    from ..envs.base import Environment
+    from ..jobs.scene import SceneSpec
     from ..landscapes.measures.convergence_record import Convergence
     from ..landscapes.measures.mixed import MixedTradeoff
     from ..landscapes.measures.model import ModelStudy
     from ..landscapes.measures.tradeoff import Tradeoff
-
-    Scene = str | type[Environment] | Environment | SceneSpec
 
 
 @overload

@@ -24,7 +24,7 @@ from gradscape.gallery.figures import Figure
 from gradscape.gallery.files import STORE
 from gradscape.gallery.paper import PaperCaption
 from gradscape.gallery.site.build import build_site
-from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
@@ -63,7 +63,7 @@ MEASURE = """async ([kind, move, frames]) => {
 }"""
 
 
-class Rugged:
+class Rugged(Objective):
     """Ripples on a bowl, with a disc where nothing is finite."""
 
     name = "rugged"

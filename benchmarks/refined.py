@@ -70,7 +70,7 @@ class Row:
         return f"> {self.points / self.sampled:.1f}" if math.isinf(full) else f"{full / self.sampled:.2g}"
 
 
-class Known:
+class Known(Objective):
     """Answer from a slice that was sampled everywhere."""
 
     def __init__(self, objective: Objective, plane: Plane, dataset: Any) -> None:

@@ -32,7 +32,7 @@ from gradscape.landscapes.objective import Evaluation, Objective, Status
 # Workers import this file, and must choose their GPU before an engine starts: what starts one is imported in functions.
 
 
-class Pretended:
+class Pretended(Objective):
     """Take as long for an evaluation as a GPU that does `rate` episodes a second, and no core."""
 
     def __init__(self, env: str, fidelity: str, rate: float, batch: int) -> None:

@@ -12,114 +12,155 @@ from typing import Annotated, Any
 
 import typer
 
+from ..envs.registry import refuse_unknown
 from ..jobs.scene import SceneSpec
 
 Env = Annotated[
     str,
     typer.Argument(
-        metavar="ENV", help="The environment: one that `landscape envs` lists, or a class in a file, FILE.py:Class."
+        metavar="ENV",
+        help="The environment: a name that `landscape envs` lists, or FILE.py:NAME for a simulator in "
+        "a file of your own.",
     ),
 ]
 Of = Annotated[
     str | None,
-    typer.Option("--env", help="Where the slice's environment is, if it is a class in a file: FILE.py:Class."),
+    typer.Option(
+        "--env",
+        help="The simulator that the slice was sampled from, as FILE.py:NAME, if it is not a registered environment.",
+    ),
 ]
 Dims = Annotated[
     list[str],
-    typer.Option("--dims", metavar="DIM [DIM]", help="The one or two parameters to vary, by number or by name."),
+    typer.Option("--dims", metavar="DIM [DIM]", help="One or two parameters to vary, by number or by name."),
 ]
 SomeDims = Annotated[
     list[str] | None,
-    typer.Option("--dims", metavar="DIM [DIM]", help="The one or two parameters to vary, by number or by name."),
+    typer.Option(
+        "--dims",
+        metavar="DIM [DIM]",
+        help="One or two parameters to vary, by number or by name. An environment with at most two needs none.",
+    ),
 ]
 Along = Annotated[
     str | None,
     typer.Option(
-        help="Instead of --dims: random:SEED, gradient, hessian, pca:RUN, a line between two points A:B, or the plane "
-        "through three, A:B:C."
+        help="Directions to vary instead of --dims: random:SEED, gradient, hessian, pca:RUN, the line "
+        "A:B through two points, or the plane A:B:C through three."
     ),
 ]
-Resolution = Annotated[int, typer.Option(min=2, help="Points along each axis.")]
-Fidelity = Annotated[str | None, typer.Option(help="How accurately to simulate: draft, standard or reference.")]
+Resolution = Annotated[int, typer.Option(min=2, help="Number of points along each axis.")]
+Fidelity = Annotated[
+    str | None,
+    typer.Option(help="Accuracy of the simulation: draft, standard or reference. The default is the cheapest."),
+]
 Tolerance = Annotated[
     str | None,
     typer.Option(
-        help="Instead of --fidelity: the quickest that `landscape tradeoff` found within this loss error, 5% of the "
-        "losses' spread or a number in their unit."
+        help="Pick the fastest fidelity whose measured loss error is below this: 5% of the spread of "
+        "losses, or a number in their unit. `landscape tradeoff` measures the errors."
     ),
 ]
-Device = Annotated[str, typer.Option(help="auto, cpu or cuda; auto takes CUDA where it is.")]
+Device = Annotated[
+    str, typer.Option(help="Device to compute on: auto, cpu or cuda. auto takes CUDA if there is a GPU.")
+]
 Deterministic = Annotated[
-    bool, typer.Option("--deterministic", help="Refuse an engine whose results on a GPU are not the same every time.")
+    bool, typer.Option("--deterministic", help="Fail if the engine is not reproducible on a GPU.")
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Random seed.")]
 Engine = Annotated[
     str | None,
     typer.Option(
-        help="One of the scene's engines, by default its first: warp, or taichi where a scene has it, the reference to "
-        "hold Warp against."
+        help="Engine that simulates. The default is the first of the environment, usually warp; some "
+        "also have taichi, as an independent reference."
     ),
 ]
-Set = Annotated[list[str] | None, typer.Option("--set", help="A scene option, name=value; may be repeated.")]
+Set = Annotated[
+    list[str] | None, typer.Option("--set", help="An option of the environment, as name=value. It may be repeated.")
+]
 Out = Annotated[
-    str | None, typer.Option(help="Folder for the results; by default one under out/ named after the slice.")
+    str | None, typer.Option(help="Folder for the results. The default is named after the slice, under out/.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print the summary as one JSON object on standard output.")]
-Force = Annotated[bool, typer.Option("--force", help="Begin anew where a slice exists already.")]
-Budget = Annotated[int, typer.Option(min=1, help="Episodes to evaluate, not one more.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace a slice that exists already.")]
+Budget = Annotated[int, typer.Option(min=1, help="Number of episodes to evaluate. It is never exceeded.")]
 OutOfRun = Annotated[
-    str | None, typer.Option("--out", help="Folder for the results; by default one under out/ named after the run.")
+    str | None, typer.Option("--out", help="Folder for the results. The default is named after the run, under out/.")
 ]
-ForceRun = Annotated[bool, typer.Option("--force", help="Begin anew where a run exists already.")]
+ForceRun = Annotated[bool, typer.Option("--force", help="Replace a run that exists already.")]
 OutOfStudy = Annotated[
-    str | None, typer.Option("--out", help="Folder for the results; by default one under out/ named after the study.")
+    str | None, typer.Option("--out", help="Folder for the results. The default is named after the study, under out/.")
 ]
-ForceStudy = Annotated[bool, typer.Option("--force", help="Begin anew where a study exists already.")]
+ForceStudy = Annotated[bool, typer.Option("--force", help="Replace a study that exists already.")]
 Extent = Annotated[
     str | None,
-    typer.Option(help="What to cover: a fraction of the box around the point, or LOW:HIGH; the whole box by default."),
+    typer.Option(
+        help="Range to cover: a fraction of the box around the point, or the values LOW:HIGH. The "
+        "default is the whole box."
+    ),
 ]
 Through = Annotated[
     str,
     typer.Option(
-        help="The point it goes through: center, random:SEED, example:NAME, best, best:RUN, a file of numbers, or a "
-        "row of a table, TABLE.csv:ROW, by default the one of the least loss; slice and sweep take several, "
+        help="Point that the slice passes through: center, random:SEED, example:NAME, best, best:RUN, "
+        "a file of numbers, or a row of a table, TABLE.csv:ROW. Row 1 of a table is its heading; "
+        "without ROW it is the row with the lowest loss. slice and sweep take several points, "
         "A,B."
     ),
 ]
 Scheduler = Annotated[
     str | None,
     typer.Option(
-        help="Dask workers to compute on: the address of a scheduler, or local:N for N of them here; local alone has "
-        "one per GPU, or per core."
+        help="Compute on Dask workers: the address of a scheduler, or local:N for N workers on this "
+        "machine. local alone starts one per GPU, or per core."
     ),
 ]
 Policy = Annotated[
     str | None,
     typer.Option(
-        help="Sample over the weights of a policy instead of the environment's own parameters: mlp:32x32, a perceptron "
-        "with two hidden layers of 32 that decides by what it sees. Losses only."
+        help="Sample over the weights of a neural policy instead of the parameters of the environment:"
+        " mlp:32x32 has two hidden layers of 32. It has losses only."
     ),
 ]
 Gradients = Annotated[
     int,
-    typer.Option(
-        "--gradients", min=1, help="Have gradients at every so many samples along each axis, losses at all of them."
-    ),
+    typer.Option("--gradients", min=1, help="Compute gradients only at every N-th sample per axis."),
 ]
-NoGradients = Annotated[bool, typer.Option("--no-gradients", help="Sample losses only.")]
+NoGradients = Annotated[bool, typer.Option("--no-gradients", help="Compute losses without gradients.")]
 Refine = Annotated[
     str | None,
     typer.Option(
         metavar="SHARE",
-        help="Sample only where neighbours and their gradients do not explain what is between them, until 95 % of the "
-        "other points are exact to this share of the range of the losses: 1%.",
+        help="Adaptive sampling: refine until 95 % of the interpolated points are within this fraction"
+        " of the loss range, such as 1%.",
     ),
 ]
 RefineBudget = Annotated[
     int | None,
-    typer.Option("--budget", min=1, help="The same with this many points at most, alone or with --refine."),
+    typer.Option(
+        "--budget", min=1, help="Adaptive sampling with at most this many points, alone or together with --refine."
+    ),
 ]
+Methods = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Methods to race, a,b or repeated. The default is all that can run here; `landscape methods` lists them."
+    ),
+]
+Seeds = Annotated[int, typer.Option(min=1, help="Number of runs per method, with seeds 0, 1, ...")]
+Processes = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        help="Number of processes that fit Gaussian processes. The default is one per core; results do not "
+        "depend on it.",
+    ),
+]
+MethodOption = Annotated[
+    list[str] | None, typer.Option(help="An option of a method, as METHOD.NAME=VALUE. It may be repeated.")
+]
+Claims = Annotated[bool, typer.Option("--report", help="Check the paper's claims about which method wins.")]
+ForceRuns = Annotated[bool, typer.Option("--force", help="Replace runs that exist already.")]
 Print = Annotated[
     list[float] | None,
     typer.Option(
@@ -127,13 +168,13 @@ Print = Annotated[
         metavar="MM",
         min=80,
         max=400,
-        help="Also write the picture for print, as PDF and SVG, this wide [mm]: 85 for a column, 170 for a page; may "
-        "be repeated.",
+        help="Also write the figure for print, as PDF and SVG of this width [mm]: 85 for a column, 170"
+        " for a page. It may be repeated.",
     ),
 ]
 Data = Annotated[
     str | None,
-    typer.Option(help="Folder of the figures' data; by default a checkout's own, or else out/gallery-data."),
+    typer.Option(help="Folder with the data of the figures. The default is that of a checkout, else out/gallery-data."),
 ]
 
 SCENE: dict[str, tuple[Any, Any]] = {
@@ -182,7 +223,24 @@ def takes_scene(*without: str, **fixed: Any) -> Callable[[Callable[..., None]], 
 
 
 def _scene(*, env: str, set_: Sequence[str] | None = None, **how: Any) -> SceneSpec:
-    return SceneSpec(env, **how, options=read_settings(set_ or []))
+    scene = SceneSpec(env, **how, options=read_settings(set_ or []))
+    refuse_words(scene)
+    return scene
+
+
+def refuse_words(scene: SceneSpec, dims: Sequence[str] | None = None, policy: str | None = None) -> None:
+    """Raise ValueError for what a scene cannot have, as far as that is known before what simulates is imported.
+
+    Parameters are numbered as its class has them; options of the scene and a `policy` may change that.
+    """
+    if not isinstance(scene.name, str) or not scene.name:
+        return
+    numbered = () if scene.options or policy else dims or ()
+    refuse_unknown(scene.name, fidelity=scene.fidelity, device=scene.device, engine=scene.engine, dims=numbered)
+    if scene.tolerance is not None:
+        from ..jobs.tolerance import tolerance_of
+
+        tolerance_of(scene)
 
 
 def read_settings(settings: Sequence[str], flag: str = "--set") -> dict[str, Any]:
@@ -197,6 +255,11 @@ def read_settings(settings: Sequence[str], flag: str = "--set") -> dict[str, Any
         if flag == "--set" and name in OWN:
             raise ValueError(f"{flag} takes a scene's own options; {name} is none, and chosen by --{name} if at all")
     return {name: value for name, _, value in pairs}
+
+
+def read_names(texts: Sequence[str] | None) -> list[str]:
+    """Return names given as a,b or repeated."""
+    return [name.strip() for text in texts or () for name in text.split(",") if name.strip()]
 
 
 def read_share(text: str | None, flag: str) -> float | None:
@@ -217,4 +280,6 @@ def read_extent(text: str | None) -> float | tuple[float, float] | None:
     try:
         return (float(low), float(high)) if colon else float(low)
     except ValueError:
-        raise ValueError(f"--extent takes a fraction or LOW:HIGH in the parameters' unit; got {text!r}") from None
+        raise ValueError(
+            f"--extent takes a fraction or values LOW:HIGH in the parameters' unit; got {text!r}"
+        ) from None

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ..jobs.scene import SceneSpec
-from .arguments import Json, takes_scene
+from .arguments import Json, refuse_words, takes_scene
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -22,27 +23,31 @@ if TYPE_CHECKING:
 @takes_scene("tolerance")
 def bench(
     scene: SceneSpec,
-    against: Annotated[str | None, typer.Option(help="Another engine, to run in turn with the first.")] = None,
+    against: Annotated[str | None, typer.Option(help="A second engine, timed in turn with the first.")] = None,
     batch: Annotated[
         list[int] | None,
-        typer.Option(min=1, help="Episodes at once; may be repeated. By default 1 and what the environment prefers."),
+        typer.Option(
+            min=1,
+            help="Batch size in episodes. It may be repeated; the default is 1 and the preferred batch of "
+            "the environment.",
+        ),
     ] = None,
-    seconds: Annotated[float, typer.Option(min=0.0, help="How long to time each batch size, about.")] = 10.0,
+    seconds: Annotated[float, typer.Option(min=0.0, help="Approximate time to spend on each batch size [s].")] = 10.0,
     roofline: Annotated[
-        bool, typer.Option(help="Hold each kernel against what the device moves and calculates at best, as measured.")
+        bool,
+        typer.Option(help="Compare each kernel with the measured memory bandwidth and arithmetic peak of the device."),
     ] = False,
     json_: Json = False,
 ) -> None:
-    """Measure episodes per second, forward and with gradient, and what they are spent on; nothing is written.
+    """Measure episodes per second, with and without gradients, and where the time goes.
 
-    Rates are the best of repetitions that alternate; with --against, engines alternate too, and ratios are of one run.
+    Rates are the best of alternating repetitions. With --against the engines alternate too, so that ratios come from
+    one run. It writes no file.
 
     Example: landscape bench fluid --against taichi
     """
-    from ..envs.registry import environment_class
-
-    if isinstance(scene.name, str):
-        environment_class(scene.name)  # a name that does not exist is refused before what measures is loaded
+    if against is not None:
+        refuse_words(replace(scene, engine=against))
     from ..jobs.bench import BenchJob
     from .terminal import Bars, Console, command_line, print_json
 

@@ -17,9 +17,11 @@ if TYPE_CHECKING:
 def card(
     scenes: Annotated[
         list[str] | None,
-        typer.Option("--scene", help='A scene of the card, "flight" or another; may be repeated; all by default.'),
+        typer.Option(
+            "--scene", help="A scene of the card, such as flight. It may be repeated; the default is all scenes."
+        ),
     ] = None,
-    resolution: Annotated[int, typer.Option(min=3, help="Points along each axis of the small slices.")] = 17,
+    resolution: Annotated[int, typer.Option(min=3, help="Number of points along each axis of the small slices.")] = 17,
     device: Device = "auto",
     out: OutOfStudy = None,
     print_: Print = None,
@@ -28,10 +30,10 @@ def card(
 ) -> None:
     """Check the gradients of several engines in the same scenes, and show their landscapes side by side.
 
-    Every engine that is installed, ours included, goes through `landscape check` and is cut along one small plane. The
-    folder then holds card.json, with the findings, the versions and the commands, and card.png. Nothing of it is
-    written down beforehand: another release of an engine is measured anew. Stop it at any moment: the same command goes
-    on with the next engine. The exit code is 0 whatever is found.
+    Every installed engine, ours included, goes through `landscape check` and is sampled on one small plane. The folder
+    then holds card.json (findings, versions and commands) and card.png. All of it is measured, so another release of
+    an engine is measured again. Stop at any time: the same command goes on with the next engine. The exit code is
+    always 0.
 
     Example: landscape card --scene "flight"
     """

@@ -18,22 +18,25 @@ if TYPE_CHECKING:
 @takes_scene("deterministic")
 def census(
     scene: SceneSpec,
-    slices: Annotated[int, typer.Option(min=1, help="Slices, about as many base points as cuts.")] = 64,
-    resolution: Annotated[int, typer.Option(min=6, help="Points along each axis of a slice.")] = 24,
+    slices: Annotated[int, typer.Option(min=1, help="Number of slices.")] = 64,
+    resolution: Annotated[int, typer.Option(min=6, help="Number of points along each axis of a slice.")] = 24,
     gradients: Annotated[
         int,
         typer.Option(
             min=1,
-            help="Have gradients at every so many samples along each axis, losses at all: 2 takes half the time where "
-            "a gradient takes three times a loss.",
+            help="Compute gradients only at every N-th sample per axis. 2 halves the time if a gradient "
+            "costs as much as three losses.",
         ),
     ] = 1,
     along: Annotated[
-        str, typer.Option(help="What cuts are: pairs of parameters over the whole box, or random directions over it.")
+        str,
+        typer.Option(
+            help="How slices are oriented: pairs of parameters, or random directions, both over the whole box."
+        ),
     ] = "pairs",
     also: Annotated[
         str | None,
-        typer.Option(help="A fidelity at which one slice of each base point is measured, too: how much that changes."),
+        typer.Option(help="Repeat one slice per base point at this fidelity, to see its effect."),
     ] = None,
     seed: Seed = 0,
     out: OutOfStudy = None,
@@ -42,12 +45,12 @@ def census(
     json_: Json = False,
     force: ForceStudy = False,
 ) -> None:
-    """Sample many slices through random points along random cuts, and say what they have in common.
+    """Measure many random slices of an environment, and report what they have in common.
 
-    One slice says what the landscape is like there. A census measures each of many as `report` does, and says which
-    share of them every word fits, how every measure is distributed, and how much of its variance goes with the point,
-    the cut, the resolution and the fidelity. The folder then holds census.json, census.npz with the losses, and
-    census.png. Stop it at any moment: the same command goes on with the next slice.
+    A census measures each slice as `landscape report` does. It says to which fraction of the slices each word applies,
+    how each measure is distributed, and how much of its variance comes from the point, the orientation, the resolution
+    and the fidelity. The folder then holds census.json, census.npz (the losses) and census.png. Stop at any time: the
+    same command goes on with the next slice.
 
     Example: landscape census bounce --slices 16
     """

@@ -30,17 +30,17 @@ STYLES = {
 @takes_scene("tolerance", "deterministic")
 def check(
     scene: SceneSpec,
-    points: Annotated[int, typer.Option(min=2, help="Random points of the box to check at.")] = 4,
+    points: Annotated[int, typer.Option(min=2, help="Number of random points to check at.")] = 4,
     seed: Seed = 0,
     json_: Json = False,
 ) -> None:
-    """Check that an environment keeps what every environment promises, and that it answers at the extremes.
+    """Check that the gradients of an environment are right, and that it behaves at the extremes.
 
-    Checked are shapes, refusals, batches, determinism, gradients against differences over several steps and at special
-    places, their growth with the length of an episode, forward against reverse differentiation where both exist,
-    corners of the box and beyond, long time steps, materials, horizons and precision. Each check prints a line; nothing
-    is written. A warning is no failure: the gradient is right, and of no use over an optimiser's step. The exit code is
-    0 where the environment passes and 1 where it fails.
+    It checks shapes, refusals, batches, determinism, gradients against differences at several steps and at special
+    points, their growth with the horizon, forward against reverse differentiation if both exist, corners of the box
+    and beyond, long time steps, materials, horizons and precision. Each check prints a line. A warning is no failure:
+    the gradient is right, but useless over an optimiser's step. The exit code is 0 if the environment passes, else 1.
+    It writes no file.
 
     Example: landscape check bounce
     """

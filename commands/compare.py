@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..jobs.scene import SceneSpec
-from .arguments import Json, Print, takes_scene
+from .arguments import Json, Print, refuse_words, takes_scene
 
 if TYPE_CHECKING:
     from ..landscapes.measures.slice_comparison_record import SliceComparison
@@ -23,35 +23,40 @@ LISTED = 12  # settings that differ, in the terminal
 @takes_scene("env", env="")
 def compare(
     scene: SceneSpec,
-    slice_: Annotated[str, typer.Argument(metavar="SLICE", help="The slice A: its folder.")],
+    slice_: Annotated[str, typer.Argument(metavar="SLICE", help="Folder of slice A.")],
     other: Annotated[
         str,
         typer.Argument(
             metavar="SLICE|ENV",
-            help="What is held against it, B: the folder of a slice of the same plane, or an environment, which is "
-            "sampled on that plane, with the options below.",
+            help="Folder of slice B on the same plane, or an environment to sample on that plane with the "
+            "options below.",
         ),
     ],
     out: Annotated[
-        str | None, typer.Option(help="Folder for the results; by default one under out/ named after both.")
+        str | None, typer.Option(help="Folder for the results. The default is named after both slices, under out/.")
     ] = None,
     print_: Print = None,
     json_: Json = False,
     force: Annotated[
-        bool, typer.Option("--force", help="Replace another comparison that is there, and sample B anew.")
+        bool, typer.Option("--force", help="Replace a comparison that exists already, and sample B again.")
     ] = False,
 ) -> None:
-    """Hold two slices of one plane against each other: losses, their order, gradients, and where they part.
+    """Compare two slices of the same plane: losses, their order, gradients and the largest differences.
 
-    They may be of two fidelities, engines, options, versions or environments, as long as these have the same
-    parameters and the same unit of the loss. The folder then holds compare.json and compare.png, and the slice B where
-    it was sampled here. Stop it at any moment: the same command goes on where it stopped.
+    They may differ in fidelity, engine, options, version or environment, if the environments have the same parameters
+    and the same unit of the loss. The folder then holds compare.json and compare.png, and slice B if it was sampled
+    here. Stop at any time: the same command goes on from there.
 
     Example: landscape compare out/my-slice bounce --fidelity standard
     """
+    from ..landscapes.storage.paths import refuse_missing
+    from .terminal import Bars, Console, command_line, print_json
+
+    refuse_missing(slice_, "slice")
+    if not Path(other).exists():
+        refuse_words(replace(scene, name=other))
     from ..api.slice import open_slice
     from ..jobs.compare import PICTURE, RECORD, CompareJob
-    from .terminal import Bars, Console, command_line, print_json
 
     bars = Bars()
     second = _second(other, scene, bars)  # which may be refused at once

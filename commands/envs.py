@@ -7,11 +7,13 @@ from typing import Annotated
 import typer
 
 
-def envs(name: Annotated[str | None, typer.Argument(help="One environment, to show it in full.")] = None) -> None:
-    """List the environments: name, dimension, parameters, model and fidelities.
+def envs(
+    name: Annotated[str | None, typer.Argument(help="Name of the environment to describe in full.")] = None,
+) -> None:
+    """List the environments, or describe one in full.
 
-    With NAME it shows one in full: what it models, bounds, fidelities, engines, options and examples, and how far its
-    step is from what is stable, where `landscape extremes` measured it. It writes no file.
+    With NAME it shows what the environment models, its bounds, fidelities, engines, options and examples, and how
+    close its time step is to the stability limit, if `landscape extremes` measured that. It writes no file.
 
     Example: landscape envs fluid
     """
@@ -40,24 +42,28 @@ def _list() -> None:
 
 def _describe(name: str) -> None:
     """Print all there is to know about one environment."""
-    from dataclasses import asdict
+    from ..envs.registry import make, refuse_unknown
 
-    from ..envs.registry import make
+    refuse_unknown(name)
     from ..gallery.paper import read_paper
     from ..jobs.margins import say_margins
     from ..landscapes.options import in_full
+    from ..landscapes.space import LOG10
     from .terminal import Console, table
 
     env, console = make(name, device="cpu"), Console(soft_wrap=True, highlight=False)
     about = env.about() or "It says nothing of itself: its class has no docstring."
     console.print(f"{env.name}: {env.space.dim} parameter{'s' if env.space.dim > 1 else ''}\n\n{about}\n")
     bounded = table("no.", "parameter", "lower", "upper", "unit")
-    bounds = zip(env.space.lower.tolist(), env.space.upper.tolist(), strict=True)
-    for number, (label, unit, (lower, upper)) in enumerate(zip(env.space.names, env.space.units, bounds, strict=True)):
-        bounded.add_row(str(number), label, f"{lower:g}", f"{upper:g}", unit)
+    space = env.space
+    lower, upper = (space.to_values(end).tolist() for end in (space.lower, space.upper))
+    rows = zip(space.names, space.scales, lower, upper, space.units, strict=True)
+    for number, (one, scale, low, high, unit) in enumerate(rows):
+        label = f"{one} (logarithmic)" if scale == LOG10 else one
+        bounded.add_row(str(number), label, f"{low:g}", f"{high:g}", unit)
     console.print(bounded)
     for fidelity in env.fidelities.values():
-        console.print(f"fidelity {asdict(fidelity)}")
+        console.print(f"fidelity {fidelity.record()}")
     console.print(f"engines: {', '.join(env.engines)}")
     for said in say_margins(env) if any(one.dt for one in env.fidelities.values()) else ():
         console.print(said)

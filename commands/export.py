@@ -9,18 +9,21 @@ import typer
 
 
 def export(
-    what: Annotated[str, typer.Argument(metavar="SLICE|RUN", help="The folder of a slice or of a run.")],
-    to: Annotated[str, typer.Option(help="csv, parquet or netcdf.")] = "csv",
-    out: Annotated[str | None, typer.Option(help="The file to write; by default one beside the slice or run.")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace the file where it exists already.")] = False,
+    what: Annotated[str, typer.Argument(metavar="SLICE|RUN", help="Folder of a slice or of a run.")],
+    to: Annotated[str, typer.Option(help="Format to write: csv, parquet or netcdf.")] = "csv",
+    out: Annotated[str | None, typer.Option(help="File to write. The default lies beside the slice or run.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that exists already.")] = False,
 ) -> None:
-    """Write a slice or a run as a table that other programs read.
+    """Write a slice or a run as CSV, Parquet or netCDF, for other programs.
 
-    The file has a row for each sample or episode, and columns with units; it is slice.csv or run.csv in the folder,
-    unless --out says another. netCDF holds the arrays themselves, with names, units and how they were made.
+    A table has a row per sample or episode, and columns with units. netCDF holds the arrays with names, units and
+    provenance. The default file is slice.csv or run.csv in the folder.
 
     Example: landscape export out/my-run --to parquet
     """
+    from ..landscapes.storage.paths import refuse_missing
+
+    refuse_missing(what, "slice and no run")
     from ..jobs.export import export as write
     from .terminal import Bars
 

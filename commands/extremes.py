@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..jobs.scene import SceneSpec
-from .arguments import ForceStudy, Json, OutOfStudy, Print, Seed, takes_scene
+from .arguments import ForceStudy, Json, OutOfStudy, Print, Seed, read_names, takes_scene
 
 if TYPE_CHECKING:
     from ..landscapes.measures.extremes import Extremes, Limit
@@ -18,41 +18,54 @@ if TYPE_CHECKING:
 @takes_scene("tolerance", "deterministic")
 def extremes(
     scene: SceneSpec,
-    points: Annotated[int, typer.Option(min=4, help="Corners of the box and Sobol points that decide.")] = 16,
+    points: Annotated[
+        int, typer.Option(min=4, help="Number of corners of the box and Sobol points to simulate at each setting.")
+    ] = 16,
     seed: Seed = 0,
     knobs: Annotated[
         list[str] | None,
         typer.Option(
-            help="What to turn, a,b or repeated: dt, resolution, box, horizon, or an option of the scene that is a "
-            "number above 0; by default the first four and what says how stiff the scene is."
+            help="Settings to vary, a,b or repeated: dt, resolution, box, horizon, or an option of the "
+            "environment that is a positive number. The default is the first four and the contact "
+            "stiffness."
         ),
     ] = None,
     pairs: Annotated[
         list[str] | None,
-        typer.Option(help="Pairs of knobs to map, dt:ke or repeated, or none; by default dt against the others."),
+        typer.Option(
+            help="Pairs of settings to map, as dt:ke, or none. It may be repeated; the default is dt with "
+            "each other setting."
+        ),
     ] = None,
     precisions: Annotated[
-        list[str] | None, typer.Option(help="float32, float64 or both; by default both where the scene has them.")
+        list[str] | None,
+        typer.Option(
+            help="Precision to test: float32, float64 or both. The default is both if the environment has them."
+        ),
     ] = None,
-    grid: Annotated[int, typer.Option(min=2, max=64, help="Values of each knob on a map.")] = 8,
-    width: Annotated[float, typer.Option(help="Relative width to which limits are bisected.")] = 0.05,
+    grid: Annotated[int, typer.Option(min=2, max=64, help="Number of values of each setting on a map.")] = 8,
+    width: Annotated[float, typer.Option(help="Relative width at which the bisection of a limit stops.")] = 0.05,
     accuracy: Annotated[
-        float, typer.Option(help="Loss error in 95 % of the points that is accurate, as a share of the spread.")
+        float,
+        typer.Option(
+            help="Loss error that counts as accurate, at the 95th percentile and as a fraction of the spread of losses."
+        ),
     ] = 0.1,
     against: Annotated[
-        str | None, typer.Option(help="The fidelity that judges finite losses; by default the last, the reference.")
+        str | None,
+        typer.Option(help="Fidelity that finite losses are compared with. The default is the last, the reference."),
     ] = None,
     out: OutOfStudy = None,
     print_: Print = None,
     json_: Json = False,
     force: ForceStudy = False,
 ) -> None:
-    """Find how far a scene's knobs can be turned before it fails: step, grid, stiffness, controls, length.
+    """Find how far time step, grid, stiffness, controls and horizon can be turned before a simulation fails.
 
-    Each knob is scanned, then its first failure is bisected; pairs of knobs are mapped. Finite losses are held against
-    the reference: a fluid that explodes politely is still wrong. The fidelity is standard unless another is given. The
-    folder then holds extremes.json and extremes.png; `landscape envs NAME` says what was found of the step. Stop it at
-    any moment: the same command goes on with the next setting.
+    Each setting is scanned and its first failure bisected; pairs of settings are mapped. Finite losses are compared
+    with the reference, because a simulation can be stable and wrong. The default fidelity is standard. The folder then
+    holds extremes.json and extremes.png; `landscape envs NAME` shows what was found about the time step. Stop at any
+    time: the same command goes on with the next setting.
 
     Example: landscape extremes bounce --knobs dt,ke
     """
@@ -61,7 +74,11 @@ def extremes(
     from .terminal import Bars, Console, command_line, print_json
 
     how: dict[str, Any] = {"points": points, "seed": seed, "grid": grid, "width": width, "accuracy": accuracy}
-    how |= {"knobs": _split(knobs), "pairs": None if pairs is None else _split(pairs), "precisions": _split(precisions)}
+    how |= {
+        "knobs": read_names(knobs),
+        "pairs": None if pairs is None else read_names(pairs),
+        "precisions": read_names(precisions),
+    }
     how |= {"reference": against, "out": Path(out) if out else None, "force": force, "prints": print_ or []}
     bars, job = Bars(), ExtremesJob.open(scene, **how, command=command_line())
     found = job.run(bars)
@@ -72,10 +89,6 @@ def extremes(
     )
     if json_:
         print_json(found.record(), folder=str(job.folder))
-
-
-def _split(texts: list[str] | None) -> list[str]:
-    return [part for text in texts or [] for part in text.split(",") if part]
 
 
 def show(found: Extremes, console: Console) -> None:

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from ..landscapes.plain import printable
 from .arguments import Data, Device, Fidelity, Json, Scheduler
 
 Site = Annotated[str, typer.Option(help="Folder of the site.")]
@@ -13,39 +14,44 @@ Site = Annotated[str, typer.Option(help="Folder of the site.")]
 
 def compute(
     only: Annotated[
-        list[str] | None, typer.Option(help="A figure's id or an environment; may be repeated. By default all.")
+        list[str] | None,
+        typer.Option(help="A figure's id or an environment. It may be repeated; the default is all figures."),
     ] = None,
     part: Annotated[
         list[str] | None,
         typer.Option(
-            help="slices, companions (the same cut through other points), sweeps, episodes, searches, reports, "
-            "tradeoffs, league or league-slices; may be repeated. By default all of them but the league, which takes "
-            "longest."
+            help="Part to compute: slices, companions (the same slice through other points), sweeps, "
+            "episodes, searches, reports, tradeoffs, league or league-slices. It may be repeated; the"
+            " default is all but the league, which takes longest."
         ),
     ] = None,
     fidelity: Fidelity = None,
     device: Device = "auto",
-    resolution: Annotated[int | None, typer.Option(min=2, help="Points along each axis, for all figures.")] = None,
+    resolution: Annotated[
+        int | None, typer.Option(min=2, help="Number of points along each axis, for all figures.")
+    ] = None,
     scheduler: Scheduler = None,
     data: Data = None,
 ) -> None:
-    """Compute what is missing of the figures, and say first what it should cost.
+    """Compute what is missing of the figures, after an estimate of its cost.
 
-    The folder of the data then holds a folder for each figure: slice.zarr at the figure's fidelity, companions.json of
-    the same cut through other points, episode-*.mp4 at some of its nodes, sweep.mp4 at draft fidelity, report.json and
-    measures.json. In runs/ are searches at the figures' fidelity, in tradeoff/ the accuracy of each environment against
-    its time, in league/ races of nine methods at the figures' fidelity. Stop it at any moment: the same command goes on
-    where it stopped. A figure that fails does not stop the others.
+    The data folder then holds a folder per figure: slice.zarr at the fidelity of the figure, companions.json (the same
+    slice through other points), episode-*.mp4 at some of its points, sweep.mp4 at draft fidelity, report.json and
+    measures.json. runs/ holds searches at the fidelity of the figures, tradeoff/ the accuracy and time of each
+    environment, league/ races of nine methods. Stop at any time: the same command goes on from there. A figure that
+    fails does not stop the others.
 
     Example: landscape gallery compute --only fluid --part slices --device cuda
     """
-    from ..gallery.compute import change_figures, compute_parts
     from ..gallery.figures import choose_figures, read_figures
+
+    chosen = choose_figures(read_figures(), only or [])
+    from ..gallery.compute import change_figures, compute_parts
     from ..gallery.files import data_folder
     from .terminal import Bars
 
     bars, root = Bars(), data_folder(data)
-    figures = change_figures(choose_figures(read_figures(), only or []), fidelity, resolution, root)
+    figures = change_figures(chosen, fidelity, resolution, root)
     failed = compute_parts(figures, root, bars, parts=part or [], device=device, scheduler=scheduler)
     if failed:
         bars.note(
@@ -56,7 +62,9 @@ def compute(
 
 
 def list_(data: Data = None, json_: Json = False) -> None:
-    """List the figures, and how much of each is there. It writes no file.
+    """List the figures, and how much of each is computed.
+
+    It writes no file.
 
     Example: landscape gallery list
     """
@@ -90,7 +98,7 @@ def list_(data: Data = None, json_: Json = False) -> None:
 
 
 def build(data: Data = None, out: Site = "out/gallery") -> None:
-    """Build the site from the data that is there, without simulating.
+    """Build the site from the computed data, without simulating.
 
     The folder then holds the whole site: index.html opens it without a network, manifest.json lists it for programs.
 
@@ -123,9 +131,11 @@ def build(data: Data = None, out: Site = "out/gallery") -> None:
 
 def serve(
     out: Site = "out/gallery",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of this machine; 0 takes a free one.")] = 8000,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on this machine. 0 picks a free one.")] = 8000,
 ) -> None:
-    """Serve the site to a browser of this machine alone, until Ctrl-C. It writes no file.
+    """Serve the site to a browser on this machine, until Ctrl-C.
+
+    It writes no file.
 
     Example: landscape gallery serve --out site --port 0
     """
@@ -134,5 +144,5 @@ def serve(
     from ..gallery.site.server import open_server
 
     with open_server(out, port) as server, contextlib.suppress(KeyboardInterrupt):
-        print(f"{out} is at {server.address}/ until Ctrl-C", flush=True)
+        print(f"{printable(str(out))} is at {server.address}/ until Ctrl-C", flush=True)
         server.serve_forever()

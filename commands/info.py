@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def info() -> None:
-    """Print the versions of gradscape and of the libraries it stands on, and this machine's devices.
+    """Print the versions of gradscape and its libraries, and the devices of this machine.
 
     It writes no file.
 

@@ -8,7 +8,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .arguments import Budget, Deterministic, Device, Fidelity, Json, Print, Scheduler
+from .arguments import (
+    Budget,
+    Claims,
+    Deterministic,
+    Device,
+    Fidelity,
+    ForceRuns,
+    Json,
+    Methods,
+    Print,
+    Processes,
+    Scheduler,
+    Seeds,
+    read_names,
+    refuse_words,
+)
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -21,55 +36,52 @@ def league(
         list[str] | None,
         typer.Argument(
             metavar="[ENV...]",
-            help="The scenes, ENV or ENV@FIDELITY each; by default all sixteen that gradscape simulates itself.",
+            help="Environments to race in, as ENV or ENV@FIDELITY. The default is all sixteen that "
+            "gradscape simulates itself.",
         ),
     ] = None,
-    methods: Annotated[
-        list[str] | None,
-        typer.Option(help="Methods, a,b or repeated; by default all that can run here (`landscape methods`)."),
-    ] = None,
+    methods: Methods = None,
     budget: Budget = 1000,
-    seeds: Annotated[int, typer.Option(min=1, help="Runs of each method, with seeds 0, 1, ...")] = 10,
+    seeds: Seeds = 10,
     fidelity: Fidelity = None,
     device: Device = "auto",
     deterministic: Deterministic = False,
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Processes that compute Gaussian processes, by default one a core; losses do not depend on it.",
-        ),
-    ] = None,
+    workers: Processes = None,
     scheduler: Scheduler = None,
     out: Annotated[
-        str | None, typer.Option(help="Folder for the results; by default one under out/ for all leagues on a device.")
+        str | None, typer.Option(help="Folder for the results. The default, under out/, holds all leagues on a device.")
     ] = None,
     print_: Print = None,
     json_: Json = False,
-    report: Annotated[bool, typer.Option("--report", help="Say which of the paper's orderings hold.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Begin anew where these runs exist already.")] = False,
+    report: Claims = False,
+    force: ForceRuns = False,
 ) -> None:
-    """Race the same methods in many scenes, one after another, and rank them in each and over all.
+    """Race the same methods in many environments, and rank them in each and overall.
 
-    It says first what is there of each scene and what the others take to simulate. The folder then holds a race for
-    each scene, as `landscape race` leaves it, league.png (mean ranks) and league.json (a row for each scene and method,
-    and the best point of each scene). Stop it at any moment: the same command goes on where it stopped. More scenes,
-    methods, seeds or episodes go on from there too. A scene that cannot be raced is named, with why, and leaves the
-    others to be raced; the exit code is 1 then.
+    It first says what is there of each environment and how long the others take to simulate. The folder then holds a
+    race per environment, as `landscape race` leaves it, league.png (mean ranks) and league.json (a row per environment
+    and method, and the best points). Stop at any time: the same command goes on from there. More environments,
+    methods, seeds or episodes also continue from there. An environment that fails is named with the reason, the others
+    are raced, and the exit code is 1.
 
     Example: landscape league bounce fluid@standard --methods random,cma-es,bo-leap --budget 200 --seeds 3
     """
-    from ..envs.engines.runtime import cores
-    from ..gallery.paper import read_paper
-    from ..jobs.league import PICTURE, RECORD, LeagueJob, read_scene, simulated_scenes
-    from ..jobs.scene import SceneSpec
-    from ..jobs.workers import workers as cluster
+    from ..jobs.methods import check_methods
+    from ..jobs.scene import SceneSpec, read_scene
     from .terminal import Bars, command_line, print_json
 
     if workers and scheduler:
         raise ValueError(f"--scheduler has workers of its own, so --workers is left out; got {workers}")
     bars, one = Bars(), SceneSpec("", fidelity, device=device, deterministic=deterministic)
-    chosen = [name.strip() for text in methods or [] for name in text.split(",") if name.strip()]
+    chosen = read_names(methods)
+    check_methods(chosen)
+    for text in envs or ():
+        refuse_words(read_scene(text, one))
+    from ..envs.engines.runtime import cores
+    from ..gallery.paper import read_paper
+    from ..jobs.league import PICTURE, RECORD, LeagueJob, simulated_scenes
+    from ..jobs.workers import workers as cluster
+
     how: dict[str, Any] = {"out": Path(out) if out else None, "force": force, "prints": print_ or []}
     scenes = [read_scene(text, one) for text in envs or simulated_scenes()]
     job = LeagueJob.of(scenes, chosen, budget=budget, seeds=seeds, command=command_line(), **how)

@@ -11,8 +11,10 @@ from ..jobs.scene import SceneSpec
 from .arguments import Budget, ForceRun, Json, OutOfRun, Print, read_settings, takes_scene
 
 
-def methods(name: Annotated[str | None, typer.Argument(help="One method, to see all of it.")] = None) -> None:
-    """List the optimisation methods: what each does, its options and their defaults. Writes nothing.
+def methods(name: Annotated[str | None, typer.Argument(help="Name of the method to describe in full.")] = None) -> None:
+    """List the optimisation methods, or describe one with its options.
+
+    It writes no file.
 
     Example: landscape methods bo-leap
     """
@@ -22,25 +24,29 @@ def methods(name: Annotated[str | None, typer.Argument(help="One method, to see 
 @takes_scene()
 def optimize(
     scene: SceneSpec,
-    method: Annotated[str, typer.Option(help="The method; `landscape methods` lists them.")],
+    method: Annotated[str, typer.Option(help="Method to search with. `landscape methods` lists them.")],
     budget: Budget = 1000,
     seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
-    option: Annotated[list[str] | None, typer.Option(help="A method's option, name=value; may be repeated.")] = None,
+    option: Annotated[
+        list[str] | None, typer.Option(help="An option of the method, as name=value. It may be repeated.")
+    ] = None,
     out: OutOfRun = None,
     print_: Print = None,
     json_: Json = False,
     force: ForceRun = False,
 ) -> None:
-    """Search an environment's parameters for the least loss, and keep every point that was evaluated.
+    """Search for the lowest loss with one method, and keep every evaluated point.
 
-    The folder then holds run.zarr (every episode), progress.png and summary.json. Stop it at any moment: the same
-    command goes on where it stopped. With a larger budget it goes on from the end, to the run that had this budget from
-    the beginning.
+    The folder then holds run.zarr (every episode), progress.png and summary.json. Stop at any time: the same command
+    goes on from there. A larger budget continues the run, which is then the same as one that had this budget from the
+    start.
 
     Example: landscape optimize fluid --method bo-leap --budget 300
     """
+    from ..optim.registry import find_method
     from .terminal import Bars, command_line, print_json
 
+    find_method(method)  # a name that does not exist is refused before what searches is imported
     bars, options = Bars(), read_settings(option or [], "--option")
     env = scene.make(bars)
     from ..jobs.search import SearchJob, make_optimizer

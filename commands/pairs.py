@@ -25,20 +25,20 @@ def pairs(
         int | None,
         typer.Option(
             min=2,
-            help="Base points, each of 1 + 5 x dim + 28 episodes (fewer below 8 parameters); by default 16, from some "
-            "20 parameters on fewer, down to 4.",
+            help="Number of base points, of 1 + 5 x dim + 28 episodes each (fewer below 8 parameters). The"
+            " default is 16, and down to 4 with many parameters.",
         ),
     ] = None,
     seed: Seed = 0,
-    top: Annotated[int, typer.Option(min=1, help="Pairs to show.")] = 10,
+    top: Annotated[int, typer.Option(min=1, help="Number of pairs to show.")] = 10,
     out: OutOfStudy = None,
     json_: Json = False,
     force: ForceStudy = False,
 ) -> None:
-    """Rank pairs of parameters by sensitivity, ruggedness and misleading gradients: which slices to look at.
+    """Rank pairs of parameters by sensitivity, ruggedness and misleading gradients, to choose which to slice.
 
-    The folder then holds pairs.json, with all pairs, and the episodes that were evaluated. Stop it at any moment: the
-    same command goes on where it stopped.
+    The folder then holds pairs.json (all pairs) and the evaluated episodes. Stop at any time: the same command goes on
+    from there.
 
     Example: landscape pairs fluid
     """

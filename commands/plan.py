@@ -11,7 +11,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..jobs.scene import SceneSpec
-from .arguments import Along, Extent, Gradients, Json, NoGradients, SomeDims, Through, read_extent, takes_scene
+from .arguments import (
+    Along,
+    Extent,
+    Gradients,
+    Json,
+    MethodOption,
+    NoGradients,
+    SomeDims,
+    Through,
+    read_extent,
+    refuse_words,
+    takes_scene,
+)
 from .plan_race import print_race_plan
 
 if TYPE_CHECKING:
@@ -28,12 +40,11 @@ def plan(
     what: Annotated[str, typer.Argument(metavar="ENV|FIGURES.toml", help="An environment, or a list of figures.")],
     dims: SomeDims = None,
     along: Along = None,
-    over: Annotated[
-        str | None, typer.Option(help="Plan a sweep: what moves from frame to frame, as for `landscape sweep`.")
-    ] = None,
-    frames: Annotated[int, typer.Option(min=2, help="Frames of the sweep.")] = 24,
+    over: Annotated[str | None, typer.Option(help="Plan a sweep over this, as for `landscape sweep`.")] = None,
+    frames: Annotated[int, typer.Option(min=2, help="Number of frames of the sweep.")] = 24,
     resolution: Annotated[
-        int | None, typer.Option(min=2, help="Points along each axis; 16, or what the figures say.")
+        int | None,
+        typer.Option(min=2, help="Number of points along each axis. The default is 16, or that of the figures."),
     ] = None,
     through: Through = "center",
     extent: Extent = None,
@@ -41,36 +52,41 @@ def plan(
     no_gradients: NoGradients = False,
     methods: Annotated[
         list[str] | None,
-        typer.Option(help="Plan a race of these methods, a,b or repeated, or of all, as for `landscape race`."),
+        typer.Option(help="Plan a race of these methods, a,b or repeated, or of all methods with all."),
     ] = None,
-    seeds: Annotated[int | None, typer.Option(min=1, help="Seeds of a race's methods, by default 10.")] = None,
-    budget: Annotated[int | None, typer.Option(min=1, help="Episodes of a race's runs, by default 1000.")] = None,
-    option: Annotated[
-        list[str] | None, typer.Option(help="A method's option, METHOD.NAME=VALUE; may be repeated.")
+    seeds: Annotated[
+        int | None, typer.Option(min=1, help="Number of seeds per method of a race. The default is 10.")
     ] = None,
+    budget: Annotated[
+        int | None, typer.Option(min=1, help="Number of episodes per run of a race. The default is 1000.")
+    ] = None,
+    option: MethodOption = None,
     workers: Annotated[
         int | None,
         typer.Option(
             min=1,
-            help="Workers, each with a device such as this one, by default 1; of a race, processes that compute "
-            "Gaussian processes, by default one a core.",
+            help="Number of workers, each with a device such as this one, 1 by default. For a race, number"
+            " of processes that fit Gaussian processes, one per core by default.",
         ),
     ] = None,
     json_: Json = False,
 ) -> None:
-    """Predict episodes, time, memory and disk of a slice, a sweep, the gallery's slices or a race, without making them.
+    """Predict the episodes, time, memory and disk of a slice, sweep, race or gallery before computing it.
 
-    Without --dims and --along it is of parameters 0 and 1. A few episodes, tiles and pictures are made and thrown away;
-    nothing is written. For a CUDA device that is not here, what `landscape tradeoff` kept of one counts. With --methods
-    it is of a race, and each method searches a made-up landscape a little; then --seeds and --budget count.
+    The default plane is that of parameters 0 and 1. A dry run makes a few episodes, tiles and pictures in a temporary
+    folder. For a CUDA device that is not here, it uses rates that `landscape tradeoff` stored. With --methods it plans
+    a race, to which --seeds and --budget apply; each method then searches a cheap synthetic landscape for a moment.
 
     Example: landscape plan fluid --dims 6 8 --resolution 48 --fidelity standard
     """
     began = time.perf_counter() - time.process_time()  # about when this process did
-    from ..jobs.plan import PlanJob
+    from ..jobs.cut import refuse_cut
     from .terminal import Bars, command_line, print_json
 
     bars, scene = Bars(), replace(scene, name=what)
+    if not what.endswith(".toml"):
+        refuse_words(scene, dims)
+    refuse_cut(dims, along)
     wanted = 0 if no_gradients else gradients
     cut = bool(dims or along or over or extent or resolution or wanted != 1 or through != "center")
     if methods or seeds or budget or option:
@@ -84,6 +100,8 @@ def plan(
         return
     where: dict[str, Any] = {"through": through, "extent": read_extent(extent), "gradients": wanted}
     first = dims if dims or along else ["0", "1"]
+    from ..jobs.plan import PlanJob
+
     job = PlanJob(scene, first, resolution or RESOLUTION, **where, over=over, frames=frames, along=along)
     found = job.run(bars, began=began)
     if json_:
@@ -102,12 +120,12 @@ def _refuse_more(said: bool) -> None:
 
 def _figure_jobs(path: str, resolution: int | None, scene: SceneSpec, *, grad: bool) -> list[tuple[Figure, PlanJob]]:
     """Return what there is to plan of a list of figures. Raises ValueError where there is no such list."""
+    if not Path(path).is_file():
+        raise ValueError(f"there is no list of figures at {path}; the gallery's own is gallery/figures.toml")
     from ..envs.registry import environment_class
     from ..gallery.figures import read_figures
     from ..jobs.plan import PlanJob
 
-    if not Path(path).is_file():
-        raise ValueError(f"there is no list of figures at {path}; the gallery's own is gallery/figures.toml")
     jobs = []
     for figure in read_figures(Path(path)):
         wanted = scene.fidelity or figure.fidelity

@@ -26,10 +26,9 @@ def print_race_plan(
     as_json: bool,
 ) -> None:
     """Plan a race and print it. Raises ValueError where no methods are named, and for what is said of a slice."""
-    from ..envs.engines.runtime import cores
     from ..jobs.methods import check_methods
-    from ..jobs.plan_race import RacePlanJob
-    from .race import read_method_options, read_names
+    from .arguments import read_names
+    from .race import read_method_options
     from .terminal import Bars, command_line, print_json
 
     if not (names := read_names(methods)):
@@ -42,6 +41,9 @@ def print_race_plan(
     if str(scene.name).endswith(".toml"):
         raise ValueError(f"a race is of one environment; got the list of figures {scene.name} and --methods")
     given = read_method_options(options, check_methods(names))
+    from ..envs.engines.runtime import cores
+    from ..jobs.plan_race import RacePlanJob
+
     job = RacePlanJob(scene, names, seeds or SEEDS, budget or BUDGET, workers or cores(), given)
     found = job.run(Bars(), began=began)
     if as_json:

@@ -10,7 +10,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..jobs.scene import SceneSpec
-from .arguments import Budget, Json, Print, Scheduler, read_settings, takes_scene
+from .arguments import (
+    Budget,
+    Claims,
+    ForceRuns,
+    Json,
+    MethodOption,
+    Methods,
+    Print,
+    Processes,
+    Scheduler,
+    Seeds,
+    read_names,
+    read_settings,
+    takes_scene,
+)
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -23,56 +37,45 @@ ENOUGH = 10  # seeds, as the paper has
 @takes_scene("tolerance")
 def race(
     scene: SceneSpec,
-    methods: Annotated[
-        list[str] | None,
-        typer.Option(help="Methods, a,b or repeated; by default all that can run here (`landscape methods`)."),
-    ] = None,
+    methods: Methods = None,
     budget: Budget = 1000,
-    seeds: Annotated[int, typer.Option(min=1, help="Runs of each method, with seeds 0, 1, ...")] = 10,
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Processes that compute Gaussian processes, by default one a core; losses do not depend on it.",
-        ),
-    ] = None,
+    seeds: Seeds = 10,
+    workers: Processes = None,
     scheduler: Scheduler = None,
-    option: Annotated[
-        list[str] | None, typer.Option(help="A method's option, METHOD.NAME=VALUE; may be repeated.")
-    ] = None,
+    option: MethodOption = None,
     out: Annotated[
-        str | None, typer.Option(help="Folder for the results; by default one under out/ named after the race.")
+        str | None, typer.Option(help="Folder for the results. The default is named after the race, under out/.")
     ] = None,
     best_known: Annotated[
-        float | None, typer.Option(help="The least loss known from elsewhere, down to which targets go.")
+        float | None, typer.Option(help="Lowest loss known from elsewhere, at which the targets end.")
     ] = None,
     print_: Print = None,
     json_: Json = False,
-    report: Annotated[bool, typer.Option("--report", help="Say which of the paper's orderings hold.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Begin anew where these runs exist already.")] = False,
+    report: Claims = False,
+    force: ForceRuns = False,
 ) -> None:
-    """Let methods compete on the same budget, with several seeds each: best loss, targets reached, ranks.
+    """Compare methods on the same budget over several seeds: best losses, targets reached and ranks.
 
-    All runs go on in lockstep: what they propose is simulated in one batch, as many points at once as there are runs.
-    The folder then holds race.png, race.json (ranks, how every two methods compare, running times, curves) and each run
-    in a folder of its own. Stop it
-    at any moment: the same command goes on where it stopped. More methods, seeds or episodes go on from there too; runs
-    that are finished are not repeated. Refuses --workers beside --scheduler.
+    All runs advance in lockstep, and one batch evaluates the proposals of all of them. The folder then holds race.png,
+    race.json (ranks, pairwise comparisons, running times, curves) and a folder per run. Stop at any time: the same
+    command goes on from there. More methods, seeds or episodes also continue from there, and finished runs are not
+    repeated. --workers and --scheduler exclude each other.
 
     Example: landscape race fluid --methods random,bo-leap --budget 200 --seeds 3
     """
-    from ..envs.engines.runtime import cores
-    from ..gallery.paper import read_paper
     from ..jobs.methods import check_methods
-    from ..jobs.race import RaceJob
-    from ..jobs.workers import workers as cluster
     from .terminal import Bars, command_line, print_json
 
     if workers and scheduler:
         raise ValueError(f"--scheduler has workers of its own, so --workers is left out; got {workers}")
-    chosen = check_methods(read_names(methods or []))
+    chosen = check_methods(read_names(methods))
     bars, options = Bars(), read_method_options(option or [], chosen)
     env = scene.make(bars)
+    from ..envs.engines.runtime import cores
+    from ..gallery.paper import read_paper
+    from ..jobs.race import RaceJob
+    from ..jobs.workers import workers as cluster
+
     how: dict[str, Any] = {"out": Path(out) if out else None, "force": force, "prints": print_ or [], "watch": bars}
     how |= {
         "claims": read_paper().claims_about(env.name),
@@ -90,11 +93,6 @@ def race(
     else:
         _print(summary, claims=report)
     bars.note(f"{job.folder}: {', '.join(summary.files)}")
-
-
-def read_names(texts: Sequence[str]) -> list[str]:
-    """Return names given as a,b or repeated."""
-    return [name.strip() for text in texts for name in text.split(",") if name.strip()]
 
 
 def read_method_options(settings: Sequence[str], chosen: Sequence[str]) -> dict[str, dict[str, str]]:

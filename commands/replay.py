@@ -17,19 +17,19 @@ def replay(
     params: Annotated[
         str,
         typer.Option(
-            help="The episode's parameters: center, random:SEED, example:NAME, best:RUN or a file of numbers."
+            help="Parameters of the episode: center, random:SEED, example:NAME, best:RUN or a file of numbers."
         ),
     ] = "center",
     out: Annotated[
-        str | None, typer.Option(help="Folder for the results; by default one under out/ named after the episode.")
+        str | None, typer.Option(help="Folder for the results. The default is named after the episode, under out/.")
     ] = None,
     print_: Print = None,
-    film: Annotated[bool, typer.Option(help="Film the episode, too; that takes about a minute.")] = True,
+    film: Annotated[bool, typer.Option(help="Also film the episode, which takes about a minute.")] = True,
 ) -> None:
-    """Simulate one episode, and draw and film it.
+    """Simulate one episode, draw it and film it.
 
     The folder then holds episode.png (key frames side by side), episode.mp4 and episode.gif (films), episode.rrd (a
-    3-D scene, which `landscape view` opens) and episode.json (parameters, loss and how it was simulated).
+    3-D scene, which `landscape view` opens) and episode.json (parameters, loss and settings).
 
     Example: landscape replay fluid --params example:scoop
     """

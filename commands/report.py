@@ -18,44 +18,49 @@ if TYPE_CHECKING:
 def report_(
     what: Annotated[
         str | None,
-        typer.Argument(metavar="[SLICE|ENV]", help="A slice's folder, or an environment: its figures, else one slice."),
+        typer.Argument(
+            metavar="[SLICE|ENV]",
+            help="Folder of a slice, or an environment: its figures of the gallery, else a slice that is "
+            "sampled for it.",
+        ),
     ] = None,
     env: Of = None,
-    everything: Annotated[bool, typer.Option("--all", help="Every figure of the gallery that is sampled.")] = False,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Report on every figure of the gallery that is sampled.")
+    ] = False,
     fidelity: Fidelity = None,
     device: Device = "auto",
     points: Annotated[
-        int, typer.Option(min=2, help="Points along each axis where gradients are tested by new evaluations.")
+        int, typer.Option(min=2, help="Number of points along each axis at which new evaluations test gradients.")
     ] = 6,
     seed: Seed = 0,
     data: Data = None,
     out: Annotated[
-        str | None, typer.Option(help="Folder for the results; by default one under out/ named after the report.")
+        str | None, typer.Option(help="Folder for the results. The default is named after the report, under out/.")
     ] = None,
     print_: Print = None,
     json_: Json = False,
 ) -> None:
-    """Say what a landscape is like: minima, flatness, jumps, correlation, gradient quality, and the verdict in words.
+    """Measure one landscape: minima, flatness, jumps, correlation and gradient quality, with a verdict in words.
 
-    The folder then holds report.json, measures.json, gradient-quality.png and gradient-quality.npz, which the picture
-    is drawn from; of several slices a folder each, with report.json and the table report.md beside them. Stop it at any
-    moment: the same command goes on with the next slice. With --all a slice that fails is named at the end, and the
-    exit code is 1. docs/measures.md says what each number means.
+    The folder then holds report.json, measures.json, gradient-quality.png and gradient-quality.npz (the data of the
+    picture). Several slices have a folder each, beside report.json and the table report.md. Stop at any time: the same
+    command goes on with the next slice. With --all a slice that fails is named at the end, and the exit code is 1.
+    docs/measures.md explains each number.
 
     Example: landscape report out/fluid-6-8-draft-24x24-4e5ab2
     """
+    _refuse_words(what, everything, fidelity, device, env)
     from ..gallery.files import data_folder
     from ..gallery.paper import read_paper
     from ..jobs.report import ReportJob
     from .terminal import Bars, command_line
 
-    _refuse_both(what, everything)
-    _register(env)
     bars, root = Bars(), data_folder(data)
     subjects = _figures(root) if what is None else _subjects(what, root, fidelity, device, points, bars)
     single = what is not None and len(subjects) == 1
     how: dict[str, Any] = {"points": points, "seed": seed, "out": Path(out) if out else None, "device": device}
-    how |= {"prints": print_ or [], "paper": read_paper().words, "command": command_line()}
+    how |= {"prints": print_ or [], "paper": read_paper().words, "command": command_line(), "env": env}
     job = ReportJob.open(subjects, what=Path(what or "all").name, single=single, **how)
     found = job.run(bars)
     if single:
@@ -64,18 +69,16 @@ def report_(
         _show_several(found, job.folder, bars, as_json=json_)
 
 
-def _refuse_both(what: str | None, everything: bool) -> None:
-    """Raise ValueError unless it is said what to report on, once."""
+def _refuse_words(what: str | None, everything: bool, fidelity: str | None, device: str, env: str | None) -> None:
+    """Raise ValueError unless it is said what to report on, once, and for an environment that there is not."""
+    from ..envs.registry import refuse_unknown
+
     if (what is None) != everything:
         raise ValueError("report takes a slice's folder, an environment, or --all for every figure of the gallery")
-
-
-def _register(source: str | None) -> None:
-    """Register the class of a file, which the slice's environment may be."""
-    from ..envs.registry import environment_class
-
-    if source:
-        environment_class(source)
+    if what is not None and not Path(what).exists():
+        refuse_unknown(what, fidelity=fidelity, device=device)
+    if env is not None:
+        refuse_unknown(env)
 
 
 def _figures(root: Path) -> list[ReportedSlice]:
@@ -91,14 +94,13 @@ def _figures(root: Path) -> list[ReportedSlice]:
 
 def _subjects(what: str, root: Path, fidelity: str | None, device: str, points: int, bars: Bars) -> list[ReportedSlice]:
     """Return a slice, or an environment's figures, or a slice sampled now for want of any."""
-    from ..envs.registry import environment_class, make
+    from ..envs.registry import make
     from ..gallery.figures import read_figures
     from ..jobs.report import ReportedSlice, sample_subject
     from .terminal import command_line
 
     if Path(what).exists():
         return [ReportedSlice.of(Path(what))]
-    environment_class(what)  # refuses a name that does not exist, with those that come close
     figures = [figure for figure in read_figures() if figure.env == what and fidelity in (None, figure.fidelity)]
     if found := [ReportedSlice.of(root / figure.id) for figure in figures if _is_finished(root / figure.id)]:
         return found

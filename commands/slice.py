@@ -28,6 +28,7 @@ from .arguments import (
     Through,
     read_extent,
     read_share,
+    refuse_words,
     takes_scene,
 )
 
@@ -51,12 +52,12 @@ def slice_(
     json_: Json = False,
     force: Force = False,
 ) -> None:
-    """Sample losses and gradients over a plane through parameter space, and draw them.
+    """Sample losses and gradients on a plane through parameter space, and draw them.
 
-    The folder then holds slice.zarr (the samples), landscape.png and summary.json. Stop it at any moment: the same
-    command goes on where it stopped. With --refine or --budget it is the finest grid that --resolution says: what is
-    smooth is sampled coarser, status tells what is interpolated, and no measure uses that. Through several points,
-    A,B, there is a slice for each, in a folder of its own.
+    The folder then holds slice.zarr (the samples), landscape.png and summary.json. Stop at any time: the same command
+    goes on from there. --refine and --budget sample adaptively, on a grid of at most --resolution; the status tells
+    which points are interpolated, and no measure uses those. With several points, --through A,B, each has a slice in a
+    folder of its own.
 
     Example: landscape slice fluid --dims 6 8 --resolution 24
     """
@@ -69,7 +70,7 @@ def slice_(
 @takes_scene("env", "tolerance", "engine", "deterministic", env="bounce", fidelity="standard")
 def bounce(
     scene: SceneSpec,
-    axis: Annotated[str, typer.Option(help="The initial velocity to vary: x, y or z.")],
+    axis: Annotated[str, typer.Option(help="Component of the initial velocity to vary: x, y or z.")],
     resolution: Annotated[int, typer.Option(min=2, help="Number of velocities.")] = 512,
     through: Through = "example:aim",
     extent: Extent = None,
@@ -78,7 +79,7 @@ def bounce(
     json_: Json = False,
     force: Force = False,
 ) -> None:
-    """Draw loss and gradient of the bouncing ball over one velocity, and mark where the number of bounces changes.
+    """Draw loss and gradient of the bouncing ball along one velocity, and mark where the number of bounces changes.
 
     The folder then holds slice.zarr (the samples), landscape.png and summary.json.
 
@@ -109,25 +110,27 @@ def _sample(
     policy: str | None = None,
 ) -> None:
     """Sample a slice, and say what came out."""
+    from ..jobs.cut import cut, describe_cut, folder_for, refuse_cut, split_points
     from .terminal import Bars, command_line, print_json
 
-    bars = Bars()
+    refuse_words(scene, dims, policy)
+    refuse_cut(dims, along)
+    where: dict[str, Any] = {"extent": read_extent(extent), "resolution": resolution}
+    share, bars = read_share(refine, "--refine"), Bars()
     env = scene.make(bars)
     subject = with_policy(env, policy)
-    from ..jobs.cut import cut, describe_cut, folder_for, split_points
     from ..jobs.slice import SliceJob
     from ..jobs.workers import workers
     from ..landscapes.sampling.refine import Refinement
 
     points = split_points(through)
-    where: dict[str, Any] = {"extent": read_extent(extent), "resolution": resolution}
     how: dict[str, Any] = {
         "command": command_line(),
         "gradients": gradients if policy is None else 0,
         "force": force,
         "prints": prints or [],
     }
-    how["refinement"] = Refinement.of(read_share(refine, "--refine"), budget)
+    how["refinement"] = Refinement.of(share, budget)
     folders = {point: folder_for(Path(out), point, points) if out else None for point in points}
     kept = {name: how[name] for name in ("gradients", "refinement")}
     planes = {  # all of them, or none is sampled

@@ -11,22 +11,26 @@ from .arguments import Print
 
 
 def surface(
-    slice_: Annotated[str, typer.Argument(metavar="SLICE", help="A slice's folder.")],
+    slice_: Annotated[str, typer.Argument(metavar="SLICE", help="Folder of the slice.")],
     runs: Annotated[
         list[str] | None, typer.Argument(metavar="[RUN]...", help="Folders of runs, or of a race for all of its runs.")
     ] = None,
     out: Annotated[
-        str | None, typer.Option(help="Folder for the results; by default one under out/ named after the surface.")
+        str | None, typer.Option(help="Folder for the results. The default is named after the surface, under out/.")
     ] = None,
     print_: Print = None,
 ) -> None:
-    """Draw a slice as a lit surface whose height and colour are the loss, with runs draped on it.
+    """Draw a slice as a lit surface with the loss as height and colour, and runs on top.
 
-    The folder then holds surface.png, and surface.gltf, which any viewer of 3-D models turns around. A sample that
-    failed is a hole.
+    The folder then holds surface.png, and surface.gltf for any viewer of 3-D models. Failed samples are holes.
 
     Example: landscape surface out/my-slice out/my-run
     """
+    from ..landscapes.storage.paths import refuse_missing
+
+    refuse_missing(slice_, "slice")
+    for run in runs or ():
+        refuse_missing(run, "run")
     from ..jobs.surface import SurfaceJob
     from .terminal import Bars
 

@@ -20,6 +20,7 @@ from .arguments import (
     SomeDims,
     Through,
     read_extent,
+    refuse_words,
     takes_scene,
 )
 
@@ -29,11 +30,13 @@ def sweep(
     scene: SceneSpec,
     over: Annotated[
         str,
-        typer.Option(help="What moves from frame to frame: a third parameter over its bounds, horizon, or smoothing."),
+        typer.Option(
+            help="What changes from frame to frame: a third parameter over its bounds, horizon, or smoothing."
+        ),
     ],
     dims: SomeDims = None,
     along: Along = None,
-    frames: Annotated[int, typer.Option(min=2, help="Number of its values, both ends included.")] = 24,
+    frames: Annotated[int, typer.Option(min=2, help="Number of frames, both ends included.")] = 24,
     resolution: Resolution = 16,
     through: Through = "center",
     extent: Extent = None,
@@ -41,26 +44,29 @@ def sweep(
     no_gradients: NoGradients = False,
     scheduler: Scheduler = None,
     out: Annotated[
-        str | None, typer.Option(help="Folder for the results; by default one under out/ named after the sweep.")
+        str | None, typer.Option(help="Folder for the results. The default is named after the sweep, under out/.")
     ] = None,
     json_: Json = False,
-    force: Annotated[bool, typer.Option("--force", help="Begin anew where a sweep exists already.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace a sweep that exists already.")] = False,
 ) -> None:
-    """Sample a slice for each value of a third parameter, and film the slices on one colour scale.
+    """Sample one slice per value of a third parameter, and film them on one colour scale.
 
-    The folder then holds frames/ (the samples of each frame; slice.zarr where there is one slice only), sweep.mp4,
-    sweep.gif, sweep.rrd (a 3-D scene, which `landscape view` opens) and summary.json. Stop it at any moment: the same
-    command goes on where it stopped.
+    The folder then holds frames/ (the samples of each frame; slice.zarr if there is only one slice), sweep.mp4,
+    sweep.gif, sweep.rrd (a 3-D scene, which `landscape view` opens) and summary.json. Stop at any time: the same
+    command goes on from there.
 
     Example: landscape sweep fluid --dims 6 8 --over 7 --frames 12
     """
-    from ..jobs.cut import cut, describe_cut, folder_for, split_points
-    from ..jobs.sweep import SweepJob
-    from ..jobs.workers import workers
+    from ..jobs.cut import cut, describe_cut, folder_for, refuse_cut, split_points
     from .terminal import Bars, command_line, print_json
 
-    bars = Bars()
-    env, points, ends = scene.make(bars), split_points(through), read_extent(extent)
+    refuse_words(scene, [*(dims or ()), over])
+    refuse_cut(dims, along)
+    bars, points, ends = Bars(), split_points(through), read_extent(extent)
+    env = scene.make(bars)
+    from ..jobs.sweep import SweepJob
+    from ..jobs.workers import workers
+
     how: dict[str, Any] = {"command": command_line(), "gradients": 0 if no_gradients else gradients, "force": force}
     planes = {point: cut(env, dims, along, through=point, extent=ends, resolution=resolution) for point in points}
     said = list[dict[str, Any]]()

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from ..jobs.scene import SceneSpec
-from .arguments import ForceStudy, Json, OutOfStudy, Print, Seed, takes_scene
+from .arguments import ForceStudy, Json, OutOfStudy, Print, Seed, read_names, takes_scene
 from .ladders import convergence, fidelity, mixed, model
 from .ladders.study import Study
 
@@ -27,61 +27,63 @@ def tradeoff(
     ladder: Annotated[
         str,
         typer.Option(
-            help="What is measured: fidelity, how far off cheaper and dearer variants are; model, what each part of "
-            "the scene's model is for; convergence, whether the reference is one; mixed, which draft and standard "
-            "should be, by a search with all settings changed together."
+            help="Study to run. fidelity: errors of cheaper and dearer variants. model: effect of each "
+            "part of the model. convergence: is the reference converged? mixed: a search over all "
+            "settings together for better draft and standard fidelities."
         ),
     ] = "fidelity",
-    points: Annotated[int, typer.Option(min=2, help="Sobol points at which everything is measured.")] = 64,
+    points: Annotated[int, typer.Option(min=2, help="Number of Sobol points at which every variant is measured.")] = 64,
     seed: Seed = 0,
     variants: Annotated[
         list[str] | None,
         typer.Option(
-            help="With --ladder fidelity: what to change beside the named fidelities, a,b or repeated: dt, resolution, "
-            "particles, precision, stiffness, engine, device; with convergence what to refine: dt, resolution, "
-            "particles, joint, precision; by default all that the scene has."
+            help="Settings to change, a,b or repeated. fidelity takes dt, resolution, particles, "
+            "precision, stiffness, engine and device; convergence takes dt, resolution, particles, "
+            "joint and precision. The default is all that the environment has."
         ),
     ] = None,
     at_most: Annotated[
         float | None,
-        typer.Option(help="With --ladder mixed: how many times today's cost a variant may cost; by default 4."),
+        typer.Option(
+            help="With --ladder mixed: largest cost of a variant, as a multiple of the present one. The default is 4."
+        ),
     ] = None,
     budget: Annotated[
         float | None,
-        typer.Option(help="With --ladder mixed: seconds that the search may measure; by default 600."),
+        typer.Option(help="With --ladder mixed: time to spend on measurements [s]. The default is 600."),
     ] = None,
     chaotic: Annotated[
         bool,
-        typer.Option("--chaotic", help="With --ladder mixed: the motion is chaotic, so gradients are no criterion."),
+        typer.Option("--chaotic", help="With --ladder mixed: ignore gradients, because the motion is chaotic."),
     ] = False,
     out: OutOfStudy = None,
     print_: Print = None,
     json_: Json = False,
     force: ForceStudy = False,
 ) -> None:
-    """Measure accuracy against speed: the same points in several variants of a scene, each against the reference.
+    """Measure accuracy against speed for several variants of an environment.
 
-    Each ladder leaves a record and a picture of its name in the folder:
+    All variants are evaluated at the same points and compared with a reference. Each study leaves a record and a
+    picture of its name in the folder:
 
-    fidelity (tradeoff.json, tradeoff.png): the variants are fidelities and what is changed of them; the record is also
-    kept for --tolerance.
+    fidelity (tradeoff.json, tradeoff.png): the variants are the fidelities and changes of their settings. The record
+    is also kept for --tolerance.
 
-    model: each variant changes one part of the scene's model, leaves it out or puts it in; the reference is the full
-    model at --fidelity.
+    model: each variant changes, removes or adds one part of the model. The reference is the full model at --fidelity.
 
-    convergence: every knob of the reference is refined, to say by which order losses converge, what is left to win, and
-    whether neighbours part so fast that nothing converges point by point; 16 points are enough.
+    convergence: each setting of the reference is refined. The study reports the order of convergence, the remaining
+    error, and whether neighbouring points diverge too fast to converge. 16 points are enough.
 
-    mixed: the variants are those that a search of the front needs; it says what draft and standard should be.
+    mixed: the variants are those that a search of the front needs. It says what draft and standard should be.
 
-    Stop it at any moment: the same command goes on with the next variant.
+    Stop at any time: the same command goes on with the next variant.
 
     Example: landscape tradeoff bounce --variants dt,precision
     """
     from ..jobs.variants import refuse_ladder
     from .terminal import command_line
 
-    settings = [part for text in variants or [] for part in text.split(",") if part]
+    settings = read_names(variants)
     refuse_ladder(ladder, LADDERS, settings)
     given = {"at_most": at_most, "budget": budget, "chaotic": chaotic or None}
     limits = {name: value for name, value in given.items() if value is not None}

@@ -27,10 +27,10 @@ def view(
     file: Annotated[str, typer.Argument(help="A picture, a film, a page, a recording (.rrd), or a results folder.")],
     serve: Annotated[bool, typer.Option("--serve", help="Serve a recording to a browser, until Ctrl-C.")] = False,
 ) -> None:
-    """Open what the other verbs leave, with the viewer it is made for.
+    """Open the results of other verbs in a viewer.
 
-    Pictures, films and pages open in this system's programs, recordings (.rrd) in rerun's viewer or with --serve in a
-    browser. It writes no file.
+    Pictures, films and pages open in the programs of this system. Recordings (.rrd) open in the rerun viewer, or with
+    --serve in a browser. It writes no file.
 
     Example: landscape view out/my-episode --serve
     """

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import abc
 import inspect
-import re
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from contextlib import suppress
+from dataclasses import asdict, replace
 from functools import partial
 from importlib import import_module
 from types import ModuleType
@@ -19,44 +19,46 @@ from torch import Tensor
 
 from ..landscapes.episode import Episode as Episode
 from ..landscapes.identity import MODEL_VERSION
-from ..landscapes.objective import Evaluation
+from ..landscapes.objective import ContractError, Evaluation, Objective, check_points, first_line
 from ..landscapes.options import NoOptions, read_options
-from ..landscapes.sampling.memory import free_memory
+from ..landscapes.sampling.memory import free_memory, is_out_of_memory
 from ..landscapes.space import ParameterSpace, as_tensor
 from .batching import Pool, cores, map_parts
 from .engines import find_engine
 from .engines.engine import Engine
-from .installed import install_line
 from .records import Fidelity as Fidelity
 from .records import MaterialRange as MaterialRange
 from .records import ModelPart as ModelPart
 from .records import Work as Work
+from .records import unknown_fidelity
 
 T = TypeVar("T")
 FLOAT32 = torch.finfo(torch.float32).max
+PROBES = 8  # points that are tried, beside the centre, where a simulation has only raised so far
 
 
-class Environment(abc.ABC):
+class Environment(Objective):
     """A differentiable scene: a batch of parameter vectors in, losses and gradients out.
 
     A scene is written by deriving from this class: the class attributes say what it is, `_evaluate` simulates; needed
-    are `space` and `_evaluate`. An environment is an `Objective`, and a torch function: `env(x)` returns losses, shape
-    (batch,), that can be differentiated. `fidelity` is a name from `fidelities`, the first unless said otherwise, or a
-    record of one's own; `device` is auto, cpu or cuda; `engine` is one of `engines`, the first unless said otherwise;
-    options are those of the class's `Options`. Two runs give the same bits, on a CPU and on a GPU, alone or in a batch,
-    but for an engine that cannot promise that; `deterministic` refuses such an engine.
+    are `space` and `_evaluate`. What only some scenes can do has a default. An environment is a torch function, too:
+    `env(x)` returns losses, shape (batch,), that can be differentiated. `fidelity` is a name from `fidelities`, the
+    first unless said otherwise, or a record of one's own; `device` is auto, cpu or cuda; `engine` is one of `engines`,
+    the first unless said otherwise; options are those of the class's `Options`. Two runs give the same bits, on a CPU
+    and on a GPU, alone or in a batch, but for an engine that cannot promise that; `deterministic` refuses such an
+    engine.
     """
 
-    name: ClassVar[str]  # of a class that says none, its own in lower case
-    model_version: ClassVar[int | Mapping[str, int]] = 1  # of all engines or by name; raised when numbers change
+    # Of all engines or by name, raised by hand when numbers change; 0 where nothing says when they do.
+    model_version: ClassVar[int | Mapping[str, int]] = 1
     fidelities: ClassVar[Mapping[str, Fidelity]] = {"default": Fidelity("default", dt=0.0, precision="float64")}
     examples: ClassVar[Mapping[str, tuple[float, ...]]] = {}
     Options: ClassVar[type[Any]] = NoOptions
     devices: ClassVar[tuple[str, ...]] = ("cpu",)
     engines: ClassVar[tuple[str, ...]] = ("warp",)
-    loss_unit: ClassVar[str] = ""
-    beyond_box: ClassVar[bool] = False  # whether parameters beyond their bounds mean something and may be tried
-    decisions: ClassVar[int] = 1  # how often controls are chosen in an episode: dim / decisions of them, time first
+    horizon_option: ClassVar[str] = (
+        "horizon"  # the setting that says how long an episode is, where there is one of this name
+    )
     control_step: ClassVar[float] = 0.0  # how long a control is held [s], in whole time steps; 0 where any step does
     known_failures: ClassVar[Mapping[str, Mapping[str, str]]] = {}  # fidelity -> check of `landscape check` -> reason
     contact_stiffness: ClassVar[str] = ""  # the option that says how stiff contact is, where it is by penalty
@@ -65,18 +67,9 @@ class Environment(abc.ABC):
     designed_order: ClassVar[Mapping[str, float]] = {}  # of convergence in dt, resolution, joint (both at once)
     model_parts: ClassVar[tuple[ModelPart, ...]] = ()  # what the model is made of, each with options that change it
 
-    space: ParameterSpace
-    _named: ClassVar[bool] = False
     _solvers: Pool[Any] | None = None  # a scene on an engine sets both in `_setup`: what simulates,
     _capacity = 1 << 20  # and how many rows it takes at once,
     _max_rows = 1 << 20  # at most
-
-    def __init_subclass__(cls, **how: Any) -> None:
-        super().__init_subclass__(**how)
-        if "name" in vars(cls):
-            cls._named = True
-        elif not cls._named:
-            cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", cls.__name__).lower()
 
     def __init__(
         self,
@@ -98,39 +91,72 @@ class Environment(abc.ABC):
             raise ValueError(f"{self.name} is deterministic on engine {able or 'none'} only; got engine {engine}")
         self.options = read_options(self.name, self.Options, options)
         self._stop = threading.Event()
+        self._answered = False  # whether any point was evaluated without an error
         self._setup()
         if not isinstance(getattr(self, "space", None), ParameterSpace):
             raise ValueError(
                 f"{self.name} needs its parameters: give the class a ParameterSpace as `space`, or set one in `_setup`"
             )
 
-    @final
     def identity(self) -> dict[str, Any]:
         """Return what decides the numbers, as plain JSON: scene and its version, options, fidelity, device, engine."""
         return {
             "objective": self.name,
             "options": asdict(self.options),
             "fidelity": self.fidelity.name,
-            "settings": asdict(self.fidelity),
+            "settings": self.fidelity.record(),
             "device": self.device,
             "engine": self.engine,
             "deterministic": self.deterministic,
             MODEL_VERSION: self.version_on(self.engine),
         }
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what belongs to this process, so that an environment of Python alone can be sent to another one."""
+        return {name: value for name, value in vars(self).items() if name != "_stop"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take over what was sent."""
+        vars(self).update(state, _stop=threading.Event())
+
+    @final
+    def remake(
+        self,
+        *,
+        fidelity: str | Fidelity | None = None,
+        device: str | None = None,
+        engine: str | None = None,
+        deterministic: bool | None = None,
+        **options: Any,
+    ) -> Environment:
+        """Return this environment with other settings; those that are not given stay as they are.
+
+        Raises ValueError for what the environment does not have.
+        """
+        return self._remake(
+            fidelity=self.fidelity if fidelity is None else fidelity,
+            device=device or self.device,
+            engine=engine or self.engine,
+            deterministic=self.deterministic if deterministic is None else deterministic,
+            **{**asdict(self.options), **options},
+        )
+
     @final
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
-        """Return losses, and gradients if asked, at points `x`, shape (batch, dim), in the parameters' units.
+        """Return losses, and gradients if asked, at points `x` of the space, shape (batch, dim).
 
-        Rows do not depend on each other. A row whose simulation fails says so in its status. Raises ValueError where x
-        has another shape, another type or values that are not finite.
+        A row is a point of `space`: a parameter on a logarithmic scale is there by its decimal logarithm. Rows do not
+        depend on each other. A row whose simulation fails says so in its status; one that raises has status ERROR, and
+        the evaluation holds the first message. Raises ValueError where x has another shape, another type or values
+        that are not finite, and where the simulation raises wherever it is tried.
         """
         x = self._check_points(x)
         if len(x) == 0:
             return Evaluation.empty(self.space.dim, grad=grad)
-        whole = Evaluation.join(self._map_parts(partial(self._simulate, grad=grad), x), dim=self.space.dim, grad=grad)
+        parts = self._map_parts(partial(self._evaluate_rows, grad=grad), x)
+        whole = Evaluation.join(parts, dim=self.space.dim, grad=grad)
         slope = None if whole.grad is None else whole.grad.to(x)
-        return Evaluation.from_results(whole.loss.to(x), slope, whole.status.cpu())
+        return Evaluation.from_results(whole.loss.to(x), slope, whole.status.cpu(), whole.error)
 
     @final
     def __call__(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"]:
@@ -165,11 +191,10 @@ class Environment(abc.ABC):
         return cls.control_step / max(1, round(cls.control_step / dt)) if cls.control_step else dt
 
     @final
-    @classmethod
-    def check_engine(cls, engine: str) -> str:
+    def check_engine(self, engine: str) -> str:
         """Return the name of one of the scene's engines. Raises ValueError where the scene has no such engine."""
-        if engine not in cls.engines:
-            raise ValueError(f"{cls.name} has engine {' and '.join(cls.engines)}; got engine {engine!r}")
+        if engine not in self.engines:
+            raise ValueError(f"{self.name} has engine {' and '.join(self.engines)}; got engine {engine!r}")
         return engine
 
     @final
@@ -177,11 +202,11 @@ class Environment(abc.ABC):
         """Return a parameter vector this scene is known for. Raises ValueError where it has no such example."""
         if name not in self.examples:
             raise ValueError(f"{self.name} has no example {name!r}; it has {', '.join(self.examples) or 'none'}")
-        return torch.tensor(self.examples[name], dtype=torch.float64)
+        return self.space.from_values(torch.tensor(self.examples[name], dtype=torch.float64))
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return the frames of the episode at one point. Raises ValueError where a scene has nothing to draw."""
-        raise ValueError(f"{self.name} has no episode to draw")
+        raise ValueError(f"{self.name} has no episode to draw; a class with a method `episode` has")
 
     def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Int[Tensor, " batch"]]:
         """Count what happens in each episode, name -> shape (batch,); where a count changes, losses may jump."""
@@ -208,9 +233,8 @@ class Environment(abc.ABC):
         other than 1, where episodes are not shared by decisions.
         """
         x = self._check_points(x)
-        horizon = getattr(self.options, "horizon", 1.0)
-        if self.decisions > 1 and horizon != 1.0:
-            raise ValueError(f"{self.name} is decided step by step at horizon 1 only; got horizon {horizon:g}")
+        if self.decisions > 1 and self.horizon not in (None, 1.0):
+            raise ValueError(f"{self.name} is decided step by step at horizon 1 only; got horizon {self.horizon:g}")
         if not 0 <= decision < self.decisions:
             raise ValueError(f"{self.name} numbers its decisions 0 to {self.decisions - 1}; got {decision}")
         ahead = self.space.center[self.space.dim * decision // self.decisions :]
@@ -243,12 +267,49 @@ class Environment(abc.ABC):
         return Work(1, "evaluation")
 
     @property
+    def precision(self) -> str:
+        """float32 or float64: what losses are computed in."""
+        return self.fidelity.precision
+
+    @property
+    def packages(self) -> tuple[str, ...]:
+        """Packages that the environment's engine needs, beside those that all need."""
+        from .registry import EXTRAS
+
+        return EXTRAS.get(self.capabilities.extra, ())
+
+    @property
+    def horizon(self) -> float | None:
+        """How long an episode is, in the unit of the setting that says so; None where none does."""
+        value = vars(self.options).get(self.horizon_option)
+        return None if value is None else float(value)
+
+    def with_horizon(self, horizon: float) -> Environment:
+        """Return this environment with episodes of another length, in whole numbers where its setting is one.
+
+        Raises ValueError where no setting says how long an episode is.
+        """
+        value = vars(self.options).get(self.horizon_option)
+        if value is None:
+            raise ValueError(f"{self.name} has no setting that says how long an episode is; name one as horizon")
+        options: dict[str, Any] = {self.horizon_option: max(1, round(horizon)) if isinstance(value, int) else horizon}
+        return self.remake(**options)
+
+    def length(self) -> float:
+        """Return what is proportional to the time that an episode simulates, for one size of the scene."""
+        return self.work().count * self.fidelity.dt
+
+    def engine_call(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Callable[[], object] | None:
+        """Return what calls the engine alone at these points, for timing; None where evaluating does no more."""
+        return None
+
+    @property
     def stiffness_parameters(self) -> tuple[str, ...]:
         """Names of the parameters that say how stiff a material is: those that say so in their name."""
         return tuple(name for name in self.space.names if "stiffness" in name)
 
     @property
-    def threads(self) -> int:
+    def threads(self) -> int:  # type: ignore[override] # read only
         """Number of threads a batch is spread over: on a CPU, if the engine's solvers run beside each other."""
         return cores() if self._solvers is not None and self.device == "cpu" and self.capabilities.concurrent else 1
 
@@ -262,13 +323,20 @@ class Environment(abc.ABC):
         return 1 if self.device == "cuda" else None  # one takes what memory a GPU has
 
     @property
-    def preferred_batch(self) -> int:
+    def preferred_batch(self) -> int:  # type: ignore[override] # read only
         """Number of points worth evaluating at once."""
         return 16 if self._solvers is None else self._capacity * self.threads
 
     @abc.abstractmethod
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
-        """Simulate at least one point; called from several threads at once where `threads` is above one."""
+        """Simulate at least one point, given by the parameters' own values.
+
+        Called from several threads at once where `threads` is above one.
+        """
+
+    def _remake(self, **settings: Any) -> Environment:
+        """Return this environment with all settings given."""
+        return type(self)(**settings)
 
     def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
         """Return the state just before a decision, in units that make it about one."""
@@ -278,25 +346,58 @@ class Environment(abc.ABC):
         """Return the energy over time of a motion that nothing drives [J], of no more rows than a solver takes."""
         return None
 
+    def _evaluate_rows(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+        """Evaluate rows together; where that raises, in halves, so that what raises is found."""
+        try:
+            found = self._simulate(x, grad=grad)
+        except Exception as error:
+            if isinstance(error, ContractError) or is_out_of_memory(error):
+                raise
+            if len(x) > 1:
+                parts = [self._evaluate_rows(part, grad=grad) for part in torch.tensor_split(x, 2)]
+                return Evaluation.join(parts, dim=x.shape[1], grad=grad)
+            self._refuse_if_always(error, x)
+            return Evaluation.raised(error, dim=x.shape[1], grad=grad)
+        self._answered = True
+        return found
+
+    def _refuse_if_always(self, error: Exception, x: Float[Tensor, "one dim"]) -> None:
+        """Raise ValueError where the simulation raises at other points of the box as well, and has never answered."""
+        if self._answered:
+            return
+        for point in torch.cat([self.space.center[None], self.space.sobol(PROBES, seed=0)]):
+            with suppress(Exception):
+                self._simulate(point[None], grad=False)
+                self._answered = True
+                return
+        raise ContractError(
+            f"{self.name} raised {type(error).__name__} at every one of {PROBES + 2} points that were tried: "
+            f"{first_line(error)}; the first was x = {x[0].tolist()}"
+        ) from error
+
     def _simulate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
-        with torch.set_grad_enabled(grad):  # torch switches it off around `_Bridge.forward`; threads have their own
-            found = self._evaluate(x, grad=grad)
+        values = self.space.to_values(x)
+        # Torch switches gradients off around `_Bridge.forward`, and callers may have; threads have their own switch.
+        with torch.inference_mode(False), torch.set_grad_enabled(grad):
+            found = self._evaluate(values, grad=grad)
         if not isinstance(found, Evaluation):
-            raise ValueError(
+            raise ContractError(
                 f"{self.name}._evaluate must return an Evaluation; got {type(found).__name__}. "
                 "Evaluation.from_results(losses, gradients) makes one"
             )
         if grad and found.grad is None:
-            raise ValueError(f"{self.name}._evaluate was asked for gradients (grad=True) and returned none")
-        return found
+            raise ContractError(f"{self.name}._evaluate was asked for gradients (grad=True) and returned none")
+        if found.grad is None or self.space.is_linear:
+            return found
+        return replace(found, grad=self.space.chain(values, found.grad.detach().to(values)))
 
-    def _setup(self) -> None:  # noqa: B027 -- a scene that shares nothing needs none
+    def _setup(self) -> None:
         """Prepare what all evaluations share; sets `space` unless the class does."""
 
-    def _compile_ahead(self) -> None:  # noqa: B027 -- a solver compiles what it needs, but one part after the other
+    def _compile_ahead(self) -> None:
         """Compile all kernels beside each other."""
 
-    def _prepare(self) -> None:  # noqa: B027 -- nothing, for most scenes
+    def _prepare(self) -> None:
         """Make what else a first evaluation would make."""
 
     @final
@@ -310,9 +411,8 @@ class Environment(abc.ABC):
         try:
             return import_module(f".engines.{module}", __package__)
         except ImportError as error:
-            extra = self.capabilities.extra
-            there = f"; {install_line(extra)}" if extra else ""
-            raise ValueError(f"{self.name} cannot run on engine {self.engine} here: {error}{there}") from error
+            why = self.capabilities.lacking_wheels() or self.capabilities.with_advice(str(error))
+            raise ValueError(f"{self.name} cannot run on engine {self.engine} here: {why}") from error
 
     @final
     def _limit_rows(self, capacity: int) -> int:
@@ -336,12 +436,7 @@ class Environment(abc.ABC):
         return map_parts(work, parts, threads=self.threads, stop=self._stop)
 
     def _check_points(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch dim"]:
-        x = as_tensor(x, self.name)
-        if x.ndim != 2 or x.shape[1] != self.space.dim:
-            raise ValueError(
-                f"{self.name} takes {self.space.dim} parameters, x of shape (batch, {self.space.dim}); "
-                f"got x of shape {tuple(x.shape)}"
-            )
+        x = check_points(x, self.space, self.name)
         if not bool(x.isfinite().all()):
             row = int((~x.isfinite().all(dim=1)).nonzero()[0])
             raise ValueError(f"{self.name} takes finite parameters; row {row} of x holds {x[row].tolist()}")
@@ -353,8 +448,8 @@ class Environment(abc.ABC):
         return x
 
     def _row(self, x: Float[Tensor, " dim"]) -> Float[Tensor, "one dim"]:
-        """Return a single point, as `episode` takes it, as a batch of one row."""
-        return self._check_points(as_tensor(x, self.name)[None])
+        """Return the parameters' own values at a single point, as `episode` takes it, as a batch of one row."""
+        return self.space.to_values(self._check_points(as_tensor(x, self.name)[None]))
 
     def _find_fidelity(self, fidelity: str | Fidelity | None) -> Fidelity:
         if isinstance(fidelity, Fidelity):
@@ -362,7 +457,7 @@ class Environment(abc.ABC):
         if fidelity is None:
             return next(iter(self.fidelities.values()))
         if fidelity not in self.fidelities:
-            raise ValueError(f"{self.name} has fidelities {', '.join(self.fidelities)}; got {fidelity!r}")
+            raise unknown_fidelity(self.name, self.fidelities, fidelity)
         return self.fidelities[fidelity]
 
     def _find_device(self, device: str) -> str:

@@ -9,6 +9,10 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from typing import Generic, TypeVar
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
 T = TypeVar("T")
 Part = TypeVar("Part")
 Result = TypeVar("Result")
@@ -43,6 +47,14 @@ class Pool(Generic[T]):
                 yield item
             finally:
                 self._idle.put(item)
+
+
+def copied(values: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Copy numbers out of a solver's memory, which its next run overwrites, to float64 on the CPU.
+
+    `.double().cpu()` would return that memory itself where a solver computes in float64 on a CPU.
+    """
+    return values.to("cpu", torch.float64, copy=True)
 
 
 def map_parts(

@@ -16,7 +16,7 @@ from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
 from .base import Environment, Episode, Fidelity, MaterialRange, ModelPart, Work
-from .batching import Pool
+from .batching import Pool, copied
 from .engines.balls.rigid import Ball, Solver
 from .engines.runtime import to_torch
 from .options import EpisodeOptions
@@ -73,15 +73,15 @@ class Bounce(Environment):
     """
 
     model_version = 1
-    name: ClassVar[str] = "bounce"
+    name = "bounce"
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
-    beyond_box: ClassVar[bool] = True
+    beyond_box = True
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=1 / 320),
         "standard": Fidelity("standard", dt=1 / 480),
         "reference": Fidelity("reference", dt=1 / 7680, precision="float64"),
     }
-    loss_unit: ClassVar[str] = "m²"
+    loss_unit = "m²"
     model_parts: ClassVar[tuple[ModelPart, ...]] = (
         ModelPart("friction", {"mu": 0.0, "kf": 0.0}, "a smooth ground"),
         ModelPart("damping", {"kd": 0.0}, "an elastic ground"),
@@ -104,7 +104,7 @@ class Bounce(Environment):
     )
 
     @property
-    def preferred_batch(self) -> int:
+    def preferred_batch(self) -> int:  # type: ignore[override] # read only
         """Number of points worth evaluating at once."""
         return 512 if self.device == "cpu" else 1 << 16
 
@@ -127,8 +127,7 @@ class Bounce(Environment):
         counts = []
         for part in torch.split(self._check_points(x), self._capacity):
             with self._solvers.lend() as solver:
-                height = solver.run(torch.tensor(START), part)[:, :, 1].cpu()
-            inside = height < self.ball.radius
+                inside = solver.run(torch.tensor(START), part)[:, :, 1].cpu() < self.ball.radius
             counts.append((inside[:-1] & ~inside[1:]).sum(dim=0))
         return torch.cat(counts) if counts else torch.zeros(0, dtype=torch.int64)
 
@@ -140,7 +139,7 @@ class Bounce(Environment):
         """Return the ball's flight."""
         (row,) = self._row(x)
         with self._solvers.lend() as solver:
-            flight = solver.run(torch.tensor(START), row[None]).double().cpu()
+            flight = copied(solver.run(torch.tensor(START), row[None]))
         time = self.fidelity.dt * torch.arange(self.steps + 1, dtype=torch.float64)
         target = self.target.expand(len(time), 3)
         parts = (
@@ -174,8 +173,8 @@ class Bounce(Environment):
     def _energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"]:
         """Return kinetic and potential energy of each flight, that of the ground's spring included."""
         with self._solvers.lend() as solver:
-            flight = solver.run(torch.tensor(START), x).double().cpu()
-            roll = to_torch(solver.roll)[1:, : len(x)].double().cpu()
+            flight = copied(solver.run(torch.tensor(START), x))
+            roll = copied(to_torch(solver.roll)[1:, : len(x)])
         ball, speed = self.ball, flight.diff(dim=0) / self.fidelity.dt  # semi-implicit Euler: the step's own
         height = flight[1:, :, 1] - ball.radius
         spring = ball.ke / 2 * height.clamp(max=0.0).square()

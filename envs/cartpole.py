@@ -15,7 +15,7 @@ from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
 from .base import Environment, Episode, Fidelity, ModelPart, Work
-from .batching import Pool
+from .batching import Pool, copied
 from .controls import extend, hold
 from .engines.chain import Chain, Solver
 from .options import EpisodeOptions
@@ -72,16 +72,16 @@ class Cartpole(Environment):
     """
 
     model_version = 1
-    name: ClassVar[str] = "cartpole"
+    name = "cartpole"
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
-    beyond_box: ClassVar[bool] = True
+    beyond_box = True
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=SPAN),
         "standard": Fidelity("standard", dt=SPAN / 2),
         "reference": Fidelity("reference", dt=SPAN / 8, precision="float64"),
     }
-    loss_unit: ClassVar[str] = "m"
-    decisions: ClassVar[int] = CONTROLS
+    loss_unit = "m"
+    decisions = CONTROLS
     control_step: ClassVar[float] = SPAN
     designed_order: ClassVar[dict[str, float]] = {"dt": 4.0}  # classical Runge-Kutta; controls change between steps
     model_parts: ClassVar[tuple[ModelPart, ...]] = (
@@ -125,7 +125,7 @@ class Cartpole(Environment):
         """Return the cart, and the joints of the chain with its tip."""
         controls = self._controls(self._row(x))
         with self._solvers.lend() as solver:
-            phi = _swing(solver, controls)[:, 0].cpu().double()
+            phi = copied(_swing(solver, controls)[:, 0])
         joints = _joints(self._cart(controls)[0], phi)
         joints = torch.cat([joints, torch.zeros_like(joints[..., :1])], dim=2)
         time = self.fidelity.dt * torch.arange(self.steps + 1, dtype=torch.float64)
@@ -153,7 +153,7 @@ class Cartpole(Environment):
         x = x.clone().requires_grad_(grad)
         controls = self._controls(x)
         with self._solvers.lend() as solver:
-            phi = _swing(solver, controls.detach())[-1].cpu().double().requires_grad_(grad)
+            phi = copied(_swing(solver, controls.detach())[-1]).requires_grad_(grad)
             tip = _joints(self._cart(controls)[:, -1], phi)[:, -1]
             loss = (tip - self.target).norm(dim=1)
             slope = _pull_back(solver, loss, phi, controls, x) if grad else None
@@ -175,7 +175,7 @@ class Cartpole(Environment):
         """Watch the cart and the sines and cosines of angles, and how fast cart and angles changed in the last step."""
         controls, step = self._controls(x), decision * self.steps // CONTROLS
         with self._solvers.lend() as solver:
-            phi = _swing(solver, controls).cpu().double().transpose(0, 1)
+            phi = copied(_swing(solver, controls)).transpose(0, 1)
         joints = torch.cat([self._cart(controls)[:, :, None], phi], dim=2)
         rate = (joints[:, step] - joints[:, max(0, step - 1)]) * (TEMPO / self.fidelity.dt)
         return torch.cat([joints[:, step, :1], phi[:, step].sin(), phi[:, step].cos(), rate], dim=1)

@@ -31,7 +31,7 @@ class Function(Environment):
     """
 
     model_version = 1
-    beyond_box: ClassVar[bool] = True
+    beyond_box = True
 
     fidelities: ClassVar[dict[str, Fidelity]] = {"exact": Fidelity("exact", dt=0.0, precision="float64")}
     synthetic: ClassVar[Any]  # a class of botorch.test_functions.synthetic

@@ -75,13 +75,13 @@ class Pinball(Environment):
 
     model_version = 1
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
-    beyond_box: ClassVar[bool] = True
+    beyond_box = True
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=1 / 30),
         "standard": Fidelity("standard", dt=1 / 30, precision="float64"),
         "reference": Fidelity("reference", dt=1 / 240, precision="float64"),
     }
-    loss_unit: ClassVar[str] = "m"
+    loss_unit = "m"
     model_parts: ClassVar[tuple[ModelPart, ...]] = (
         ModelPart("friction", {"friction": 0.0}, "smooth walls and bars"),
         ModelPart("spin", {"spin": False}, "a ball that cannot spin, which friction brakes"),
@@ -168,7 +168,7 @@ class Pinball2(Pinball):
     other scene, is among the best of 4096 random points at draft, taken for its small loss at all fidelities.
     """
 
-    name: ClassVar[str] = "pinball-2"
+    name = "pinball-2"
     examples: ClassVar[dict[str, tuple[float, ...]]] = {"aim": (0.55, -0.22)}
     pivots = ((2.2, 6.0), (5.8, 6.0))
     half_length = 1.6
@@ -179,7 +179,7 @@ class Pinball2(Pinball):
 class Pinball16(Pinball):
     """Lead a falling ball to the goal by the angles of four rows of four bars, 0.94 m long."""
 
-    name: ClassVar[str] = "pinball-16"
+    name = "pinball-16"
     examples: ClassVar[dict[str, tuple[float, ...]]] = {
         "aim": (
             0.77,

@@ -19,7 +19,7 @@ FORMS = (
 
 
 def point(environment: Environment, text: str) -> Float[Tensor, " dim"]:
-    """Return the point that `text` means: center, random:SEED, example:NAME or a file of numbers.
+    """Return the point that `text` means: center, random:SEED, example:NAME or a file of the parameters' values.
 
     Raises ValueError where there is no such example or file, or the file holds anything but the scene's parameters.
     """
@@ -51,4 +51,4 @@ def _read(environment: Environment, path: Path) -> Float[Tensor, " dim"]:
         raise ValueError(
             f"{environment.name} takes {environment.space.dim} finite parameters; {path} holds {len(flat)} numbers"
         )
-    return flat
+    return environment.space.from_values(flat)

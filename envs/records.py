@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 
@@ -13,7 +13,8 @@ class Fidelity:
 
     `dt` is the time step [s], `resolution` the number of grid cells (or mesh edges) across the scene, 0 where it has
     none, `sampling` the particles per cell along each axis, `precision` that of the engine: float32 or float64.
-    `particles` is how many there are, in scenes that count them instead.
+    `particles` is how many there are, in scenes that count them instead. `settings` are what else a function is given
+    by name, name -> value.
     """
 
     name: str
@@ -22,10 +23,16 @@ class Fidelity:
     resolution: int = 0
     sampling: float = 2.0
     particles: int = 0
+    settings: Mapping[str, Any] = field(default_factory=dict, hash=False)
+
+    def record(self) -> dict[str, Any]:
+        """Return it as plain JSON that `Fidelity(**record)` takes."""
+        known = asdict(self)
+        return known if self.settings else {name: value for name, value in known.items() if name != "settings"}
 
     def changes_from(self, known: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
         """Return the settings that are others than a record has of this fidelity: what it has, and what they are."""
-        now = vars(self)
+        now = self.record()
         return {name: (value, now.get(name)) for name, value in known.items() if value != now.get(name)}
 
 
@@ -58,3 +65,8 @@ class ModelPart:
     options: Mapping[str, Any]
     change: str
     missing: bool = False
+
+
+def unknown_fidelity(name: str, known: Iterable[str], given: str) -> ValueError:
+    """Return the error of a fidelity that a scene does not have."""
+    return ValueError(f"{name} has fidelities {', '.join(known)}; got {given!r}")

@@ -5,41 +5,48 @@ Another package registers its own by an entry point of the group `gradscape.envi
     [project.entry-points."gradscape.environments"]
     my-arm = "my_package.arm:Arm"
 
-A program or a notebook registers a class by `register`, and the command takes a class from a file as `FILE.py:Class`.
+A program or a notebook registers a class by `register`, and the command takes whatever simulator a file holds as
+`FILE.py:NAME`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import cache
 from importlib.metadata import entry_points
+from pathlib import Path
+from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..landscapes.storage.files import resolve
-from .importing import IN_FILE, import_named
+from .engines import refuse_engine
+from .importing import IN_FILE, import_named, refuse_absent_name
 from .installed import install_line, is_installed
+from .records import unknown_fidelity
 
 if TYPE_CHECKING:
     from .base import Environment, Fidelity
 
-Kind = TypeVar("Kind", bound="Environment")
+Kind = TypeVar("Kind", bound="type[Environment] | Environment")
 GROUP = "gradscape.environments"
 EXTRAS = {"mjx": ("mujoco", "mujoco-mjx", "jax"), "newton": ("newton",)}  # of this package, and what each brings
 SCENE = ("draft", "standard", "reference")
+DEVICES = ("auto", "cpu", "cuda")
 
 
 @dataclass(frozen=True)
 class Entry:
     """Say what an environment is without importing it.
 
-    `target` is "module:Class", "FILE.py:Class" or the class itself. What another package's entry point cannot say is
-    empty; `complete_entry` asks the class. An environment whose engine is not always installed comes with an `extra`
+    `target` is "module:Class", "FILE.py:NAME", a class or an environment. What another package's entry point cannot say
+    is empty; `complete_entry` asks the class. An environment whose engine is not always installed comes with an `extra`
     of this package.
     """
 
     name: str
-    target: str | type[Environment]
+    target: str | type[Environment] | Environment
     dim: str = ""
     parameters: str = ""
     model: str = ""
@@ -182,23 +189,26 @@ def entries() -> dict[str, Entry]:
     return found
 
 
-def register(kind: type[Kind]) -> type[Kind]:
-    """Let an environment's class be found by its `name` in this process, and return it (so it can be a decorator).
+def register(what: Kind) -> Kind:
+    """Let an environment or the class of one be found by its `name` in this process, and return it.
 
-    Raises ValueError where another environment has that name. A class that is run again, as in a notebook, takes the
-    place of the earlier one.
+    It can be a decorator. Raises ValueError where another environment has that name. One that is run again, as in a
+    notebook, takes the place of the earlier one.
     """
     from .base import Environment
 
-    if not (isinstance(kind, type) and issubclass(kind, Environment)):
-        raise ValueError(f"register takes a class derived from Environment; got {kind!r}")
-    taken = entries().get(kind.name)
-    if taken and not (isinstance(taken.target, type) and taken.target.__qualname__ == kind.__qualname__):
-        raise ValueError(
-            f"an environment called {kind.name!r} exists already ({taken.model}); give the class another name"
-        )
-    entries()[kind.name] = Entry(kind.name, kind, model="registered by this program")
-    return kind
+    if not (isinstance(what, Environment) or (isinstance(what, type) and issubclass(what, Environment))):
+        raise ValueError(f"register takes an environment, or a class derived from Environment; got {what!r}")
+    taken = entries().get(what.name)
+    if taken and (isinstance(taken.target, str) or _origin(taken.target) != _origin(what)):
+        raise ValueError(f"an environment called {what.name!r} exists already ({taken.model}); give it another name")
+    entries()[what.name] = Entry(what.name, what, model="registered by this program")
+    return what
+
+
+def _origin(what: type[Environment] | Environment) -> str:
+    """Return what a class is called where it is written, or of what kind an environment is."""
+    return what.__qualname__ if isinstance(what, type) else type(what).__qualname__
 
 
 def installs(entry: Entry) -> str:
@@ -225,66 +235,159 @@ def complete_entry(entry: Entry) -> Entry:
     )
 
 
-def environment_class(name: str) -> type[Environment]:
-    """Import and return the class of a registered environment, or of `FILE.py:Class`, which is registered by that.
+def find_environment(what: Any) -> type[Environment] | Environment:
+    """Return the environment, or the class of one, that somebody names or gives.
 
-    Raises ValueError where no environment has that name, or its module or file cannot be imported.
+    That is a registered name, FILE.py:NAME, a class, an environment, or an object with `space` and `evaluate`. Raises
+    ValueError for what is none of these, and where a module or a file cannot be imported.
     """
-    if IN_FILE.fullmatch(name):
-        return _import_from_file(name)
-    known = entries()
-    if name not in known:
-        close = get_close_matches(name, known, n=1)
-        hint = f"; did you mean {close[0]}?" if close else ";"
-        raise ValueError(f"no environment is called {name!r}{hint} `landscape envs` lists all {len(known)}")
-    target = known[name].target
-    if isinstance(target, type):
+    from .base import Environment
+
+    if isinstance(what, str):
+        return _import_from_file(what) if IN_FILE.fullmatch(what) else registered_environment(what)
+    if isinstance(what, Environment) or (isinstance(what, type) and issubclass(what, Environment)):
+        return what
+    from .adapters import GivenEnvironment
+
+    if isinstance(what, FunctionType | BuiltinFunctionType | MethodType):
+        raise ValueError(
+            f"{what.__name__} is a function, and nothing says what its parameters are: "
+            f"gs.from_torch({what.__name__}, space), from_jax, from_numpy or from_warp make an environment of it"
+        )
+    return GivenEnvironment.of(what() if isinstance(what, type) else what)
+
+
+def environment_class(name: str) -> type[Environment]:
+    """Return the class of a registered environment. Raises ValueError as `registered_environment` does."""
+    found = registered_environment(name)
+    return found if isinstance(found, type) else type(found)
+
+
+def as_environment(what: Any) -> Environment:
+    """Return what somebody names or gives as an environment. Raises ValueError as `find_environment` does."""
+    found = find_environment(what)
+    return found() if isinstance(found, type) else found
+
+
+def refuse_unknown(
+    what: str,
+    *,
+    fidelity: str | Fidelity | None = None,
+    device: str = "auto",
+    engine: str | None = None,
+    dims: Sequence[str] = (),
+) -> None:
+    """Raise ValueError for what cannot exist, as far as that is known without importing the scene or running its file.
+
+    Whoever makes the environment refuses the rest, after an import that takes seconds. `dims` are parameters, of which
+    numbers are held against how many a scene has where nothing changes that.
+    """
+    if IN_FILE.fullmatch(what):
+        file, path, name = _place_in_file(what)
+        refuse_absent_name(file, name, path)
+        return
+    entry = _find_entry(what)
+    if not entry.fidelities:
+        return  # registered by others: their class knows
+    if isinstance(fidelity, str) and fidelity not in entry.fidelities:
+        raise unknown_fidelity(what, entry.fidelities, fidelity)
+    if device not in DEVICES:
+        raise ValueError(f"{what} runs on {', '.join(DEVICES[:-1])} or {DEVICES[-1]}; got device {device!r}")
+    if engine is not None:
+        refuse_engine(what, engine)
+    for number in map(int, filter(str.isdecimal, dims)):
+        if entry.dim.isdecimal() and number >= int(entry.dim):
+            raise ValueError(f"{what} has parameters numbered 0 to {int(entry.dim) - 1}; got {number}")
+
+
+def registered_environment(name: str) -> type[Environment] | Environment:
+    """Return what is registered by a name, which runs no file of anybody's.
+
+    Raises ValueError where no environment has that name, or its module cannot be imported.
+    """
+    target = _find_entry(name).target
+    if not isinstance(target, str):
         return target
     module, _, attribute = target.rpartition(":")
     try:
-        found: type[Environment] = getattr(import_named(module), attribute)
+        found: type[Environment] | Environment = getattr(import_named(module), attribute)
     except (ImportError, AttributeError) as error:
         raise ValueError(f"{name} is registered as {target}, which cannot be imported: {error}") from error
     return found
 
 
-def source_of(env: Environment) -> str | type[Environment]:
-    """Return what makes such an environment in another process, where not all that is registered here may be."""
+def _find_entry(name: str) -> Entry:
+    """Return what is registered by a name. Raises ValueError, with a name that comes close, where nothing is."""
+    known = entries()
+    if name not in known:
+        close = get_close_matches(name, known, n=1)
+        hint = f"; did you mean {close[0]}?" if close else ";"
+        raise ValueError(
+            f"no environment is called {name!r}{hint} `landscape envs` lists all {len(known)}, and one in a file of "
+            "your own is FILE.py:NAME"
+        )
+    return known[name]
+
+
+def source_of(env: Environment) -> str | type[Environment] | Environment:
+    """Return what makes such an environment in another process, where not all that is registered here may be.
+
+    A class is enough where its settings make the environment again; a function goes there itself.
+    """
+    from .adapters import GivenEnvironment
+    from .function import FunctionEnvironment
+
     entry = entries().get(env.name)
-    if entry is None or isinstance(entry.target, type):
-        return type(env)
-    return entry.target if IN_FILE.fullmatch(entry.target) else env.name
+    if entry is not None and isinstance(entry.target, str):
+        return entry.target if IN_FILE.fullmatch(entry.target) else env.name
+    return env if isinstance(env, FunctionEnvironment | GivenEnvironment) else type(env)
 
 
-def _import_from_file(text: str) -> type[Environment]:
-    """Import a class from a file and register it under its name."""
-    from .base import Environment
-
-    path, _, attribute = text.rpartition(":")
-    file = resolve(path)
-    if not file.is_file():
-        raise ValueError(f"there is no file {path} to take {attribute} from")
+def _import_from_file(text: str) -> type[Environment] | Environment:
+    """Return what a file calls by a name as an environment or the class of one, and register it by its own name."""
+    file, path, attribute = _place_in_file(text)
     module = import_named(str(file))
-    kind = getattr(module, attribute, None)
-    if not (isinstance(kind, type) and issubclass(kind, Environment)):
-        there = [one.__name__ for one in vars(module).values() if _is_scene_of(one, module.__name__)]
-        raise ValueError(f"{path} holds no environment {attribute}; it has {', '.join(there) or 'none'}")
-    taken = entries().get(kind.name)
-    target = f"{file}:{attribute}"
-    if taken and taken.target not in (target, kind):  # a file may register its class itself
-        raise ValueError(f"{text} is called {kind.name!r}, and so is {taken.target}; give the class another name")
-    entries()[kind.name] = Entry(kind.name, target, model=f"of {path}")
-    return kind
+    if attribute not in vars(module):
+        there = ", ".join(name for name, one in vars(module).items() if _is_offered(name, one, module.__name__))
+        raise ValueError(f"{path} holds no {attribute}; it has {there or 'no simulator'}")
+    try:
+        found = _named(find_environment(vars(module)[attribute]), attribute)
+    except ValueError as error:
+        raise ValueError(f"{text}: {error}") from None
+    taken, target = entries().get(found.name), f"{file}:{attribute}"
+    if taken and taken.target not in (target, found):  # a file may register its class itself
+        raise ValueError(f"{text} is called {found.name!r}, and so is {taken.target}; give it another name")
+    entries()[found.name] = Entry(found.name, target, model=f"of {path}")
+    return found
 
 
-def _is_scene_of(value: object, module: str) -> bool:
+def _place_in_file(text: str) -> tuple[Path, str, str]:
+    """Return the file of FILE.py:NAME, what it was called, and the name. Raises ValueError where there is no file."""
+    path, _, name = text.rpartition(":")
+    if not (file := resolve(path)).is_file():
+        raise ValueError(f"there is no file {path} to take {name} from")
+    return file, path, name
+
+
+def _named(found: type[Environment] | Environment, attribute: str) -> type[Environment] | Environment:
+    """Return a function that has no name of its own by what its file calls it."""
+    from .function import NAMELESS, FunctionEnvironment
+
+    return found.named(attribute) if isinstance(found, FunctionEnvironment) and found.name == NAMELESS else found
+
+
+def _is_offered(name: str, value: object, module: str) -> bool:
+    """Say whether a value of a file is a simulator: an environment, a class of one, or an object like one."""
     from .base import Environment
 
-    return isinstance(value, type) and issubclass(value, Environment) and value.__module__ == module
+    if isinstance(value, type) and value.__module__ != module:  # imported there
+        return False
+    is_class = isinstance(value, type) and issubclass(value, Environment)
+    return is_class or (not name.startswith("_") and hasattr(value, "space") and hasattr(value, "evaluate"))
 
 
 def make(
-    name: str | type[Environment],
+    what: Any,
     /,
     *,
     fidelity: str | Fidelity | None = None,
@@ -293,12 +396,19 @@ def make(
     deterministic: bool = False,
     **options: Any,
 ) -> Environment:
-    """Make an environment by its registered name, by FILE.py:Class, or of a class.
+    """Make an environment with settings, of a registered name, FILE.py:NAME, a class, an environment or one's object.
 
-    `fidelity` defaults to its cheapest, `engine` to its first; `device` is auto, cpu or cuda. Raises ValueError where
+    `fidelity` defaults to the cheapest, `engine` to the first, and both, like options, to those of an environment that
+    is given; `device` is auto, cpu or cuda. Raises ValueError where
     the environment does not exist, or has no such fidelity, device, engine or option, or where the engine does not give
     the same bits every time and they are to be `deterministic`.
     """
-    kind = name if isinstance(name, type) else environment_class(name)
-    settings: dict[str, Any] = {"fidelity": fidelity, "device": device, "engine": engine}
-    return kind(**settings, deterministic=deterministic, **options)
+    found = find_environment(what)
+    if isinstance(found, type):
+        return found(fidelity=fidelity, device=device, engine=engine, deterministic=deterministic, **options)
+    if not (fidelity or engine or deterministic or options) and device in ("auto", found.device):
+        return found
+    chosen = None if device == "auto" else device
+    return found.remake(
+        fidelity=fidelity, device=chosen, engine=engine, deterministic=deterministic or found.deterministic, **options
+    )

@@ -13,7 +13,7 @@ import torch
 from ..envs.registry import environment_class
 from ..jobs.scene import SceneSpec
 from ..jobs.watch import Watch
-from ..landscapes.objective import Evaluation, Status, evaluate
+from ..landscapes.objective import Evaluation, evaluate
 from ..landscapes.plain import number, optional, text
 from ..landscapes.storage.records import read_json, reading, write_record
 from .figures import Figure
@@ -133,8 +133,7 @@ def sample(env: Environment, plane: Plane) -> np.ndarray[Any, np.dtype[np.float3
     grid = plane.grid()
     batches = torch.split(grid.reshape(-1, plane.dim), env.preferred_batch)
     found = Evaluation.join((evaluate(env, x, grad=False) for x in batches), dim=plane.dim, grad=False)
-    loss = found.loss.masked_fill(found.status != Status.OK, torch.nan)
-    return loss.reshape(grid.shape[:-1]).to(torch.float32).numpy()
+    return found.loss.reshape(grid.shape[:-1]).to(torch.float32).numpy()
 
 
 def _companion(name: str, loss: np.ndarray[Any, Any]) -> Companion:

@@ -21,7 +21,7 @@ from ..envs.engines.profiling import count_compiled_modules
 from ..envs.engines.runtime import cores, device_names, free_memory
 from ..landscapes.capacity import Need, require
 from ..landscapes.cost import duration
-from ..landscapes.objective import Evaluation, Status
+from ..landscapes.objective import Evaluation, ObjectiveWrapper
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.fill import sample
 from ..landscapes.storage.store import SliceStore
@@ -281,7 +281,7 @@ def _points(env: Environment, count: int) -> Float[Tensor, "count dim"]:
 
 def _time_batch(envs: Mapping[str, Environment], points: Tensor, seconds: float) -> list[BatchRate]:
     """Time one batch on every engine in turn, forward and with gradient; the first engine's rate holds the ratios."""
-    failed = {name: int((env.evaluate(points).status != Status.OK).sum()) for name, env in envs.items()}  # warms up too
+    lost = {name: int(env.evaluate(points).failed.sum()) for name, env in envs.items()}  # warms up too
     calls = {
         (name, grad): partial(env.evaluate, points, grad=grad) for grad in WAYS.values() for name, env in envs.items()
     }
@@ -290,7 +290,7 @@ def _time_batch(envs: Mapping[str, Environment], points: Tensor, seconds: float)
     for name, env in envs.items():
         forward, sloped = (Rate.of(env, len(points), min(times[name, grad])) for grad in WAYS.values())
         costs = sloped.seconds / forward.seconds
-        found.append(BatchRate(name, len(points), failed[name], len(times[name, True]), forward, sloped, costs))
+        found.append(BatchRate(name, len(points), lost[name], len(times[name, True]), forward, sloped, costs))
     for other in found[1:]:
         found[0] = replace(
             found[0],
@@ -315,13 +315,13 @@ def alternate(calls: Mapping[K, Callable[[], object]], seconds: float) -> dict[K
 
 def _time_adapter(env: Environment, seconds: float) -> AdapterShare | None:
     """Time some 256 episodes against the engine's program alone, in turn; None where the program is our own."""
-    engine_call = getattr(env, "engine_call", None)
-    if engine_call is None:
-        return None
     points = _points(env, -(-ADAPTED // env.preferred_batch) * env.preferred_batch)
     shares = {}
     for way, grad in WAYS.items():
-        calls = {"ours": partial(env.evaluate, points, grad=grad), "engine": engine_call(points, grad=grad)}
+        engine = env.engine_call(points, grad=grad)
+        if engine is None:
+            return None
+        calls: dict[str, Callable[[], object]] = {"ours": partial(env.evaluate, points, grad=grad), "engine": engine}
         for call in calls.values():
             call()
         times = alternate(calls, seconds)
@@ -329,17 +329,17 @@ def _time_adapter(env: Environment, seconds: float) -> AdapterShare | None:
     return AdapterShare(len(points), **shares)
 
 
-class _Clocked:
+class _Clocked(ObjectiveWrapper):
     """An environment that adds up the seconds spent in `evaluate`."""
 
     def __init__(self, env: Environment) -> None:
-        self.name, self.space, self.preferred_batch = env.name, env.space, env.preferred_batch
-        self._env, self.seconds = env, 0.0
+        super().__init__(env)
+        self.seconds = 0.0
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
         """Evaluate, and note how long it took."""
         began = time.perf_counter()
-        result = self._env.evaluate(x, grad=grad)
+        result = self.objective.evaluate(x, grad=grad)
         self.seconds += time.perf_counter() - began
         return result
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any
 
@@ -138,7 +138,7 @@ class CheckJob:
         return CheckReport(
             env=env.name,
             fidelity=env.fidelity.name,
-            settings=asdict(env.fidelity),
+            settings=env.fidelity.record(),
             options=asdict(env.options),
             device=env.device,
             engine=env.engine,
@@ -152,11 +152,11 @@ class CheckJob:
     def _run(self, follow: Callable[[str], None]) -> Iterator[Finding]:
         from ..landscapes.conformance.suite import check
 
-        return check(
+        yield from check(  # once the cost is known, and by that the type of the losses
             self.env,
             points=self.points,
             seed=self.seed,
-            precision=self.env.fidelity.precision,
+            precision=self.env.precision,
             twin=_twin(self),
             variants=[*_time_steps(self), *_materials(self), *_horizons(self)],
             horizons=_lengths(self),
@@ -167,11 +167,11 @@ class CheckJob:
 
     @cached_property
     def longer(self) -> dict[int, Callable[[], Environment]]:
-        """What makes the environment with episodes so many times as long, once each; empty without `horizon`."""
-        if "horizon" not in {field.name for field in fields(self.env.options)}:
+        """What makes the environment with episodes so many times as long, once each; empty without a horizon."""
+        own = self.env.horizon
+        if not own:
             return {}
-        own = self.env.options.horizon
-        others = {factor: cache(_with_option(self.spec, "horizon", factor * own)) for factor in FACTORS[1:]}
+        others = {factor: cache(partial(self.env.with_horizon, factor * own)) for factor in FACTORS[1:]}
         return {1: lambda: self.env, **others}
 
     def _cost(self) -> str:
@@ -183,6 +183,8 @@ class CheckJob:
         sloped += 2 * (sum(FACTORS) + 4)  # two points over longer horizons, time steps and materials
         seconds = (plain * cost.forward + sloped * cost.gradient) / env.threads
         subject = f"{env.name} · {env.fidelity.name} · {env.device} · {env.engine} · {self.points} points"
+        if env.precision != env.fidelity.precision:
+            subject += f" · its losses are {env.precision}"
         return f"{subject}: some {plain} episodes and {sloped} with gradients, about {duration(seconds)}"
 
 
@@ -251,7 +253,7 @@ def _horizons(job: CheckJob) -> list[ExtremeCase]:
     from ..landscapes.conformance.extremes import ExtremeCase
 
     if not job.longer:
-        return [ExtremeCase("horizon 1x to 8x", why="it has no option `horizon`")]
+        return [ExtremeCase("horizon 1x to 8x", why="no setting says how long an episode is")]
     return [ExtremeCase(f"horizon {factor}x", make) for factor, make in job.longer.items()]
 
 
@@ -260,15 +262,14 @@ def _lengths(job: CheckJob) -> dict[float, Callable[[], Environment]]:
     if job.longer and job.env.fidelity.precision != "float64":
         exact = replace(job.spec, fidelity=replace(job.env.fidelity, precision="float64"))
         with suppress(ValueError):  # refused: it computes in its own precision only
-            exact.make()
-            own = job.env.options.horizon
-            return {factor: _with_option(exact, "horizon", factor * own) for factor in GROWTH}
+            env = exact.make()
+            return {factor: partial(env.with_horizon, factor * (job.env.horizon or 1.0)) for factor in GROWTH}
     return {factor: make for factor, make in job.longer.items() if factor in GROWTH}
 
 
 def _other_mode(job: CheckJob) -> Callable[[], Environment] | None:
     """Return what makes the environment with gradients by the other mode, where its option `mode` offers both."""
-    mode = getattr(job.env.options, "mode", None)
+    mode = vars(job.env.options).get("mode")
     if mode not in MODES:
         return None
     (other,) = set(MODES) - {mode}

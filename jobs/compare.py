@@ -20,6 +20,7 @@ from ..landscapes.measures.slice_comparison_record import SliceComparison
 from ..landscapes.objective import Objective
 from ..landscapes.plain import plain_json
 from ..landscapes.slice import Slice
+from ..landscapes.space import scaled_labels
 from ..landscapes.storage.files import tidy, visible_files
 from ..landscapes.storage.paths import slice_exists
 from ..landscapes.storage.records import read_json, reading, write_record
@@ -77,12 +78,12 @@ class CompareJob:
             check_finished(ours, theirs)
             identity = {"a": slice.identity, "b": other.identity}
         else:
-            unit = getattr(other, "loss_unit", "")
-            check_landscapes(parameters(ours), other.space.names, loss_unit(ours), unit)
+            names = scaled_labels(other.space.names, other.space.scales)
+            check_landscapes(parameters(ours), names, loss_unit(ours), other.loss_unit)
             check_finished(ours)
             identity = {"a": slice.identity, "b": identity_of(other)}
-        names = [str(one.get("objective", "slice")) for one in identity.values()]
-        folder = out or folder_named(["compare", *dict.fromkeys(names)], identity)
+        named = [str(one.get("objective", "slice")) for one in identity.values()]
+        folder = out or folder_named(["compare", *dict.fromkeys(named)], identity)
         COMPARISON.check(folder, allowed=[file for file in visible_files(folder) if slice_exists(file / SLICE_STORE)])
         if not force:
             _refuse_another(folder / RECORD, identity)

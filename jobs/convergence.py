@@ -131,7 +131,7 @@ class ConvergenceJob:
         One that is refused takes none.
         """
         left = self.variants_left()
-        base = replace(SceneSpec.of(self.env), fidelity=next(iter(self.env.fidelities))).make()
+        base = self.env.remake(fidelity=next(iter(self.env.fidelities)))
         base.prepare()
         rate = seconds_per_episode(base, self.x[: base.preferred_batch], grad=True) / base.work().count
         seconds = {variant.name: 0.0 for variant in left}
@@ -159,7 +159,7 @@ class ConvergenceJob:
     def _make(self, variant: Variant) -> Environment | None:
         """Make a variant's environment; note what a scene refuses, and why, and what a CPU has no memory for."""
         try:
-            env = variant.make(SceneSpec.of(self.env).name)
+            env = variant.make(self.env)
             if env.device == "cpu":
                 require("episodes", 1, lambda count: Need(float(count * env.memory())))
             return env
@@ -250,7 +250,6 @@ class ConvergenceJob:
         return spread or None, Scale(whole, sum_up(far, whole, self.seed)[1], self.seed)
 
     def _ladders(self, values: dict[str, Values]) -> list[Ladder]:
-        from dataclasses import asdict
 
         from ..landscapes.measures.convergence_record import Level
         from ..landscapes.measures.self_convergence import Ladder
@@ -259,7 +258,7 @@ class ConvergenceJob:
         for one in self.refinements:
             known = [(variant, width) for variant, width in one.levels if variant.name in values]
             levels = [
-                Level(variant.name, width, asdict(variant.fidelity), values[variant.name].seconds)
+                Level(variant.name, width, variant.fidelity.record(), values[variant.name].seconds)
                 for variant, width in known
             ]
             said = [values[variant.name] for variant, _ in known]

@@ -6,23 +6,28 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Tensor
-
-from ..landscapes.foreign import SUFFIXES
 from ..landscapes.plain import plain_name
 from .scene import named_point, plane_through, runs_in
-from .slice_place import kept_plane
-from .slice_summary import JOINED
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from ..landscapes.objective import Objective
     from ..landscapes.plane import Plane
     from ..landscapes.space import ParameterSpace
 
+ONE_OF = "a slice takes --dims, one or two parameters, or --along, directions; give one of them"
 WORDS = ("center", "example", "random", "best")  # that names of points begin with
 HALF, LEAST = 0.5, 1e-3  # of a width of the box: how far a slice reaches at least, and what is no width for one
 SPREAD = 1 / 8  # the same by the root of how many parameters there are: each moves by that share of its width
+
+
+def refuse_cut(dims: Sequence[str] | None, along: str | None) -> None:
+    """Raise ValueError for parameters beside directions, and for a word that names no directions."""
+    if dims and along is not None:
+        raise ValueError(ONE_OF)
+    if along is not None and not joined_points(along):
+        _check_directions(along)
 
 
 def cut(
@@ -37,20 +42,25 @@ def cut(
 ) -> Plane:
     """Return the line or plane along parameters, or along directions that are named.
 
-    `kept` says where a slice may have been begun, as for `kept_plane`: it goes on along its own directions. Raises
-    ValueError where both or neither are given, and as `plane_through` and `plane_along` do.
+    Where there are no more than two parameters and neither is given, it varies all. `kept` says where a slice may have
+    been begun, as for `kept_plane`: it goes on along its own directions. Raises ValueError where both are given, or
+    neither with more parameters, and as `plane_through` and `plane_along` do.
     """
     if not isinstance(through, str) and any(isinstance(one, str) for one in through):
         raise ValueError(f"a slice goes through one point here; got {len(through)} names, so ask for each by itself")
-    if (dims is None or len(dims) == 0) == (along is None):
-        raise ValueError("a slice takes --dims, one or two parameters, or --along, directions; give one of them")
+    chosen = list(dims) if dims is not None else []
+    if not chosen and along is None and objective.space.dim <= 2:
+        chosen = list(range(objective.space.dim))
+    if bool(chosen) == (along is not None):
+        raise ValueError(ONE_OF)
     if along is None:
-        assert dims is not None  # as one of the two is given
-        return plane_through(objective, dims, through=through, extent=extent, resolution=resolution)
+        return plane_through(objective, chosen, through=through, extent=extent, resolution=resolution)
     if not isinstance(resolution, int):
         raise ValueError(f"a slice along {along} takes one resolution for its axes; got {list(resolution)}")
     where: dict[str, Any] = {"through": through, "extent": extent}
     if kept is not None and (named := describe_cut(along, **where)):
+        from .slice_place import kept_plane
+
         rank = len(joined_points(along)) - 1 if joined_points(along) else 2
         if (found := kept_plane(objective, named, (resolution,) * rank, **kept)) is not None:
             return found
@@ -71,11 +81,13 @@ def plane_along(
     there are more than sixteen parameters. Points of a line or a plane are named as those it goes through. Raises
     ValueError for what is none of these.
     """
+    import torch
+
     from ..landscapes.directions import gradient_directions, hessian_directions, joining, random_directions
     from ..landscapes.plane import Plane
 
-    kind, _, value = along.partition(":")
     names = joined_points(along)
+    kind, value = ("", "") if names else _check_directions(along)
     elsewhere = extent is not None or not isinstance(through, str) or through != "center"
     if (names or kind == "pca") and elsewhere:
         raise ValueError(f"--along {along} says where it goes; leave out --through and --extent")
@@ -84,21 +96,27 @@ def plane_along(
     if kind == "pca":
         from ..landscapes.overlay import principal_plane
 
-        if not value:
-            raise ValueError("--along pca:RUN takes the folder of a run or of a race; got no folder")
         return principal_plane(runs_in(objective, value), resolution=(resolution, resolution))
     point = named_point(objective, through) if isinstance(through, str) else through
-    if kind == "random" and value.isdecimal():
+    if kind == "random":
         directions, labels = random_directions(objective.space, int(value))
     elif along == "gradient":
         directions, labels = gradient_directions(objective, point)
-    elif along == "hessian":
-        directions, labels = hessian_directions(objective, point)
     else:
-        raise ValueError(f"--along takes random:SEED, gradient, hessian, pca:RUN, A:B or A:B:C; got {along!r}")
+        directions, labels = hessian_directions(objective, point)
     spans = torch.from_numpy(directions) * (objective.space.upper - objective.space.lower)
     lower, upper = _reach(objective.space, point, spans) if extent is None else _ends(extent)
     return Plane.span(point, spans, resolution=resolution, extent=(lower, upper), labels=labels)
+
+
+def _check_directions(along: str) -> tuple[str, str]:
+    """Return the kind of directions that a word names, and what follows it. Raises ValueError where it names none."""
+    kind, _, value = along.partition(":")
+    if along in ("pca", "pca:"):
+        raise ValueError("--along pca:RUN takes the folder of a run or of a race; got no folder")
+    if not (along in ("gradient", "hessian") or kind == "pca" or (kind == "random" and value.isdecimal())):
+        raise ValueError(f"--along takes random:SEED, gradient, hessian, pca:RUN, A:B or A:B:C; got {along!r}")
+    return kind, value
 
 
 def _reach(space: ParameterSpace, point: Tensor, spans: Tensor) -> tuple[list[float], list[float]]:
@@ -106,6 +124,8 @@ def _reach(space: ParameterSpace, point: Tensor, spans: Tensor) -> tuple[list[fl
 
     A direction of many parameters has a little of each: there it is an eighth of the root of their number, if more.
     """
+    import torch
+
     most = max(HALF, SPREAD * space.dim**0.5)
     ends = [[(bound - point) / span for bound in (space.lower, space.upper)] for span in spans]
     lower = [max(-most, float(torch.minimum(*pair).nan_to_num(-most).max())) for pair in ends]
@@ -126,6 +146,8 @@ def describe_cut(
     """Return what a slice along directions is known by; None for one along parameters."""
     if along is None:
         return None
+    from .slice_summary import JOINED
+
     names = joined_points(along)
     point = through if isinstance(through, str) else through.tolist()
     return {"along": along, "through": point, "extent": extent, **({JOINED: names} if names else {})}
@@ -158,7 +180,13 @@ def points_in(text: str) -> list[str]:
     while parts:
         name = parts.pop(0)
         after = parts[0] if parts else ""
-        row = name.lower().endswith(SUFFIXES) and after.isdecimal()
+        row = after.isdecimal() and _is_table(name)
         takes = name in ("example", "random") or row or (name == "best" and after not in WORDS)
         names.append(f"{name}:{parts.pop(0)}" if takes and parts else name)
     return names
+
+
+def _is_table(name: str) -> bool:
+    from ..landscapes.foreign import SUFFIXES
+
+    return name.lower().endswith(SUFFIXES)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .. import __version__
-from ..landscapes.objective import Status
+from ..landscapes.objective import Status, failed, has_loss
 from ..landscapes.storage.files import tidy, write_json
 from .folder import EPISODE, folder_named
 from .scene import named_point, provenance
@@ -121,21 +121,26 @@ class EpisodeJob:
         from ..landscapes.draw.figures.contact import Caption
         from ..landscapes.draw.style import FAILURES, number
 
-        env, failed = self.env, status != Status.OK
-        outcome = f"no loss: {FAILURES[status]}" if failed else f"loss {number(loss)} {env.loss_unit}".rstrip()
+        env = self.env
+        outcome = f"no loss: {FAILURES[status]}" if failed(status) else f"loss {number(loss)} {env.loss_unit}".rstrip()
         values = {
             name: f"{number(value)} {unit}".rstrip()
-            for name, value, unit in zip(env.space.names, self.x.tolist(), env.space.units, strict=True)
+            for name, value, unit in zip(env.space.names, self._values(), env.space.units, strict=True)
         }
         about = provenance(env, self.command)
         said = [f"gradscape {__version__}", env.device, str(about["created"]), str(about["command"])]
         return Caption(f"{env.name} · {env.fidelity.name}", outcome, self.source, values, RECORD, " · ".join(said))
 
+    def _values(self) -> list[float]:
+        """Return the parameters' values."""
+        values: list[float] = self.env.space.to_values(self.x).tolist()
+        return values
+
     def _record(self, loss: float, status: Status) -> EpisodeRecord:
         return EpisodeRecord(
             identity=self.env.identity(),
             provenance=provenance(self.env, self.command),
-            parameters=dict(zip(self.env.space.names, self.x.tolist(), strict=True)),
-            loss=loss if status == Status.OK else None,
+            parameters=dict(zip(self.env.space.names, self._values(), strict=True)),
+            loss=loss if has_loss(status) else None,
             status=status.name,
         )

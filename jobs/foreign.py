@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
-from ..landscapes.foreign import SUFFIXES, experiment_frame, points_table, read_points, study_frame
+from ..landscapes.foreign import SUFFIXES, Note, Trials, experiment_trials, points_table, read_points, study_trials
 from ..landscapes.plain import plain_name
 from .folder import run_tables
 from .scene import environment_of
+from .watch import Watch
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -19,13 +20,15 @@ if TYPE_CHECKING:
     from ..landscapes.slice import Slice
 
 TABLE, STUDY, EXPERIMENT = "table", "optuna", "ax"  # what points in memory are called
+NEGATED = " (negated)"  # after that, where losses are the values of what was maximised
 
 
-def tables_over(slice: Slice, given: Sequence[Any]) -> list[xr.Dataset]:
+def tables_over(slice: Slice, given: Sequence[Any], watch: Watch | None = None) -> list[xr.Dataset]:
     """Return what runs evaluated, and tables of points, as they are laid over a slice: first runs on disk, then others.
 
     Each is the folder of a run or a race, a CSV or Parquet file, a `Run`, a pandas table, an Optuna study, or a client
-    or an experiment of Ax. Runs without an episode are left out.
+    or an experiment of Ax, whose values are negated where they are maximised. Runs without an episode are left out.
+    `watch` is told what is left out of tables and what is made of them.
 
     Raises ValueError where a path holds none of these, a table lacks a column, or there is no episode at all.
     """
@@ -41,7 +44,9 @@ def tables_over(slice: Slice, given: Sequence[Any]) -> list[xr.Dataset]:
     found = [*(run_tables(paths) if paths else []), *(run.data for run in runs if run.data.sizes["evaluation"])]
     if tables:
         space = (slice.remake() if slice.remake else environment_of(slice.data, "cpu")).space
-        found += [points_table(frame, slice.data, space, name) for frame, name in map(_frame, tables)]
+        for one in tables:
+            frame, name = _frame(one, note := (watch or Watch()).note)
+            found.append(points_table(frame, slice.data, space, name, note=note))
     if not found:
         raise ValueError("there are no episodes yet in these runs; `gradscape.optimize` evaluates them")
     return found
@@ -59,12 +64,20 @@ def _experiment_of(one: Any) -> Any:
     return held if hasattr(held, "lookup_data") else None
 
 
-def _frame(one: Any) -> tuple[pd.DataFrame, str]:
+def _frame(one: Any, note: Note) -> tuple[pd.DataFrame, str]:
     """Return a table of points, and what a picture calls it."""
     if isinstance(one, str | Path):
         return read_points(Path(one)), plain_name(Path(one).stem)
     if hasattr(one, "trials_dataframe"):
-        return study_frame(one), plain_name(f"{STUDY}-{one.study_name}")
+        return _losses_of(study_trials(one), plain_name(f"{STUDY}-{one.study_name}"), note)
     if (experiment := _experiment_of(one)) is not None:
-        return experiment_frame(experiment), plain_name(f"{EXPERIMENT}-{experiment.name}")
+        return _losses_of(experiment_trials(experiment), plain_name(f"{EXPERIMENT}-{experiment.name}"), note)
     return one, TABLE
+
+
+def _losses_of(trials: Trials, name: str, note: Note) -> tuple[pd.DataFrame, str]:
+    """Return trials and their name, which says where their losses are values of another sign; so does a note."""
+    if not trials.negated:
+        return trials.frame, name
+    note(f"{name} maximises: its values are negated, so that a smaller loss is better")
+    return trials.frame, name + NEGATED

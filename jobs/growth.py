@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..landscapes.adapters import within_box
 from ..landscapes.identity import plane_of, stored_identity
-from ..landscapes.objective import evaluate
-from .motion import HORIZON
-from .scene import SceneSpec
+from ..landscapes.objective import BoxedObjective, evaluate
 from .watch import Watch
 
 if TYPE_CHECKING:
@@ -27,31 +25,30 @@ POINTS = 16
 
 def effort(env: Environment) -> int:
     """Return how many gradients of shorter and whole episodes `measure_growth_of` evaluates."""
-    return len(SHARES) * POINTS if hasattr(env.options, HORIZON) else 0
+    return len(SHARES) * POINTS if env.horizon else 0
 
 
 def measure_growth_of(env: Environment, dataset: xr.Dataset, watch: Watch) -> dict[str, Any] | None:
     """Measure how gradients grow with the length of episodes at points of a slice; return the record of it.
 
-    None where a scene's episodes have no option `horizon`, or nothing to draw that says how long they last.
+    None where no setting says how long episodes are. Where a scene draws none, time is in the unit of that setting.
     """
     from ..landscapes.measures.gradient_quality import subgrid
     from ..landscapes.measures.lyapunov import measure_growth
 
-    if not effort(env):
+    if not env.horizon:
         return None
-    try:
+    time = env.horizon
+    with suppress(ValueError):  # nothing to draw
         time = float(env.episode(env.space.center).time[-1])
-    except ValueError:  # nothing to draw
-        return None
     plane = plane_of(dataset)
     x = plane.lift(subgrid(plane, math.isqrt(POINTS) if plane.rank == 2 else POINTS))
     boxed = bool(stored_identity(dataset).get("boxed"))
-    width, spec, norms = env.space.upper - env.space.lower, SceneSpec.of(env), list[Tensor]()
+    width, norms = env.space.upper - env.space.lower, list[Tensor]()
     with watch.progress(effort(env), "gradients of shorter episodes") as advance:
         for share in SHARES:
-            other = spec.make(horizon=share * env.options.horizon)
-            found = evaluate(within_box(other) if boxed else other, x, grad=True)
+            other = env.with_horizon(share * env.horizon)
+            found = evaluate(BoxedObjective(other) if boxed else other, x, grad=True)
             assert found.grad is not None
             norms.append((found.grad * width).norm(dim=1))
             advance(len(norms) * len(x))

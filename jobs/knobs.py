@@ -75,10 +75,11 @@ class Knobs:
         found += [knob for one in fields(env.options) if (knob := self._option(one.name))]
         if env.beyond_box:
             found.append(Knob(BOX, "\N{MULTIPLICATION SIGN} the box", 1.0, ("largest",)))
-        if HORIZON in {one.name for one in fields(env.options)}:
-            most = _most(env.options, HORIZON)
-            unit = "\N{MULTIPLICATION SIGN} the episode"
-            found.append(Knob(HORIZON, unit, env.options.horizon, ("largest",), most=most))
+        if env.horizon:
+            known = {one.name for one in fields(env.options)}
+            most = _most(env.options, env.horizon_option) if env.horizon_option in known else math.inf
+            unit = "\N{MULTIPLICATION SIGN} the episode" if env.model_version else ""
+            found.append(Knob(HORIZON, unit, env.horizon, ("largest",), most=most))
         return {knob.name: knob for knob in found}
 
     @cached_property
@@ -140,8 +141,10 @@ class Knobs:
             own = replace(own, name=name, precision=precision, **changes)  # type: ignore[arg-type] # each of its kind
         else:
             own = self.base.fidelities[fidelity]
-        options = {name: value for name, value in settings.items() if name not in (DT, RESOLUTION, BOX)}
-        return replace(self.spec, fidelity=own, options={**self.spec.options, **options}).make()
+        own_knobs = (DT, RESOLUTION, BOX, HORIZON)
+        options: dict[str, Any] = {name: value for name, value in settings.items() if name not in own_knobs}
+        env = self.base.remake(fidelity=own, **options)
+        return env.with_horizon(settings[HORIZON]) if HORIZON in settings else env
 
     def axis(self, knob: Knob) -> Axis:
         """Return what a knob is measured on."""
@@ -180,7 +183,7 @@ class Knobs:
         value, ends = getattr(self.base.options, name), self.base.material_range
         if ends is not None and ends.option == name and not ends.softest > 0:
             return Knob(name, "", value, ("largest", "smallest"), ends.softest, ends.stiffest, linear=True)
-        if name == HORIZON or isinstance(value, bool) or not isinstance(value, float) or not value > 0:
+        if name == self.base.horizon_option or isinstance(value, bool) or not isinstance(value, float) or not value > 0:
             return None
         return Knob(name, "", value, ("largest", "smallest"), most=_most(self.base.options, name))
 

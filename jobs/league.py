@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..envs.registry import entries, environment_class
+from ..envs.registry import entries
 from ..landscapes.cost import duration, episode_cost
 from ..landscapes.space import as_whole
 from ..landscapes.storage.disk import full, is_full
@@ -25,7 +25,7 @@ from ..optim.runs.journal import Journal
 from .folder import LEAGUE, ROOT, RUN_STORE, folder_named
 from .methods import check_methods, divide_methods
 from .race import RaceJob, lockstep_seconds
-from .scene import SceneSpec
+from .scene import AT, SceneSpec
 from .watch import PREPARING, Stopped, Watch, resumable
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from ..optim.race import Race
 
 RECORD, PICTURE = LEAGUE.files
-AT = "@"  # between a scene and its fidelity
 
 
 @dataclass(frozen=True)
@@ -239,14 +238,6 @@ class LeagueJob:
         return league
 
 
-def read_scene(text: str, scene: SceneSpec) -> SceneSpec:
-    """Return a scene given as ENV or ENV@FIDELITY, else as `scene` has it."""
-    name, at, fidelity = text.rpartition(AT)
-    if not at or "/" in fidelity or ":" in fidelity:
-        return replace(scene, name=text)
-    return replace(scene, name=name, fidelity=fidelity)
-
-
 def simulated_scenes() -> list[str]:
     """Return the names of the scenes that this package simulates itself: those with a draft and no extra."""
     return [name for name, one in entries().items() if not one.extra and "draft" in one.fidelities]
@@ -263,7 +254,7 @@ def _known_fidelities(scene: SceneSpec) -> tuple[str, tuple[str, ...]]:
     entry = entries().get(scene.name) if isinstance(scene.name, str) else None
     if entry and (entry.fidelities or entry.extra):
         return entry.name, entry.fidelities
-    kind = environment_class(scene.name) if isinstance(scene.name, str) else scene.name
+    kind = scene.kind
     return kind.name, tuple(kind.fidelities)
 
 

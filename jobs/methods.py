@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from ..optim.memory import SearchSize, require_method, require_runs
 from ..optim.registry import find_method, methods
-from .search import make_optimizer
 from .watch import Watch
 
 if TYPE_CHECKING:
@@ -27,6 +26,8 @@ def able_methods(env: Environment, watch: Watch) -> list[str]:
 
 def divide_methods(env: Environment, names: Sequence[str] = (), *, budget: int = 0) -> tuple[list[str], dict[str, str]]:
     """Return which methods, by default of all, can search an environment here, and why the others cannot."""
+    from .search import make_optimizer
+
     able, unable = list[str](), dict[str, str]()
     for method in names or methods():
         try:
@@ -55,6 +56,8 @@ def require_room(
     folder: Path,
 ) -> None:
     """Raise TooLargeError where a race of these methods, with these options by method, is larger than this machine."""
+    from .search import make_optimizer
+
     require_runs(env.space.dim, budget, seeds, folder, abreast=len(methods))
     for method in methods:
         optimizer = make_optimizer(method, env, options=options.get(method))

@@ -321,7 +321,7 @@ class MixedJob(TradeoffJob):
 
     def _seconds(self, name: str) -> float:
         """Time a batch of a variant, the second after it is made [s per episode with gradient]."""
-        env, rows = self._variant(name).make(self._source), self.samples[name].batch
+        env, rows = self._variant(name).make(self.env), self.samples[name].batch
         batch = self.x.repeat(-(-rows // len(self.x)), 1)[:rows]
         env.evaluate(batch, grad=True)
         began = time.perf_counter()
@@ -358,7 +358,7 @@ class MixedJob(TradeoffJob):
         from .tolerance import seconds_with_gradient
 
         say(f"timing {name} on the CPU, where a draft's cost counts")
-        return seconds_with_gradient(replace(self._variant(name), device="cpu").make(self._source))
+        return seconds_with_gradient(replace(self._variant(name), device="cpu").make(self.env))
 
     def _choose(self, complete: bool, say: Callable[[str], None]) -> MixedTradeoff:
         from ..landscapes.measures.mixed import MixedTradeoff

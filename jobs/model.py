@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -148,8 +148,7 @@ class ModelJob:
 
     def _changed(self, part: ModelPart) -> Environment:
         """Make the model with a part changed; raises ValueError where that is the full model, or the scene refuses."""
-        full = SceneSpec.of(self.env)
-        env = replace(full, options={**full.options, **part.options}).make()
+        env = self.env.remake(**part.options)
         if env.options == self.env.options:
             raise ValueError(f"the full model's options are those of {part.change!r} already")
         return env
@@ -243,7 +242,7 @@ class ModelJob:
         from ..landscapes.measures.fidelity import Seconds, spread
         from ..landscapes.measures.model import ModelStudy, Noise
         from ..landscapes.measures.tradeoff import RefusedVariant
-        from ..landscapes.objective import Status
+        from ..landscapes.objective import failed
 
         whole = full.sample()
         noise = Noise.of(again.sample(), full.again(REPEATS).sample(), rounding=self._rounding, seed=self.seed)
@@ -255,7 +254,7 @@ class ModelJob:
             seed=self.seed,
             loss_unit=self.env.loss_unit,
             spread=spread(whole),
-            failed=int((full.status != Status.OK).sum()),
+            failed=int(failed(full.status).sum()),
             seconds=Seconds(*(min((float(one[way]) for one in times), default=0.0) for way in (0, 1))),
             noise=noise,
             parts=tuple(self._judge(p, changes[p.name], whole, noise) for p in self.parts if p.name in changes),

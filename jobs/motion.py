@@ -12,7 +12,6 @@ import numpy as np
 
 from ..landscapes.capacity import BLOCK, Need, require
 from .folder import SWEEP
-from .scene import SceneSpec
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -32,7 +31,7 @@ FRAMES, ONLY = SWEEP.files[:2]  # the folder of a sweep's slices, and the slice 
 class Motion:
     """Say what moves: frames show `slices` of what is sampled on `planes` at the `values` of what `label` names.
 
-    `env_at` makes the environment of a plane, by its number.
+    `env_at` makes the environment of a plane, by its number. A `logarithmic` one moves by equal ratios.
     """
 
     label: str
@@ -40,6 +39,7 @@ class Motion:
     planes: tuple[Plane, ...]
     env_at: Callable[[int], Environment]
     slices: Callable[[Sequence[xr.Dataset]], Sequence[xr.Dataset]] = list
+    logarithmic: bool = False
 
     @classmethod
     def of(cls, env: Environment, plane: Plane, over: int | str, frames: int) -> Motion:
@@ -87,27 +87,37 @@ def _parameter(name: int | str, env: Environment, plane: Plane, frames: int) -> 
     """Move a parameter from one of its bounds to the other."""
     import torch
 
+    from ..landscapes.space import LOG10, to_values
+
     number = env.space.index(name)
     if _holds(plane, number):
         raise ValueError(
             f"a sweep moves a third parameter, {HORIZON} or {SMOOTHING}; got --over {name}, which the slice varies"
         )
-    low, high = float(env.space.lower[number]), float(env.space.upper[number])
-    values = tuple(torch.linspace(low, high, frames, dtype=torch.float64).tolist())
-    planes = tuple(replace(plane, origin=_with(plane.origin, number, value)) for value in values)
-    return Motion(env.space.labels[number], values, planes, lambda _: env)
+    space = env.space
+    places = torch.linspace(float(space.lower[number]), float(space.upper[number]), frames, dtype=torch.float64)
+    planes = tuple(replace(plane, origin=_with(plane.origin, number, place)) for place in places.tolist())
+    scale = space.scales[number]
+    values = tuple(to_values(places[:, None], [scale])[:, 0].tolist())
+    return Motion(space.labels[number], values, planes, lambda _: env, logarithmic=scale == LOG10)
 
 
 def _horizon(env: Environment, plane: Plane, frames: int) -> Motion:
     """End the episode later and later, up to the scene's own end."""
-    if not hasattr(env.options, HORIZON):
-        raise ValueError(f"{env.name} has no {HORIZON} to sweep over; sweep a third parameter or {SMOOTHING}")
-    if env.options.horizon != 1:
+    whole = env.horizon
+    if whole is None:
+        raise ValueError(
+            f"{env.name} has no {HORIZON} to sweep over: no setting says how long an episode is (horizon= of a "
+            f"function names one); sweep a third parameter or {SMOOTHING}"
+        )
+    if env.horizon_option == HORIZON and whole != 1 and env.model_version:
         raise ValueError(f"--over {HORIZON} moves that option itself; leave out --set {HORIZON}=...")
     shares = [(frame + 1) / frames for frame in range(frames)]
-    label, scene = "share of the scene's duration [%]", SceneSpec.of(env)
     values = tuple(100 * share for share in shares)
-    return Motion(label, values, (plane,) * frames, lambda number: scene.make(horizon=shares[number]))
+    return Motion(
+        "share of the scene's duration [%]", values, (plane,) * frames,
+        lambda number: env.with_horizon(shares[number] * whole),
+    )  # fmt: skip
 
 
 def _smoothing(env: Environment, plane: Plane, frames: int) -> Motion:

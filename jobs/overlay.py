@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
+from ..envs.registry import as_environment
 from ..landscapes.identity import MODEL_VERSION, plane_of, stored_identity
-from ..landscapes.objective import Objective, Status
+from ..landscapes.objective import Objective, failed
 from ..landscapes.overlay import best_point, overlay, principal_plane
 from ..landscapes.plane import Plane
 from ..landscapes.slice import Slice
@@ -93,11 +94,13 @@ class OverlaySummary:
     failed: int
     farthest: float
     files: list[str]
+    skipped: int = 0  # rows of tables that hold no point
 
     def outcome(self) -> str:
         """Say it in a line."""
         counted = f"{self.runs} run{'s' if self.runs > 1 else ''}, {self.points} points"
-        where = f"{self.outside} beyond the map, {self.failed} failed"
+        skipped = f", {self.skipped} row{'s' if self.skipped > 1 else ''} skipped" if self.skipped else ""
+        where = f"{self.outside} beyond the map, {self.failed} failed{skipped}"
         return f"{counted}: {where}; the farthest is {self.farthest:.2g} half-widths of the box off the plane"
 
 
@@ -120,9 +123,10 @@ class Overlay:
             runs=len(self.runs),
             points=sum(run.sizes["evaluation"] for run in self.runs),
             outside=sum(int(run["outside"].sum()) for run in self.runs),
-            failed=sum(int((run["status"] != Status.OK).sum()) for run in self.runs),
+            failed=sum(int(failed(run["status"]).sum()) for run in self.runs),
             farthest=max(float(run["distance"].max().round(9)) for run in self.runs),
             files=self.files,
+            skipped=sum(int(run.attrs.get("skipped", 0)) for run in self.runs),
         )
 
     def plot(self, *, width: float | None = None) -> Picture:
@@ -197,9 +201,8 @@ class OverlayJob:
 
     def _objective(self) -> Objective:
         """Return what the slice was sampled from."""
-        if self.device == "auto" and self.slice.remake:
-            return self.slice.remake()
-        return environment_of(self.slice.data, self.device)
+        found = self.slice.remake() if self.slice.remake else environment_of(self.slice.data, self.device)
+        return found if self.device == "auto" else as_environment(found).remake(device=self.device)
 
     def _write(self, drawn: Overlay) -> Overlay:
         from ..landscapes.draw.figures.page import save, save_prints

@@ -378,7 +378,8 @@ def _filming(job: SweepJob, seconds_each: float, folder: Path, frames: int) -> t
 
     def film(count: int) -> None:
         at = range(most) if count == most else (0, most - 1)  # a few of them are the first and the last
-        sweep = Sweep(job.motion.label, tuple(values[one] for one in at), [datasets[one] for one in at])
+        moved, chosen = job.motion, [datasets[one] for one in at]
+        sweep = Sweep(moved.label, tuple(values[one] for one in at), chosen, moved.logarithmic)
         save_films(sweep, folder / "sweep.mp4", folder / "sweep.gif")
         save_stream(sweep, folder / "sweep.rrd")
 

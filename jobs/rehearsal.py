@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from ..landscapes.objective import Evaluation, Objective
+from ..landscapes.objective import Evaluation, Objective, ObjectiveWrapper
 from ..landscapes.sampling.fill import Progress, sample
-from ..landscapes.space import ParameterSpace
 from ..landscapes.storage.arrays import write_finished
 from ..landscapes.storage.store import SliceStore
 from .slice import SOON, first_points, pause_after
@@ -34,7 +33,7 @@ JITTER = 1e-3  # by how much, relatively, a repeated value differs from the true
 BLOCK = 1024  # points that are made up at a time
 
 
-class Replica:
+class Replica(ObjectiveWrapper):
     """An objective that repeats the evaluations of another, each where it is nearest, slightly altered.
 
     `rows` true evaluations are made, at the first points of `store`, which spread over all of it. `seconds` were spent
@@ -44,8 +43,7 @@ class Replica:
     seconds = 0.0
 
     def __init__(self, objective: Objective, store: SliceStore, rows: int) -> None:
-        self.space: ParameterSpace = objective.space
-        self.preferred_batch: int = getattr(objective, "preferred_batch", 1)
+        super().__init__(objective)
         x = first_points(store, store.tiles(), rows)
         self._plane = store.plane
         self._tree = cKDTree(self._place(x))
@@ -57,7 +55,7 @@ class Replica:
     @classmethod
     def of(cls, objective: Objective, store: SliceStore, seconds_each: float) -> Replica:
         """Make as many true evaluations as fit into a moment and a batch, at least one."""
-        rows = min(int(SEEN / max(seconds_each, 1e-9)), getattr(objective, "preferred_batch", 1))
+        rows = min(int(SEEN / max(seconds_each, 1e-9)), objective.preferred_batch)
         return cls(objective, store, max(1, rows))
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:

@@ -18,7 +18,7 @@ from torch import Tensor
 from ..landscapes.capacity import Need, require, size
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.identity import MODEL_VERSION, stored_identity
-from ..landscapes.objective import Evaluation
+from ..landscapes.objective import BoxedObjective, Evaluation, ObjectiveWrapper
 from ..landscapes.storage.disk import is_full
 from ..landscapes.storage.files import make_folder, other_files, replacing, tidy, write_json
 from ..landscapes.storage.records import read_json, write_record
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from ..landscapes.measures.profile import Profile
     from ..landscapes.measures.records import ProfileRecord
     from ..landscapes.objective import Objective
-    from ..landscapes.space import ParameterSpace
 
 TABLE = REPORTS.files[1]
 POINTS = 6  # along each axis where gradients are tested by new evaluations
@@ -91,6 +90,7 @@ class ReportJob:
     paper: Mapping[str, Quoted] = field(default_factory=dict)
     prints: Sequence[float] = ()
     command: str = ""
+    env: Any = None  # of the slices, where it is not registered by their name for it
 
     @classmethod
     def open(
@@ -162,7 +162,7 @@ class ReportJob:
         One that is to be drawn for print is not taken from beside the slice without what it is drawn from.
         """
         dataset = _open(subject)
-        env = environment_of(dataset, self.device)
+        env = environment_of(dataset, self.device, self.env)
         key: ReportKey = {
             "points": self.points,
             "seed": self.seed,
@@ -215,12 +215,11 @@ class ReportJob:
 
 def measure(env: Environment, dataset: xr.Dataset, points: int, seed: int, watch: Watch) -> Profile:
     """Announce what measuring a slice of an environment costs, and measure it."""
-    from ..landscapes.adapters import within_box
     from ..landscapes.measures.profile import PRECISION, effort, measure_profile
 
     total = sum(effort(dataset["loss"].ndim, points, dataset["loss"].shape))
     _announce(env, dataset, points, watch)
-    objective = within_box(env) if stored_identity(dataset).get("boxed") else env
+    objective = BoxedObjective(env) if stored_identity(dataset).get("boxed") else env
     with watch.progress(total) as advance:
         counted = _Counted(objective, env.preferred_batch, advance)
         rounding = PRECISION[env.fidelity.precision]
@@ -229,14 +228,12 @@ def measure(env: Environment, dataset: xr.Dataset, points: int, seed: int, watch
     return found
 
 
-class _Counted:
+class _Counted(ObjectiveWrapper):
     """Evaluate an objective a batch at a time, and say how many rows are done."""
 
     def __init__(self, objective: Objective, batch: int, advance: Callable[[int], None]) -> None:
-        self.objective, self.batch, self.advance, self.done = objective, batch, advance, 0
-        self.space: ParameterSpace = objective.space
-        self.beyond_box = getattr(objective, "beyond_box", False)
-        self.name = getattr(objective, "name", type(objective).__name__)
+        super().__init__(objective)
+        self.batch, self.advance, self.done = batch, advance, 0
 
     def evaluate(self, x: Tensor, *, grad: bool = True) -> Evaluation:
         """Return losses, and gradients if asked, at points `x` in the parameters' own units."""
@@ -364,7 +361,7 @@ def _keep(folder: Path, key: ReportKey, device: str, watch: Watch) -> Report:
     _leave_measures(folder, kept)
     elsewhere = f", measured on {kept.device}" if kept.device != device else ""
     watch.note(f"{folder} is there already{elsewhere}")
-    if (theirs := kept.key[MODEL_VERSION]) != (ours := key[MODEL_VERSION]):
+    if (theirs := kept.key["model_version"]) != (ours := key["model_version"]):
         said = f"{kept.env} model {theirs}; this is model {ours}"
         watch.note(f"warning: it was measured by {said}. Delete the folder to measure it anew")
     return kept

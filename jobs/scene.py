@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from .. import __version__
 from ..envs.installed import installed_version
-from ..envs.registry import EXTRAS, environment_class, make
+from ..envs.registry import find_environment, make, registered_environment
 from ..landscapes.identity import PACKAGE, VERSIONS
 from .watch import Watch
 
@@ -26,6 +26,7 @@ PACKAGES = (
     *("numpy", "torch", "warp-lang", "taichi", "xarray", "zarr", "matplotlib"),
     *("pyvista", "rerun-sdk", "botorch", "gpytorch", "cma", "typer", "rich"),
 )
+AT = "@"  # between a scene and its fidelity
 ABSENT = "not installed"  # in the place of a version
 
 
@@ -33,13 +34,13 @@ ABSENT = "not installed"  # in the place of a version
 class SceneSpec:
     """Say which scene is simulated, and how.
 
-    `name` is a registered name, FILE.py:Class, or an environment's class. `fidelity` is a name or a record, by default
-    the cheapest; `tolerance` chooses it by measured loss errors instead ("5%" of the losses' spread, or "0.05" in their
-    unit). `device` is auto, cpu or cuda, `engine` one of the scene's, by default its first, and `options` are
-    the scene's own.
+    `name` is a registered name, FILE.py:NAME, an environment's class, or an environment. `fidelity` is a name or a
+    record, by default the cheapest; `tolerance` chooses it by measured loss errors instead ("5%" of the losses' spread,
+    or "0.05" in their unit). `device` is auto, cpu or cuda, `engine` one of the scene's, by default its first, and
+    `options` are the scene's own.
     """
 
-    name: str | type[Environment]
+    name: str | type[Environment] | Environment
     fidelity: str | Fidelity | None = None
     tolerance: str | None = None
     device: str = "auto"
@@ -57,9 +58,9 @@ class SceneSpec:
         return cls(source_of(env), env.fidelity, None, env.device, env.engine, env.deterministic, asdict(env.options))
 
     @property
-    def kind(self) -> type[Environment]:
-        """The environment's class. Raises ValueError where there is none of that name."""
-        return environment_class(self.name) if isinstance(self.name, str) else self.name
+    def kind(self) -> type[Environment] | Environment:
+        """The environment, or the class of one. Raises ValueError where there is none of that name."""
+        return find_environment(self.name)
 
     def resolve(self, watch: Watch) -> SceneSpec:
         """Return the spec with the fidelity that its tolerance chooses.
@@ -85,7 +86,7 @@ def provenance(objective: Objective, command: str) -> dict[str, Any]:
         "command": command,
         "created": datetime.now(UTC).strftime("%Y-%m-%d"),
         VERSIONS: {PACKAGE: __version__, **{package: _version(package) for package in _packages(objective)}},
-        "loss_unit": getattr(objective, "loss_unit", ""),
+        "loss_unit": objective.loss_unit,
     }
 
 
@@ -96,8 +97,7 @@ def _version(package: str) -> str:
 
 def _packages(objective: Objective) -> tuple[str, ...]:
     """Return the packages whose versions are worth keeping: beside those of all results, what its engine needs."""
-    engine = getattr(objective, "capabilities", None)
-    return (*PACKAGES, *EXTRAS.get(engine.extra, ())) if engine else PACKAGES
+    return (*PACKAGES, *objective.packages)
 
 
 def with_policy(env: Environment, policy: str | None) -> Objective:
@@ -112,10 +112,13 @@ def with_policy(env: Environment, policy: str | None) -> Objective:
     return PolicyObjective(env, policy)
 
 
-def environment_of(dataset: xr.Dataset, device: str) -> Environment:
-    """Return the environment that a slice was sampled from, on a device.
+def environment_of(dataset: xr.Dataset, device: str, env: Any = None) -> Environment:
+    """Return the environment that a slice or a run was evaluated in, with its settings, on a device.
 
-    Raises ValueError where the slice is none of an environment, or of one that is not registered here.
+    It is the one that is registered by its name, or `env`: FILE.py:NAME, a class, an environment or an object of one's
+    own. Nothing that a result says of itself is run.
+
+    Raises ValueError where there is none, where it has other settings, and where the slice is none of an environment.
     """
     from ..envs.base import Fidelity
     from ..landscapes.identity import stored_identity
@@ -128,12 +131,20 @@ def environment_of(dataset: xr.Dataset, device: str) -> Environment:
             f"the slice is not one of an environment, its identity lacks {', '.join(sorted(missing))}; "
             "`landscape slice ENV` samples one"
         )
-    how = {"engine": identity["engine"], "deterministic": identity["deterministic"], **identity["options"]}
+    name = str(identity["objective"])
     try:
-        kind = environment_class(identity["objective"])
+        found = registered_environment(name) if env is None else find_environment(env)
     except ValueError as error:
-        raise ValueError(f"{error}; of a class in a file, say where it is: --env FILE.py:Class") from None
-    return make(kind, fidelity=Fidelity(**identity["settings"]), device=device, **how)
+        if env is not None:
+            raise
+        raise ValueError(
+            f"{name} is not registered here, and evaluating it anew needs it: say where it is, --env FILE.py:NAME, or "
+            "env= in Python"
+        ) from error
+    return make(
+        found, fidelity=Fidelity(**identity["settings"]), device=device, engine=identity["engine"],
+        deterministic=identity["deterministic"], **identity["options"],
+    )  # fmt: skip
 
 
 def point_of(env: Environment, text: str) -> Tensor:
@@ -209,10 +220,9 @@ def plane_through(
 def runs_in(objective: Objective, run: str) -> list[xr.Dataset]:
     """Return the runs in a folder. Raises ValueError where they searched another environment."""
     from ..landscapes.identity import stored_identity
-    from ..landscapes.objective import name_of
     from .folder import run_tables
 
-    tables, name = run_tables([run]), name_of(objective)
+    tables, name = run_tables([run]), objective.name
     searched = {str(stored_identity(table).get("objective")) for table in tables}
     if searched != {name}:
         raise ValueError(f"{run} holds no runs of {name} alone; it holds those of {', '.join(sorted(searched))}")
@@ -223,7 +233,6 @@ def named_point(objective: Objective, text: str) -> Tensor:
     """Return the point that `text` names, of any objective. Raises ValueError where there is no such point."""
     from ..envs.base import Environment
     from ..landscapes.foreign import table_point
-    from ..landscapes.objective import name_of
 
     if (found := table_point(objective.space, text)) is not None:
         return found
@@ -235,4 +244,12 @@ def named_point(objective: Objective, text: str) -> Tensor:
     if kind == "random" and seed.isdecimal():
         return objective.space.uniform(1, seed=int(seed))[0]
     forms = "center, random:SEED, a table (.csv, .parquet) or a tensor"
-    raise ValueError(f"{name_of(objective)} can be cut through {forms}; got {text!r}")
+    raise ValueError(f"{objective.name} can be cut through {forms}; got {text!r}")
+
+
+def read_scene(text: str, scene: SceneSpec) -> SceneSpec:
+    """Return a scene given as ENV or ENV@FIDELITY, else as `scene` has it."""
+    name, at, fidelity = text.rpartition(AT)
+    if not at or "/" in fidelity or ":" in fidelity:
+        return replace(scene, name=text)
+    return replace(scene, name=name, fidelity=fidelity)

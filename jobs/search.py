@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 
 from ..landscapes.cost import duration, episode_cost
 from ..landscapes.identity import METHOD_VERSION
-from ..landscapes.objective import Objective, Status
+from ..landscapes.objective import FAILED, Objective, Status, describe_errors
 from ..landscapes.space import as_whole
 from ..landscapes.storage.files import clear, tidy, write_json
 from ..landscapes.threads import one_torch_thread
@@ -42,7 +42,10 @@ class BestRecord(TypedDict):
 
 @dataclass(frozen=True)
 class SearchSummary:
-    """Say what a run cost and found, as `summary.json` beside it has it; `best` is None where no episode succeeded."""
+    """Say what a run cost and found, as `summary.json` beside it has it; `best` is None where no episode succeeded.
+
+    `error` is what the first episode that raised said.
+    """
 
     env: str
     method: str
@@ -62,6 +65,7 @@ class SearchSummary:
     best: BestRecord | None
     command: str
     files: list[str]
+    error: str = ""
 
     def record(self) -> dict[str, Any]:
         """Return the summary as its file has it."""
@@ -71,9 +75,14 @@ class SearchSummary:
         """Say in a line what the run cost and found."""
         best = self.best
         found = f"best loss {best['loss']:.6g} at episode {best['episode']}" if best else "no episode succeeded"
-        failed = sum(count for status, count in self.status.items() if status != "ok")
-        failures = f"; {failed} failed" if failed else ""
-        return f"{self.episodes} episodes in {duration(self.seconds)}; {found}{failures}"
+        counts = {kind: self.status.get(kind.name.lower(), 0) for kind in Status}
+        lost, lacking = sum(counts[kind] for kind in FAILED), counts[Status.NO_GRADIENT]
+        parts = [
+            f"{lost} failed" if lost else "",
+            f"{lacking} without a gradient" if lacking else "",
+            describe_errors(counts[Status.ERROR], self.error),
+        ]
+        return "; ".join([f"{self.episodes} episodes in {duration(self.seconds)}", found, *filter(None, parts)])
 
 
 @dataclass(frozen=True)
@@ -213,6 +222,7 @@ class SearchJob:
             best=best,
             command=self.command,
             files=files,
+            error=self.store.error,
         )
 
 
@@ -229,7 +239,7 @@ def make_optimizer(
 
     kind = optimizer_class(method)
     chosen = read_options(method, kind.Options, options or {})
-    require_method(kind, chosen, SearchSize(objective.space.dim, getattr(objective, "decisions", 1)))
+    require_method(kind, chosen, SearchSize(objective.space.dim, objective.decisions))
     return kind.on(objective, seed=seed, options=chosen)
 
 

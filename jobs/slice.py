@@ -10,20 +10,19 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import torch
 import xarray as xr
 from jaxtyping import Float
 from torch import Tensor
 
-from ..landscapes.adapters import within_box
 from ..landscapes.capacity import size
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.identity import with_stride
 from ..landscapes.lattice import check_gradients
 from ..landscapes.measures.unresolved import probes, stored_unresolved
-from ..landscapes.objective import Objective, Status
+from ..landscapes.objective import BoxedObjective, Objective, Status, failed
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.distribution import RemoteSite, Site, evaluator, run_tasks, workers_of
 from ..landscapes.sampling.fill import Progress, sample
@@ -155,7 +154,7 @@ class SliceJob:
         identity |= ({"boxed": True} if boxed else {}) | ({"cut": dict(cut)} if cut else {})
         out = out or default_folder(identity, plane.resolution, plane, gradients > 0, root, refinement)
         return cls.open(
-            within_box(objective) if boxed else objective,
+            BoxedObjective(objective) if boxed else objective,
             plane,
             out,
             picture_of(objective, plane),
@@ -236,8 +235,8 @@ class SliceJob:
             def follow(now: Progress) -> None:
                 nonlocal drawn, pause, computed
                 computed = now.done - now.resumed
-                failed = sum(count for status, count in now.statuses.items() if status != Status.OK)
-                advance(now.done, f"episodes, {failed} failed" if failed else "")
+                lost = sum(count for status, count in now.statuses.items() if failed(status))
+                advance(now.done, f"episodes, {lost} failed" if lost else "")
                 if now.level_complete and now.done < now.total and (began := time.monotonic()) - drawn > pause:
                     self.picture()
                     drawn = time.monotonic()
@@ -286,6 +285,7 @@ class SliceJob:
             command=self.command,
             files=files,
             barrier=barrier_of(dataset),
+            error=self.store.error,
         )
 
 
@@ -307,10 +307,8 @@ def picture_of(objective: Objective, plane: Plane) -> Draw:
     def profile(dataset: xr.Dataset, width: float | None = None) -> Figure:
         from ..landscapes.draw.figures.profile import profile_figure
 
-        u, env = torch.tensor(dataset["u"].to_numpy()), cast(Any, objective)
-        return profile_figure(
-            dataset, events=env.events(plane.lift(u[:, None])) if hasattr(env, "events") else {}, width=width
-        )
+        u = torch.tensor(dataset["u"].to_numpy())
+        return profile_figure(dataset, events=objective.events(plane.lift(u[:, None])), width=width)
 
     return surface if plane.rank == 2 else profile
 
@@ -321,10 +319,9 @@ def pieces_in(folder: Path) -> Checkpoint:
 
 
 def _gpu_memory(objective: Objective) -> str:
-    if getattr(objective, "device", "cpu") != "cuda":
+    if objective.device != "cuda":
         return ""
-    env: Any = objective
-    return f", {size(env.memory() * env.preferred_batch)} of it on the GPU at a time"
+    return f", {size(objective.memory() * objective.preferred_batch)} of it on the GPU at a time"
 
 
 def pause_after(seconds: float) -> float:
@@ -353,8 +350,8 @@ def cost_of(objective: Objective, store: SliceStore) -> SliceCost:
     left = sum(store.count(tile) for tile in pending)
     if not left:
         return SliceCost(0, 0.0, peak_memory())
-    getattr(objective, "prepare", lambda: None)()
-    batch = first_points(store, pending, getattr(objective, "preferred_batch", 1))
+    objective.prepare()
+    batch = first_points(store, pending, objective.preferred_batch)
     sloped = sum(int(store.sloped(tile).sum()) for tile in pending)
     counts = {True: sloped, False: left - sloped}
     each = {grad: seconds_per_episode(objective, batch, grad=grad, count=n) for grad, n in counts.items() if n}

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from ..landscapes.identity import with_stride
-from ..landscapes.objective import Objective, name_of
+from ..landscapes.objective import Objective
 from ..landscapes.plain import plain_name
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.refine import Refinement
@@ -73,5 +73,4 @@ def kept_plane(
 
 def identity_of(objective: Objective) -> dict[str, Any]:
     """Return what decides an objective's numbers, as far as it says: an environment all, any other its name."""
-    say: Callable[[], dict[str, Any]] = getattr(objective, "identity", lambda: {"objective": name_of(objective)})
-    return say()
+    return objective.identity()

@@ -17,7 +17,7 @@ from ..landscapes.directions import barrier
 from ..landscapes.identity import plane_of, stored_identity
 from ..landscapes.measures.records import UnresolvedRecord
 from ..landscapes.measures.unresolved import attribute_of, find_unresolved, say_unresolved
-from ..landscapes.objective import Objective, Status, name_of
+from ..landscapes.objective import Objective, Status, describe_errors
 from ..landscapes.sampling.refine import Refined
 
 JOINED = "joined"  # in the identity of a slice that was cut between points: their names
@@ -29,7 +29,7 @@ class SliceSummary:
 
     Gradients are at every `gradients_every` samples along each axis. `episodes` are those of the samples; `unresolved`
     has those that looked between them, and what they found, None where nothing is known of it. `barrier` [loss unit] is
-    that between the ends of a line.
+    that between the ends of a line. `error` is what the first point that raised said.
     """
 
     env: str | None
@@ -51,11 +51,13 @@ class SliceSummary:
     command: str
     files: list[str]
     barrier: float | None = None
+    error: str = ""
 
     def outcome(self) -> str:
         """Say in a line what the slice cost and what came out."""
         counts = {kind: count for kind, count in self.status.items() if count}
-        ends = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+        ends = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in counts.items())
+        raised = f"; {said}" if (said := describe_errors(counts.get("error", 0), self.error)) else ""
         refined = f"; {self.refinement.say()}" if self.refinement else ""
         losses = say_range(self.loss)
         sloped = math.prod(-(-points // self.gradients_every) for points in self.resolution)
@@ -64,7 +66,8 @@ class SliceSummary:
         flat = f"; gradient exactly zero at {share:.1%} of points" if share else ""
         barred = "" if self.barrier is None else f"; barrier of {self.barrier:.4g} above the line between its ends"
         hidden = f"; {said}" if (said := say_unresolved(self.unresolved)) else ""
-        return f"{self.episodes} episodes in {duration(self.seconds)}; {ends}; {losses}{flat}{barred}{refined}{hidden}"
+        spent = f"{self.episodes} episodes in {duration(self.seconds)}"
+        return f"{spent}; {ends}{raised}; {losses}{flat}{barred}{refined}{hidden}"
 
 
 def look_between(objective: Objective, dataset: xr.Dataset) -> dict[str, Any]:
@@ -77,7 +80,7 @@ def look_between(objective: Objective, dataset: xr.Dataset) -> dict[str, Any]:
     except (OSError, MemoryError):  # lost workers, a full disk: the slice is finished once they are there again
         raise
     except Exception as error:
-        said = f"{name_of(objective)} raised between the samples, so what they hide is not known: {error}"
+        said = f"{objective.name} raised between the samples, so what they hide is not known: {error}"
         warnings.warn(said, RuntimeWarning, stacklevel=2)
         return {}
 

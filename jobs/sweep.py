@@ -16,12 +16,11 @@ from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
-from ..landscapes.adapters import within_box
 from ..landscapes.capacity import size
 from ..landscapes.cost import duration
 from ..landscapes.identity import with_stride
 from ..landscapes.lattice import check_gradients
-from ..landscapes.objective import Objective, Status
+from ..landscapes.objective import BoxedObjective, Objective, failed
 from ..landscapes.plain import plain_name
 from ..landscapes.sampling.fill import Progress, sample
 from ..landscapes.storage.files import discard, tidy, visible_files, write_json
@@ -214,7 +213,8 @@ class SweepJob:
             slices = [self._sample(number, count) for number in range(len(self.stores))]
         from ..landscapes.draw.figures.sweep import Sweep
 
-        return Sweep(self.motion.label, self.motion.values, self.motion.slices(slices))
+        moved = self.motion
+        return Sweep(moved.label, moved.values, moved.slices(slices), moved.logarithmic)
 
     def say_kept(self) -> str:
         """Say how much of it is on disk."""
@@ -244,7 +244,7 @@ class SweepJob:
     def _sampled(self, number: int) -> tuple[Objective, Callable[[], Objective] | None]:
         """Return what is sampled on a plane, and how workers make it, None where they are sent it."""
         env = self.motion.env_at(number)
-        return (within_box(env), None) if self.boxed else (env, recipe(env))
+        return (BoxedObjective(env), None) if self.boxed else (env, recipe(env))
 
     def _film(self, drawn: Sweep) -> None:
         from ..landscapes.draw.figures.sweep import save_films
@@ -289,15 +289,15 @@ class _Count:
 
     def follow(self, now: Progress) -> None:
         """Show how far the slice under way is."""
-        failed = self.failed + now.done - now.statuses.get(Status.OK, 0)
-        said = f"slice {self.number} of {self.slices}" + (f", {failed} failed" if failed else "")
+        lost = self.failed + sum(count for status, count in now.statuses.items() if failed(status))
+        said = f"slice {self.number} of {self.slices}" + (f", {lost} failed" if lost else "")
         self.advance(self.finished + now.done, said)
 
     def add(self, dataset: xr.Dataset) -> None:
         """Count a slice that is finished."""
         self.number += 1
         self.finished += dataset["status"].size
-        self.failed += int((dataset["status"] != Status.OK).sum())
+        self.failed += int(failed(dataset["status"]).sum())
 
 
 def sweep_folder(

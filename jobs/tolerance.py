@@ -13,10 +13,9 @@ from platformdirs import user_data_path
 
 from .. import __version__
 from ..envs.registry import make
-from ..landscapes.cost import episode_cost
 from ..landscapes.identity import MODEL_VERSION
+from ..landscapes.storage.disk import moved_by
 from .folder import digest
-from .variants import expected_work
 
 if TYPE_CHECKING:
     from ..envs.base import Environment, Fidelity
@@ -30,21 +29,30 @@ FARTHER = 2.0  # times the least expected work, beyond which a variant is no can
 ENOUGH, SHORTEST = 1e6, 0.05  # work of an episode that is timed, if it can be shortened so far; least share of it
 
 
-def keep(found: Tradeoff) -> Path:
-    """Keep a trade-off where `choose_fidelity` finds it, in the user's data folder, in the place of an earlier one."""
+def keep(found: Tradeoff) -> Path | None:
+    """Keep a trade-off where `choose_fidelity` finds it, in the user's data folder, in the place of an earlier one.
+
+    That of a function is not kept: nothing would say when the function has changed.
+    """
     from ..landscapes.storage.records import write_record
 
+    if not found.identity.get("model_version"):
+        return None
     path = _place(found.env, found.identity["options"], found.identity["device"])
-    write_record(path, found.record())
+    with moved_by("XDG_DATA_HOME", "what was measured"):
+        write_record(path, found.record())
     return path
 
 
-def keep_convergence(found: Convergence) -> Path:
-    """Keep a study of convergence beside the trade-off of the same scene, in the place of an earlier one."""
+def keep_convergence(found: Convergence) -> Path | None:
+    """Keep a study of convergence beside the trade-off of the same scene, as `keep` does."""
     from ..landscapes.storage.records import write_record
 
+    if not found.identity.get("model_version"):
+        return None
     path = _place(found.env, found.identity["options"], found.identity["device"]).with_suffix(CONVERGED)
-    write_record(path, found.record())
+    with moved_by("XDG_DATA_HOME", "what was measured"):
+        write_record(path, found.record())
     return path
 
 
@@ -80,12 +88,15 @@ def choose_fidelity(spec: SceneSpec, watch: Watch) -> Fidelity:
     Raises ValueError where the spec names a fidelity too, where its tolerance cannot be read, where nothing was
     measured of the scene with these options, and where no measured fidelity is within the tolerance.
     """
-    if spec.fidelity is not None:
-        raise ValueError(f"--tolerance chooses the fidelity; got --fidelity {spec.fidelity} too, leave out one of them")
     tolerance = str(spec.tolerance)
-    limit, relative = read_tolerance(tolerance)
+    limit, relative = tolerance_of(spec)
     env = make(spec.name, device=spec.device, engine=spec.engine, **spec.options)
     name = env.name
+    if not env.model_version:
+        raise ValueError(
+            f"--tolerance chooses among stored measurements, and nothing says whether {name} is still what was "
+            f"measured; name a fidelity, {', '.join(env.fidelities)}"
+        )
     found, source, rows = _candidates(env, spec.options)
     from ..envs.base import Fidelity
 
@@ -118,6 +129,8 @@ def _quickest(watch: Watch, env: Environment, rows: Sequence[MeasuredVariant]) -
         best = min(rows, key=lambda row: row.seconds)
         return best, f"{best.seconds:.3g} s an episode with gradient on {env.device}, by `landscape tradeoff`"
     made = {row.name: _make(env, row) for row in rows}
+    from .variants import expected_work
+
     work = {name: expected_work(one) for name, one in made.items()}
     likely = [row for row in rows if work[row.name] <= FARTHER * min(work.values())]
     if len(likely) == 1:
@@ -133,7 +146,7 @@ def _make(env: Environment, row: MeasuredVariant) -> Environment:
     from ..envs.base import Fidelity
 
     fidelity = Fidelity(**row.fidelity)
-    return make(env.name, fidelity=fidelity, device=env.device, engine=env.engine, **asdict(env.options))
+    return env.remake(fidelity=fidelity)
 
 
 def _time(env: Environment, variants: Sequence[Environment]) -> dict[str, float]:
@@ -153,7 +166,7 @@ def _time(env: Environment, variants: Sequence[Environment]) -> dict[str, float]
             known = {name: number(seconds) for name, seconds in read_json(path).items()}
     timed = {}
     for variant in variants:
-        key = f"{variant.fidelity.name} {digest(asdict(variant.fidelity))}"
+        key = f"{variant.fidelity.name} {digest(variant.fidelity.record())}"
         if key not in known:
             known[key] = seconds_with_gradient(variant)
             write_json(path, known)
@@ -163,10 +176,11 @@ def _time(env: Environment, variants: Sequence[Environment]) -> dict[str, float]
 
 def seconds_with_gradient(env: Environment) -> float:
     """Time an episode with gradient [s]; of a long one only the beginning is simulated."""
-    whole, horizon = env.work().count, getattr(env.options, "horizon", None)
-    if horizon and whole > ENOUGH:
-        how = {**asdict(env.options), "horizon": horizon * max(SHORTEST, ENOUGH / whole)}
-        env = make(env.name, fidelity=env.fidelity, device=env.device, engine=env.engine, **how)
+    whole = env.work().count
+    if env.horizon and whole > ENOUGH:
+        env = env.with_horizon(env.horizon * max(SHORTEST, ENOUGH / whole))
+    from ..landscapes.cost import episode_cost
+
     return episode_cost(env).gradient * whole / env.work().count
 
 
@@ -177,12 +191,19 @@ def find_variant(env: Environment, device: str) -> tuple[MeasuredVariant, Path]:
     """
     found = _find(env.name, asdict(env.options), device)
     for row in _rows(found[0], env, device) if found else []:
-        if found and row.device == device and row.fidelity == asdict(env.fidelity):
+        if found and row.device == device and row.fidelity == env.fidelity.record():
             return row, found[1]
     raise ValueError(
         f"there is no {device} device here, and no rate of {env.name} at {env.fidelity.name} on one is kept; "
         f"`landscape tradeoff {env.name} --device {device}` measures it where there is one"
     )
+
+
+def tolerance_of(spec: SceneSpec) -> tuple[float, bool]:
+    """Return the tolerance of a scene as `read_tolerance` does. Raises ValueError where it names a fidelity, too."""
+    if spec.fidelity is not None:
+        raise ValueError(f"--tolerance chooses the fidelity; got --fidelity {spec.fidelity} too, leave out one of them")
+    return read_tolerance(str(spec.tolerance))
 
 
 def read_tolerance(text: str) -> tuple[float, bool]:
@@ -249,7 +270,7 @@ def _rows(found: Tradeoff, env: Environment, device: str) -> Sequence[MeasuredVa
 
     What had the name of a fidelity whose settings have changed since is left out.
     """
-    options, named = found.identity["options"], {name: asdict(one) for name, one in env.fidelities.items()}
+    options, named = found.identity["options"], {name: one.record() for name, one in env.fidelities.items()}
     rows = [row for row in found.variants if row.engine == env.engine and row.options == options]
     rows = [row for row in rows if named.get(row.name, row.fidelity) == row.fidelity]
     return [row for row in rows if row.device == device] or rows

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -127,13 +127,8 @@ class TradeoffJob:
             seconds[variant.name] = len(self.x) * each + 2 * repetition
         return seconds
 
-    @property
-    def _source(self) -> str | type[Environment]:
-        return SceneSpec.of(self.env).name
-
     def _cheapest(self) -> Environment:
-        spec = SceneSpec.of(self.env)
-        env = replace(spec, fidelity=next(iter(self.env.fidelities))).make()
+        env = self.env.remake(fidelity=next(iter(self.env.fidelities)))
         env.prepare()
         return env
 
@@ -158,7 +153,7 @@ class TradeoffJob:
         """Make each variant's environment; note what a scene refuses, and why."""
         for variant in variants:
             try:
-                yield variant, variant.make(self._source)
+                yield variant, variant.make(self.env)
             except ValueError as error:
                 self.refused[variant.name] = " ".join(str(error).split())
 
@@ -239,11 +234,11 @@ class TradeoffJob:
         return MeasuredVariant(
             variant.name,
             variant.changed,
-            asdict(variant.fidelity),
+            variant.fidelity.record(),
             variant.engine,
             variant.device,
             variant.options,
-            variant.make(self._source).memory(),
+            variant.make(self.env).memory(),
             compare(sample, reference, seed=self.seed),
         )
 

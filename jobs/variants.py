@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ..envs.base import Environment, Fidelity
-from ..envs.registry import make
+if TYPE_CHECKING:
+    from ..envs.base import Environment, Fidelity
 
 FIDELITY = "fidelity"  # the ladder whose variants are fidelities and what is changed of them
 CHANGING = (FIDELITY, "convergence")  # the ladders that are told what to change
@@ -37,16 +37,14 @@ class Variant:
         """Return the variant that an environment is."""
         return cls(env.fidelity.name, "named", env.fidelity, env.engine, env.device, asdict(env.options))
 
-    def make(self, scene: str | type[Environment]) -> Environment:
-        """Make the environment of this variant.
+    def make(self, scene: Environment) -> Environment:
+        """Make the environment of this variant of a scene.
 
         Raises ValueError where the scene refuses it, or would round its steps to an episode of another length.
         """
-        settings: dict[str, Any] = {"engine": self.engine, "device": self.device, **self.options}
-        env = make(scene, fidelity=self.fidelity, **settings)
+        env = scene.remake(fidelity=self.fidelity, engine=self.engine, device=self.device, **self.options)
         if self.base is not None and self.fidelity.dt != self.base.fidelity.dt:
-            steps = replace(self.fidelity, dt=self.base.fidelity.dt)
-            longer = _length(env) / _length(make(scene, fidelity=steps, **settings))
+            longer = env.length() / env.remake(fidelity=replace(self.fidelity, dt=self.base.fidelity.dt)).length()
             if abs(longer - 1) > 1e-3:
                 raise ValueError(
                     f"{env.name} cuts an episode into whole steps; with dt {self.fidelity.dt:.4g} s it would be "
@@ -89,7 +87,11 @@ def variants(env: Environment, settings: Sequence[str]) -> list[Variant]:
 def refuse_single(env: Environment) -> None:
     """Raise ValueError for a scene that has one fidelity only: nothing of it can be traded."""
     if len(env.fidelities) < 2:
-        raise ValueError(f"{env.name} has fidelity {', '.join(env.fidelities)} only; there is nothing to trade")
+        raise ValueError(
+            f"{env.name} has one fidelity, {', '.join(env.fidelities)}, so there is nothing to hold against the other; "
+            "name several: a function takes fidelities={'draft': {'dt': 0.02}, 'reference': {'dt': 0.001}}, and a "
+            "class has `fidelities`"
+        )
 
 
 def refuse_ladder(ladder: str, known: Collection[str], settings: Collection[str]) -> None:
@@ -108,11 +110,6 @@ def refuse_ladder(ladder: str, known: Collection[str], settings: Collection[str]
 def expected_work(env: Environment) -> float:
     """Return what an episode is expected to cost, beside other variants of its scene."""
     return env.work().count * (SLOWER if env.fidelity.precision == "float64" else 1.0)
-
-
-def _length(env: Environment) -> float:
-    """Return what is proportional to the time an episode simulates, at fixed size of the scene."""
-    return env.work().count * env.fidelity.dt
 
 
 def _dts(base: Variant, env: Environment) -> Iterator[Variant]:

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..envs.registry import make, source_of
 from ..landscapes.draw.loopback import LOOPBACK
+from ..landscapes.plain import printable
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
@@ -66,7 +67,7 @@ def workers(scheduler: str | None, device: str) -> Iterator[Executor | None]:
         except (OSError, ValueError) as error:
             raise ConnectionError(f"no Dask scheduler answers at {scheduler}: {error}") from error
         if not client.nthreads():
-            print(f"waiting for a first worker of {scheduler}", file=sys.stderr)
+            print(f"waiting for a first worker of {printable(scheduler)}", file=sys.stderr)
             client.wait_for_workers(1)
         try:
             yield client.get_executor(pure=False)
@@ -102,7 +103,7 @@ def _greet(address: str) -> None:
         raise ConnectionError(f"no Dask scheduler answers at {address}: {said}") from error
     if not closed:
         print(
-            f"warning: {address} is without TLS, so whoever reaches it runs code on its workers and here; "
+            f"warning: {printable(address)} is without TLS, so whoever reaches it runs code on its workers and here; "
             "docs/clusters.md says how a cluster is closed",
             file=sys.stderr,
         )
@@ -122,7 +123,7 @@ def recipe(objective: Objective) -> partial[Environment] | None:
     return partial(_make_checked, source_of(env), env.version_on(env.engine), how | asdict(env.options))
 
 
-def _make_checked(source: str | type[Environment], model: int, settings: dict[str, Any]) -> Environment:
+def _make_checked(source: str | type[Environment] | Environment, model: int, settings: dict[str, Any]) -> Environment:
     env = make(source, **settings)
     if (theirs := env.version_on(env.engine)) != model:
         raise ValueError(

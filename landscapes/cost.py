@@ -33,7 +33,7 @@ class EpisodeCost:
 
 def episode_cost(objective: Objective, *, grad: bool = True) -> EpisodeCost:
     """Measure one random episode, without and with gradient in turn: the best of those that fit into a moment."""
-    getattr(objective, "prepare", lambda: None)()
+    objective.prepare()
     x = objective.space.uniform(1, seed=0)
     best = {False: float("inf"), True: float("inf") if grad else float("nan")}
     began, rounds = time.perf_counter(), 0
@@ -56,8 +56,8 @@ def seconds_per_episode(
     MemoryError where it does not hold one point.
     """
     bound = MemoryBound(objective)
-    whole = getattr(objective, "device", "cpu") == "cuda" or getattr(objective, "whole_batches", False)
-    rows = len(points) if whole else min(len(points), getattr(objective, "threads", 1))
+    whole = objective.device == "cuda" or objective.whole_batches
+    rows = len(points) if whole else min(len(points), objective.threads)
     seconds = measure_seconds(bound, points[:rows], grad=grad)
     if seconds < WARM_UP:
         seconds = measure_seconds(bound, points[:rows], grad=grad)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .objective import Objective, evaluate, name_of
+from .objective import Objective, evaluate
 from .plane import Plane
 from .space import ParameterSpace
 
@@ -44,13 +44,13 @@ def gradient_directions(objective: Objective, x: Float[Tensor, " dim"]) -> tuple
     curvature = _Curvature(objective, x)
     g = curvature.gradient(np.zeros(objective.space.dim))
     if not (size := float(np.linalg.norm(g))):
-        raise ValueError(f"{name_of(objective)} has a gradient of zero at this point; cut it through another")
+        raise ValueError(f"{objective.name} has a gradient of zero at this point; cut it through another")
     first = g / size
     change = curvature(first)
     second = change - (change @ first) * first
     if not np.linalg.norm(second) > 1e-6 * np.linalg.norm(change):  # what differences of gradients can tell from none
         raise ValueError(
-            f"{name_of(objective)}'s gradient changes along itself only at this point; cut along random:SEED instead"
+            f"{objective.name}'s gradient changes along itself only at this point; cut along random:SEED instead"
         )
     labels = [f"gradient [{SHARES}]", f"where the gradient turns most [{SHARES}]"]
     return np.stack([first, second / np.linalg.norm(second)]), labels
@@ -65,9 +65,9 @@ def hessian_directions(objective: Objective, x: Float[Tensor, " dim"]) -> tuple[
     dim = objective.space.dim
     _two(objective.space)
     curvature = _Curvature(objective, x)
-    values, vectors = _eigen(curvature, dim, name_of(objective))
+    values, vectors = _eigen(curvature, dim, objective.name)
     if not np.abs(values).max():
-        raise ValueError(f"{name_of(objective)} has no curvature at this point; cut it through another")
+        raise ValueError(f"{objective.name} has no curvature at this point; cut it through another")
     order = np.argsort(-np.abs(values), kind="stable")[:2]
     frame = vectors[:, order].T
     frame = frame * np.sign(np.take_along_axis(frame, np.abs(frame).argmax(axis=1)[:, None], axis=1))
@@ -108,7 +108,7 @@ class _Curvature:
         points = torch.from_numpy(self.x + np.stack(offsets) * self.width)
         found = evaluate(self.objective, points, grad=True).grad
         if found is None or not bool(found.isfinite().all()):
-            raise ValueError(f"{name_of(self.objective)} has no finite gradient at this point; cut it through another")
+            raise ValueError(f"{self.objective.name} has no finite gradient at this point; cut it through another")
         grad: Array = found.numpy() * self.width
         return grad[0] if len(offsets) == 1 else grad
 

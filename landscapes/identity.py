@@ -8,14 +8,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from .. import __version__
+from .objective import Status, describe_errors
 from .plain import plain_json
-from .plane import Plane
-from .space import ParameterSpace
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from .plane import Plane
+    from .space import ParameterSpace
+
 EVERY = "gradients_every"  # of a slice's identity; not there where its gradients are at every sample
+ERROR = "error"  # the attribute of a slice or a run with what the first point that raised said
+SCALES = "scales"  # of the parameters in an identity; not there where all are linear
 ABSENT = "none"  # in the place of a setting's value
 LISTED_SETTINGS = 6  # settings that differ, in the refusal of a store
 MODEL_VERSION: Final = "model_version"  # in an identity; and so is
@@ -50,10 +54,23 @@ def full_identity(identity: Mapping[str, Any], plane: Plane, space: ParameterSpa
 
     Raises ValueError where the settings hold a name of the slice's own, or are not plain JSON.
     """
-    own = {"plane": plane.record(), "parameters": space.names, "gradients": grad}
+    own = {"plane": plane.record(), **record_parameters(space), "gradients": grad}
     if clash := own.keys() & identity.keys():
         raise ValueError(f"a slice's identity gets {', '.join(sorted(clash))} from the slice; leave them out")
     return plain_json({**identity, **own}, "a slice's identity")
+
+
+def record_parameters(space: ParameterSpace) -> dict[str, Any]:
+    """Return what an identity says of the parameters: their names, and their scales unless all are linear."""
+    return {"parameters": list(space.names), **({} if space.is_linear else {SCALES: list(space.scales)})}
+
+
+def stored_scales(dataset: xr.Dataset) -> tuple[str, ...]:
+    """Return the scales that the parameters of a slice or a run are on, linear where nothing else is said."""
+    from .space import LINEAR
+
+    about = stored_identity(dataset) if "identity" in dataset.attrs else {}
+    return tuple(about.get(SCALES, [LINEAR] * dataset.sizes["dim"]))
 
 
 def current_identity(stored: Mapping[str, Any]) -> dict[str, Any]:
@@ -105,8 +122,15 @@ def stored_provenance(dataset: xr.Dataset) -> dict[str, Any]:
     return current_provenance(_decode(dataset, "provenance"), _decode(dataset, "identity"))
 
 
+def errors_of(dataset: xr.Dataset) -> str:
+    """Say how many points of a slice or a run raised and what the first of them said; nothing where none did."""
+    return describe_errors(int((dataset["status"] == Status.ERROR).sum()), str(dataset.attrs.get(ERROR, "")))
+
+
 def plane_of(dataset: xr.Dataset) -> Plane:
     """Return the plane that a slice was sampled on; raises ValueError where the dataset is no slice."""
+    from .plane import Plane
+
     return Plane.from_record(stored_identity(dataset)["plane"])
 
 

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import abc
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, overload
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .space import ParameterSpace, as_tensor
+
+if TYPE_CHECKING:
+    import numpy as np
+    import xarray as xr
+    from numpy.typing import NDArray
 
 ROUNDING = 1e-9  # of the box; points that are no farther beyond it are moved back
 
@@ -20,6 +27,7 @@ class Status(IntEnum):
     """Say how the evaluation of one point ended; a NaN result is not a missing one.
 
     INTERPOLATED is a point of a refined slice that was not evaluated, as those around it explain it: its loss is NaN.
+    NO_GRADIENT has a finite loss, which is kept, and a gradient that is not finite and therefore NaN.
     """
 
     MISSING = 0
@@ -28,9 +36,55 @@ class Status(IntEnum):
     ESCAPED = 3
     ERROR = 4
     INTERPOLATED = 5
+    NO_GRADIENT = 6
 
 
 NOT_EVALUATED = (Status.MISSING, Status.INTERPOLATED)
+HAS_LOSS = (Status.OK, Status.NO_GRADIENT)
+FAILED = (Status.NONFINITE, Status.ESCAPED, Status.ERROR)
+LONGEST_ERROR = 200  # characters of a message that are shown
+
+
+@overload
+def has_loss(status: Tensor) -> Tensor: ...
+@overload
+def has_loss(status: xr.DataArray) -> xr.DataArray: ...
+@overload
+def has_loss(status: NDArray[Any]) -> NDArray[np.bool_]: ...
+@overload
+def has_loss(status: int) -> bool: ...
+def has_loss(status: Any) -> Any:
+    """Say which points have a finite loss; `status` is a tensor, an array or one Status."""
+    return _is_any(status, HAS_LOSS)
+
+
+@overload
+def failed(status: Tensor) -> Tensor: ...
+@overload
+def failed(status: xr.DataArray) -> xr.DataArray: ...
+@overload
+def failed(status: NDArray[Any]) -> NDArray[np.bool_]: ...
+@overload
+def failed(status: int) -> bool: ...
+def failed(status: Any) -> Any:
+    """Say which points were evaluated and have no loss; `status` is a tensor, an array or one Status."""
+    return _is_any(status, FAILED)
+
+
+def describe_errors(count: int, first: str) -> str:
+    """Say how many points raised and what the first of them said, in a line; nothing where none did."""
+    if not count:
+        return ""
+    said = " ".join(first.split())
+    shown = said if len(said) <= LONGEST_ERROR else f"{said[:LONGEST_ERROR]}..."
+    return f"{count} point{'s' if count > 1 else ''} raised" + (f": first {shown!r}" if shown else "")
+
+
+def _is_any(status: Any, kinds: tuple[Status, ...]) -> Any:
+    found = status == kinds[0]
+    for kind in kinds[1:]:
+        found = found | (status == kind)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,18 +92,35 @@ class Evaluation:
     """Hold the result of evaluating a batch of points.
 
     `loss` [objective's unit], float64, shape (batch,); `grad` [loss unit / parameter unit], float64, shape
-    (batch, dim), or None where it was not asked for; `status`, int8, shape (batch,). Where the status is not OK, loss
-    and gradient are NaN. Arrays become tensors; raises ValueError for what is no real number, or no Status.
+    (batch, dim), or None where it was not asked for; `status`, int8, shape (batch,). Where the status is not OK, the
+    gradient is NaN, and so is the loss unless the status is NO_GRADIENT. `error` is what the first of the points with
+    status ERROR raised. Arrays become tensors; raises ValueError for what is no real number, or no Status.
     """
 
     loss: Float[Tensor, " batch"]
     grad: Float[Tensor, "batch dim"] | None
     status: Int[Tensor, " batch"]
+    error: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "loss", _real(self.loss, "a loss"))
         object.__setattr__(self, "grad", None if self.grad is None else _real(self.grad, "a gradient"))
         object.__setattr__(self, "status", _check_codes(self.status))
+
+    @property
+    def has_loss(self) -> Bool[Tensor, " batch"]:
+        """Which points have a finite loss."""
+        return has_loss(self.status)
+
+    @property
+    def has_gradient(self) -> Bool[Tensor, " batch"]:
+        """Which points have a finite gradient; none where gradients were not asked for."""
+        return (self.status == Status.OK) & (self.grad is not None)
+
+    @property
+    def failed(self) -> Bool[Tensor, " batch"]:
+        """Which points have no loss."""
+        return failed(self.status)
 
     @classmethod
     def from_results(
@@ -57,10 +128,12 @@ class Evaluation:
         loss: Float[Tensor, " batch"],
         grad: Float[Tensor, "batch dim"] | None,
         failed: Int[Tensor, " batch"] | None = None,
+        error: str = "",
     ) -> Evaluation:
-        """Make an evaluation from raw results: mark non-finite rows, keep what `failed` says, blank every failure.
+        """Make an evaluation from raw results: mark non-finite rows, keep what `failed` says, blank what is missing.
 
-        `failed` holds a Status per row, OK where nothing is known to have gone wrong.
+        `failed` holds a Status per row, OK where nothing is known to have gone wrong. A row whose loss alone is finite
+        keeps it and has status NO_GRADIENT; without gradients, none is missing, and its status is OK.
 
         Raises ValueError where results are no real numbers, or codes in `failed` mean no Status.
         """
@@ -68,12 +141,14 @@ class Evaluation:
         status = torch.full(loss.shape, Status.OK, dtype=torch.int8)
         if failed is not None:
             status = _check_codes(failed).to(torch.int8).clone()
-        finite = loss.isfinite() if grad is None else loss.isfinite() & grad.isfinite().all(dim=1)
-        status[(status == Status.OK) & ~finite] = Status.NONFINITE
-        blank = status != Status.OK
-        loss = loss.masked_fill(blank, torch.nan)
-        grad = None if grad is None else grad.masked_fill(blank[:, None], torch.nan)
-        return cls(loss, grad, status)
+        there = has_loss(status)
+        status[there & ~loss.isfinite()] = Status.NONFINITE
+        loss = loss.masked_fill(~has_loss(status), torch.nan)
+        if grad is None:
+            status[status == Status.NO_GRADIENT] = Status.OK
+            return cls(loss, None, status, error)
+        status[(status == Status.OK) & ~grad.isfinite().all(dim=1)] = Status.NO_GRADIENT
+        return cls(loss, grad.masked_fill((status != Status.OK)[:, None], torch.nan), status, error)
 
     judged = from_results  # its first name, which environments of others call it by
 
@@ -90,32 +165,176 @@ class Evaluation:
         if grad and len(slopes) < len(parts):
             raise ValueError(f"{len(parts) - len(slopes)} of {len(parts)} evaluations to join have no gradients")
         loss, status = torch.cat([part.loss for part in parts]), torch.cat([part.status for part in parts])
-        return cls(loss, torch.cat(slopes) if grad else None, status)
+        error = next((part.error for part in parts if part.error), "")
+        return cls(loss, torch.cat(slopes) if grad else None, status, error)
 
     def rows(self, rows: slice | Int[Tensor, " some"]) -> Evaluation:
-        """Return the evaluation of some of the points."""
-        return Evaluation(self.loss[rows], None if self.grad is None else self.grad[rows], self.status[rows])
+        """Return the evaluation of some of the points; the error message stays with those that raised."""
+        status = self.status[rows]
+        error = self.error if bool((status == Status.ERROR).any()) else ""
+        return Evaluation(self.loss[rows], None if self.grad is None else self.grad[rows], status, error)
 
     @classmethod
-    def empty(cls, dim: int, *, grad: bool) -> Evaluation:
+    def raised(cls, error: Exception, *, dim: int, grad: bool) -> Evaluation:
+        """Return the evaluation of one point at which the simulation raised."""
+        loss = torch.full((1,), torch.nan, dtype=torch.float64)
+        slope = loss.expand(1, dim).clone() if grad else None
+        status = torch.full((1,), Status.ERROR, dtype=torch.int8)
+        return cls(loss, slope, status, f"{type(error).__name__}: {first_line(error)}")
+
+    @classmethod
+    def empty(cls, dim: int, *, grad: bool, error: str = "") -> Evaluation:
         """Return the evaluation of no points at all."""
         loss = torch.zeros(0, dtype=torch.float64)
-        return cls.from_results(loss, loss.new_zeros(0, dim) if grad else None)
+        return cls.from_results(loss, loss.new_zeros(0, dim) if grad else None, error=error)
 
 
-@runtime_checkable
-class Objective(Protocol):
+class Objective(abc.ABC):
     """Anything with a parameter space that can be evaluated at a batch of points.
 
-    It is never asked beyond its bounds unless it invites that by an attribute `beyond_box` that is true.
+    Needed are `space` and `evaluate`. What only some can do has a default, so that nobody has to ask. An objective is
+    evaluated inside its bounds only, unless `beyond_box` allows more.
     """
 
+    name: str  # by default the class's own in lower case
+    space: ParameterSpace  # the parameters and their box
+    loss_unit: str = ""
+    beyond_box: bool = False  # whether parameters beyond their bounds mean something and may be tried
+    device: str = "cpu"
+    threads: int = 1  # that a batch is spread over
+    preferred_batch: int = 1  # points worth evaluating at once
+    whole_batches: bool = False  # whether a part of a batch takes as long as all of it
+    decisions: int = 1  # how often controls are chosen in an episode: dim / decisions of them, time first
+    _named: bool = False
+
+    def __init_subclass__(cls, **how: Any) -> None:
+        super().__init_subclass__(**how)
+        if "name" in vars(cls):
+            cls._named = True
+        elif not cls._named:
+            cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", cls.__name__).lower().lstrip("_")
+
+    @abc.abstractmethod
+    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
+        """Return losses, and gradients if asked, at points `x` of the space."""
+
     @property
-    def space(self) -> ParameterSpace:
-        """The parameters and their box."""
+    def precision(self) -> str:
+        """float32 or float64: what losses are computed in."""
+        return "float64"
+
+    @property
+    def packages(self) -> tuple[str, ...]:
+        """Packages that losses depend on, beside those that all depend on."""
+        return ()
+
+    def identity(self) -> dict[str, Any]:
+        """Return what decides the numbers, as plain JSON."""
+        return {"objective": self.name}
+
+    def prepare(self) -> None:  # noqa: B027 -- most have nothing to prepare
+        """Do what the first evaluation would do beside evaluating."""
+
+    def shrink(self, rows: int) -> None:  # noqa: B027 -- most hold no memory between evaluations
+        """Take at most `rows` points at once from now on."""
+
+    def memory(self) -> int:
+        """Estimate the bytes that the evaluation of one point takes."""
+        return 0
+
+    def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Int[Tensor, " batch"]]:
+        """Count what happens at each point, name -> shape (batch,); where a count changes, losses may jump."""
+        return {}
+
+    def energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"] | None:
+        """Return the mechanical energy [J] over time of a motion that nothing drives; None where there is none."""
+        return None
+
+    def noise(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"] | None:
+        """Return the standard error of the loss at each point [loss unit]; None where repeats have to tell."""
+        return None
+
+    def observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
+        """Return what a policy sees before a decision: here no more than that nothing has happened yet."""
+        return x.new_zeros(len(x), 1)
+
+
+class ObjectiveWrapper(Objective):
+    """An objective around another one, which has all that the other one has."""
+
+    def __init__(self, objective: Objective) -> None:
+        self.objective = objective
+        self.name, self.space, self.loss_unit = objective.name, objective.space, objective.loss_unit
+        self.beyond_box, self.device, self.decisions = objective.beyond_box, objective.device, objective.decisions
+        self.whole_batches = objective.whole_batches
+
+    @property
+    def threads(self) -> int:  # type: ignore[override] # read only
+        """Number of threads that a batch is spread over."""
+        return self.objective.threads
+
+    @property
+    def preferred_batch(self) -> int:  # type: ignore[override] # read only
+        """Number of points worth evaluating at once."""
+        return self.objective.preferred_batch
+
+    @property
+    def precision(self) -> str:
+        """float32 or float64: what losses are computed in."""
+        return self.objective.precision
+
+    @property
+    def packages(self) -> tuple[str, ...]:
+        """Packages that losses depend on, beside those that all depend on."""
+        return self.objective.packages
+
+    def identity(self) -> dict[str, Any]:
+        """Return what decides the numbers, as plain JSON."""
+        return self.objective.identity()
+
+    def prepare(self) -> None:
+        """Do what the first evaluation would do beside evaluating."""
+        self.objective.prepare()
+
+    def shrink(self, rows: int) -> None:
+        """Take at most `rows` points at once from now on."""
+        self.objective.shrink(rows)
+
+    def memory(self) -> int:
+        """Estimate the bytes that the evaluation of one point takes."""
+        return self.objective.memory()
+
+    def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Int[Tensor, " batch"]]:
+        """Count what happens at each point."""
+        return self.objective.events(x)
+
+    def energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"] | None:
+        """Return the mechanical energy [J] over time."""
+        return self.objective.energy(x)
+
+    def noise(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"] | None:
+        """Return the standard error of the loss at each point."""
+        return self.objective.noise(x)
+
+    def observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
+        """Return what a policy sees before a decision."""
+        return self.objective.observe(x, decision)
+
+
+class BoxedObjective(ObjectiveWrapper):
+    """Evaluate an objective inside its box only, though it allows points beyond: these have status ESCAPED."""
+
+    def __init__(self, objective: Objective) -> None:
+        super().__init__(objective)
+        self.beyond_box = False
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
-        """Return losses, and gradients if asked, at points `x` in the parameters' own units."""
+        """Return losses, and gradients if asked, at points `x` of the space."""
+        return evaluate_inside(self.objective, check_points(x, self.space, self.name), grad=grad)
+
+
+class ContractError(ValueError):
+    """What a simulator returned is not what it has to return; no status of a single point can say that."""
 
 
 def evaluate(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
@@ -125,11 +344,10 @@ def evaluate(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool)
 
     Raises ValueError where the objective's answer is not what the protocol says, and what it raises itself.
     """
-    invited = getattr(objective, "beyond_box", False)
-    raw = _ask(objective, x, grad=grad) if invited else evaluate_inside(objective, x, grad=grad)
+    raw = _ask(objective, x, grad=grad) if objective.beyond_box else evaluate_inside(objective, x, grad=grad)
     loss, status = (tensor.detach().cpu() for tensor in (raw.loss, raw.status))
     gradient = raw.grad.detach().cpu().double() if grad and raw.grad is not None else None
-    return Evaluation.from_results(loss.double(), gradient, status)
+    return Evaluation.from_results(loss.double(), gradient, status, raw.error)
 
 
 def evaluate_inside(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
@@ -145,20 +363,21 @@ def evaluate_inside(objective: Objective, x: Float[Tensor, "batch dim"], *, grad
     if bool(inside.all()):
         return _ask(objective, _clamp(objective.space, x), grad=grad)
     loss, slope = x.new_full((len(x),), torch.nan), torch.full_like(x, torch.nan) if grad else None
-    status = torch.full((len(x),), Status.ESCAPED, dtype=torch.int8)
+    status, error = torch.full((len(x),), Status.ESCAPED, dtype=torch.int8), ""
     if bool(inside.any()):
         found = _ask(objective, _clamp(objective.space, x[inside]), grad=grad)
+        error = found.error
         loss[inside], status[inside] = found.loss.detach().to(loss), found.status.to(status)
         if slope is not None and found.grad is not None:
             slope[inside] = found.grad.detach().to(slope)
-    return Evaluation(loss, slope, status)
+    return Evaluation(loss, slope, status, error)
 
 
 def _ask(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
     """Return what an objective says of points, held against the protocol."""
-    found, who = objective.evaluate(x, grad=grad), name_of(objective)
+    found, who = objective.evaluate(x, grad=grad), objective.name
     if not isinstance(found, Evaluation):
-        raise ValueError(f"{who} must return an Evaluation; got {type(found).__name__}")
+        raise ContractError(f"{who} must return an Evaluation; got {type(found).__name__}")
     count = len(x)
     wanted: dict[str, tuple[Tensor, tuple[int, ...]]] = {
         "loss": (found.loss, (count,)),
@@ -168,12 +387,12 @@ def _ask(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> 
         wanted["grad"] = (_require_gradient(found.grad, who), tuple(x.shape))
     for field, (tensor, shape) in wanted.items():
         if tuple(tensor.shape) != shape:
-            raise ValueError(
+            raise ContractError(
                 f"{who} must return {field} of shape {shape} for x of shape {tuple(x.shape)}; got {tuple(tensor.shape)}"
             )
     for status in NOT_EVALUATED:
         if bool((found.status == status).any()):
-            raise ValueError(f"{who} must say how every point ended; got status {status.name}")
+            raise ContractError(f"{who} must say how every point ended; got status {status.name}")
     return found
 
 
@@ -187,9 +406,20 @@ def _clamp(space: ParameterSpace, x: Float[Tensor, "batch dim"]) -> Float[Tensor
     return torch.clamp(x, space.lower, space.upper)
 
 
-def name_of(objective: Objective) -> str:
-    """Return what an objective is called."""
-    return str(getattr(objective, "name", type(objective).__name__))
+def check_points(x: object, space: ParameterSpace, name: str) -> Float[Tensor, "batch dim"]:
+    """Return points as a tensor. Raises ValueError where they are no points of the space."""
+    points = as_tensor(x, name)
+    if points.ndim != 2 or points.shape[1] != space.dim:
+        raise ValueError(
+            f"{name} takes {space.dim} parameters, x of shape (batch, {space.dim}); got x of shape "
+            f"{tuple(points.shape)}"
+        )
+    return points
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of what an error says: others' messages may go on for pages."""
+    return (str(error).strip().splitlines() or ["it says nothing"])[0].rstrip(":")
 
 
 def _real(values: object, what: str) -> Tensor:
@@ -211,7 +441,7 @@ def _check_codes(status: object) -> Tensor:
 
 def _require_gradient(grad: Tensor | None, who: str) -> Tensor:
     if grad is None:
-        raise ValueError(
+        raise ContractError(
             f"{who} was asked for gradients and returned none; sample with gradients=0 (--no-gradients), "
             "or search with a method that needs none"
         )

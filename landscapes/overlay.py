@@ -13,8 +13,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .identity import plane_of
+from .identity import plane_of, stored_scales
 from .lattice import own_cells
+from .objective import Status
 from .plane import Plane
 
 IMPROVEMENTS_OF = "improvements_of"  # attribute of a run of which only improvements are laid: how many episodes it has
@@ -50,6 +51,11 @@ def lay(dataset: xr.Dataset, table: xr.Dataset, label: str) -> xr.Dataset:
         raise ValueError(
             f"{label} searched {table.sizes['dim']} parameters ({_list_parameters(table)}), the slice has "
             f"{len(parameters)} ({_list_parameters(dataset)}); lay runs over slices of the same environment"
+        )
+    if stored_scales(dataset) != stored_scales(table):
+        raise ValueError(
+            f"{label} searched parameters on the scales {', '.join(stored_scales(table))}, the slice has "
+            f"{', '.join(stored_scales(dataset))}; lay runs over slices of the same environment"
         )
     half, x = _box(table)[1], _points(table)
     scaled = replace(plane, origin=plane.origin / half, basis=plane.basis / half)
@@ -87,7 +93,7 @@ def lowered(best: NDArray[np.float64]) -> NDArray[np.intp]:
 
 
 def best_point(tables: Sequence[xr.Dataset]) -> tuple[Float[Tensor, " dim"], float]:
-    """Return the point of least loss among all the runs, and its loss.
+    """Return the point of least loss among all the runs, as `evaluate` takes it, and its loss.
 
     Raises ValueError where no episode succeeded.
     """
@@ -133,7 +139,8 @@ def _previous(table: xr.Dataset) -> NDArray[np.intp]:
     z, slope = (table["x"].to_numpy() - center) / half, -table["grad"].to_numpy() * half
     found = np.full(len(z), -1)
     free = np.isfinite(slope).all(axis=1) & (slope != 0).any(axis=1)  # may be followed, once
-    for row in np.flatnonzero(np.isfinite(slope).all(axis=1) | np.isnan(table["loss"].to_numpy())):
+    lacking = table["status"].to_numpy() == Status.NO_GRADIENT
+    for row in np.flatnonzero(np.isfinite(slope).all(axis=1) | np.isnan(table["loss"].to_numpy()) | lacking):
         first = max(0, int(row) - RECENT)
         earlier = first + np.flatnonzero(free[first:row])
         if len(earlier) and (near := _is_aligned(z[row] - z[earlier], slope[earlier], np.abs(z[row]) < 1 - 1e-9)).any():

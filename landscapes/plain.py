@@ -1,4 +1,4 @@
-"""Values as plain JSON: what a report, a record or an identity may hold, and what becomes of all else."""
+"""Values as plain JSON, and as plain text: what records, names and terminals may hold, and what becomes of all else."""
 
 from __future__ import annotations
 
@@ -7,6 +7,14 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from typing import Any
+
+# What a terminal obeys and does not show, but for tabs and line ends; and what turns the direction of writing.
+CONTROL = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+
+
+def printable(text: str) -> str:
+    """Return text as a terminal may have it: a control character is its escape, as in Python's strings."""
+    return CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 def finite(value: float) -> float | None:

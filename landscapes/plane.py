@@ -12,7 +12,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .space import ParameterSpace, as_tensor, as_whole, tensor_of
+from .space import LINEAR, LOG10, ParameterSpace, as_tensor, as_whole, from_values, scaled_labels, tensor_of, to_values
+
+DECADE = "decade"
 
 Bound = float | Sequence[float] | NDArray[Any] | Tensor
 
@@ -24,7 +26,8 @@ class Plane:
     A point with plane coordinates `u` has parameters `origin + u @ basis`. `origin` [parameters' own units] is float64
     of shape (dim,); `basis` [parameter unit / plane unit] is float64 of shape (rank, dim), with independent rows of any
     length and angle; `lower` and `upper` [plane units], shape (rank,), bound what is sampled, at `resolution` points
-    per axis with both ends included. `labels` name the axes with their units: "speed, segment 3 [m/s]".
+    per axis with both ends included. `labels` name the axes with their units: "speed, segment 3 [m/s]". `scales` are
+    "log10" for axes along a logarithmic parameter, whose coordinate is the decimal logarithm of its value.
     """
 
     origin: Float[Tensor, " dim"]
@@ -33,6 +36,7 @@ class Plane:
     upper: Float[Tensor, " rank"]
     resolution: tuple[int, ...]
     labels: tuple[str, ...]
+    scales: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for field in ("origin", "basis", "lower", "upper"):
@@ -40,6 +44,7 @@ class Plane:
         object.__setattr__(
             self, "resolution", tuple(as_whole(n, "a slice's resolution", least=2) for n in self.resolution)
         )
+        object.__setattr__(self, "scales", tuple(self.scales) or (LINEAR,) * len(self.basis))
         self._check()
 
     def _check(self) -> None:
@@ -48,7 +53,7 @@ class Plane:
         if self.origin.shape != self.basis.shape[1:]:
             raise ValueError(f"Plane needs an origin of shape ({self.dim},); got {tuple(self.origin.shape)}")
         sizes = {"lower": self.lower.numel(), "upper": self.upper.numel()}
-        sizes |= {"resolution": len(self.resolution), "labels": len(self.labels)}
+        sizes |= {"resolution": len(self.resolution), "labels": len(self.labels), "scales": len(self.scales)}
         for field, size in sizes.items():
             if size != self.rank:
                 raise ValueError(f"Plane of rank {self.rank} needs {self.rank} values of {field}; got {size}")
@@ -74,9 +79,10 @@ class Plane:
     ) -> Plane:
         """Vary one or two parameters, named or numbered, and hold the others as they are at `origin`.
 
-        The plane coordinate is the parameter's own value. `extent` is None for the parameters' bounds, a fraction of
-        them for a window of that size around `origin` (moved to stay inside the bounds if it fits), or a pair (lower,
-        upper) in the parameters' units, each one number or one per axis.
+        The plane coordinate is the parameter's own value, or its decimal logarithm as `space` has it. `extent` is None
+        for the parameters' bounds, a fraction of them for a window of that size around `origin` (moved to stay inside
+        the bounds if it fits), or a pair (lower, upper) of values in the parameters' units, each one number or one per
+        axis.
 
         Raises ValueError where parameters, point, resolution or extent are none of this space's.
         """
@@ -88,12 +94,13 @@ class Plane:
         origin = as_tensor(origin, "a slice's point")
         if origin.shape != (space.dim,):
             raise ValueError(f"a slice goes through a point of shape ({space.dim},); got shape {tuple(origin.shape)}")
-        lower, upper = _bounds(space.lower[numbers], space.upper[numbers], origin[numbers], extent)
+        scales = tuple(space.scales[number] for number in numbers)
+        lower, upper = _bounds(space.lower[numbers], space.upper[numbers], origin[numbers], extent, scales)
         start = origin.clone()
         start[numbers] = 0
         basis = torch.eye(space.dim, dtype=torch.float64)[numbers]
         labels = tuple(space.labels[number] for number in numbers)
-        return cls(start, basis, lower, upper, _per_axis(resolution, len(numbers)), labels)
+        return cls(start, basis, lower, upper, _per_axis(resolution, len(numbers)), labels, scales)
 
     @classmethod
     def span(
@@ -171,6 +178,20 @@ class Plane:
         """Units of the axes, empty where they have none."""
         return tuple(_split_label(label)[1] for label in self.labels)
 
+    @property
+    def coordinate_units(self) -> tuple[str, ...]:
+        """Units of the coordinates: decades along a logarithmic axis, else those of the axes."""
+        return tuple(DECADE if scale == LOG10 else unit for unit, scale in zip(self.units, self.scales, strict=True))
+
+    @property
+    def scaled_labels(self) -> tuple[str, ...]:
+        """What columns of coordinates are called, where those of `to_values` are called as `labels`."""
+        return scaled_labels(self.labels, self.scales)
+
+    def to_values(self, u: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
+        """Return the values along the axes, in their units, at plane coordinates `u`."""
+        return to_values(u, self.scales)
+
     def lift(self, u: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch dim"]:
         """Return the parameters at plane coordinates `u`; each row's bits are independent of the batch it is in."""
         return self.origin + (tensor_of(u, "lift")[..., :, None] * self.basis).sum(dim=-2)
@@ -215,7 +236,8 @@ class Plane:
     def record(self) -> dict[str, Any]:
         """Return the plane as plain numbers and strings, exactly."""
         tensors = {name: getattr(self, name).tolist() for name in ("origin", "basis", "lower", "upper")}
-        return tensors | {"resolution": list(self.resolution), "labels": list(self.labels)}
+        scales = {"scales": list(self.scales)} if LOG10 in self.scales else {}
+        return tensors | {"resolution": list(self.resolution), "labels": list(self.labels)} | scales
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Plane:
@@ -223,7 +245,8 @@ class Plane:
         origin, basis, lower, upper = (
             torch.tensor(record[name], dtype=torch.float64) for name in ("origin", "basis", "lower", "upper")
         )
-        return cls(origin, basis, lower, upper, tuple(record["resolution"]), tuple(record["labels"]))
+        resolution, labels, scales = tuple(record["resolution"]), tuple(record["labels"]), record.get("scales", ())
+        return cls(origin, basis, lower, upper, resolution, labels, scales)
 
 
 def _per_axis(resolution: int | Sequence[int], rank: int) -> tuple[Any, ...]:
@@ -252,16 +275,25 @@ def _ends(extent: Sequence[Bound], rank: int) -> tuple[Float[Tensor, " rank"], F
     return _as_bound(extent[0], rank), _as_bound(extent[1], rank)
 
 
+def _scaled(end: Float[Tensor, " rank"], scales: tuple[str, ...]) -> Float[Tensor, " rank"]:
+    for scale, value in zip(scales, end.tolist(), strict=True):
+        if scale == LOG10 and not value > 0:
+            raise ValueError(f"extent takes positive values along a logarithmic parameter; got {value:g}")
+    return from_values(end, scales)
+
+
 def _bounds(
     lower: Float[Tensor, " rank"],
     upper: Float[Tensor, " rank"],
     center: Float[Tensor, " rank"],
     extent: float | tuple[Bound, Bound] | None,
+    scales: tuple[str, ...],
 ) -> tuple[Float[Tensor, " rank"], Float[Tensor, " rank"]]:
     if extent is None:
         return lower.clone(), upper.clone()
     if _is_sequence(extent):
-        return _ends(extent, len(lower))
+        start, end = _ends(extent, len(lower))
+        return _scaled(start, scales), _scaled(end, scales)
     fraction = float(as_tensor(extent, "extent"))
     if not 0 < fraction < np.inf:
         raise ValueError(f"extent as a fraction of the bounds must be positive and finite; got {fraction}")

@@ -16,9 +16,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from .adapters import check_points
 from .capacity import Need, require
-from .objective import Evaluation, Status
+from .objective import Evaluation, Objective, ObjectiveWrapper, Status, check_points
 from .space import ParameterSpace
 
 FORM = re.compile(r"mlp:([1-9]\d{0,8}(?:x[1-9]\d{0,8})*)")
@@ -26,7 +25,7 @@ REACH = 3.0  # times as far as torch draws weights at first: where learning may 
 COPIES = 8  # of the weights of all rows, at most
 
 
-class PolicyObjective:
+class PolicyObjective(ObjectiveWrapper):
     """The loss of an episode in which a policy decides, over the policy's weights.
 
     Weights and biases of a layer with n inputs lie within 3 / sqrt(n), three times as far as torch draws them at first;
@@ -34,10 +33,8 @@ class PolicyObjective:
     not differentiated, and without that they would be wrong.
     """
 
-    whole_batches = True  # of every decision most of the time is no row's
-
-    def __init__(self, env: Any, policy: str) -> None:
-        """Give an environment, an objective with decisions and `observe`, a policy: mlp:32x32 has two hidden layers.
+    def __init__(self, env: Objective, policy: str) -> None:
+        """Give an environment with decisions a policy: mlp:32x32 has two hidden layers.
 
         Raises ValueError for another form, and where the environment decides but once or its decisions are not alike;
         TooLargeError for more weights than there is memory for.
@@ -48,9 +45,10 @@ class PolicyObjective:
                 f"{env.name} decides {'once' if env.decisions == 1 else 'unequally'} in an episode, so that there is "
                 "nothing to see for a policy; slice its own parameters, without --policy"
             )
+        super().__init__(env)
         self._env, self.policy = env, policy
-        self.name, self.loss_unit, self.device = f"{env.name} with policy {policy}", env.loss_unit, env.device
-        self.preferred_batch, self.threads = env.preferred_batch, env.threads
+        self.name, self.beyond_box = f"{env.name} with policy {policy}", False
+        self.whole_batches = True  # of every decision most of the time is no row's
         features = env.observe(env.space.center[None], 0).shape[1]
         self._sizes = list(pairwise([features, *hidden, env.space.dim // env.decisions]))
         dim = sum((n + 1) * m for n, m in self._sizes)
@@ -61,20 +59,6 @@ class PolicyObjective:
     def identity(self) -> dict[str, Any]:
         """Return what decides the numbers: all that does of the environment, and the policy."""
         return {**self._env.identity(), "objective": self.name, "policy": self.policy}
-
-    def prepare(self) -> None:
-        """Make the first evaluation as quick as the next."""
-        self._env.prepare()
-
-    def shrink(self, rows: int) -> None:
-        """Let the environment take at most `rows` episodes at once from now on."""
-        self._env.shrink(rows)
-        self.preferred_batch = self._env.preferred_batch
-
-    def memory(self) -> int:
-        """Estimate the bytes one episode takes while it runs."""
-        needed: int = self._env.memory()
-        return needed
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
         """Return the losses of episodes that are played with these weights, a row for each policy.
@@ -89,9 +73,9 @@ class PolicyObjective:
             )
         decided, blind = self._play(x)
         found: Evaluation = self._env.evaluate(decided, grad=False)
-        lost = blind & (found.status == Status.OK)
+        lost = blind & found.has_loss
         status = found.status.masked_fill(lost, Status.NONFINITE)
-        return Evaluation(found.loss.masked_fill(lost, torch.nan), None, status)
+        return Evaluation(found.loss.masked_fill(lost, torch.nan), None, status, found.error)
 
     def decide(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch decided"]:
         """Return the environment's parameters that policies with these weights decide on, one after another."""

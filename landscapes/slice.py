@@ -13,7 +13,7 @@ import torch
 import xarray as xr
 from numpy.typing import NDArray
 
-from .identity import plane_of, stored_identity, stored_provenance
+from .identity import errors_of, plane_of, stored_identity, stored_provenance
 from .objective import Objective, Status
 from .plane import Plane
 
@@ -37,8 +37,9 @@ class Slice:
     """Hold the samples of a slice.
 
     `data` is an xarray dataset of loss(v, u), grad(v, u, dim) unless sampled without, and status(v, u); a line has no
-    v. `folder` is where its files are, None for one in memory. `remake` makes the objective again that it was sampled
-    from, for what has to be evaluated anew.
+    v. Along a logarithmic parameter a coordinate is the decimal logarithm of the value, and has the attribute `scale`,
+    "log10"; gradients are by it. `folder` is where its files are, None for one in memory. `remake` makes the objective
+    again that it was sampled from, for what has to be evaluated anew.
     """
 
     data: xr.Dataset
@@ -71,12 +72,17 @@ class Slice:
         found: NDArray[np.float64] = self.plane.slope(torch.from_numpy(self.data["grad"].to_numpy())).numpy()
         return found
 
+    @property
+    def errors(self) -> str:
+        """How many points raised and what the first of them said, in a line; empty where none did."""
+        return errors_of(self.data)
+
     def minima(self, depth: float = 0.01) -> pd.DataFrame:
         """Return the local minima deeper than a share of the range of the losses, deepest first, a row each.
 
-        The columns are the plane's coordinates, the loss there, and the depth: how far one must climb to get to a lower
-        minimum (persistence). The depth of the lowest is the range of the losses. Of a refined slice its finest lattice
-        that is sampled everywhere counts.
+        The columns are the values along the plane's axes, the loss there, and the depth: how far one must climb to get
+        to a lower minimum (persistence). The depth of the lowest is the range of the losses. Of a refined slice its
+        finest lattice that is sampled everywhere counts.
         """
         import pandas as pd
 
@@ -88,8 +94,9 @@ class Slice:
         found = minima(loss)
         deep = found.depth > depth * span(loss)
         places = np.unravel_index(found.sample[deep], loss.shape)[::-1]  # u first
-        axes = (axis.numpy()[at] for axis, at in zip(plane_of(data).axes(), places, strict=True))
-        columns = dict(zip(self.plane.labels, axes, strict=True))
+        axes = [axis[torch.from_numpy(at)] for axis, at in zip(plane_of(data).axes(), places, strict=True)]
+        values = self.plane.to_values(torch.stack(axes, dim=-1))
+        columns = dict(zip(self.plane.labels, values.numpy().T, strict=True))
         return pd.DataFrame({**columns, "loss": loss.ravel()[found.sample[deep]], "depth": found.depth[deep]})
 
     def plot(self, runs: Sequence[HasData] = (), *, width: float | None = None) -> Picture:
@@ -117,9 +124,9 @@ class Slice:
         `points` x `points` places of the slice are evaluated anew, with points near them. Raises ValueError for a slice
         without gradients, for one that is not finished, and for one whose objective cannot be made again.
         """
-        from .adapters import within_box
         from .lattice import sampled_lattice
         from .measures.profile import PRECISION, measure_profile
+        from .objective import BoxedObjective
 
         if missing := int((self.data["status"] == Status.MISSING).sum()):
             raise ValueError(f"{missing} samples of this slice are missing; let what samples it go on first")
@@ -129,8 +136,8 @@ class Slice:
         objective = self.remake()
         rounding = PRECISION[self.identity.get("settings", {}).get("precision", "float64")]
         return measure_profile(
-            within_box(objective) if self.identity.get("boxed") else objective, sampled_lattice(self.data),
-            rounding=rounding, points=points, seed=seed, events=getattr(objective, "events", None),
+            BoxedObjective(objective) if self.identity.get("boxed") else objective, sampled_lattice(self.data),
+            rounding=rounding, points=points, seed=seed, events=objective.events,
         )  # fmt: skip
 
     def __repr__(self) -> str:
@@ -141,10 +148,12 @@ class Slice:
         low, high = float(loss.min()), float(loss.max())
         finite = f"losses from {low:.4g} to {high:.4g}" if low <= high else "no finite loss"
         where = f" in {self.folder}" if self.folder else ""
-        return f"<Slice of {' · '.join(about)} over {', '.join(self.plane.labels)}: {points} points, {finite}{where}>"
+        raised = f"; {self.errors}" if self.errors else ""
+        over = ", ".join(self.plane.labels)
+        return f"<Slice of {' · '.join(about)} over {over}: {points} points, {finite}{raised}{where}>"
 
     def _events(self) -> dict[str, Any]:
         """Count what happens in the episodes along a line, where an environment says what does."""
-        env: Any = self.remake() if self.remake else None
-        counts = getattr(env, "events", None)
-        return dict(counts(self.plane.lift(self.plane.axes()[0][:, None]))) if counts else {}
+        if self.remake is None:
+            return {}
+        return dict(self.remake().events(self.plane.lift(self.plane.axes()[0][:, None])))

@@ -1,7 +1,8 @@
-"""The box of parameters a landscape is spanned by."""
+"""The box of parameters a landscape is spanned by, and the scales that they are worked with on."""
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,60 +10,110 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 from torch import Tensor
+
+LINEAR, LOG10 = SCALES = ("linear", "log10")
+
+
+@dataclass(frozen=True)
+class Log:
+    """Bound a parameter, in its own unit, that is worked with by its decimal logarithm."""
+
+    lower: float
+    upper: float
+    unit: str = ""
+
+    def __post_init__(self) -> None:
+        for field in ("lower", "upper"):
+            object.__setattr__(self, field, float(as_tensor(getattr(self, field), f"log's {field} bound")))
+        if not 0 < self.lower < self.upper < math.inf:
+            raise ValueError(
+                f"log takes the bounds of a logarithmic parameter, 0 < lower < upper; got {self.lower:g} to "
+                f"{self.upper:g}"
+            )
+
+
+def log(lower: float, upper: float, unit: str = "") -> Log:
+    """Bound a parameter of a `ParameterSpace` that is worked with by its decimal logarithm.
+
+        ParameterSpace({"k": log(1e-2, 1e6, "N/m"), "c": (0, 5)})
+
+    The bounds are in the parameter's own unit. Raises ValueError unless 0 < lower < upper.
+    """
+    return Log(lower, upper, unit)
 
 
 @dataclass(frozen=True, eq=False, init=False)
 class ParameterSpace:
-    """Name the parameters of an objective, their units and their bounds.
+    """Name the parameters of an objective, their units, their bounds and their scales.
 
         ParameterSpace({"kp": (0, 2, "N/m"), "kd": (0, 0.5)})
-        ParameterSpace(["kp", "kd"], lower=[0, 0], upper=[2, 0.5], units=["N/m", ""])
+        ParameterSpace({"k": log(1e-2, 1e6, "N/m"), "c": (0, 5)})
+        ParameterSpace(["k", "c"], lower=[1e-2, 0], upper=[1e6, 5], units=["N/m", ""], scales=["log10", "linear"])
 
-    `lower` and `upper`, numbers of any kind, become float64, shape (dim,), in the parameters' own units, which are none
-    where they are not given. The bounds say where a landscape is looked at, and an objective is not asked beyond them
-    unless it invites that (`Objective`). Raises ValueError where names, bounds or units do not belong together.
+    Bounds are given as numbers of any kind in the parameters' own units, which are none where they are not given. A
+    point `x` has, for each parameter, its value, or the decimal logarithm of it where its scale is "log10": such
+    points are what `evaluate` takes, what slices, searches and checks work with, and what `lower` and `upper`, float64
+    of shape (dim,), bound. `to_values` and `from_values` turn one into the other. The bounds say where a landscape is
+    looked at, and an objective is not asked beyond them unless it invites that (`Objective`).
+
+    Raises ValueError where names, bounds, units or scales do not belong together.
     """
 
     names: tuple[str, ...]
     lower: Float[Tensor, " dim"]
     upper: Float[Tensor, " dim"]
     units: tuple[str, ...]
+    scales: tuple[str, ...]
 
     def __init__(
         self,
-        names: Sequence[str] | Mapping[str, Sequence[Any]],
+        names: Sequence[str] | Mapping[str, Sequence[Any] | Log],
         lower: Sequence[float] | Float[Tensor, " dim"] | None = None,
         upper: Sequence[float] | Float[Tensor, " dim"] | None = None,
         units: Sequence[str] | None = None,
+        scales: Sequence[str] | None = None,
     ) -> None:
         if isinstance(names, Mapping):
-            if not (lower is None and upper is None and units is None):
+            if not (lower is None and upper is None and units is None and scales is None):
                 raise ValueError("ParameterSpace takes names with their bounds and units, or each of them; got both")
-            lower, upper, units = _columns(names)
+            lower, upper, units, scales = _columns(names)
         if isinstance(names, str) or lower is None or upper is None:
             raise ValueError(f"ParameterSpace takes names, lower and upper bounds; got {names!r}, {lower}, {upper}")
         names = tuple(map(str, names))
         units = ("",) * len(names) if units is None else units
-        for field, value in (("names", names), ("units", tuple(map(str, units)))):
+        scales = (LINEAR,) * len(names) if scales is None else scales
+        for field, value in (("names", names), ("units", tuple(map(str, units))), ("scales", tuple(map(str, scales)))):
             object.__setattr__(self, field, value)
         for field, bound in (("lower", lower), ("upper", upper)):
             values = as_tensor(bound, f"ParameterSpace's {field}").clone()  # what becomes of the caller's is no bound
             object.__setattr__(self, field, values if values.ndim else values[None])
         self._check()
+        for field in ("lower", "upper"):
+            object.__setattr__(self, field, self.from_values(getattr(self, field)))
 
     def _check(self) -> None:
-        for field, shape in (("units", (len(self.units),)), ("lower", self.lower.shape), ("upper", self.upper.shape)):
+        sizes = {field: (len(getattr(self, field)),) for field in ("units", "scales")}
+        for field, shape in (*sizes.items(), ("lower", self.lower.shape), ("upper", self.upper.shape)):
             if tuple(shape) != (self.dim,):
                 raise ValueError(
                     f"ParameterSpace has {self.dim} names; {field} must have as many, got shape {tuple(shape)}"
                 )
         if len(set(self.names)) != self.dim or not self.dim:
             raise ValueError(f"ParameterSpace needs distinct names; got {', '.join(self.names) or 'none'}")
-        for name, low, high in zip(self.names, self.lower.tolist(), self.upper.tolist(), strict=True):
+        for name, scale, low, high in zip(
+            self.names, self.scales, self.lower.tolist(), self.upper.tolist(), strict=True
+        ):
+            if scale not in SCALES:
+                raise ValueError(f"ParameterSpace takes the scales {' and '.join(SCALES)}; got {scale!r} for {name}")
             if not (low < high and np.isfinite(high - low)):
                 raise ValueError(f"ParameterSpace needs finite lower < upper for {name}; got {low:g} to {high:g}")
+            if scale == LOG10 and not low > 0:
+                raise ValueError(
+                    f"ParameterSpace needs lower > 0 for {name}, whose scale is log10; got {low:g} to {high:g}"
+                )
 
     @classmethod
     def box(cls, names: Sequence[str], lower: float, upper: float, unit: str = "") -> ParameterSpace:
@@ -81,9 +132,46 @@ class ParameterSpace:
         return (self.lower + self.upper) / 2
 
     @property
+    def is_linear(self) -> bool:
+        """Whether a point holds the parameters' own values, as none of them is logarithmic."""
+        return LOG10 not in self.scales
+
+    @property
     def labels(self) -> tuple[str, ...]:
-        """Names with units, as an axis shows them."""
+        """Names with units, as an axis shows them, and as columns of values are called."""
         return tuple(f"{name} [{unit}]" if unit else name for name, unit in zip(self.names, self.units, strict=True))
+
+    @property
+    def scaled_labels(self) -> tuple[str, ...]:
+        """What columns of points `x` are called: a logarithmic parameter is "log10 k [N/m]"."""
+        return scaled_labels(self.labels, self.scales)
+
+    def to_values(self, x: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
+        """Return the parameters' own values at points `x`; each row's bits are independent of the batch it is in."""
+        return to_values(tensor_of(x, "to_values"), self.scales)
+
+    def from_values(self, values: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
+        """Return the points with the parameters' own values.
+
+        Raises ValueError where one on a logarithmic scale is not positive.
+        """
+        values = tensor_of(values, "from_values")
+        if self.is_linear:
+            return values
+        for name, scale, column in zip(self.names, self.scales, values.unbind(-1), strict=True):
+            if scale == LOG10 and bool((column <= 0).any()):
+                raise ValueError(
+                    f"{name} is on a logarithmic scale and takes positive values; got {float(column.min()):g}"
+                )
+        return from_values(values, self.scales)
+
+    def chain(
+        self, values: Float[Tensor, "*batch dim"], grad: Float[Tensor, "*batch dim"]
+    ) -> Float[Tensor, "*batch dim"]:
+        """Return gradients by `x`, given those by the parameters' own `values`: dL/dx = dL/dvalue * value * ln 10."""
+        if self.is_linear:
+            return grad
+        return torch.where(_logarithmic(self.scales), grad * values * math.log(10), grad)
 
     def from_unit(self, u: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
         """Map the unit cube onto the box."""
@@ -120,6 +208,51 @@ class ParameterSpace:
         if not 0 <= number < self.dim:
             raise ValueError(f"parameters are numbered 0 to {self.dim - 1}; got {number}")
         return number
+
+
+def to_values(x: Float[Tensor, "*batch dim"], scales: Sequence[str]) -> Float[Tensor, "*batch dim"]:
+    """Return values of points on their scales: 10^x in logarithmic columns.
+
+    NumPy computes them, as the last bits of torch's powers depend on the place in a batch.
+    """
+    if LOG10 not in scales:
+        return x
+    chosen, found = _logarithmic(scales), x.detach().clone()
+    found[..., chosen] = torch.from_numpy(_power_of_ten(found[..., chosen].numpy()))
+    return found
+
+
+def _power_of_ten(exponents: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return 10^x; of the numbers that have this logarithm the one of twelve digits, where there is one.
+
+    So bounds come back as they were given: 10^log10(5) is 5.000000000000001 as NumPy rounds it, beyond a bound of 5.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        values = np.asarray(np.power(10.0, exponents))
+        digits = values / np.power(10.0, np.floor(exponents)) * 1e11
+        near = np.abs(digits - np.rint(digits)) < 0.02  # what rounding of logarithms up to 40 may change
+    short = np.array([float(f"{value:.12g}") for value in values[near].tolist()])
+    values[near] = np.where(np.log10(short) == exponents[near], short, values[near])
+    return values
+
+
+def from_values(values: Float[Tensor, "*batch dim"], scales: Sequence[str]) -> Float[Tensor, "*batch dim"]:
+    """Return points on their scales, the decimal logarithm in logarithmic columns, NaN where there is none."""
+    if LOG10 not in scales:
+        return values
+    chosen, found = _logarithmic(scales), values.detach().clone()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found[..., chosen] = torch.from_numpy(np.log10(found[..., chosen].numpy()))
+    return found
+
+
+def scaled_labels(labels: Sequence[str], scales: Sequence[str]) -> tuple[str, ...]:
+    """Return what columns of points on their scales are called, given what columns of values are."""
+    return tuple(f"{LOG10} {label}" if scale == LOG10 else label for label, scale in zip(labels, scales, strict=True))
+
+
+def _logarithmic(scales: Sequence[str]) -> Bool[Tensor, " dim"]:
+    return torch.tensor([scale == LOG10 for scale in scales])
 
 
 def sobol(count: int, dim: int, *, seed: int) -> Float[Tensor, "count dim"]:
@@ -174,11 +307,20 @@ def as_tensor(x: object, who: str) -> Float[Tensor, "*shape"]:
     return torch.from_numpy(np.array(values, dtype=np.float64, order="C"))
 
 
-def _columns(named: Mapping[str, Sequence[Any]]) -> tuple[list[float], list[float], list[str]]:
-    """Return lower bounds, upper bounds and units of parameters given as name: (lower, upper) or (..., unit)."""
+def _columns(
+    named: Mapping[str, Sequence[Any] | Log],
+) -> tuple[list[float], list[float], list[str], list[str]]:
+    """Return bounds, units and scales of parameters given as name: (lower, upper), (lower, upper, unit) or log(...)."""
+    rows = list[tuple[Any, ...]]()
     for name, bounds in named.items():
-        if isinstance(bounds, str) or not hasattr(bounds, "__len__") or len(bounds) not in (2, 3):
-            raise ValueError(f"parameter {name!r} needs (lower, upper) or (lower, upper, unit); got {bounds!r}")
-    rows = [(*bounds, "")[:3] for bounds in named.values()]
-    lower, upper, units = (list(column) for column in zip(*rows, strict=True)) if rows else ([], [], [])
-    return lower, upper, units
+        if isinstance(bounds, Log):
+            rows.append((bounds.lower, bounds.upper, bounds.unit, LOG10))
+        elif isinstance(bounds, str) or not hasattr(bounds, "__len__") or len(bounds) not in (2, 3):
+            raise ValueError(
+                f"parameter {name!r} needs (lower, upper), (lower, upper, unit) or log(lower, upper, unit); got "
+                f"{bounds!r}"
+            )
+        else:
+            rows.append((*(*bounds, "")[:3], LINEAR))
+    lower, upper, units, scales = (list(column) for column in zip(*rows, strict=True)) if rows else ([], [], [], [])
+    return lower, upper, units, scales

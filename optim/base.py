@@ -15,7 +15,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..landscapes.objective import Evaluation, Objective, Status
+from ..landscapes.objective import Evaluation, Objective
 from ..landscapes.options import NoOptions as NoOptions
 from ..landscapes.space import ParameterSpace, as_whole
 from .memory import FLOAT, SearchSize
@@ -48,8 +48,8 @@ class Optimizer(abc.ABC):
 
     A method is written by deriving from this class. Its hooks see the box scaled to [-1, 1] in every dimension, as
     numpy arrays: `_ask` proposes points there, `_tell` takes their losses (+inf where an episode failed) and, where it
-    asked for them, gradients (zero where an episode failed) with respect to the scaled parameters. Randomness comes
-    from `self.random` alone, so that a seed decides everything.
+    asked for them, gradients with respect to the scaled parameters: zero where an episode failed, NaN where it has a
+    loss alone. Randomness comes from `self.random` alone, so that a seed decides everything.
 
     Between `tell` and `ask` an optimiser is its `state`: what `from_state` makes of it goes on bit for bit. A method
     whose attributes are numbers, strings, arrays, lists and mappings of them needs nothing for that; any other says in
@@ -107,7 +107,7 @@ class Optimizer(abc.ABC):
 
     def _take_in(self, x: Float[Tensor, "count dim"], evaluation: Evaluation) -> tuple[Points, Points, Points | None]:
         """Return points and what they came out as, as the hooks see them."""
-        ok = (evaluation.status == Status.OK).numpy()
+        ok = evaluation.has_loss.numpy()
         loss = np.where(ok, evaluation.loss.numpy(), math.inf)
         if ok.any():
             highest = float(loss[ok].max())

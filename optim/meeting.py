@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..landscapes.objective import Evaluation, Objective, name_of
+from ..landscapes.objective import Evaluation, Objective, ObjectiveWrapper
 from ..landscapes.sampling.memory import MemoryBound
 from .turns import Turns, aside
 
@@ -39,7 +39,7 @@ class _Question:
     settled: threading.Event = field(default_factory=threading.Event)
 
 
-class Meeting:
+class Meeting(ObjectiveWrapper):
     """An objective for several threads, each of which asks for a few points at a time and waits for the answer.
 
     Once all `members` wait, the thread that calls `serve` answers them: it evaluates the points of all who want the
@@ -49,8 +49,7 @@ class Meeting:
     """
 
     def __init__(self, objective: Objective, members: int) -> None:
-        self.objective = objective
-        self.space, self.name = objective.space, name_of(objective)
+        super().__init__(objective)
         self._bound = MemoryBound(objective)
         self._present = members
         self._questions: dict[int, _Question] = {}
@@ -58,10 +57,6 @@ class Meeting:
         self._turns = Turns()
         self._ended = False
         self._changed = threading.Condition()  # on which the thread that serves waits
-
-    def __getattr__(self, name: str) -> Any:
-        """Return what else the objective says of itself, such as how many decisions an episode has."""
-        return getattr(self.objective, name)
 
     def seat(self, number: int) -> None:
         """Give the thread that calls this its number, by which points are ordered in a batch, and its first turn."""

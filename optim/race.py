@@ -73,7 +73,7 @@ def _run_abreast(
     progress: Callable[[Competitor, SearchProgress], None] | None,
 ) -> None:
     optimizers = [one.make() for one in left]
-    getattr(objective, "prepare", lambda: None)()
+    objective.prepare()
     pairs = zip(optimizers, left, strict=True)
     if gradient_cost is None and any(made.needs_grad and one.run.gradient_cost is None for made, one in pairs):
         gradient_cost = episode_cost(objective).ratio

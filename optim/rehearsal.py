@@ -7,14 +7,13 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..landscapes.objective import Evaluation, Objective
+from ..landscapes.objective import Evaluation, Objective, ObjectiveWrapper
 from .base import Optimizer
 from .processes import seconds_computed
 from .runs.store import RunStore
@@ -58,20 +57,16 @@ class Rehearsal:
         return here, apart
 
 
-class MadeUp:
+class MadeUp(ObjectiveWrapper):
     """A landscape with the box of an objective, and whatever else that one says of itself, at no cost.
 
     Its loss is a bowl with waves over the box scaled to [0, 1]. `asked` counts points, and those with a gradient.
     """
 
     def __init__(self, objective: Objective) -> None:
-        self._objective, self.space = objective, objective.space
+        super().__init__(objective)
         self.name = "made up"
         self.asked = {False: 0, True: 0}
-
-    def __getattr__(self, name: str) -> Any:
-        """Return what else the objective says of itself, such as how many decisions an episode has."""
-        return getattr(self._objective, name)
 
     def prepare(self) -> None:
         """Do nothing: there is nothing to compile."""

@@ -10,7 +10,7 @@ from typing import Any
 
 from ..landscapes.cost import episode_cost
 from ..landscapes.identity import StoreError
-from ..landscapes.objective import Objective, evaluate, name_of
+from ..landscapes.objective import Objective, evaluate
 from ..landscapes.space import as_whole
 from .base import Optimizer
 from .registry import optimizer_class
@@ -71,7 +71,7 @@ def search(
 
 def _in_memory(objective: Objective, method: Optimizer | str, budget: int) -> RunStore:
     name, seed = (method, 0) if isinstance(method, str) else (method.name, method.seed)
-    identity = {"objective": name_of(objective), "method": name, "seed": seed}
+    identity = {"objective": objective.name, "method": name, "seed": seed}
     return RunStore.in_memory(objective.space, identity=identity, budget=budget)
 
 
@@ -115,7 +115,7 @@ def _begin(objective: Objective, method: Optimizer | str, run: RunStore, gradien
     run.rewind()
     if state is None:
         run.save(optimizer.state)  # what to go back to
-    getattr(objective, "prepare", lambda: None)()
+    objective.prepare()
     if optimizer.needs_grad and run.gradient_cost is None:
         run.set_gradient_cost(gradient_cost or episode_cost(objective).ratio)
     return optimizer

@@ -33,9 +33,9 @@ class Switches:
 class Parted(Environment):
     """A bowl with wind, whose parts do what their names say; painting takes as long as all the rest."""
 
-    name: ClassVar[str] = "parted"
+    name = "parted"
     Options: ClassVar[type[Any]] = Switches
-    loss_unit: ClassVar[str] = "J"
+    loss_unit = "J"
     space = ParameterSpace.box(["x0", "x1"], 0.0, 1.0)
     model_parts: ClassVar[tuple[ModelPart, ...]] = (
         ModelPart("wind", {"wind": False}, "no wind"),

@@ -7,7 +7,7 @@ import pytest
 from benchmarks import checks
 from benchmarks.checks import HEAD
 
-from gradscape.landscapes.adapters import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.conformance.suite import check
 from gradscape.landscapes.space import ParameterSpace
 

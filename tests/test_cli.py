@@ -95,7 +95,7 @@ def test_a_folder_of_other_files_is_left_alone(run: Callable[..., Said], tmp_pat
     ("arguments", "said"),
     [
         (["slice", "flud", "--dims", "0", "1"], "did you mean fluid?"),
-        (["slice", "branin"], "--dims"),
+        (["slice", "bounce"], "--dims"),
         (["slice", "branin", "--dims", "0", "2"], "numbered 0 to 1; got 2"),
         (["slice", "branin", "--dims", "0", "0"], "two different parameters; got 0, 0"),
         (["slice", "branin", "--dims", "0", "1", "--resolution", "1"], "--resolution"),

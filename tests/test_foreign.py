@@ -122,17 +122,19 @@ def test_a_line_has_one_dimension(run: Callable[..., Said], folder: Path, words:
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("arm.py:Leg", "arm.py holds no environment Leg; it has TwoLinkArm, Arm"),
-        ("arm.py:NOTHING", "arm.py holds no environment NOTHING"),
+        ("arm.py:Leg", "arm.py holds no Leg; it has Stiffness, TwoLinkArm, Arm, NOTHING"),
+        ("arm.py:NOTHING", "arm.py:NOTHING: int is no simulator"),
         ("leg.py:Leg", "there is no file leg.py"),
         ("broken.py:Arm", "broken.py cannot be imported: ZeroDivisionError"),
+        ("leaves.py:Arm", "leaves.py called sys.exit(3) while it was imported; let it do that as a program only"),
         ("fluid.py:Mine", "fluid.py:Mine is called 'fluid', and so is gradscape.envs.mpm.fluid:Fluid"),
     ],
 )
 def test_a_file_without_the_class_is_refused_by_name(
     run: Callable[..., Said], folder: Path, name: str, said: str
 ) -> None:
-    (folder / "broken.py").write_text("1 / 0")
+    (folder / "broken.py").write_text("Arm = 1 / 0")
+    (folder / "leaves.py").write_text("import sys\nArm = sys.exit(3)")
     (folder / "fluid.py").write_text(
         ARM.replace("TwoLinkArm", "Mine").replace("loss_unit", 'name = "fluid"\n    loss_unit')
     )

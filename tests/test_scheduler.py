@@ -25,11 +25,11 @@ import torch
 from distributed.comm import connect
 from distributed.security import Security
 
+from gradscape.envs.adapters import from_torch
 from gradscape.envs.functions import Branin
 from gradscape.envs.registry import make
 from gradscape.jobs.slice import STORE
 from gradscape.jobs.workers import recipe, workers
-from gradscape.landscapes.adapters import from_torch
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.distribution import WorkersLostError
 from gradscape.landscapes.sampling.fill import sample

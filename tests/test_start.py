@@ -55,6 +55,34 @@ def packages(loaded: set[str]) -> set[str]:
     return {name.partition(".")[0] for name in loaded} & depended()
 
 
+REFUSED = (
+    *("slice nosuch --dims 0 1", "check own.py:Bowls", "check missing.py:Bowl", "replay nosuch", "tradeoff nosuch"),
+    *("slice branin --dims 7 8", "slice fluid --dims 0 --along gradient", "slice fluid --along nowhere"),
+    *("slice fluid --dims 0 --resolution x", "slice fluid --dims 0 --extent x", "slice fluid --dims 0 --refine x"),
+    *("slice fluid --dims 0 --tolerance x", "slice fluid --dims 0 --tolerance 5% --fidelity draft"),
+    *("slice bounce --dims 0 --set nosuch", "slice bounce --dims 0 --fidelity nosuch"),
+    *("slice bounce --dims 0 --device nosuch", "slice bounce --dims 0 --engine nosuch", "bounce --axis w"),
+    *("sweep fluid --dims 0 1 --over 12", "plan fluid --dims 12 0", "plan nosuch.toml", "plan fluid --methods nosuch"),
+    *("race fluid --methods nosuch", "race fluid --methods random --option bo.a=1", "optimize bounce --method nosuch"),
+    *("league nosuch", "league fluid@nosuch", "league fluid --methods nosuch", "methods nosuch", "envs nosuch"),
+    *("report nosuch", "report fluid --fidelity nosuch", "bench fluid --against nosuch", "tradeoff fluid --ladder no"),
+    *("compare nosuch fluid", "overlay nosuch run", "surface nosuch", "export nosuch", "view nosuch", "nosuch"),
+)
+
+
+def test_what_is_wrong_with_a_commands_words_is_said_before_anything_that_computes_is_imported(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(BOWL)
+    code = (
+        "import sys\nfrom gradscape.cli import main\n"
+        f"for text in {REFUSED}:\n    try: main(text.split())\n"
+        "    except SystemExit as left:\n"
+        "        heavy = {'torch', 'numpy', 'warp', 'matplotlib'} & set(sys.modules)\n"
+        "        print(text, left.code, *heavy, sep='|')"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert said.stdout.splitlines() == [f"{text}|2" for text in REFUSED]
+
+
 @pytest.fixture(scope="module")
 def sliced(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
     """Return what a slice of somebody's function imports, its picture drawn, where Dask is not installed.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from .study import Study, number, percent, share
+from .study import Study, number, percent, say_missing, share
 
 if TYPE_CHECKING:
     from ...landscapes.measures.tradeoff import MeasuredVariant, Tradeoff
@@ -59,6 +59,8 @@ def show(found: Tradeoff, console: Console) -> None:
         "median, 95 %: loss error as a share of the spread (95 % interval); rank: Spearman's correlation of losses; "
         "cosine, slope: of gradients, median cosine and relative error; ms an episode; * none is quicker and nearer"
     )
+    if said := say_missing((one.name, one.comparison) for one in found.variants):
+        console.print(said)
     for fit in found.orders:
         console.print(f"error ~ dt^{fit.order:z.2f} ± {fit.standard_error:.2f}: {', '.join(fit.variants)}")
     for why in dict.fromkeys(refused.why for refused in found.refused):

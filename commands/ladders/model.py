@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from .study import Study, number, percent, share
+from .study import Study, number, percent, say_missing, share
 
 if TYPE_CHECKING:
     from ...landscapes.measures.fidelity import Bootstrap
@@ -41,6 +41,8 @@ def show(found: ModelStudy, console: Console) -> None:
         _print_parts(console, found.missing, "parts that are missing, and what putting each in does")
     for part in (*found.present, *found.missing):
         console.print(f"{part.name}, {part.change}: {part.verdict}")
+    if said := say_missing((one.name, one.comparison) for one in (*found.present, *found.missing)):
+        console.print(said)
     console.print(
         "median, 95 %: how far losses move, as a share of the spread, at half and at 95 % of points (95 % interval); "
         "moved: points whose loss moves beyond the noise; rank: Spearman's correlation of losses; cosine, slope: of "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ...jobs.scene import SceneSpec
 
 if TYPE_CHECKING:
-    from ...landscapes.measures.fidelity import Bootstrap
+    from ...landscapes.measures.fidelity import Bootstrap, Comparison
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,12 @@ class Study:
     force: bool
     command: str
     limits: Mapping[str, Any] = field(default_factory=dict)
+
+
+def say_missing(rows: Iterable[tuple[str, Comparison]]) -> str:
+    """Say which variants lack gradients where the reference has them, and at what share; nothing where none does."""
+    lacking = [f"{name} at {found.missing:.0%}" for name, found in rows if found.missing]
+    return f"no gradient, of the points that have a loss: {', '.join(lacking)}" if lacking else ""
 
 
 def percent(value: float | None) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 
 from gradscape.envs.base import Environment
@@ -82,7 +81,7 @@ def _parameters(env: Environment) -> str:
 
 def _settings(env: Environment) -> Iterator[str]:
     """Yield fidelities, engines, examples, options, and how far the step is from what is stable."""
-    settings = [asdict(one) for one in env.fidelities.values()]
+    settings = [one.record() for one in env.fidelities.values()]
     yield table([*settings[0]], [[f"{value:.4g}" if isinstance(value, float) else str(value) for value in one.values()]
                                  for one in settings])  # fmt: skip
     yield (

@@ -1,11 +1,12 @@
-"""An objective of a function that launches Warp kernels, differentiated by Warp's tape."""
+"""Functions that launch Warp kernels, differentiated by Warp's tape."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -13,65 +14,63 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from ...landscapes.adapters import check_shape, function_name
-from ...landscapes.objective import Evaluation, Objective
-from ...landscapes.space import ParameterSpace, as_whole
-from .functions import ROWS, FunctionObjective
+from ...landscapes.objective import ContractError
+from ..function import check_shape
 from .runtime import cuda_available, precision
+
+if TYPE_CHECKING:
+    from ..function import Compute, Function
 
 CORRUPTS = "This may corrupt gradient computation"  # how Warp ends what it says of an array that is overwritten
 
 
-def from_warp(
-    fn: Callable[[Any], Any],
-    space: ParameterSpace,
-    *,
-    name: str | None = None,
-    loss_unit: str = "",
-    precision: str = "float32",
-    device: str = "auto",
-    rows: int = ROWS,
-    check_overwrites: bool = True,
-) -> Objective:
-    """Make an objective of a function that launches Warp kernels, from points to losses.
+@dataclass(frozen=True)
+class WarpBackend:
+    """Call functions that launch Warp kernels."""
 
-    The function takes a Warp array of points, shape (batch, dim), and returns one of losses, shape (batch,), both of
-    `precision`; each loss may depend on its own row only. At most `rows` points are in one call. What it launches is
-    recorded on a tape, and the tape is played backwards for the gradients; the gradients of arrays that the function
-    keeps are set to zero after each evaluation. The losses are made with requires_grad=True.
+    device: str
+    check_overwrites: bool
+    engine: str = "warp"
+    devices: tuple[str, ...] = ("cpu", "cuda")
 
-    A kernel that writes to an array which an earlier one has read makes gradients wrong without a word.
-    `check_overwrites` looks for that once, before the first gradient, and builds the function's kernels anew for it,
-    which may take long; leave it out for a simulator that is known to be right.
+    def find_device(self, device: str) -> str:
+        """Return the device that auto stands for, or the one named."""
+        wanted = self.device if device == "auto" else device
+        found = ("cuda" if cuda_available() else "cpu") if wanted == "auto" else wanted
+        if found not in self.devices or (found == "cuda" and not cuda_available()):
+            raise ValueError(
+                f"from_warp runs on auto, cpu, or cuda where there is a CUDA device; got device {wanted!r}"
+            )
+        return found
 
-    Raises ValueError for other precisions and devices; evaluating raises it where the function returns no such array,
-    launches nothing, does not read its points, or writes to what was read.
-    """
-    at = ("cuda" if cuda_available() else "cpu") if device == "auto" else device
-    if at not in ("cpu", "cuda") or (at == "cuda" and not cuda_available()):
-        raise ValueError(f"from_warp runs on auto, cpu, or cuda where there is a CUDA device; got device {device!r}")
-    most = as_whole(rows, "from_warp's rows", least=1)
-    return WarpObjective(fn, space, name or function_name(fn), loss_unit, precision, most, at, check_overwrites)
+    def bind(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> Compute:
+        """Return what computes the function with these keyword arguments."""
+        fn = partial(call.fn, **settings)
+        return WarpFunction(fn, call.name, precision, device, unchecked=self.check_overwrites)
 
 
 @dataclass(eq=False)
-class WarpObjective(FunctionObjective):
-    """What `from_warp` makes; `unchecked` until it has looked for what is overwritten."""
+class WarpFunction:
+    """A function of Warp points; `unchecked` until it has looked for what is overwritten."""
 
+    fn: Callable[[Any], Any]
+    name: str
+    precision: str
     device: str
     unchecked: bool
 
     def __post_init__(self) -> None:
         self.real = precision(self.precision).real
 
-    def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+    def __call__(self, x: Float[Tensor, "batch dim"], grad: bool) -> tuple[Tensor, Tensor | None, str]:
+        """Return losses, gradients if asked for, and the type of numbers that losses come in."""
         with wp.ScopedDevice(self.device):
             if grad and self.unchecked:
                 self._refuse_overwrites(x[:1])
                 self.unchecked = False
             points: Any = wp.array(x.numpy(), dtype=self.real, requires_grad=grad)
             if not grad:
-                return Evaluation.from_results(_tensor(self._losses(points)), None)
+                return _tensor(self._losses(points)), None, self.precision
             tape = wp.Tape()
             with tape:
                 losses = self._losses(points)
@@ -79,16 +78,24 @@ class WarpObjective(FunctionObjective):
                 slope = self._gradient(tape, losses, points)
             finally:
                 tape.zero()  # of arrays that the function keeps
-            return Evaluation.from_results(_tensor(losses), slope)
+            return _tensor(losses), slope, self.precision
 
     def _losses(self, points: Any) -> Any:
         """Return what the function makes of points, held against what it must be."""
-        losses = self.fn(points)
+        try:
+            losses = self.fn(points)
+        except Exception as error:  # Warp's own types of errors differ from release to release
+            if wanted := _wanted_type(error, self.real):
+                raise ContractError(
+                    f"{self.name} launches kernels that want {wanted} where its points are {self.precision}: pass "
+                    f"precision={wanted!r} to from_warp, or write kernels for {self.precision} ({_line(error)})"
+                ) from error
+            raise
         if not isinstance(losses, wp.array):
-            raise ValueError(f"{self.name} must return a Warp array; got {type(losses).__name__}")
+            raise ContractError(f"{self.name} must return a Warp array; got {type(losses).__name__}")
         check_shape(tuple(losses.shape), (len(points),), "losses", self.name)
         if losses.dtype != self.real:
-            raise ValueError(
+            raise ContractError(
                 f"{self.name} must return losses of {self.real.__name__}, as its points are; got "
                 f"{losses.dtype.__name__} (from_warp's precision says which)"
             )
@@ -96,19 +103,21 @@ class WarpObjective(FunctionObjective):
 
     def _gradient(self, tape: Any, losses: Any, points: Any) -> Float[Tensor, "batch dim"]:
         if not tape.launches:
-            raise ValueError(
+            raise ContractError(
                 f"{self.name} launched no kernel, so its tape is empty; launch kernels that read its points and write "
                 "its losses, or sample with gradients=0 (--no-gradients)"
             )
         if not losses.requires_grad:
-            raise ValueError(f"{self.name} returned losses that carry no gradient; make them with requires_grad=True")
+            raise ContractError(
+                f"{self.name} returned losses that carry no gradient; make them with requires_grad=True"
+            )
         tape.backward(grads={losses: wp.ones_like(losses, requires_grad=False)})
         if points not in tape.gradients:
-            raise ValueError(f"{self.name} launched no kernel that reads its points, so its losses have no gradient")
+            raise ContractError(f"{self.name} launched no kernel that reads its points, so its losses have no gradient")
         return _tensor(tape.gradients[points])
 
     def _refuse_overwrites(self, x: Float[Tensor, "batch dim"]) -> None:
-        """Raise ValueError where a kernel writes to what an earlier one has read."""
+        """Raise ContractError where a kernel writes to what an earlier one has read."""
         points: Any = wp.array(x.numpy(), dtype=self.real, requires_grad=True)
         with wp.Tape() as tape:  # which kernels there are: they are built anew to be looked at
             self._losses(points)
@@ -123,7 +132,7 @@ class WarpObjective(FunctionObjective):
         launched = [f"in kernel {kernel.adj.fun_name} at" for kernel in kernels]  # a module may hold others
         found = [one for one in said if any(name in one for name in launched)]
         if found:
-            raise ValueError(
+            raise ContractError(
                 f"{self.name} writes to what it has read, so its gradients would be wrong: {found[0]} "
                 "Write to an array of its own for each step, or pass check_overwrites=False to from_warp"
             )
@@ -162,6 +171,16 @@ class _Listener:
 
     def error(self, message: str) -> None:
         """Drop it: what fails raises."""
+
+
+def _wanted_type(error: Exception, real: Any) -> str:
+    """Return the precision that a kernel's argument has where Warp refused ours for it, empty for another error."""
+    said, other = str(error), {"float32": "float64", "float64": "float32"}[real.__name__]
+    return other if real.__name__ in said and other in said else ""
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())
 
 
 def _tensor(values: Any) -> Tensor:

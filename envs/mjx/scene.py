@@ -71,7 +71,7 @@ class MjxScene(Environment):
     duration: ClassVar[float]
     segments: ClassVar[int] = 1
     engines: ClassVar[tuple[str, ...]] = ("mjx",)
-    whole_batches: ClassVar[bool] = True  # one point costs as much as a batch
+    whole_batches = True  # one point costs as much as a batch
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=1 / 250, precision="float64"),
         "standard": Fidelity("standard", dt=1 / 500, precision="float64"),
@@ -84,7 +84,7 @@ class MjxScene(Environment):
         """Return the loss of the last state, traced by JAX: `mujoco.mjx.Data` of one row."""
 
     @property
-    def preferred_batch(self) -> int:
+    def preferred_batch(self) -> int:  # type: ignore[override] # read only
         """Number of points worth evaluating at once."""
         return min(ROWS, self._max_rows)
 
@@ -115,15 +115,17 @@ class MjxScene(Environment):
         self._rollout = solver.Rollout(self.mjcf, settings, self.fidelity.precision, name=self.name)
         first = [one for one in self.parameters if one.field != "ctrl"]
         held = [one for one in self.parameters if one.field == "ctrl"]
-        named = [(one.name, one) for one in first]
-        named += [(f"t{k} {one.name}", one) for k in range(self.segments) for one in held]
-        self.space = ParameterSpace({name: (one.lower, one.upper, one.unit) for name, one in named})
+        turns = [f"t{k} " for k in range(self.segments)] if self.segments > 1 else [""]
+        names = [one.name for one in first] + [f"{turn}{one.name}" for turn in turns for one in held]
+        bounds = [(one.lower, one.upper, one.unit) for one in (*first, *(held * self.segments))]
+        self.space = ParameterSpace(names, *zip(*bounds, strict=True))
         places = tuple(self._rollout.find(one.field, one.index) for one in (*first, *held))
         each = round(self.duration / self.segments / self.fidelity.dt)
         count, steps = (1, o.count_steps(each)) if self.segments == 1 else (o.count_steps(self.segments), each)
         self._course = solver.Course(places, self.segments, count, steps, self.act)
-        how: dict[str, Any] = {"mode": o.mode, "precision": self.fidelity.precision, "rows": self.preferred_batch}
-        self._objective = solver.from_jax(self._loss, self.space, name=self.name, **how)
+        self._function = solver.JaxFunction(
+            self._loss, self.space.dim, self.name, self.fidelity.precision, self.preferred_batch, o.mode
+        )
 
     def _loss(self, x: Any) -> Any:
         return self.loss_of(self._rollout.end(x, self._course))
@@ -134,17 +136,15 @@ class MjxScene(Environment):
 
     def engine_call(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Callable[[], object]:
         """Return what calls MJX's compiled program alone, on points that JAX holds already."""
-        call: Callable[[], object] = self._objective.engine_call(x, grad=grad)
+        call: Callable[[], object] = self._function.engine_call(x, grad=grad)
         return call
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         """Evaluate batches of one size only: programs for other sizes round in another order."""
         whole = torch.cat([x, x[-1:].expand(-len(x) % self.preferred_batch, -1)])
-        alone: Evaluation = self._objective.evaluate(whole, grad=False).rows(slice(len(x)))
-        if not grad:
-            return alone
-        both = self._objective.evaluate(whole, grad=True).rows(slice(len(x)))
-        return Evaluation.from_results(alone.loss, both.grad, alone.status)
+        loss, _, _ = self._function(whole, False)
+        slope = self._function(whole, True)[1][: len(x)] if grad else None
+        return Evaluation.from_results(loss[: len(x)], slope)
 
 
 def draw(

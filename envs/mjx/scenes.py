@@ -40,11 +40,11 @@ class Drop(MjxScene):
     `straight`) does not slide when it touches, which is where gradients of such contacts are worth a look.
     """
 
-    name: ClassVar[str] = "mjx-drop"
+    name = "mjx-drop"
     mjcf: ClassVar[str] = BALL.format(place="0 0 1", contact="")
     parameters: ClassVar[tuple[Parameter, ...]] = _speeds(2.0)
     duration: ClassVar[float] = 0.6
-    loss_unit: ClassVar[str] = "m²"
+    loss_unit = "m²"
     examples: ClassVar[dict[str, tuple[float, ...]]] = {"straight": (0.0, 0.0, 0.0)}
 
     def loss_of(self, state: Any) -> Any:
@@ -62,13 +62,13 @@ class MjxBounce(MjxScene):
     Loss: squared distance of the ball's centre to the target (2, 0, 1) m after 2 s [m^2].
     """
 
-    name: ClassVar[str] = "mjx-bounce"
+    name = "mjx-bounce"
     mjcf: ClassVar[str] = BALL.format(
         place="-0.5 0 1", contact='solref="-10000 -10" solimp="0.999 0.999 0.001" friction="0.25 0 0"'
     )
     parameters: ClassVar[tuple[Parameter, ...]] = _speeds(10.0)
     duration: ClassVar[float] = 2.0
-    loss_unit: ClassVar[str] = "m²"
+    loss_unit = "m²"
 
     def loss_of(self, state: Any) -> Any:
         """Return the squared distance to the target [m^2]."""
@@ -122,12 +122,12 @@ class MjxCartpole(MjxScene):
     Parameters and loss are those of `cartpole`, which this scene was made to be held against.
     """
 
-    name: ClassVar[str] = "mjx-cartpole"
+    name = "mjx-cartpole"
     mjcf: ClassVar[str] = _chain()
     duration: ClassVar[float] = 2.0
     segments: ClassVar[int] = 100
     control_step: ClassVar[float] = 0.02
-    loss_unit: ClassVar[str] = "m"
+    loss_unit = "m"
     Options: ClassVar[type[Any]] = ChainOptions
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=0.02, precision="float64"),
@@ -163,7 +163,7 @@ class Push(MjxScene):
     Loss: squared distance of the box's centre on the floor to (0.6, 0.15) m [m^2].
     """
 
-    name: ClassVar[str] = "mjx-push"
+    name = "mjx-push"
     mjcf: ClassVar[str] = """
 <mujoco>
   <option timestep="0.004"/>
@@ -192,7 +192,7 @@ class Push(MjxScene):
     duration: ClassVar[float] = 1.0
     segments: ClassVar[int] = 5
     control_step: ClassVar[float] = 0.2
-    loss_unit: ClassVar[str] = "m²"
+    loss_unit = "m²"
     examples: ClassVar[dict[str, tuple[float, ...]]] = {"straight": (0.8, 0.0) * 5}
 
     def loss_of(self, state: Any) -> Any:

@@ -86,7 +86,7 @@ class Fluid(MpmScene):
     """
 
     model_version = 1
-    name: ClassVar[str] = "fluid"
+    name = "fluid"
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=SPAN / 6, resolution=12, sampling=16 / 12),
         "standard": Fidelity("standard", dt=SPAN / 14, resolution=32, sampling=1.5),
@@ -95,7 +95,7 @@ class Fluid(MpmScene):
     examples: ClassVar[dict[str, tuple[float, ...]]] = {
         "scoop": (0.9, -0.79, -0.26, 1.43, -0.49, 1.97, -0.97, 1.56, -0.42, 1.2)
     }
-    loss_unit: ClassVar[str] = "m"
+    loss_unit = "m"
     control_step: ClassVar[float] = SPAN
     Options: ClassVar[type[Any]] = FluidOptions
     material_range: ClassVar[MaterialRange] = MaterialRange("viscosity", 2.0, 40.0)  # a tenth to twice the default

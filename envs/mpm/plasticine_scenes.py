@@ -29,7 +29,7 @@ class Assembly(Plasticine):
     the ball on the box, where upstream has it.
     """
 
-    name: ClassVar[str] = "assembly"
+    name = "assembly"
     examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
         0.017 0.806 0.02 0.313 0.871 -0.114
@@ -55,7 +55,7 @@ class Pinch(Plasticine):
     PlasticineLab's target, not as its cube, which weighs 0.6 of it.
     """
 
-    name: ClassVar[str] = "pinch"
+    name = "pinch"
     fidelities: ClassVar[dict[str, Fidelity]] = fidelities(draft=(32, 800, 9), standard=(64, 5000, 20))
     examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
@@ -89,7 +89,7 @@ class RollingPin(Plasticine):
     the vertical and rises or sinks; yield stress 50 Pa.
     """
 
-    name: ClassVar[str] = "rolling-pin"
+    name = "rolling-pin"
     fidelities: ClassVar[dict[str, Fidelity]] = fidelities(draft=(40, 1500, 12), standard=(64, 10_000, 10))
     examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
@@ -115,7 +115,7 @@ class Rope(Plasticine):
     The target is a full ring around the post, which the rope is too short for: its loss cannot vanish.
     """
 
-    name: ClassVar[str] = "rope"
+    name = "rope"
     fidelities: ClassVar[dict[str, Fidelity]] = fidelities(draft=(40, 1500, 12), standard=(80, 10_000, 25))
     examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
@@ -144,7 +144,7 @@ class Table(Plasticine):
     the end: pushed for longer it takes the table along, because a leg bends at about the force that the floor holds.
     """
 
-    name: ClassVar[str] = "table"
+    name = "table"
     examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
         0.08 0 -0.08
@@ -172,7 +172,7 @@ class Torus(Plasticine):
     A slab 0.3 m wide and 0.1 m high on a sticky floor, a torus (0.05 m, tube 0.03 m) above it; yield stress 50 Pa.
     """
 
-    name: ClassVar[str] = "torus"
+    name = "torus"
     fidelities: ClassVar[dict[str, Fidelity]] = fidelities(draft=(32, 800, 9), standard=(64, 5000, 10))
     examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
@@ -200,7 +200,7 @@ class TripleMove(Plasticine):
     hang in the air, so that blocks must be lifted and held.
     """
 
-    name: ClassVar[str] = "triple-move"
+    name = "triple-move"
     examples: ClassVar[dict[str, tuple[float, ...]]] = _parse_demonstration(
         """
         0.123 0.083 0.002 -0.071 0.103 0.018 0.221 0.078 -0.161
@@ -233,7 +233,7 @@ class Writer(Plasticine):
     yield stress 50 Pa.
     """
 
-    name: ClassVar[str] = "writer"
+    name = "writer"
     model_parts: ClassVar[tuple[ModelPart, ...]] = tuple(
         part
         for part in Plasticine.model_parts

@@ -16,7 +16,7 @@ from torch import Tensor
 from ...landscapes.episode import Part, View
 from ...landscapes.objective import Evaluation, Status
 from ..base import Environment, Episode, Work
-from ..batching import Pool
+from ..batching import Pool, copied
 from ..engines.mpm.model import Model
 from ..engines.mpm.solver import Solver, capacity, memory
 from ..observation import describe_motion, watch
@@ -33,9 +33,9 @@ class Stage:
 
 class MpmScene(Environment):  # noqa: D101 -- `about` prints the docstrings of a scene's family, each for its readers
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
-    beyond_box: ClassVar[bool] = True
+    beyond_box = True
     engines: ClassVar[tuple[str, ...]] = ("warp", "taichi")
-    decisions: ClassVar[int] = SEGMENTS
+    decisions = SEGMENTS
     designed_order: ClassVar[dict[str, float]] = {"dt": 1.0, "resolution": 2.0, "joint": 1.0}  # Euler; splines
     model: Model
     _solvers: Pool[Any]
@@ -55,8 +55,7 @@ class MpmScene(Environment):  # noqa: D101 -- `about` prints the docstrings of a
     def end(self, x: Float[Tensor, " dim"]) -> Float[Tensor, "particle 3"]:
         """Return where particles are at the end of the episode at one point [m]."""
         with self._solvers.lend() as stage:
-            end: Tensor = stage.solver.run(self.tools(self._row(x)))[0].double().cpu()
-        return end
+            return copied(stage.solver.run(self.tools(self._row(x)))[0])
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return bodies and tools at the ends of control steps."""
@@ -159,7 +158,7 @@ class MpmScene(Environment):  # noqa: D101 -- `about` prints the docstrings of a
         return describe_motion(*seen, scale=scale, intervals=STEPS // SEGMENTS)
 
     def _watch(self, solver: Solver, step: int, rows: int) -> Float[Tensor, "batch seen 3"]:
-        return watch(solver.read_positions(step, rows).double().cpu(), self._sizes)
+        return watch(copied(solver.read_positions(step, rows)), self._sizes)
 
     @property
     def _sizes(self) -> list[int]:

@@ -46,8 +46,8 @@ class NewtonScene(Environment):
     rows: ClassVar[int]
     bytes_per_step: ClassVar[dict[str, int]]  # of a row, by solver: states with their adjoints, and what steps allocate
     engines: ClassVar[tuple[str, ...]] = ("newton",)
-    whole_batches: ClassVar[bool] = True  # one point costs as much as a batch
-    loss_unit: ClassVar[str] = "m²"
+    whole_batches = True  # one point costs as much as a batch
+    loss_unit = "m²"
     Options: ClassVar[type[Any]] = NewtonOptions
     _solvers: Pool[Any]
 

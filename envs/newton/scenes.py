@@ -26,7 +26,7 @@ class Flight(NewtonScene):
     by the velocity, T being the time it flies, whatever the solver: the scene is there to hold solvers against that.
     """
 
-    name: ClassVar[str] = "newton-flight"
+    name = "newton-flight"
     duration: ClassVar[float] = 0.5
     target: ClassVar[tuple[float, float, float]] = (1.0, 1.0, 0.0)
     rows: ClassVar[int] = 64
@@ -65,7 +65,7 @@ class Ball(NewtonScene):
     Source: Newton's example `diffsim_ball`, without its wall.
     """
 
-    name: ClassVar[str] = "newton-ball"
+    name = "newton-ball"
     duration: ClassVar[float] = 2.0
     target: ClassVar[tuple[float, float, float]] = (2.0, 1.0, 0.0)
     rows: ClassVar[int] = 256
@@ -107,7 +107,7 @@ class ClothThrow(NewtonScene):
     Source: Newton's example `diffsim_cloth`, with springs and a floor in the place of triangles and air.
     """
 
-    name: ClassVar[str] = "newton-cloth"
+    name = "newton-cloth"
     duration: ClassVar[float] = 0.75
     target: ClassVar[tuple[float, float, float]] = (1.0, 0.5, 0.0)
     rows: ClassVar[int] = 16

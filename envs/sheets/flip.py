@@ -66,7 +66,7 @@ class Flip(SheetScene):
     appendix A.2.3; geometry and material where it is silent are ours.
     """
 
-    name: ClassVar[str] = "flip"
+    name = "flip"
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=1 / 400, resolution=8),
         "standard": Fidelity("standard", dt=1 / 1000, resolution=24),
@@ -87,7 +87,7 @@ class Flip(SheetScene):
         ModelPart("friction", {"friction": 0.3}, "friction of pan and floor", missing=True),
         ModelPart("air", {"drag": 0.5}, "drag of the air", missing=True),
     )
-    decisions: ClassVar[int] = SEGMENTS
+    decisions = SEGMENTS
     duration: ClassVar[float] = 1.0
     Options: ClassVar[type[Any]] = FlipOptions
     view: ClassVar[View] = View((-0.24, FLOOR, -0.2), (0.24, 0.26, 0.2), eye=(0.2, 0.5, 1.0), ground=FLOOR)

@@ -16,7 +16,7 @@ from torch import Tensor
 from ...landscapes.episode import Part, View
 from ...landscapes.objective import Evaluation, Status
 from ..base import Environment, Episode, Work
-from ..batching import Pool
+from ..batching import Pool, copied
 from ..engines.sheets.contact import Rule
 from ..engines.sheets.springs import Sheet, Solver, capacity
 from ..observation import describe_motion, watch
@@ -61,9 +61,9 @@ class SheetScene(Environment):
 
     model_version = 1
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
-    beyond_box: ClassVar[bool] = True
+    beyond_box = True
     engines: ClassVar[tuple[str, ...]] = ("warp", "taichi")
-    loss_unit: ClassVar[str] = "m"
+    loss_unit = "m"
     designed_order: ClassVar[dict[str, float]] = {"dt": 1.0, "resolution": 2.0, "joint": 1.0}  # Euler; springs
     Options: ClassVar[type[Any]] = SheetOptions
     duration: ClassVar[float]  # of an episode of horizon 1 [s]
@@ -99,7 +99,7 @@ class SheetScene(Environment):
         if shown[-1] != self.steps:
             shown = torch.cat([shown, shown.new_tensor([self.steps])])
         with self._solvers.lend() as solver:
-            frames = solver.run(*drive.detach())[:, 0].double().cpu()[shown]
+            frames = copied(solver.run(*drive.detach())[shown, 0])
         poses = drive.poses[0, shown].detach()
         parts = self._parts(frames, poses)
         return Episode(self.fidelity.dt * shown, {"sheet": frames}, self._surroundings(poses), parts, self.view)
@@ -107,8 +107,7 @@ class SheetScene(Environment):
     def end(self, x: Float[Tensor, " dim"]) -> Float[Tensor, "vertex 3"]:
         """Return where vertices are at the end of the episode at one point [m]."""
         with self._solvers.lend() as solver:
-            end: Tensor = solver.run(*self._drive(self._row(x)).detach())[-1, 0].double().cpu()
-        return end
+            return copied(solver.run(*self._drive(self._row(x)).detach())[-1, 0])
 
     @abc.abstractmethod
     def _sheet(self) -> Sheet:
@@ -152,7 +151,7 @@ class SheetScene(Environment):
         x = x.clone().requires_grad_(grad)
         drive = self._drive(x)
         with self._solvers.lend() as solver:
-            end = solver.run(*drive.detach())[-1].double().cpu().requires_grad_(grad)
+            end = copied(solver.run(*drive.detach())[-1]).requires_grad_(grad)
             loss = torch.stack([self._loss(row) for row in end])  # by row: batched sums round as the batch is split
             slope = self._pull_back(solver, loss, end, drive, x) if grad else None
         return Evaluation(loss.detach(), slope, torch.full((len(x),), Status.OK, dtype=torch.int8))
@@ -163,7 +162,7 @@ class SheetScene(Environment):
             return super()._observe(x, decision)
         drive, step = self._drive(x), decision * self.steps // self.decisions
         with self._solvers.lend() as solver:
-            frames = solver.run(*drive.detach()).double().cpu()
+            frames = copied(solver.run(*drive.detach()))
         seen = [
             torch.cat([watch(frames[k], [frames.shape[2]]), drive.poses[:, k, None]], dim=1)
             for k in (0, max(0, step - 1), step)

@@ -15,6 +15,7 @@ from torch import Tensor
 from ...landscapes.episode import Part, View
 from ...landscapes.space import ParameterSpace
 from ..base import Fidelity, ModelPart
+from ..batching import copied
 from ..engines.sheets.contact import Floor
 from ..engines.sheets.springs import Sheet
 from ..outlines import triangles
@@ -113,7 +114,7 @@ class Swing(SheetScene):
         """Return kinetic energy, that of height above the floor, and that of the springs."""
         drive, sheet = self._drive(x), self.sheet
         with self._solvers.lend() as solver:
-            frames = solver.run(*drive.detach()).double().cpu()
+            frames = copied(solver.run(*drive.detach()))
         mass = torch.from_numpy(sheet.masses.copy())
         speed = (frames.diff(dim=0) / self.fidelity.dt).square().sum(dim=3)  # the step's own velocities
         ends = torch.from_numpy(sheet.pairs).T.long()
@@ -178,7 +179,7 @@ class SwingVelocity(Swing):
     Parameters: initial velocity x, y, z [m/s] of all vertices that are not held. Stiffness is 10 N/m throughout.
     """
 
-    name: ClassVar[str] = "swing-velocity"
+    name = "swing-velocity"
     examples: ClassVar[dict[str, tuple[float, ...]]] = {"target": (1.0, -0.5, 0.3)}
     space = ParameterSpace.box([f"velocity {axis}" for axis in "xyz"], -2.0, 2.0, "m/s")
 
@@ -194,7 +195,7 @@ class SwingStiffness(Swing):
     (1, -0.5, 0) m/s.
     """
 
-    name: ClassVar[str] = "swing-stiffness"
+    name = "swing-stiffness"
     examples: ClassVar[dict[str, tuple[float, ...]]] = {
         "target": (12.0, 6.0, 7.0, 13.0, 5.0, 9.0, 11.0, 4.0, 8.0, 3.0, 4.0, 9.0, 10.0, 12.0, 6.0, 7.0)
     }

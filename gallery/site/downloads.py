@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import xarray as xr
 
-from ...landscapes.export import frame
+from ...landscapes.export import frame, quoted, save_csv
 from ...landscapes.identity import plane_of
 from ..files import CSV, ZARR
 
@@ -27,7 +27,7 @@ def save_slice(dataset: xr.Dataset, store: Path, folder: Path) -> list[str]:
     for name, column in _slopes(dataset).items():
         table[name] = column
     exact = table.select_dtypes(float).columns  # digits of single precision say all there is
-    table.astype(dict.fromkeys(exact, np.float32)).to_csv(folder / CSV, index=False)
+    save_csv(table.astype(dict.fromkeys(exact, np.float32)), folder / CSV)
     if not store.is_dir():
         return [CSV]
     with ZipFile(folder / ZARR, "w", ZIP_STORED) as packed:  # chunks are compressed already
@@ -42,13 +42,13 @@ def _slopes(dataset: xr.Dataset) -> dict[str, np.ndarray[Any, Any]]:
     plane = plane_of(dataset)
     grad = dataset["grad"].to_numpy().reshape(dataset["loss"].size, -1)
     along = plane.slope(torch.from_numpy(grad)).numpy().T
-    slopes = {f"slope along {label}": column for label, column in zip(plane.labels, along, strict=True)}
+    slopes = {f"slope along {label}": column for label, column in zip(plane.scaled_labels, along, strict=True)}
     return {**slopes, "length of the gradient in all dimensions": np.linalg.norm(grad, axis=1)}
 
 
 def save_table(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Write records as CSV, a row each; what is in a record of a record has a column of its own, named by both."""
-    flat = [dict(_flatten(row)) for row in rows]
+    flat = [{quoted(name): quoted(cell) for name, cell in _flatten(row)} for row in rows]
     columns = list(dict.fromkeys(name for row in flat for name in row))
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns, restval="", lineterminator="\n")

@@ -104,11 +104,15 @@ class Trajectory(Search):
 
 @dataclass(frozen=True)
 class Axis:
-    """An axis of a map: its label, the values at its nodes, and where it is labelled."""
+    """An axis of a map: its label, the coordinates of its nodes, and where it is labelled.
+
+    Coordinates along a `logarithmic` one are decimal logarithms of values.
+    """
 
     label: str
     values: Sequence[float]
     ticks: Sequence[float]
+    logarithmic: bool = False
 
 
 @dataclass(frozen=True)

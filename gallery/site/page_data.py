@@ -19,6 +19,7 @@ from ...landscapes.measures.unresolved import contradicted_cells, stored_unresol
 from ...landscapes.objective import NOT_EVALUATED, Status
 from ...landscapes.plain import number
 from ...landscapes.plane import Plane
+from ...landscapes.space import LOG10
 from ...landscapes.storage.records import read_json, reading
 from ..files import EPISODE_KINDS, EPISODES, MEASURES, REMAKE, SWEEP_FILM, SWEEP_RECORD
 from ..records import Node, SweepRecord, read_nodes
@@ -84,10 +85,14 @@ def pack(values: np.ndarray[Any, Any], kind: str = "f4") -> str:
 
 
 def _axes(plane: Plane) -> list[Axis]:
+    from ...landscapes.draw.decades import decades
     from ...landscapes.draw.style import round_values
 
-    labelled = zip(plane.labels, (axis.tolist() for axis in plane.axes()), strict=True)
-    return [Axis(label, values, round_values(values[0], values[-1])) for label, values in labelled]
+    found = list[Axis]()
+    for label, places, scale in zip(plane.labels, (axis.tolist() for axis in plane.axes()), plane.scales, strict=True):
+        ticks = (decades if scale == LOG10 else round_values)(places[0], places[-1])
+        found.append(Axis(label, places, ticks, scale == LOG10))
+    return found
 
 
 def _scales(loss: np.ndarray[Any, Any], below: Sequence[float]) -> dict[str, ColourScale]:
@@ -127,8 +132,8 @@ def read_episodes(folder: Path, dataset: xr.Dataset) -> list[EpisodeEntry]:
 
 
 def _episode(node: Node, folder: Path, plane: Plane) -> EpisodeEntry:
-    places = zip(plane.labels, plane.axes(), (node.column, node.row), strict=False)
-    at = {label: float(axis[place]) for label, axis, place in places}
+    place = torch.stack([axis[at] for axis, at in zip(plane.axes(), (node.column, node.row), strict=False)])
+    at = dict(zip(plane.labels, plane.to_values(place).tolist(), strict=True))
     files = {kind: f"{node.name}.{kind}" for kind in EPISODE_KINDS}
     there = {kind: name for kind, name in files.items() if (folder / name).exists()}
     return EpisodeEntry(node.row, node.column, node.why, node.loss, node.status, at, **there)

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from ...landscapes.identity import stored_identity, stored_provenance
-from ...landscapes.objective import Status
+from ...landscapes.objective import failed
 from ...landscapes.overlay import improvements, lay
 from ..files import RUN_SUFFIX, RUNS
 from ..runs import open_run, searched
@@ -42,7 +42,7 @@ def _trajectory(run: xr.Dataset, reach: float, points: int, top: float) -> Traje
 
     loss, distance = run["loss"].to_numpy(), run["distance"].to_numpy()
     outside = run["outside"].to_numpy() | (loss > top)
-    failed = run["status"].to_numpy() != Status.OK
+    lost = failed(run["status"].to_numpy())
     radius = np.sqrt(point_areas(distance, reach, points) / np.pi) * 4 / 3  # a point is 4/3 of a pixel
     return Trajectory(
         **{name: run.attrs[name] for name in ("method", "seed", "label", "fidelity", "budget")},
@@ -50,7 +50,7 @@ def _trajectory(run: xr.Dataset, reach: float, points: int, top: float) -> Traje
         episodes=run.sizes["evaluation"],
         best=float(np.nanmin(loss)) if np.isfinite(loss).any() else None,
         outside=int(outside.sum()),
-        failed=int(failed.sum()),
+        failed=int(lost.sum()),
         distance=(float(distance.min()), float(distance.max())),
         command=stored_provenance(run).get("command", ""),
         u=round_off(run["u"].to_numpy()),

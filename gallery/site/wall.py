@@ -12,7 +12,7 @@ import numpy as np
 
 from ...envs.registry import entries
 from ...landscapes.measures.census_record import Census
-from ...landscapes.measures.classify import GOOD, NOISY, OPPOSITE, WORDS, ZERO
+from ...landscapes.measures.classify import GOOD, MISSING, NOISY, OPPOSITE, WORDS, ZERO
 from ...landscapes.storage.records import read_json, reading
 from ...landscapes.storage.store import open_slice
 from ..files import CENSUSES, DEVICES, STORE, WALL_PICTURE, WALL_TABLE
@@ -21,7 +21,7 @@ from .downloads import save_table
 from .manifest import FigureEntry, Tile, WordShare
 from .studio import Studio
 
-GRADIENTS = (GOOD, NOISY, OPPOSITE, ZERO)
+GRADIENTS = (GOOD, NOISY, OPPOSITE, ZERO, MISSING)
 SHAPES = tuple(word for word in WORDS if word not in GRADIENTS)
 FITS = 1 / 3  # of the slices: from this share on a word is said of an environment
 REMAKE = "delete it, and `landscape census {} --device {}` measures it anew"

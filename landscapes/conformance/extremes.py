@@ -12,15 +12,23 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..objective import Evaluation, Objective, Status
-from .finding import SKIP, Finding, verdict
+from ..objective import Evaluation, Objective, Status, failed
+from ..space import ParameterSpace
+from .finding import FAIL, SKIP, Finding, verdict
 from .subject import Subject, difference
 
 CORNERS = 16  # a box of no more corners is checked at all of them
 OUTSIDE = (0.01, 0.1)  # how far outside the box, as shares of it
 ROWS = 2  # points that a variant is checked at
 RISE = 0.1  # of the energy there is at first: what semi-implicit steps may add for a while in a stiff contact
-KINDS = {"finite": Status.OK, "non-finite": Status.NONFINITE, "escaped": Status.ESCAPED, "error": Status.ERROR}
+KINDS = {
+    "finite": Status.OK,
+    "without gradient": Status.NO_GRADIENT,
+    "non-finite": Status.NONFINITE,
+    "escaped": Status.ESCAPED,
+    "error": Status.ERROR,
+}
+NAMED = 4  # parameters of a point that are named, at most
 
 
 @dataclass(frozen=True)
@@ -45,8 +53,8 @@ def checks(
     ends = corners(space.dim)
     some = f"{len(ends)} of 2^{space.dim} corners, every two parameters in all four combinations"
     many = f"all {len(ends)} corners" if len(ends) == 2**space.dim else some
-    yield "corners", lambda: _check_at("corners", objective, space.from_unit(ends), many)
-    yield "centre", lambda: _check_at("centre", objective, space.center[None])
+    yield "corners", lambda: _check_inside("corners", objective, space.from_unit(ends), many)
+    yield "centre", lambda: _check_inside("centre", objective, space.center[None])
     for share in OUTSIDE:
         name, beyond = f"{share:.0%} outside the box", space.from_unit(ends + share * (2 * ends - 1))
         yield name, partial(_check_beyond, name, objective, beyond)
@@ -72,8 +80,8 @@ def corners(dim: int) -> Float[Tensor, "corner dim"]:
 
 
 def count_endings(found: Evaluation) -> tuple[dict[str, float | None], str]:
-    """Count how rows ended, and say what is wrong with them: loss and gradient are finite exactly where OK."""
-    status = found.status
+    """Count how rows ended, and say what is wrong with them: loss and gradient are finite where the status says so."""
+    status, none = found.status, found.status == Status.NO_GRADIENT
     counts: dict[str, float | None] = {kind: float((status == code).sum()) for kind, code in KINDS.items()}
     finite = found.loss.isfinite()
     if found.grad is not None:
@@ -83,7 +91,8 @@ def count_endings(found: Evaluation) -> tuple[dict[str, float | None], str]:
     wrong = {
         "rows have no status": int(sum(count or 0.0 for kind, count in counts.items() if kind in KINDS)) < len(status),
         "rows of status OK are not finite": bool(((status == Status.OK) & ~finite).any()),
-        "rows that failed have a finite loss": bool(((status != Status.OK) & found.loss.isfinite()).any()),
+        "rows that failed have a finite loss": bool((failed(status) & found.loss.isfinite()).any()),
+        "rows of status NO_GRADIENT have a gradient or no loss": bool((none & (finite | ~found.loss.isfinite())).any()),
     }
     return counts, "; ".join(what for what, so in wrong.items() if so)
 
@@ -95,20 +104,39 @@ def describe_counts(counts: Mapping[str, float | None]) -> str:
     return ends + ("" if largest is None else f"; largest |grad| {largest:.1e}")
 
 
-def _check_at(
-    name: str, objective: Objective, x: Float[Tensor, "batch dim"], what: str = "", *, may_refuse: bool = False
-) -> Finding:
+def describe_missing(space: ParameterSpace, x: Float[Tensor, "batch dim"], found: Evaluation, place: str = "") -> str:
+    """Say where the gradient is NaN beside a finite loss, or nothing where that is nowhere; `place` names one point."""
+    rows = (found.status == Status.NO_GRADIENT).nonzero().flatten()
+    if not len(rows):
+        return ""
+    values = [f"{name} = {value:.4g}" for name, value in zip(space.names, x[rows[0]].tolist(), strict=True)]
+    at = ", ".join([*values[:NAMED], *(["..."] if len(values) > NAMED else [])])
+    if place:
+        return f"the gradient is NaN at {place} ({at}), where the loss is {float(found.loss[rows[0]]):.4g}"
+    share = f"{len(rows) / len(x):.0%}".replace("%", " %")
+    return f"the gradient is NaN at {share} of the points (first at {at}), where the loss is finite"
+
+
+def _check_inside(name: str, objective: Objective, x: Float[Tensor, "batch dim"], what: str = "") -> Finding:
+    """Check points of the box itself, where a finite loss has a gradient."""
+    found = objective.evaluate(x)
+    judged = _judge(name, found, what)
+    missing = describe_missing(objective.space, x, found, "" if len(x) > 1 else f"the {name}")
+    return replace(judged, outcome=FAIL, why=missing) if missing else judged
+
+
+def _check_at(name: str, objective: Objective, x: Float[Tensor, "batch dim"], *, may_refuse: bool = False) -> Finding:
     try:
         found = objective.evaluate(x)
     except ValueError as refusal:
         if not may_refuse:
             raise
         return verdict(name, True, f"refused: {' '.join(str(refusal).split())}")
-    return _judge(name, found, what)
+    return _judge(name, found)
 
 
 def _check_beyond(name: str, objective: Objective, x: Float[Tensor, "batch dim"]) -> Finding:
-    if not getattr(objective, "beyond_box", False):
+    if not objective.beyond_box:
         return Finding(name, SKIP, "not asked", "it does not invite points beyond its box (beyond_box = True does)")
     return _check_at(name, objective, x, may_refuse=True)
 
@@ -138,7 +166,7 @@ def _check_energy(subject: Subject, name: str) -> Finding:
 
     `energy(x)` returns it over time, shape (batch, step), counted from rest at the lowest place, or None.
     """
-    offered = getattr(subject.objective, "energy", None)
+    offered = subject.objective.energy
     found = None if offered is None else offered(subject.x[:ROWS])
     if found is None:
         return Finding(name, SKIP, "n/a", "the objective offers no energy")

@@ -139,7 +139,7 @@ def gradcheck(double: Subject, name: str) -> Finding:
         return Finding(name, SKIP, "not checked", "repeats differ, and a pointwise check would measure that")
     rows = (double.first.status == Status.OK).nonzero().flatten()[:2]
     if not len(rows):
-        return Finding(name, SKIP, "not checked", "no point has a loss")
+        return Finding(name, SKIP, "not checked", "no point has a gradient")
     room = 2 * GRADCHECK_STEPS[0]  # so that the longest step stays within the box
     function, u = _unit(double), double.objective.space.to_unit(double.x[rows]).clamp(room, 1 - room)
     said = ""

@@ -6,13 +6,14 @@ a branch, while beside it all is right. A gradient there must lie between the sl
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..objective import evaluate
+from ..objective import Evaluation, Status, evaluate
 from ..space import ParameterSpace
 from .finding import SKIP, Finding, verdict
 from .gradients import CLEAR
@@ -54,6 +55,8 @@ def check_special_places(subject: Subject, name: str) -> Finding:
     here = subject.evaluate(space.from_unit(base))
     if here.grad is None:
         return Finding(name, SKIP, "no gradient")
+    if missing := _name_missing(where, here):
+        return verdict(name, False, f"{len(missing)} of {len(where)} places have no gradient", "; ".join(missing))
     generator = torch.Generator().manual_seed(subject.seed)
     axes = torch.randperm(space.dim, generator=generator)[:AXES].sort().values
     exact = (here.grad * (space.upper - space.lower))[:, axes]
@@ -79,6 +82,13 @@ def check_special_places(subject: Subject, name: str) -> Finding:
     )
     found = verdict(name, False, figure, "a gradient has to lie between the slopes to either side")
     return replace(found, numbers={"wrong": float(wrong.sum()), "compared": float(seen.any(dim=0).sum())})
+
+
+def _name_missing(where: Iterable[str], found: Evaluation) -> list[str]:
+    """Say at which places the gradient is NaN beside a finite loss."""
+    missing = found.status == Status.NO_GRADIENT
+    rows = zip(where, found.loss.tolist(), missing.tolist(), strict=True)
+    return [f"the gradient is NaN at {place}, where the loss is {loss:.4g}" for place, loss, none in rows if none]
 
 
 def _slopes(subject: Subject, base: Tensor, loss: Tensor, axes: Tensor, step: float) -> Float[Tensor, "2 place axis"]:

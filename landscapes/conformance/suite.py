@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..objective import Evaluation, Objective, Status, evaluate
+from ..objective import Evaluation, Objective, ObjectiveWrapper, Status, evaluate, failed
 from ..sampling.memory import ADVICE, is_out_of_memory
 from . import extremes
 from . import gradients as gradient_checks
@@ -168,20 +168,22 @@ def _check_shapes(objective: Objective, x: Float[Tensor, "batch dim"]) -> Findin
     return verdict("shapes", not wrong, shape, "; ".join(dict.fromkeys(wrong)))
 
 
-class _Given:
+class _Given(ObjectiveWrapper):
     """An objective whose evaluation is there already."""
 
     def __init__(self, objective: Objective, evaluation: Evaluation) -> None:
-        self.name = getattr(objective, "name", type(objective).__name__)
-        self.space, self._evaluation = objective.space, evaluation
+        super().__init__(objective)
+        self._evaluation = evaluation
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
         return self._evaluation
 
 
 def _check_status(subject: Subject, name: str) -> Finding:
-    counts, wrong = extremes.count_endings(subject.objective.evaluate(subject.x))
-    return verdict(name, not wrong, extremes.describe_counts(counts), wrong)
+    found = subject.objective.evaluate(subject.x)
+    counts, wrong = extremes.count_endings(found)
+    missing = extremes.describe_missing(subject.objective.space, subject.x, found)
+    return verdict(name, not (wrong or missing), extremes.describe_counts(counts), missing or wrong)
 
 
 def _check_refusal_of_shapes(subject: Subject, name: str) -> Finding:
@@ -210,9 +212,9 @@ def _check_refusal_of_nan(subject: Subject, name: str) -> Finding:
         return verdict(name, True, "refused")
     others = subject.rows(torch.arange(1, len(x)))
     clean = subject.agree(found.rows(slice(1, None)), others)
-    ok = int(found.status[0]) != Status.OK and clean
-    why = "the other rows changed with it" if not clean else "a row of nan was given a loss and status OK"
-    return verdict(name, ok, f"answered by status {Status(int(found.status[0])).name}", why)
+    status = Status(int(found.status[0]))
+    why = "the other rows changed with it" if not clean else f"a row of nan was given a loss and status {status.name}"
+    return verdict(name, failed(status) and clean, f"answered by status {status.name}", why)
 
 
 def _check_determinism(subject: Subject, name: str) -> Finding:
@@ -248,7 +250,8 @@ def _compare(subject: Subject, name: str, found: Evaluation, rows: Tensor) -> Fi
 
 def _check_empty_batch(subject: Subject, name: str) -> Finding:
     found = subject.objective.evaluate(subject.x[:0])
-    shapes = {field: tuple(tensor.shape) for field, tensor in vars(found).items() if tensor is not None}
+    fields = {"loss": found.loss, "grad": found.grad, "status": found.status}
+    shapes = {field: tuple(tensor.shape) for field, tensor in fields.items() if tensor is not None}
     wanted: dict[str, Any] = {"loss": (0,), "grad": (0, subject.objective.space.dim), "status": (0,)}
     figure = ", ".join(f"{field} {shape}" for field, shape in shapes.items())
     return verdict(name, shapes == wanted, figure, f"wanted {wanted}")

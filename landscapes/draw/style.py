@@ -16,6 +16,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
+from ..large import refuse_large
 from ..objective import Status
 
 DPI, PRINT_DPI = 150, 600  # of a picture for a screen, and of what is pixels in one for print
@@ -36,12 +37,14 @@ SLOPE_MAP_DARK: Colormap = ListedColormap(colormaps["magma"](np.linspace(0.42, 1
 
 FAILURES = {Status.NONFINITE: "not finite", Status.ESCAPED: "outside the domain", Status.ERROR: "error"}
 _FAILED: dict[str, Any] = {"facecolor": "white", "edgecolor": QUIET, "linewidth": 0.0}
-STATUS_LOOKS: dict[Status, dict[str, Any]] = {  # of every sample that is not OK
+STATUS_LOOKS: dict[Status, dict[str, Any]] = {  # of every sample that has no loss
     Status.MISSING: {"facecolor": UNSAMPLED, "linewidth": 0.0},
     Status.NONFINITE: _FAILED | {"hatch": "////"},
     Status.ESCAPED: _FAILED | {"hatch": "\\\\\\\\"},
     Status.ERROR: _FAILED | {"hatch": "xxxx"},
 }
+NO_GRADIENT = "no gradient"
+NO_GRADIENT_LOOK: dict[str, Any] = {"facecolor": BAND[0], "edgecolor": QUIET, "linewidth": 0.0, "hatch": ".."}
 
 ARROWS = 32  # most arrows per axis
 LONGEST_ARROW = 0.055  # as a fraction of a side
@@ -140,6 +143,7 @@ OUTCOMES: dict[str, dict[str, Any]] = {  # of a setting on a stability map; thos
     "not judged": {"facecolor": "#c9d3e0", "linewidth": 0.0},
     "refused": {"facecolor": UNSAMPLED, "edgecolor": QUIET, "linewidth": 0.0, "hatch": ".."},
     **{kind.name: STATUS_LOOKS[kind] for kind in FAILURES},
+    Status.NO_GRADIENT.name: NO_GRADIENT_LOOK,
 }
 _BOUNDARY: dict[str, Any] = {"color": INK, "linewidth": 1.4, "markersize": 3.6, "markerfacecolor": "white", "zorder": 3}
 BOUNDARIES: tuple[dict[str, Any], dict[str, Any]] = (  # of accuracy, of stability
@@ -297,6 +301,7 @@ def _span(values: NDArray[np.float64]) -> tuple[float, float, str]:
     finite = values[np.isfinite(values)]
     if finite.size == 0:
         return 0.0, 1.0, "neither"
+    refuse_large(finite)
     least, low, high, most = (float(value) for value in np.percentile(finite, (0, 1, 99, 100)))
     room = high - low
     below, above = least < low - room, most > high + room

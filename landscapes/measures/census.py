@@ -19,7 +19,7 @@ from torch import Tensor
 from ..directions import orthonormal
 from ..identity import plane_of
 from ..lattice import count_gradients
-from ..objective import Objective
+from ..objective import Objective, ObjectiveWrapper
 from ..plane import Plane
 from ..sampling.fill import sample
 from ..space import ParameterSpace
@@ -172,7 +172,7 @@ def sample_cut(objective: Objective, plane: Plane, *, gradients: int = 1) -> xr.
     Gradients are at every so many samples along each axis, `gradients`. Raises what `sample` does.
     """
     found = sample(objective, plane, gradients=gradients)
-    return _dataset(plane, found["loss"].to_numpy(), found["grad"].to_numpy())
+    return _dataset(plane, *(found[name].to_numpy() for name in ("loss", "grad", "status")))
 
 
 def thin_out(whole: xr.Dataset) -> xr.Dataset:
@@ -184,15 +184,15 @@ def thin_out(whole: xr.Dataset) -> xr.Dataset:
     ]
     ends = [low + 2 * step * (count - 1) for low, step, count in zip(plane.lower, steps, shape, strict=True)]
     return _dataset(
-        Plane(plane.origin, plane.basis, plane.lower, torch.stack(ends), shape, plane.labels),
-        thin["loss"].to_numpy(),
-        thin["grad"].to_numpy(),
+        Plane(plane.origin, plane.basis, plane.lower, torch.stack(ends), shape, plane.labels, plane.scales),
+        *(thin[name].to_numpy() for name in ("loss", "grad", "status")),
     )
 
 
-def _dataset(plane: Plane, loss: Array, grad: Array) -> xr.Dataset:
+def _dataset(plane: Plane, loss: Array, grad: Array, status: Array) -> xr.Dataset:
     about = {"identity": json.dumps({"plane": plane.record()})}
-    return xr.Dataset({"loss": (("v", "u"), loss), "grad": (("v", "u", "dim"), grad)}, attrs=about)
+    columns = {"loss": (("v", "u"), loss), "grad": (("v", "u", "dim"), grad), "status": (("v", "u"), status)}
+    return xr.Dataset(columns, attrs=about)
 
 
 def _measure(
@@ -235,14 +235,12 @@ def _values(found: Ruggedness, jumps: float, cosine: Array) -> Array:
     )
 
 
-class _Counted:
+class _Counted(ObjectiveWrapper):
     """Count how many points within its box an objective is asked."""
 
     def __init__(self, objective: Objective) -> None:
-        self.objective, self.space, self.asked = objective, objective.space, 0
-        self.beyond_box = getattr(objective, "beyond_box", False)
-        if batch := getattr(objective, "preferred_batch", None):
-            self.preferred_batch = batch
+        super().__init__(objective)
+        self.asked = 0
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Any:
         self.asked += len(x)

@@ -44,7 +44,8 @@ CLAIMS = (Claim("draft", rank=0.95, cosine=0.9, error=0.1), Claim("standard", ra
 class Shortfall:
     """Hold the largest lack of a variant as a ratio to what a claim allows, with the ends of its 95 % interval.
 
-    `by` names what lacks most. All are infinite where a point failed, or where something is not known.
+    `by` names what lacks most. All are infinite where a point failed or lacks its gradient, or where something is not
+    known.
     """
 
     value: float
@@ -57,6 +58,8 @@ class Shortfall:
         """Hold what was measured of a variant against a claim; an interval's end is the largest of the parts' ends."""
         if found.diverged is None or found.diverged > 0:
             return cls(math.inf, math.inf, math.inf, "failed")
+        if found.missing:
+            return cls(math.inf, math.inf, math.inf, "missing gradients")
         limits = claim.limits(chaotic=chaotic)
         ratios = {what: [lack / limit for lack in _lacks(found, what)] for what, limit in limits.items()}
         value, low, high = (max(ends) for ends in zip(*ratios.values(), strict=True))

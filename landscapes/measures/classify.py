@@ -22,12 +22,14 @@ from .ruggedness import Ruggedness
 VERY_SMOOTH, SMOOTH, RUGGED, EXTREME = "very smooth", "smooth with local minima", "rugged", "extremely rugged"
 LARGE_FLAT, DISCONTINUOUS = "large flat regions", "discontinuous"
 GOOD, NOISY, OPPOSITE, ZERO = "gradients good", "gradients noisy", "gradients opposite", "gradients zero"
-WORDS = (VERY_SMOOTH, SMOOTH, RUGGED, EXTREME, LARGE_FLAT, DISCONTINUOUS, GOOD, NOISY, OPPOSITE, ZERO)
+FAILS, MISSING = "mostly failed", "gradients missing"
+WORDS = (FAILS, VERY_SMOOTH, SMOOTH, RUGGED, EXTREME, LARGE_FLAT, DISCONTINUOUS, GOOD, NOISY, OPPOSITE, ZERO, MISSING)
 
 FEW_TURNS = 0.1  # of the steps between samples: Himmelblau's function turns at 0.03, Levy's at 0.15 of them
 MANY_TURNS = 0.5  # Rastrigin's function turns at 0.45 of them, white noise at 0.65
 FEW_MINIMA = 10  # notable ones: Himmelblau's function has 4, Levy's 20
-MUCH = 0.2  # share of the samples from which flat regions are large and zero gradients are worth a word
+MUCH = 0.2  # share of the samples from which flat regions are large, and zero or missing gradients are worth a word
+MOSTLY = 0.5  # share of the samples from which a slice that failed is called nothing else
 AGREE = 0.9  # mean cosine with the slope over two samples: Ackley's gradients have 0.96, those of fine ripples 0.3
 OFTEN = 1 / 3  # share of gradients that point uphill: fine ripples make it 0.3 to 0.4, random directions a half
 
@@ -52,7 +54,8 @@ def classify(found: Ruggedness, jumps: Jumps | None, cosine: Values) -> Verdict:
     """Put a landscape into words.
 
     `cosine` is that of its gradients with differences over two samples, NaN where neither shows a slope. A gradient
-    of zero is no direction, so it counts for the word zero only. What jumps is not called very smooth.
+    of zero is no direction, so it counts for the word zero only. What jumps is not called very smooth, and gradients
+    are not called good where many are missing. Where most samples failed nothing else is said.
     """
     return judge(found, jumps, *likeness(cosine))
 
@@ -65,6 +68,8 @@ def likeness(cosine: Values) -> tuple[float, float]:
 
 def judge(found: Ruggedness, jumps: Jumps | None, average: float, uphill: float) -> Verdict:
     """Put a landscape into words, of whose gradients the mean cosine and the share uphill are known."""
+    if found.failed > MOSTLY * found.samples:
+        return Verdict({FAILS: f"no loss at {found.failed / found.samples:.0%} of the samples"})
     reasons = dict([_surface(found)])
     if found.level.value >= MUCH:
         reasons[LARGE_FLAT] = f"{found.level.value:.0%} of the samples are level with their neighbours"
@@ -89,10 +94,17 @@ def _gradients(found: Ruggedness, average: float, uphill: float) -> dict[str, st
     reasons = {}
     if found.flat is not None and found.flat.value >= MUCH:
         reasons[ZERO] = f"effectively zero at {found.flat.value:.0%} of the samples"
+    lacking = 0.0 if found.missing is None else found.missing.value
+    beside = f"gradient missing at {lacking:.1%} of the points that have a loss" if lacking else ""
+    if lacking >= MUCH:
+        reasons[MISSING] = beside
     if math.isnan(average):
         return reasons
-    said = f"mean cosine {average:z.2f} with the slope over two samples"
-    reasons[GOOD if average >= AGREE else NOISY] = said
+    said = "; ".join(filter(None, (f"mean cosine {average:z.2f} with the slope over two samples", beside)))
+    if average < AGREE:
+        reasons[NOISY] = said
+    elif lacking < MUCH:
+        reasons[GOOD] = said
     if uphill >= OFTEN:
         reasons[OPPOSITE] = f"{uphill:.0%} of the gradients point up that slope"
     return reasons

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..objective import Evaluation, Objective, Status, evaluate
+from ..objective import Evaluation, Objective, Status, evaluate, has_loss
 from ..plain import finite, number, optional
 from ..statistics import CONFIDENCE, fit_line
 
@@ -110,9 +110,9 @@ def measure(
     at most `patience` [s] beyond one evaluation, where that is given.
     """
     repetition, largest = (REPETITION, LARGEST) if patience is None else (patience, patience)
-    at_once = getattr(objective, "preferred_batch", 1)
+    at_once = objective.preferred_batch
     full = min(at_once, len(x))
-    getattr(objective, "prepare", lambda: None)()
+    objective.prepare()
     began = time.perf_counter()
     evaluate(objective, x[:1], grad=True)  # what is made at first use is made now, a batch's threads too if quick
     if (time.perf_counter() - began) * full < repetition:
@@ -187,7 +187,8 @@ class Comparison:
     """Hold a variant against the reference, at the points where that one did not fail: so many are `compared`.
 
     An episode that failed counts as infinitely far off, so that a percentile can be None. Where both have a loss:
-    `spearman`, rank correlation of losses, and `gradient`. `diverged` is the share that failed, `batch` how many
+    `spearman`, rank correlation of losses; where both have a gradient, `gradient`. `diverged` is the share that failed,
+    `missing` that of the points with a loss and a reference's gradient that have none themselves, `batch` how many
     episodes were timed at once. Fields are called as files have them.
     """
 
@@ -198,6 +199,7 @@ class Comparison:
     compared: int
     seconds: Seconds
     batch: int
+    missing: float | None = None
 
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> Comparison:
@@ -211,6 +213,7 @@ class Comparison:
             record["compared"],
             Seconds(number(record["seconds"]["forward"]), number(record["seconds"]["with_gradient"])),
             record["batch"],
+            optional(number, record.get("missing")),
         )
 
     def p95(self, *, relative: bool) -> float | None:
@@ -224,10 +227,12 @@ def compare(variant: Sample, reference: Sample, *, seed: int) -> Comparison:
     The 95th percentile is the next larger error of the sample, not interpolated. Gradients are per width of the box;
     they are equal where both are exactly zero, and where one is, their cosine is 0 and they are infinitely far off.
     """
-    known = reference.status == Status.OK
-    fine = known & (variant.status == Status.OK)
-    error = np.where(variant.status == Status.OK, np.abs(variant.loss - reference.loss), np.inf)[known]
-    cosine, off = gradient_error(variant.grad[fine], reference.grad[fine])
+    known = has_loss(reference.status)
+    fine = known & has_loss(variant.status)
+    wanted = fine & (reference.status == Status.OK)
+    sloped = wanted & (variant.status == Status.OK)
+    error = np.where(has_loss(variant.status), np.abs(variant.loss - reference.loss), np.inf)[known]
+    cosine, off = gradient_error(variant.grad[sloped], reference.grad[sloped])
     scale = spread(reference)
     median, p95 = (Bootstrap.of(of, error, seed=seed) for of in (median_of, p95_of))
     return Comparison(
@@ -238,12 +243,13 @@ def compare(variant: Sample, reference: Sample, *, seed: int) -> Comparison:
         int(known.sum()),
         Seconds(variant.forward, variant.with_gradient),
         variant.batch,
+        float(1 - sloped.sum() / wanted.sum()) if wanted.any() else None,
     )
 
 
 def spread(reference: Sample) -> float | None:
     """Return what errors are shares of: the 5th to 95th percentile of the reference's losses; None without one."""
-    loss = reference.loss[reference.status == Status.OK]
+    loss = reference.loss[has_loss(reference.status)]
     width = float(np.subtract(*np.percentile(loss, (95, 5)))) if loss.size else 0.0
     return width or None
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..identity import current_identity
-from ..objective import Status
+from ..objective import has_loss
 from ..plain import number, optional, text
 from .fidelity import Bootstrap, Comparison, Sample, Seconds, compare
 from .tradeoff import RefusedVariant
@@ -60,7 +60,7 @@ class Noise:
     @classmethod
     def of(cls, repeats: Sample, full: Sample, *, rounding: float, seed: int) -> Noise:
         """Hold repeats of the full model against it, point by point; those where either fails are no difference."""
-        fine = (repeats.status == Status.OK) & (full.status == Status.OK)
+        fine = has_loss(repeats.status) & has_loss(full.status)
         largest = np.abs(repeats.loss - full.loss)[fine].max(initial=0.0)
         digit = rounding * np.abs(full.loss)[fine].max(initial=0.0)
         return cls(compare(repeats, full, seed=seed), float(largest), float(digit), rounding)
@@ -225,7 +225,7 @@ def _columns(part: MeasuredPart) -> dict[str, Any]:
 
 def share_moved(part: Sample, full: Sample, noise: Noise) -> float | None:
     """Return the share of points whose loss moves by more than twice the largest noise; None without points."""
-    fine = (part.status == Status.OK) & (full.status == Status.OK)
+    fine = has_loss(part.status) & has_loss(full.status)
     limit = BEYOND * max(noise.largest, noise.digit)
     return float((np.abs(part.loss - full.loss)[fine] > limit).mean()) if fine.any() else None
 
@@ -236,7 +236,7 @@ def judge_effect(found: Comparison, noise: Noise, moved: float | None) -> Effect
     It fails where more than one point in twenty fails. It moves losses where one of them moves by more than twice the
     largest noise, or their median or 95th percentile by more than twice that of the noise; and their order where the
     rank correlation is below 0.99 and below the interval of the noise's own. It moves gradients where their median
-    relative error is more than twice the noise's.
+    relative error is more than twice the noise's, or where more than one point in twenty has lost its own.
     """
     if found.diverged is None or round(found.diverged, 9) > OFTEN:
         return Effect.FAILURE
@@ -244,6 +244,8 @@ def judge_effect(found: Comparison, noise: Noise, moved: float | None) -> Effect
     errors = [(found.loss_error.median, own.loss_error.median), (found.loss_error.p95, own.loss_error.p95)]
     if not moved and not any(_exceeds(one, other, noise.digit) for one, other in errors):
         slopes = found.gradient.relative_error, own.gradient.relative_error
+        if round(found.missing or 0.0, 9) > OFTEN:
+            return Effect.GRADIENTS
         return Effect.GRADIENTS if _exceeds(*slopes, noise.rounding) else Effect.NOTHING
     rank, low = found.spearman.value, own.spearman.low
     kept = SAME_ORDER if low is None else min(SAME_ORDER, low)

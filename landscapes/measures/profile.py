@@ -13,8 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..capacity import Need
-from ..identity import plane_of
-from ..objective import Evaluation, Objective, evaluate, in_box, name_of
+from ..identity import errors_of, plane_of
+from ..objective import Evaluation, Objective, ObjectiveWrapper, evaluate, in_box
 from ..statistics import EstimateRecord
 from . import gradient_quality as gradients
 from .classify import Verdict, classify, thresholds
@@ -38,7 +38,8 @@ class Profile:
 
     `steps`, `samples` and `smooth` are what `gradients.ladder`, `of_samples` and `smoothed_slopes` return. `cut` of
     `asked` evaluations would have been beyond the box of an objective that does not invite that, and were left out.
-    `unresolved` and `at_twice` say what its samples hide, None where that is not known.
+    `unresolved` and `at_twice` say what its samples hide, None where that is not known; `errors` says how many of them
+    raised and what the first of them said.
     """
 
     losses: Ruggedness
@@ -52,6 +53,7 @@ class Profile:
     cut: int
     unresolved: UnresolvedRecord | None = None
     at_twice: Twice | None = None
+    errors: str = ""
 
     @property
     def words(self) -> tuple[str, ...]:
@@ -72,6 +74,7 @@ class Profile:
             "beyond_the_box": {"asked": self.asked, "cut": self.cut},
             "unresolved": self.unresolved,
             "at_twice": self.at_twice.record() if self.at_twice else None,
+            "errors": self.errors,
         }
 
 
@@ -136,21 +139,20 @@ def measure_profile(
         between = looked.record()
     twice = at_twice(objective, dataset, found, jumps, cosine, deviation=deviation, seed=seed)
     asked = objective.asked, objective.cut
-    return Profile(found, fuzz, jumps, steps, samples, smooth, words, *asked, between, twice)
+    return Profile(found, fuzz, jumps, steps, samples, smooth, words, *asked, between, twice, errors_of(dataset))
 
 
-class _Within:
+class _Within(ObjectiveWrapper):
     """Evaluate an objective where it may be asked, and count the points where it may not."""
 
-    beyond_box = True  # those are left out here
-
     def __init__(self, objective: Objective) -> None:
-        self.objective, self.space, self.name = objective, objective.space, name_of(objective)
+        super().__init__(objective)
+        self.beyond_box = True  # those are left out here
         self.asked = self.cut = 0
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
         self.asked += len(x)
-        if not getattr(self.objective, "beyond_box", False):
+        if not self.objective.beyond_box:
             self.cut += int((~in_box(self.space, x)).sum())
         return evaluate(self.objective, x, grad=grad)
 
@@ -160,7 +162,11 @@ def named_measures(record: ProfileRecord) -> dict[str, str]:
     losses, jumps = record["losses"], record["jumps"]
     near, smooth = record["differences_of_samples"][0], record["smoothing"]
     fewest, most = losses["minima_halved"]
+    lacking = losses.get("missing")
     named = {
+        "Samples that failed": _percent(losses["failed"] / losses["samples"]) if losses["failed"] else "",
+        "Points that raised": record.get("errors", ""),
+        "Gradients missing beside a loss": _shares(lacking) if lacking and lacking["value"] else "",
         "Local minima above the noise": f"{losses['minima']} ({fewest} to {most} at half the resolution)",
         "Local minima deeper than 1 % of the range": str(losses["notable"]),
         "Basin of the lowest sample": _percent(losses["lowest_basin"]),

@@ -22,6 +22,7 @@ class LossesRecord(TypedDict):
     lowest_basin: float | None
     zero: EstimateRecord | None
     flat: EstimateRecord | None
+    missing: NotRequired[EstimateRecord | None]  # nor this
     level: EstimateRecord
     correlation_length: list[EstimateRecord]
     holder: NotRequired[list[EstimateRecord]]  # reports of early versions do not have it
@@ -143,4 +144,5 @@ class ProfileRecord(TypedDict):
     beyond_the_box: NotRequired[BeyondRecord]
     unresolved: NotRequired[UnresolvedRecord | None]
     at_twice: NotRequired[TwiceRecord | None]
+    errors: NotRequired[str]
     growth: NotRequired[dict[str, Any] | None]  # what `lyapunov.GradientGrowth` holds

@@ -18,8 +18,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..identity import plane_of
+from ..large import refuse_large
+from ..objective import Status
 from ..plain import plain
-from ..statistics import Estimate, Values, fit_line, jackknife
+from ..statistics import Estimate, Values, fit_line, jackknife, share
 from .records import LossesRecord
 
 FLAT_SLOPE = 1e-3  # a slope below it is effectively zero [ranges of the losses per side of the box]
@@ -88,7 +90,8 @@ def minima_of_halves(loss: Values, depth: float) -> tuple[int, int]:
 
 
 def span(loss: Values) -> float:
-    """Return the range of the losses."""
+    """Return the range of the losses. Raises ValueError where they are too large to have differences."""
+    refuse_large(loss)
     known = loss[np.isfinite(loss)]
     return float(known.max() - known.min()) if known.size else math.nan
 
@@ -227,7 +230,8 @@ class Ruggedness:
 
     `minima` counts those deeper than the floor, `minima_halved` what every second sample shows of them; `curve` counts
     by depths in fractions of the range. `zero` and `flat` are shares of samples whose gradient along the plane is
-    exactly and effectively zero, `level` of those whose neighbours' losses differ by no more than the floor.
+    exactly and effectively zero, `missing` of those that have a loss and, though it was asked for, no gradient; `level`
+    of those whose neighbours' losses differ by no more than the floor.
     """
 
     samples: int
@@ -242,6 +246,7 @@ class Ruggedness:
     lowest_basin: float
     zero: Estimate | None
     flat: Estimate | None
+    missing: Estimate | None
     level: Estimate
     correlation_length: tuple[Estimate, ...]
     holder: tuple[Estimate, ...]
@@ -260,7 +265,7 @@ class Ruggedness:
 def ruggedness(dataset: xr.Dataset, *, floor: float, estimate: Callable[..., Estimate] = jackknife) -> Ruggedness:
     """Measure the ruggedness of a slice; `estimate` takes a statistic and samples, and gives its interval, too."""
     loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
-    found, whole = minima(loss), span(loss)
+    whole, found = span(loss), minima(loss)
     notable = found.sample[found.depth > max(floor, NOTABLE * whole)]
     shares = basins(loss, notable) if len(notable) else np.full(1, math.nan)
     axes = range(loss.ndim)[::-1]  # u first
@@ -278,6 +283,7 @@ def ruggedness(dataset: xr.Dataset, *, floor: float, estimate: Callable[..., Est
         lowest_basin=float(shares[0]),
         zero=None if slopes is None else estimate(_mean, _below(slopes, 0.0), least=0.0, most=1.0),
         flat=None if slopes is None else estimate(_mean, _below(slopes, FLAT_SLOPE * whole), least=0.0, most=1.0),
+        missing=missing_gradients(dataset),
         level=estimate(_mean, level_samples(loss, floor), least=0.0, most=1.0),
         correlation_length=tuple(
             estimate(lambda part, axis=axis: correlation_length(part, axis), loss, least=0.0, most=1.0) for axis in axes
@@ -294,6 +300,15 @@ def ruggedness(dataset: xr.Dataset, *, floor: float, estimate: Callable[..., Est
         dispersion=estimate(dispersion, loss, least=0.0),
         fitness_distance=estimate(fitness_distance, loss, least=-1.0, most=1.0),
     )
+
+
+def missing_gradients(dataset: xr.Dataset) -> Estimate | None:
+    """Return the share of samples without a gradient among those with a loss that were asked for one, None of none."""
+    if "grad" not in dataset or "status" not in dataset:
+        return None
+    lacking = int((dataset["status"] == Status.NO_GRADIENT).sum())
+    having = int(np.isfinite(dataset["grad"].to_numpy()).all(axis=-1).sum())
+    return share(lacking, lacking + having) if lacking + having else None
 
 
 def box_slopes(dataset: xr.Dataset) -> Values:

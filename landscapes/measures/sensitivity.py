@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..objective import Objective, Status, evaluate
+from ..objective import Objective, evaluate
 from ..plain import finite
 from ..space import ParameterSpace, sobol
 
@@ -219,7 +219,7 @@ def rank(found: Responses) -> list[Pair]:
 
 def _groups(objective: Objective, design: Design) -> list[range]:
     """Group base points so that the points moved from them fill a batch."""
-    size = -(-getattr(objective, "preferred_batch", BATCH) // (LINE * design.space.dim))
+    size = -(-objective.preferred_batch // (LINE * design.space.dim))
     edges = [*range(0, len(design.base), size), len(design.base)]
     return [range(low, high) for low, high in pairwise(edges)]
 
@@ -247,9 +247,9 @@ def _evaluate_pairs(
 
 
 def _losses(objective: Objective, x: Float[Tensor, "point dim"]) -> Array:
-    at_once = getattr(objective, "preferred_batch", BATCH)
+    at_once = objective.preferred_batch
     parts = [evaluate(objective, part, grad=False) for part in torch.split(x, at_once)]
-    return np.concatenate([part.loss.masked_fill(part.status != Status.OK, torch.nan).numpy() for part in parts])
+    return np.concatenate([part.loss.numpy() for part in parts])
 
 
 def _mean(values: Array, axis: int) -> Array:

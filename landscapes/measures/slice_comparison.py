@@ -12,9 +12,11 @@ import torch
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..identity import differing_settings, plane_of, stored_identity, stored_provenance
+from ..identity import differing_settings, plane_of, stored_identity, stored_provenance, stored_scales
+from ..large import refuse_large
 from ..lattice import sampled_lattice
 from ..objective import Status
+from ..space import scaled_labels
 from ..statistics import Estimate, jackknife
 from .fidelity import gradient_error, median_of, p95_of, spearman
 from .ruggedness import box_slopes, span
@@ -44,6 +46,7 @@ def compare_slices(a: xr.Dataset, b: xr.Dataset, *, command: str = "") -> SliceC
     a, b = _on_one_lattice(a, b)
     differing = differing_settings(*(_settings(one) for one in (a, b)))
     losses, cosine = [one["loss"].to_numpy() for one in (a, b)], _cosine(a, b)
+    refuse_large(np.stack(losses))
     apart, names = np.abs(losses[1] - losses[0]), _names(a, b, differing)
     known = np.isfinite(apart)
     return SliceComparison(
@@ -115,8 +118,8 @@ def _where_apart(one: torch.Tensor, other: torch.Tensor) -> str:
 
 
 def parameters(dataset: xr.Dataset) -> list[str]:
-    """Return the names of a slice's parameters."""
-    return [str(name) for name in dataset["dim"].to_numpy()]
+    """Return the names of a slice's parameters, with the scales that they are on."""
+    return list(scaled_labels([str(name) for name in dataset["dim"].to_numpy()], stored_scales(dataset)))
 
 
 def loss_unit(dataset: xr.Dataset) -> str:
@@ -199,7 +202,7 @@ def _part(dataset: xr.Dataset, losses: Sequence[Values], apart: Values) -> Parti
     at = np.unravel_index(np.nanargmax(apart), apart.shape)
     plane = plane_of(dataset)
     u = (float(axis[index]) for axis, index in zip(plane.axes(), at[::-1], strict=True))
-    return Parting(dict(zip(plane.labels, u, strict=True)), *(float(loss[at]) for loss in losses))
+    return Parting(dict(zip(plane.scaled_labels, u, strict=True)), *(float(loss[at]) for loss in losses))
 
 
 def _over_blocks(

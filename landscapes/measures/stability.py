@@ -81,7 +81,8 @@ def ask(objective: Objective, x: Float[Tensor, "point dim"]) -> Answer:
 def _ask_together(objective: Objective, x: Float[Tensor, "point dim"]) -> tuple[Evaluation, str]:
     """Evaluate all points, one by one where that raises, and return what the first of them raised, too."""
     try:
-        return MemoryBound(objective).evaluate(x, grad=True), ""
+        found = MemoryBound(objective).evaluate(x, grad=True)
+        return found, found.error
     except (OSError, ValueError, MemoryError):  # of the system or of the setting, not of a point
         raise
     except Exception as raised:
@@ -116,8 +117,8 @@ class Cell:
     """Say how a setting ended: `values` of knobs, in the order of their map or of a limit's one knob.
 
     `outcome` is accurate, inaccurate or not judged where all points are fine, else the name of the commonest failure
-    (NONFINITE, ESCAPED, ERROR), or refused. `share` is that of the fine points; `error` the 95th percentile of
-    |loss - reference's|, as a share of the spread of the reference's losses there, over the points that are fine;
+    (NONFINITE, ESCAPED, ERROR, NO_GRADIENT), or refused. `share` is that of the fine points; `error` the 95th
+    percentile of |loss - reference's|, as a share of the spread of the reference's losses there, over the fine points;
     `loss` the median |loss| [objective's unit] and `slope` the largest gradient [loss unit / width of the box] of them.
     """
 

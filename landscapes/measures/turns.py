@@ -67,7 +67,7 @@ def ask(
 ) -> Answers:
     """Evaluate an objective at the points of a study; `follow` hears how many points are done."""
     parts, done = list[Evaluation](), 0
-    for part in torch.split(x, getattr(objective, "preferred_batch", 1)):
+    for part in torch.split(x, objective.preferred_batch):
         parts.append(evaluate(objective, part, grad=True))
         follow(done := done + len(part))
     whole = Evaluation.join(parts, dim=objective.space.dim, grad=True)
@@ -96,9 +96,9 @@ def take_turns(first: Objective, second: Objective, x: Float[Tensor, "point dim"
 
 def _batch(both: tuple[Objective, Objective], x: Float[Tensor, "point dim"]) -> Float[Tensor, "batch dim"]:
     """Return as many points as take both long enough to be timed, from as many as there are threads; warm both up."""
-    most = min(len(x), *(getattr(one, "preferred_batch", 1) for one in both))
-    whole = getattr(both[0], "device", "cpu") == "cuda"  # takes all at once: of one point most would be launches
-    rows = most if whole else min(most, max(getattr(one, "threads", 1) for one in both))
+    most = min(len(x), *(one.preferred_batch for one in both))
+    whole = both[0].device == "cuda"  # takes all at once: of one point most would be launches
+    rows = most if whole else min(most, max(one.threads for one in both))
     while True:
         for one in both:
             measure_seconds(one, x[:rows], grad=True)

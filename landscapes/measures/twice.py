@@ -171,7 +171,9 @@ def _measure(
     ]
     average, uphill = likeness(cosine)
     level = float((np.max(apart, axis=0) <= floor).mean())
-    flat = float((np.linalg.norm(slope[inner], axis=-1) <= FLAT_SLOPE * whole).mean())
+    sizes = np.linalg.norm(slope[inner], axis=-1)
+    sizes = sizes[np.isfinite(sizes)]
+    flat = float((sizes <= FLAT_SLOPE * whole).mean()) if sizes.size else math.nan
     return [float(np.concatenate(turned).mean()), level, flat, average, uphill]
 
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..identity import StoreError, check_identity
-from ..objective import Evaluation, Objective, Status, name_of
+from ..objective import Evaluation, Objective, ObjectiveWrapper, Status
 from ..storage.paths import place_of
 from ..storage.store import SliceStore
 from ..storage.tiles import Tile
@@ -45,11 +45,12 @@ class WorkersLostError(OSError):
 
 @dataclass(frozen=True)
 class FilledTile:
-    """A finished tile: how its points ended, and what to warn of."""
+    """A finished tile: how its points ended, what to warn of, and what the first point that raised said."""
 
     tile: Tile
     statuses: Mapping[Status, int]
     notes: tuple[str, ...] = ()
+    error: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,12 +74,13 @@ class Site:
         pending, finished = set(tiles if pending is None else pending), self.store.ascending
         for tile, found in evaluate_tiles(self.objective, self.store, tiles, batch, pending):
             self.store.write(tile, found)
-            yield FilledTile(tile, Counter(map(Status, found.status.tolist())), self.objective.take_notes())
+            statuses = Counter(map(Status, found.status.tolist()))
+            yield FilledTile(tile, statuses, self.objective.take_notes(), found.error)
             if self.store.ascending != finished:  # by another process, and has other tiles since
                 return
 
     def __reduce__(self) -> tuple[Any, ...]:
-        who = name_of(self.objective)
+        who = self.objective.name
         if self.store.path is None:
             raise ValueError(f"{who} is sampled by other processes, which share no memory; give sample a store on disk")
         try:
@@ -115,7 +117,8 @@ class RemoteSite:
         """Do what `Site.fill` does, but for tiles that a worker finished before it died."""
         site = self.here()
         found = {tile: site.store.statuses(tile) for tile in tiles}
-        yield from (FilledTile(tile, statuses) for tile, statuses in found.items() if statuses)
+        error = site.store.error
+        yield from (FilledTile(tile, statuses, error=error) for tile, statuses in found.items() if statuses)
         yield from site.fill(tiles, batch, {tile for tile, statuses in found.items() if not statuses})
 
 
@@ -204,12 +207,11 @@ class ReadBack:
         return self._values
 
 
-class Distributed:
+class Distributed(ObjectiveWrapper):
     """An objective whose points an executor's workers evaluate, each an equal part of a batch."""
 
     def __init__(self, site: Site, executor: Executor) -> None:
-        self.objective, self.space, self.name = site.objective, site.objective.space, site.objective.name
-        self.beyond_box = getattr(site.objective.objective, "beyond_box", False)
+        super().__init__(site.objective)
         self._site, self._executor = site, executor
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:

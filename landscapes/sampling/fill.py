@@ -13,8 +13,8 @@ from typing import Any
 
 import xarray as xr
 
-from ..identity import check_identity, with_stride
-from ..objective import Objective, Status, name_of
+from ..identity import check_identity, record_parameters, with_stride
+from ..objective import Objective, Status
 from ..plane import Plane
 from ..space import as_stride, as_whole
 from ..storage.disk import full, is_full
@@ -80,7 +80,7 @@ def sample(
         about["identity"] = with_stride(about["identity"], gradients)
         store = SliceStore.in_memory(plane, objective.space, **about, grad=gradients > 0)
     _check_store(store, objective, plane, grad=gradients > 0)
-    batch = as_whole(getattr(objective, "preferred_batch", 1) if batch is None else batch, "sample's batch", least=1)
+    batch = as_whole(objective.preferred_batch if batch is None else batch, "sample's batch", least=1)
     status = store.status()
     counts: Counter[Status] = Counter({kind: int((status == kind).sum()) for kind in Status if kind != Status.MISSING})
     resumed, pending = counts.total(), store.pending(status)
@@ -102,6 +102,7 @@ def sample(
         for filled in tiles:
             for note in filled.notes:
                 warnings.warn(note, RuntimeWarning, stacklevel=2)
+            store.keep_error(filled.error)
             counts.update(filled.statuses)
             left -= Counter([filled.tile.level])  # none is kept at zero
             report()
@@ -117,8 +118,7 @@ def sample(
 
 def describe(objective: Objective) -> dict[str, dict[str, Any]]:
     """Return what an objective says of itself: an environment its fidelity and options, any its name and unit."""
-    about: Callable[[], dict[str, Any]] = getattr(objective, "identity", lambda: {"objective": name_of(objective)})
-    return {"identity": about(), "provenance": {"loss_unit": getattr(objective, "loss_unit", "")}}
+    return {"identity": objective.identity(), "provenance": {"loss_unit": objective.loss_unit}}
 
 
 def _fill(
@@ -153,5 +153,5 @@ def resumable(store: SliceStore, counts: Counter[Status]) -> Iterator[None]:
 
 
 def _check_store(store: SliceStore, objective: Objective, plane: Plane, *, grad: bool) -> None:
-    wanted = {"plane": plane.record(), "parameters": list(objective.space.names), "gradients": grad}
+    wanted = {"plane": plane.record(), **record_parameters(objective.space), "gradients": grad}
     check_identity(store.path, wanted=wanted, found={name: store.identity[name] for name in wanted})

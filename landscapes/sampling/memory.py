@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..objective import Evaluation, Objective, evaluate, name_of
+from ..objective import Evaluation, Objective, ObjectiveWrapper, evaluate
 
 # What torch, Warp, Taichi and CUDA say; the first of them alone has a type of its own.
 SAID = re.compile(
@@ -18,7 +18,7 @@ SAID = re.compile(
 ADVICE = "end what else uses the device, or take a lower --fidelity or another --device"
 
 
-class MemoryBound:
+class MemoryBound(ObjectiveWrapper):
     """Evaluate an objective at fewer points at a time once its device ran out of memory, down to one.
 
     That changes no result, given an objective whose rows do not depend on their batch. One that holds memory for all
@@ -26,10 +26,7 @@ class MemoryBound:
     """
 
     def __init__(self, objective: Objective) -> None:
-        self.objective = objective
-        self.space = objective.space
-        self.name = name_of(objective)
-        self.beyond_box = getattr(objective, "beyond_box", False)
+        super().__init__(objective)
         self._notes: list[str] = []
         self._most: int | None = None
 
@@ -46,7 +43,7 @@ class MemoryBound:
             if part is None:
                 free_memory()  # the arrays of the attempt that failed
                 self._most = len(rows) // 2
-                getattr(self.objective, "shrink", _keep)(self._most)
+                self.shrink(self._most)
                 self._notes.append(f"{self.name} ran out of memory at {len(rows)} points; going on with {self._most}")
                 continue
             parts.append(part)
@@ -74,10 +71,6 @@ def free_memory() -> None:
     """Collect garbage and empty the cache of GPU memory."""
     gc.collect()  # some, such as a solver and its launches, refer to each other
     torch.cuda.empty_cache()
-
-
-def _keep(rows: int) -> None:
-    """Leave an objective that holds no memory between evaluations as it is."""
 
 
 def is_out_of_memory(error: BaseException) -> bool:

@@ -23,7 +23,7 @@ import torch
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..identity import DamagedError, check_identity
+from ..identity import DamagedError, check_identity, record_parameters
 from ..objective import Objective, Status, evaluate
 from ..plane import Plane
 from ..storage.checkpoint import Checkpoint
@@ -138,7 +138,7 @@ def refine(
     Raises StoreMismatchError where the store was made by other settings, ValueError for a budget that does not cover
     the coarsest lattice, DamagedError where a finished one is damaged, and what `sample` does.
     """
-    wanted = {"plane": plane.record(), "parameters": list(objective.space.names)}
+    wanted = {"plane": plane.record(), **record_parameters(objective.space)}
     check_identity(store.path, wanted=wanted, found={name: store.identity[name] for name in wanted})
     refinement.check(plane)
     if store.ascending:
@@ -146,7 +146,7 @@ def refine(
             raise DamagedError.of(store.path, "samples are lost", "restore it, or begin anew with --force")
         dataset = store.dataset()
     else:
-        batch = max(LEAST_BATCH, getattr(objective, "preferred_batch", 1))
+        batch = max(LEAST_BATCH, objective.preferred_batch)
         batch *= workers_of(executor) if executor else 1
         run = Refining(
             evaluator(objective, store, executor, made), batch, plane, store, refinement, pieces, progress, seed
@@ -344,6 +344,7 @@ class Refining:
         if found.grad is not None and self.store.grad:
             arrays["grad"] = found.grad.numpy()
         self.samples.take(at, arrays["loss"], arrays["status"], arrays.get("grad"))
+        self.store.keep_error(found.error)
         if self.pieces is not None:
             self.pieces.save("-".join(map(str, [len(at), *at[0]])), at=at, **arrays)
         self._report()

@@ -17,7 +17,7 @@ from ..capacity import BLOCK, Need, require
 from ..identity import PACKAGE, VERSIONS, with_package
 from ..objective import Status
 from ..plane import Plane
-from ..space import ParameterSpace
+from ..space import LOG10, ParameterSpace
 from .checksums import SUMS, lay_out_sums, text_sum, write_sums
 from .layout import CODECS, COMPACT_CODECS, analysis_chunks, consolidate, create_array, flags
 from .ownership import store_files
@@ -129,6 +129,7 @@ def parameters_of(dataset: xr.Dataset) -> list[tuple[str, str]]:
 
 def _axis(plane: Plane, number: int) -> dict[str, str]:
     about = {"label": plane.labels[number], "long_name": plane.names[number]}
+    about |= {"scale": LOG10} if plane.scales[number] == LOG10 else {}
     return about | ({"units": plane.units[number]} if plane.units[number] else {})
 
 

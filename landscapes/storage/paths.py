@@ -27,6 +27,14 @@ def slice_exists(path: Path) -> bool:
     return place_of(path).exists()
 
 
+def refuse_missing(path: str | Path, what: str) -> None:
+    """Raise StoreError where nothing is at a path that is to hold `what`; whoever opens it says more."""
+    from ..identity import StoreError
+
+    if not slice_exists(Path(path)):
+        raise StoreError(f"there is no {what} at {path}; give the folder of one")
+
+
 def is_slice(path: Path) -> bool:
     """Say whether a slice of this format, finished or not, is at `path`."""
     from .arrays import FORMAT

@@ -11,7 +11,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from ..objective import Status
+from ..objective import Status, has_loss
 from .checksums import Checksums, tile_sum
 from .paths import corner
 from .tiles import Tile
@@ -23,8 +23,8 @@ Box = tuple[slice, ...]
 class Samples:
     """Hold the arrays `loss`, `status` and perhaps `grad` of an open store, in stored order.
 
-    A tile counts when it decodes, its status has no MISSING, loss and gradient are finite exactly where the status is
-    OK, and its checksum is right. Everything else is as if it had never been written. `place` is the store's folder,
+    A tile counts when it decodes, its status has no MISSING, loss and gradient are finite exactly where the status says
+    so, and its checksum is right. Everything else is as if it had never been written. `place` is the store's folder,
     None of one in memory; `ascending` says that it was finished, so that every tile is there. `sloped` says along each
     axis which samples have a gradient where the others on it do, too; the gradient of all others is NaN.
     """
@@ -124,11 +124,12 @@ class Samples:
 
     def _check_status(self, values: Mapping[str, NDArray[Any]], box: Box) -> NDArray[np.int8]:
         """Return the status, MISSING where it and the numbers contradict each other."""
-        intact = np.isfinite(values["loss"])
-        if "grad" in values:
-            intact &= np.isfinite(values["grad"]).all(axis=-1) | ~self.sloped(box)
         status: NDArray[np.int8] = values["status"]
-        status[(status == Status.OK) != intact] = Status.MISSING
+        finite, lacking = np.isfinite(values["loss"]), np.zeros(status.shape, dtype=bool)
+        if "grad" in values:
+            lacking = ~np.isfinite(values["grad"]).all(axis=-1) & self.sloped(box)
+        whole = np.where(has_loss(status), finite & (lacking == (status == Status.NO_GRADIENT)), ~finite)
+        status[~whole] = Status.MISSING
         return status
 
     def _load(self, box: Box) -> Arrays:

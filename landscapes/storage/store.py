@@ -33,6 +33,7 @@ from torch import Tensor
 from zarr.storage import MemoryStore
 
 from ..identity import (
+    ERROR,
     StoreError,
     StoreExistsError,
     check_identity,
@@ -45,7 +46,17 @@ from ..objective import Evaluation, Status
 from ..plain import plain_json
 from ..plane import Plane
 from ..space import ParameterSpace
-from .arrays import AXES, FILES, FORMAT, INTERPOLATED, attributes_of, axes_of, lay_out, refuse_too_large, write_finished
+from .arrays import (
+    AXES,
+    FILES,
+    FORMAT,
+    INTERPOLATED,
+    attributes_of,
+    axes_of,
+    lay_out,
+    refuse_too_large,
+    write_finished,
+)
 from .checksums import text_sum
 from .files import placing, resolve
 from .integrity import check_integrity, check_layouts, damage
@@ -206,6 +217,11 @@ class SliceStore:
         return self.place is not None and self.place == self.path
 
     @property
+    def error(self) -> str:
+        """What the first point that raised said; empty where none did."""
+        return str(self._about.get(ERROR, ""))
+
+    @property
     def grad(self) -> bool:
         """Whether the slice holds gradients."""
         return "grad" in self._samples.arrays
@@ -274,6 +290,7 @@ class SliceStore:
         counts = zip(tile.index, self._samples.tile_counts, strict=True)
         if self._follow_finished() or any(at >= count for at, count in counts):
             return  # another process has finished the slice, which has larger and fewer tiles since
+        self.keep_error(evaluation.error)
         arrays: Arrays = {}
         for name, stored in self._samples.arrays.items():
             tensor: Tensor = getattr(evaluation, name)
@@ -283,6 +300,16 @@ class SliceStore:
         except FileNotFoundError:
             if not self._follow_finished():
                 raise
+
+    def keep_error(self, error: str) -> None:
+        """Keep what the first point that raised said, as an attribute; what later ones say is not kept."""
+        if not error or self.error:
+            return
+        self._about[ERROR] = error
+        if self.place is not None and not self.ascending:
+            with contextlib.suppress(FileNotFoundError):  # another process has finished the slice meanwhile
+                open_group(self.place, "r+").attrs.update({ERROR: error})
+                consolidate(self.place)
 
     def status(self) -> NDArray[np.int8]:
         """Return the status of every point in stored order, MISSING wherever a tile is not finished."""

@@ -12,7 +12,7 @@ import torch
 
 from ..base import Points
 from ..options import MANY, MethodOptions, number
-from .descent import Descending, Descents
+from .descent import Descending, Descents, lacks
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class AdamOptions(MethodOptions):
 
 
 class AdamDescent(Descending):
-    """Follow gradients by torch's Adam from `start`. It stays inside the box; a failed episode ends it."""
+    """Follow gradients by torch's Adam from `start`, inside the box, until an episode fails or has no gradient."""
 
     def __init__(self, start: Points, options: AdamOptions) -> None:
         super().__init__(start, options)
@@ -49,7 +49,9 @@ class AdamDescent(Descending):
         if not math.isfinite(loss):
             self.done = True
             return
-        self.done = self._ends_with(loss)
+        self.done = self._ends_with(loss) or lacks(grad)
+        if lacks(grad):
+            return
         self._z.grad = torch.from_numpy(np.nan_to_num(grad))
         self._adam.step()
         self.at = self._z.clamp_(-1.0, 1.0).numpy().copy()

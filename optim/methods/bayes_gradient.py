@@ -52,8 +52,8 @@ class BOGradient(BO):
     The process has GPyTorch's squared-exponential covariance of a function and its slopes (`RBFKernelGrad`). A point
     with its gradient in d parameters makes d + 1 rows, and the cost grows with the cube of the rows: 1000 are modelled
     at most, those of the points with the least losses for one half and points spread over the run for the other. So it
-    is for few parameters: of 10 it models 90 points, and more than 49, of which it could model 20, are refused. Where
-    losses jump, slopes mislead it.
+    is for few parameters: of 10 it models 90 points, and more than 49, of which it could model 20, are refused. A point
+    that has a loss and no gradient is one row. Where losses jump, slopes mislead it.
     """
 
     name = "bo-gradient"
@@ -90,7 +90,10 @@ class SlopeSurrogate(Surrogate):
         self.grad: Points = np.empty((0, dim))
 
     def learn(self, z: Points, loss: Points, grad: Points) -> None:
-        """Take in points and gradients, shape (count, dim), and losses, shape (count,), +inf where one failed."""
+        """Take in points and gradients, shape (count, dim), NaN where one is missing, and losses, shape (count,).
+
+        Losses are +inf where an episode failed.
+        """
         self.add(z, loss)
         self.grad = np.concatenate([self.grad, grad])
 
@@ -106,7 +109,12 @@ class SlopeSurrogate(Surrogate):
     def _to_fit(self) -> GradientProcess:
         chosen = select(self.loss, max(LEAST, FIT_ROWS // (1 + self.z.shape[1])))
         rows = torch.from_numpy(standardised(self.loss, self.grad)[chosen])
-        return with_parameters(GradientProcess(unit(self.z[chosen]), rows), self._hyper)
+        return with_parameters(GradientProcess(self._places(chosen), rows), self._hyper)
+
+    def _places(self, rows: Rows) -> Float[Tensor, "point column"]:
+        """Return points of [0, 1]^dim, with a column that says whose slopes are missing where some are."""
+        lacking = np.isnan(self.grad[rows]).any(axis=1, keepdims=True)
+        return torch.from_numpy(np.hstack([unit(self.z[rows]), lacking])) if lacking.any() else unit(self.z[rows])
 
     def _covariance(self) -> Sloped:
         return Sloped(torch.from_numpy(self._hyper["scale"]))
@@ -120,8 +128,8 @@ class GradientProcess(ExactGP, GPyTorchModel):  # type: ignore[misc]
 
     num_outputs = 1
 
-    def __init__(self, u: Float[Tensor, "point dim"], rows: Float[Tensor, "point 1+dim"]) -> None:
-        dim = u.shape[1]
+    def __init__(self, u: Float[Tensor, "point column"], rows: Float[Tensor, "point 1+dim"]) -> None:
+        dim = rows.shape[1] - 1
         prior = get_covar_module_with_dim_scaled_prior(dim, use_rbf_kernel=True)
         super().__init__(u, rows, MultitaskGaussianLikelihood(num_tasks=dim + 1, rank=0, has_task_noise=False))
         self.mean_module = ConstantMeanGrad()
@@ -139,8 +147,9 @@ class GradientProcess(ExactGP, GPyTorchModel):  # type: ignore[misc]
 def standardised(loss: Points, grad: Points) -> Points:
     """Return losses with mean 0 and deviation 1 and their slopes along [0, 1]^dim, shape (point, 1 + dim).
 
-    A failure counts as the worst loss so far, with slopes of zero.
+    A failure counts as the worst loss so far, with slopes of zero; slopes that are missing are zero, too.
     """
+    grad = np.where(np.isnan(grad), 0.0, grad)
     finite = np.isfinite(loss)
     known = np.where(finite, loss, loss[finite].max())
     large = max(1.0, float(np.abs(known).max()), float(np.abs(grad).max()))  # their squares might be no numbers

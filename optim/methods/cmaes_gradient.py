@@ -26,8 +26,8 @@ class CMAESGradient(CMAES):
     Before each population the mean is evaluated with its gradient g. The population's first point is then mean -
     sigma sqrt(dim) C g / sqrt(g' C g), as far from the mean as a typical sample and in the direction that the natural
     gradient has (Hansen 2011, "Injecting External Solutions Into CMA-ES"); the library sees to it that no point counts
-    as farther than its own samples may be. Where the episode of the mean failed or its gradient is zero, nothing is
-    injected.
+    as farther than its own samples may be. Where the episode of the mean failed, or its gradient is zero or missing,
+    nothing is injected.
     """
 
     name = "cma-es-gradient"

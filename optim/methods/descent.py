@@ -37,11 +37,17 @@ class DescentOptions(MethodOptions):
     tolerance: float = number(1e-4, 0, 1)
 
 
+def lacks(grad: Points) -> bool:
+    """Whether a point with a loss has no gradient."""
+    return bool(np.isnan(grad).any())
+
+
 class Descending(ABC):
     """A descent in the scaled box: `at` is the iterate to evaluate next, until `done`; `best` is the least loss so far.
 
     By its options it ends after `steps` iterates, or after more than `patience` in a row that have not lowered the best
-    loss by `tolerance`, a fraction of it.
+    loss by `tolerance`, a fraction of it. An iterate without a gradient, which is NaN then, ends it: nothing says where
+    to go from there.
     """
 
     def __init__(self, start: Points, options: Any) -> None:
@@ -75,8 +81,8 @@ class Descending(ABC):
 class Descent(Descending):
     """Follow gradients from `start`, by steps along them.
 
-    Every iterate is evaluated once, loss and gradient, and both are used; the one that ends it stays in `at`, unless
-    its episode failed: then the one before, the last that has a loss.
+    Every iterate is evaluated once, loss and gradient, and both are used; the one that ends it stays in `at`, also
+    where it has a loss and no gradient, unless its episode failed: then the one before, the last that has a loss.
     """
 
     def __init__(self, start: Points, options: DescentOptions) -> None:
@@ -90,6 +96,9 @@ class Descent(Descending):
             self.at, self.done = self._last, True
             return
         last = self._ends_with(loss)
+        if lacks(grad):
+            self.done = True
+            return
         self._scale *= self.options.shrink if loss > self._last_loss else 1.0
         moved = self._move(grad)
         self.done = last or np.array_equal(moved, self.at)  # at a stationary point, or pushed against the border

@@ -127,7 +127,7 @@ class PolicySearch(Optimizer):
         Raises ValueError where its decisions have not equally many controls.
         """
         self._objective = objective
-        self.decisions = int(getattr(objective, "decisions", 1))
+        self.decisions = objective.decisions
         if self.space.dim % self.decisions:
             raise ValueError(
                 f"{self.name} needs decisions with equally many controls; "

@@ -17,6 +17,7 @@ from scipy.optimize import minimize
 from ..base import Kind, Optimizer, Points, Proposal
 from ..memory import FLOAT, SearchSize
 from ..options import MANY, MethodOptions, number
+from .descent import lacks
 
 MEMORY = 10  # pairs of steps and gradients that the Hessian is made of, as scipy's default has it
 THREAD = "L-BFGS-B"  # what threads are called in which scipy minimises
@@ -68,10 +69,17 @@ class LocalSearch:
         self._thread: tuple[SimpleQueue[Any], Values] | None = None
 
     def tell(self, loss: float, grad: Points) -> None:
-        """Take in the loss and the gradient, shape (dim,), of the point asked for; raises whatever scipy raises."""
+        """Take in the loss and the gradient, shape (dim,), of the point asked for; raises whatever scipy raises.
+
+        A point that has no gradient ends the search, at the least loss so far: scipy makes nothing of NaN.
+        """
         self.z.append(self.at)
         self.loss.append(loss)
         self.grad.append(grad)
+        if lacks(grad):
+            least = int(np.argmin(self.loss))
+            self.done, self.failed, self.best, self.best_loss = True, True, self.z[least], self.loss[least]
+            return
         asked, values = self._thread or self._begin()
         values.put((loss, grad.copy()))
         found = asked.get()
@@ -131,7 +139,8 @@ class LBFGSBOptions(MethodOptions):
 class LBFGSB(Optimizer):
     """Minimise by scipy's L-BFGS-B from uniformly random starts: where one search ends, the next begins.
 
-    Every episode is with gradient. A failed one counts as the worst loss so far, on a plain.
+    Every episode is with gradient. A failed one counts as the worst loss so far, on a plain; one that has a loss and no
+    gradient ends its search.
     """
 
     name = "l-bfgs-b"

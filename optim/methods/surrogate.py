@@ -12,7 +12,9 @@ from botorch.models import SingleTaskGP
 from botorch.models.utils.gpytorch_modules import get_covar_module_with_dim_scaled_prior
 from gpytorch.means import ZeroMean
 from gpytorch.models import ExactGP
+from jaxtyping import Float
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ..base import Points
 from ..memory import FLOAT, SearchSize
@@ -107,7 +109,7 @@ class Surrogate:
         """Return the process over [0, 1]^dim given the points, its hyper-parameters fitted if that is due."""
         with exclusive():
             rows = self._learn()
-            u, values = unit(self.z[rows]), torch.from_numpy(self._values(rows))
+            u, values = self._places(rows), torch.from_numpy(self._values(rows))
             return Process(self._covariance(), float(self._hyper["noise"][0]), u, values, len(self._chosen))
 
     def _learn(self) -> Rows:
@@ -125,6 +127,10 @@ class Surrogate:
     def _to_fit(self) -> ExactGP:
         """Return the model whose hyper-parameters are fitted."""
         return self._condition(_thin(np.arange(len(self.loss)), FIT_POINTS))
+
+    def _places(self, rows: Rows) -> Float[Tensor, "point column"]:
+        """Return points as the covariance takes them."""
+        return unit(self.z[rows])
 
     def _covariance(self) -> Covariance:
         return Radial(self.options.kernel, torch.from_numpy(self._hyper["scale"]))

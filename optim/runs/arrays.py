@@ -12,7 +12,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from ...landscapes.identity import with_package
+from ...landscapes.identity import record_parameters, with_package
 from ...landscapes.objective import Status
 from ...landscapes.plain import plain_json
 from ...landscapes.space import ParameterSpace
@@ -88,7 +88,7 @@ def attributes_of(
     space: ParameterSpace, identity: Mapping[str, Any], provenance: Mapping[str, Any], budget: int
 ) -> dict[str, Any]:
     """Return what a run says of itself, on disk as attributes of its group."""
-    box = {"parameters": space.names, "lower": space.lower.tolist(), "upper": space.upper.tolist()}
+    box = {**record_parameters(space), "lower": space.lower.tolist(), "upper": space.upper.tolist()}
     whole = plain_json({**identity, **box}, "a run's identity")
     return {
         "gradscape_run": FORMAT,

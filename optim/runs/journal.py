@@ -17,12 +17,12 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from ...landscapes.identity import StoreError
+from ...landscapes.identity import ERROR, StoreError
 from ...landscapes.storage.files import replacing
 
 STATE = "state"
 CHUNK = 64  # rows
-CHANGING = {"budget", "gradient_cost"}  # attributes of a run that are not what they were when it was made
+CHANGING = {"budget", "gradient_cost", ERROR}  # attributes of a run that are not what they were when it was made
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ import xarray as xr
 from jaxtyping import Float
 from torch import Tensor
 
-from ...landscapes.identity import stored_identity, stored_provenance
+from ...landscapes.identity import errors_of, stored_identity, stored_provenance, stored_scales
+from ...landscapes.space import to_values
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -25,7 +26,7 @@ LABELS = {"forwards": "forward equivalents"}  # of columns whose stored names sa
 
 @dataclass(frozen=True)
 class BestEpisode:
-    """The episode of least loss: its parameters `x`, each in its own unit, and its number, from 1 on."""
+    """The episode of least loss: the values `x` of its parameters, each in its own unit, and its number, from 1 on."""
 
     x: Float[Tensor, " dim"]
     loss: float
@@ -36,9 +37,10 @@ class BestEpisode:
 class Run:
     """Hold the episodes of a run: `data` is an xarray dataset of x(evaluation, dim), loss(evaluation) and others.
 
-    `grad`(evaluation, dim) is the gradient where one was asked for, `status` how the episode ended, `kind` what it was
-    evaluated for; `episodes`, `forwards` and `seconds` [s] are what the run had cost by then, the second in forward
-    equivalents: episodes without gradient. `folder` is where its files are, None of one in memory.
+    `x` are points as `evaluate` takes them: of a logarithmic parameter decimal logarithms; `best` and `table` have
+    values. `grad`(evaluation, dim) is the gradient where one was asked for, `status` how the episode ended, `kind` what
+    it was evaluated for; `episodes`, `forwards` and `seconds` [s] are what the run had cost by then, the second in
+    forward equivalents: episodes without gradient. `folder` is where its files are, None of one in memory.
     """
 
     data: xr.Dataset
@@ -71,7 +73,13 @@ class Run:
         if not np.isfinite(loss).any():
             raise ValueError(f"{self._name()} has no best episode: none of {len(loss)} succeeded")
         row = int(np.nanargmin(loss))
-        return BestEpisode(torch.from_numpy(self.data["x"].to_numpy()[row].copy()), float(loss[row]), row + 1)
+        x = to_values(torch.from_numpy(self.data["x"].to_numpy()[row].copy()), stored_scales(self.data))
+        return BestEpisode(x, float(loss[row]), row + 1)
+
+    @property
+    def errors(self) -> str:
+        """How many episodes raised and what the first of them said, in a line; empty where none did."""
+        return errors_of(self.data)
 
     def table(self) -> pd.DataFrame:
         """Return a row for each episode: number, parameters, loss, status, kind, costs and gradient.
@@ -99,7 +107,8 @@ class Run:
         count = self.data.sizes["evaluation"]
         found = f"best loss {self.best.loss:.6g}" if np.isfinite(self.data["loss"]).any() else "none succeeded"
         where = f", in {self.folder}" if self.folder else ""
-        return f"<Run of {self._name()}: {count} of {self.data.attrs['budget']} episodes, {found}{where}>"
+        raised = f"; {self.errors}" if self.errors else ""
+        return f"<Run of {self._name()}: {count} of {self.data.attrs['budget']} episodes, {found}{raised}{where}>"
 
     def _name(self) -> str:
         return f"{self.method} on {self.data.attrs['env']}, seed {self.seed}"

@@ -30,13 +30,14 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...landscapes.identity import StoreError, StoreExistsError, check_identity, current_identity
-from ...landscapes.objective import Evaluation, Status
+from ...landscapes.identity import ERROR, StoreError, StoreExistsError, check_identity, current_identity
+from ...landscapes.objective import Evaluation, failed
 from ...landscapes.space import ParameterSpace
 from ...landscapes.storage.files import placing, resolve
 from ...landscapes.storage.layout import FILL, consolidate, open_group
 from ...landscapes.storage.ownership import check_ours, clear_halves, has_lost_root
 from ..base import Kind
+from . import RUN as RUN
 from .arrays import (
     COLUMNS,
     FILES,
@@ -56,7 +57,6 @@ from .state import decode, encode
 
 PAUSE = 1.0  # least seconds between two writes, so that quick episodes are not held up
 SHARE = 0.05  # most of the time that may go into writing, that of all runs that go on abreast
-RUN = "run.zarr"  # what the store of a run is called in its folder
 
 
 class RunStore:
@@ -178,7 +178,12 @@ class RunStore:
     @property
     def failed(self) -> int:
         """Number of episodes that failed."""
-        return int((self._columns["status"][: self.count] != Status.OK).sum())
+        return int(failed(self._columns["status"][: self.count]).sum())
+
+    @property
+    def error(self) -> str:
+        """What the first episode that raised said; empty where none did."""
+        return str(self.attributes.get(ERROR, ""))
 
     def state(self) -> dict[str, Any] | None:
         """Return the optimiser's state after `told` rows, None before the first.
@@ -272,6 +277,8 @@ class RunStore:
         if rows.stop > self.budget:
             raise ValueError(f"a run of {self.budget} episodes has {self.budget - self.count} left; got {len(x)} more")
         self._make_room(rows.stop)
+        if evaluation.error and not self.error:
+            self._set(**{ERROR: evaluation.error})
         for name, values in self._rows(x, evaluation, kind, seconds).items():
             self._columns[name][rows] = values
         self.count = rows.stop

@@ -12,21 +12,18 @@ if TYPE_CHECKING:
     from .api.measure import card, census, check, extremes, pairs, report
     from .api.overlay import overlay
     from .api.search import open_run, optimize, race
-    from .api.slice import open_slice, slice
+    from .api.slice import open_slice, sample, slice
     from .api.sweep import sweep
     from .api.tradeoff import tradeoff
+    from .envs.adapters import from_jax, from_numpy, from_step, from_torch, from_warp
     from .envs.base import Environment, Fidelity
-    from .envs.engines.jax_functions import from_jax
-    from .envs.engines.warp_functions import from_warp
-    from .envs.registry import make, register
+    from .envs.registry import as_environment, make, register
     from .jobs.scene import SceneSpec
-    from .landscapes.adapters import from_numpy, from_torch
     from .landscapes.episode import Episode
-    from .landscapes.objective import Evaluation, Objective, Status
+    from .landscapes.objective import Evaluation, Status
     from .landscapes.plane import Plane
-    from .landscapes.sampling.fill import sample
     from .landscapes.slice import Slice
-    from .landscapes.space import ParameterSpace
+    from .landscapes.space import ParameterSpace, log
     from .optim.race import Race
     from .optim.runs.run import Run
 
@@ -36,7 +33,6 @@ _HOMES = {
     "Episode": "landscapes.episode",
     "Evaluation": "landscapes.objective",
     "Fidelity": "envs.base",
-    "Objective": "landscapes.objective",
     "ParameterSpace": "landscapes.space",
     "Plane": "landscapes.plane",
     "Race": "optim.race",
@@ -44,16 +40,19 @@ _HOMES = {
     "SceneSpec": "jobs.scene",
     "Slice": "landscapes.slice",
     "Status": "landscapes.objective",
+    "as_environment": "envs.registry",
     "card": "api.measure",
     "check": "api.measure",
     "compare": "api.compare",
     "extremes": "api.measure",
-    "from_jax": "envs.engines.jax_functions",
-    "from_numpy": "landscapes.adapters",
-    "from_torch": "landscapes.adapters",
-    "from_warp": "envs.engines.warp_functions",
+    "from_jax": "envs.adapters",
+    "from_numpy": "envs.adapters",
+    "from_step": "envs.adapters",
+    "from_torch": "envs.adapters",
+    "from_warp": "envs.adapters",
     "league": "api.league",
     "list_envs": "api.environments",
+    "log": "landscapes.space",
     "make": "envs.registry",
     "open_run": "api.search",
     "open_slice": "api.slice",
@@ -64,7 +63,7 @@ _HOMES = {
     "race": "api.search",
     "register": "envs.registry",
     "report": "api.measure",
-    "sample": "landscapes.sampling.fill",
+    "sample": "api.slice",
     "slice": "api.slice",
     "sweep": "api.sweep",
     "tradeoff": "api.tradeoff",
@@ -75,7 +74,6 @@ __all__ = [
     "Episode",
     "Evaluation",
     "Fidelity",
-    "Objective",
     "ParameterSpace",
     "Plane",
     "Race",
@@ -84,6 +82,7 @@ __all__ = [
     "Slice",
     "Status",
     "__version__",
+    "as_environment",
     "card",
     "census",
     "check",
@@ -91,10 +90,12 @@ __all__ = [
     "extremes",
     "from_jax",
     "from_numpy",
+    "from_step",
     "from_torch",
     "from_warp",
     "league",
     "list_envs",
+    "log",
     "make",
     "open_run",
     "open_slice",

@@ -11,9 +11,13 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from matplotlib.text import Text
 
 import gradscape as gs
+from gradscape.jobs.foreign import tables_over
+from gradscape.jobs.watch import Watch
 from gradscape.landscapes.export import save_as
+from gradscape.landscapes.foreign import points_table
 
 from ..command import make
 
@@ -98,9 +102,12 @@ def test_a_point_without_a_loss_has_failed(cut: gs.Slice, tmp_path: Path) -> Non
     [
         ({"a": [1.0], "loss": [1.0]}, "has no column"),
         ({0: [1.0], 1: [1.0]}, "has no column 'loss'"),
-        ({0: ["low"], 1: [1.0], "loss": [1.0]}, "holds no numbers"),
-        ({0: [1.0, None], 1: [1.0, 2.0], "loss": [1.0, 2.0]}, "has no number in row 2"),
-        ({0: [], 1: [], "loss": []}, "holds no point"),
+        ({0: ["failed"], 1: [1.0], "loss": [1.0]}, "the column 'x0' of table holds no numbers: row 0 has 'failed'"),
+        ({0: [1.0, 2.0], 1: [1.0, 2.0], "loss": ["low", "high"]}, "holds no numbers: row 0 has 'low'"),
+        ({0: [1.0, None], 1: [None, 2.0], "loss": [1.0, 2.0]}, "each of its 2 rows lacks a number in column x0, x1"),
+        ({0: [], 1: [], "loss": []}, "holds no point: below its heading there is no row of numbers"),
+        ({0: ["m"], 1: ["m"], "loss": ["J"]}, "holds no point: below its heading there is no row of numbers"),
+        ({0: [1.0], 1: [1.0], "params_x0": [1.0], "loss": [1.0]}, "'x0' .column 1. and 'params_x0' .column 3."),
     ],
 )
 def test_a_table_that_lacks_something_is_refused(
@@ -141,8 +148,81 @@ def test_a_study_of_optuna_is_laid_over_a_slice(cut: gs.Slice, tmp_path: Path) -
     assert (laid.summary.points, laid.summary.failed) == (6, 1)
     assert laid.runs[0].attrs["label"] == "optuna-of-branin"
     np.testing.assert_allclose(float(laid.runs[0]["best"][-1]), study.best_value)
-    with pytest.raises(ValueError, match="MAXIMIZE"):
-        gs.overlay(cut, optuna.create_study(direction="maximize"))
+    frame = study.trials_dataframe()
+    frame.to_csv(tmp_path / "trials.csv")
+    going = pd.concat([frame, frame.tail(1).assign(state="RUNNING", value=-1e9)], ignore_index=True)
+    for given in (frame, tmp_path / "trials.csv", study.trials_dataframe(multi_index=True), going):
+        again = gs.overlay(cut, given, out=tmp_path / "again")
+        for name in ("x", "loss", "status"):
+            np.testing.assert_array_equal(again.runs[0][name], laid.runs[0][name])
+    with pytest.raises(ValueError, match="has the directions MINIMIZE, MAXIMIZE; a loss is one value"):
+        gs.overlay(cut, optuna.create_study(directions=["minimize", "maximize"]))
+    with pytest.raises(ValueError, match="study 'none' holds no trial yet"):
+        gs.overlay(cut, optuna.create_study(study_name="none"))
+
+
+def test_values_that_a_study_maximises_are_negated_and_its_name_says_so(
+    cut: gs.Slice, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    optuna = pytest.importorskip("optuna")
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    study = optuna.create_study(study_name="gain", direction="maximize", sampler=optuna.samplers.RandomSampler(seed=0))
+    study.optimize(lambda trial: trial.suggest_float("x0", 0, 1) + trial.suggest_float("x1", 0, 1), n_trials=3)
+    told = Told()
+    (table,) = tables_over(cut, [study], told)
+    np.testing.assert_array_equal(table["loss"], -study.trials_dataframe()["value"])
+    assert told.lines == ["optuna-gain maximises: its values are negated, so that a smaller loss is better"]
+    laid = gs.overlay(cut, study, out=tmp_path / "over")
+    assert laid.runs[0].attrs["label"] == "optuna-gain (negated)"
+    assert "optuna-gain (negated): " in " ".join(text.get_text() for text in laid.plot().findobj(Text))
+    assert not capfd.readouterr().err  # a recording takes any name
+
+
+class Told(Watch):
+    """Keep what a job tells."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def note(self, text: str) -> None:
+        self.lines.append(text)
+
+
+COMMAS = "X0;x1;LOSS;note\n[m];[m];[J];\n1,5;2,25;3,5;a\n\n1,5;failed;3;b\n2,5;;1e0;\n-0,5;1;failed;c;;\n;;;\n"
+
+
+def test_a_table_as_a_spreadsheet_writes_it_is_read(cut: gs.Slice, tmp_path: Path) -> None:
+    """It has other capitals, a row of units, decimal commas, and rows without a number."""
+    path, told = tmp_path / "sheet.csv", Told()
+    path.write_bytes(COMMAS.encode("utf-8-sig"))
+    (table,) = tables_over(cut, [path], told)
+    np.testing.assert_array_equal(table["x"], [[1.5, 2.25], [-0.5, 1.0]])
+    np.testing.assert_array_equal(table["loss"], [3.5, np.nan])
+    assert told.lines == [
+        "sheet: row 2 holds units ([m], [m], [J]) and is no point",
+        "sheet: 2 of 4 rows skipped: no number in column x1",
+    ]
+    laid = gs.overlay(cut, path, out=tmp_path / "over")
+    assert "2 points: 0 beyond the map, 1 failed, 2 rows skipped" in repr(laid)
+    path.write_text("x0,x1,loss\n1,2,3,4\n")
+    with pytest.raises(ValueError, match="row 2 has 4 cells, the heading 3"):
+        gs.overlay(cut, path)
+    path.write_text("x0,x0,x1,loss\n1,1,2,3\n")
+    with pytest.raises(ValueError, match=r"several columns for 'x0': 'x0' \(column 1\) and 'x0' \(column 2\)"):
+        gs.overlay(cut, path)
+    for nothing, said in (("", "it is empty"), ("x0,x1,loss\n", "sheet holds no point")):
+        path.write_text(nothing)
+        with pytest.raises(ValueError, match=said):
+            gs.overlay(cut, path)
+
+
+def test_capitals_tell_parameters_apart_where_both_are_there(cut: gs.Slice) -> None:
+    space = gs.ParameterSpace({"k": (0, 1), "K": (0, 1)})
+    dataset = cut.data.assign_coords(dim=["k", "K"])
+    table = points_table(pd.DataFrame({"K": [0.25], "k": [0.5], "loss": [1.0]}), dataset, space, "both")
+    np.testing.assert_array_equal(table["x"], [[0.5, 0.25]])
+    with pytest.raises(ValueError, match="both has no column 'k'"):
+        points_table(pd.DataFrame({"K": [0.25], "loss": [1.0]}), dataset, space, "both")
 
 
 def experiment_of_ax(names: tuple[str, ...], *, minimize: bool = True) -> Any:
@@ -168,5 +248,9 @@ def test_an_experiment_of_ax_and_its_client_are_laid_over_a_slice(cut: gs.Slice,
         assert (laid.summary.points, laid.summary.failed) == (4, 1)
         assert laid.runs[0].attrs["label"] == "ax-of-branin"
         np.testing.assert_array_equal(laid.runs[0]["best"], [4.0, 2.0, 2.0, 2.0])
-    with pytest.raises(ValueError, match="Ax's experiment 'of branin' has the objective"):
-        gs.overlay(cut, experiment_of_ax(names, minimize=False))
+    laid = gs.overlay(cut, experiment_of_ax(names, minimize=False), out=tmp_path / "most")
+    assert laid.runs[0].attrs["label"] == "ax-of-branin (negated)"
+    np.testing.assert_array_equal(laid.runs[0]["best"], [-4.0, -4.0, -4.0, -8.0])
+    experiment.trials.clear()
+    with pytest.raises(ValueError, match="Ax's experiment 'of branin' holds no trial that has ended"):
+        gs.overlay(cut, experiment)

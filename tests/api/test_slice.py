@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import gradscape as gs
+from gradscape.jobs.slice_summary import SliceSummary
 from gradscape.landscapes.identity import StoreMismatchError, stored_identity
 
 from ..command import Said
@@ -53,6 +54,31 @@ def test_slope_and_minima_are_those_of_a_closed_form() -> None:
     assert lowest == {"a": 0.0, "b": 0.0, "loss": 0.0, "depth": 2.0}
     assert cut.folder is None
     assert cut.plane.resolution == (5, 9)
+
+
+class Raises:
+    """A bowl that raises in a corner, and has no gradient at its minimum."""
+
+    name, space = "raises", BOX
+
+    def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> gs.Evaluation:
+        raised = (x > 0.5).all(dim=1)
+        slope = (2 * x).masked_fill((x == 0).all(dim=1, keepdim=True), torch.nan)
+        said = "RuntimeError: too much work" if bool(raised.any()) else ""
+        status = torch.where(raised, gs.Status.ERROR, gs.Status.OK)
+        return gs.Evaluation.from_results(x.square().sum(dim=1), slope if grad else None, status, said)
+
+
+def test_what_raised_is_counted_and_said_and_a_loss_without_gradient_is_no_failure(tmp_path: Path) -> None:
+    cut = gs.slice(Raises(), (0, 1), resolution=9, out=tmp_path / "cut")
+    said = "4 points raised: first 'RuntimeError: too much work'"
+    for one in (cut, gs.open_slice(tmp_path / "cut")):
+        assert one.errors == said
+        assert said in repr(one)
+    assert float(cut.data["loss"].min()) == 0.0
+    summary = SliceSummary(**json.loads((tmp_path / "cut" / "summary.json").read_text()))
+    assert "76 ok, 4 error, 1 no gradient; " + said in summary.outcome()
+    assert gs.slice(bowl(), (0, 1), resolution=3).errors == ""
 
 
 def test_a_point_and_an_extent_cut_what_they_say() -> None:

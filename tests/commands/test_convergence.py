@@ -26,7 +26,7 @@ Command = Callable[..., Said]
 class Second(Environment):
     """A bowl off by (1 + x0) dt^2, whose motion goes round in circles."""
 
-    name: ClassVar[str] = "second"
+    name = "second"
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=0.1),
         "standard": Fidelity("standard", dt=0.05),
@@ -54,7 +54,7 @@ class Second(Environment):
 class Wild(Second):
     """The same losses, noisy by the step, of a motion in which neighbours part a millionfold."""
 
-    name: ClassVar[str] = "wild"
+    name = "wild"
     rate: ClassVar[float] = 14.0
 
     def _evaluate(self, x: Tensor, *, grad: bool) -> Evaluation:
@@ -174,7 +174,7 @@ def test_widths_are_those_of_the_levels_fidelities() -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["branin"], "there is nothing to trade"),
+        (["branin"], "there is nothing to hold against"),
         (["bounce", "--variants", "speed"], "--variants takes dt, resolution, particles, joint, precision"),
         (["bounce", "--variants", "resolution"], "bounce has nothing of resolution to refine"),
         (["bounce", "--fidelity", "draft"], "leave it out"),

@@ -25,12 +25,12 @@ TURN = ["extremes", "stepping", "--points", "4", "--device", "cpu", "--out", "tu
 class Stepping(Environment):
     """A bowl that fails beyond a step of 0.35 s, or beyond three times its box; in float32 beyond 0.25 s."""
 
-    name: ClassVar[str] = "stepping"
+    name = "stepping"
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "standard": Fidelity("standard", dt=0.1),
         "reference": Fidelity("reference", dt=0.01, precision="float64"),
     }
-    beyond_box: ClassVar[bool] = True
+    beyond_box = True
     space = ParameterSpace.box(["x0", "x1"], -1.0, 1.0)
 
     def work(self) -> Work:

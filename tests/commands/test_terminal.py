@@ -1,4 +1,4 @@
-"""Tables on narrow terminals: what has a name is folded, and not cut."""
+"""Tables on narrow terminals: what has a name is folded, and not cut; no name steers the terminal."""
 
 import re
 from collections.abc import Callable
@@ -6,9 +6,10 @@ from io import StringIO
 from pathlib import Path
 
 import pytest
+from rich.text import Text
 
 import gradscape
-from gradscape.commands.terminal import Console, table
+from gradscape.commands.terminal import Bars, Console, table
 from gradscape.envs.registry import entries
 from gradscape.gallery.figures import read_figures
 from gradscape.optim.registry import methods
@@ -30,6 +31,46 @@ def test_a_cell_that_is_too_wide_goes_on_in_the_next_line_with_every_letter() ->
     assert "".join(first) == name
     assert "[of them]" in text  # brackets are what they are, and no markup
     assert "[of" in text
+
+
+EVIL = "a\x1b]0;title\x07\x1b[2J\rb\x9b1m\u202ec"
+SHOWN = r"a\x1b]0;title\x07\x1b[2J\rb\x9b1m\u202ec"
+
+
+def test_control_characters_in_names_are_shown_and_not_obeyed() -> None:
+    shown = StringIO()
+    console = Console(file=shown, width=60, force_terminal=True, color_system=None)
+    found = table(EVIL, title=EVIL)
+    found.add_row(EVIL)
+    console.print(found)
+    rows = shown.getvalue().splitlines()
+    assert sum(SHOWN in row for row in rows) == 3
+    assert len({len(row) for row in rows[1:]}) == 1  # what is escaped has its room
+    console.print(EVIL)
+    console.print(Text("laid out before: \x1b[2J"))
+    with Bars(console).busy(EVIL) as say:
+        say(f"more {EVIL}")
+    with Bars(console).progress(2, EVIL) as advance:
+        advance(1, EVIL)
+    assert r"laid out before: \x1b[2J" in shown.getvalue()
+    for control in ("\x1b]", "\x1b[2J", "\x07", "\x9b", "\u202e"):
+        assert control not in shown.getvalue()
+
+
+def test_a_class_of_others_does_not_steer_the_terminal(run: Callable[..., Said], tmp_path: Path) -> None:
+    (tmp_path / "evil.py").write_text(
+        "import gradscape as gs\nclass Evil(gs.Environment):\n    'It \\x1b[2J.'\n    name = 'evil\\x1b[2J'\n"
+        "    space = gs.ParameterSpace({'\\x1b]0;k': (0, 1, 'm\\x07'), 'x': (0, 1)})\n"
+        "    def _evaluate(self, x, *, grad): return gs.Evaluation.from_results(x[:, 0], None)\n"
+    )
+    for command in (
+        ["envs", "evil.py:Evil"],
+        ["slice", "evil.py:Evil", "--dims", "k", "0"],
+        ["slice", "branin", "--dims", "0", "1", "--through", "\x1b[2J.npy"],
+    ):
+        said = run(*command, cwd=tmp_path)
+        assert r"\x1b" in said.stdout + said.stderr
+        assert not set("\x1b\x07") & set(said.stdout + said.stderr), command
 
 
 def test_every_table_is_made_that_way() -> None:

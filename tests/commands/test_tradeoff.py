@@ -35,7 +35,7 @@ class Converging(Environment):
     Refuses dt of 0.4 or more, diverges at 0.2 where x0 is large.
     """
 
-    name: ClassVar[str] = "converging"
+    name = "converging"
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=0.1),
         "standard": Fidelity("standard", dt=0.05),
@@ -231,7 +231,7 @@ def test_another_study_is_not_overwritten(run: Command, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["tradeoff", "branin"], "branin has fidelity exact only; there is nothing to trade"),
+        (["tradeoff", "branin"], "branin has one fidelity, exact, so there is nothing to hold against"),
         (["tradeoff", "bounce", "--variants", "speed"], "--variants takes dt, resolution"),
         (
             ["slice", "bounce", "--dims", "0", "1", "--tolerance", "5%", "--set", "horizon=0.5"],

@@ -6,11 +6,15 @@ A new one is found by its family.
 from dataclasses import replace
 from functools import cache
 
+import torch
+from torch import Tensor
+
 from gradscape.envs.base import Environment, Fidelity
 from gradscape.envs.functions import Function
 from gradscape.envs.mjx.scene import MjxScene
 from gradscape.envs.mpm.fluid import Fluid
 from gradscape.envs.mpm.plasticine import Plasticine
+from gradscape.envs.mpm.scene import MpmScene
 from gradscape.envs.newton.scene import NewtonScene
 from gradscape.envs.registry import entries, environment_class, make
 from gradscape.envs.sheets.sheets import SheetScene
@@ -61,3 +65,30 @@ def made_once(name: str) -> Environment:
     The contract's fixture is another one.
     """
     return made(name)
+
+
+def assert_returns_stay(env: Environment) -> None:
+    """Hold what a scene returns of one point while it simulates another, in the memory of the same solver."""
+    first, second = env.space.uniform(2, seed=5)
+    returned = _returns(env, first)
+    before = [one.clone() for one in returned]
+    _returns(env, second)
+    for one, kept in zip(returned, before, strict=True):
+        assert torch.equal(one.nan_to_num(), kept.nan_to_num())
+
+
+def _returns(env: Environment, x: Tensor) -> list[Tensor]:
+    """Return every tensor that a scene gives of one point."""
+    found = env.evaluate(x[None])
+    assert found.grad is not None
+    tensors = [found.loss, found.grad, found.status, env(x[None]), *env.events(x[None]).values()]
+    if getattr(env.options, "horizon", 1.0) == 1.0:
+        tensors.append(env.observe(x[None], env.decisions - 1))
+    if (energy := env.energy(x[None])) is not None:
+        tensors.append(energy)
+    if isinstance(env, MpmScene | SheetScene):
+        tensors.append(env.end(x))
+    if not isinstance(env, Function):
+        episode = env.episode(x)
+        tensors += [episode.time, *episode.points.values(), *(part.at for part in episode.parts)]
+    return tensors

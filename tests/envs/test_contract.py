@@ -12,7 +12,7 @@ from gradscape.envs.registry import entries, environment_class, make
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 
 from .numbers import POINTS, moved, points_of
-from .scenes import SMALL_STEPS, made, made_once
+from .scenes import SETTINGS, SHORT, SIMULATED, SMALL_STEPS, assert_returns_stay, made, made_once
 
 ROWS = POINTS["tiny"][0]
 
@@ -102,6 +102,26 @@ def test_an_empty_batch_gives_an_empty_evaluation(env, points):
     x = points[:0].clone().requires_grad_()
     env(x).sum().backward()
     assert x.grad.shape == (0, env.space.dim)
+
+
+def test_another_call_leaves_what_was_returned_as_it_was(env):
+    if isinstance(env, MjxScene) and not isinstance(env, Drop):
+        pytest.skip("nothing writes to JAX's arrays, and to trace episodes takes a minute; Drop's stand for that class")
+    assert_returns_stay(env)
+
+
+OTHER_PRECISIONS = [
+    (name, precision)
+    for name in SIMULATED
+    for precision in sorted({one.precision for one in environment_class(name).fidelities.values()})
+    if precision != SETTINGS[name]["fidelity"].precision
+]
+
+
+@pytest.mark.parametrize(("name", "precision"), OTHER_PRECISIONS)
+def test_so_it_does_in_every_precision_of_its_fidelities(name, precision):
+    settings = {"fidelity": replace(SETTINGS[name]["fidelity"], precision=precision)} | SHORT.get(name, {})
+    assert_returns_stay(make(name, device="cpu", **settings))
 
 
 def test_the_same_point_gives_the_same_bits(env, points, result):

@@ -13,7 +13,7 @@ from gradscape.landscapes.objective import Status
 from gradscape.landscapes.space import ParameterSpace
 
 from .numbers import moved, points_of
-from .scenes import SETTINGS, SHORT, TAICHI
+from .scenes import SETTINGS, SHORT, TAICHI, assert_returns_stay
 
 pytestmark = pytest.mark.skipif(find_spec("taichi") is None, reason="Taichi has no wheel for this machine")
 
@@ -43,6 +43,10 @@ def test_episodes_agree(both):
     assert ours.points.keys() == theirs.points.keys()
     for body, points in ours.points.items():
         torch.testing.assert_close(theirs.points[body], points, rtol=0.0, atol=1e-9)
+
+
+def test_another_call_leaves_what_was_returned_as_it_was(both):
+    assert_returns_stay(both[1])
 
 
 def test_taichi_gets_one_thread_and_the_rows_of_all(both):

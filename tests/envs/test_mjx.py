@@ -71,6 +71,11 @@ def test_parameters_set_the_state_the_model_and_the_controls_they_name(dart):
     torch.testing.assert_close(found.grad[:, [0, 1, 3, 4]], wanted.grad[:, [0, 1, 3, 4]], rtol=1e-7, atol=1e-9)
 
 
+def test_a_control_that_is_held_throughout_is_called_by_its_name():
+    held = type("Held", (Dart,), {"segments": 1})
+    assert held(fidelity=STEP).space.names == ("speed", "mass", "damping", "push")
+
+
 def test_precisions_take_turns_in_one_process():
     """Each computes in its own, and again the same: what JAX has traced in one does not fit the other.
 

@@ -3,9 +3,9 @@
 import numpy as np
 import torch
 
+from gradscape.envs.adapters import from_numpy
 from gradscape.gallery.episodes import choose_nodes
 from gradscape.gallery.records import Node
-from gradscape.landscapes.adapters import from_numpy
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace

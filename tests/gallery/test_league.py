@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from gradscape.cli import main
+from gradscape.envs.adapters import from_numpy
 from gradscape.envs.registry import make
 from gradscape.gallery import league as gallery_league
 from gradscape.gallery.compute import PARTS
@@ -19,7 +20,6 @@ from gradscape.jobs import known
 from gradscape.jobs.race import RaceJob
 from gradscape.jobs.scene import point_of
 from gradscape.jobs.watch import Watch
-from gradscape.landscapes.adapters import from_numpy
 from gradscape.landscapes.identity import DamagedError, plane_of, stored_identity
 from gradscape.landscapes.overlay import IMPROVEMENTS_OF, best_point, lowered
 from gradscape.landscapes.space import ParameterSpace

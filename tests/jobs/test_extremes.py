@@ -41,7 +41,7 @@ class Stiff:
 class Spring(Environment):
     """A spring by semi-implicit Euler: x grows without bound where dt > 2 / sqrt(k / m), and not below."""
 
-    name: ClassVar[str] = "spring-of-test"
+    name = "spring-of-test"
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "standard": Fidelity("standard", dt=0.02, precision="float64"),
         "reference": Fidelity("reference", dt=0.001, precision="float64"),
@@ -69,7 +69,7 @@ class Spring(Environment):
 class Decay(Spring):
     """A decay at rate k by explicit Euler, x (1 - k dt)^n: it grows where dt > 2 / k."""
 
-    name: ClassVar[str] = "decay-of-test"
+    name = "decay-of-test"
 
     def _gain(self, dt: float, k: float) -> float:
         growth = abs(1 - k * dt)
@@ -79,7 +79,7 @@ class Decay(Spring):
 class Patchy(Spring):
     """Stable up to 0.05 s, and again from 0.2 to 0.7 s."""
 
-    name: ClassVar[str] = "patchy-of-test"
+    name = "patchy-of-test"
     contact_stiffness: ClassVar[str] = ""
 
     def _gain(self, dt: float, k: float) -> float:
@@ -89,7 +89,7 @@ class Patchy(Spring):
 class Harmless(Patchy):
     """Never fails."""
 
-    name: ClassVar[str] = "harmless-of-test"
+    name = "harmless-of-test"
 
     def _gain(self, dt: float, k: float) -> float:
         return 1.0
@@ -98,7 +98,7 @@ class Harmless(Patchy):
 class Polite(Patchy):
     """Explodes politely: beyond 0.1 s its losses are finite, and a thousand times too large."""
 
-    name: ClassVar[str] = "polite-of-test"
+    name = "polite-of-test"
 
     def _gain(self, dt: float, k: float) -> float:
         return 1.0 if dt <= 0.1 else 1000.0
@@ -107,8 +107,8 @@ class Polite(Patchy):
 class Fenced(Patchy):
     """Raises where the start is beyond 3 m, refuses what is beyond 20 m."""
 
-    name: ClassVar[str] = "fenced-of-test"
-    beyond_box: ClassVar[bool] = True
+    name = "fenced-of-test"
+    beyond_box = True
 
     def _evaluate(self, x: Tensor, *, grad: bool) -> Evaluation:
         if float(x.abs().max()) > 20:
@@ -121,7 +121,7 @@ class Fenced(Patchy):
 class Hurried(Patchy):
     """Its own step of 0.02 s fails; 0.004 s does not."""
 
-    name: ClassVar[str] = "hurried-of-test"
+    name = "hurried-of-test"
 
     def _gain(self, dt: float, k: float) -> float:
         return 1.0 if dt <= 0.004 else math.inf
@@ -130,7 +130,7 @@ class Hurried(Patchy):
 class Ranged(Harmless):
     """Restitution from 0 to 1, stable up to 0.9."""
 
-    name: ClassVar[str] = "ranged-of-test"
+    name = "ranged-of-test"
     material_range: ClassVar[MaterialRange] = MaterialRange("k", 0.0, 1.0)
 
     def _gain(self, dt: float, k: float) -> float:

@@ -11,10 +11,10 @@ import torch
 from gradscape.envs.functions import Branin
 from gradscape.envs.registry import make
 from gradscape.gallery.paper import read_paper
-from gradscape.jobs.league import LeagueJob, read_scene, simulated_scenes
+from gradscape.jobs.league import LeagueJob, simulated_scenes
 from gradscape.jobs.methods import divide_methods
 from gradscape.jobs.race import RaceJob
-from gradscape.jobs.scene import SceneSpec
+from gradscape.jobs.scene import SceneSpec, read_scene
 from gradscape.jobs.watch import Stopped, Watch
 from gradscape.landscapes.storage.records import read_json
 from gradscape.optim.claims import ClaimVerdict

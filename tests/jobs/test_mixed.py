@@ -50,7 +50,7 @@ class Trading(Environment):
     Fails in half of the box at dt of `stable` or more.
     """
 
-    name: ClassVar[str] = "trading"
+    name = "trading"
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=1 / 10, resolution=6),
         "standard": Fidelity("standard", dt=1 / 50, resolution=16),

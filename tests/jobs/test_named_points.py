@@ -7,9 +7,9 @@ import pytest
 import torch
 
 import gradscape as gs
+from gradscape.envs.adapters import from_torch
 from gradscape.jobs.cut import points_in
 from gradscape.jobs.scene import named_point
-from gradscape.landscapes.adapters import from_torch
 from gradscape.landscapes.space import ParameterSpace
 
 SPACE = ParameterSpace({"mass": (0.0, 4.0, "kg"), "speed": (-1.0, 1.0, "m/s")})
@@ -26,7 +26,8 @@ def table(path: Path, **more: list[float | None]) -> Path:
 @pytest.mark.parametrize("name", ["points.csv", "Points.CSV", "points.parquet"])
 def test_a_row_and_the_best_row_are_points(tmp_path: Path, name: str) -> None:
     path = table(tmp_path / name, loss=[3.0, None, 0.5, 2.0])
-    assert named_point(BOWL, f"{path}:2").tolist() == [2.0, 0.2]
+    row = 2 if path.suffix == ".parquet" else 3  # of the file: row 1 of a CSV file is its heading
+    assert named_point(BOWL, f"{path}:{row}").tolist() == [2.0, 0.2]
     assert named_point(BOWL, str(path)).tolist() == [3.0, 0.3]
 
 
@@ -43,9 +44,11 @@ def test_what_names_no_row_is_refused(tmp_path: Path) -> None:
     path = table(tmp_path / "points.csv")
     with pytest.raises(ValueError, match="4 rows and no column 'loss'; say which one"):
         named_point(BOWL, str(path))
-    for row in ("0", "5"):
-        with pytest.raises(ValueError, match=f"has 4 rows of points, counted from 1; got row {row}"):
+    for row in ("0", "1", "6"):
+        with pytest.raises(ValueError, match=rf"has points in its rows 2 to 5 \(1 is the heading\); got row {row}"):
             named_point(BOWL, f"{path}:{row}")
+    with pytest.raises(ValueError, match="has points in its rows 1 to 4; got row 5"):
+        named_point(BOWL, f"{table(tmp_path / 'points.parquet')}:5")
     with pytest.raises(ValueError, match=r"no row of .* has a loss"):
         named_point(BOWL, str(table(tmp_path / "lost.csv", loss=[None] * 4)))
     (tmp_path / "half.csv").write_text("mass\n1\n")
@@ -53,6 +56,17 @@ def test_what_names_no_row_is_refused(tmp_path: Path) -> None:
         named_point(BOWL, str(tmp_path / "half.csv"))
     with pytest.raises(ValueError, match="a table"):
         named_point(BOWL, str(tmp_path / "missing.csv"))
+
+
+def test_rows_are_counted_as_in_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "points.csv"
+    path.write_text("Mass;Speed;loss\nkg;m/s;\n\n1;0,5;9\nfailed;0,25;1\n2;0,125;8\n")
+    assert named_point(BOWL, f"{path}:4").tolist() == [1.0, 0.5]
+    assert named_point(BOWL, str(path)).tolist() == [2.0, 0.125]  # of the least loss among those that are points
+    with pytest.raises(ValueError, match=r"row 5 of .* has no number in column Mass"):
+        named_point(BOWL, f"{path}:5")
+    with pytest.raises(ValueError, match=r"rows 4 to 6 \(1 is the heading\); got row 2"):
+        named_point(BOWL, f"{path}:2")
 
 
 def test_a_line_joins_rows_of_a_table() -> None:

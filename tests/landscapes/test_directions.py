@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from gradscape.envs.adapters import from_torch
 from gradscape.jobs.cut import cut, points_in
-from gradscape.landscapes.adapters import from_torch
 from gradscape.landscapes.directions import (
     barrier,
     gradient_directions,

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gradscape import Environment, Evaluation, Fidelity, ParameterSpace, Plane, Status, from_numpy, from_torch, sample
-from gradscape.landscapes.adapters import within_box
+from gradscape.landscapes.objective import BoxedObjective, Objective
 from gradscape.optim.search import search
 
 INF, NAN = math.inf, math.nan
@@ -21,7 +21,7 @@ PLANE = Plane.through(SPACE, SPACE.center, [0, 1], resolution=3)
 
 
 @dataclass
-class Own:
+class Own(Objective):
     """Somebody's own objective, which answers as a test says."""
 
     answer: Callable[[Any], Any]
@@ -176,7 +176,7 @@ def test_arrays_of_every_kind_are_numbers(kind: str) -> None:
     flat = [ARRAYS[kind](x[:, :1])[i][0] for i in range(len(x))]
     given = [
         BOWL.evaluate(as_kind).loss - BOWL.evaluate(X).loss,
-        within_box(BOWL).evaluate(as_kind).loss - BOWL.evaluate(X).loss,
+        BoxedObjective(BOWL).evaluate(as_kind).loss - BOWL.evaluate(X).loss,
         Single().evaluate(as_kind).loss - Single().evaluate(X).loss,
         from_numpy(lambda _: (flat, as_kind), SPACE).evaluate(X).grad - X,
         Evaluation.from_results(flat, as_kind, [1] * 4).loss - X[:, 0],

@@ -5,20 +5,19 @@ import pytest
 import torch
 
 from gradscape import Evaluation, ParameterSpace, Plane, Status, from_numpy, sample
-from gradscape.landscapes.adapters import within_box
 from gradscape.landscapes.conformance.suite import check
 from gradscape.landscapes.measures.fidelity import measure
 from gradscape.landscapes.measures.gradient_quality import compare_differences, subgrid
 from gradscape.landscapes.measures.profile import measure_profile, named_measures
 from gradscape.landscapes.measures.sensitivity import Design, explore
-from gradscape.landscapes.objective import evaluate
+from gradscape.landscapes.objective import BoxedObjective, Objective, evaluate, failed, has_loss
 from gradscape.landscapes.storage.checkpoint import Checkpoint
 
 BOUNDS = torch.tensor([[-1.0, 0.1, -3.0], [2.0, 0.7, 3.0]], dtype=torch.float64)
 SPACE = ParameterSpace(("a", "b", "c"), *BOUNDS, ("", "m", "s"))
 
 
-class Strict:
+class Strict(Objective):
     """A bowl that refuses whatever lies beyond its bounds, by as little as one part in 10^12, as many functions do."""
 
     space, name = SPACE, "strict"
@@ -53,7 +52,7 @@ def test_points_beyond_have_left_the_domain_and_the_others_their_losses():
     assert bool(found.loss[3:].isnan().all() & found.grad[3:].isnan().all())
     assert evaluate(Strict(), x[3:], grad=False).status.tolist() == [Status.ESCAPED] * 2
     assert evaluate(Inviting(), x, grad=True).status.tolist() == [Status.OK] * 5
-    assert evaluate(within_box(Inviting()), x, grad=True).status.tolist() == found.status.tolist()
+    assert evaluate(BoxedObjective(Inviting()), x, grad=True).status.tolist() == found.status.tolist()
 
 
 def test_a_window_beyond_the_box_shows_what_lies_in_it():
@@ -133,3 +132,50 @@ def test_the_first_name_of_raw_results_still_works() -> None:
     torch.testing.assert_close(
         Evaluation.judged(loss, None).loss, Evaluation.from_results(loss, None).loss, equal_nan=True
     )
+
+
+def test_a_loss_without_a_gradient_is_kept():
+    nan, inf = float("nan"), float("inf")
+    loss = torch.tensor([1.0, 2.0, nan, 4.0, 5.0, inf], dtype=torch.float64)
+    grad = torch.tensor([[1.0, 1], [nan, 1], [1, 1], [1, 1], [1, -inf], [nan, 1]], dtype=torch.float64)
+    given = torch.tensor([Status.OK, Status.OK, Status.OK, Status.ERROR, Status.OK, Status.NO_GRADIENT])
+    found = Evaluation.from_results(loss, grad, given, "RuntimeError: too much work")
+    ended = [Status.OK, Status.NO_GRADIENT, Status.NONFINITE, Status.ERROR, Status.NO_GRADIENT, Status.NONFINITE]
+    assert found.status.tolist() == ended
+    assert found.loss.nan_to_num(-1).tolist() == [1, 2, -1, -1, 5, -1]
+    assert found.grad is not None
+    assert found.grad.isnan().all(dim=1).tolist() == [False, *[True] * 5]
+    assert found.has_loss.tolist() == [True, True, False, False, True, False]
+    assert found.has_gradient.tolist() == [True, *[False] * 5]
+    assert found.failed.tolist() == (~found.has_loss).tolist()
+    alone = Evaluation.from_results(loss, None, found.status)
+    assert alone.status.tolist()[:2] == [Status.OK] * 2
+    assert not alone.has_gradient.any()
+
+
+def test_statuses_are_told_apart_in_tensors_and_arrays_alike():
+    codes = np.array(list(Status), dtype=np.int8)
+    told = [Status.OK, Status.NO_GRADIENT], [Status.NONFINITE, Status.ESCAPED, Status.ERROR]
+    for ask, kinds in zip((has_loss, failed), told, strict=True):
+        assert ask(torch.from_numpy(codes)).tolist() == ask(codes).tolist() == [one in kinds for one in Status]
+        assert all(ask(kind) for kind in kinds)
+
+
+def test_the_message_of_the_first_point_that_raised_stays_with_its_points():
+    def part(status: Status, error: str) -> Evaluation:
+        loss = torch.zeros(2, dtype=torch.float64)
+        return Evaluation.from_results(loss, None, torch.tensor([Status.OK, status]), error)
+
+    parts = [part(Status.OK, ""), part(Status.ERROR, "first"), part(Status.ERROR, "second")]
+    whole = Evaluation.join(parts, dim=1, grad=False)
+    assert whole.error == "first"
+    assert whole.rows(slice(2, 4)).error == "first"
+    assert whole.rows(slice(0, 3)).error == ""
+
+    class Raises(Strict):
+        def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
+            loss = torch.zeros(len(x), dtype=torch.float64)
+            return Evaluation.from_results(loss, None, torch.full((len(x),), Status.ERROR), "RuntimeError: no")
+
+    inside = torch.stack([SPACE.center, SPACE.upper + 1.0])
+    assert evaluate(Raises(), inside, grad=False).error == "RuntimeError: no"

@@ -7,7 +7,7 @@ from matplotlib.colors import to_rgba
 
 from gradscape.landscapes.draw import style
 from gradscape.landscapes.draw.figures.overlay import joint_scale, overlay_figure
-from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.overlay import best_point, improvements, overlay, principal_plane
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
@@ -21,7 +21,7 @@ SPACE = ParameterSpace(
 CENTER, HALF = np.array([0.0, 1000, 0]), np.array([1.0, 1000, 10])
 
 
-class Bowl:
+class Bowl(Objective):
     """The squared distance from the middle of the scaled box, and a corner that is not finite."""
 
     space = SPACE

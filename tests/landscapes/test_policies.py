@@ -10,7 +10,7 @@ import torch
 import gradscape as gs
 from gradscape.jobs.scene import environment_of
 from gradscape.landscapes.capacity import TooLargeError
-from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.policies import REACH, PolicyObjective
 from gradscape.landscapes.sampling.memory import MemoryBound
 from gradscape.landscapes.space import ParameterSpace
@@ -20,7 +20,7 @@ from ..command import Said
 STEPS = 3
 
 
-class Cart:
+class Cart(Objective):
     """A place that each of three decisions moves by its own amount; the loss is the square of where it ends."""
 
     name, loss_unit, device, decisions, preferred_batch, threads = "cart", "m²", "cpu", STEPS, 8, 1

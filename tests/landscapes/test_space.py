@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gradscape.landscapes.plane import Plane
-from gradscape.landscapes.space import ParameterSpace
+from gradscape.landscapes.space import ParameterSpace, log
 
 SPACE = ParameterSpace(
     ("speed", "angle"), torch.tensor([-2.0, 0.0]).double(), torch.tensor([4.0, 0.5]).double(), ("m/s", "")
@@ -91,3 +91,79 @@ def test_planes_go_through_lists_and_arrays_too():
         plane = Plane.through(SPACE, point, ["angle"], resolution=3)
         assert plane.lift(torch.tensor([[0.5]]).double()).tolist() == [[1.0, 0.5]]
     assert Plane.span([0, 0], [[1, 0], [0, 2]], resolution=3).basis.tolist() == [[1, 0], [0, 2]]
+
+
+DECADES = ParameterSpace({"k": log(1e-2, 1e6, "N/m"), "c": (0, 5)})
+
+
+def test_a_logarithmic_parameter_is_bounded_by_its_logarithm_and_labelled_by_its_value():
+    assert (DECADES.scales, DECADES.units) == (("log10", "linear"), ("N/m", ""))
+    assert DECADES.lower.tolist() == [-2, 0]
+    assert DECADES.upper.tolist() == [6, 5]
+    assert DECADES.to_values(DECADES.center).tolist() == [100, 2.5]
+    assert DECADES.labels == ("k [N/m]", "c")
+    assert DECADES.scaled_labels == ("log10 k [N/m]", "c")
+    listed = ParameterSpace(["k", "c"], [1e-2, 0], [1e6, 5], ["N/m", ""], ["log10", "linear"])
+    assert torch.equal(listed.lower, DECADES.lower)
+    assert listed.scales == DECADES.scales
+
+
+@FEW
+@given(st.lists(st.tuples(st.floats(-2, 6), st.floats(0, 5)), min_size=1, max_size=7))
+def test_points_and_values_turn_into_each_other_and_no_row_depends_on_the_others(rows):
+    x = torch.tensor(rows, dtype=torch.float64)
+    values = DECADES.to_values(x)
+    torch.testing.assert_close(DECADES.from_values(values), x, rtol=0, atol=1e-14)
+    assert torch.equal(values[:, 1], x[:, 1])
+    assert torch.equal(torch.stack([DECADES.to_values(row) for row in x]), values)
+
+
+@FEW
+@given(st.integers(1, 10**9), st.integers(-30, 20))
+def test_a_bound_comes_back_as_it_was_given(digits, exponent):
+    bound = float(f"{digits}e{exponent}")
+    space = ParameterSpace({"k": log(bound / 1024, bound)})
+    assert float(space.to_values(space.upper)) == bound
+
+
+def test_the_chain_rule_gives_what_differences_along_the_scale_do():
+    x, step = torch.tensor([[1.5, 2.0], [-2.0, 0.5]], dtype=torch.float64), 1e-6
+
+    def loss(x):
+        k, c = DECADES.to_values(x).unbind(-1)
+        return (k + 1).sqrt() * c
+
+    k, c = DECADES.to_values(x).unbind(-1)
+    grad = DECADES.chain(torch.stack([k, c], -1), torch.stack([c / (k + 1).sqrt() / 2, (k + 1).sqrt()], -1))
+    steps = step * torch.eye(2, dtype=torch.float64)
+    differences = torch.stack([(loss(x + one) - loss(x - one)) / (2 * step) for one in steps], -1)
+    torch.testing.assert_close(grad, differences, rtol=1e-8, atol=1e-8)
+
+
+def test_points_of_a_logarithmic_parameter_are_spread_evenly_over_its_decades():
+    values = DECADES.to_values(DECADES.sobol(1024, seed=0))[:, 0]
+    counts = torch.histc(values.log10(), bins=8, min=-2, max=6)
+    torch.testing.assert_close(counts, torch.full((8,), 128.0).double(), rtol=0, atol=2)
+
+
+def test_a_linear_space_costs_nothing():
+    x = SPACE.center
+    assert SPACE.is_linear
+    assert all(found is x for found in (SPACE.to_values(x), SPACE.from_values(x), SPACE.chain(SPACE.upper, x)))
+
+
+@pytest.mark.parametrize("ends", [(0, 1), (-1, 1), (2, 1), (1, 1), (1, float("inf")), (float("nan"), 1)])
+def test_a_logarithmic_parameter_is_refused_without_positive_ascending_bounds(ends):
+    with pytest.raises(ValueError, match="0 < lower < upper; got"):
+        log(*ends)
+
+
+def test_a_scale_that_does_not_fit_is_refused_with_the_parameter():
+    with pytest.raises(ValueError, match="lower > 0 for k, whose scale is log10; got 0 to 1"):
+        ParameterSpace(["k"], [0], [1], scales=["log10"])
+    with pytest.raises(ValueError, match="scales linear and log10; got 'log' for k"):
+        ParameterSpace(["k"], [1], [2], scales=["log"])
+    with pytest.raises(ValueError, match="scales must have as many"):
+        ParameterSpace(["k"], [1], [2], scales=[])
+    with pytest.raises(ValueError, match="k is on a logarithmic scale and takes positive values; got -3"):
+        DECADES.from_values(torch.tensor([[1.0, -3.0], [-3.0, 1.0]]))

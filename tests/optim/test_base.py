@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind, NoOptions, Optimizer, Points, Proposal
 
@@ -26,7 +26,7 @@ class Recorder(Optimizer):
         self.z, self.loss, self.grad = z, loss, grad
 
 
-class Bowl:
+class Bowl(Objective):
     space = SPACE
 
     def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:

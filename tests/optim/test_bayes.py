@@ -3,9 +3,9 @@ import pytest
 import torch
 from botorch.acquisition.analytic import UpperConfidenceBound
 
+from gradscape.envs.adapters import from_torch
 from gradscape.envs.registry import make
-from gradscape.landscapes.adapters import from_torch
-from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
 from gradscape.optim.methods.bayes import BO, BODescents, BODescentsOptions
@@ -18,7 +18,7 @@ SPACE = ParameterSpace.box(("x", "y"), -2.0, 4.0, "m")
 BOWL = from_torch(lambda x: ((x - 1.5) ** 2).sum(dim=1) + (3 * x).cos().prod(dim=1), SPACE)
 
 
-class Hole:
+class Hole(Objective):
     """A bowl that fails over a third of the box."""
 
     space = SPACE

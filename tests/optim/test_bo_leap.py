@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from gradscape.envs.adapters import from_torch
 from gradscape.envs.registry import make
-from gradscape.landscapes.adapters import from_torch
-from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
 from gradscape.optim.methods.bo_leap import BOLeap, BOLeapOptions, SemiLocal
@@ -116,7 +116,7 @@ def test_a_new_proposal_is_made_once_the_local_budget_is_spent(monkeypatch):
 
 
 def test_the_process_sees_population_and_descents_failures_and_all():
-    class Hole:
+    class Hole(Objective):
         space = SPACE
 
         def evaluate(self, x, *, grad=True):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.stats import special_ortho_group
 
-from gradscape.landscapes.adapters import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind, Points
@@ -111,7 +111,7 @@ def test_a_flat_landscape_is_searched_all_over() -> None:
 
 
 def test_failed_episodes_push_the_search_away() -> None:
-    class Cliff:
+    class Cliff(Objective):
         space, name = BOX, "cliff"
 
         def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:

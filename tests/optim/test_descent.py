@@ -2,11 +2,12 @@ import numpy as np
 import pytest
 import torch
 
-from gradscape.landscapes.adapters import from_torch
-from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.envs.adapters import from_torch
+from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
 from gradscape.optim.methods.descent import Descent, DescentOptions, Descents, DescentsOptions
+from gradscape.optim.methods.quasi_newton import LocalSearch
 from gradscape.optim.search import search
 
 from .states import restored
@@ -110,8 +111,54 @@ def test_descents_go_on_bit_for_bit_from_its_state():
         other = restored(other, BOWL)
 
 
+class HalfBlind:
+    """A bowl that has no gradient in half of the box, nor at its minimum."""
+
+    name = "half blind"
+    space = ParameterSpace.box(("a", "b"), -1.0, 1.0)
+
+    def evaluate(self, x, *, grad=True):
+        missing = (x[:, :1] < 0) | (x == 0).all(dim=1, keepdim=True)
+        return Evaluation.from_results(x.square().sum(dim=1) / 2, x.masked_fill(missing, torch.nan) if grad else None)
+
+
+@pytest.mark.parametrize(
+    "method",
+    ["adam", "descents", "l-bfgs-b", "basin-hopping", "cma-es-gradient", "bo-descents", "bo-gradient", "bo-leap"],
+)
+def test_every_method_takes_losses_without_gradients_and_asks_for_no_nan(method):
+    store = search(HalfBlind(), method, budget=60, gradient_cost=2.0)
+    table = store.dataset()
+    lacking = (table["status"] == Status.NO_GRADIENT).to_numpy()
+    assert lacking.any()
+    assert (table["status"] == Status.OK).any()
+    assert np.isfinite(table["x"]).all()
+    assert np.isfinite(table["loss"]).all()
+    assert store.failed == 0
+    assert store.best_loss == float(table["loss"].min())
+
+
+def test_a_descent_ends_at_a_minimum_that_has_no_gradient_and_keeps_its_loss():
+    options = DescentsOptions(step=1.0, max_step=10.0)
+    run = search(HalfBlind(), Descents(HalfBlind.space, seed=0, options=options), budget=40, gradient_cost=2.0).read()
+    assert run.best.loss == 0.0
+    assert int(run.data["status"][run.best.episode - 1]) == Status.NO_GRADIENT
+    started = Descent(np.array([0.5, 0.5]), options)
+    started.tell(0.25, np.array([np.nan, np.nan]))
+    assert (started.done, started.best) == (True, 0.25)
+    np.testing.assert_array_equal(started.at, [0.5, 0.5])
+
+
+def test_a_local_search_ends_where_there_is_no_gradient_at_its_best_point():
+    local = LocalSearch(np.array([0.5, 0.5]), 100)
+    local.tell(0.25, np.array([0.5, 0.5]))
+    local.tell(7.0, np.array([np.nan, np.nan]))
+    assert (local.done, local.failed, local.best_loss) == (True, True, 0.25)
+    np.testing.assert_array_equal(local.best, [0.5, 0.5])
+
+
 def test_descents_go_on_past_failures():
-    class Cliff:
+    class Cliff(Objective):
         space = SPACE
 
         def evaluate(self, x, *, grad=True):

@@ -8,7 +8,7 @@ import torch
 
 pytest.importorskip("stable_baselines3", reason="the extra rl is not installed")
 
-from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
 from gradscape.optim.methods.policy import PPO, SAC, PPOOptions, SACOptions
@@ -18,7 +18,7 @@ from gradscape.optim.search import search
 from .states import restored
 
 
-class Bowl:
+class Bowl(Objective):
     """A bandit: one decision of two controls, best at (0.8, -1)."""
 
     space = ParameterSpace.box(("x", "y"), -2.0, 2.0)
@@ -27,7 +27,7 @@ class Bowl:
         return Evaluation.from_results((x - torch.tensor([0.8, -1.0])).square().sum(dim=1), None)
 
 
-class Coin:
+class Coin(Objective):
     """Four decisions: the first tosses a coin, whose side the others must match; only a look shows it."""
 
     space = ParameterSpace.box([f"u{k}" for k in range(4)], -3.0, 3.0)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.race import Competitor, race
 from gradscape.optim.registry import optimizer_class
@@ -14,7 +14,7 @@ from gradscape.optim.runs.store import RunStore
 from gradscape.optim.search import search
 
 
-class Bowl:
+class Bowl(Objective):
     """A bowl that fails in a corner, counts its episodes, and can be interrupted after some."""
 
     space = ParameterSpace.box(("x", "y"), -2.0, 2.0, "m")

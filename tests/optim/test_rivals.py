@@ -11,7 +11,7 @@ from botorch.optim.closures import get_loss_closure_with_grads
 from gpytorch.mlls import ExactMarginalLogLikelihood
 from scipy.optimize import Bounds, basinhopping, minimize
 
-from gradscape.landscapes.adapters import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
 from gradscape.optim.methods.adam import Adam, AdamOptions
@@ -23,6 +23,7 @@ from gradscape.optim.methods.cmaes_gradient import CMAESGradient
 from gradscape.optim.methods.fit import closure_of
 from gradscape.optim.methods.process import Process, covariance_of
 from gradscape.optim.methods.quasi_newton import LBFGSB, THREAD, BasinHopping, LocalSearch
+from gradscape.optim.methods.sloped import Sloped
 from gradscape.optim.methods.surrogate import Surrogate, SurrogateOptions
 from gradscape.optim.methods.turbo import TuRBO, TuRBOOptions, region
 from gradscape.optim.runs.store import RunStore
@@ -256,6 +257,31 @@ def test_the_process_of_losses_and_slopes_is_that_of_the_closed_form():
         step = 1e-5 * torch.eye(2, dtype=torch.float64)
         differences = [(bound(points + one) - bound(points - one)) / 2e-5 for one in step]
         np.testing.assert_allclose(slope, torch.stack(differences, dim=1), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("first", [7, 4])
+def test_a_process_given_some_slopes_is_that_of_its_known_rows_alone(first):
+    random = np.random.default_rng(1)
+    u, loss, grad = random.uniform(size=(7, 2)), random.normal(size=7), random.normal(size=(7, 2))
+    grad[[1, 5]] = np.nan
+    lacking = np.isnan(grad).any(axis=1)
+    known = np.repeat(~lacking[:, None], 3, axis=1)
+    known[:, 0] = True
+    rows = standardised(loss, grad)
+    assert np.isfinite(rows).all()
+    covariance, noise, new = Sloped(torch.tensor([0.4, 0.7]).double()), 1e-3, random.uniform(size=(5, 2))
+    kept, points = known.ravel(), torch.from_numpy(u)
+    within = covariance.dense(points, points).numpy()[kept][:, kept] + noise * np.eye(kept.sum())
+    cross = covariance.across(torch.from_numpy(new), points)[0].numpy()[:, kept]
+    mean = cross @ np.linalg.solve(within, rows.ravel()[kept])
+    deviation = np.sqrt(1.0 - np.einsum("ij,ji->i", cross, np.linalg.solve(within, cross.T)))
+    flagged = torch.from_numpy(np.column_stack([u, lacking]))
+    bound = LowerBound(Process(covariance, noise, flagged, torch.from_numpy(rows.ravel()), first), 2.0)
+    value, slope = bound.with_slope(torch.from_numpy(new))
+    np.testing.assert_allclose(value, mean - 2.0 * deviation, rtol=1e-8)
+    step = 1e-5 * torch.eye(2, dtype=torch.float64)
+    differences = [(bound(torch.from_numpy(new) + one) - bound(torch.from_numpy(new) - one)) / 2e-5 for one in step]
+    np.testing.assert_allclose(slope, torch.stack(differences, dim=1), rtol=1e-5, atol=1e-6)
 
 
 def test_the_covariance_of_slopes_and_the_likelihood_are_those_of_gpytorch():

@@ -44,6 +44,23 @@ def points(count: int, *, grad: bool = True, start: int = 0) -> tuple[torch.Tens
     )
 
 
+def test_a_run_keeps_what_the_first_episode_that_raised_said(tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run.zarr")
+    run.append(*points(2), Kind.RANDOM, 0.0)
+    assert (run.error, run.read().errors) == ("", "")
+    for said in ("RuntimeError: too much work", "another"):
+        x, loss = torch.zeros(2, 2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
+        raised = Evaluation.from_results(loss, None, torch.tensor([Status.OK, Status.ERROR]), said)
+        run.append(x, raised, Kind.RANDOM, 0.0)
+    run.save(lambda: {})
+    again = RunStore.open(tmp_path / "run.zarr")
+    assert again.failed == 2
+    said = "2 points raised: first 'RuntimeError: too much work'"
+    assert again.read().errors == said
+    assert said in repr(again.read())
+    assert xr.open_zarr(tmp_path / "run.zarr").attrs["error"] == "RuntimeError: too much work"
+
+
 def test_a_run_reads_back_as_it_was_written(tmp_path: Path) -> None:
     run = run_at(tmp_path / "run.zarr")
     run.set_gradient_cost(2.5)

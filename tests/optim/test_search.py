@@ -7,9 +7,9 @@ import pytest
 import torch
 import xarray as xr
 
-from gradscape.landscapes.adapters import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.cost import LONG, MOMENT, episode_cost
-from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind, NoOptions, Optimizer, Points, Proposal
 from gradscape.optim.methods.cmaes import CMAES
@@ -23,7 +23,7 @@ from ..processes import Instant, alone
 SPACE = ParameterSpace(("a", "b", "c"), torch.tensor([-2.0, 0, 5]), torch.tensor([2.0, 9, 6]), ("m", "s", ""))
 
 
-class Pit:
+class Pit(Objective):
     """A bowl with a strip at its bottom where episodes fail; it counts what it is asked."""
 
     space, name = SPACE, "pit"

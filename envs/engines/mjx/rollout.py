@@ -16,8 +16,8 @@ from mujoco import mjx
 from numpy.typing import NDArray
 from platformdirs import user_cache_dir
 
+from ..jax_functions import JaxFunction as JaxFunction
 from ..jax_functions import compiled, computing_in
-from ..jax_functions import from_jax as from_jax
 
 if jax.config.values.get("jax_compilation_cache_dir") is None:  # a scene takes long to compile
     jax.config.update("jax_compilation_cache_dir", user_cache_dir("gradscape") + "/jax")

@@ -2,4 +2,10 @@
 
 from ..engine import Engine
 
-ENGINE = Engine("taichi", {"mpm": "taichi.mpm", "springs": "taichi.springs"}, deterministic=False, concurrent=False)
+ENGINE = Engine(
+    "taichi",
+    {"mpm": "taichi.mpm", "springs": "taichi.springs"},
+    deterministic=False,
+    concurrent=False,
+    newest_python=(3, 12),
+)

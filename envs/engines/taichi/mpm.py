@@ -26,6 +26,7 @@ import numpy as np
 import torch
 
 from ....landscapes.threads import one_torch_thread
+from ...batching import copied
 from ..mpm.model import EMPTY, Model
 from ..mpm.smoothing import smooth_volume_ratios
 from ..runtime import precision
@@ -115,7 +116,7 @@ class Solver:
 
     def read_trajectory(self, environment: int) -> torch.Tensor:
         """Return x [m] of one environment of the last run at the ends of control steps, (step + 1, particle, 3)."""
-        return self.checkpoints.x[:, environment].double().cpu()
+        return copied(self.checkpoints.x[:, environment])
 
     def read_escaped(self, batch: int) -> torch.Tensor:
         """Say for each environment whether a particle has left the grid, shape (batch,)."""

@@ -35,7 +35,7 @@ function apart(ticks, where, room) {
 function ticksOf(axis, begin) {
   if (view.zoom === 1) return axis.ticks;
   const [low, high] = [begin, begin + 1 / view.zoom].map((place) => valueAt(place, axis));
-  return roundValues(Math.min(low, high), Math.max(low, high), 5);
+  return roundPlaces(axis, Math.min(low, high), Math.max(low, high));
 }
 
 function drawAxes() {
@@ -45,13 +45,13 @@ function drawAxes() {
   pen.lineWidth = 1;
   pen.strokeRect(PAD.left, PAD.top, box.width, box.height);
   pen.font = "12px system-ui, sans-serif";
-  for (const value of apart(ticksOf(across, view.right), x, (one) => pen.measureText(number(one)).width + 10)) {
+  for (const value of apart(ticksOf(across, view.right), x, (one) => pen.measureText(valueSaid(across, one)).width + 10)) {
     tick(x(value), bottom, x(value), bottom + 4);
-    write(number(value), x(value), bottom + 17, "center");
+    write(valueSaid(across, value), x(value), bottom + 17, "center");
   }
   for (const value of apart(up ? ticksOf(up, view.up) : scale.ticks, y, () => 15)) {
     tick(PAD.left - 4, y(value), PAD.left, y(value));
-    write(number(value), PAD.left - 7, y(value) + 4, "right");
+    write(up ? valueSaid(up, value) : number(value), PAD.left - 7, y(value) + 4, "right");
   }
   pen.font = "13px system-ui, sans-serif";
   write(across.label, PAD.left + box.width / 2, bottom + 37, "center");

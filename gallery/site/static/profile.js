@@ -51,7 +51,7 @@ function sayProfile() {
   const known = along.filter((loss) => loss === loss);
   const failed = along.length - known.length;
   const range = known.length ? `${number(Math.min(...known))} to ${number(Math.max(...known))}${SLICE.unit ? " " + SLICE.unit : ""}` : "none";
-  const place = (index) => `${number(across.values[at(index)[0]])}, ${number(up.values[at(index)[1]])}`;
+  const place = (index) => `${valueSaid(across, across.values[at(index)[0]])}, ${valueSaid(up, up.values[at(index)[1]])}`;
   const text = `Line from ${place(profile[0])} to ${place(profile[1])}: ${along.length} nodes, losses ${range}${failed ? `, ${failed} without` : ""}.`;
   document.getElementById("profile-said").textContent = text;
   chart.setAttribute("aria-label", "Loss along the line drawn over the map. " + text);
@@ -85,16 +85,16 @@ function drawLineAxes(brush, width, height) {
   moves.forEach(([axis, begin, end], place) => {
     const [side, down] = place ? [EDGE.top, -1] : [height - EDGE.bottom, 1];
     let last = -Infinity;
-    for (const value of roundValues(Math.min(begin, end), Math.max(begin, end), 5).sort((one, other) => (one - other) * Math.sign(end - begin))) {
+    for (const value of roundPlaces(axis, Math.min(begin, end), Math.max(begin, end)).sort((one, other) => (one - other) * Math.sign(end - begin))) {
       const right = EDGE.left + ((value - begin) / (end - begin)) * long;
-      const wide = brush.measureText(number(value)).width / 2 + 5;
+      const wide = brush.measureText(valueSaid(axis, value)).width / 2 + 5;
       if (right - wide < last) continue;
       last = right + wide;
       brush.beginPath();
       brush.moveTo(right, side);
       brush.lineTo(right, side + 4 * down);
       brush.stroke();
-      brush.fillText(number(value), right, side + (down > 0 ? 17 : -7));
+      brush.fillText(valueSaid(axis, value), right, side + (down > 0 ? 17 : -7));
     }
     brush.fillText(axis.label, EDGE.left + long / 2, side + (down > 0 ? 36 : -21));
   });
@@ -181,8 +181,9 @@ document.getElementById("profile-up").addEventListener("click", () => {
 document.getElementById("profile-drop").addEventListener("click", dropProfile);
 
 function profileTable() {
-  const quoted = (text) => `"${text.replaceAll('"', '""')}"`;
+  const plain = (text) => (/^[=+\-@\t\r\n]/.test(text) ? "'" : "") + text; // no formula to a spreadsheet
+  const quoted = (text) => `"${plain(text).replaceAll('"', '""')}"`;
   const head = [across.label, up.label, lossLabel, "status"].map(quoted).join(",");
-  const row = (index) => [across.values[at(index)[0]], up.values[at(index)[1]], losses[index] === losses[index] ? losses[index] : "", statusOf(index)].join(",");
+  const row = (index) => [valueOf(across, across.values[at(index)[0]]), valueOf(up, up.values[at(index)[1]]), losses[index] === losses[index] ? losses[index] : "", statusOf(index)].join(",");
   return [head, ...nodesAlong(profile).map(row), ""].join("\n");
 }

@@ -48,6 +48,19 @@ function roundValues(low, high, count) {
   return found;
 }
 
+// Coordinates along a logarithmic axis are decimal logarithms of the values that are read.
+const valueOf = (axis, place) => (axis.logarithmic ? 10 ** place : place);
+const valueSaid = (axis, place) => number(valueOf(axis, place));
+
+// Where about five round values of an axis are between two coordinates: at decades, where it has two.
+function roundPlaces(axis, low, high) {
+  if (!axis.logarithmic) return roundValues(low, high, 5);
+  const step = Math.max(1, Math.ceil((high - low) / 6));
+  const found = [];
+  for (let k = step * Math.ceil(low / step - 1e-9); k <= high + 1e-9; k += step) found.push(k);
+  return found.length > 1 ? found : roundValues(10 ** low, 10 ** high, 5).map(Math.log10);
+}
+
 // Colours of the style sheet, read once for each colour scheme.
 const dark = matchMedia("(prefers-color-scheme: dark)");
 let inks = {};

@@ -127,7 +127,7 @@ function beside(brush, axis, put, under) {
   brush.textAlign = "center";
   for (const value of [axis.ticks[0], axis.ticks[axis.ticks.length - 1]]) {
     const [right, down] = flat(edge(side, along(value, axis), 0.07));
-    brush.fillText(number(value), right, down + 4);
+    brush.fillText(valueSaid(axis, value), right, down + 4);
   }
   brush.font = "13px system-ui, sans-serif";
   const [[right, down], wide, long] = [flat(edge(side, 0.5, 0.09)), stage.clientWidth, brush.measureText(axis.label).width];

@@ -16,7 +16,7 @@ function episodeAt(index) {
 function tell() {
   const [column, row] = at(node);
   const lines = [across, up].filter(Boolean).map((axis, rank) => {
-    return axis.label + ": " + number(axis.values[rank ? row : column]);
+    return axis.label + ": " + valueSaid(axis, axis.values[rank ? row : column]);
   });
   lines.push("Loss: " + lossSaid(losses[node], statusOf(node)));
   if (slopes && slopes[0][node] === slopes[0][node]) {

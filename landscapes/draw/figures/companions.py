@@ -57,7 +57,7 @@ def companions_figure(cuts: Sequence[Cut], dataset: xr.Dataset, *, width: float 
     y = plane.labels[1] if plane.rank == 2 else page.loss_name(dataset)
     for ax, cut in zip(axes, cuts, strict=True):
         _draw(ax, cut, dataset, scale)
-        panel.dress(ax)
+        panel.dress(ax, plane)
         if plane.rank == 1 and scale.logarithmic:
             panel.log_axis(ax.yaxis)
         panel.caption(ax, cut.title())

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...identity import plane_of
 from ...measures.ruggedness import box_slopes
-from ...objective import Status
+from ...objective import has_loss
 from .. import style
 from . import contour, page, panel
 
@@ -133,7 +133,7 @@ def _draw_lines(found: SliceComparison, width: float | None) -> tuple[page.Pictu
         _curves(axes[2], found, [box_slopes(one)[:, 0] for one in found.data])
         panel.name_axes(axes[2], y=f"slope [{found.loss_unit or 'loss'} per side]")
     for ax in axes:
-        panel.dress(ax)
+        panel.dress(ax, plane)
         ax.set_box_aspect(height / (sheet.width - ROOM * sheet.type))
         ax.set_xlim(float(plane.lower[0]), float(plane.upper[0]))
     for ax in axes[1:]:
@@ -152,9 +152,9 @@ def _curves(ax: Axes, found: SliceComparison, values: list[Any]) -> list[Artist]
 
 
 def _where_either_failed(found: SliceComparison) -> xr.Dataset:
-    """Return slice A with the status of B where A is well: what is hatched in a map of both."""
+    """Return slice A with the status of B where A has a loss: what is hatched in a map of both."""
     ours, theirs = (one["status"] for one in found.data)
-    return found.data[0].assign(status=ours.copy(data=np.where(ours == Status.OK, theirs, ours)))
+    return found.data[0].assign(status=ours.copy(data=np.where(has_loss(ours), theirs, ours)))
 
 
 def _failures(both: xr.Dataset) -> list[Patch]:

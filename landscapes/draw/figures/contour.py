@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from matplotlib.path import Path
 from numpy.typing import NDArray
 
 from ...identity import gradient_stride, plane_of, stored_identity
+from ...large import in_unit
 from ...lattice import own_cells, with_gradients
 from ...objective import Status
 from ...plane import Plane
@@ -34,8 +35,9 @@ def landscape_figure(dataset: xr.Dataset, *, width: float | None = None) -> page
     Each cell is one sample, or for a coarse or a refined slice the part of the box nearest to it; nothing is
     interpolated. All
     arrows are equally long and point down the steepest slope of the picture as it is seen, its axes scaled to the same
-    length; their colour is the magnitude of the gradient along the plane. Failures are hatched and counted. `width` is
-    that of a page for print [mm]; as for every picture, without it the picture is as large as suits a screen.
+    length; their colour is the magnitude of the gradient along the plane. Failures are hatched and counted, and
+    among the arrows samples with a loss and no gradient are dotted. `width` is that of a page for print [mm]; as for
+    every picture, without it the picture is as large as suits a screen.
 
     Raises ValueError where the slice is a line, or the page too narrow or too wide.
     """
@@ -46,7 +48,7 @@ def landscape_figure(dataset: xr.Dataset, *, width: float | None = None) -> page
     sheet = style.Sheet.of(width, pitch=PITCH, panels=panels)
     picture = page.Picture(sheet, panels / sheet.columns * sheet.pitch)
     axes = panel.grid(picture, panels, share=True)
-    entries = loss_panel(axes[0], dataset)
+    entries = loss_panel(axes[0], in_unit(dataset))
     entries += arrow_panel(axes[1], dataset) if panels == 2 else []
     for ax in axes:
         frame(ax, dataset, plane)
@@ -58,17 +60,20 @@ def landscape_figure(dataset: xr.Dataset, *, width: float | None = None) -> page
 
 def frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
     """Give a panel over a slice its limits, its ticks and its failures."""
-    panel.dress(ax)
+    panel.dress(ax, plane)
     ax.set_box_aspect(1)
     ax.set_xlim(*_limits(plane, 0))
     ax.set_ylim(*_limits(plane, 1))
     panel.name_axes(ax, y=plane.labels[1])
-    status = own_cells(dataset)["status"].to_numpy()
-    edges = cell_edges(dataset)
     for kind, look in style.STATUS_LOOKS.items():
-        if (where := status == kind).any():
-            patch = PathPatch(_cells(*edges, where), **look, zorder=1.5, antialiased=False, gid=kind.name)
-            ax.add_patch(patch)
+        _shade(ax, dataset, kind, look)
+
+
+def _shade(ax: Axes, dataset: xr.Dataset, kind: Status, look: dict[str, Any]) -> None:
+    """Shade the cells of the samples that ended in one way."""
+    if (where := own_cells(dataset)["status"].to_numpy() == kind).any():
+        patch = PathPatch(_cells(*cell_edges(dataset), where), **look, zorder=1.5, antialiased=False, gid=kind.name)
+        ax.add_patch(patch)
 
 
 def _cells(u: Grid, v: Grid, where: NDArray[np.bool_]) -> Path:
@@ -136,12 +141,15 @@ def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None)
     )  # fmt: skip
     bar = panel.colour_bar(ax, quiver, label, scale)
     bar.ax.set_visible(bool(seen.any()))  # hidden rather than left out, so that both panels keep their width
+    entries: list[Artist] = [*page.gradient_key(dataset)]
+    if entries:
+        _shade(ax, dataset, Status.NO_GRADIENT, style.NO_GRADIENT_LOOK)
     if not flat.any():
-        return []
+        return entries
     look = page.sheet_of(ax).look(style.FLAT_MARK)
     ax.plot(u[flat[at]], v[flat[at]], **look, zorder=2.5)
     asked = page.evaluated(with_gradients(dataset))
-    return [Line2D([], [], **look, label=f"gradient exactly zero: {int(flat.sum())} of {asked}")]
+    return [*entries, Line2D([], [], **look, label=f"gradient exactly zero: {int(flat.sum())} of {asked}")]
 
 
 def log_magnitude(dataset: xr.Dataset) -> Grid:
@@ -155,9 +163,10 @@ def log_magnitude(dataset: xr.Dataset) -> Grid:
 
 def descent(slope: Grid, plane: Plane) -> Grid:
     """Return the direction of steepest descent as unit vectors in fractions of the picture's sides; NaN where flat."""
-    scaled = slope * _sides(plane)
+    scaled = slope
     with np.errstate(divide="ignore", invalid="ignore"):
-        scaled = scaled / np.abs(scaled).max(axis=-1, keepdims=True)  # no overflow, no underflow
+        for sides in (_sides(plane), 1.0):  # before they count and after: no overflow, no underflow
+            scaled = scaled / np.abs(scaled).max(axis=-1, keepdims=True) * sides
         direction: Grid = -scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)
     return direction
 
@@ -168,14 +177,24 @@ def magnitude(slope: Grid, plane: Plane, loss_unit: str) -> tuple[Grid, str]:
     Where both axes have the same unit it is the gradient's projection on the plane. Otherwise lengths along them cannot
     be added, and it is taken per width of the box instead.
     """
-    if len(set(plane.units)) == 1:
-        along: Grid = slope @ torch.linalg.pinv(plane.basis).T.numpy()
-        unit = plane.units[0]
+    if len(set(plane.coordinate_units)) == 1:
+        with np.errstate(over="ignore", invalid="ignore"):
+            along: Grid = slope @ torch.linalg.pinv(plane.basis).T.numpy()
+        unit = plane.coordinate_units[0]
         unit = f"{loss_unit or '1'}/({unit})" if "/" in unit else f"{loss_unit or '1'}/{unit}" if unit else loss_unit
     else:
         along = slope * (plane.upper - plane.lower).numpy()
         unit = f"{loss_unit or 'loss'} per width of the box"
-    return np.linalg.norm(along, axis=-1), f"log₁₀ |gradient| [{unit}]" if unit else "log₁₀ |gradient|"
+    return _lengths(along), f"log₁₀ |gradient| [{unit}]" if unit else "log₁₀ |gradient|"
+
+
+def _lengths(vectors: Grid) -> Grid:
+    """Return the lengths of vectors along the last axis, also where their squares are too large or too small."""
+    most = np.abs(vectors).max(axis=-1, keepdims=True)
+    with np.errstate(over="ignore", invalid="ignore"):
+        plain: Grid = np.linalg.norm(vectors, axis=-1)
+        safe: Grid = most[..., 0] * np.linalg.norm(vectors / np.where(most > 0, most, 1.0), axis=-1)
+    return np.where(np.isinf(plain) | (plain == 0), safe, plain)
 
 
 def _limits(plane: Plane, axis: int) -> tuple[float, float]:

@@ -8,7 +8,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from ...objective import Status
+from ...objective import failed
 from .. import style
 from . import page, panel
 
@@ -83,10 +83,10 @@ def _draw_best(ax: Axes, table: xr.Dataset, best: NDArray[np.float64]) -> Artist
 
 def _draw_failures(ax: Axes, table: xr.Dataset) -> list[Artist]:
     status, episodes = table["status"].to_numpy(), table["episodes"].to_numpy()
-    failed = status != Status.OK
-    if not failed.any():
+    lost = failed(status)
+    if not lost.any():
         return []
-    label = f"failed: {int(failed.sum())} of {len(failed)}"
+    label = f"failed: {int(lost.sum())} of {len(lost)}"
     look = page.sheet_of(ax).look({"color": style.QUIET, "marker": "|", "markersize": 7, "linestyle": "none"})
-    at = np.full(failed.sum(), 0.02)
-    return list(ax.plot(episodes[failed], at, transform=ax.get_xaxis_transform(), label=label, gid="failed", **look))
+    at = np.full(lost.sum(), 0.02)
+    return list(ax.plot(episodes[lost], at, transform=ax.get_xaxis_transform(), label=label, gid="failed", **look))

@@ -16,6 +16,7 @@ from matplotlib.ticker import FixedLocator
 from numpy.typing import NDArray
 
 from ...measures.stability import ACCURATE, INACCURATE, REFUSED, UNJUDGED, Cell
+from ...objective import Status
 from .. import style
 from . import page, panel
 
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 PITCH, LEAST = 4.0, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
 LOWEST, HIGHEST = 1e-4, 1e4  # of the error axis [% of the spread]; what is beyond stands on the edge
 NAMES = {ACCURATE: "accurate", INACCURATE: "finite, but wrong", UNJUDGED: "finite, not judged", REFUSED: "refused"}
-NAMES |= {kind.name: name for kind, name in style.FAILURES.items()}
+NAMES |= {kind.name: name for kind, name in style.FAILURES.items()} | {Status.NO_GRADIENT.name: style.NO_GRADIENT}
 ROOM = 1.35  # what the axis of factors reaches beyond the outermost marks, as a ratio
 
 Grid = NDArray[np.float64]

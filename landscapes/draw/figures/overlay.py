@@ -16,7 +16,7 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from ...identity import plane_of
-from ...objective import Status
+from ...objective import failed
 from ...overlay import IMPROVEMENTS_OF, improvements, run_name
 from ...plane import Plane
 from .. import style
@@ -100,9 +100,9 @@ def _draw_run(ax: Axes, run: xr.Dataset, plane: Plane, scale: style.Scale, reach
         if (some := here & outside).any():
             u, v = place[some].T
             ax.scatter(u, v, gid="outside", **look, **sheet.look(style.BORDER))
-    failed = (run["status"].to_numpy() != Status.OK) & ~outside
-    if failed.any():
-        ax.scatter(place[failed, 0], place[failed, 1], **sheet.look(style.FAILED_MARK), gid="failed")
+    lost = failed(run["status"].to_numpy()) & ~outside
+    if lost.any():
+        ax.scatter(place[lost, 0], place[lost, 1], **sheet.look(style.FAILED_MARK), gid="failed")
     if np.isfinite(loss).any():
         row = int(np.nanargmin(loss))
         inside = "none" if outside[row] else [style.LOSS_MAP(scale.norm(loss[row]))]
@@ -262,11 +262,11 @@ def _distance_entries(sheet: style.Sheet, runs: Runs, reach: float) -> list[Arti
 def _count_entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
     total = _count(runs)
     outside = sum(int(run["outside"].sum()) for run in runs)
-    failed = sum(int((run["status"] != Status.OK).sum()) for run in runs)
+    lost = sum(int(failed(run["status"]).sum()) for run in runs)
     hollow, cross = _mark(sheet, marker="o", markerfacecolor="none"), _mark(sheet, marker="x")
     return [
         Line2D([], [], **look, label=f"{name}: {count} of {total} points")
-        for look, name, count in ((hollow, "beyond the map", outside), (cross, "failed episode", failed))
+        for look, name, count in ((hollow, "beyond the map", outside), (cross, "failed episode", lost))
         if count
     ]
 

@@ -20,6 +20,7 @@ from matplotlib.patches import Patch
 from matplotlib.text import Text
 
 from ...identity import PACKAGE, VERSIONS, stored_identity, stored_provenance
+from ...lattice import with_gradients
 from ...measures.unresolved import say_unresolved, stored_unresolved
 from ...objective import Status
 from ...sampling.refine import Refined
@@ -139,6 +140,13 @@ def failure_key(dataset: xr.Dataset) -> list[Patch]:
         for kind, name in names.items()
         if (count := int((status == kind).sum()))
     ]
+
+
+def gradient_key(dataset: xr.Dataset) -> list[Patch]:
+    """Return the legend entry of the samples that have a loss and no gradient, with how many they are; none of none."""
+    lacking = int((dataset["status"] == Status.NO_GRADIENT).sum()) if "status" in dataset else 0
+    label = f"{style.NO_GRADIENT}: {lacking} of {evaluated(with_gradients(dataset))}"
+    return [Patch(**style.NO_GRADIENT_LOOK, label=label)] if lacking else []
 
 
 def unresolved_key(dataset: xr.Dataset) -> list[Patch]:

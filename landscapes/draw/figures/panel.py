@@ -12,7 +12,10 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
+from ...plane import Plane
+from ...space import LOG10
 from .. import style
+from ..decades import mark_decades
 from .page import Picture, picture_of, sheet_of, write_over
 from .typesetting import side_room, title_room
 
@@ -31,14 +34,17 @@ def grid(picture: Picture, panels: int, *, share: bool = False) -> list[Axes]:
     return every[:panels]
 
 
-def dress(ax: Axes) -> None:
-    """Give a panel its ticks and frame."""
+def dress(ax: Axes, plane: Plane | None = None) -> None:
+    """Give a panel its ticks and frame; over a plane, or a line, logarithmic parameters have decades."""
     sheet = sheet_of(ax)
     ax.tick_params(which="both", **_ticks(sheet))
     ax.tick_params(which="minor", length=2 * sheet.type)
     ax.spines[:].set(color=style.QUIET, linewidth=max(0.4, 0.6 * sheet.weight))
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_locator(MaxNLocator(5 if sheet.pitch > NARROW else 3))
+    for number, scale in enumerate(plane.scales if plane else ()):
+        if scale == LOG10:
+            mark_decades((ax.xaxis, ax.yaxis)[number], DECADES[sheet.pitch > NARROW])
 
 
 def log_axis(axis: Axis) -> None:

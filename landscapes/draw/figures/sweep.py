@@ -24,11 +24,15 @@ RATES, LEAST = (10, 5, 4, 2), 4.0  # frames per second to choose from, so that a
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """The same window sampled at growing `values` of what `label` names with its unit; one slice for each value."""
+    """The same window sampled at growing `values` of what `label` names with its unit; one slice for each value.
+
+    Those of a `logarithmic` one grow by equal ratios.
+    """
 
     label: str
     values: Sequence[float]
     slices: Sequence[xr.Dataset]
+    logarithmic: bool = False
 
     @property
     def name(self) -> str:
@@ -36,11 +40,11 @@ class Sweep:
         return self.label.partition(" [")[0]
 
     def write_value(self, value: float) -> str:
-        """Write a value with its unit, and as many decimals for each of them."""
+        """Write a value with its unit, and as many decimals for each of them, or digits of a logarithmic one."""
         span = abs(self.values[-1] - self.values[0])
         decimals = min(9, max(0, 2 - math.floor(math.log10(span))))
         unit = self.label.partition(" [")[2].removesuffix("]")
-        return f"{style.number(value, f'.{decimals}f')} {unit}".rstrip()
+        return f"{style.number(value, '.3g' if self.logarithmic else f'.{decimals}f')} {unit}".rstrip()
 
     def plot(self, number: int = -1) -> page.Picture:
         """Draw a frame, by default the last, on the scales that all frames share."""
@@ -163,7 +167,8 @@ def save_films(sweep: Sweep, mp4: Path, gif: Path | None, *, dpi: int = DPI, los
 
 def _draw_range(picture: page.Picture, layout: Layout, sweep: Sweep, value: float) -> None:
     """Say the value, and mark it on a bar from the lowest to the highest."""
-    low, high, sheet = sweep.values[0], sweep.values[-1], layout.sheet
+    ends, sheet = (sweep.values[0], sweep.values[-1]), layout.sheet
+    low, high, here = ((math.log10(one) if sweep.logarithmic else one) for one in (*ends, value))
     place = layout.box(LEFT * sheet.type, layout.height - 0.9 * sheet.type, layout.side, 0.16 * sheet.type)
     ax = picture.add_axes(place, gid="range")
     ax.set_axis_off()
@@ -171,11 +176,11 @@ def _draw_range(picture: page.Picture, layout: Layout, sweep: Sweep, value: floa
     ax.set_ylim(-1, 1)
     bar = sheet.look({"linewidth": 3, "solid_capstyle": "round", "clip_on": False})
     ax.plot([low, high], [0, 0], color=style.FAINT, **bar)
-    ax.plot([low, value], [0, 0], color=style.LOSS_LINE, **bar)
-    ax.plot([value], [0], marker="o", color=style.LOSS_LINE, **sheet.look({"markersize": 8, "clip_on": False}))
+    ax.plot([low, here], [0, 0], color=style.LOSS_LINE, **bar)
+    ax.plot([here], [0], marker="o", color=style.LOSS_LINE, **sheet.look({"markersize": 8, "clip_on": False}))
     plain: dict[str, Any] = {"textcoords": "offset points", "parse_math": False, "annotation_clip": False}
-    for end, at in ((low, "left"), (high, "right")):
+    for end, spot, at in zip(ends, (low, high), ("left", "right"), strict=True):
         look: dict[str, Any] = {"size": sheet.tick, "color": style.QUIET, "ha": at, "va": "top"}
-        ax.annotate(sweep.write_value(end), (end, 0), (0, -7 * sheet.type), **look, **plain)
+        ax.annotate(sweep.write_value(end), (spot, 0), (0, -7 * sheet.type), **look, **plain)
     said, look = f"{sweep.name} = {sweep.write_value(value)}", {"size": sheet.label + 1, "color": style.INK}
     ax.annotate(said, (low, 0), (0, 8 * sheet.type), weight="bold", **look, **plain)

@@ -16,7 +16,7 @@ from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 
 from ...identity import plane_of
-from ...objective import Status
+from ...objective import failed
 from ...overlay import improvements
 from ...plane import Plane
 from .. import style
@@ -143,7 +143,7 @@ def log_axes(stream: rr.RecordingStream, scene: Scene, dataset: xr.Dataset) -> N
         ticks, share = scene.body.ticks(axis)
         places = [scene.stand.beside(axis, part, TICKS) for part in share]
         places.append(scene.stand.beside(axis, 0.5, NAMES) if axis < 2 else scene.stand.beside(axis, OVER, TICKS))
-        labels = [*map(style.number, ticks.tolist()), name]
+        labels = [*(scene.body.write(axis, tick) for tick in ticks.tolist()), name]
         points = rr.Points3D(places, labels=labels, show_labels=True, colors=rgba(style.MID_GREY), radii=DOT)
         _log(stream, f"landscape/axes/{'uvz'[axis]}", points)
 
@@ -153,7 +153,7 @@ def _log_key(stream: rr.RecordingStream, scene: Scene, runs: Runs) -> None:
     shown = {name: style.POINT_MARKS[name]["color"] for run in runs for name, _ in by_kind(run)}
     if any(run["outside"].any() for run in runs):
         shown["outside"] = style.BEYOND
-    if any((run["status"] != Status.OK).any() for run in runs):
+    if any(failed(run["status"]).any() for run in runs):
         shown["failed"] = style.LOST
     behind, left = (np.array(scene.stand.place(turn, 1.0, -relief.FOCUS)) for turn in (180.0, -90.0))
     high = np.array([0.0, 0.0, 1.25 * HEIGHT])
@@ -165,12 +165,12 @@ def _log_key(stream: rr.RecordingStream, scene: Scene, runs: Runs) -> None:
 
 
 def _log_run(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None:
-    path, loss, outside = f"landscape/runs/{run.attrs['label']}", run["loss"].to_numpy(), run["outside"].to_numpy()
+    path, loss, outside = f"landscape/runs/{_path_of(run)}", run["loss"].to_numpy(), run["outside"].to_numpy()
     places = scene.at(run["u"].to_numpy(), run["v"].to_numpy(), np.nan_to_num(loss, nan=-np.inf))
     radii = RADIUS * np.sqrt(style.point_areas(run["distance"].to_numpy(), scene.reach, 1) / style.MARK_AREAS[1])
-    failed = run["status"].to_numpy() != Status.OK
-    groups = [(name, here & ~outside & ~failed, style.POINT_MARKS[name]["color"]) for name, here in by_kind(run)]
-    groups += [("outside", outside & ~failed, style.BEYOND), ("failed", failed, style.LOST)]
+    lost = failed(run["status"].to_numpy())
+    groups = [(name, here & ~outside & ~lost, style.POINT_MARKS[name]["color"]) for name, here in by_kind(run)]
+    groups += [("outside", outside & ~lost, style.BEYOND), ("failed", lost, style.LOST)]
     for name, here, color in groups:
         _log_points(stream, f"{path}/{name}", np.flatnonzero(here), places, radii, color)
     rows = np.flatnonzero(run["previous"].to_numpy() >= 0)
@@ -194,14 +194,22 @@ def _log_best(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None
     known = np.flatnonzero(np.isfinite(best))
     if not len(known):
         return
-    curve = np.log10(best[known]) if scene.scale.logarithmic else best[known]
-    _log(stream, f"best/{label}", rr.SeriesLines(colors=rgba(color), names=label, widths=1.5))
-    stream.send_columns(f"best/{label}", _times(known), rr.Scalars.columns(scalars=curve), strict=True)
+    with np.errstate(divide="ignore", invalid="ignore"):  # a run may go below the losses of a slice, and below zero
+        curve = np.log10(best[known]) if scene.scale.logarithmic else best[known]
+    _log(stream, f"best/{_path_of(run)}", rr.SeriesLines(colors=rgba(color), names=label, widths=1.5))
+    stream.send_columns(f"best/{_path_of(run)}", _times(known), rr.Scalars.columns(scalars=curve), strict=True)
     lowered = improvements(run)
     places = scene.at(*(run[name].to_numpy()[lowered] for name in ("u", "v", "loss")))
     spread = np.empty((run.sizes["evaluation"], 3))
     spread[lowered] = places
-    _log_points(stream, f"landscape/runs/{label}/best", lowered, spread, np.full(len(spread), 1.6 * RADIUS), color)
+    _log_points(
+        stream, f"landscape/runs/{_path_of(run)}/best", lowered, spread, np.full(len(spread), 1.6 * RADIUS), color
+    )
+
+
+def _path_of(run: xr.Dataset) -> str:
+    """Return a run's label as a part of a path, which has no spaces or brackets."""
+    return str(rr.escape_entity_path_part(run.attrs["label"]))
 
 
 def _log_points(
@@ -281,10 +289,10 @@ def _about(dataset: xr.Dataset, runs: Runs, scene: Scene) -> str:
 
 
 def _row(run: xr.Dataset) -> str:
-    failed = int((run["status"] != Status.OK).sum())
+    lost = int(failed(run["status"]).sum())
     best = float(run["best"][-1]) if run.sizes["evaluation"] else float("nan")
     said = style.number(best) if np.isfinite(best) else "none"
-    return f"| {run.attrs['label']} | {run.sizes['evaluation']} | {failed} | {int(run['outside'].sum())} | {said} |"
+    return f"| {run.attrs['label']} | {run.sizes['evaluation']} | {lost} | {int(run['outside'].sum())} | {said} |"
 
 
 def _digest(dataset: xr.Dataset, runs: Runs) -> str:

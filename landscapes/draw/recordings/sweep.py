@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from ...objective import Status
+from ...objective import failed
 from .. import style
 from ..figures import page
 from ..figures.sweep import RATES, Scales, Sweep
@@ -79,8 +79,8 @@ def _row(sweep: Sweep, number: int) -> str:
     dataset = sweep.slices[number]
     least = dataset["loss"].min().item()
     said = style.number(least) if np.isfinite(least) else "none"
-    failed = int((dataset["status"] != Status.OK).sum())
-    return f"| {number} | {sweep.write_value(sweep.values[number])} | {said} | {failed} |"
+    lost = int(failed(dataset["status"]).sum())
+    return f"| {number} | {sweep.write_value(sweep.values[number])} | {said} | {lost} |"
 
 
 def _digest(sweep: Sweep) -> str:

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from ...lattice import own_cells
 from ...plane import Plane
+from ...space import LOG10
 from .. import style
+from ..decades import decades, write_power
 from ..figures import contour
 
 Grid = NDArray[np.float64]
@@ -53,18 +55,30 @@ class Relief:
             return np.clip(np.asarray(self.scale.norm(np.maximum(loss, least)), dtype=np.float64), 0.0, 1.0)
 
     def ticks(self, axis: int) -> tuple[Grid, Grid]:
-        """Return round values along u, v or the loss, and where they are along it, 0 to 1.
+        """Return round coordinates along u, v or the loss, and where they are along it, 0 to 1.
 
         Of the loss none is at the foot, where another axis begins.
         """
         low, high = [*zip(*(side.tolist() for side in self.plane.cell_bounds()), strict=True), self.scale.ends][axis]
-        logarithmic = axis == 2 and self.scale.logarithmic
-        ticks = np.asarray((LogLocator(numticks=6) if logarithmic else MaxNLocator(5)).tick_values(low, high))
+        if self._has_decades(axis):
+            ticks = np.asarray(decades(low, high))
+        else:
+            logarithmic = axis == 2 and self.scale.logarithmic
+            ticks = np.asarray((LogLocator(numticks=6) if logarithmic else MaxNLocator(5)).tick_values(low, high))
         ticks = ticks[(ticks >= low) & (ticks <= high)]
         if axis < 2:
             return ticks, (ticks - low) / (high - low)
         share = self.shade(ticks)
         return ticks[share > FOOT], share[share > FOOT]
+
+    def write(self, axis: int, tick: float) -> str:
+        """Write a tick along u, v or the loss."""
+        if self._has_decades(axis):
+            return write_power(tick)
+        return style.power(tick) if axis == 2 and self.scale.logarithmic else style.number(tick)
+
+    def _has_decades(self, axis: int) -> bool:
+        return axis < 2 and self.plane.scales[axis] == LOG10
 
 
 @dataclass(frozen=True)

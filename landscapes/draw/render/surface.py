@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ...identity import plane_of
 from ...lattice import own_cells
-from ...objective import Status
+from ...objective import has_loss
 from ...storage.files import replacing
 from .. import style
 from ..figures import page, panel
@@ -199,12 +199,11 @@ def _label(ax: Axes, dataset: xr.Dataset, shown: Shown) -> None:
     room = sheet.type / sheet.zoom  # that type takes up of the scene
     for axis, name in enumerate((*body.plane.labels, page.loss_name(dataset))):
         ticks, share = body.ticks(axis)
-        logarithmic = axis == 2 and body.scale.logarithmic
         spots = shown.on_picture(np.array([shown.stand.beside(axis, part, room * AWAY[axis]) for part in share]))
         look: dict[str, Any] = {"size": sheet.tick, "color": style.INK, "va": "center"}
         look["ha"] = "left" if axis == 2 else "center"
         for tick, (x, y) in zip(ticks.tolist(), spots, strict=True):
-            ax.text(x, y, style.power(tick) if logarithmic else style.number(tick), **look)
+            ax.text(x, y, body.write(axis, tick), **look)
         _name(ax, shown, axis, name, room * OUT[axis])
 
 
@@ -233,5 +232,5 @@ def _entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
 
 def _holes(dataset: xr.Dataset) -> list[Artist]:
     status = dataset["status"].to_numpy()
-    failed = int((status != Status.OK).sum())
-    return [Line2D([], [], linestyle="none", label=f"holes: {failed} of {status.size} samples")] if failed else []
+    holes = int((~has_loss(status)).sum())
+    return [Line2D([], [], linestyle="none", label=f"holes: {holes} of {status.size} samples")] if holes else []

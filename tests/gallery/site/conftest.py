@@ -15,7 +15,7 @@ from gradscape.gallery.files import RUN_SUFFIX, RUNS, LeagueFiles, LeagueSliceFi
 from gradscape.gallery.paper import PaperCaption
 from gradscape.gallery.runs import save_run
 from gradscape.gallery.site.build import build_site
-from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
@@ -113,7 +113,7 @@ CARD = {
 }  # fmt: skip
 
 
-class Bowl:
+class Bowl(Objective):
     """The squared distance from a point of the scaled box, and a corner that is not finite."""
 
     space = SPACE

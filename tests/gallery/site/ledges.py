@@ -9,7 +9,7 @@ from PIL import Image
 from gradscape.gallery.figures import Figure
 from gradscape.gallery.paper import PaperCaption
 from gradscape.gallery.site import build, studio
-from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.sampling.refine import Refinement, refine
@@ -25,7 +25,7 @@ FIGURES = [
 ]
 
 
-class Ledge:
+class Ledge(Objective):
     """A bowl with a ledge that its gradients do not show, and a corner that is not finite."""
 
     name, space = "ledge", SPACE

@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
-from gradscape.landscapes.adapters import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.conformance.extremes import CORNERS, ExtremeCase, corners
 from gradscape.landscapes.conformance.suite import check
-from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.space import ParameterSpace
 
 SPACE = ParameterSpace.box(["a", "b", "c"], -1.0, 2.0)
@@ -27,7 +27,7 @@ def failures(objective, **settings):
     return {name for name, found in outcomes(objective, **settings).items() if found.bad}
 
 
-class Sound:
+class Sound(Objective):
     """A smooth objective that keeps every promise; a defect overrides one part of it."""
 
     name = "sound"
@@ -162,6 +162,18 @@ class BadCentre(Sound):
         return with_loss(found, found.loss.masked_fill((x == SPACE.center).all(dim=1), NAN))
 
 
+class NanGradientWhere(Sound):
+    """The loss is finite everywhere, its gradient NaN at some points."""
+
+    def __init__(self, where):
+        self.where = where
+
+    def spoil(self, x, found, grad):
+        return Evaluation.from_results(
+            found.loss, found.grad.masked_fill(self.where(x)[:, None], NAN) if grad else None
+        )
+
+
 class OverTheEdge(Sound):
     def spoil(self, x, found, grad):
         return with_loss(found, found.loss.masked_fill((x > SPACE.upper + 0.1).any(dim=1), NAN))
@@ -229,6 +241,33 @@ def test_a_sound_objective_passes(objective):
 )
 def test_a_defect_makes_its_own_check_fail(defect, checks):
     assert failures(defect()) == checks
+
+
+def test_a_nan_gradient_beside_a_finite_loss_fails_by_its_name_and_no_other():
+    found = outcomes(NanGradientWhere(lambda x: (x == SPACE.center).all(dim=1)))
+    assert {name for name, finding in found.items() if finding.bad} == {"special places", "centre"}
+    loss = float(Sound().evaluate(SPACE.center[None]).loss)
+    at = f"the gradient is NaN at the centre (a = 0.5, b = 0.5, c = 0.5), where the loss is {loss:.4g}"
+    assert found["centre"].why == at
+    x = SPACE.uniform(8, seed=0)
+    median = x[:, 0].median()
+    found = outcomes(NanGradientWhere(lambda x: x[:, 0] <= median), points=8)
+    share = f"{float((x[:, 0] <= median).double().mean()):.0%}".replace("%", " %")
+    row = x[x[:, 0] <= median][0].tolist()
+    first = ", ".join(f"{name} = {value:.4g}" for name, value in zip(SPACE.names, row, strict=True))
+    said = f"the gradient is NaN at {share} of the points (first at {first}), where the loss is finite"
+    assert found["status"].why == said
+    assert {name for name, finding in found.items() if finding.bad} <= {"status", "corners", "centre", "special places"}
+    assert not any("depends on grad=" in finding.why for finding in found.values())
+
+
+def test_a_row_of_nan_that_is_given_a_loss_without_a_gradient_fails():
+    class LossOfNan(Sound):
+        def evaluate(self, x, *, grad=True):
+            found = super().evaluate(x.nan_to_num(), grad=grad)
+            return Evaluation.from_results(found.loss, found.grad.where(x.isfinite(), NAN) if grad else None)
+
+    assert failures(LossOfNan()) == {"refusal of nan"}
 
 
 def test_an_objective_that_can_be_evaluated_once_only_fails():

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 import torch
 
-from gradscape.landscapes.adapters import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.measures.census import MEASURES, CensusDesign, sample_cut, survey, thin_out
 from gradscape.landscapes.measures.census_statistics import bootstrap, divide, spread, word_shares
-from gradscape.landscapes.objective import Evaluation, evaluate
+from gradscape.landscapes.objective import Evaluation, Objective, evaluate
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.space import ParameterSpace
 
 BOX = ParameterSpace.box([f"x{n}" for n in range(5)], -1.0, 3.0)
 
 
-class Bowl:
+class Bowl(Objective):
     """A bowl that nobody may ask beyond its box."""
 
     space = BOX

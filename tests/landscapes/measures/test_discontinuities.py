@@ -8,9 +8,10 @@ import pytest
 import torch
 import xarray as xr
 
-from gradscape import Objective, ParameterSpace, Plane, from_numpy, from_torch, sample
+from gradscape import ParameterSpace, Plane, from_numpy, from_torch, sample
 from gradscape.landscapes.measures.discontinuities import find_jumps
 from gradscape.landscapes.measures.noise import noise
+from gradscape.landscapes.objective import Objective
 
 SPACE = ParameterSpace.box(("x", "y"), -1.0, 1.0)
 EDGE = 0.2371

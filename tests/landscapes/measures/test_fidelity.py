@@ -1,5 +1,7 @@
 """Errors, fronts, orders and the choice of a rung, on numbers whose answer is known."""
 
+import json
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -10,12 +12,13 @@ from matplotlib.text import Text
 from scipy.stats import spearmanr
 from torch import Tensor
 
-from gradscape.landscapes.adapters import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.draw.figures.page import save
 from gradscape.landscapes.draw.figures.tradeoff import short_name, tradeoff_figure
 from gradscape.landscapes.measures import fidelity as tradeoff
 from gradscape.landscapes.measures.fidelity import (
     Bootstrap,
+    Comparison,
     Sample,
     cheapest,
     compare,
@@ -23,7 +26,7 @@ from gradscape.landscapes.measures.fidelity import (
     gradient_error,
     pareto_front,
 )
-from gradscape.landscapes.objective import Status
+from gradscape.landscapes.objective import Objective, Status
 from gradscape.landscapes.space import ParameterSpace
 
 
@@ -61,6 +64,17 @@ def test_an_episode_that_failed_is_infinitely_far_off_and_a_failed_reference_is_
     assert many.diverged == pytest.approx(1 / 18)
     assert many.loss_error.p95.value is None
     assert many.loss_error.median.value == 1.0
+
+
+def test_a_loss_without_a_gradient_is_no_failure_and_the_share_of_missing_gradients_is_said() -> None:
+    reference, variant = sample([float(k) for k in range(20)]), sample([k + 1.0 for k in range(20)])
+    reference.status[:4], reference.grad[:4] = Status.NO_GRADIENT, np.nan
+    variant.status[2:8], variant.grad[2:8] = Status.NO_GRADIENT, np.nan
+    found = compare(variant, reference, seed=0)
+    assert (found.compared, found.diverged, found.loss_error.median.value) == (20, 0, 1.0)
+    assert found.missing == pytest.approx(4 / 16)
+    assert found.gradient.cosine.value == pytest.approx(1.0)
+    assert Comparison.of_record(json.loads(json.dumps(asdict(found)))).missing == found.missing
 
 
 def test_rank_correlation_is_spearmans() -> None:
@@ -132,7 +146,7 @@ def test_seconds_are_those_of_an_episode_in_a_batch(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(tradeoff.time, "perf_counter", lambda: clock[0])
     space = ParameterSpace.box(["a"], 0.0, 1.0)
 
-    class Slow:
+    class Slow(Objective):
         preferred_batch = 4
         space = ParameterSpace.box(["a"], 0.0, 1.0)
 

@@ -9,7 +9,7 @@ from gradscape.landscapes.draw.figures.model import model_figure
 from gradscape.landscapes.measures import turns
 from gradscape.landscapes.measures.fidelity import Bootstrap
 from gradscape.landscapes.measures.model import Effect, ModelStudy, Price, judge_price
-from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.space import ParameterSpace
 
 from ...clock import Clock
@@ -69,7 +69,7 @@ def test_a_price_is_named_where_the_interval_of_the_ratio_excludes_one(
 def test_a_machine_that_gets_slower_and_slower_disturbs_both_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
 
-    class Slow:
+    class Slow(Objective):
         """Takes so many seconds a point, more at each call."""
 
         space, preferred_batch, calls = ParameterSpace.box(["x"], 0.0, 1.0), 8, 0

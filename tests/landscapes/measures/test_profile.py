@@ -13,6 +13,7 @@ from gradscape.landscapes.draw.figures.quality import quality_figure
 from gradscape.landscapes.measures import gradient_quality as gradients
 from gradscape.landscapes.measures.classify import WORDS
 from gradscape.landscapes.measures.profile import Profile, effort, measure_profile, named_measures
+from gradscape.landscapes.objective import Evaluation, Status
 
 Function = Callable[[torch.Tensor], torch.Tensor]
 
@@ -62,6 +63,56 @@ def test_words_fit_functions_that_are_known(fn: Function, box: tuple[float, floa
     found = profile(fn, *box)
     assert set(found.verdict.words) == words
     assert set(found.verdict.reasons) == words
+
+
+class Partly:
+    """A bowl of which some points have no loss, and others none but a loss."""
+
+    name, space = "partly", ParameterSpace.box(("x", "y"), -1.0, 1.0)
+
+    def __init__(self, missing: float, failing: float) -> None:
+        self.missing, self.failing = missing, failing
+
+    def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
+        u = self.space.to_unit(x)
+        failed = torch.where(u[:, 1] < self.failing, Status.ERROR, Status.OK)
+        slope = (2 * x).masked_fill(u[:, :1] < self.missing, torch.nan)
+        said = "RuntimeError: too much work" if bool((failed == Status.ERROR).any()) else ""
+        return Evaluation.from_results(x.square().sum(dim=1), slope if grad else None, failed, said)
+
+    def profile(self) -> Profile:
+        dataset = sample(self, Plane.through(self.space, self.space.center, (0, 1), resolution=16))
+        return measure_profile(self, dataset, rounding=2**-52, points=2)
+
+
+def test_gradients_that_are_missing_are_said_to_be_and_losses_beside_them_count() -> None:
+    half = Partly(0.5, 0.0).profile()
+    assert set(half.words) == {"very smooth", "gradients missing"}
+    assert half.verdict.reasons["gradients missing"] == "gradient missing at 50.0% of the points that have a loss"
+    named = named_measures(half.record())
+    assert named["Gradients missing beside a loss"].startswith("50.0 %")
+    assert "Samples that failed" not in named
+    assert half.losses.failed == 0
+    whole = Partly(0.0, 0.0).profile()
+    assert (half.losses.minima, half.losses.range, half.losses.level) == (
+        whole.losses.minima,
+        whole.losses.range,
+        whole.losses.level,
+    )
+    assert set(whole.words) == {"very smooth", "gradients good"}
+    few = Partly(0.1, 0.0).profile()
+    assert set(few.words) == {"very smooth", "gradients good"}
+    assert "gradient missing at 12.5% of the points that have a loss" in few.verdict.reasons["gradients good"]
+
+
+def test_a_slice_that_mostly_failed_is_called_nothing_else() -> None:
+    found = Partly(0.0, 0.6).profile()
+    share = f"{found.losses.failed / found.losses.samples:.0%}"
+    assert found.verdict.reasons == {"mostly failed": f"no loss at {share} of the samples"}
+    named = named_measures(found.record())
+    assert named["Samples that failed"].startswith(share[:2])
+    assert named["Points that raised"] == f"{found.losses.failed} points raised: first 'RuntimeError: too much work'"
+    assert Partly(0.0, 1.1).profile().words == ("mostly failed",)
 
 
 def test_somebody_elses_words_are_held_against_ours() -> None:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gradscape.landscapes.adapters import from_numpy, from_torch
+from gradscape.envs.adapters import from_numpy, from_torch
 from gradscape.landscapes.measures.sensitivity import Design, Responses, default_samples, explore, rank
 from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.space import ParameterSpace
@@ -101,7 +101,7 @@ def test_lines_stay_within_the_box_and_hold_their_base_point() -> None:
     np.testing.assert_allclose(design.offsets[inner], np.tile([-0.05, -0.025, 0.025, 0.05], (inner.sum(), 1)))
 
 
-class Counted:
+class Counted(Objective):
     """A bowl that counts its episodes, may be stopped after some of them, and fails at a corner if asked."""
 
     preferred_batch = 8

@@ -10,7 +10,7 @@ import pytest
 import torch
 import xarray as xr
 
-from gradscape.landscapes.adapters import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.measures.slice_comparison import compare_slices
 from gradscape.landscapes.objective import Status
 from gradscape.landscapes.plane import Plane

@@ -11,8 +11,8 @@ import torch
 import xarray as xr
 from torch import Tensor
 
+from gradscape.envs.adapters import from_numpy, from_torch
 from gradscape.jobs.slice_summary import look_between
-from gradscape.landscapes.adapters import from_numpy, from_torch
 from gradscape.landscapes.measures.unresolved import (
     UNRESOLVED,
     Unresolved,

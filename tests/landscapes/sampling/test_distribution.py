@@ -16,16 +16,16 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gradscape.landscapes.adapters import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.identity import StoreError
-from gradscape.landscapes.objective import Objective
+from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling import distribution as spread
 from gradscape.landscapes.sampling.distribution import Site, WorkersLostError, equal_groups
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.sampling.memory import MemoryBound
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.landscapes.storage.store import SliceStore
+from gradscape.landscapes.storage.store import SliceStore, open_slice
 
 from ...clock import Clock
 from ...processes import FORK
@@ -67,6 +67,31 @@ def test_processes_write_the_bits_of_one_and_progress_counts_every_tile(tmp_path
     assert same(store, alone)
     assert [now.done for now in seen] == sorted({now.done for now in seen})
     assert (seen[-1].done, seen[-1].levels) == (288, 5)
+
+
+class Raising:
+    """A sum that raises in half of the box, and has no gradient in a part of the other half."""
+
+    space, name = SPACE, "raising"
+
+    def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
+        raised = x[:, 0] > 0
+        status = torch.where(raised, Status.ERROR, Status.OK)
+        slope = torch.ones_like(x).masked_fill(x[:, :1] < -1, torch.nan) if grad else None
+        return Evaluation.from_results(x.sum(dim=1), slope, status, "RuntimeError: no" if bool(raised.any()) else "")
+
+
+def test_what_the_first_point_that_raised_said_comes_back_from_workers_and_stays(tmp_path, processes):
+    store, here = (store_at(tmp_path / f"{name}.zarr") for name in ("workers", "here"))
+    found, wanted = (
+        sample(Raising(), PLANE, one, batch=40, executor=pool) for one, pool in ((store, processes), (here, None))
+    )
+    assert found.attrs["error"] == wanted.attrs["error"] == "RuntimeError: no"
+    assert open_slice(store.path).attrs["error"] == "RuntimeError: no"
+    assert same(store, here)
+    counts = {kind: int((found["status"] == kind).sum()) for kind in (Status.ERROR, Status.NO_GRADIENT)}
+    assert min(counts.values()) > 0
+    assert int(found["loss"].isnull().sum()) == counts[Status.ERROR]
 
 
 def test_threads_share_the_objective_and_a_slice_in_memory(alone):

@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from gradscape.envs.adapters import from_torch
 from gradscape.envs.engines.sheets import springs
 from gradscape.envs.registry import make
-from gradscape.landscapes.adapters import from_torch
 from gradscape.landscapes.cost import seconds_per_episode
 from gradscape.landscapes.identity import StoreError
 from gradscape.landscapes.measures.stability import ask
-from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.sampling.memory import MemoryBound, is_out_of_memory
@@ -38,7 +38,7 @@ def wave(x: torch.Tensor) -> torch.Tensor:
     return (3 * x).sin().prod(dim=1) + x.exp().sum(dim=1)
 
 
-class Small:
+class Small(Objective):
     """A device with memory for so many points, the wave's."""
 
     space, name, device = SPACE, "wave", "cpu"

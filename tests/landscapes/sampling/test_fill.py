@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gradscape.landscapes.identity import StoreError
-from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
@@ -21,10 +21,14 @@ from ...processes import Instant, alone
 
 SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
 PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 16))
+SAID = "RuntimeError: too much work"
 
 
-class Wave:
-    """A smooth wave that is not finite in one corner and escapes in another; it counts what it is asked."""
+class Wave(Objective):
+    """A smooth wave that escapes in one corner and raises in another, and has no gradients in the middle.
+
+    It counts what it is asked.
+    """
 
     space = SPACE
 
@@ -41,7 +45,9 @@ class Wave:
         loss = (3 * x).sin().prod(dim=1) + x.exp().sum(dim=1)
         loss[(x > 1).all(dim=1)] = torch.nan
         failed = torch.where((x[:, 0] < -1) & (x[:, 2] < -1), Status.ESCAPED, Status.OK)
-        return Evaluation.from_results(loss, 3 * (3 * x).cos() if grad else None, failed)
+        failed[raised := (x[:, 0] > 1) & (x[:, 2] < -1)] = Status.ERROR
+        slope = (3 * (3 * x).cos()).masked_fill((x[:, [0, 2]].abs() < 0.5).all(dim=1, keepdim=True), torch.nan)
+        return Evaluation.from_results(loss, slope if grad else None, failed, SAID if bool(raised.any()) else "")
 
 
 def store_at(path: Path, *, grad: bool = True) -> SliceStore:
@@ -56,7 +62,12 @@ def test_a_slice_holds_the_objective_at_its_own_points():
     np.testing.assert_array_equal(dataset["status"], wanted.status.reshape(16, 18))
     np.testing.assert_allclose(dataset["loss"], wanted.loss.reshape(16, 18), rtol=1e-14)
     np.testing.assert_allclose(dataset["grad"], wanted.grad.reshape(16, 18, 3), rtol=1e-14)
-    assert {int(s) for s in np.unique(dataset["status"])} == {Status.OK, Status.ESCAPED}
+    ended = {Status.OK, Status.ESCAPED, Status.ERROR, Status.NO_GRADIENT}
+    assert {int(s) for s in np.unique(dataset["status"])} == ended
+    lacking = (dataset["status"] == Status.NO_GRADIENT).to_numpy()
+    assert np.isfinite(dataset["loss"].to_numpy()[lacking]).all()
+    assert np.isnan(dataset["grad"].to_numpy()[lacking]).all()
+    assert dataset.attrs["error"] == SAID
 
 
 @settings(max_examples=4)
@@ -113,6 +124,7 @@ def test_sigkill_at_any_instant_changes_no_bit(tmp_path):
         xr.testing.assert_equal(resumed, whole)
         for name in ("loss", "grad", "status"):
             assert resumed[name].values.tobytes() == whole[name].values.tobytes()
+        assert resumed.attrs["error"] == SliceStore.open(path).dataset().attrs["error"] == SAID
         for name, file in files.items():
             assert (path / name).read_bytes() == file.read_bytes()
     assert found[0] == 0
@@ -190,5 +202,5 @@ def test_a_silent_nan_becomes_a_status():
             return Evaluation(x[:, 0], gradient, torch.full((len(x),), Status.OK))
 
     dataset = sample(Silent(), PLANE)
-    assert (dataset["status"] == Status.NONFINITE).sum() == len(SliceStore.in_memory(PLANE, SPACE).tiles())
-    assert dataset["loss"].isnull().sum() == (dataset["status"] != Status.OK).sum()
+    assert (dataset["status"] == Status.NO_GRADIENT).sum() == len(SliceStore.in_memory(PLANE, SPACE).tiles())
+    assert not dataset["loss"].isnull().any()

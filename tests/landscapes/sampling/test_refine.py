@@ -174,7 +174,7 @@ def test_failures_are_surrounded_and_not_interpolated_over() -> None:
     assert set(np.unique(everywhere["status"])) == {Status.NONFINITE, Status.INTERPOLATED}
 
 
-class Stopping:
+class Stopping(Objective):
     """A function that is stopped at every so many points, as Ctrl-C does; it says how often it was asked what."""
 
     preferred_batch = 40
@@ -296,7 +296,7 @@ def test_it_says_what_it_came_to() -> None:
 
 
 def test_an_objective_may_not_interpolate() -> None:
-    class Guessing:
+    class Guessing(Objective):
         space, name = SPACE, "guessing"
 
         def evaluate(self, x: Tensor, *, grad: bool = True) -> Evaluation:

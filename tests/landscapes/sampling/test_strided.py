@@ -20,7 +20,7 @@ from gradscape.landscapes.measures.gradient_quality import compare_samples
 from gradscape.landscapes.measures.ruggedness import ruggedness
 from gradscape.landscapes.measures.twice import Twice, at_twice
 from gradscape.landscapes.measures.unresolved import find_unresolved
-from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.sampling.distribution import equal_groups
 from gradscape.landscapes.sampling.fill import Progress
 from gradscape.landscapes.storage.store import SliceStore, open_slice
@@ -32,7 +32,7 @@ PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 21))
 LINE = Plane.through(SPACE, SPACE.center, ["y"], resolution=30)
 
 
-class Counted:
+class Counted(Objective):
     """A wave that is not finite in a corner; it counts losses and gradients, and stops after so many points.
 
     `batches` holds the points of every call, by whether gradients were asked for.

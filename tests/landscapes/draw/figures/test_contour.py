@@ -14,7 +14,7 @@ from gradscape.landscapes.draw import style
 from gradscape.landscapes.draw.figures import page
 from gradscape.landscapes.draw.figures.contour import landscape_figure
 from gradscape.landscapes.draw.figures.profile import profile_figure
-from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
@@ -28,7 +28,7 @@ SPACE = ParameterSpace(
 )
 
 
-class Bowl:
+class Bowl(Objective):
     """A bowl with a flat corner, a corner that is not finite and one that escapes."""
 
     space = SPACE
@@ -110,7 +110,7 @@ def test_colour_is_the_projected_gradient_in_its_unit_when_units_agree():
         torch.ones(2).double(), (4, 4), ("p [m/s]", "q [m/s]"),
     )  # fmt: skip
 
-    class Ramp:
+    class Ramp(Objective):
         def __init__(self):
             self.space = space
 
@@ -154,6 +154,36 @@ def test_zero_gradients_are_dots_and_failures_are_neither_dots_nor_arrows():
     assert (np.asarray(dots.get_xdata()) < -0.4).all()
     assert len(quiver_of(FIGURE).U) == (DATASET["status"] == Status.OK).sum() - flat.sum()
     assert f"gradient exactly zero: {flat.sum()} of 192" in legend_of(FIGURE)
+
+
+class HalfBlind(Bowl):
+    """A bowl whose gradient is missing at negative speeds."""
+
+    name = "half blind"
+
+    def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
+        missing = x[:, 0] < 0
+        gradient = torch.stack([2 * x[:, 0] + 3, 0 * x[:, 1] + 0.01, 0 * x[:, 2]], 1)
+        gradient[missing] = torch.nan
+        return Evaluation.from_results(x[:, 0] ** 2 + 3 * x[:, 0], gradient if grad else None)
+
+
+def test_a_loss_without_a_gradient_is_drawn_as_a_value_and_dotted_among_the_arrows_alone():
+    dataset = sample(HalfBlind(), plane(16, 12))
+    figure = landscape_figure(dataset)
+    top, bottom = figure.axes[:2]
+    lacking = int((dataset["status"] == Status.NO_GRADIENT).sum())
+    assert 0 < lacking < 192
+    assert not np.ma.getmaskarray(np.ma.masked_array(mesh_of(figure).get_array())).any()
+    assert not patches_of(top)
+    assert set(patches_of(bottom)) == {"NO_GRADIENT"}
+    assert patches_of(bottom)["NO_GRADIENT"].get_path().contains_point((-0.9, 25.0))
+    assert len(quiver_of(figure).U) == 192 - lacking
+    assert f"no gradient: {lacking} of 192" in legend_of(figure)
+    line = profile_figure(sample(HalfBlind(), plane(9, dims=("speed",))))
+    said = legend_of(line)
+    assert "no gradient: 4 of 9" in said
+    assert not any("not finite" in one for one in said)
 
 
 def test_the_star_is_on_the_lowest_sample():

@@ -16,7 +16,7 @@ from rerun.chunk import RrdReader
 from gradscape.landscapes.draw.figures.sweep import Scales, Sweep, frame_figure, save_films
 from gradscape.landscapes.draw.film import picture, save_film
 from gradscape.landscapes.draw.recordings.sweep import save_stream
-from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.smoothing import smooth
@@ -26,7 +26,7 @@ SPACE = ParameterSpace.box(("a", "b", "c"), -1.0, 1.0, "m")
 VALUES = (-1.0, -0.25, 0.5, 1.25)
 
 
-class Bowl:
+class Bowl(Objective):
     """Move its minimum along a with c, grow with it, and fail in a corner."""
 
     space = SPACE

@@ -17,7 +17,7 @@ from rerun.chunk import RrdReader
 
 from gradscape.landscapes.draw.recordings import viewer
 from gradscape.landscapes.draw.recordings.runs import HEIGHT, SIDE, save_stream
-from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.overlay import overlay
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
@@ -28,7 +28,7 @@ from ....processes import alone
 SPACE = ParameterSpace.box(("a", "b", "c"), -1.0, 1.0, "m")
 
 
-class Bowl:
+class Bowl(Objective):
     space = SPACE
     name = "bowl"
 

@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgb
 
 from gradscape.landscapes.draw import style
 from gradscape.landscapes.draw.render import relief, surface
-from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
@@ -20,7 +20,7 @@ SPACE = ParameterSpace.box(["a", "b"], -1.0, 1.0, "m")
 PEAK = (0.5, -0.5)
 
 
-class Hill:
+class Hill(Objective):
     """A hill, a loss that is not finite where a and b are both above a half."""
 
     space = SPACE
