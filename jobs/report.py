@@ -164,9 +164,11 @@ class ReportJob:
         dataset = _open(subject)
         env = environment_of(dataset, self.device, self.env)
         key: ReportKey = {
-            "points": self.points, "seed": self.seed, "slice": digest_of(dataset),
-            "model_version": env.version_on(env.engine),
-        }  # fmt: skip
+            "points": self.points,
+            "seed": self.seed,
+            "slice": digest_of(dataset),
+            MODEL_VERSION: env.version_on(env.engine),
+        }
         beside = subject.store.parent
         if not self.prints or (beside / ARRAYS).exists():
             _fetch(beside, folder, key, watch)
