@@ -186,7 +186,6 @@ class _Torch:
     engine: str = "torch"
     devices: tuple[str, ...] = ("cpu", "cuda")
     rows: int = ROWS
-    whole_batches: bool = False
 
     def find_device(self, device: str) -> str:
         """Return the device of points, which auto leaves to `from_torch`."""
@@ -242,7 +241,6 @@ class _NumPy:
     engine: str = "numpy"
     devices: tuple[str, ...] = ("cpu",)
     rows: int = ROWS
-    whole_batches: bool = False
 
     def find_device(self, device: str) -> str:
         """Return the CPU."""
@@ -373,7 +371,7 @@ class GivenEnvironment(Environment):
         return cls(given)
 
     @property
-    def preferred_batch(self) -> int:
+    def preferred_batch(self) -> int:  # type: ignore[override] # read only
         """Number of points worth evaluating at once."""
         return min(int(getattr(self.given, "preferred_batch", super().preferred_batch)), self._max_rows)
 

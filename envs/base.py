@@ -49,13 +49,13 @@ class Environment(Objective):
     engine.
     """
 
-    model_version: ClassVar[int | Mapping[str, int]] = 1  # of all engines or by name; raised when numbers change
+    # Of all engines or by name, raised by hand when numbers change; 0 where nothing says when they do.
+    model_version: ClassVar[int | Mapping[str, int]] = 1
     fidelities: ClassVar[Mapping[str, Fidelity]] = {"default": Fidelity("default", dt=0.0, precision="float64")}
     examples: ClassVar[Mapping[str, tuple[float, ...]]] = {}
     Options: ClassVar[type[Any]] = NoOptions
     devices: ClassVar[tuple[str, ...]] = ("cpu",)
     engines: ClassVar[tuple[str, ...]] = ("warp",)
-    model_version: ClassVar[int] = 1  # raised by hand whenever numbers change; 0 of what nothing is known to change
     horizon_option: ClassVar[str] = (
         "horizon"  # the setting that says how long an episode is, where there is one of this name
     )
@@ -202,11 +202,11 @@ class Environment(Objective):
         """Return a parameter vector this scene is known for. Raises ValueError where it has no such example."""
         if name not in self.examples:
             raise ValueError(f"{self.name} has no example {name!r}; it has {', '.join(self.examples) or 'none'}")
-        return torch.tensor(self.examples[name], dtype=torch.float64)
+        return self.space.from_values(torch.tensor(self.examples[name], dtype=torch.float64))
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return the frames of the episode at one point. Raises ValueError where a scene has nothing to draw."""
-        raise ValueError(f"{self.name} has no episode to draw")
+        raise ValueError(f"{self.name} has no episode to draw; a class with a method `episode` has")
 
     def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Int[Tensor, " batch"]]:
         """Count what happens in each episode, name -> shape (batch,); where a count changes, losses may jump."""
@@ -292,7 +292,8 @@ class Environment(Objective):
         value = vars(self.options).get(self.horizon_option)
         if value is None:
             raise ValueError(f"{self.name} has no setting that says how long an episode is; name one as horizon")
-        return self.remake(**{self.horizon_option: max(1, round(horizon)) if isinstance(value, int) else horizon})
+        options: dict[str, Any] = {self.horizon_option: max(1, round(horizon)) if isinstance(value, int) else horizon}
+        return self.remake(**options)
 
     def length(self) -> float:
         """Return what is proportional to the time that an episode simulates, for one size of the scene."""
@@ -308,7 +309,7 @@ class Environment(Objective):
         return tuple(name for name in self.space.names if "stiffness" in name)
 
     @property
-    def threads(self) -> int:
+    def threads(self) -> int:  # type: ignore[override] # read only
         """Number of threads a batch is spread over: on a CPU, if the engine's solvers run beside each other."""
         return cores() if self._solvers is not None and self.device == "cpu" and self.capabilities.concurrent else 1
 
@@ -322,7 +323,7 @@ class Environment(Objective):
         return 1 if self.device == "cuda" else None  # one takes what memory a GPU has
 
     @property
-    def preferred_batch(self) -> int:
+    def preferred_batch(self) -> int:  # type: ignore[override] # read only
         """Number of points worth evaluating at once."""
         return 16 if self._solvers is None else self._capacity * self.threads
 

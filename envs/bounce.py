@@ -104,7 +104,7 @@ class Bounce(Environment):
     )
 
     @property
-    def preferred_batch(self) -> int:
+    def preferred_batch(self) -> int:  # type: ignore[override] # read only
         """Number of points worth evaluating at once."""
         return 512 if self.device == "cpu" else 1 << 16
 

@@ -58,10 +58,17 @@ Compute = Callable[[Float[Tensor, "batch dim"], bool], tuple[Tensor, Tensor | No
 class Backend(Protocol):
     """A library that a function is written in, and how it is called and differentiated there."""
 
-    engine: str
-    devices: tuple[str, ...]
-    rows: int  # points in one call, at most
-    whole_batches: bool
+    @property
+    def engine(self) -> str:
+        """What the library is called."""
+
+    @property
+    def devices(self) -> tuple[str, ...]:
+        """What it runs on."""
+
+    @property
+    def rows(self) -> int:
+        """Points in one call, at most."""
 
     def find_device(self, device: str) -> str:
         """Return the device that auto stands for, or the one named. Raises ValueError where it is not there."""
@@ -127,11 +134,11 @@ class Function:
         """Whether the horizon counts time steps: times dt, it is the same time in every fidelity."""
         if not {self.horizon, "dt"} <= set(self.fidelity_arguments):
             return False
-        steps = [one.settings.get(self.horizon) for one in self.fidelities.values()]
+        steps: list[Any] = [one.settings.get(self.horizon) for one in self.fidelities.values()]
         if not all(isinstance(count, int) for count in steps):
             return False
         times = [count * one.dt for count, one in zip(steps, self.fidelities.values(), strict=True)]
-        return max(times) - min(times) <= SAME_TIME * max(times)
+        return bool(max(times) - min(times) <= SAME_TIME * max(times))
 
     def settings_of(self, options: Any, fidelity: Fidelity) -> dict[str, Any]:
         """Return the function's keyword arguments, but for its random numbers, with these options at a fidelity."""
@@ -158,7 +165,6 @@ class FunctionEnvironment(Environment):
     def __init__(self, function: Function, /, **settings: Any) -> None:
         self.function = function
         self.name, self.space, self.loss_unit = function.name, function.space, function.loss_unit
-        self.whole_batches = function.backend.whole_batches
         vars(self).update(
             fidelities=function.fidelities,
             Options=function.options_class,
@@ -170,7 +176,7 @@ class FunctionEnvironment(Environment):
         super().__init__(**settings)
 
     @property
-    def preferred_batch(self) -> int:
+    def preferred_batch(self) -> int:  # type: ignore[override] # read only
         """Number of points worth evaluating at once."""
         return min(self.function.backend.rows, self._max_rows)
 
@@ -201,7 +207,10 @@ class FunctionEnvironment(Environment):
 
     def length(self) -> float:
         """Return what is proportional to the time that an episode simulates: 1 where nobody says how long it is."""
-        return self._settings[self.horizon_option] * self.fidelity.dt if self.function.counts_steps else 1.0
+        if not self.function.counts_steps:
+            return 1.0
+        steps: float = self._settings[self.horizon_option]
+        return steps * self.fidelity.dt
 
     def about(self) -> str:  # type: ignore[override] # a function's documentation is its own, not the class's
         """Return what the function says of itself."""
@@ -213,7 +222,8 @@ class FunctionEnvironment(Environment):
             return None
         values = self.space.to_values(self._check_points(x))
         losses = torch.stack([self._compute(seed)(values, False)[0].double() for seed in self._seeds])
-        return losses.std(dim=0) / len(losses) ** 0.5
+        error: Tensor = losses.std(dim=0) / len(losses) ** 0.5
+        return error
 
     def named(self, name: str) -> FunctionEnvironment:
         """Return the same environment by another name."""

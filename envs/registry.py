@@ -380,9 +380,10 @@ def _is_offered(name: str, value: object, module: str) -> bool:
     """Say whether a value of a file is a simulator: an environment, a class of one, or an object like one."""
     from .base import Environment
 
-    if isinstance(value, type):
-        return issubclass(value, Environment) and value.__module__ == module
-    return not name.startswith("_") and hasattr(value, "space") and hasattr(value, "evaluate")
+    if isinstance(value, type) and value.__module__ != module:  # imported there
+        return False
+    is_class = isinstance(value, type) and issubclass(value, Environment)
+    return is_class or (not name.startswith("_") and hasattr(value, "space") and hasattr(value, "evaluate"))
 
 
 def make(

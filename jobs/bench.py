@@ -321,7 +321,7 @@ def _time_adapter(env: Environment, seconds: float) -> AdapterShare | None:
         engine = env.engine_call(points, grad=grad)
         if engine is None:
             return None
-        calls = {"ours": partial(env.evaluate, points, grad=grad), "engine": engine}
+        calls: dict[str, Callable[[], object]] = {"ours": partial(env.evaluate, points, grad=grad), "engine": engine}
         for call in calls.values():
             call()
         times = alternate(calls, seconds)

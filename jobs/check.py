@@ -152,7 +152,7 @@ class CheckJob:
     def _run(self, follow: Callable[[str], None]) -> Iterator[Finding]:
         from ..landscapes.conformance.suite import check
 
-        return check(
+        yield from check(  # once the cost is known, and by that the type of the losses
             self.env,
             points=self.points,
             seed=self.seed,
@@ -183,6 +183,8 @@ class CheckJob:
         sloped += 2 * (sum(FACTORS) + 4)  # two points over longer horizons, time steps and materials
         seconds = (plain * cost.forward + sloped * cost.gradient) / env.threads
         subject = f"{env.name} · {env.fidelity.name} · {env.device} · {env.engine} · {self.points} points"
+        if env.precision != env.fidelity.precision:
+            subject += f" · its losses are {env.precision}"
         return f"{subject}: some {plain} episodes and {sloped} with gradients, about {duration(seconds)}"
 
 

@@ -93,7 +93,10 @@ class ExtremesJob:
         found = Knobs(env, spec)
         turned = found.pick(knobs)
         if not turned:
-            raise ValueError(f"{env.name} has no step, no grid and no option to turn, and is not asked beyond its box")
+            raise ValueError(
+                f"{env.name} has nothing to turn: no time step, no grid, no option that is a number above 0 and no "
+                "horizon, and it is not asked beyond its box; a function takes options=, fidelities= and horizon="
+            )
         judge_by = _find_reference(env, reference)
         identity = {**env.identity(), "points": points, "seed": seed, "reference": judge_by}
         folder = out or folder_named(["extremes", env.name, env.fidelity.name, points], identity, root)

@@ -13,12 +13,12 @@ from ..landscapes.storage import paths
 from ..landscapes.storage.files import other_files, visible_files
 from ..landscapes.storage.ownership import refuse_others
 from ..landscapes.storage.paths import slice_exists
-from ..optim.runs import RUN
+from ..optim import runs
 
 if TYPE_CHECKING:
     import xarray as xr
 
-SLICE_STORE, RUN_STORE = paths.SLICE, RUN
+SLICE_STORE, RUN_STORE = paths.SLICE, runs.RUN
 ROOT = Path("out")  # where results go that are given no folder
 
 

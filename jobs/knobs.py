@@ -141,7 +141,8 @@ class Knobs:
             own = replace(own, name=name, precision=precision, **changes)  # type: ignore[arg-type] # each of its kind
         else:
             own = self.base.fidelities[fidelity]
-        options = {name: value for name, value in settings.items() if name not in (DT, RESOLUTION, BOX, HORIZON)}
+        own_knobs = (DT, RESOLUTION, BOX, HORIZON)
+        options: dict[str, Any] = {name: value for name, value in settings.items() if name not in own_knobs}
         env = self.base.remake(fidelity=own, **options)
         return env.with_horizon(settings[HORIZON]) if HORIZON in settings else env
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from platformdirs import user_data_path
 
 from ..landscapes.identity import MODEL_VERSION, current_identity
+from ..landscapes.storage.disk import moved_by
 from ..landscapes.storage.records import read_json, reading, write_record
 from .folder import digest
 
@@ -31,7 +32,8 @@ def keep(found: Extremes) -> Path | None:
     known = found.identity
     decides = [known["settings"], known["options"], known["engine"]]
     path = _folder() / f"{found.env}-{known['device']}-{digest(decides)}.json"
-    write_record(path, found.record())
+    with moved_by("XDG_DATA_HOME", "what was measured"):
+        write_record(path, found.record())
     return path
 
 

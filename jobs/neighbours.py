@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from ..landscapes.objective import evaluate
-from .scene import SceneSpec
 from .watch import Watch
 
 if TYPE_CHECKING:
@@ -69,7 +68,6 @@ class Neighbours:
 
         first, second = (self._around(seed) for seed in (1, 2))
         variants = self.compared()
-        source = SceneSpec.of(self.env).name
         losses: dict[str, NDArray[np.float64]] = {}
         with watch.progress(2 + len(variants), "fidelities over neighbourhoods") as advance:
             pair = tuple(
@@ -77,7 +75,7 @@ class Neighbours:
             )
             for number, variant in enumerate(variants):
                 advance(2 + number, variant.name)
-                env = variant.make(source)
+                env = variant.make(self.env)
                 losses[variant.name] = self._losses(f"around-{variant.name}", env, second)
             advance(2 + len(variants))
         shape = (-1, AROUND)

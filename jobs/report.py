@@ -163,8 +163,10 @@ class ReportJob:
         """
         dataset = _open(subject)
         env = environment_of(dataset, self.device, self.env)
-        key: ReportKey = {"points": self.points, "seed": self.seed, "slice": digest_of(dataset)}
-        key[MODEL_VERSION] = env.version_on(env.engine)
+        key: ReportKey = {
+            "points": self.points, "seed": self.seed, "slice": digest_of(dataset),
+            "model_version": env.version_on(env.engine),
+        }  # fmt: skip
         beside = subject.store.parent
         if not self.prints or (beside / ARRAYS).exists():
             _fetch(beside, folder, key, watch)
@@ -357,7 +359,7 @@ def _keep(folder: Path, key: ReportKey, device: str, watch: Watch) -> Report:
     _leave_measures(folder, kept)
     elsewhere = f", measured on {kept.device}" if kept.device != device else ""
     watch.note(f"{folder} is there already{elsewhere}")
-    if (theirs := kept.key[MODEL_VERSION]) != (ours := key[MODEL_VERSION]):
+    if (theirs := kept.key["model_version"]) != (ours := key["model_version"]):
         said = f"{kept.env} model {theirs}; this is model {ours}"
         watch.note(f"warning: it was measured by {said}. Delete the folder to measure it anew")
     return kept

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NotRequired, Protocol, TypedDict, cast
 
-from ..landscapes.identity import MODEL_VERSION, current_identity
+from ..landscapes.identity import current_identity
 from ..landscapes.measures.records import ProfileRecord, WordRecord
 from ..landscapes.plain import number, text
 from ..landscapes.storage.records import read_json, reading
@@ -82,7 +82,7 @@ class Report:
         with reading(path, "delete it, and the same command measures the slice anew"):
             report = replace(cls.of_record(read_json(path)), folder=path.parent)
             report.measures, slices_markdown([report]), by_environment([report])
-            number(report.key[MODEL_VERSION])
+            number(report.key["model_version"])
             own = report.name, report.env, report.device, report.profile.get("errors", "")
             for said in (*own, *report.verdict_lines()):
                 text(said)

@@ -13,6 +13,8 @@ from platformdirs import user_data_path
 
 from .. import __version__
 from ..envs.registry import make
+from ..landscapes.identity import MODEL_VERSION
+from ..landscapes.storage.disk import moved_by
 from .folder import digest
 
 if TYPE_CHECKING:
@@ -37,7 +39,8 @@ def keep(found: Tradeoff) -> Path | None:
     if not found.identity.get("model_version"):
         return None
     path = _place(found.env, found.identity["options"], found.identity["device"])
-    write_record(path, found.record())
+    with moved_by("XDG_DATA_HOME", "what was measured"):
+        write_record(path, found.record())
     return path
 
 
@@ -48,7 +51,8 @@ def keep_convergence(found: Convergence) -> Path | None:
     if not found.identity.get("model_version"):
         return None
     path = _place(found.env, found.identity["options"], found.identity["device"]).with_suffix(CONVERGED)
-    write_record(path, found.record())
+    with moved_by("XDG_DATA_HOME", "what was measured"):
+        write_record(path, found.record())
     return path
 
 
@@ -57,7 +61,6 @@ def find_convergence(found: Tradeoff) -> Convergence | None:
 
     Looks among the user's own studies, then in the gallery's; raises DamagedError where one cannot be read.
     """
-    from ..landscapes.identity import MODEL_VERSION
     from ..landscapes.measures.convergence_record import Convergence
     from ..landscapes.storage.records import read_json, reading
 
@@ -96,7 +99,6 @@ def choose_fidelity(spec: SceneSpec, watch: Watch) -> Fidelity:
         )
     found, source, rows = _candidates(env, spec.options)
     from ..envs.base import Fidelity
-    from ..landscapes.identity import MODEL_VERSION
 
     errors = {row.name: off for row in rows if (off := row.comparison.p95(relative=relative)) is not None}
     within = [row for row in rows if errors.get(row.name, float("inf")) <= limit]

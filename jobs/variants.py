@@ -87,7 +87,11 @@ def variants(env: Environment, settings: Sequence[str]) -> list[Variant]:
 def refuse_single(env: Environment) -> None:
     """Raise ValueError for a scene that has one fidelity only: nothing of it can be traded."""
     if len(env.fidelities) < 2:
-        raise ValueError(f"{env.name} has fidelity {', '.join(env.fidelities)} only; there is nothing to trade")
+        raise ValueError(
+            f"{env.name} has one fidelity, {', '.join(env.fidelities)}, so there is nothing to hold against the other; "
+            "name several: a function takes fidelities={'draft': {'dt': 0.02}, 'reference': {'dt': 0.001}}, and a "
+            "class has `fidelities`"
+        )
 
 
 def refuse_ladder(ladder: str, known: Collection[str], settings: Collection[str]) -> None:

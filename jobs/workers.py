@@ -123,7 +123,7 @@ def recipe(objective: Objective) -> partial[Environment] | None:
     return partial(_make_checked, source_of(env), env.version_on(env.engine), how | asdict(env.options))
 
 
-def _make_checked(source: str | type[Environment], model: int, settings: dict[str, Any]) -> Environment:
+def _make_checked(source: str | type[Environment] | Environment, model: int, settings: dict[str, Any]) -> Environment:
     env = make(source, **settings)
     if (theirs := env.version_on(env.engine)) != model:
         raise ValueError(

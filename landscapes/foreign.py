@@ -327,8 +327,9 @@ def _places(frame: pd.DataFrame, space: ParameterSpace, name: str) -> list[int]:
 
 def _gaps(frame: pd.DataFrame, x: Values, space: ParameterSpace, name: str) -> list[str]:
     """Return the names of the columns that lack a number for a parameter in any row of `x`."""
-    heading, lacks = _heading(frame), ~np.isfinite(x).all(axis=0)
-    return [heading[at] for at, one in zip(_places(frame, space, name), lacks.tolist(), strict=True) if one]
+    heading, lacks = _heading(frame), np.flatnonzero(~np.isfinite(x).all(axis=0))
+    places = _places(frame, space, name)
+    return [heading[places[number]] for number in lacks]
 
 
 def _losses(frame: pd.DataFrame, names: Sequence[str], name: str) -> Values:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .. import __version__
+from .objective import Status, describe_errors
 from .plain import plain_json
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from .space import ParameterSpace
 
 EVERY = "gradients_every"  # of a slice's identity; not there where its gradients are at every sample
+ERROR = "error"  # the attribute of a slice or a run with what the first point that raised said
 SCALES = "scales"  # of the parameters in an identity; not there where all are linear
 ABSENT = "none"  # in the place of a setting's value
 LISTED_SETTINGS = 6  # settings that differ, in the refusal of a store
@@ -117,6 +119,11 @@ def stored_provenance(dataset: xr.Dataset) -> dict[str, Any]:
     Raises ValueError where the dataset is neither.
     """
     return current_provenance(_decode(dataset, "provenance"), _decode(dataset, "identity"))
+
+
+def errors_of(dataset: xr.Dataset) -> str:
+    """Say how many points of a slice or a run raised and what the first of them said; nothing where none did."""
+    return describe_errors(int((dataset["status"] == Status.ERROR).sum()), str(dataset.attrs.get(ERROR, "")))
 
 
 def plane_of(dataset: xr.Dataset) -> Plane:

@@ -266,8 +266,17 @@ class ObjectiveWrapper(Objective):
         self.objective = objective
         self.name, self.space, self.loss_unit = objective.name, objective.space, objective.loss_unit
         self.beyond_box, self.device, self.decisions = objective.beyond_box, objective.device, objective.decisions
-        self.threads, self.whole_batches = objective.threads, objective.whole_batches
-        self.preferred_batch = objective.preferred_batch
+        self.whole_batches = objective.whole_batches
+
+    @property
+    def threads(self) -> int:  # type: ignore[override] # read only
+        """Number of threads that a batch is spread over."""
+        return self.objective.threads
+
+    @property
+    def preferred_batch(self) -> int:  # type: ignore[override] # read only
+        """Number of points worth evaluating at once."""
+        return self.objective.preferred_batch
 
     @property
     def precision(self) -> str:
@@ -290,7 +299,6 @@ class ObjectiveWrapper(Objective):
     def shrink(self, rows: int) -> None:
         """Take at most `rows` points at once from now on."""
         self.objective.shrink(rows)
-        self.preferred_batch = self.objective.preferred_batch
 
     def memory(self) -> int:
         """Estimate the bytes that the evaluation of one point takes."""

@@ -13,10 +13,9 @@ import torch
 import xarray as xr
 from numpy.typing import NDArray
 
-from .identity import plane_of, stored_identity, stored_provenance
+from .identity import errors_of, plane_of, stored_identity, stored_provenance
 from .objective import Objective, Status
 from .plane import Plane
-from .storage.arrays import errors_of
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -32,7 +32,6 @@ class JaxBackend:
     rows: int
     engine: str = "jax"
     devices: tuple[str, ...] = ("cpu", "cuda")
-    whole_batches: bool = False
 
     def find_device(self, device: str) -> str:
         """Return the device that auto stands for, JAX's default, or the one named."""

@@ -11,8 +11,11 @@ from typing import Any
 import torch
 import warp as wp
 
+from ...landscapes.storage.disk import moved_by
+
 wp.config.log_level = wp.LOG_ERROR  # no banner
 
+CACHE = ("WARP_CACHE_PATH", "Warp's kernels")
 MANY = ".engines.mpm."  # where solvers are whose kernels are of many modules
 
 
@@ -21,7 +24,8 @@ def _start() -> None:
     previous, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 2)
-        wp.init()
+        with moved_by(*CACHE):
+            wp.init()
     finally:
         os.dup2(previous, 2)
         os.close(previous)
@@ -109,7 +113,8 @@ def load(kernels: Iterable[Any], device: str) -> None:
     before = wp.config.use_precompiled_headers
     wp.config.use_precompiled_headers = any(MANY in where for where in modules.values())
     try:
-        wp.force_load(device, list(modules), max_workers=cores())
+        with moved_by(*CACHE):
+            wp.force_load(device, list(modules), max_workers=cores())
     finally:
         wp.config.use_precompiled_headers = before
 

@@ -33,7 +33,6 @@ class WarpBackend:
     check_overwrites: bool
     engine: str = "warp"
     devices: tuple[str, ...] = ("cpu", "cuda")
-    whole_batches: bool = False
 
     def find_device(self, device: str) -> str:
         """Return the device that auto stands for, or the one named."""

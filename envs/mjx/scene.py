@@ -84,7 +84,7 @@ class MjxScene(Environment):
         """Return the loss of the last state, traced by JAX: `mujoco.mjx.Data` of one row."""
 
     @property
-    def preferred_batch(self) -> int:
+    def preferred_batch(self) -> int:  # type: ignore[override] # read only
         """Number of points worth evaluating at once."""
         return min(ROWS, self._max_rows)
 

@@ -16,6 +16,7 @@ from platformdirs import user_cache_path
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
+from ...landscapes.storage.disk import moved_by
 from ...landscapes.storage.files import replacing
 from ..engines.mpm.model import Model
 from ..engines.mpm.raster import Raster
@@ -125,7 +126,7 @@ def load_or_make(name: str, content: str, make: Callable[[], np.ndarray]) -> np.
     if found is None:
         log.info("%s: making the target by its demonstration", name)
         found = make()
-        with replacing(path) as partial, partial.open("wb") as file:
+        with moved_by("XDG_CACHE_HOME", "targets"), replacing(path) as partial, partial.open("wb") as file:
             np.save(file, found)
     return found
 

@@ -16,6 +16,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
+from ..large import refuse_large
 from ..objective import Status
 
 DPI, PRINT_DPI = 150, 600  # of a picture for a screen, and of what is pixels in one for print
@@ -300,6 +301,7 @@ def _span(values: NDArray[np.float64]) -> tuple[float, float, str]:
     finite = values[np.isfinite(values)]
     if finite.size == 0:
         return 0.0, 1.0, "neither"
+    refuse_large(finite)
     least, low, high, most = (float(value) for value in np.percentile(finite, (0, 1, 99, 100)))
     room = high - low
     below, above = least < low - room, most > high + room

@@ -13,10 +13,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..capacity import Need
-from ..identity import plane_of
+from ..identity import errors_of, plane_of
 from ..objective import Evaluation, Objective, ObjectiveWrapper, evaluate, in_box
 from ..statistics import EstimateRecord
-from ..storage.arrays import errors_of
 from . import gradient_quality as gradients
 from .classify import Verdict, classify, thresholds
 from .discontinuities import Count, Jumps, find_jumps

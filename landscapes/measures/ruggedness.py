@@ -18,6 +18,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..identity import plane_of
+from ..large import refuse_large
 from ..objective import Status
 from ..plain import plain
 from ..statistics import Estimate, Values, fit_line, jackknife, share
@@ -89,7 +90,8 @@ def minima_of_halves(loss: Values, depth: float) -> tuple[int, int]:
 
 
 def span(loss: Values) -> float:
-    """Return the range of the losses."""
+    """Return the range of the losses. Raises ValueError where they are too large to have differences."""
+    refuse_large(loss)
     known = loss[np.isfinite(loss)]
     return float(known.max() - known.min()) if known.size else math.nan
 
@@ -263,7 +265,7 @@ class Ruggedness:
 def ruggedness(dataset: xr.Dataset, *, floor: float, estimate: Callable[..., Estimate] = jackknife) -> Ruggedness:
     """Measure the ruggedness of a slice; `estimate` takes a statistic and samples, and gives its interval, too."""
     loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
-    found, whole = minima(loss), span(loss)
+    whole, found = span(loss), minima(loss)
     notable = found.sample[found.depth > max(floor, NOTABLE * whole)]
     shares = basins(loss, notable) if len(notable) else np.full(1, math.nan)
     axes = range(loss.ndim)[::-1]  # u first

@@ -13,6 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..identity import differing_settings, plane_of, stored_identity, stored_provenance, stored_scales
+from ..large import refuse_large
 from ..lattice import sampled_lattice
 from ..objective import Status
 from ..space import scaled_labels
@@ -45,6 +46,7 @@ def compare_slices(a: xr.Dataset, b: xr.Dataset, *, command: str = "") -> SliceC
     a, b = _on_one_lattice(a, b)
     differing = differing_settings(*(_settings(one) for one in (a, b)))
     losses, cosine = [one["loss"].to_numpy() for one in (a, b)], _cosine(a, b)
+    refuse_large(np.stack(losses))
     apart, names = np.abs(losses[1] - losses[0]), _names(a, b, differing)
     known = np.isfinite(apart)
     return SliceComparison(

@@ -30,6 +30,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..identity import plane_of
+from ..large import LARGE, in_unit, unit_of
 from ..lattice import has_all_gradients, lift_between
 from ..objective import Objective, Status, evaluate
 from ..plain import finite
@@ -78,15 +79,16 @@ def find_unresolved(
     `floor` [loss unit] is the least difference that is more than noise. A slice whose range is zero has steps of zero,
     so that any difference beyond rounding counts.
     """
+    unit, dataset = unit_of(dataset["loss"].to_numpy()), in_unit(dataset)
     loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
     slope = _step_slopes(dataset, loss)
-    least = _least(loss, floor)
+    least = _least(loss, floor / unit)
     strata = _strata(loss, slope, least)
     budget = probes(_evaluated(dataset), grad=has_all_gradients(dataset))
     cells = sum(map(len, strata.values()))
     if not cells:
         return None
-    look = _Look(objective, plane_of(dataset), loss, slope, least)
+    look = _Look(objective, plane_of(dataset), loss, slope, least, unit)
     generator, parts = np.random.default_rng(seed), list[tuple[int, int, Values]]()
     for name, stratum in strata.items():
         most = _most(name, strata, budget, budget - look.episodes)
@@ -100,7 +102,7 @@ def find_unresolved(
             [(count, int(one.sum()), len(one)) for (count, _, _), one in zip(parts, decided, strict=True)],
             of=math.prod(points - 1 for points in loss.shape) if _evaluated(dataset) < loss.size else cells,
         ),
-        least=least,
+        least=least * unit,
         cells=cells,
         probed=sum(drawn for _, drawn, _ in parts),
         found=int(sum(one.sum() for one in decided)),
@@ -164,8 +166,9 @@ def contradicted_cells(dataset: xr.Dataset) -> NDArray[np.bool_]:
     A cell with a corner that failed or was not sampled is none. A difference counts from what the slice's own record
     says on, and without a record from half a step of a ramp through the range.
     """
-    record, loss = stored_unresolved(dataset), dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
-    least = _least(loss, 0.0) if record is None or record["least"] is None else record["least"]
+    record, unit, dataset = stored_unresolved(dataset), unit_of(dataset["loss"].to_numpy()), in_unit(dataset)
+    loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+    least = _least(loss, 0.0) if record is None or record["least"] is None else record["least"] / unit
     found = np.zeros([points - 1 for points in loss.shape], dtype=bool)
     found[tuple(_strata(loss, _step_slopes(dataset, loss), least)[CONTRADICTED].T)] = True
     return found
@@ -183,7 +186,7 @@ def _step_slopes(dataset: xr.Dataset, loss: Values) -> Values:
     if not has_all_gradients(dataset):
         return np.stack([np.gradient(loss, axis=axis) for axis in range(loss.ndim)], axis=-1)
     slopes: Values = (box_slopes(dataset) / (np.array(plane_of(dataset).resolution) - 1))[..., ::-1]
-    return slopes
+    return np.clip(slopes, -LARGE, LARGE)  # no loss goes on like that, and sums of them are numbers
 
 
 def _strata(loss: Values, slope: Values, least: float) -> dict[str, Cells]:
@@ -241,8 +244,11 @@ class _Look:
     An answer is 1 for a cell that is unresolved, 0 for one that is not, NaN where an evaluation failed.
     """
 
-    def __init__(self, objective: Objective, plane: Plane, loss: Values, slope: Values, least: float) -> None:
+    def __init__(
+        self, objective: Objective, plane: Plane, loss: Values, slope: Values, least: float, unit: float
+    ) -> None:
         self.objective, self.plane, self.loss, self.slope, self.least = objective, plane, loss, slope, least
+        self.unit = unit  # of losses, slopes and `least`
         self.episodes = 0
 
     def ask(self, at: Values) -> Values:
@@ -250,7 +256,8 @@ class _Look:
         if not len(at):
             return np.zeros(0)
         self.episodes += len(at)
-        return cast("Values", evaluate(self.objective, lift_between(self.plane, at), grad=False).loss.numpy())
+        losses: Values = evaluate(self.objective, lift_between(self.plane, at), grad=False).loss.numpy() / self.unit
+        return losses
 
     def middles(self, cells: Cells) -> Values:
         """Look at the middles of cells, against all their corners."""

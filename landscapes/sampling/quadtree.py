@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..large import refuse_large
+
 Values = NDArray[np.float64]
 Places = NDArray[np.intp]  # of points of the grid, shape (count, rank), in array order
 CELLS = 6  # along the longer axis, of the coarsest lattice, at least
@@ -81,8 +83,9 @@ class Quadtree:
 
     @property
     def range(self) -> float:
-        """The range of the losses."""
+        """The range of the losses. Raises ValueError where they are too large to have differences."""
         known = self.loss[np.isfinite(self.loss)]
+        refuse_large(known)
         return float(np.ptp(known)) if known.size else 0.0
 
     def lattice(self) -> Places:

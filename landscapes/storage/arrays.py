@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..capacity import BLOCK, Need, require
 from ..identity import PACKAGE, VERSIONS, with_package
-from ..objective import Status, describe_errors
+from ..objective import Status
 from ..plane import Plane
 from ..space import LOG10, ParameterSpace
 from .checksums import SUMS, lay_out_sums, text_sum, write_sums
@@ -26,7 +26,6 @@ from .tiles import coarse_to_fine, tile_side
 FORMAT = 2
 AXES = ("u", "v")
 CF = "CF-1.11"
-ERROR = "error"  # the attribute of a slice or a run with what the first point that raised said
 INTERPOLATED = "interpolated"  # the array of a refined slice that has what was not sampled
 FILES = store_files(("loss", "grad", "status", INTERPOLATED, SUMS, *AXES, "dim", "unit"))  # of a slice on disk
 DRAWN = 150  # bytes that a picture takes for each sample
@@ -126,11 +125,6 @@ def parameters_of(dataset: xr.Dataset) -> list[tuple[str, str]]:
     """Return the name and the unit of every parameter of a slice."""
     names, units = (map(str, dataset[name].to_numpy()) for name in ("dim", "unit"))
     return list(zip(names, units, strict=True))
-
-
-def errors_of(dataset: xr.Dataset) -> str:
-    """Say how many points of a slice or a run raised and what the first of them said; nothing where none did."""
-    return describe_errors(int((dataset["status"] == Status.ERROR).sum()), str(dataset.attrs.get(ERROR, "")))
 
 
 def _axis(plane: Plane, number: int) -> dict[str, str]:

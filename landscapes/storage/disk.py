@@ -1,4 +1,4 @@
-"""Full disks: a job ends with a message that says what is kept and how to go on."""
+"""Disks that take nothing: a job ends with what is kept and how to go on, or with how a folder is moved."""
 
 from __future__ import annotations
 
@@ -16,6 +16,26 @@ class DiskFullError(OSError):
 
     def __str__(self) -> str:
         return str(self.strerror)
+
+
+class UnwritableError(OSError):
+    """A folder that the system chose cannot be written to; the message says how it is moved."""
+
+    def __str__(self) -> str:
+        return str(self.strerror)
+
+
+@contextmanager
+def moved_by(variable: str, what: str) -> Iterator[None]:
+    """Raise UnwritableError where `what` cannot be kept, which says that an environment variable moves its folder."""
+    try:
+        yield
+    except OSError as error:
+        if is_full(error) or error.filename is None or error.strerror is None:
+            raise
+        why = f"{what} cannot be kept at {error.filename} ({error.strerror.lower()})"
+        said = f"{why}; set the environment variable {variable} to a folder that can be written to"
+        raise UnwritableError(error.errno, said) from error
 
 
 def is_full(error: BaseException) -> TypeGuard[OSError]:

@@ -33,6 +33,7 @@ from torch import Tensor
 from zarr.storage import MemoryStore
 
 from ..identity import (
+    ERROR,
     StoreError,
     StoreExistsError,
     check_identity,
@@ -47,7 +48,6 @@ from ..plane import Plane
 from ..space import ParameterSpace
 from .arrays import (
     AXES,
-    ERROR,
     FILES,
     FORMAT,
     INTERPOLATED,

@@ -17,8 +17,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from ...landscapes.identity import StoreError
-from ...landscapes.storage.arrays import ERROR
+from ...landscapes.identity import ERROR, StoreError
 from ...landscapes.storage.files import replacing
 
 STATE = "state"

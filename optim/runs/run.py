@@ -13,9 +13,8 @@ import xarray as xr
 from jaxtyping import Float
 from torch import Tensor
 
-from ...landscapes.identity import stored_identity, stored_provenance, stored_scales
+from ...landscapes.identity import errors_of, stored_identity, stored_provenance, stored_scales
 from ...landscapes.space import to_values
-from ...landscapes.storage.arrays import errors_of
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -30,10 +30,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...landscapes.identity import StoreError, StoreExistsError, check_identity, current_identity
+from ...landscapes.identity import ERROR, StoreError, StoreExistsError, check_identity, current_identity
 from ...landscapes.objective import Evaluation, failed
 from ...landscapes.space import ParameterSpace
-from ...landscapes.storage.arrays import ERROR
 from ...landscapes.storage.files import placing, resolve
 from ...landscapes.storage.layout import FILL, consolidate, open_group
 from ...landscapes.storage.ownership import check_ours, clear_halves, has_lost_root

@@ -92,7 +92,7 @@ def test_a_tradeoff_has_a_front_a_table_and_a_picture(tmp_path: Path) -> None:
     assert found.record() == read_json(tmp_path / "trade/tradeoff.json")
     assert gs.tradeoff("bounce", **how, out=tmp_path / "trade") == found  # type: ignore[arg-type]
     assert found.plot()._repr_png_().startswith(b"\x89PNG")
-    with pytest.raises(ValueError, match="there is nothing to trade"):
+    with pytest.raises(ValueError, match="there is nothing to hold against"):
         gs.tradeoff("branin")
 
 

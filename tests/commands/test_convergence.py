@@ -174,7 +174,7 @@ def test_widths_are_those_of_the_levels_fidelities() -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["branin"], "there is nothing to trade"),
+        (["branin"], "there is nothing to hold against"),
         (["bounce", "--variants", "speed"], "--variants takes dt, resolution, particles, joint, precision"),
         (["bounce", "--variants", "resolution"], "bounce has nothing of resolution to refine"),
         (["bounce", "--fidelity", "draft"], "leave it out"),

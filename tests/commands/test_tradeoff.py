@@ -231,7 +231,7 @@ def test_another_study_is_not_overwritten(run: Command, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["tradeoff", "branin"], "branin has fidelity exact only; there is nothing to trade"),
+        (["tradeoff", "branin"], "branin has one fidelity, exact, so there is nothing to hold against"),
         (["tradeoff", "bounce", "--variants", "speed"], "--variants takes dt, resolution"),
         (
             ["slice", "bounce", "--dims", "0", "1", "--tolerance", "5%", "--set", "horizon=0.5"],

@@ -17,6 +17,7 @@ from matplotlib.path import Path
 from numpy.typing import NDArray
 
 from ...identity import gradient_stride, plane_of, stored_identity
+from ...large import in_unit
 from ...lattice import own_cells, with_gradients
 from ...objective import Status
 from ...plane import Plane
@@ -47,7 +48,7 @@ def landscape_figure(dataset: xr.Dataset, *, width: float | None = None) -> page
     sheet = style.Sheet.of(width, pitch=PITCH, panels=panels)
     picture = page.Picture(sheet, panels / sheet.columns * sheet.pitch)
     axes = panel.grid(picture, panels, share=True)
-    entries = loss_panel(axes[0], dataset)
+    entries = loss_panel(axes[0], in_unit(dataset))
     entries += arrow_panel(axes[1], dataset) if panels == 2 else []
     for ax in axes:
         frame(ax, dataset, plane)
@@ -162,9 +163,10 @@ def log_magnitude(dataset: xr.Dataset) -> Grid:
 
 def descent(slope: Grid, plane: Plane) -> Grid:
     """Return the direction of steepest descent as unit vectors in fractions of the picture's sides; NaN where flat."""
-    scaled = slope * _sides(plane)
+    scaled = slope
     with np.errstate(divide="ignore", invalid="ignore"):
-        scaled = scaled / np.abs(scaled).max(axis=-1, keepdims=True)  # no overflow, no underflow
+        for sides in (_sides(plane), 1.0):  # before they count and after: no overflow, no underflow
+            scaled = scaled / np.abs(scaled).max(axis=-1, keepdims=True) * sides
         direction: Grid = -scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)
     return direction
 
@@ -176,13 +178,23 @@ def magnitude(slope: Grid, plane: Plane, loss_unit: str) -> tuple[Grid, str]:
     be added, and it is taken per width of the box instead.
     """
     if len(set(plane.coordinate_units)) == 1:
-        along: Grid = slope @ torch.linalg.pinv(plane.basis).T.numpy()
+        with np.errstate(over="ignore", invalid="ignore"):
+            along: Grid = slope @ torch.linalg.pinv(plane.basis).T.numpy()
         unit = plane.coordinate_units[0]
         unit = f"{loss_unit or '1'}/({unit})" if "/" in unit else f"{loss_unit or '1'}/{unit}" if unit else loss_unit
     else:
         along = slope * (plane.upper - plane.lower).numpy()
         unit = f"{loss_unit or 'loss'} per width of the box"
-    return np.linalg.norm(along, axis=-1), f"log₁₀ |gradient| [{unit}]" if unit else "log₁₀ |gradient|"
+    return _lengths(along), f"log₁₀ |gradient| [{unit}]" if unit else "log₁₀ |gradient|"
+
+
+def _lengths(vectors: Grid) -> Grid:
+    """Return the lengths of vectors along the last axis, also where their squares are too large or too small."""
+    most = np.abs(vectors).max(axis=-1, keepdims=True)
+    with np.errstate(over="ignore", invalid="ignore"):
+        plain: Grid = np.linalg.norm(vectors, axis=-1)
+        safe: Grid = most[..., 0] * np.linalg.norm(vectors / np.where(most > 0, most, 1.0), axis=-1)
+    return np.where(np.isinf(plain) | (plain == 0), safe, plain)
 
 
 def _limits(plane: Plane, axis: int) -> tuple[float, float]:

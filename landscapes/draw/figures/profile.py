@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
 
 from ...identity import plane_of
+from ...large import LARGEST, in_unit
 from ...lattice import sampled_line, with_gradients
 from ...objective import Status
 from ...plane import Plane
@@ -38,6 +39,7 @@ def profile_figure(
     plane = plane_of(dataset)
     if plane.rank != 1:
         raise ValueError(f"profile_figure draws lines; got a slice of rank {plane.rank}, so use landscape_figure")
+    dataset = in_unit(dataset)
     counted = {name: _counts(name, values, dataset.sizes["u"]) for name, values in (events or {}).items()}
     places, whole, dataset = dataset["u"].to_numpy(), dataset, sampled_line(dataset)
     sheet = style.Sheet.of(width, pitch=WIDTH)
@@ -87,8 +89,8 @@ def _draw_loss(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
 
 def _draw_slope(ax: Axes, dataset: xr.Dataset, plane: Plane) -> list[Artist]:
     u, loss, sloped = dataset["u"].to_numpy(), dataset["loss"].to_numpy(), with_gradients(dataset)
-    slope = plane.slope(torch.from_numpy(sloped["grad"].to_numpy())).numpy()[:, 0]
-    differences = _differences(u, loss)
+    slopes = plane.slope(torch.from_numpy(sloped["grad"].to_numpy())).numpy()[:, 0]
+    slope, differences = (np.where(np.abs(one) > LARGEST, np.nan, one) for one in (slopes, _differences(u, loss)))
     ax.axhline(0, color=style.FAINT, linewidth=0.8, zorder=0.5)
     sheet, thin = page.sheet_of(ax), {"color": style.QUIET, "linewidth": 0.7}
     (behind,) = ax.plot(u, differences, **sheet.look(thin), label="central difference of the loss")
@@ -98,7 +100,7 @@ def _draw_slope(ax: Axes, dataset: xr.Dataset, plane: Plane) -> list[Artist]:
     low, high = style.span_of_line(slope, differences)
     ax.set_ylim(low, high)
     panel.name_axes(ax, y=_slope_label(plane, dataset["loss"].attrs.get("units", "")))
-    for drawn, values in ((line, slope), (behind, differences)):
+    for drawn, values in ((line, slopes), (behind, differences)):
         if off := int(((values < low) | (values > high)).sum()):
             drawn.set_label(f"{drawn.get_label()} ({off} off scale)")
     _shade(ax, dataset, Status.NO_GRADIENT, style.NO_GRADIENT_LOOK)
@@ -109,7 +111,8 @@ def _differences(u: NDArray[np.float64], loss: NDArray[np.float64]) -> NDArray[n
     """Return the slope of the parabola through every three samples, which may be unevenly apart; NaN at the ends."""
     found = np.full_like(u, np.nan)
     before, after = np.diff(u)[:-1], np.diff(u)[1:]
-    rises = np.diff(loss) / np.diff(u)
+    with np.errstate(over="ignore"):
+        rises = np.diff(loss) / np.diff(u)
     found[1:-1] = (rises[:-1] * after + rises[1:] * before) / (before + after)
     return found
 
@@ -117,7 +120,8 @@ def _differences(u: NDArray[np.float64], loss: NDArray[np.float64]) -> NDArray[n
 def _slope_label(plane: Plane, loss_unit: str) -> str:
     unit = plane.coordinate_units[0]
     per = f"({unit})" if "/" in unit else unit
-    return f"slope of the loss [{loss_unit or '1'}/{per}]" if unit else "slope of the loss"
+    named = f"{loss_unit or '1'}/{per}" if unit else loss_unit
+    return f"slope of the loss [{named}]" if named else "slope of the loss"
 
 
 def _frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:

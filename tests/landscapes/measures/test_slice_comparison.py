@@ -196,9 +196,9 @@ def test_names_tell_the_two_apart_and_settings_that_differ_are_named() -> None:
     alone = compare_slices(one, labelled(one, options={"goal": "printed", "drag": 0.0}))
     assert alone.settings() == ["only A has options.walls", "only B has options.drag"]
     assert (found.a, found.b) == ("fluid · draft · goal printed", "fluid · draft · goal easy")
-    finer = compare_slices(one, labelled(one, fidelity="standard", gradscape="9.9"))
+    finer = compare_slices(one, labelled(one, fidelity="standard", model_version=2))
     assert (finer.a, finer.b) == ("fluid · draft", "fluid · standard")
-    assert set(finer.differing) == {"fidelity", "versions.gradscape"}
+    assert set(finer.differing) == {"fidelity", "model_version"}
     newer = other.assign_attrs(provenance=json.dumps({"versions": {"torch": "9.0"}}))
     assert compare_slices(other, newer).differing["versions.torch"][1] == "'9.0'"
 

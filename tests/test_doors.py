@@ -1,0 +1,194 @@
+"""Whatever is a simulator goes through every public function and every verb, or is told what it lacks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from benchmarks.results import leave_blank
+
+import gradscape as gs
+from gradscape.envs.registry import as_environment, entries
+
+from .command import Said, verbs
+
+SIMULATORS = """
+import jax.numpy as jnp
+import warp as wp
+
+import gradscape as gs
+
+space = gs.ParameterSpace({"x": (-1, 2, "m"), "y": (-1, 2, "m")})
+of_torch = gs.from_torch(lambda x: (x**2).sum(1), space, name="of-torch")
+of_jax = gs.from_jax(lambda p: jnp.sum(p**2), space, name="of-jax")
+of_numpy = gs.from_numpy(lambda x: (x**2).sum(1), space, differences=1e-4)
+
+
+@wp.kernel
+def square(x: wp.array2d(dtype=wp.float32), loss: wp.array(dtype=wp.float32)):
+    i = wp.tid()
+    loss[i] = x[i, 0] * x[i, 0] + x[i, 1] * x[i, 1]
+
+
+def launch(x):
+    loss = wp.zeros(len(x), dtype=wp.float32, requires_grad=True)
+    wp.launch(square, dim=len(x), inputs=[x], outputs=[loss])
+    return loss
+
+
+of_warp = gs.from_warp(launch, space, name="of-warp", device="cpu")
+
+
+class Bowl(gs.Environment):
+    space = space
+
+    def _evaluate(self, x, *, grad):
+        return gs.Evaluation.from_results((x**2).sum(1), 2 * x if grad else None)
+
+
+bowl = Bowl()
+
+
+class Own:
+    space = space
+
+    def evaluate(self, x, *, grad=True):
+        return gs.Evaluation.from_results((x**2).sum(1), 2 * x if grad else None)
+
+
+own = Own()
+"""
+NAMES = ("of_torch", "of_jax", "of_numpy", "of_warp", "Bowl", "bowl", "own")
+LACKING = {  # what some verbs need of a simulator
+    "replay": "has no episode to draw; a class with a method `episode` has",
+    "tradeoff": "has one fidelity, default, so there is nothing",
+    "extremes": "nothing to turn",
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    found = tmp_path_factory.mktemp("doors")
+    (found / "doors.py").write_text(SIMULATORS)
+    return found
+
+
+@pytest.fixture
+def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Work in the folder of the simulators, and draw blank pictures."""
+    monkeypatch.chdir(folder)
+    leave_blank(monkeypatch.setattr)
+    yield folder
+    entries.cache_clear()
+
+
+def functions(f: Any, name: str) -> dict[str, Callable[[], Any]]:
+    """Return a call of every public function that takes a simulator, by the function's name."""
+    small: dict[str, Any] = {"budget": 6, "seeds": 2}
+    return {
+        "as_environment": lambda: gs.as_environment(f),
+        "make": lambda: gs.make(f),
+        "check": lambda: gs.check(f, points=2),
+        "slice": lambda: gs.slice(f, resolution=6, out=f"{name}/slice"),
+        "sample": lambda: gs.sample(f, gs.open_slice(f"{name}/slice").plane),
+        "open_slice": lambda: gs.open_slice(f"{name}/slice", env=f).report(points=2),
+        "report": lambda: gs.report(f"{name}/slice", env=f, points=2, out=f"{name}/report"),
+        "sweep": lambda: gs.sweep(f, (0, 1), "smoothing", frames=2, resolution=4, out=f"{name}/sweep"),
+        "optimize": lambda: gs.optimize(f, "random", budget=6, out=f"{name}/run"),
+        "open_run": lambda: gs.open_run(f"{name}/run"),
+        "race": lambda: gs.race(f, ["random", "cma-es"], **small, out=f"{name}/race"),
+        "league": lambda: gs.league([f], ["random", "cma-es"], **small, out=f"{name}/league"),
+        "overlay": lambda: gs.overlay(
+            gs.open_slice(f"{name}/slice", env=f), f"{name}/run", through="best", out=f"{name}/overlay"
+        ),
+        "compare": lambda: gs.compare(f"{name}/slice", f, out=f"{name}/compare"),
+        "pairs": lambda: gs.pairs(f, samples=2, out=f"{name}/pairs"),
+        "census": lambda: gs.census(f, slices=2, resolution=6, out=f"{name}/census"),
+        "tradeoff": lambda: gs.tradeoff(f, points=4, out=f"{name}/tradeoff"),
+        "extremes": lambda: gs.extremes(f, points=4, out=f"{name}/extremes"),
+    }
+
+
+def commands(f: str, name: str) -> dict[str, str]:
+    """Return a command of every verb that takes a simulator, or what others made of one, by the verb."""
+    return {
+        "envs": f"envs {f}",
+        "slice": f"slice {f} --resolution 6 --out {name}/s",
+        "report": f"report {name}/s --env {f} --points 2 --out {name}/r",
+        "check": f"check {f} --points 2",
+        "sweep": f"sweep {f} --dims 0 1 --over smoothing --frames 2 --resolution 4 --out {name}/w",
+        "optimize": f"optimize {f} --method random --budget 6 --out {name}/o",
+        "race": f"race {f} --methods random,cma-es --budget 6 --seeds 2 --out {name}/a",
+        "league": f"league {f} --methods random,cma-es --budget 6 --seeds 2 --out {name}/l",
+        "overlay": f"overlay {name}/s {name}/o --env {f} --through best --out {name}/v",
+        "compare": f"compare {name}/s {f} --out {name}/c",
+        "surface": f"surface {name}/s --out {name}/u",
+        "export": f"export {name}/s",
+        "plan": f"plan {f} --dims 0 1 --resolution 6",
+        "pairs": f"pairs {f} --samples 2 --out {name}/p",
+        "census": f"census {f} --slices 2 --resolution 6 --out {name}/n",
+        "replay": f"replay {f}",
+        "tradeoff": f"tradeoff {f} --points 4 --out {name}/t",
+        "extremes": f"extremes {f} --points 4 --out {name}/x",
+    }
+
+
+OTHER_FUNCTIONS = {"card", "list_envs", "log", "register"}  # of no simulator that is given
+OTHER_VERBS = {"bench", "bounce", "card", "info", "methods", "view"}  # so are these; bench times, which takes long
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_function_takes_it_or_says_what_it_lacks(name: str, here: Path) -> None:
+    found = vars(_module(here))[name]
+    for verb, call in functions(found, f"function-{name}").items():
+        if verb in LACKING:
+            with pytest.raises(ValueError, match=LACKING[verb]):
+                call()
+        else:
+            call()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_verb_takes_it_or_says_what_it_lacks(name: str, here: Path, run: Callable[..., Said]) -> None:
+    for verb, words in commands(f"doors.py:{name}", f"verb-{name}").items():
+        said = run(*words.split(), cwd=here)
+        if verb in LACKING:
+            assert said.returncode == 2, (words, said)
+            assert LACKING[verb] in said.stderr
+        else:
+            assert said.returncode == 0, (words, said)
+
+
+def test_the_walk_leaves_out_no_function_and_no_verb() -> None:
+    public = {one for one in gs.__all__ if callable(getattr(gs, one)) and not isinstance(getattr(gs, one), type)}
+    makers = {one for one in public if one.startswith("from_")}
+    assert public - makers - OTHER_FUNCTIONS == set(functions(None, ""))
+    known = {one for one in verbs() if not one.startswith("gallery")}
+    assert known - OTHER_VERBS == set(commands("", ""))
+
+
+def test_functions_of_a_file_have_its_names(here: Path) -> None:
+    assert as_environment("doors.py:of_torch").name == "of-torch"
+    assert as_environment("doors.py:of_numpy").name == "of_numpy"
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ("doors.py:nothing", r"holds no nothing; it has of_torch, of_jax, of_numpy, of_warp, Bowl, bowl, Own, own"),
+        ("doors.py:launch", "launch is a function, and nothing says what its parameters are"),
+        ("doors.py:space", "ParameterSpace is no simulator: it has no space and no evaluate"),
+        ("elsewhere.py:f", "there is no file elsewhere.py to take f from"),
+    ],
+)
+def test_what_is_no_simulator_is_refused_in_words(what: str, said: str, here: Path) -> None:
+    with pytest.raises(ValueError, match=said):
+        as_environment(what)
+
+
+def _module(folder: Path) -> Any:
+    from gradscape.envs.importing import import_named
+
+    return import_named(str(folder / "doors.py"))
