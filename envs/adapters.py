@@ -19,7 +19,6 @@ from .function import Compute, Function, FunctionEnvironment, FunctionKeywords, 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-ROWS = 256  # points in one call, at most, unless said otherwise
 LEAST_STEP = 1e-12  # of differences: losses are rounded to 1e-16 of themselves, and their difference is divided by it
 Mode = Literal["reverse", "forward"]
 Batch = Literal["vmap", "map"]
@@ -37,7 +36,7 @@ def from_torch(
 
     Gradients come by autograd. Each loss may depend on its own row only. With `vectorized=False` the function takes a
     single point, shape (dim,), and returns one loss. Points lie on `device`, cpu or cuda. The other keywords are those
-    of `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision.
+    of `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows.
 
     Raises ValueError for settings that the function does not take; evaluating raises it where the function returns no
     losses of the batch, or losses that carry no gradient.
@@ -59,7 +58,7 @@ def from_numpy(
     `differences` makes gradients by central differences with that step, a fraction of each parameter's range; at the
     bounds they are one-sided, since the function is not asked beyond them. With `vectorized=False` the function takes a
     single point, shape (dim,), and returns one loss, or that and its gradient. The other keywords are those of
-    `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision.
+    `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows.
 
     Raises ValueError where `differences` is no fraction of the bounds, or lost in rounding beside them.
     """
@@ -73,18 +72,16 @@ def from_jax(
     *,
     mode: Mode = "reverse",
     batch: Batch = "vmap",
-    rows: int = ROWS,
     **said: Unpack[FunctionKeywords],
 ) -> Environment:
     """Make an environment of a JAX function from one point, an array of shape (dim,), to its loss, of shape ().
 
     Gradients come by reverse differentiation, or forward, which loops of unknown length need and few parameters
     favour. `batch` says how many points are computed together: `vmap` vectorizes the function, `map` calls it point
-    after point, which functions without a batching rule and large simulations need. At most `rows` points are in one
-    call, and smaller batches are padded to the next power of four, since the function is compiled for each size. It
-    runs in its own precision, whatever JAX is configured to. Settings are static: the function is compiled for each.
-    The other keywords are those of `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds,
-    precision.
+    after point, which functions without a batching rule and large simulations need. Batches smaller than `rows` are
+    padded to the next power of four, since the function is compiled for each size. It runs in its own precision,
+    whatever JAX is configured to. Settings are static: the function is compiled for each. The other keywords are those
+    of `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows.
 
     Raises ValueError where JAX is not installed, and for other modes and batches; evaluating raises it where the
     function returns no single number, or JAX cannot trace, differentiate or vectorize it.
@@ -96,7 +93,7 @@ def from_jax(
         from .engines.jax_functions import JaxBackend
     except ImportError as error:
         raise ValueError(f"from_jax needs JAX, which is not here ({error}): pip install jax") from error
-    backend = JaxBackend(mode, batch, as_whole(rows, "from_jax's rows", least=1))
+    backend = JaxBackend(mode, batch)
     return FunctionEnvironment(Function.of(fn, space, backend, said))
 
 
@@ -105,28 +102,27 @@ def from_warp(
     space: ParameterSpace,
     *,
     device: str = "auto",
-    rows: int = ROWS,
     check_overwrites: bool = True,
     **said: Unpack[FunctionKeywords],
 ) -> Environment:
     """Make an environment of a function that launches Warp kernels, from points to losses.
 
     The function takes a Warp array of points, shape (batch, dim), and returns one of losses, shape (batch,), both of
-    its `precision`, by default float32; each loss may depend on its own row only. At most `rows` points are in one
-    call. What it launches is recorded on a tape, and the tape is played backwards for the gradients; the gradients of
-    arrays that the function keeps are set to zero after each evaluation. The losses are made with requires_grad=True.
+    its `precision`, by default float32; each loss may depend on its own row only. What it launches is recorded on a
+    tape, and the tape is played backwards for the gradients; the gradients of arrays that the function keeps are set to
+    zero after each evaluation. The losses are made with requires_grad=True.
 
     A kernel that writes to an array which an earlier one has read makes gradients wrong without a word.
     `check_overwrites` looks for that once, before the first gradient, and builds the function's kernels anew for it,
     which may take long; leave it out for a simulator that is known to be right. The other keywords are those of
-    `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision.
+    `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows.
 
     Raises ValueError for other precisions and devices; evaluating raises it where the function returns no such array,
     launches nothing, does not read its points, or writes to what was read.
     """
     from .engines.warp_functions import WarpBackend
 
-    backend = WarpBackend(device, as_whole(rows, "from_warp's rows", least=1), check_overwrites)
+    backend = WarpBackend(device, check_overwrites)
     return FunctionEnvironment(Function.of(fn, space, backend, {"precision": "float32", **said}))
 
 
@@ -185,7 +181,6 @@ class _Torch:
     device: str
     engine: str = "torch"
     devices: tuple[str, ...] = ("cpu", "cuda")
-    rows: int = ROWS
 
     def find_device(self, device: str) -> str:
         """Return the device of points, which auto leaves to `from_torch`."""
@@ -240,7 +235,6 @@ class _NumPy:
     differences: float | None
     engine: str = "numpy"
     devices: tuple[str, ...] = ("cpu",)
-    rows: int = ROWS
 
     def find_device(self, device: str) -> str:
         """Return the CPU."""

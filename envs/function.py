@@ -19,6 +19,7 @@ from .base import Environment, Fidelity
 DEFAULT = "default"  # the fidelity of a function that names none
 NAMELESS = "function"  # what a lambda is called
 SAME_TIME = 0.01  # relative difference of what counts as the same time
+ROWS = 256  # points in one call, at most, unless said otherwise
 SEED_ARGUMENTS = ("key", "seed")  # of a function that draws random numbers
 FIDELITY_FIELDS = ("dt", "resolution", "sampling", "particles")  # that a function and a `Fidelity` call the same
 KINDS = (bool, int, float, str)  # of options
@@ -38,7 +39,7 @@ class FunctionKeywords(TypedDict, total=False):
 
     A function that takes a `key` (of JAX) or a `seed` gets the same one at every point: common random numbers. The
     loss is the mean over `seeds` of them, and then it knows its standard error.
-    `precision`, float64 or float32, is what it is given its points in.
+    `precision`, float64 or float32, is what it is given its points in, at most `rows` of them in one call.
     """
 
     name: str | None
@@ -49,6 +50,7 @@ class FunctionKeywords(TypedDict, total=False):
     horizon: str | None
     seeds: int
     precision: str
+    rows: int
 
 
 Compute = Callable[[Float[Tensor, "batch dim"], bool], tuple[Tensor, Tensor | None, str]]
@@ -65,10 +67,6 @@ class Backend(Protocol):
     @property
     def devices(self) -> tuple[str, ...]:
         """What it runs on."""
-
-    @property
-    def rows(self) -> int:
-        """Points in one call, at most."""
 
     def find_device(self, device: str) -> str:
         """Return the device that auto stands for, or the one named. Raises ValueError where it is not there."""
@@ -93,6 +91,7 @@ class Function:
     horizon: str = ""
     seed_argument: str = ""
     seeds: int = 1
+    rows: int = ROWS
 
     @classmethod
     def of(cls, fn: Callable[..., Any], space: ParameterSpace, backend: Backend, said: FunctionKeywords) -> Function:
@@ -111,6 +110,7 @@ class Function:
         _check_arguments(name, known, found, own, said.get("horizon"))
         precision = _check_precision(said.get("precision", "float64"), f"from_{backend.engine}")
         seeds = as_whole(said.get("seeds", 1), f"from_{backend.engine}'s seeds", least=1)
+        rows = as_whole(said.get("rows", ROWS), f"from_{backend.engine}'s rows", least=1)
         seed_argument = next((one for one in SEED_ARGUMENTS if one in known and one not in own | found), "")
         if seeds > 1 and not seed_argument:
             raise ValueError(
@@ -120,7 +120,7 @@ class Function:
             found["seed"] = 0
         return cls(
             fn, space, backend, name, said.get("loss_unit", ""), said.get("maximize", False), found,
-            _read_fidelities(name, given, precision), tuple(own), said.get("horizon") or "", seed_argument, seeds,
+            _read_fidelities(name, given, precision), tuple(own), said.get("horizon") or "", seed_argument, seeds, rows,
         )  # fmt: skip
 
     @cached_property
@@ -178,7 +178,7 @@ class FunctionEnvironment(Environment):
     @property
     def preferred_batch(self) -> int:  # type: ignore[override] # read only
         """Number of points worth evaluating at once."""
-        return min(self.function.backend.rows, self._max_rows)
+        return min(self.function.rows, self._max_rows)
 
     @property
     def precision(self) -> str:

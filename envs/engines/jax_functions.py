@@ -29,7 +29,6 @@ class JaxBackend:
 
     mode: str
     batch: str
-    rows: int
     engine: str = "jax"
     devices: tuple[str, ...] = ("cpu", "cuda")
 
@@ -50,7 +49,7 @@ class JaxBackend:
                 return call.fn(x, **{**fixed, "key": jax.random.key(fixed["key"])})
             return call.fn(x, **fixed)
 
-        function = JaxFunction(fn, call.space.dim, call.name, precision, self.rows, self.mode, self.batch)
+        function = JaxFunction(fn, call.space.dim, call.name, precision, call.rows, self.mode, self.batch)
         chosen = jax.devices("cpu" if device == "cpu" else None)[0]
 
         def compute(x: Float[Tensor, "batch dim"], grad: bool) -> tuple[Tensor, Tensor | None, str]:

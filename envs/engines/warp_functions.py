@@ -29,7 +29,6 @@ class WarpBackend:
     """Call functions that launch Warp kernels."""
 
     device: str
-    rows: int
     check_overwrites: bool
     engine: str = "warp"
     devices: tuple[str, ...] = ("cpu", "cuda")
