@@ -1,8 +1,19 @@
 # `make demo` draws a first landscape, `make test` runs every test; both set up .venv by themselves.
-# Needs CPython 3.11 or 3.12; name another interpreter with PYTHON=...
-PYTHON ?= $(firstword $(foreach p,python3.11 python3.12 python3,$(if $(shell $(p) -c 'import sys; print(sys.version_info[:2] in ((3, 11), (3, 12)) or "")' 2>/dev/null | grep True),$(p))))
-BIN := .venv/bin
+# Needs CPython 3.11 to 3.14; name an interpreter with PYTHON=..., and with VENV=... where its environment goes:
+# `make test PYTHON=python3.13 VENV=.venv-3.13`. The engine Taichi has no wheels past 3.12.
+PYTHON ?= $(firstword $(foreach p,python3.11 python3.12 python3.13 python3.14 python3,$(if $(shell $(p) -c 'import sys; print((3, 11) <= sys.version_info < (3, 15) or "")' 2>/dev/null | grep True),$(p))))
+VENV ?= .venv
+BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+
+# An environment that is there already is of the Python that it was made with.
+ifeq ($(origin PYTHON),command line)
+ifneq ($(wildcard $(BIN)/python),)
+ifneq ($(shell $(BIN)/python -V),$(shell $(PYTHON) -V))
+$(error $(VENV) is of $(shell $(BIN)/python -V), not of $(shell $(PYTHON) -V); name another folder, as VENV=.venv-other)
+endif
+endif
+endif
 
 # A gallery that was built (`landscape gallery build`) becomes a part of the documentation.
 GALLERY ?= out/gallery
@@ -33,27 +44,27 @@ docs: setup-docs
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -D gallery_site="$(GALLERY)" -d build/doctrees docs build/docs
 	$(BIN)/python -m docs.pages.check build/docs
 
-setup: .venv/.installed
-setup-test: .venv/.installed-test
-setup-docs: .venv/.installed-docs
+setup: $(VENV)/.installed
+setup-test: $(VENV)/.installed-test
+setup-docs: $(VENV)/.installed-docs
 
-.venv/bin/python:
-	@test -n "$(PYTHON)" || { echo "gradscape needs CPython 3.11 or 3.12; none was found. Install one, or name it: make PYTHON=/path/to/python3.11" >&2; exit 1; }
-	$(PYTHON) -m venv .venv
+$(BIN)/python:
+	@test -n "$(PYTHON)" || { echo "gradscape needs CPython 3.11 to 3.14; none was found. Install one, or name it: make PYTHON=/path/to/python3.12" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
 
 # torch comes first and by itself: named exactly, it is the build the constraints ask for.
-.venv/.installed: pyproject.toml constraints.txt | .venv/bin/python
+$(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) torch==$(shell sed -n 's/^torch==//p' constraints.txt)
 	$(INSTALL) --editable .
 	@touch $@
 
-.venv/.installed-test: .venv/.installed
+$(VENV)/.installed-test: $(VENV)/.installed
 	$(INSTALL) --editable '.[test,dev]'
 	@touch $@
 
-.venv/.installed-docs: .venv/.installed
+$(VENV)/.installed-docs: $(VENV)/.installed
 	$(INSTALL) --editable '.[docs]'
 	@touch $@
 
 clean:
-	rm -rf .venv build dist docs/generated
+	rm -rf $(VENV) build dist docs/generated

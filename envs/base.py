@@ -411,7 +411,7 @@ class Environment(Objective):
         try:
             return import_module(f".engines.{module}", __package__)
         except ImportError as error:
-            why = self.capabilities.lacking_wheels() or self.capabilities.with_advice(str(error))
+            why = self.capabilities.explain(error)
             raise ValueError(f"{self.name} cannot run on engine {self.engine} here: {why}") from error
 
     @final

@@ -21,7 +21,7 @@ from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..landscapes.storage.files import resolve
-from .engines import refuse_engine
+from .engines import ENGINES
 from .importing import IN_FILE, import_named, refuse_absent_name
 from .installed import install_line, is_installed
 from .records import unknown_fidelity
@@ -293,8 +293,8 @@ def refuse_unknown(
         raise unknown_fidelity(what, entry.fidelities, fidelity)
     if device not in DEVICES:
         raise ValueError(f"{what} runs on {', '.join(DEVICES[:-1])} or {DEVICES[-1]}; got device {device!r}")
-    if engine is not None:
-        refuse_engine(what, engine)
+    if engine is not None and engine not in ENGINES:
+        raise ValueError(f"{what} has no engine {engine!r}; there are {', '.join(ENGINES)}")
     for number in map(int, filter(str.isdecimal, dims)):
         if entry.dim.isdecimal() and number >= int(entry.dim):
             raise ValueError(f"{what} has parameters numbered 0 to {int(entry.dim) - 1}; got {number}")

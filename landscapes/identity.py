@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from .. import __version__
-from .objective import Status, describe_errors
 from .plain import plain_json
 
 if TYPE_CHECKING:
@@ -124,6 +123,8 @@ def stored_provenance(dataset: xr.Dataset) -> dict[str, Any]:
 
 def errors_of(dataset: xr.Dataset) -> str:
     """Say how many points of a slice or a run raised and what the first of them said; nothing where none did."""
+    from .objective import Status, describe_errors
+
     return describe_errors(int((dataset["status"] == Status.ERROR).sum()), str(dataset.attrs.get(ERROR, "")))
 
 

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from benchmarks.results import leave_blank
 
 from gradscape.cli import app, main
 
+needs_taichi = pytest.mark.skipif(find_spec("taichi") is None, reason="Taichi has no wheels past Python 3.12")
 NO_BROWSER = "there is no Chromium here: `apt-get install -y chromium` (or your system's) lets them run"
 PATIENCE = 600_000  # milliseconds until a browser is given up, and no measure of anything
 

@@ -12,7 +12,7 @@ import pytest
 import gradscape
 from gradscape.envs.bounce import Bounce
 
-from .command import Said, modules
+from .command import Said, modules, needs_taichi
 from .processes import Instant, alone, landscape
 
 
@@ -178,6 +178,7 @@ def test_bounce_counts_the_bounces_it_marks(run: Callable[..., Said], tmp_path: 
     assert (tmp_path / "b/landscape.png").exists()
 
 
+@needs_taichi
 def test_bench_prints_rates_ratios_and_memory_as_json(run: Callable[..., Said], tmp_path: Path) -> None:
     command = ["bench", "swing-velocity", "--against", "taichi", "--batch", "2", "--seconds", "0"]
     done = run(*command, "--json", cwd=tmp_path)
@@ -210,6 +211,7 @@ def test_bench_prints_tables(run: Callable[..., Said], tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@needs_taichi
 def test_a_slice_of_one_engine_is_not_continued_by_another(run: Callable[..., Said], tmp_path: Path) -> None:
     command = ["slice", "swing-velocity", "--dims", "0", "1", "--resolution", "2"]
     first, second = (

@@ -28,17 +28,12 @@ class Engine:
     extra: str = ""
     newest_python: tuple[int, int] | None = None
 
-    def lacking_wheels(self) -> str:
-        """Return why the engine is not to be had for this Python, and what to do; empty where it is."""
-        newest, here = self.newest_python, sys.version_info[:2]
-        if newest is None or here <= newest:
-            return ""
-        last, ours = (".".join(map(str, version)) for version in (newest, here))
-        return (
-            f"{self.name.capitalize()} has no wheels past Python {last}, and this is Python {ours}; take engine warp, "
-            f"or install gradscape with Python {last}"
-        )
-
-    def with_advice(self, why: str) -> str:
-        """Return why the engine cannot be imported, and what installs it."""
-        return f"{why}; {install_line(self.extra)}" if self.extra else why
+    def explain(self, error: ImportError) -> str:
+        """Return why the engine cannot be imported here, and what to do."""
+        if self.newest_python and sys.version_info[:2] > self.newest_python:
+            newest, here = (".".join(map(str, one)) for one in (self.newest_python, sys.version_info[:2]))
+            return (
+                f"{self.name.capitalize()} has no wheels past Python {newest}, and this is Python {here}; take engine "
+                f"warp, or install gradscape with Python {newest}"
+            )
+        return f"{error}; {install_line(self.extra)}" if self.extra else str(error)

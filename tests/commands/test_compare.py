@@ -103,7 +103,7 @@ def test_lines_are_compared_too(run: Run, tmp_path: Path) -> None:
         ("a b --set drag=1", "b is there already: leave them out"),
         ("a cartpole", "A has velocity x where B has t0 cart velocity"),
         ("a nothing", "no environment is called 'nothing'"),
-        ("bounce a", "there is no slice store at"),
+        ("bounce a", "there is no slice at bounce; give the folder of one"),
         ("a b --out a", "a holds other files and no comparison"),
     ],
 )

@@ -12,10 +12,11 @@ from gradscape.envs.registry import entries, environment_class, make
 from gradscape.landscapes.objective import Status
 from gradscape.landscapes.space import ParameterSpace
 
+from ..command import needs_taichi
 from .numbers import moved, points_of
 from .scenes import SETTINGS, SHORT, TAICHI, assert_returns_stay
 
-pytestmark = pytest.mark.skipif(find_spec("taichi") is None, reason="Taichi has no wheel for this machine")
+pytestmark = needs_taichi
 
 
 @pytest.fixture(scope="module", params=TAICHI)

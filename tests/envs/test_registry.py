@@ -2,10 +2,13 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
 
+from gradscape.envs.engines import ENGINES
+from gradscape.envs.engines.engine import Engine
 from gradscape.envs.registry import BUILTIN, GROUP, entries, environment_class, make
 
 ENVIRONMENT = """
@@ -89,3 +92,17 @@ def test_listing_loads_no_engine():
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
+
+
+def test_an_engine_without_wheels_for_this_python_says_so_and_what_to_do(monkeypatch):
+    gone = Engine("taichi", {"mpm": "nowhere.mpm"}, newest_python=(3, 10))
+    monkeypatch.setitem(ENGINES, "taichi", gone)
+    with pytest.raises(ValueError, match=r"^fluid cannot run on engine taichi here: Taichi has no wheels past") as said:
+        make("fluid", engine="taichi", device="cpu")
+    here = f"{sys.version_info.major}.{sys.version_info.minor}"
+    assert str(said.value).endswith(
+        f"3.10, and this is Python {here}; take engine warp, or install gradscape with Python 3.10"
+    )
+    monkeypatch.setitem(ENGINES, "taichi", replace(gone, newest_python=(3, 99)))
+    with pytest.raises(ValueError, match=r"here: No module named 'gradscape.envs.engines.nowhere'$"):
+        make("fluid", engine="taichi", device="cpu")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,6 +31,7 @@ WIRE = 0.006  # radius of a tank's edges, per width
 @contextmanager
 def off_screen(size: tuple[int, int]) -> Iterator[pv.Plotter]:
     """Give an empty, unlit plotter on white, of a size [pixel], that needs no display and closes at the end."""
+    _import_triton()
     with pv.vtk_verbosity("error"):  # otherwise VTK warns that there is no X server, and renders without
         plotter = pv.Plotter(off_screen=True, window_size=list(size), lighting="none")
         try:
@@ -36,6 +39,15 @@ def off_screen(size: tuple[int, int]) -> Iterator[pv.Plotter]:
             yield plotter
         finally:
             plotter.close()
+
+
+def _import_triton() -> None:
+    """Import triton before Mesa renders, if a CUDA build of torch has brought it.
+
+    Both carry LLVM. With Mesa's loaded first, whatever imports triton later crashes: torch does so in `torch.func`.
+    """
+    if find_spec("triton"):
+        import_module("triton")
 
 
 def mesh(part: Part, frame: int) -> pv.PolyData:
