@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from platformdirs import user_data_path
 
+from ..landscapes.plain import digest
 from ..landscapes.storage.records import read_json, reading, write_record
-from .folder import digest
 
 if TYPE_CHECKING:
     from ..envs.base import Environment

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
+from ..landscapes.adapters import within_box
 from ..landscapes.identity import plane_of, stored_identity
 from ..landscapes.objective import Objective, Status
 from ..landscapes.overlay import best_point, overlay, principal_plane
@@ -18,10 +19,11 @@ from ..landscapes.slice import Slice
 from ..landscapes.storage.files import tidy, visible_files
 from ..landscapes.storage.paths import slice_exists
 from ..landscapes.storage.store import open_slice
+from ..landscapes.verification import RESAMPLE, verify_dataset
 from .folder import OVERLAY, ROOT, SLICE_STORE, folder_named, run_tables
 from .scene import environment_of, named_point
 from .slice import SliceJob
-from .watch import Watch, resumable
+from .watch import PREPARING, Watch, resumable
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -177,7 +179,8 @@ class OverlayJob:
     def run(self, watch: Watch | None = None) -> Overlay:
         """Sample the new slice, if there is to be one, lay the runs over it and write the files.
 
-        Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
+        Raises StoreMismatchError where a slice is to be cut anew that its objective gives other numbers for, Stopped
+        where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
         """
         beneath = self._sample(watch or Watch()) if self.cut else self.slice
         with resumable(lambda: f"each file in {self.folder} is whole"):
@@ -187,12 +190,20 @@ class OverlayJob:
         """Sample the slice that is cut anew."""
         assert self.cut is not None  # as `run` has seen
         env = self._objective()
+        self._verify(env, watch)
         plane = self.cut.plane(plane_of(self.slice.data), self.runs, env)
         how: dict[str, Any] = {"gradients": int("grad" in self.slice.data), "boxed": self.cut.principal}
         job = SliceJob.of(env, plane, command=self.command, root=self.folder, **how)
         summary = job.run(watch)
         watch.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
         return Slice(open_slice(job.folder / SLICE_STORE), job.folder, lambda: env)
+
+    def _verify(self, env: Objective, watch: Watch) -> None:
+        """Verify the slice that is cut anew: what lies beneath the runs is to be of the same landscape."""
+        boxed = bool(self.slice.identity.get("boxed"))
+        with resumable(lambda: f"each file in {self.folder} is whole"), watch.busy(PREPARING):
+            if self.slice.folder is not None:
+                verify_dataset(within_box(env) if boxed else env, self.slice.data, self.slice.folder, todo=RESAMPLE)
 
     def _objective(self) -> Objective:
         """Return what the slice was sampled from."""

@@ -22,6 +22,7 @@ from ..landscapes.objective import Evaluation
 from ..landscapes.storage.disk import is_full
 from ..landscapes.storage.files import make_folder, other_files, replacing, tidy, write_json
 from ..landscapes.storage.records import read_json, write_record
+from ..landscapes.verification import RESAMPLE, verify_dataset
 from . import growth
 from .folder import REPORT, REPORTS, ROOT, SLICE_STORE, folder_named, store_in
 from .report_record import ARRAYS, MEASURES, PICTURE, RECORD, PaperRecord, Quoted, Report, ReportKey, Reports
@@ -180,7 +181,7 @@ class ReportJob:
 
         require("number of samples", dataset["loss"].size, lambda count: Need(own_cost(count)[1]))
         start = time.monotonic()
-        profile = measure(env, dataset, self.points, self.seed, watch)
+        profile = measure(env, dataset, self.points, self.seed, watch, path=subject.store)
         grown = growth.measure_growth_of(env, dataset, watch)
         report = Report(
             name=subject.name,
@@ -208,14 +209,19 @@ class ReportJob:
         watch.note(f"{report.folder}: {', '.join(printed)}")
 
 
-def measure(env: Environment, dataset: xr.Dataset, points: int, seed: int, watch: Watch) -> Profile:
-    """Announce what measuring a slice of an environment costs, and measure it."""
+def measure(env: Environment, dataset: xr.Dataset, points: int, seed: int, watch: Watch, *, path: Path) -> Profile:
+    """Announce what measuring a slice of an environment costs, and measure it; `path` is where the slice is.
+
+    Raises StoreMismatchError where the environment gives other numbers than the slice holds.
+    """
     from ..landscapes.adapters import within_box
     from ..landscapes.measures.profile import PRECISION, effort, measure_profile
 
     total = sum(effort(dataset["loss"].ndim, points, dataset["loss"].shape))
-    _announce(env, dataset, points, watch)
     objective = within_box(env) if stored_identity(dataset).get("boxed") else env
+    with watch.busy(f"{env.name}: {PREPARING}"):
+        verify_dataset(objective, dataset, path, todo=RESAMPLE)
+    _announce(env, dataset, points, watch)
     with watch.progress(total) as advance:
         counted = _Counted(objective, env.preferred_batch, advance)
         rounding = PRECISION[env.fidelity.precision]

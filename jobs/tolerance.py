@@ -13,7 +13,7 @@ from platformdirs import user_data_path
 
 from ..envs.registry import make
 from ..landscapes.cost import episode_cost
-from .folder import digest
+from ..landscapes.plain import digest
 from .variants import expected_work
 
 if TYPE_CHECKING:

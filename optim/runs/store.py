@@ -36,6 +36,7 @@ from ...landscapes.space import ParameterSpace
 from ...landscapes.storage.files import placing, resolve
 from ...landscapes.storage.layout import FILL, consolidate, open_group
 from ...landscapes.storage.ownership import check_ours, clear_halves, has_lost_root
+from ...landscapes.verification import StoredPoints
 from ..base import Kind
 from .arrays import (
     COLUMNS,
@@ -78,6 +79,7 @@ class RunStore:
         self._written = 0  # rows known to be on disk
         self._saved_at = time.monotonic()
         self._next_save = PAUSE  # seconds after that
+        self.verified = False  # whether an objective gave some of the rows again
         self.abreast = 1  # runs that are filled beside each other, this one included
         if path:
             self._inode = path.stat().st_ino
@@ -230,6 +232,19 @@ class RunStore:
             yield
         finally:
             os.close(folder)
+
+    def reload(self) -> None:
+        """Read the run once more, which another process has filled meanwhile."""
+        with self.lock():
+            self.verified = False
+
+    def points(self) -> StoredPoints:
+        """Return the points of the run, to be verified."""
+        columns = {
+            name: torch.from_numpy(self._columns[name][: self.count]) for name in ("x", "loss", "grad", "status")
+        }
+        found = Evaluation(columns["loss"], columns["grad"], columns["status"])
+        return StoredPoints(self.path or "the store", "run", columns["x"], found, self.gradient_cost is not None)
 
     def set_gradient_cost(self, gradient_cost: float) -> None:
         """Keep what an episode with gradient costs, in episodes without."""

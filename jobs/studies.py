@@ -1,0 +1,47 @@
+"""How studies and runs go on: alone in their folder, with a simulator that gives the numbers that are stored."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..landscapes.storage.locks import holding
+from ..optim.search import verify_runs
+from .watch import PREPARING, Watch, resumable
+
+if TYPE_CHECKING:
+    from ..envs.base import Environment
+    from ..landscapes.objective import Objective
+    from ..landscapes.storage.checkpoint import Checkpoint
+    from ..optim.runs.store import RunStore
+
+
+@contextmanager
+def going_on(
+    pieces: Checkpoint, make: Callable[[], Environment] | None, kept: Callable[[], str], watch: Watch
+) -> Iterator[None]:
+    """Hold a study's folder, after another process that fills it, and verify the environment that `make` returns.
+
+    Raises StoreMismatchError where it gives other numbers than when the study began, and as `resumable` does.
+    """
+    with resumable(kept), holding(pieces.folder, watch.note):
+        if make is not None:
+            with watch.busy(PREPARING):
+                pieces.verify(make())
+        yield
+
+
+@contextmanager
+def filling(objective: Objective, runs: Sequence[RunStore], folder: Path, watch: Watch) -> Iterator[None]:
+    """Hold a folder of runs, after another process that fills it, and verify the runs.
+
+    Raises StoreMismatchError where the objective gives other numbers than they hold.
+    """
+    with holding(folder, watch.note) as waited:
+        for run in runs if waited else ():
+            run.reload()
+        with watch.busy(PREPARING):
+            verify_runs(objective, runs)
+        yield
