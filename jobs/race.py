@@ -306,8 +306,6 @@ def _race_there(
         Competitor(method, how["seed"], RunStore.open(path), partial(make_optimizer, method, env, **how))
         for path, method, how in recipes
     ]
-    for one in share:
-        one.run.verified = True  # by who asked for them
     number_of, seen = dict(zip(map(id, share), numbers, strict=True)), {}
 
     def follow(one: Competitor, now: SearchProgress) -> None:

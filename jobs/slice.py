@@ -29,13 +29,14 @@ from ..landscapes.plane import Plane
 from ..landscapes.sampling.distribution import RemoteSite, Site, evaluator, run_tasks, workers_of
 from ..landscapes.sampling.fill import Progress, sample
 from ..landscapes.sampling.memory import MemoryBound
-from ..landscapes.sampling.refine import Refined, Refinement, partly_refined, refine, verify_refined
+from ..landscapes.sampling.refine import Refined, Refinement, partly_refined, refine
 from ..landscapes.storage.arrays import need_of
 from ..landscapes.storage.checkpoint import Checkpoint
 from ..landscapes.storage.files import clear, tidy, write_json
 from ..landscapes.storage.paths import slice_exists
 from ..landscapes.storage.store import SliceStore
 from ..landscapes.storage.tiles import Tile
+from ..landscapes.verification import verify_dataset, verify_store
 from .folder import ROOT, SLICE, SUMMARY
 from .scene import provenance
 from .slice_place import default_folder, identity_of
@@ -212,7 +213,10 @@ class SliceJob:
     def _verify(self, watch: Watch) -> None:
         """Evaluate a few stored points anew, before anything is added to them."""
         with watch.busy(f"{self.store.identity.get('objective')}: {PREPARING}"):
-            verify_refined(self.objective, self.store, self._pieces if self.refinement else None)
+            if self.refinement and not self.store.ascending:
+                verify_dataset(self.objective, self._so_far(), self.folder)
+            else:
+                verify_store(self.objective, self.store)
 
     @property
     def _pieces(self) -> Checkpoint:

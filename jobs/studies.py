@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..landscapes.storage.locks import holding
-from ..optim.search import verify_runs
+from ..landscapes.verification import POINTS, verify
 from .watch import PREPARING, Watch, resumable
 
 if TYPE_CHECKING:
@@ -37,11 +37,13 @@ def going_on(
 def filling(objective: Objective, runs: Sequence[RunStore], folder: Path, watch: Watch) -> Iterator[None]:
     """Hold a folder of runs, after another process that fills it, and verify the runs.
 
-    Raises StoreMismatchError where the objective gives other numbers than they hold.
+    Three points of a single run are evaluated anew, one of each of several, in one batch. Raises StoreMismatchError
+    where the objective gives other numbers than they hold.
     """
     with holding(folder, watch.note) as waited:
         for run in runs if waited else ():
             run.reload()
+        begun = [run.points() for run in runs if run.count]
         with watch.busy(PREPARING):
-            verify_runs(objective, runs)
+            verify(objective, begun, points=POINTS if len(begun) == 1 else 1)
         yield

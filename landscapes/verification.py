@@ -7,7 +7,7 @@ lies farther apart than that is the result of another function, a refusal with b
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +24,6 @@ from .objective import NOT_EVALUATED, Evaluation, Objective, Status, evaluate, i
 
 if TYPE_CHECKING:
     from .storage.store import SliceStore
-    from .storage.tiles import Tile
 
 POINTS = 3  # of a result that are evaluated anew
 ROUNDING = {"float32": 1e-4, "float64": 1e-10}  # what rounding changes: a share of the losses' spread, of a gradient
@@ -136,24 +135,21 @@ def verify(objective: Objective, results: Sequence[StoredPoints], *, points: int
             _compare(objective, suspects, now.rows(torch.tensor(unlike)), grad=grad, todo=todo)
 
 
-def verify_store(objective: Objective, store: SliceStore, pending: Collection[Tile] | None = None) -> None:
-    """Verify a slice that is on disk by three of its finished tiles; once, for one objective.
+def verify_store(objective: Objective, store: SliceStore) -> None:
+    """Verify a slice on disk by three of its finished tiles, once for an objective.
 
-    `pending` are the tiles that are not finished, where that is known. Raises StoreMismatchError where the objective
-    gives other numbers.
+    Raises StoreMismatchError where the objective gives other numbers.
     """
     if store.path is None or store.verified_for is objective:
         return
-    left = set(store.pending() if pending is None else pending)
+    left = set(store.pending())
     finished = [tile for tile in store.tiles() if tile not in left]
     chosen = sorted({0, len(finished) // 2, len(finished) - 1}) if finished else []
     read = [(tile, store.read_tile(tile)) for tile in (finished[number] for number in chosen)]
     parts = [(store.points(tile), values) for tile, values in read if values is not None]
     if parts:
-        x = torch.cat([x for x, _ in parts])
-        found = Evaluation.join(
-            (_evaluation(values, x.shape[1]) for _, values in parts), dim=x.shape[1], grad=store.grad
-        )
+        x, dim = torch.cat([x for x, _ in parts]), store.plane.dim
+        found = Evaluation.join((_evaluation(values, dim) for _, values in parts), dim=dim, grad=store.grad)
         verify(objective, [StoredPoints(store.path, "slice", x, found, store.grad)])
     store.verified_for = objective
 
@@ -218,8 +214,8 @@ def _compare(objective: Objective, probes: Sequence[_Probe], now: Evaluation, *,
         elif _loss_moved(probe, here, again, precision):
             said = f"whose losses are others now: {_both(float(then.loss), float(here.loss))}"
         elif (axis := _moved_axis(probe, here, again, precision)) is not None:
-            assert then.grad is not None and here.grad is not None  # as one of them has moved
-            both = _both(float(then.grad[0, axis]), float(here.grad[0, axis]))
+            pair = [float(one.grad[0, axis]) for one in (then, here) if one.grad is not None]
+            both = _both(*pair)
             said = f"whose gradients are others now: gradient by {objective.space.names[axis]} {both}"
         else:
             continue

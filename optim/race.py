@@ -20,7 +20,7 @@ from .curves import Tables, final_losses
 from .meeting import Meeting, work_abreast
 from .runs.run import Run
 from .runs.store import RunStore
-from .search import SearchProgress, search, verify_runs
+from .search import SearchProgress, search
 from .statistics import RaceStatistics
 from .targets import hits
 
@@ -59,10 +59,7 @@ def race(
     most at a time; the objective is only used by the thread that calls this, `progress` by any. `gradient_cost`, what
     an episode with gradient costs in episodes without, is measured if a run needs it. Stop it at any instant: the same
     call goes on.
-
-    Raises StoreMismatchError where a run on disk holds other numbers than the objective gives now.
     """
-    verify_runs(objective, [one.run for one in competitors])
     left = [one for one in competitors if one.run.count < budget]
     for start in range(0, len(left), ABREAST):
         _run_abreast(objective, left[start : start + ABREAST], budget, gradient_cost, progress)

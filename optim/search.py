@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,6 @@ from ..landscapes.cost import episode_cost
 from ..landscapes.identity import StoreError
 from ..landscapes.objective import Objective, evaluate, name_of
 from ..landscapes.space import as_whole
-from ..landscapes.verification import POINTS, verify
 from .base import Optimizer
 from .registry import optimizer_class
 from .runs.store import RunStore
@@ -47,8 +46,8 @@ def search(
     `gradient_cost` is what an episode with gradient costs in episodes without; it is measured if not given. `clock`
     says which time [s] the rows' seconds are of; by default that on the wall.
 
-    Raises ValueError for a budget, a method or a gradient cost that cannot be, StoreMismatchError where the run on disk
-    holds other numbers than the objective gives now, and StoreError where it cannot be gone on from.
+    Raises ValueError for a budget, a method or a gradient cost that cannot be, and StoreError where the run on disk
+    cannot be gone on from.
     """
     budget = as_whole(budget, "a budget", least=1)
     if gradient_cost is not None and not 0 < gradient_cost < math.inf:
@@ -56,7 +55,6 @@ def search(
     if run is None:
         run = _in_memory(objective, method, budget)
     with run.lock():
-        verify_runs(objective, [run])
         optimizer = _begin(objective, method, run, gradient_cost) if run.count < budget else None
         resumed = run.count
 
@@ -69,17 +67,6 @@ def search(
             run.extend(budget)
             _fill(objective, optimizer, run, budget, report, clock or time.perf_counter)
     return run
-
-
-def verify_runs(objective: Objective, runs: Sequence[RunStore]) -> None:
-    """Evaluate three points of a run on disk anew, or one of each of several runs, in one batch; once for each run.
-
-    Raises StoreMismatchError where the objective gives other numbers.
-    """
-    left = [run for run in runs if run.path and run.count and not run.verified]
-    verify(objective, [run.points() for run in left], points=POINTS if len(left) == 1 else 1)
-    for run in left:
-        run.verified = True
 
 
 def _in_memory(objective: Objective, method: Optimizer | str, budget: int) -> RunStore:

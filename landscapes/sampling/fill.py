@@ -83,12 +83,12 @@ def sample(
         about["identity"] = with_stride(about["identity"], gradients)
         store = SliceStore.in_memory(plane, objective.space, **about, grad=gradients > 0)
     _check_store(store, objective, plane, grad=gradients > 0)
+    verify_store(objective, store)
     batch = as_whole(getattr(objective, "preferred_batch", 1) if batch is None else batch, "sample's batch", least=1)
     status = store.status()
     counts: Counter[Status] = Counter({kind: int((status == kind).sum()) for kind in Status if kind != Status.MISSING})
     resumed, pending = counts.total(), store.pending(status)
     left = Counter(tile.level for tile in pending)  # tiles, by level
-    verify_store(objective, store, pending)
     all_levels = 1 + store.tiles()[-1].level
     levels = min(left, default=all_levels)
     _warn_of_damage(store, pending)

@@ -28,7 +28,6 @@ from ..objective import Objective, Status, evaluate
 from ..plane import Plane
 from ..storage.checkpoint import Checkpoint
 from ..storage.store import SliceStore
-from ..verification import verify_dataset, verify_store
 from .distribution import evaluator, workers_of
 from .fill import Progress, resumable
 from .quadtree import Places, Quadtree, Values, coarsest_lattice
@@ -136,13 +135,12 @@ def refine(
     as in a slice that is sampled everywhere. What is in `pieces` is not evaluated again; they go when it is finished.
     `progress`, `executor`, `made` and `conclude` are those of `sample`.
 
-    Raises StoreMismatchError where the store was made by other settings or holds other numbers than the objective gives
-    now, ValueError for a budget that does not cover the coarsest lattice, DamagedError where a finished one is damaged, and what `sample` does.
+    Raises StoreMismatchError where the store was made by other settings, ValueError for a budget that does not cover
+    the coarsest lattice, DamagedError where a finished one is damaged, and what `sample` does.
     """
     wanted = {"plane": plane.record(), "parameters": list(objective.space.names)}
     check_identity(store.path, wanted=wanted, found={name: store.identity[name] for name in wanted})
     refinement.check(plane)
-    verify_refined(objective, store, pieces)
     if store.ascending:
         if store.path is not None and store.pending():
             raise DamagedError.of(store.path, "samples are lost", "restore it, or begin anew with --force")
@@ -171,15 +169,6 @@ def partly_refined(store: SliceStore, pieces: Checkpoint) -> xr.Dataset:
         return empty
     samples.load(pieces)
     return samples.put_into(empty)
-
-
-def verify_refined(objective: Objective, store: SliceStore, pieces: Checkpoint | None) -> None:
-    """Verify what is sampled of a slice so far; raises StoreMismatchError where the objective gives other numbers."""
-    if store.ascending:
-        verify_store(objective, store)
-    elif store.path is not None and pieces is not None and store.verified_for is not objective:
-        verify_dataset(objective, partly_refined(store, pieces), store.path)
-        store.verified_for = objective
 
 
 class _Samples:

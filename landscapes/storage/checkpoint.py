@@ -103,7 +103,7 @@ class Checkpoint:
             return None
 
     def _read(self, name: str, todo: str) -> dict[str, NDArray[Any]]:
-        """Return the arrays of a part. Raises DamagedError, which says what `todo`, where it is not what was written."""
+        """Return the arrays of a part. Raises DamagedError, which says what `todo`, where it is damaged."""
         path = self._path(name)
         with reading(path, todo), np.load(path, allow_pickle=False) as arrays:
             found = dict(arrays)

@@ -79,7 +79,6 @@ class RunStore:
         self._written = 0  # rows known to be on disk
         self._saved_at = time.monotonic()
         self._next_save = PAUSE  # seconds after that
-        self.verified = False  # whether an objective gave some of the rows again
         self.abreast = 1  # runs that are filled beside each other, this one included
         if path:
             self._inode = path.stat().st_ino
@@ -236,15 +235,14 @@ class RunStore:
     def reload(self) -> None:
         """Read the run once more, which another process has filled meanwhile."""
         with self.lock():
-            self.verified = False
+            pass
 
     def points(self) -> StoredPoints:
         """Return the points of the run, to be verified."""
-        columns = {
-            name: torch.from_numpy(self._columns[name][: self.count]) for name in ("x", "loss", "grad", "status")
-        }
-        found = Evaluation(columns["loss"], columns["grad"], columns["status"])
-        return StoredPoints(self.path or "the store", "run", columns["x"], found, self.gradient_cost is not None)
+        names = ("x", "loss", "grad", "status")
+        x, loss, grad, status = (torch.from_numpy(self._columns[name][: self.count]) for name in names)
+        found, sloped = Evaluation(loss, grad, status), self.gradient_cost is not None
+        return StoredPoints(self.path or "the store", "run", x, found, sloped)
 
     def set_gradient_cost(self, gradient_cost: float) -> None:
         """Keep what an episode with gradient costs, in episodes without."""
