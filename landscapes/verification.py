@@ -29,7 +29,7 @@ POINTS = 3  # of a result that are evaluated anew
 ROUNDING = {"float32": 1e-4, "float64": 1e-10}  # what rounding changes: a share of the losses' spread, of a gradient
 LAST_PLACE = {"float32": 2.0**-23, "float64": 2.0**-52}
 PLACES = 64  # units in the last place of a loss that rounding changes
-REPEATS, MOVES, REACH = 2, 8, 8  # evaluations again, moved ones, and how far these move [units in the last place]
+MOVES, REACH = 8, 8  # evaluations at points that are moved, and how far these are [units in the last place]
 MARGIN = 10.0  # times what changes by noise
 SHOWN = 6  # parameters of a point that a refusal shows
 TODO = "write elsewhere with --out, or replace it with --force"
@@ -256,20 +256,20 @@ def _precision(objective: Objective, probes: Sequence[_Probe], now: Evaluation) 
 def _evaluate_again(
     objective: Objective, x: Float[Tensor, "point dim"], *, grad: bool, reach: float
 ) -> list[Evaluation]:
-    """Evaluate points once more, one by one, and together with others that lie within rounding of them."""
+    """Evaluate points once more, one by one, in pairs, and together with others that lie within rounding of them."""
     space, generator = objective.space, torch.Generator().manual_seed(0)
-    found = []
-    for _ in range(REPEATS):
-        rows = [evaluate(objective, row[None], grad=grad) for row in x]
-        found.append(Evaluation.join(rows, dim=space.dim, grad=grad))
     moves = 2 * torch.rand(MOVES, *x.shape, generator=generator, dtype=torch.float64) - 1
     moved = x + moves * reach * (space.upper - space.lower)
-    inside = in_box(space, x)[:, None]
-    moved = torch.where(inside, moved.clamp(space.lower, space.upper), moved)
-    batch = max(1, getattr(objective, "preferred_batch", 1))
-    parts = torch.split(torch.cat([x, *moved]), batch)
-    whole = Evaluation.join((evaluate(objective, part, grad=grad) for part in parts), dim=space.dim, grad=grad)
-    return found + [whole.rows(slice(at, at + len(x))) for at in range(0, len(whole.loss), len(x))]
+    moved = torch.where(in_box(space, x)[:, None], moved.clamp(space.lower, space.upper), moved)
+    batches = [*x[:, None], torch.cat([x, x]), *torch.split(torch.cat([x, *moved]), _most(objective, x))]
+    parts = [evaluate(objective, batch, grad=grad) for batch in batches]
+    whole = Evaluation.join(parts, dim=space.dim, grad=grad)
+    return [whole.rows(slice(at, at + len(x))) for at in range(0, len(whole.loss), len(x))]
+
+
+def _most(objective: Objective, x: Tensor) -> int:
+    """Return how many points are evaluated at once: as many as an objective prefers, or all where it does not say."""
+    return max(1, getattr(objective, "preferred_batch", (1 + MOVES) * len(x)))
 
 
 def _name(found: Evaluation) -> str:
