@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..landscapes.sampling.memory import free_memory
 from ..landscapes.storage.locks import holding
 from ..landscapes.verification import POINTS, verify
 from .watch import PREPARING, Watch, resumable
@@ -30,6 +31,7 @@ def going_on(
         if make is not None:
             with watch.busy(PREPARING):
                 pieces.verify(make())
+                free_memory()  # which the environment has taken, if nobody else has it
         yield
 
 

@@ -1,4 +1,4 @@
-"""Two commands that are started on the same result together: one fills it, the other waits and goes on with the rest."""
+"""Two commands on the same result, started together: one fills it, the other waits and goes on with the rest."""
 
 import signal
 import subprocess

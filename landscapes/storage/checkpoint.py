@@ -105,7 +105,7 @@ class Checkpoint:
     def _read(self, name: str, todo: str) -> dict[str, NDArray[Any]]:
         """Return the arrays of a part. Raises DamagedError, which says what `todo`, where it is damaged."""
         path = self._path(name)
-        with reading(path, todo), np.load(path, allow_pickle=False) as arrays:
+        with reading(path, todo), path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             found = dict(arrays)
             if str(found.pop(NAME_KEY, "")) != name:
                 raise ValueError("it is another part")
