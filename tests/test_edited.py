@@ -16,6 +16,7 @@ from torch import Tensor
 
 import gradscape as gs
 from gradscape import Environment, Evaluation, Fidelity, ParameterSpace, Plane
+from gradscape.envs.functions import Branin
 from gradscape.envs.records import ModelPart
 from gradscape.jobs.convergence import ConvergenceJob
 from gradscape.jobs.mixed import MixedJob
@@ -282,6 +283,28 @@ def test_a_race_of_another_scene_takes_no_more_seeds(tmp_path: Path, monkeypatch
     with pytest.raises(StoreMismatchError, match="losses are others now"):
         gs.race(Throw, ["random"], budget=4, seeds=2, out=tmp_path / "race")
     assert not gs.open_run(tmp_path / "race/random-1").data.sizes["evaluation"]
+
+
+def test_a_league_names_the_scene_that_was_edited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    gs.league([Throw], ["random"], budget=4, seeds=1, out=tmp_path / "league")
+    monkeypatch.setattr(Throw, "curvature", 3.0)
+    with pytest.raises(ValueError, match=r"throw@draft: StoreMismatchError: .* whose losses are others now"):
+        gs.league([Throw], ["random"], budget=4, seeds=1, out=tmp_path / "league")
+
+
+def test_a_card_goes_on_with_the_same_engines_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    how: dict[str, Any] = {"resolution": 3, "device": "cpu", "out": tmp_path / "card"}
+    gs.card(["control"], **how)
+    gs.card(["control"], **how)
+    evaluate = Branin._evaluate
+
+    def halved(env: Branin, x: Tensor, *, grad: bool) -> Evaluation:
+        found = evaluate(env, x, grad=grad)
+        return Evaluation(found.loss / 2, found.grad, found.status)
+
+    monkeypatch.setattr(Branin, "_evaluate", halved)
+    with pytest.raises(StoreMismatchError, match="a study of branin whose losses are others now"):
+        gs.card(["control"], **how)
 
 
 # --- files that are edited between two commands ---
