@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
-from ..landscapes.adapters import within_box
 from ..landscapes.identity import plane_of, stored_identity
 from ..landscapes.objective import Objective, Status
 from ..landscapes.overlay import best_point, overlay, principal_plane
@@ -183,27 +182,25 @@ class OverlayJob:
         where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
         """
         beneath = self._sample(watch or Watch()) if self.cut else self.slice
-        with resumable(lambda: f"each file in {self.folder} is whole"):
+        with resumable(self._say_kept):
             return self._write(Overlay(beneath, overlay(beneath.data, self.runs), self.folder, []))
+
+    def _say_kept(self) -> str:
+        return f"each file in {self.folder} is whole"
 
     def _sample(self, watch: Watch) -> Slice:
         """Sample the slice that is cut anew."""
         assert self.cut is not None  # as `run` has seen
         env = self._objective()
-        self._verify(env, watch)
+        if self.slice.folder is not None:
+            with resumable(self._say_kept), watch.busy(PREPARING):
+                verify_dataset(env, self.slice.data, self.slice.folder, todo=RESAMPLE)
         plane = self.cut.plane(plane_of(self.slice.data), self.runs, env)
         how: dict[str, Any] = {"gradients": int("grad" in self.slice.data), "boxed": self.cut.principal}
         job = SliceJob.of(env, plane, command=self.command, root=self.folder, **how)
         summary = job.run(watch)
         watch.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
         return Slice(open_slice(job.folder / SLICE_STORE), job.folder, lambda: env)
-
-    def _verify(self, env: Objective, watch: Watch) -> None:
-        """Verify the slice that is cut anew: what lies beneath the runs is to be of the same landscape."""
-        boxed = bool(self.slice.identity.get("boxed"))
-        with resumable(lambda: f"each file in {self.folder} is whole"), watch.busy(PREPARING):
-            if self.slice.folder is not None:
-                verify_dataset(within_box(env) if boxed else env, self.slice.data, self.slice.folder, todo=RESAMPLE)
 
     def _objective(self) -> Objective:
         """Return what the slice was sampled from."""

@@ -180,8 +180,9 @@ class ReportJob:
         from ..landscapes.measures.profile import own_cost
 
         require("number of samples", dataset["loss"].size, lambda count: Need(own_cost(count)[1]))
+        verify_dataset(env, dataset, subject.store, todo=RESAMPLE)
         start = time.monotonic()
-        profile = measure(env, dataset, self.points, self.seed, watch, path=subject.store)
+        profile = measure(env, dataset, self.points, self.seed, watch)
         grown = growth.measure_growth_of(env, dataset, watch)
         report = Report(
             name=subject.name,
@@ -209,19 +210,14 @@ class ReportJob:
         watch.note(f"{report.folder}: {', '.join(printed)}")
 
 
-def measure(env: Environment, dataset: xr.Dataset, points: int, seed: int, watch: Watch, *, path: Path) -> Profile:
-    """Announce what measuring a slice of an environment costs, and measure it; `path` is where the slice is.
-
-    Raises StoreMismatchError where the environment gives other numbers than the slice holds.
-    """
+def measure(env: Environment, dataset: xr.Dataset, points: int, seed: int, watch: Watch) -> Profile:
+    """Announce what measuring a slice of an environment costs, and measure it."""
     from ..landscapes.adapters import within_box
     from ..landscapes.measures.profile import PRECISION, effort, measure_profile
 
     total = sum(effort(dataset["loss"].ndim, points, dataset["loss"].shape))
-    objective = within_box(env) if stored_identity(dataset).get("boxed") else env
-    with watch.busy(f"{env.name}: {PREPARING}"):
-        verify_dataset(objective, dataset, path, todo=RESAMPLE)
     _announce(env, dataset, points, watch)
+    objective = within_box(env) if stored_identity(dataset).get("boxed") else env
     with watch.progress(total) as advance:
         counted = _Counted(objective, env.preferred_batch, advance)
         rounding = PRECISION[env.fidelity.precision]

@@ -208,7 +208,7 @@ class SliceJob:
 
     def _so_far(self) -> xr.Dataset:
         """Return what is sampled of a slice that is refined."""
-        return partly_refined(self.store, self._pieces)
+        return partly_refined(self.store, pieces_in(self.folder, self.store))
 
     def _verify(self, watch: Watch) -> None:
         """Evaluate a few stored points anew, before anything is added to them."""
@@ -217,11 +217,6 @@ class SliceJob:
                 verify_dataset(self.objective, self._so_far(), self.folder)
             else:
                 verify_store(self.objective, self.store)
-
-    @property
-    def _pieces(self) -> Checkpoint:
-        """What is kept of it while it is refined."""
-        return pieces_in(self.folder, self.store)
 
     def _announce(self, watch: Watch) -> None:
         """Say what is left to compute and what that costs."""
@@ -268,7 +263,7 @@ class SliceJob:
             how |= {"progress": follow, "conclude": conclude}
             if self.refinement is None:
                 return sample(self.objective, self.plane, self.store, gradients=int(self.store.grad), **how), computed
-            how |= {"refinement": self.refinement, "pieces": self._pieces}
+            how |= {"refinement": self.refinement, "pieces": pieces_in(self.folder, self.store)}
             return refine(self.objective, self.plane, self.store, **how), computed
 
     def _save(self, dataset: xr.Dataset) -> None:

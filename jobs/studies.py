@@ -7,14 +7,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import torch
+
+from ..landscapes.objective import Evaluation, Objective
 from ..landscapes.sampling.memory import free_memory
 from ..landscapes.storage.locks import holding
-from ..landscapes.verification import POINTS, verify
+from ..landscapes.verification import POINTS, StoredPoints, verify
 from .watch import PREPARING, Watch, resumable
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
-    from ..landscapes.objective import Objective
     from ..landscapes.storage.checkpoint import Checkpoint
     from ..optim.runs.store import RunStore
 
@@ -44,8 +46,17 @@ def filling(objective: Objective, runs: Sequence[RunStore], folder: Path, watch:
     """
     with holding(folder, watch.note) as waited:
         for run in runs if waited else ():
-            run.reload()
-        begun = [run.points() for run in runs if run.count]
+            with run.lock():  # reads it
+                pass
+        begun = [_points(run) for run in runs if run.count]
         with watch.busy(PREPARING):
             verify(objective, begun, points=POINTS if len(begun) == 1 else 1)
         yield
+
+
+def _points(run: RunStore) -> StoredPoints:
+    """Return what a run evaluated."""
+    data = run.dataset()
+    x, loss, grad, status = (torch.from_numpy(data[name].to_numpy()) for name in ("x", "loss", "grad", "status"))
+    path, sloped = run.path or Path(), run.gradient_cost is not None
+    return StoredPoints(path, "run", x, Evaluation(loss, grad, status), sloped)

@@ -128,14 +128,13 @@ class Slice:
         if self.remake is None or "grad" not in self.data:
             lacking = "the objective it was sampled from" if "grad" in self.data else "gradients"
             raise ValueError(f"a report needs {lacking}, which this slice is without; sample it by gradscape.slice")
-        made = self.remake()
-        objective = within_box(made) if self.identity.get("boxed") else made
+        objective = self.remake()
         if self.folder is not None:
             verify_dataset(objective, self.data, self.folder, todo=RESAMPLE)
         rounding = PRECISION[self.identity.get("settings", {}).get("precision", "float64")]
         return measure_profile(
-            objective, sampled_lattice(self.data), rounding=rounding, points=points, seed=seed,
-            events=getattr(made, "events", None),
+            within_box(objective) if self.identity.get("boxed") else objective, sampled_lattice(self.data),
+            rounding=rounding, points=points, seed=seed, events=getattr(objective, "events", None),
         )  # fmt: skip
 
     def __repr__(self) -> str:

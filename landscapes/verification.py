@@ -19,7 +19,8 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .identity import StoreMismatchError
+from .adapters import within_box
+from .identity import StoreMismatchError, plane_of, stored_identity
 from .objective import NOT_EVALUATED, Evaluation, Objective, Status, evaluate, in_box, name_of
 
 if TYPE_CHECKING:
@@ -44,17 +45,15 @@ class StoredPoints:
     one that did not fail its gradient tells.
     """
 
-    path: Path | str
+    path: Path
     what: str
     x: Float[Tensor, "point dim"]
     found: Evaluation
     sloped: bool
 
     @classmethod
-    def of_slice(cls, dataset: xr.Dataset, path: Path | str) -> StoredPoints:
+    def of_slice(cls, dataset: xr.Dataset, path: Path) -> StoredPoints:
         """Return the points of a slice."""
-        from .identity import plane_of
-
         plane, names = plane_of(dataset), [name for name in ("v", "u") if name in dataset["loss"].dims]
         arrays = {
             name: dataset[name].transpose(*names, ...).to_numpy()
@@ -154,8 +153,10 @@ def verify_store(objective: Objective, store: SliceStore) -> None:
     store.verified_for = objective
 
 
-def verify_dataset(objective: Objective, dataset: xr.Dataset, path: Path | str, *, todo: str = TODO) -> None:
+def verify_dataset(objective: Objective, dataset: xr.Dataset, path: Path, *, todo: str = TODO) -> None:
     """Verify a slice that was read; raises StoreMismatchError where the objective gives other numbers."""
+    if stored_identity(dataset).get("boxed"):
+        objective = within_box(objective)
     verify(objective, [StoredPoints.of_slice(dataset, path)], todo=todo)
 
 

@@ -36,7 +36,6 @@ from ...landscapes.space import ParameterSpace
 from ...landscapes.storage.files import placing, resolve
 from ...landscapes.storage.layout import FILL, consolidate, open_group
 from ...landscapes.storage.ownership import check_ours, clear_halves, has_lost_root
-from ...landscapes.verification import StoredPoints
 from ..base import Kind
 from .arrays import (
     COLUMNS,
@@ -231,18 +230,6 @@ class RunStore:
             yield
         finally:
             os.close(folder)
-
-    def reload(self) -> None:
-        """Read the run once more, which another process has filled meanwhile."""
-        with self.lock():
-            pass
-
-    def points(self) -> StoredPoints:
-        """Return the points of the run, to be verified."""
-        names = ("x", "loss", "grad", "status")
-        x, loss, grad, status = (torch.from_numpy(self._columns[name][: self.count]) for name in names)
-        found, sloped = Evaluation(loss, grad, status), self.gradient_cost is not None
-        return StoredPoints(self.path or "the store", "run", x, found, sloped)
 
     def set_gradient_cost(self, gradient_cost: float) -> None:
         """Keep what an episode with gradient costs, in episodes without."""
