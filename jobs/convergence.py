@@ -110,7 +110,7 @@ class ConvergenceJob:
         from ..landscapes.draw.figures.page import save
 
         watch = watch or Watch()
-        with going_on(self.pieces, lambda: SceneSpec.of(self.env).make(), self.say_kept, watch):
+        with going_on(self.pieces, self.env.remake, self.say_kept, watch):
             self._announce(watch)
             found = self._conclude(self._measure(watch), watch)
             save(found.plot(), self.folder / PICTURE)

@@ -113,7 +113,7 @@ class MixedJob(TradeoffJob):
         from ..landscapes.draw.figures.page import save
 
         watch = watch or Watch()
-        with going_on(self.pieces, lambda: SceneSpec.of(self.env).make(), self.say_kept, watch):
+        with going_on(self.pieces, self.env.remake, self.say_kept, watch):
             self._announce(watch)
             watch.note(f"then a search among their neighbours, of {duration(self.budget)} at most (--budget)")
             with watch.busy(self.env.name) as say:

@@ -7,6 +7,7 @@ lies farther apart than that is the result of another function, a refusal with b
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -126,7 +127,7 @@ def verify(objective: Objective, results: Sequence[StoredPoints], *, points: int
         some = [probe for probe in probes if probe.grad == grad]
         if not some:
             continue
-        now = evaluate(objective, torch.stack([probe.x for probe in some]), grad=grad)
+        now = _evaluate(objective, torch.stack([probe.x for probe in some]), grad=grad)
         unlike = [number for number, probe in enumerate(some) if not _same(probe.then, _row(now, number))]
         if unlike:
             suspects = [some[number] for number in unlike]
@@ -168,7 +169,8 @@ def _evaluation(arrays: Mapping[str, NDArray[Any]], dim: int) -> Evaluation:
 def _probes(objective: Objective, stored: StoredPoints, count: int) -> list[_Probe]:
     losses, grad = stored.found.loss, stored.found.grad
     known, widths = losses[losses.isfinite()].numpy(), objective.space.upper - objective.space.lower
-    spread = float(np.subtract(*np.percentile(known, (95, 5)))) if len(known) else 0.0
+    high, low = np.percentile(known / 4, (95, 5)).tolist() if len(known) else (0.0, 0.0)
+    spread = min(4 * (high - low), sys.float_info.max)  # of losses of 1e308, too
     slopes = torch.empty(0) if grad is None else (grad * widths).abs().amax(dim=1)
     slopes = slopes[slopes.isfinite()]
     slope = float(slopes.median()) if len(slopes) else 0.0
@@ -194,7 +196,49 @@ def _numbers(one: Evaluation, other: Evaluation) -> list[tuple[Tensor, Tensor]]:
 
 def _apart(one: Tensor, other: Tensor) -> Tensor:
     """Return how far numbers are apart, 0 where either is not finite."""
-    return (one - other).abs().nan_to_num(0.0, posinf=0.0) * (one.isfinite() & other.isfinite())
+    return torch.where(one.isfinite() & other.isfinite(), (one - other).abs(), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Suspect:
+    """A stored point whose bits are others now, and what is known of it: evaluated `now`, and `again` in other ways."""
+
+    probe: _Probe
+    now: Evaluation
+    again: Sequence[Evaluation]
+    precision: str
+    statuses: set[int]
+
+    def differing_loss(self, names: Sequence[str]) -> str:
+        """Return both losses, nothing where they differ by no more than rounding and noise."""
+        then, now = self.probe.then.loss, self.now.loss
+        noise = max(float(_apart(now, one.loss)) for one in self.again)
+        size = PLACES * LAST_PLACE[self.precision] * abs(float(now.nan_to_num(0.0)))
+        allowed = max(ROUNDING[self.precision] * self.probe.spread, size, MARGIN * noise)
+        if float(_apart(then, now)) <= allowed:
+            return ""
+        return f"losses are others now: {_both(float(then), float(now))}"
+
+    def differing_status(self, names: Sequence[str]) -> str:
+        """Return how the point ended and ends now, nothing where it ends either way."""
+        then, now = int(self.probe.then.status), int(self.now.status)
+        if then in self.statuses:
+            return ""
+        return f"points end otherwise now: {Status(then).name} then, {Status(now).name} now"
+
+    def differing_gradient(self, names: Sequence[str]) -> str:
+        """Return both gradients by the parameter by which they differ most in widths of the box, nothing as above."""
+        then, now, widths = self.probe.then.grad, self.now.grad, self.probe.widths
+        if then is None or now is None:
+            return ""
+        shift = (_apart(then, now) * widths)[0]
+        noise = max(float((_apart(now, one.grad) * widths).max()) for one in self.again if one.grad is not None)
+        size = max(self.probe.slope, float((now.nan_to_num(0.0).abs() * widths).max()))
+        if float(shift.max()) <= max(ROUNDING[self.precision] * size, MARGIN * noise):
+            return ""
+        axis = int(shift.argmax())
+        both = _both(float(then[0, axis]), float(now[0, axis]))
+        return f"gradients are others now: gradient by {names[axis]} {both}"
 
 
 def _compare(objective: Objective, probes: Sequence[_Probe], now: Evaluation, *, grad: bool, todo: str) -> None:
@@ -203,44 +247,20 @@ def _compare(objective: Objective, probes: Sequence[_Probe], now: Evaluation, *,
     others = _evaluate_again(objective, x, grad=grad, reach=REACH * LAST_PLACE[precision])
     statuses = [set(map(int, column)) for column in torch.stack([one.status for one in (now, *others)]).T]
     if grad and any(int(probe.then.status) not in known for probe, known in zip(probes, statuses, strict=True)):
-        for known, status in zip(statuses, evaluate(objective, x, grad=False).status, strict=True):
+        for known, status in zip(statuses, _evaluate(objective, x, grad=False).status, strict=True):
             known.add(int(status))  # a point that failed may have been asked for its loss alone
-    for number, probe in enumerate(probes):
-        then, here = probe.then, _row(now, number)
-        again = [_row(one, number) for one in others]
-        if int(then.status) not in statuses[number]:
-            said = f"whose points end otherwise now: {_name(then)} then, {_name(here)} now"
-        elif _loss_moved(probe, here, again, precision):
-            said = f"whose losses are others now: {_both(float(then.loss), float(here.loss))}"
-        elif (axis := _moved_axis(probe, here, again, precision)) is not None:
-            pair = [float(one.grad[0, axis]) for one in (then, here) if one.grad is not None]
-            both = _both(*pair)
-            said = f"whose gradients are others now: gradient by {objective.space.names[axis]} {both}"
-        else:
-            continue
-        raise StoreMismatchError(
-            f"{probe.stored.path} holds a {probe.stored.what} of {objective.name} {said}, at x = "
-            f"{_point(objective.space.to_values(probe.x))}; {todo}"
-        )
-
-
-def _loss_moved(probe: _Probe, now: Evaluation, again: Sequence[Evaluation], precision: str) -> bool:
-    noise = max(float(_apart(now.loss, one.loss)) for one in again)
-    size = abs(float(now.loss.nan_to_num(0.0)))
-    least = max(ROUNDING[precision] * probe.spread, PLACES * LAST_PLACE[precision] * size)
-    return float(_apart(probe.then.loss, now.loss)) > max(least, MARGIN * noise)
-
-
-def _moved_axis(probe: _Probe, now: Evaluation, again: Sequence[Evaluation], precision: str) -> int | None:
-    """Return the parameter by which the gradient differs most, told in widths of the box; None where it does not."""
-    then = probe.then
-    if then.grad is None or now.grad is None:
-        return None
-    shift = (_apart(then.grad, now.grad) * probe.widths)[0]
-    moved = [_apart(now.grad, one.grad) * probe.widths for one in again if one.grad is not None]
-    noise = max((float(one.max()) for one in moved), default=0.0)
-    size = max(probe.slope, float((now.grad.nan_to_num(0.0).abs() * probe.widths).max()))
-    return int(shift.argmax()) if float(shift.max()) > max(ROUNDING[precision] * size, MARGIN * noise) else None
+    suspects = [
+        _Suspect(probe, _row(now, number), [_row(one, number) for one in others], precision, statuses[number])
+        for number, probe in enumerate(probes)
+    ]
+    for differing in (_Suspect.differing_loss, _Suspect.differing_status, _Suspect.differing_gradient):
+        for one in suspects:
+            if said := differing(one, objective.space.names):
+                stored = one.probe.stored
+                raise StoreMismatchError(
+                    f"{stored.path} holds a {stored.what} of {objective.name} whose {said}, at x = "
+                    f"{_point(objective.space.to_values(one.probe.x))}; {todo}"
+                )
 
 
 def _evaluate_again(
@@ -251,14 +271,17 @@ def _evaluate_again(
     moves = 2 * torch.rand(MOVES, *x.shape, generator=generator, dtype=torch.float64) - 1
     moved = x + moves * reach * (space.upper - space.lower)
     moved = torch.where(in_box(space, x)[:, None], moved.clamp(space.lower, space.upper), moved)
-    batches = [*x[:, None], torch.cat([x, x]), *torch.split(torch.cat([x, *moved]), objective.preferred_batch)]
-    parts = [evaluate(objective, batch, grad=grad) for batch in batches]
+    batches = [*x[:, None], torch.cat([x, x]), torch.cat([x, *moved])]
+    parts = [_evaluate(objective, batch, grad=grad) for batch in batches]
     whole = Evaluation.join(parts, dim=space.dim, grad=grad)
     return [whole.rows(slice(at, at + len(x))) for at in range(0, len(whole.loss), len(x))]
 
 
-def _name(found: Evaluation) -> str:
-    return Status(int(found.status)).name
+def _evaluate(objective: Objective, x: Float[Tensor, "point dim"], *, grad: bool) -> Evaluation:
+    """Evaluate points in batches that an objective prefers."""
+    batch = objective.preferred_batch
+    parts = [evaluate(objective, part, grad=grad) for part in torch.split(x, batch)]
+    return Evaluation.join(parts, dim=objective.space.dim, grad=grad)
 
 
 def _both(then: float, now: float) -> str:
