@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .identity import StoreMismatchError, plane_of, stored_identity
-from .objective import NOT_EVALUATED, Evaluation, BoxedObjective, Objective, Status, evaluate, in_box
+from .objective import NOT_EVALUATED, BoxedObjective, Evaluation, Objective, Status, evaluate, in_box
 
 if TYPE_CHECKING:
     from .storage.store import SliceStore
