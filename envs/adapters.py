@@ -184,7 +184,7 @@ class _Torch:
     devices: tuple[str, ...] = ("cpu", "cuda")
 
     def find_device(self, device: str) -> str:
-        """Return the device of points, which auto leaves to `from_torch`."""
+        """Return the device of points, which auto leaves to `from_torch`. Raises ValueError where it is not there."""
         found = self.device if device == "auto" else device
         if found not in self.devices or (found == "cuda" and not torch.cuda.is_available()):
             raise ValueError(f"from_torch runs on cpu, and on cuda where torch finds a device; got device {found!r}")
@@ -252,7 +252,7 @@ class _NumPy:
     devices: tuple[str, ...] = ("cpu",)
 
     def find_device(self, device: str) -> str:
-        """Return the CPU."""
+        """Return the CPU. Raises ValueError for another device."""
         if device not in ("auto", "cpu"):
             raise ValueError(f"from_numpy runs on cpu; got device {device!r}")
         return "cpu"

@@ -274,8 +274,6 @@ class Environment(Objective):
     @property
     def packages(self) -> tuple[str, ...]:
         """Packages that the environment's engine needs, beside those that all need."""
-        from .registry import EXTRAS
-
         return EXTRAS.get(self.capabilities.extra, ())
 
     @property

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from importlib.metadata import PackageNotFoundError, version
 
+EXTRAS = {"mjx": ("mujoco", "mujoco-mjx", "jax"), "newton": ("newton",)}  # of this package, and what each brings
+
 
 def installed_version(package: str) -> str | None:
     """Return the version of a package, without importing it; None where it is not installed."""

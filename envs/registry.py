@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from ..landscapes.storage.files import resolve
 from .engines import ENGINES
 from .importing import IN_FILE, import_named, refuse_absent_name
+from .installed import EXTRAS as EXTRAS
 from .installed import install_line, is_installed
 from .records import unknown_fidelity
 
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 
 Kind = TypeVar("Kind", bound="type[Environment] | Environment")
 GROUP = "gradscape.environments"
-EXTRAS = {"mjx": ("mujoco", "mujoco-mjx", "jax"), "newton": ("newton",)}  # of this package, and what each brings
 SCENE = ("draft", "standard", "reference")
 DEVICES = ("auto", "cpu", "cuda")
 

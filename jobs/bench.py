@@ -186,16 +186,14 @@ class BenchJob:
             env = envs[self.engine]
             for batch in self.batches:
                 require("batch", batch, partial(_need, env))
-            takes = f"each rate is timed for {duration(self.seconds)} or more, without and with gradients"
-            watch.note(f"{env.name}: {takes}")
+            watch.note(f"{env.name}: each rate takes {duration(self.seconds)} or more, without and with gradients")
             rates = list[BatchRate]()
             for batch in self.batches or sorted({1, env.preferred_batch}):
                 say(f"timing batches of {batch}")
                 rates += _time_batch(envs, _points(env, batch), self.seconds)
             say("timing kernels")
-            kernels = None
-            if find_engine(self.engine).profiled:
-                kernels = tabulate_kernels(env, _points(env, env._rows_per_part(env.preferred_batch)), roof)
+            part, profiled = _points(env, env._rows_per_part(env.preferred_batch)), find_engine(self.engine).profiled
+            kernels = tabulate_kernels(env, part, roof) if profiled else None
             adapter = _time_adapter(env, self.seconds)
             say("timing the sampler")
             own = [rate.with_gradient.episodes_per_second for rate in rates if rate.engine == self.engine]

@@ -1,4 +1,4 @@
-"""The house: what stands where, how long files get, what public functions say they raise, and what tests mirror."""
+"""The house: what stands where, how long functions get, what public ones say they raise, and what tests mirror."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 FOLDERS = ("api", "commands", "envs", "gallery", "jobs", "landscapes", "optim")
 SOURCES = sorted([ROOT / "cli.py", *(file for folder in FOLDERS for file in (ROOT / folder).rglob("*.py"))])
-LONGEST = 400  # lines of a file
+LONGEST = 40  # lines of a function, but for its signature, its docstring and functions within it
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
@@ -20,11 +20,15 @@ def test_the_package_s_own_folder_is_the_door_only() -> None:
     assert held == {*FOLDERS, "cli.py", "__init__.py", "__main__.py", "py.typed"}
 
 
-def test_no_file_is_longer_than_one_reads_at_once() -> None:
-    assert len(SOURCES) > 150
-    tests = [file for file in (ROOT / "tests").rglob("*.py")]
-    long = {file.relative_to(ROOT).as_posix(): _lines(file) for file in [*SOURCES, *tests] if _lines(file) > LONGEST}
-    assert long == {}
+def test_no_function_is_longer_than_one_reads_at_once() -> None:
+    long = {
+        f"{file.relative_to(ROOT)} {node.name}": length
+        for file in SOURCES
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, Function) and (length := _lines(node)) > LONGEST
+    }
+    # One step of a flight with all that it may meet: a Warp function, whose parts would be as many arguments.
+    assert long.keys() == {"envs/engines/balls/events.py move"}
 
 
 def test_tests_stand_in_folders_that_there_are() -> None:
@@ -45,8 +49,20 @@ def test_public_functions_that_raise_say_so(folder: str) -> None:
     assert silent == []
 
 
-def _lines(file: Path) -> int:
-    return len(file.read_text().splitlines())
+def _lines(node: Function) -> int:
+    """Return how many lines the statements of a function take, without those of functions within it."""
+    body = node.body[ast.get_docstring(node) is not None :]
+    within = [one for one in _children(node) if isinstance(one, Function)]
+    inner = sum((one.end_lineno or 0) - one.lineno + 1 + len(one.decorator_list) for one in within)
+    return (body[-1].end_lineno or 0) - body[0].lineno + 1 - inner if body else 0
+
+
+def _children(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield the nodes within a node, functions included but not what is within these."""
+    for child in ast.iter_child_nodes(node):
+        yield child
+        if not isinstance(child, Function):
+            yield from _children(child)
 
 
 def _docstring(node: Function) -> str:

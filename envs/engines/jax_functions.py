@@ -33,7 +33,7 @@ class JaxBackend:
     devices: tuple[str, ...] = ("cpu", "cuda")
 
     def find_device(self, device: str) -> str:
-        """Return the device that auto stands for, JAX's default, or the one named."""
+        """Return the device that auto stands for, JAX's default, or the one named. Raises ValueError for no device."""
         if device == "auto":
             return "cpu" if jax.default_backend() == "cpu" else "cuda"
         if device not in self.devices or (device == "cuda" and jax.default_backend() == "cpu"):

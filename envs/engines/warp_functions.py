@@ -34,7 +34,7 @@ class WarpBackend:
     devices: tuple[str, ...] = ("cpu", "cuda")
 
     def find_device(self, device: str) -> str:
-        """Return the device that auto stands for, or the one named."""
+        """Return the device that auto stands for, or the one named. Raises ValueError where it is not there."""
         wanted = self.device if device == "auto" else device
         found = ("cuda" if cuda_available() else "cpu") if wanted == "auto" else wanted
         if found not in self.devices or (found == "cuda" and not cuda_available()):
