@@ -56,7 +56,7 @@ class Row:
     @property
     def present(self) -> bool:
         """Whether that is what the scene is now."""
-        same = asdict(environment_class(self.scene).fidelities[self.name]) == self.settings
+        same = environment_class(self.scene).fidelities[self.name].record() == self.settings
         return same and is_present(self.scene, self.model_version)
 
     def shortfall(self, claim: Claim) -> Shortfall:
@@ -80,7 +80,7 @@ def _read(name: str, record: dict[str, Any]) -> Iterator[Row]:
     known = record["identity"]
     rungs = [one for one in record["rungs"] if all(one[key] == known[key] for key in ("device", "engine", "options"))]
     for claim in CLAIMS:
-        now = asdict(environment_class(name).fidelities[claim.name])
+        now = environment_class(name).fidelities[claim.name].record()
         same = [one for one in rungs if {**one["fidelity"], "name": claim.name} == now]
         for one in (same or [one for one in rungs if one["name"] == claim.name])[:1]:
             settings, measured = {**one["fidelity"], "name": claim.name}, {key: one[key] for key in MEASURED}

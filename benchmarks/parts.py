@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 
 from gradscape.envs.records import ModelPart
@@ -36,7 +35,7 @@ def studies(data: Path = DATA) -> dict[str, ModelStudy]:
     for name in sorted(entries()):
         for study in map(ModelStudy.of_record, records(name, TradeoffFiles.of_model, data)):
             known = study.identity
-            same = asdict(environment_class(name).fidelities[study.fidelity]) == known["settings"]
+            same = environment_class(name).fidelities[study.fidelity].record() == known["settings"]
             if same and is_present(name, known["model_version"], known["engine"]):
                 found.setdefault(name, study)
     return found

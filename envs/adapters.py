@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Unpack, get_args
@@ -11,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..landscapes.objective import ContractError, Evaluation
+from ..landscapes.objective import ContractError, Evaluation, first_line
 from ..landscapes.space import ParameterSpace, as_tensor, as_whole
 from .base import Environment
 from .function import Compute, Function, FunctionEnvironment, FunctionKeywords, check_shape
@@ -202,9 +203,9 @@ class _Torch:
 
     def _losses(self, call: Function, x: Float[Tensor, "batch dim"], settings: Mapping[str, Any]) -> Tensor:
         if self.vectorized:
-            found = call.fn(x, **settings)
+            found = _called(call, x, settings)
         else:
-            parts = [call.fn(point, **settings) for point in x]
+            parts = [_called(call, point, settings) for point in x]
             found = torch.stack(parts) if all(isinstance(one, Tensor) for one in parts) else parts[0]
         if isinstance(found, tuple):
             raise ContractError(
@@ -215,6 +216,20 @@ class _Torch:
             raise ContractError(f"{call.name} must return a tensor; got {type(found).__name__}")
         check_shape(tuple(found.shape), (len(x),), "losses", call.name)
         return found
+
+
+def _called(call: Function, x: Tensor, settings: Mapping[str, Any]) -> Any:
+    """Return what a function returns; say which precision it wants where torch refuses to mix two."""
+    try:
+        return call.fn(x, **settings)
+    except RuntimeError as error:
+        if "dtype" in str(error) and {"Float", "Double"} <= set(re.findall(r"\w+", str(error))):
+            other = "float32" if x.dtype == torch.float64 else "float64"
+            raise ContractError(
+                f"{call.name} mixes its points with numbers of another type ({first_line(error)}); pass "
+                f"precision={other!r} to from_torch, or convert its own with .to(x)"
+            ) from error
+        raise
 
 
 def _autograd(loss: Float[Tensor, " batch"], x: Float[Tensor, "batch dim"], name: str) -> Tensor:

@@ -25,10 +25,13 @@ from ..landscapes.storage.records import write_record
 from .check import CheckJob
 from .folder import CARD, ROOT, folder_named
 from .scene import ABSENT, SceneSpec, plane_through
+from .studies import going_on
 from .watch import Watch, resumable
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from ..envs.base import Environment
 
 RECORD, PICTURE = CARD.files
 OURS = (PACKAGE, "warp-lang")  # what our own scenes are simulated by
@@ -50,6 +53,10 @@ class Entrant:
     def name(self) -> str:
         """What its part of the study is called."""
         return "-".join([self.env, *(f"{name}-{value}" for name, value in self.options.items())])
+
+    def spec(self, device: str) -> SceneSpec:
+        """Return what makes its environment."""
+        return SceneSpec(self.env, device=device, options=dict(self.options))
 
     @property
     def settings(self) -> str:
@@ -133,7 +140,7 @@ class CardJob:
         from ..landscapes.draw.figures.page import save
 
         watch = watch or Watch()
-        with resumable(self.say_kept):
+        with going_on(self.pieces, None, self.say_kept, watch):
             card = self._measure(watch)
             save(card.plot(), self.folder / PICTURE)
             write_record(self.folder / RECORD, card.record())
@@ -172,9 +179,14 @@ class CardJob:
     def _arrays(self, one: Entrant) -> dict[str, NDArray[Any]]:
         """Return what is found of an entrant, from what is kept of it where that is there."""
         arrays = self.pieces.load(one.name)
-        if arrays is None:
-            arrays = _measure(one, self.resolution, self.device)
-            self.pieces.save(one.name, **arrays)
+        if arrays is not None:
+            if arrays["loss"].size:
+                self.pieces.verify(one.spec(self.device).make(), of=one.name)
+            return arrays
+        env, arrays = _measure(one, self.resolution, self.device)
+        if arrays["loss"].size:
+            self.pieces.verify(env, of=one.name)
+        self.pieces.save(one.name, **arrays)
         return arrays
 
 
@@ -184,23 +196,23 @@ def _models() -> dict[str, int]:
     return {name: kind.version_on(kind.engines[0]) for name, kind in kinds.items()}
 
 
-def _measure(one: Entrant, resolution: int, device: str) -> dict[str, NDArray[Any]]:
-    """Check an entrant, and sample its slice unless its evaluations are of the wrong form."""
+def _measure(one: Entrant, resolution: int, device: str) -> tuple[Environment, dict[str, NDArray[Any]]]:
+    """Check an entrant, and sample its slice unless its evaluations are of the wrong form; return both."""
     from ..landscapes.sampling.fill import sample
 
-    job = CheckJob.open(SceneSpec(one.env, device=device, options=dict(one.options)), points=POINTS)
+    job = CheckJob.open(one.spec(device), points=POINTS)
     report, env = job.run(Watch()).record(), job.env
     plane = plane_through(env, one.dims, through="center", extent=None, resolution=resolution)
     about = {name: report[name] for name in ("checks", "fidelity", "device")}
     about |= {"labels": plane.labels, "loss_unit": env.loss_unit}
     if report["checks"][0]["outcome"] == FAIL:
-        return {"about": np.array(json.dumps(about)), "loss": np.empty((0, 0))}
+        return env, {"about": np.array(json.dumps(about)), "loss": np.empty((0, 0))}
     dataset = sample(env, plane)
     sides = (plane.upper - plane.lower).numpy()
     slope = plane.slope(torch.from_numpy(dataset["grad"].transpose("v", "u", "dim").to_numpy())).numpy() * sides
     axes = {name: dataset[name].to_numpy() for name in ("u", "v")}
     values = {name: dataset[name].transpose("v", "u").to_numpy() for name in ("loss", "status")}
-    return {"about": np.array(json.dumps(about)), "slope": slope, **axes, **values}
+    return env, {"about": np.array(json.dumps(about)), "slope": slope, **axes, **values}
 
 
 def _slice_of(arrays: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> CardSlice:

@@ -19,7 +19,8 @@ from ..landscapes.storage.files import replacing, tidy
 from ..landscapes.storage.records import read_json, reading, write_record
 from .folder import CENSUS, ROOT, folder_named
 from .scene import SceneSpec, provenance
-from .watch import PREPARING, Watch, resumable
+from .studies import going_on
+from .watch import PREPARING, Watch
 from .workers import recipe
 
 if TYPE_CHECKING:
@@ -132,7 +133,7 @@ class CensusJob:
         from ..landscapes.draw.figures.page import save, save_prints
 
         watch = watch or Watch()
-        with resumable(self.say_kept):
+        with going_on(self.pieces, lambda: self.env, self.say_kept, watch):
             deviation = self._noise(watch)
             self._announce(watch)
             found = self._conclude(self._survey(deviation, watch))

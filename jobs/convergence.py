@@ -17,6 +17,7 @@ from ..landscapes.storage.records import write_record
 from .folder import CONVERGENCE, ROOT, folder_named
 from .refinement import Refinement, find_refinements
 from .scene import SceneSpec, provenance
+from .studies import going_on
 from .variants import Variant, expected_work, refuse_single
 from .watch import PREPARING, Watch, resumable
 
@@ -109,7 +110,7 @@ class ConvergenceJob:
         from ..landscapes.draw.figures.page import save
 
         watch = watch or Watch()
-        with resumable(self.say_kept):
+        with going_on(self.pieces, self.env.remake, self.say_kept, watch):
             self._announce(watch)
             found = self._conclude(self._measure(watch), watch)
             save(found.plot(), self.folder / PICTURE)

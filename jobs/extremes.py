@@ -17,6 +17,7 @@ from ..landscapes.storage.records import write_record
 from .folder import EXTREMES, ROOT, folder_named
 from .knobs import BOX, DEAREST, DT, RESOLUTION, Knob, Knobs, Pair, Settings, settings_key
 from .scene import SceneSpec, provenance
+from .studies import going_on
 from .variants import SLOWER
 from .watch import PREPARING, Watch, resumable
 
@@ -125,7 +126,7 @@ class ExtremesJob:
         from ..landscapes.draw.figures.page import save
 
         watch = watch or Watch()
-        with resumable(self.say_kept):
+        with going_on(self.pieces, lambda: self.env, self.say_kept, watch):
             found = self._measure(watch, self._announce(watch))
             save(found.plot(), self.folder / PICTURE)
             write_record(self.folder / RECORD, found.record())

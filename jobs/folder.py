@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..landscapes.plain import digest
 from ..landscapes.storage import paths
 from ..landscapes.storage.files import other_files, visible_files
 from ..landscapes.storage.ownership import refuse_others
@@ -70,11 +69,6 @@ EXTREMES = Results("study of extremes", ("extremes.json", "extremes.png"), "extr
 CARD = Results("report card", ("card.json", "card.png"), "card.png")
 PAIRS = Results("study of pairs", ("pairs.json",))
 CENSUS = Results("census", ("census.json", "census.npz", "census.png"), "census.png")
-
-
-def digest(settings: Any) -> str:
-    """Return six digits that are the same for the same settings, which are plain JSON."""
-    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:6]
 
 
 def folder_named(parts: Iterable[object], settings: Any, root: Path = ROOT) -> Path:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 from platformdirs import user_data_path
 
 from ..landscapes.identity import MODEL_VERSION, current_identity
+from ..landscapes.plain import digest
 from ..landscapes.storage.disk import moved_by
 from ..landscapes.storage.records import read_json, reading, write_record
-from .folder import digest
 
 if TYPE_CHECKING:
     from ..envs.base import Environment

@@ -24,6 +24,7 @@ from ..landscapes.storage.records import write_record
 from .folder import MIXED, ROOT, folder_named
 from .notches import fidelity_line, named_variant, neighbours
 from .scene import SceneSpec
+from .studies import going_on
 from .tradeoff import COPIES, TradeoffJob, reference_of
 from .variants import Variant, expected_work
 from .watch import Watch, resumable
@@ -112,7 +113,7 @@ class MixedJob(TradeoffJob):
         from ..landscapes.draw.figures.page import save
 
         watch = watch or Watch()
-        with resumable(self.say_kept):
+        with going_on(self.pieces, self.env.remake, self.say_kept, watch):
             self._announce(watch)
             watch.note(f"then a search among their neighbours, of {duration(self.budget)} at most (--budget)")
             with watch.busy(self.env.name) as say:

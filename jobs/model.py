@@ -13,10 +13,12 @@ import torch
 
 from ..landscapes.capacity import Need, require
 from ..landscapes.cost import duration, seconds_per_episode
+from ..landscapes.plain import digest
 from ..landscapes.storage.files import tidy
 from ..landscapes.storage.records import write_record
-from .folder import MODEL, ROOT, digest, folder_named
+from .folder import MODEL, ROOT, folder_named
 from .scene import SceneSpec, provenance
+from .studies import going_on
 from .watch import PREPARING, Advance, Watch, resumable
 
 if TYPE_CHECKING:
@@ -108,7 +110,7 @@ class ModelJob:
         from ..landscapes.draw.figures.page import save
 
         watch = watch or Watch()
-        with resumable(self.say_kept):
+        with going_on(self.pieces, lambda: self.env, self.say_kept, watch):
             self._announce(watch)
             found = self._conclude(*self._measure(watch))
             save(found.plot(), self.folder / PICTURE)

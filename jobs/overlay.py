@@ -19,10 +19,11 @@ from ..landscapes.slice import Slice
 from ..landscapes.storage.files import tidy, visible_files
 from ..landscapes.storage.paths import slice_exists
 from ..landscapes.storage.store import open_slice
+from ..landscapes.verification import RESAMPLE, verify_dataset
 from .folder import OVERLAY, ROOT, SLICE_STORE, folder_named, run_tables
 from .scene import environment_of, named_point
 from .slice import SliceJob
-from .watch import Watch, resumable
+from .watch import PREPARING, Watch, resumable
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -182,16 +183,23 @@ class OverlayJob:
     def run(self, watch: Watch | None = None) -> Overlay:
         """Sample the new slice, if there is to be one, lay the runs over it and write the files.
 
-        Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
+        Raises StoreMismatchError where a slice is to be cut anew that its objective gives other numbers for, Stopped
+        where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
         """
         beneath = self._sample(watch or Watch()) if self.cut else self.slice
-        with resumable(lambda: f"each file in {self.folder} is whole"):
+        with resumable(self._say_kept):
             return self._write(Overlay(beneath, overlay(beneath.data, self.runs), self.folder, []))
+
+    def _say_kept(self) -> str:
+        return f"each file in {self.folder} is whole"
 
     def _sample(self, watch: Watch) -> Slice:
         """Sample the slice that is cut anew."""
         assert self.cut is not None  # as `run` has seen
         env = self._objective()
+        if self.slice.folder is not None:
+            with resumable(self._say_kept), watch.busy(PREPARING):
+                verify_dataset(env, self.slice.data, self.slice.folder, todo=RESAMPLE)
         plane = self.cut.plane(plane_of(self.slice.data), self.runs, env)
         how: dict[str, Any] = {"gradients": int("grad" in self.slice.data), "boxed": self.cut.principal}
         job = SliceJob.of(env, plane, command=self.command, root=self.folder, **how)

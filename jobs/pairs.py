@@ -14,7 +14,8 @@ from ..landscapes.storage.checkpoint import Checkpoint
 from ..landscapes.storage.files import tidy, write_json
 from .folder import PAIRS, ROOT, folder_named
 from .scene import SceneSpec, provenance
-from .watch import PREPARING, Watch, resumable
+from .studies import going_on
+from .watch import PREPARING, Watch
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -130,7 +131,7 @@ class PairsJob:
         Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
         """
         watch = watch or Watch()
-        with resumable(self.say_kept):
+        with going_on(self.pieces, lambda: self.env, self.say_kept, watch):
             self._announce(watch)
             with watch.progress(self.design.episodes) as advance:
                 found = explore(self.env, self.design, self.pieces, follow=advance)

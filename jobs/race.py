@@ -16,6 +16,7 @@ from ..landscapes.sampling.distribution import make_objective as objective_of
 from ..landscapes.sampling.distribution import run_tasks, workers_of
 from ..landscapes.space import as_whole
 from ..landscapes.storage.files import clear, tidy, visible_files, write_json
+from ..landscapes.storage.locks import check_free
 from ..landscapes.storage.ownership import refuse_others
 from ..landscapes.threads import one_torch_thread
 from ..optim.claims import Claims, check_claims
@@ -29,6 +30,7 @@ from .methods import able_methods, check_methods, require_room
 from .race_summary import RaceSummary
 from .scene import provenance
 from .search import make_optimizer, open_run_store
+from .studies import filling
 from .watch import PREPARING, Watch, resumable
 from .workers import recipe
 
@@ -83,7 +85,8 @@ class RaceJob:
 
         `methods` are by default all that can search the environment here. Raises ValueError where the folder holds
         something else, and for methods and options that are not there, StoreMismatchError where it holds a run of other
-        settings, and TooLargeError where the race would not fit this machine.
+        settings, StoreError where another process fills the race that is to be begun anew, and TooLargeError where the
+        race would not fit this machine.
         """
         watch, options = watch or Watch(), options or {}
         budget, seeds = as_whole(budget, "a budget", least=1), as_whole(seeds, "a number of seeds", least=1)
@@ -94,6 +97,8 @@ class RaceJob:
             refuse_others(
                 folder, (one for one in visible_files(folder) if not one.is_dir() or visible_files(one)), RACE.kind
             )
+        if force:
+            check_free(folder)
         require_room(env, methods, options, seeds=seeds, budget=budget, folder=folder)
         how: dict[str, Any] = {"budget": budget, "command": command, "force": force}
         with watch.busy(f"opening {len(methods) * seeds} runs"):
@@ -120,10 +125,12 @@ class RaceJob:
     def run(self, watch: Watch | None = None) -> RaceSummary:
         """Compute what is missing, draw the race, write and return its figures.
 
-        Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
+        Raises StoreMismatchError where the scene gives other numbers than are stored, Stopped where it is interrupted,
+        and DiskFullError; the same job goes on from what is kept then.
         """
         watch = watch or Watch()
-        with resumable(self.say_kept), one_torch_thread():
+        runs = [one.run for one in self.competitors]
+        with resumable(self.say_kept), one_torch_thread(), filling(self.env, runs, self.folder, watch):
             self._search(watch)
             with watch.busy("resampling seeds"):
                 return self._save()

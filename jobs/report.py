@@ -22,6 +22,7 @@ from ..landscapes.objective import BoxedObjective, Evaluation, ObjectiveWrapper
 from ..landscapes.storage.disk import is_full
 from ..landscapes.storage.files import make_folder, other_files, replacing, tidy, write_json
 from ..landscapes.storage.records import read_json, write_record
+from ..landscapes.verification import RESAMPLE, verify_dataset
 from . import growth
 from .folder import REPORT, REPORTS, ROOT, SLICE_STORE, folder_named, store_in
 from .report_record import ARRAYS, MEASURES, PICTURE, RECORD, PaperRecord, Quoted, Report, ReportKey, Reports
@@ -164,9 +165,11 @@ class ReportJob:
         dataset = _open(subject)
         env = environment_of(dataset, self.device, self.env)
         key: ReportKey = {
-            "points": self.points, "seed": self.seed, "slice": digest_of(dataset),
-            "model_version": env.version_on(env.engine),
-        }  # fmt: skip
+            "points": self.points,
+            "seed": self.seed,
+            "slice": digest_of(dataset),
+            MODEL_VERSION: env.version_on(env.engine),
+        }
         beside = subject.store.parent
         if not self.prints or (beside / ARRAYS).exists():
             _fetch(beside, folder, key, watch)
@@ -182,6 +185,7 @@ class ReportJob:
         from ..landscapes.measures.profile import own_cost
 
         require("number of samples", dataset["loss"].size, lambda count: Need(own_cost(count)[1]))
+        verify_dataset(env, dataset, subject.store, todo=RESAMPLE)
         start = time.monotonic()
         profile = measure(env, dataset, self.points, self.seed, watch)
         grown = growth.measure_growth_of(env, dataset, watch)

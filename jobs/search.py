@@ -13,6 +13,7 @@ from ..landscapes.identity import METHOD_VERSION
 from ..landscapes.objective import FAILED, Objective, Status, describe_errors
 from ..landscapes.space import as_whole
 from ..landscapes.storage.files import clear, tidy, write_json
+from ..landscapes.storage.locks import check_free
 from ..landscapes.threads import one_torch_thread
 from ..optim.base import Kind
 from ..optim.memory import SearchSize, require_method, require_runs
@@ -23,6 +24,7 @@ from ..optim.runs.store import RunStore
 from ..optim.search import SearchProgress, search
 from .folder import ROOT, RUN, SUMMARY, folder_named
 from .scene import provenance
+from .studies import filling
 from .watch import PREPARING, Watch, resumable
 
 if TYPE_CHECKING:
@@ -111,15 +113,17 @@ class SearchJob:
     ) -> SearchJob:
         """Go on with the run in `out`, by default a folder named after it, or begin it there; `force` begins anew.
 
-        Raises ValueError where the folder holds something else, StoreMismatchError where it holds another run, and
-        TooLargeError where the run would not fit this machine.
+        Raises ValueError where the folder holds something else, StoreMismatchError where it holds another run,
+        StoreError where another process fills the run that is to be begun anew, and TooLargeError where the run would
+        not fit this machine.
         """
         budget, identity = as_whole(budget, "a budget", least=1), run_identity(env, optimizer)
         folder = out or run_folder(identity)
         require_runs(env.space.dim, budget, 1, folder)
         require_method(type(optimizer), optimizer.options, SearchSize(env.space.dim, env.decisions, budget))
         RUN.check(folder)
-        anew = force and (folder / STORE).exists()
+        if anew := force and (folder / STORE).exists():
+            check_free(folder)
         store = open_run_store(env, optimizer, folder / STORE, budget=budget, command=command, force=force)
         if anew:
             clear(folder, (PICTURE, SUMMARY), PICTURE)
@@ -128,10 +132,16 @@ class SearchJob:
     def run(self, watch: Watch | None = None) -> SearchSummary:
         """Search until the budget is spent, draw the run, write and return the summary.
 
-        Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
+        Raises StoreMismatchError where the scene gives other numbers than are stored, Stopped where it is interrupted,
+        and DiskFullError; the same job goes on from what is kept then.
         """
-        watch, start, resumed = watch or Watch(), time.monotonic(), self.store.count
-        with resumable(self.say_kept, lambda: self._on_disk().picture()), one_torch_thread():
+        watch, start = watch or Watch(), time.monotonic()
+        with (
+            resumable(self.say_kept, lambda: self._on_disk().picture()),
+            one_torch_thread(),
+            filling(self.env, [self.store], self.folder, watch),
+        ):
+            resumed = self.store.count
             if resumed < self.budget:
                 resumed = self._search(watch)
             else:

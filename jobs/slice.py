@@ -23,6 +23,7 @@ from ..landscapes.identity import with_stride
 from ..landscapes.lattice import check_gradients
 from ..landscapes.measures.unresolved import probes, stored_unresolved
 from ..landscapes.objective import BoxedObjective, Objective, Status, failed
+from ..landscapes.plain import digest
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.distribution import RemoteSite, Site, evaluator, run_tasks, workers_of
 from ..landscapes.sampling.fill import Progress, sample
@@ -34,6 +35,7 @@ from ..landscapes.storage.files import clear, tidy, write_json
 from ..landscapes.storage.paths import slice_exists
 from ..landscapes.storage.store import SliceStore
 from ..landscapes.storage.tiles import Tile
+from ..landscapes.verification import verify_dataset, verify_store
 from .folder import ROOT, SLICE, SUMMARY
 from .scene import provenance
 from .slice_place import default_folder, identity_of
@@ -117,7 +119,7 @@ class SliceJob:
         if force and slice_exists(path):
             store = SliceStore.create(path, plane, objective.space, overwrite=True, **settings)
             clear(folder, (PICTURE, SUMMARY), PICTURE)
-            pieces_in(folder).remove()
+            pieces_in(folder, store).remove()
         else:
             store = SliceStore.open_or_create(path, plane, objective.space, **settings)
         return cls(objective, plane, folder, store, draw, command, executor, remake, prints, refinement)
@@ -176,10 +178,12 @@ class SliceJob:
     def run(self, watch: Watch | None = None) -> SliceSummary:
         """Sample what is missing, draw each finer picture as it completes, write and return the summary.
 
-        Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
+        Raises StoreMismatchError where the objective gives other numbers than are stored, Stopped where it is
+        interrupted, and DiskFullError; the same job goes on from what is kept then.
         """
         watch = watch or Watch()
         with resumable(self.say_kept, self.picture):
+            self._verify(watch)
             self._announce(watch)
             start = time.monotonic()
             dataset, computed = self._sample(watch)
@@ -203,7 +207,15 @@ class SliceJob:
 
     def _so_far(self) -> xr.Dataset:
         """Return what is sampled of a slice that is refined."""
-        return partly_refined(self.store, pieces_in(self.folder))
+        return partly_refined(self.store, pieces_in(self.folder, self.store))
+
+    def _verify(self, watch: Watch) -> None:
+        """Evaluate a few stored points anew, before anything is added to them."""
+        with watch.busy(f"{self.store.identity.get('objective')}: {PREPARING}"):
+            if self.refinement and not self.store.ascending:
+                verify_dataset(self.objective, self._so_far(), self.folder)
+            else:
+                verify_store(self.objective, self.store)
 
     def _announce(self, watch: Watch) -> None:
         """Say what is left to compute and what that costs."""
@@ -250,7 +262,7 @@ class SliceJob:
             how |= {"progress": follow, "conclude": conclude}
             if self.refinement is None:
                 return sample(self.objective, self.plane, self.store, gradients=int(self.store.grad), **how), computed
-            how |= {"refinement": self.refinement, "pieces": pieces_in(self.folder)}
+            how |= {"refinement": self.refinement, "pieces": pieces_in(self.folder, self.store)}
             return refine(self.objective, self.plane, self.store, **how), computed
 
     def _save(self, dataset: xr.Dataset) -> None:
@@ -313,9 +325,9 @@ def picture_of(objective: Objective, plane: Plane) -> Draw:
     return surface if plane.rank == 2 else profile
 
 
-def pieces_in(folder: Path) -> Checkpoint:
+def pieces_in(folder: Path, store: SliceStore) -> Checkpoint:
     """Return what is kept of a slice in a folder while it is refined."""
-    return Checkpoint(folder / REFINING)
+    return Checkpoint(folder / REFINING, digest(store.identity))
 
 
 def _gpu_memory(objective: Objective) -> str:

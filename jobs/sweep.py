@@ -207,7 +207,10 @@ class SweepJob:
         return summary
 
     def sample(self, watch: Watch | None = None) -> Sweep:
-        """Sample what is missing, and return what there is to draw."""
+        """Sample what is missing, and return what there is to draw.
+
+        Raises StoreMismatchError where the scene gives other numbers than a slice holds.
+        """
         with (watch or Watch()).progress(self.total) as advance:
             count = _Count(advance, len(self.stores))
             slices = [self._sample(number, count) for number in range(len(self.stores))]

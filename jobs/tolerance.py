@@ -14,8 +14,8 @@ from platformdirs import user_data_path
 from .. import __version__
 from ..envs.registry import make
 from ..landscapes.identity import MODEL_VERSION
+from ..landscapes.plain import digest
 from ..landscapes.storage.disk import moved_by
-from .folder import digest
 
 if TYPE_CHECKING:
     from ..envs.base import Environment, Fidelity

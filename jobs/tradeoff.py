@@ -13,6 +13,7 @@ from ..landscapes.storage.files import tidy
 from ..landscapes.storage.records import write_record
 from .folder import ROOT, TRADEOFF, folder_named
 from .scene import SceneSpec, provenance
+from .studies import going_on
 from .watch import PREPARING, Watch, resumable
 
 if TYPE_CHECKING:
@@ -92,7 +93,7 @@ class TradeoffJob:
         from ..landscapes.draw.figures.page import save
 
         watch = watch or Watch()
-        with resumable(self.say_kept):
+        with going_on(self.pieces, self.env.remake, self.say_kept, watch):
             self._announce(watch)
             found = self._conclude(self._measure(watch))
             save(found.plot(), self.folder / PICTURE)

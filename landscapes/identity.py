@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from .. import __version__
 from .plain import plain_json
@@ -21,7 +21,8 @@ ERROR = "error"  # the attribute of a slice or a run with what the first point t
 SCALES = "scales"  # of the parameters in an identity; not there where all are linear
 ABSENT = "none"  # in the place of a setting's value
 LISTED_SETTINGS = 6  # settings that differ, in the refusal of a store
-MODEL_VERSION, METHOD_VERSION = "model_version", "method_version"  # in an identity
+MODEL_VERSION: Final = "model_version"  # in an identity; and so is
+METHOD_VERSION: Final = "method_version"
 REPLACED = {"code": MODEL_VERSION, "method_code": METHOD_VERSION}  # digests of source text, in identities of before
 VERSIONS, PACKAGE = "versions", "gradscape"  # in a provenance; the package's own was in the identity once
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import re
@@ -88,3 +89,8 @@ def optional(kind: Callable[[Any], Any], value: Any) -> Any:
 def plain_name(text: str) -> str:
     """Return a name of letters, digits, dots, dashes and underscores, as recordings and folders have them."""
     return re.sub(r"[^A-Za-z0-9_.-]+", "-", text).strip("-.") or "points"
+
+
+def digest(settings: Any) -> str:
+    """Return six digits that are the same for the same settings, which are plain JSON."""
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:6]

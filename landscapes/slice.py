@@ -122,11 +122,13 @@ class Slice:
         """Measure what the landscape is like here: ruggedness, noise, jumps, gradients at several scales, in words.
 
         `points` x `points` places of the slice are evaluated anew, with points near them. Raises ValueError for a slice
-        without gradients, for one that is not finished, and for one whose objective cannot be made again.
+        without gradients, for one that is not finished, and for one whose objective cannot be made again,
+        StoreMismatchError where the objective gives other numbers now than the slice holds.
         """
         from .lattice import sampled_lattice
         from .measures.profile import PRECISION, measure_profile
         from .objective import BoxedObjective
+        from .verification import RESAMPLE, verify_dataset
 
         if missing := int((self.data["status"] == Status.MISSING).sum()):
             raise ValueError(f"{missing} samples of this slice are missing; let what samples it go on first")
@@ -134,6 +136,8 @@ class Slice:
             lacking = "the objective it was sampled from" if "grad" in self.data else "gradients"
             raise ValueError(f"a report needs {lacking}, which this slice is without; sample it by gradscape.slice")
         objective = self.remake()
+        if self.folder is not None:
+            verify_dataset(objective, self.data, self.folder, todo=RESAMPLE)
         rounding = PRECISION[self.identity.get("settings", {}).get("precision", "float64")]
         return measure_profile(
             BoxedObjective(objective) if self.identity.get("boxed") else objective, sampled_lattice(self.data),

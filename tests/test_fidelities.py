@@ -1,7 +1,6 @@
 """docs/fidelities.md holds what the kept trade-offs say of every named fidelity, and which scenes changed since."""
 
 import copy
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +40,7 @@ def records(tmp_path: Path) -> dict[str, Any]:
     found["identity"]["model_version"] = kind.version_on("warp")
     for rung in found["rungs"]:
         if rung["name"] in ("draft", "standard"):
-            rung["fidelity"] = asdict(kind.fidelities[rung["name"]])
+            rung["fidelity"] = kind.fidelities[rung["name"]].record()
     return found
 
 

@@ -26,6 +26,7 @@ from distributed.comm import connect
 from distributed.security import Security
 
 from gradscape.envs.adapters import from_torch
+from gradscape.envs.functions import Branin
 from gradscape.envs.registry import make
 from gradscape.jobs.slice import STORE
 from gradscape.jobs.workers import recipe, workers
@@ -138,6 +139,14 @@ def test_two_workers_write_the_bits_of_one_process(tmp_path, executor):
     alone = sample(env, plane, store_at(tmp_path / "alone.zarr", plane, env.space))
     shared = store_at(tmp_path / "shared.zarr", plane, env.space)
     assert same(sample(env, plane, shared, batch=32, executor=executor, made=recipe(env)), alone)
+
+
+def test_a_worker_whose_scene_has_another_model_is_refused(monkeypatch):
+    made = recipe(make("branin"))
+    assert made().name == "branin"
+    monkeypatch.setattr(Branin, "model_version", 2)
+    with pytest.raises(ValueError, match=r"has branin model 2; here it is model 1: install the same version"):
+        made()
 
 
 def test_a_worker_has_a_core_and_a_thread_of_its_own(executor):

@@ -20,6 +20,7 @@ from ..space import as_stride, as_whole
 from ..storage.disk import full, is_full
 from ..storage.store import SliceStore
 from ..storage.tiles import Tile
+from ..verification import verify_store
 from .distribution import FilledTile, ReadBack, Site, WorkersLostError, distribute
 from .memory import MemoryBound
 
@@ -55,8 +56,9 @@ def sample(
 ) -> xr.Dataset:
     """Evaluate an objective on a plane and return the slice; what `store` holds already is not evaluated again.
 
-    Without a store the slice lives in memory. Losses are at all samples, gradients at every so many along each axis,
-    `gradients`, 0 for none; how far apart they are in a store it says itself. `batch` is the number of points per
+    Up to three points of a store on disk are evaluated anew, to see that they are the objective's. Without a store the
+    slice lives in memory. Losses are at all samples, gradients at every so many along each axis, `gradients`, 0 for
+    none; how far apart they are in a store it says itself. `batch` is the number of points per
     evaluation, rounded up to whole tiles (default: the objective's `preferred_batch`, else one tile); where some
     samples have no gradient, there are batches of those that have one and batches of the others, as `Batches` says.
     `progress` is called once at the start and after every tile. Stop it at any instant: the same call goes on, and the
@@ -71,8 +73,9 @@ def sample(
     that was finished before it is not called.
 
     Raises ValueError where `gradients` or `batch` is no whole number, StoreMismatchError where the store was made by
-    other settings, TooLargeError where the slice does not fit into memory, DiskFullError and WorkersLostError where
-    filling ended early, which say what is kept, and MemoryError where a single point is too much for the device.
+    other settings or holds other numbers than the objective gives now, TooLargeError where the slice does not fit into
+    memory, DiskFullError and WorkersLostError where filling ended early, which say what is kept, and MemoryError where
+    a single point is too much for the device.
     """
     gradients = as_stride(gradients)
     if store is None:
@@ -80,6 +83,7 @@ def sample(
         about["identity"] = with_stride(about["identity"], gradients)
         store = SliceStore.in_memory(plane, objective.space, **about, grad=gradients > 0)
     _check_store(store, objective, plane, grad=gradients > 0)
+    verify_store(objective, store)
     batch = as_whole(objective.preferred_batch if batch is None else batch, "sample's batch", least=1)
     status = store.status()
     counts: Counter[Status] = Counter({kind: int((status == kind).sum()) for kind in Status if kind != Status.MISSING})

@@ -1,4 +1,8 @@
-"""The checkpoint of a study: its arrays by name in a folder, each written whole, so that it can be stopped."""
+"""The checkpoint of a study: its arrays by name in a folder, each written whole, so that it can be stopped.
+
+Every part says which study it is of, so that one from elsewhere counts as damaged. What a study's simulator said at a
+few points when it began is a part of its own, by which it is verified before it is gone on with.
+"""
 
 from __future__ import annotations
 
@@ -10,30 +14,37 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ..identity import DamagedError, check_identity
-from ..plain import plain_json, text
+from ..objective import Evaluation, Objective, evaluate
+from ..plain import digest, plain_json, text
+from ..verification import POINTS, StoredPoints, verify
 from .files import discard, replacing, visible_files, write_json
+from .locks import check_free
 from .ownership import check_ours, refuse_others, remove
 from .records import read_json, reading
 
-SETTINGS, PARTS = "settings.json", "pieces"
-NAME_KEY = "piece"  # the array with a part's own name, which tells files that were swapped
+SETTINGS, PARTS, PROBES = "settings.json", "pieces", "probes"
+NAME_KEY, STUDY_KEY = "piece", "study"  # the arrays with a part's own name and its study's digest
 PART = re.compile(r"[^/]+\.npz")  # the name of one
+AGAIN = "it is computed again"
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Hold the arrays of a study in `folder`, together with what decides its numbers."""
+    """Hold the arrays of a study in `folder`, together with what decides its numbers, whose digest is `study`."""
 
     folder: Path
+    study: str = ""
 
     @classmethod
     def open(cls, folder: Path, identity: Mapping[str, Any], *, what: str, force: bool = False) -> Checkpoint:
         """Go on with a study of the same settings, or begin one; `force` begins anew where another one is.
 
-        Raises ValueError where the folder holds something else, StoreMismatchError where it holds another study.
+        Raises ValueError where the folder holds something else, StoreMismatchError where it holds another study, and
+        StoreError where another process fills the study that is to be begun anew.
         """
         wanted, path = plain_json({"kind": what, **identity}, f"a {what}'s identity"), folder / SETTINGS
         if not path.exists():
@@ -42,37 +53,76 @@ class Checkpoint:
             with reading(path, f"it is no study's or damaged: write elsewhere with --out, or delete {folder}"):
                 found = read_json(path)
                 text(found["kind"])
-            if force:
-                check_ours(folder / PARTS, PART.fullmatch, f"a {what}")
-                discard(folder / PARTS)
-            else:
+            if not force:
                 check_identity(folder, wanted=wanted, found=found, what="study")
+                return cls(folder, digest(found))
+            check_free(folder)
+            check_ours(folder / PARTS, PART.fullmatch, f"a {what}")
+            discard(folder / PARTS)
         write_json(path, wanted)
-        return cls(folder)
+        return cls(folder, digest(wanted))
+
+    def verify(self, objective: Objective, *, of: str = "") -> None:
+        """Hold an objective against what it said when the study began; where it begins, keep what it says.
+
+        Three points of its space are evaluated with their gradients. In a study of several objectives it is the one
+        `of` the part of this name.
+
+        Raises StoreMismatchError where it says other numbers now, and DamagedError where there are parts and not what
+        the study began with.
+        """
+        name, x = f"{PROBES}-{of}" if of else PROBES, objective.space.sobol(POINTS, seed=0)
+        path, todo = self._path(name), f"restore it, or begin {self.folder} anew with --force"
+        if not path.exists():
+            if any(map(self._is_ours, [of] if of else self.names())):
+                raise DamagedError.of(path, "it is missing, so nothing says what the other pieces are of", todo)
+            now = evaluate(objective, x, grad=True)
+            self.save(name, **{part: getattr(now, part).numpy() for part in ("loss", "grad", "status")})
+            return
+        with reading(path, todo):
+            kept = self._read(name, todo)
+            loss, slope, status = (torch.from_numpy(kept[part]) for part in ("loss", "grad", "status"))
+            then = Evaluation(loss, slope, status)
+        verify(objective, [StoredPoints(self.folder, "study", x, then, True)])
+
+    def _is_ours(self, name: str) -> bool:
+        """Whether a part is there, whole and of this study; those of earlier versions do not say."""
+        try:
+            self._read(name, AGAIN)
+        except (DamagedError, FileNotFoundError):
+            return False
+        return True
 
     def load(self, name: str) -> dict[str, NDArray[Any]] | None:
         """Return the arrays of a part, None where it is missing or damaged; the latter raises a warning, too."""
-        path = self._path(name)
-        if not path.exists():
+        if not self._path(name).exists():
             return None
         try:
-            with reading(path, "it is computed again"), np.load(path, allow_pickle=False) as arrays:
-                found = dict(arrays)
-                if str(found.pop(NAME_KEY, name)) != name:  # those of earlier versions do not say
-                    raise ValueError("it is another part")
-                return found
+            return self._read(name, AGAIN)
         except DamagedError as error:
             warnings.warn(str(error), RuntimeWarning, stacklevel=2)
             return None
 
+    def _read(self, name: str, todo: str) -> dict[str, NDArray[Any]]:
+        """Return the arrays of a part. Raises DamagedError, which says what `todo`, where it is damaged."""
+        path = self._path(name)
+        with reading(path, todo), path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            found = dict(arrays)
+            if str(found.pop(NAME_KEY, "")) != name:
+                raise ValueError("it is another part")
+            if str(found.pop(STUDY_KEY, None)) != self.study:
+                raise ValueError("it is not of this study, or of an earlier version, which did not say")
+            return found
+
     def save(self, name: str, **arrays: Any) -> None:
         """Write the arrays of a part, whole or not at all."""
         with replacing(self._path(name)) as partial, partial.open("wb") as file:
-            np.savez(file, **{NAME_KEY: np.array(name), **arrays})
+            np.savez(file, **{NAME_KEY: np.array(name), STUDY_KEY: np.array(self.study), **arrays})
 
     def names(self) -> list[str]:
-        """Return the names of the parts, in order."""
-        return sorted(path.stem for path in (self.folder / PARTS).glob("[!.]*.npz"))
+        """Return the names of the parts, in order, but for what the study is verified by."""
+        paths = (self.folder / PARTS).glob("[!.]*.npz")
+        return sorted(path.stem for path in paths if not path.stem.startswith(PROBES))
 
     def remove(self) -> None:
         """Remove the parts, and the folder where nothing else is in it."""
@@ -80,7 +130,7 @@ class Checkpoint:
 
     def count(self) -> int:
         """Count the parts."""
-        return len(list((self.folder / PARTS).glob("[!.]*.npz")))
+        return len(self.names())
 
     def _path(self, name: str) -> Path:
         return self.folder / PARTS / f"{name}.npz"

@@ -78,6 +78,7 @@ class SliceStore:
     """
 
     def __init__(self, group: zarr.Group, path: Path | None, place: Path | None) -> None:
+        self.verified_for: object = None  # the objective that gave a few stored points again
         self._adopt(group, path, place)
 
     def _adopt(self, group: zarr.Group, path: Path | None, place: Path | None) -> None:

@@ -12,6 +12,7 @@ from gradscape.api.sweep import sweep
 from gradscape.landscapes.directions import random_directions
 from gradscape.landscapes.identity import plane_of, stored_provenance
 from gradscape.landscapes.objective import Status
+from gradscape.landscapes.verification import POINTS
 
 from ..command import Said
 
@@ -25,10 +26,12 @@ def test_a_sweep_from_python_is_the_commands_and_goes_on_in_its_folder(
     assert done.returncode == 0, done.stderr
     (folder,) = Path("out").iterdir()
     kind = type(gradscape.make("bounce", device="cpu"))
-    monkeypatch.setattr(kind, "evaluate", lambda *_, **__: pytest.fail("evaluated again"))
+    evaluate, rows = kind.evaluate, list[int]()
+    monkeypatch.setattr(kind, "evaluate", lambda env, x, *, grad: rows.append(len(x)) or evaluate(env, x, grad=grad))
     found = sweep("bounce", (0, 1), 2, frames=2, resolution=3, through="example:aim", device="cpu")
     assert [path.name for path in Path("out").iterdir()] == [folder.name]
     assert (found.label, len(found.values)) == ("velocity z [m/s]", 2)
+    assert rows == [POINTS] * 2  # those that are verified, of each slice
     for number, dataset in enumerate(found.slices):
         xr.testing.assert_identical(dataset, gradscape.open_slice(folder / f"frames/{number:03d}.zarr").data)
 

@@ -25,6 +25,7 @@ from gradscape.jobs.slice import SliceCost, SliceJob
 from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.measures.unresolved import probes
 from gradscape.landscapes.storage.store import open_slice
+from gradscape.landscapes.verification import POINTS
 
 FIGURES = [
     Figure(
@@ -104,6 +105,7 @@ def test_compute_goes_on_where_it_stopped_and_computes_nothing_twice(
         Branin, "_evaluate", lambda env, x, *, grad: points.append(len(x)) or evaluate(env, x, grad=grad)
     )
     assert compute(tmp_path, *command) == 0
+    assert points.pop(0) == POINTS  # which are verified
     assert 0 < sum(points) - (1600 - kept) <= probes(1600, grad=True)  # which look between the samples
     points.clear()
     assert compute(tmp_path, *command) == 0

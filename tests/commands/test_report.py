@@ -144,9 +144,10 @@ def test_a_row_of_an_environment_spans_its_slices_and_says_whether_the_paper_agr
         def scale(points: int, value: float) -> dict[str, Any]:
             return {"points": points, "cosine": {"value": value}}
 
-        own = dict.fromkeys(("name", "options", "fidelity", "device", "seconds", "command", "key"))
+        own = dict.fromkeys(("name", "options", "fidelity", "device", "seconds", "command"))
         record = {
             **own,
+            "key": {},
             "env": "fluid",
             "losses": {"notable": notable, "flat": {"value": notable / 100}},
             "jumps": {"share": {"value": None}},

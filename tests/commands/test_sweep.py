@@ -19,6 +19,7 @@ from gradscape.landscapes.identity import plane_of, stored_identity
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.smoothing import smooth
 from gradscape.landscapes.storage.store import open_slice
+from gradscape.landscapes.verification import POINTS
 
 from ..command import Said
 from ..processes import Instant, alone, landscape
@@ -108,10 +109,12 @@ def test_nothing_is_computed_twice(run: Command, tmp_path: Path, monkeypatch: py
     for number, before in enumerate(first):
         xr.testing.assert_equal(open_slice(f"moved/frames/{number:03d}.zarr"), before)
     kind = type(gradscape.make("bounce", device="cpu"))
-    monkeypatch.setattr(kind, "evaluate", lambda *_, **__: pytest.fail("evaluated again"))
+    evaluate, rows = kind.evaluate, list[int]()
+    monkeypatch.setattr(kind, "evaluate", lambda env, x, *, grad: rows.append(len(x)) or evaluate(env, x, grad=grad))
     third = run(SWEEP)
     assert "all 75 episodes with gradients of 3 slices are there already" in third.stderr
     assert third.returncode == 0
+    assert rows == [POINTS] * 3  # those that are verified, of each slice
 
 
 def test_force_begins_anew_and_another_sweep_is_not_overwritten(run: Command) -> None:

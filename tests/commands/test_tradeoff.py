@@ -20,6 +20,7 @@ from gradscape.landscapes.measures import fidelity as tradeoff
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.records import read_json, write_record
+from gradscape.landscapes.verification import POINTS
 
 from ..clock import Clock
 from ..command import Said
@@ -106,12 +107,14 @@ def test_a_tradeoff_is_printed_without_being_measured_again(
     run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert run(*TRADE, "--variants", "precision", cwd=tmp_path).returncode == 0
-    monkeypatch.setattr(Converging, "_evaluate", None)
+    simulate, rows = Converging._evaluate, list[int]()
+    monkeypatch.setattr(Converging, "_evaluate", lambda *x, grad: rows.append(len(x[1])) or simulate(*x, grad=grad))
     done = run(*TRADE, "--variants", "precision", "--print", "85", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "tradeoff-85mm.pdf, tradeoff-85mm.svg" in done.stderr
     assert (tmp_path / "trade/tradeoff-85mm.pdf").read_bytes().startswith(b"%PDF")
     assert run(*TRADE, "--variants", "precision", cwd=tmp_path).returncode == 0
+    assert rows == [POINTS, POINTS]  # those that are verified, each time
 
 
 def test_rungs_that_are_refused_are_listed_and_those_that_diverge_are_counted(run: Command, tmp_path: Path) -> None:
@@ -157,7 +160,7 @@ def test_a_rung_is_gone_when_the_next_one_is_measured(
     monkeypatch.setattr(Converging, "_evaluate", followed)
     done = run(*TRADE, "--variants", "precision", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert len(simulated) == 1 + len(json.loads(done.stdout)["rungs"])  # one for the estimate
+    assert len(simulated) == 2 + len(json.loads(done.stdout)["rungs"])  # one to verify by, one for the estimate
 
 
 def test_a_dt_that_does_not_divide_the_episode_is_refused() -> None:

@@ -32,7 +32,10 @@ FACTOR = 300.0  # times the change by rounding: losses of a GPU are off by up to
 KEPT = 2  # of the points of each, those that rounding changes least
 MOVES = 8  # for each point, by rounding
 DIRECTIONS = 4
-EPSILON = {"float32": 2.0**-24, "float64": 2.0**-53}
+ROUNDING = {
+    "float32": 2.0**-24,
+    "float64": 2.0**-42,
+}  # of float64 that of some thousand steps
 POINTS = {"draft": (8, 2), "tiny": (5, 1), "compared": (3, 5)}  # how many, and their seed
 
 
@@ -111,7 +114,7 @@ def subjects(name: str) -> Iterator[tuple[Environment, str]]:
 
 def measure(env: Environment, x: Tensor) -> Numbers:
     """Return the numbers of the points that rounding changes least, and how much it changes them."""
-    epsilon = EPSILON[env.fidelity.precision]
+    epsilon = ROUNDING[env.fidelity.precision]
     width, draw = env.space.upper - env.space.lower, torch.Generator().manual_seed(0)
     found = env.evaluate(x)
     assert found.grad is not None
@@ -123,9 +126,8 @@ def measure(env: Environment, x: Tensor) -> Numbers:
         assert near.grad is not None
         for kind, value in {"loss": near.loss[:, None], "slope": slopes(near.grad)}.items():
             change[kind] = torch.maximum(change[kind], (value - whole[kind]).abs().amax(dim=1))
-    share = sum(change[kind] / value.abs().amax(dim=1).clamp_min(1e-300) for kind, value in whole.items())
-    assert isinstance(share, Tensor)
-    rows = sorted(share.argsort()[:KEPT].tolist())
+    share = torch.stack([change[kind] / value.abs().amax(dim=1) for kind, value in whole.items()]).amax(dim=0)
+    rows = sorted(share.nan_to_num(torch.inf).argsort()[:KEPT].tolist())  # those without a slope last
     return Numbers(
         rows,
         found.loss[rows].tolist(),

@@ -124,7 +124,7 @@ def test_a_stopped_study_goes_on_with_the_next_part(
         study(tmp_path)
     assert not (tmp_path / "model.json").exists()
     kept = {path.name: path.read_bytes() for path in (tmp_path / "pieces").iterdir()}
-    assert len(kept) == 4  # the full model, its repeats, two parts
+    assert len(kept) == 5  # what it is verified by, the full model, its repeats, two parts
     monkeypatch.setattr(turns, "take_turns", take)
     resumed = study(tmp_path)
     assert kept == {name: (tmp_path / "pieces" / name).read_bytes() for name in kept}

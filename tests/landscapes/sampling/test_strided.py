@@ -24,6 +24,7 @@ from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.sampling.distribution import equal_groups
 from gradscape.landscapes.sampling.fill import Progress
 from gradscape.landscapes.storage.store import SliceStore, open_slice
+from gradscape.landscapes.verification import POINTS
 
 from ...command import Said
 
@@ -166,6 +167,7 @@ def test_a_run_that_goes_on_repeats_the_batches(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         sample(stopped, SQUARE, strided_store(tmp_path / "cut.zarr", SQUARE))
     sample(last, SQUARE, strided_store(tmp_path / "cut.zarr", SQUARE))
+    assert len(last.batches[True].pop(0)) == POINTS  # which are verified
     for grad in (True, False):
         mine, theirs = last.batches[grad], whole.batches[grad]
         assert 3 < len(mine) < len(theirs)

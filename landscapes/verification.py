@@ -1,0 +1,297 @@
+"""Verification: a few points of a stored result are evaluated anew before it is gone on with.
+
+Where their bits are the stored ones, nothing else is asked. Where they are not, it is measured how far losses and
+gradients move when nothing changes: evaluated once more, in other batches, and at points moved within rounding. What
+lies farther apart than that is the result of another function, a refusal with both numbers.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+import xarray as xr
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .identity import StoreMismatchError, plane_of, stored_identity
+from .objective import NOT_EVALUATED, BoxedObjective, Evaluation, Objective, Status, evaluate, in_box
+
+if TYPE_CHECKING:
+    from .storage.store import SliceStore
+
+POINTS = 3  # of a result that are evaluated anew
+ROUNDING = {"float32": 1e-4, "float64": 1e-10}  # what rounding changes: a share of the losses' spread, of a gradient
+LAST_PLACE = {"float32": 2.0**-23, "float64": 2.0**-52}
+PLACES = 64  # units in the last place of a loss that rounding changes
+MOVES, REACH = 8, 8  # evaluations at points that are moved, and how far these are [units in the last place]
+MARGIN = 10.0  # times what changes by noise
+SHOWN = 6  # parameters of a point that a refusal shows
+TODO = "write elsewhere with --out, or replace it with --force"
+RESAMPLE = "sample it anew with --force, or take the simulator that it was sampled from"  # where it is only read
+
+
+@dataclass(frozen=True, eq=False)
+class StoredPoints:
+    """Hold points of a stored result with what was found there, and what the result is: a slice, a run.
+
+    `x` has shape (point, dim). `sloped` says that a point which failed may have been asked for its gradient, too: of
+    one that did not fail its gradient tells.
+    """
+
+    path: Path
+    what: str
+    x: Float[Tensor, "point dim"]
+    found: Evaluation
+    sloped: bool
+
+    @classmethod
+    def of_slice(cls, dataset: xr.Dataset, path: Path) -> StoredPoints:
+        """Return the points of a slice."""
+        plane, names = plane_of(dataset), [name for name in ("v", "u") if name in dataset["loss"].dims]
+        arrays = {
+            name: dataset[name].transpose(*names, ...).to_numpy()
+            for name in ("loss", "status", "grad")
+            if name in dataset
+        }
+        grid = np.meshgrid(*(dataset[name].to_numpy() for name in names), indexing="ij")[::-1]
+        x = plane.lift(torch.from_numpy(np.stack([axis.ravel() for axis in grid], axis=1)))
+        return cls(path, "slice", x, _evaluation(arrays, plane.dim), "grad" in dataset)
+
+    def choose(self, objective: Objective, count: int) -> list[int]:
+        """Return the rows to evaluate anew: the middle one by its loss, the least and the largest, as far as counted.
+
+        Those that have a gradient come first, then those that have a loss. Points that the objective is not asked at
+        are none of them.
+        """
+        space, status = objective.space, self.found.status
+        usable = self.x.isfinite().all(dim=1) & ~torch.isin(status, torch.tensor(NOT_EVALUATED, dtype=status.dtype))
+        if not objective.beyond_box:
+            usable &= in_box(space, self.x)
+        known = usable & self.found.loss.isfinite()
+        rows = next((some for some in (known & self._has_gradient(), known, usable) if bool(some.any())), known)
+        order = rows.nonzero()[:, 0]
+        order = order[self.found.loss[order].argsort(stable=True)]
+        picks = [len(order) // 2, 0, len(order) - 1][:count] if len(order) else []
+        return list(dict.fromkeys(int(order[pick]) for pick in picks))
+
+    def asked(self) -> Bool[Tensor, " point"]:
+        """Say which points were asked for their gradients, as far as is known."""
+        failed = self.found.status != Status.OK
+        return self._has_gradient() | (failed & self.sloped)
+
+    def _has_gradient(self) -> Bool[Tensor, " point"]:
+        grad = self.found.grad
+        return torch.zeros(len(self.x), dtype=torch.bool) if grad is None else grad.isfinite().all(dim=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Probe:
+    """One stored point that is evaluated anew, and the sizes that rounding is told in.
+
+    `spread` is that of all losses that are stored with it, `slope` the middle length of their gradients in widths of
+    the box, `widths`. `grad` says whether it was evaluated with its gradient.
+    """
+
+    stored: StoredPoints
+    row: int
+    spread: float
+    slope: float
+    widths: Float[Tensor, " dim"]
+    grad: bool
+
+    @property
+    def x(self) -> Float[Tensor, " dim"]:
+        return self.stored.x[self.row]
+
+    @property
+    def then(self) -> Evaluation:
+        return self.stored.found.rows(slice(self.row, self.row + 1))
+
+
+def verify(objective: Objective, results: Sequence[StoredPoints], *, points: int = POINTS, todo: str = TODO) -> None:
+    """Evaluate so many points of each stored result anew, all in one batch, and refuse other numbers.
+
+    Losses, gradients where they are stored, and how points ended are compared.
+
+    Raises StoreMismatchError, which names the result, both numbers and what `todo`.
+    """
+    probes = [probe for one in results for probe in _probes(objective, one, points)]
+    for grad in (True, False):
+        some = [probe for probe in probes if probe.grad == grad]
+        if not some:
+            continue
+        now = _evaluate(objective, torch.stack([probe.x for probe in some]), grad=grad)
+        unlike = [number for number, probe in enumerate(some) if not _same(probe.then, _row(now, number))]
+        if unlike:
+            suspects = [some[number] for number in unlike]
+            _compare(objective, suspects, now.rows(torch.tensor(unlike)), grad=grad, todo=todo)
+
+
+def verify_store(objective: Objective, store: SliceStore) -> None:
+    """Verify a slice on disk by three of its finished tiles, once for an objective.
+
+    Raises StoreMismatchError where the objective gives other numbers.
+    """
+    if store.path is None or store.verified_for is objective:
+        return
+    left = set(store.pending())
+    finished = [tile for tile in store.tiles() if tile not in left]
+    chosen = sorted({0, len(finished) // 2, len(finished) - 1}) if finished else []
+    read = [(tile, store.read_tile(tile)) for tile in (finished[number] for number in chosen)]
+    parts = [(store.points(tile), values) for tile, values in read if values is not None]
+    if parts:
+        x, dim = torch.cat([x for x, _ in parts]), store.plane.dim
+        found = Evaluation.join((_evaluation(values, dim) for _, values in parts), dim=dim, grad=store.grad)
+        verify(objective, [StoredPoints(store.path, "slice", x, found, store.grad)])
+    store.verified_for = objective
+
+
+def verify_dataset(objective: Objective, dataset: xr.Dataset, path: Path, *, todo: str = TODO) -> None:
+    """Verify a slice that was read; raises StoreMismatchError where the objective gives other numbers."""
+    if stored_identity(dataset).get("boxed"):
+        objective = BoxedObjective(objective)
+    verify(objective, [StoredPoints.of_slice(dataset, path)], todo=todo)
+
+
+def _evaluation(arrays: Mapping[str, NDArray[Any]], dim: int) -> Evaluation:
+    """Return what arrays of a slice hold, point by point."""
+    loss, status = (torch.from_numpy(arrays[name].reshape(-1)) for name in ("loss", "status"))
+    return Evaluation(loss, torch.from_numpy(arrays["grad"].reshape(-1, dim)) if "grad" in arrays else None, status)
+
+
+def _probes(objective: Objective, stored: StoredPoints, count: int) -> list[_Probe]:
+    losses, grad = stored.found.loss, stored.found.grad
+    known, widths = losses[losses.isfinite()].numpy(), objective.space.upper - objective.space.lower
+    high, low = np.percentile(known / 4, (95, 5)).tolist() if len(known) else (0.0, 0.0)
+    spread = min(4 * (high - low), sys.float_info.max)  # of losses of 1e308, too
+    slopes = torch.empty(0) if grad is None else (grad * widths).abs().amax(dim=1)
+    slopes = slopes[slopes.isfinite()]
+    slope = float(slopes.median()) if len(slopes) else 0.0
+    asked = stored.asked()
+    return [_Probe(stored, row, spread, slope, widths, bool(asked[row])) for row in stored.choose(objective, count)]
+
+
+def _row(found: Evaluation, number: int) -> Evaluation:
+    return found.rows(slice(number, number + 1))
+
+
+def _same(then: Evaluation, now: Evaluation) -> bool:
+    """Whether two evaluations of a point are the same: status, loss, and gradient as far as both are finite."""
+    if int(then.status) != int(now.status):
+        return False
+    return not any(bool((_apart(one, other) > 0).any()) for one, other in _numbers(then, now))
+
+
+def _numbers(one: Evaluation, other: Evaluation) -> list[tuple[Tensor, Tensor]]:
+    pairs = [(one.loss, other.loss)]
+    return pairs if one.grad is None or other.grad is None else [*pairs, (one.grad, other.grad)]
+
+
+def _apart(one: Tensor, other: Tensor) -> Tensor:
+    """Return how far numbers are apart, 0 where either is not finite."""
+    return torch.where(one.isfinite() & other.isfinite(), (one - other).abs(), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Suspect:
+    """A stored point whose bits are others now, and what is known of it: evaluated `now`, and `again` in other ways."""
+
+    probe: _Probe
+    now: Evaluation
+    again: Sequence[Evaluation]
+    precision: str
+    statuses: set[int]
+
+    def differing_loss(self, names: Sequence[str]) -> str:
+        """Return both losses, nothing where they differ by no more than rounding and noise."""
+        then, now = self.probe.then.loss, self.now.loss
+        noise = max(float(_apart(now, one.loss)) for one in self.again)
+        size = PLACES * LAST_PLACE[self.precision] * abs(float(now.nan_to_num(0.0)))
+        allowed = max(ROUNDING[self.precision] * self.probe.spread, size, MARGIN * noise)
+        if float(_apart(then, now)) <= allowed:
+            return ""
+        return f"losses are others now: {_both(float(then), float(now))}"
+
+    def differing_status(self, names: Sequence[str]) -> str:
+        """Return how the point ended and ends now, nothing where it ends either way."""
+        then, now = int(self.probe.then.status), int(self.now.status)
+        if then in self.statuses:
+            return ""
+        return f"points end otherwise now: {Status(then).name} then, {Status(now).name} now"
+
+    def differing_gradient(self, names: Sequence[str]) -> str:
+        """Return both gradients by the parameter by which they differ most in widths of the box, nothing as above."""
+        then, now, widths = self.probe.then.grad, self.now.grad, self.probe.widths
+        if then is None or now is None:
+            return ""
+        shift = (_apart(then, now) * widths)[0]
+        noise = max(float((_apart(now, one.grad) * widths).max()) for one in self.again if one.grad is not None)
+        size = max(self.probe.slope, float((now.nan_to_num(0.0).abs() * widths).max()))
+        if float(shift.max()) <= max(ROUNDING[self.precision] * size, MARGIN * noise):
+            return ""
+        axis = int(shift.argmax())
+        both = _both(float(then[0, axis]), float(now[0, axis]))
+        return f"gradients are others now: gradient by {names[axis]} {both}"
+
+
+def _compare(objective: Objective, probes: Sequence[_Probe], now: Evaluation, *, grad: bool, todo: str) -> None:
+    """Raise StoreMismatchError for the first point whose numbers differ by more than noise and rounding change."""
+    precision, x = objective.precision, torch.stack([probe.x for probe in probes])
+    others = _evaluate_again(objective, x, grad=grad, reach=REACH * LAST_PLACE[precision])
+    statuses = [set(map(int, column)) for column in torch.stack([one.status for one in (now, *others)]).T]
+    if grad and any(int(probe.then.status) not in known for probe, known in zip(probes, statuses, strict=True)):
+        for known, status in zip(statuses, _evaluate(objective, x, grad=False).status, strict=True):
+            known.add(int(status))  # a point that failed may have been asked for its loss alone
+    suspects = [
+        _Suspect(probe, _row(now, number), [_row(one, number) for one in others], precision, statuses[number])
+        for number, probe in enumerate(probes)
+    ]
+    for differing in (_Suspect.differing_loss, _Suspect.differing_status, _Suspect.differing_gradient):
+        for one in suspects:
+            if said := differing(one, objective.space.names):
+                stored = one.probe.stored
+                raise StoreMismatchError(
+                    f"{stored.path} holds a {stored.what} of {objective.name} whose {said}, at x = "
+                    f"{_point(objective.space.to_values(one.probe.x))}; {todo}"
+                )
+
+
+def _evaluate_again(
+    objective: Objective, x: Float[Tensor, "point dim"], *, grad: bool, reach: float
+) -> list[Evaluation]:
+    """Evaluate points once more, one by one, in pairs, and together with others that lie within rounding of them."""
+    space, generator = objective.space, torch.Generator().manual_seed(0)
+    moves = 2 * torch.rand(MOVES, *x.shape, generator=generator, dtype=torch.float64) - 1
+    moved = x + moves * reach * (space.upper - space.lower)
+    moved = torch.where(in_box(space, x)[:, None], moved.clamp(space.lower, space.upper), moved)
+    batches = [*x[:, None], torch.cat([x, x]), torch.cat([x, *moved])]
+    parts = [_evaluate(objective, batch, grad=grad) for batch in batches]
+    whole = Evaluation.join(parts, dim=space.dim, grad=grad)
+    return [whole.rows(slice(at, at + len(x))) for at in range(0, len(whole.loss), len(x))]
+
+
+def _evaluate(objective: Objective, x: Float[Tensor, "point dim"], *, grad: bool) -> Evaluation:
+    """Evaluate points in batches that an objective prefers."""
+    batch = objective.preferred_batch
+    parts = [evaluate(objective, part, grad=grad) for part in torch.split(x, batch)]
+    return Evaluation.join(parts, dim=objective.space.dim, grad=grad)
+
+
+def _both(then: float, now: float) -> str:
+    """Return two numbers with as many digits as tell them apart."""
+    for digits in range(3, 18):
+        if f"{then:.{digits}g}" != f"{now:.{digits}g}":
+            break
+    return f"{then:.{digits}g} then, {now:.{digits}g} now"
+
+
+def _point(x: Float[Tensor, " dim"]) -> str:
+    shown = [f"{value:.6g}" for value in x[:SHOWN].tolist()]
+    return f"({', '.join([*shown, *(['...'] if len(x) > SHOWN else [])])})"

@@ -1,0 +1,393 @@
+"""A simulator that was edited does not go on with what was stored before: it is refused with both numbers."""
+
+import shutil
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import gradscape as gs
+from gradscape import Environment, Evaluation, Fidelity, ParameterSpace, Plane
+from gradscape.envs.functions import Branin
+from gradscape.envs.records import ModelPart
+from gradscape.jobs.convergence import ConvergenceJob
+from gradscape.jobs.mixed import MixedJob
+from gradscape.jobs.model import ModelJob
+from gradscape.jobs.scene import SceneSpec
+from gradscape.jobs.slice import SliceJob
+from gradscape.jobs.watch import Stopped, Watch
+from gradscape.landscapes.identity import StoreMismatchError
+from gradscape.landscapes.sampling.refine import Refinement
+
+from .processes import alone, landscape
+
+SPACE = ParameterSpace({"x": (-1, 1), "y": (-1, 1)})
+DIMS = ("x", "y")
+Loss = Callable[[Tensor], Tensor]
+BOTH = r"{} of {} whose losses are others now: \S+ then, \S+ now, at x = \(\S+, \S+\); .*--out.*--force"
+
+
+def plain(x: Tensor) -> Tensor:
+    return x[:, 0] + x[:, 1] ** 2
+
+
+def edited(x: Tensor) -> Tensor:
+    return 100 * x[:, 0] + x[:, 1] ** 2
+
+
+def loss_of(fn: Loss) -> Any:
+    return gs.from_torch(fn, SPACE, name="loss")
+
+
+def bits(folder: Path) -> dict[str, bytes]:
+    """Return the content of every file of a store."""
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+class Stop(Watch):
+    """Interrupt a job once so much of it is done."""
+
+    def __init__(self, at: int) -> None:
+        self.at = at
+
+    @contextmanager
+    def progress(self, total: int, what: str = "episodes") -> Iterator[Any]:
+        def advance(done: int, said: str = "") -> None:
+            if done >= self.at:
+                raise KeyboardInterrupt
+
+        yield advance
+
+
+PLANE = Plane.through(SPACE, SPACE.center, DIMS, resolution=24)
+
+
+def half(objective: Any, out: Path, **how: Any) -> None:
+    """Sample a half of a slice."""
+    with pytest.raises(Stopped):
+        SliceJob.of(objective, PLANE, command="", out=out, **how).run(Stop(100))
+
+
+# --- slices ---
+
+
+def test_a_finished_slice_of_an_edited_function_is_refused_with_both_numbers(tmp_path: Path) -> None:
+    gs.slice(loss_of(plain), DIMS, resolution=8, out=tmp_path / "cut")
+    kept = bits(tmp_path / "cut/slice.zarr")
+    with pytest.raises(StoreMismatchError, match=BOTH.format("slice", "loss")) as refused:
+        gs.slice(loss_of(edited), DIMS, resolution=8, out=tmp_path / "cut")
+    assert str(tmp_path / "cut") in str(refused.value)
+    assert bits(tmp_path / "cut/slice.zarr") == kept
+    anew = gs.slice(loss_of(edited), DIMS, resolution=8, out=tmp_path / "cut", force=True)
+    assert float(anew.data["loss"].min()) < -90
+
+
+@pytest.mark.parametrize("refine", [None, 0.01])
+def test_a_slice_that_was_stopped_half_way_is_not_filled_up_by_an_edited_function(
+    tmp_path: Path, refine: float | None
+) -> None:
+    how = {"refinement": Refinement(refine) if refine else None}
+    half(gs.from_torch(lambda x: (8 * plain(x)).sin(), SPACE, name="loss"), tmp_path / "cut", **how)
+    kept = bits(tmp_path / "cut")
+    where = {"dims": DIMS, "resolution": 24, "out": tmp_path / "cut", "refine": refine}
+    with pytest.raises(StoreMismatchError, match=BOTH.format("slice", "loss")):
+        gs.slice(gs.from_torch(lambda x: (9 * plain(x)).sin(), SPACE, name="loss"), **where)
+    assert bits(tmp_path / "cut") == kept
+    gs.slice(gs.from_torch(lambda x: (8 * plain(x)).sin(), SPACE, name="loss"), **where)
+
+
+def test_an_edited_gradient_is_refused_by_its_parameter(tmp_path: Path) -> None:
+    def loss(x: np.ndarray[Any, Any], slope: float) -> Any:
+        return x[:, 0] + x[:, 1], np.stack([np.full(len(x), slope), np.ones(len(x))], axis=1)
+
+    gs.slice(gs.from_numpy(partial(loss, slope=2.0), SPACE, name="loss"), DIMS, resolution=8, out=tmp_path / "cut")
+    with pytest.raises(StoreMismatchError, match=r"gradients are others now: gradient by x 2 then, 1 now"):
+        gs.slice(gs.from_numpy(partial(loss, slope=1.0), SPACE, name="loss"), DIMS, resolution=8, out=tmp_path / "cut")
+
+
+def test_points_that_end_otherwise_are_refused_by_their_status(tmp_path: Path) -> None:
+    broken = gs.from_torch(lambda x: plain(x) * torch.nan, SPACE, name="loss")
+    gs.slice(broken, DIMS, resolution=8, out=tmp_path / "cut", gradients=False)
+    gs.slice(broken, DIMS, resolution=8, out=tmp_path / "cut", gradients=False)
+    with pytest.raises(StoreMismatchError, match="points end otherwise now: NONFINITE then, OK now"):
+        gs.slice(loss_of(plain), DIMS, resolution=8, out=tmp_path / "cut", gradients=False)
+
+
+@pytest.mark.parametrize("gradients", [0, 1, 4])
+def test_a_function_whose_names_alone_changed_goes_on(tmp_path: Path, gradients: int) -> None:
+    def renamed(points: Tensor) -> Tensor:
+        first, second = points[:, 0], points[:, 1]
+        return first + second**2
+
+    half(loss_of(plain), tmp_path / "cut", gradients=gradients)
+    found = gs.slice(loss_of(renamed), DIMS, resolution=24, out=tmp_path / "cut", gradients=gradients)
+    whole = gs.slice(loss_of(plain), DIMS, resolution=24, gradients=gradients)
+    np.testing.assert_array_equal(found.data["loss"], whole.data["loss"])
+
+
+def test_a_function_that_differs_at_every_call_goes_on_within_its_noise(tmp_path: Path) -> None:
+    random = torch.Generator().manual_seed(0)
+
+    def noisy(x: Tensor, factor: float = 1.0) -> Tensor:
+        return factor * plain(x) + 0.05 * torch.randn(len(x), generator=random, dtype=torch.float64)
+
+    for seed in range(20):
+        gs.slice(loss_of(noisy), DIMS, resolution=8, out=tmp_path / f"{seed}")
+        gs.slice(loss_of(noisy), DIMS, resolution=8, out=tmp_path / f"{seed}")
+    with pytest.raises(StoreMismatchError, match="losses are others now"):
+        gs.slice(loss_of(partial(noisy, factor=100.0)), DIMS, resolution=8, out=tmp_path / "0")
+
+
+def test_rounding_that_a_batch_or_a_simulator_amplifies_goes_on(tmp_path: Path) -> None:
+    """One sums in float32 in an order that the batch decides, the other amplifies the last digit a million times."""
+
+    def single(x: Tensor) -> Tensor:
+        terms = x.float() @ torch.linspace(-1, 1, 2 * 501).reshape(2, 501) + 0.1
+        return ((terms.flip(1) if len(x) % 2 else terms).cumsum(1)[:, -1] ** 2).double() / 3
+
+    def chaotic(x: Tensor, moved: float = 0.0) -> Tensor:
+        value = (x.sum(dim=1) / 4 + 0.5) * (1 + moved)
+        for _ in range(20):
+            value = 3.99 * value * (1 - value)
+        return value
+
+    gs.slice(loss_of(single), DIMS, resolution=9, out=tmp_path / "single")
+    gs.slice(loss_of(single), DIMS, resolution=9, out=tmp_path / "single")
+    gs.slice(loss_of(chaotic), DIMS, resolution=8, out=tmp_path / "chaotic")
+    gs.slice(loss_of(partial(chaotic, moved=2.0**-51)), DIMS, resolution=8, out=tmp_path / "chaotic")
+    with pytest.raises(StoreMismatchError, match="losses are others now"):
+        gs.slice(loss_of(partial(chaotic, moved=1e-4)), DIMS, resolution=8, out=tmp_path / "chaotic")
+
+
+@pytest.mark.parametrize("change", [1e-3, 1e-6, 1e-9])
+def test_a_small_edit_is_noticed(tmp_path: Path, change: float) -> None:
+    gs.slice(loss_of(plain), DIMS, resolution=8, out=tmp_path / "cut")
+    with pytest.raises(StoreMismatchError, match="losses are others now"):
+        gs.slice(loss_of(lambda x: plain(x) * (1 + change)), DIMS, resolution=8, out=tmp_path / "cut")
+
+
+def test_workers_fill_nothing_up_that_is_another_functions(tmp_path: Path) -> None:
+    half(loss_of(plain), tmp_path / "cut")
+    kept = bits(tmp_path / "cut")
+    job = SliceJob.of(loss_of(edited), PLANE, command="", out=tmp_path / "cut")
+    with ThreadPoolExecutor(2) as executor, pytest.raises(StoreMismatchError, match="losses are others now"):
+        replace(job, executor=executor).run()
+    assert bits(tmp_path / "cut") == kept
+
+
+def test_a_report_of_a_slice_refuses_an_edited_function(tmp_path: Path) -> None:
+    cut = gs.slice(loss_of(plain), DIMS, resolution=8, out=tmp_path / "cut")
+    cut.report(points=2)
+    with pytest.raises(StoreMismatchError, match="losses are others now"):
+        type(cut)(cut.data, cut.folder, lambda: loss_of(edited)).report(points=2)
+
+
+# --- every study of an environment ---
+
+
+@dataclass(frozen=True)
+class Soft:
+    """`ke` counts for nothing."""
+
+    ke: float = 8.0
+
+
+class Throw(Environment):
+    """A bowl whose curvature is edited by the tests, as no digest of its text could tell."""
+
+    name: ClassVar[str] = "throw"
+    fidelities: ClassVar[dict[str, Fidelity]] = {
+        "draft": Fidelity("draft", dt=0.1, precision="float64"),
+        "standard": Fidelity("standard", dt=0.05, precision="float64"),
+        "reference": Fidelity("reference", dt=0.01, precision="float64"),
+    }
+    Options: ClassVar[type[Any]] = Soft
+    model_parts: ClassVar[tuple[ModelPart, ...]] = (ModelPart("softness", {"ke": 4.0}, "half as soft"),)
+    space = SPACE
+    curvature: ClassVar[float] = 1.0
+
+    def _evaluate(self, x: Tensor, *, grad: bool) -> Evaluation:
+        loss = self.curvature * (x**2).sum(dim=1) + x[:, 0] + self.fidelity.dt
+        slope = 2 * self.curvature * x + torch.tensor([1.0, 0.0], dtype=torch.float64)
+        return Evaluation.from_results(loss, slope if grad else None)
+
+
+STUDIES: dict[str, Callable[[Path], Any]] = {
+    "slice": lambda out: gs.slice(Throw, DIMS, resolution=6, out=out),
+    "refined": lambda out: gs.slice(Throw, DIMS, resolution=17, refine=0.05, out=out),
+    "sweep": lambda out: gs.sweep(Throw, DIMS, over="smoothing", frames=2, resolution=4, out=out),
+    "optimize": lambda out: gs.optimize(Throw, "random", budget=4, out=out),
+    "race": lambda out: gs.race(Throw, ["random", "descents"], budget=6, seeds=2, out=out),
+    "pairs": lambda out: gs.pairs(Throw, samples=2, out=out),
+    "census": lambda out: gs.census(Throw, slices=1, resolution=6, out=out),
+    "tradeoff": lambda out: gs.tradeoff(Throw, points=2, variants=["precision"], out=out),
+    "convergence": lambda out: ConvergenceJob.open(SceneSpec(Throw), points=2, out=out).run(),
+    "model": lambda out: ModelJob.open(SceneSpec(Throw), points=2, out=out).run(),
+    "mixed": lambda out: MixedJob.open(SceneSpec(Throw), points=2, budget=0.01, out=out).run(),
+    "extremes": lambda out: gs.extremes(Throw, points=2, knobs=["dt"], precisions=["float64"], out=out),
+}
+
+
+@pytest.mark.parametrize("study", STUDIES)
+def test_the_same_call_after_an_edit_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, study: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("gradscape.jobs.margins.user_data_path", lambda name: tmp_path / "user" / name)
+    for name in ("fidelity.REPETITION", "fidelity.LARGEST", "turns.LASTING", "turns.ENOUGH"):
+        monkeypatch.setattr(f"gradscape.landscapes.measures.{name}", 0.002)
+    out = tmp_path / "made"
+    STUDIES[study](out)
+    STUDIES[study](out)
+    kept = {name: content for name, content in bits(out).items() if name.endswith(".npz") or ".zarr/" in name}
+    assert kept
+    monkeypatch.setattr(Throw, "curvature", 3.0)
+    with pytest.raises(StoreMismatchError, match=r"throw whose losses are others now: \S+ then, \S+ now") as refused:
+        STUDIES[study](out)
+    assert str(out) in str(refused.value)
+    assert {name: bits(out)[name] for name in kept} == kept
+    assert bits(out).keys() >= kept.keys()
+
+
+def test_an_overlay_over_a_slice_cut_anew_refuses_an_edited_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cut = gs.slice(Throw, DIMS, resolution=6, out=tmp_path / "cut")
+    run = gs.optimize(Throw, "random", budget=4, out=tmp_path / "run")
+    gs.overlay(cut, run, through="best", out=tmp_path / "over")
+    monkeypatch.setattr(Throw, "curvature", 3.0)
+    with pytest.raises(StoreMismatchError, match="losses are others now"):
+        gs.overlay(cut, run, through="best", out=tmp_path / "anew")
+    gs.overlay(cut, run, out=tmp_path / "stored")  # which evaluates nothing
+
+
+def test_a_run_is_not_extended_by_an_edited_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = gs.optimize(Throw, "descents", budget=6, out=tmp_path / "run").data
+    monkeypatch.setattr(Throw, "curvature", 3.0)
+    with pytest.raises(StoreMismatchError, match=r"holds a run of throw whose losses are others now"):
+        gs.optimize(Throw, "descents", budget=20, out=tmp_path / "run")
+    np.testing.assert_array_equal(gs.open_run(tmp_path / "run").data["loss"], kept["loss"])
+    monkeypatch.undo()
+    assert gs.optimize(Throw, "descents", budget=20, out=tmp_path / "run").data.sizes["evaluation"] == 20
+
+
+def test_a_race_of_another_scene_takes_no_more_seeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    gs.race(Throw, ["random"], budget=4, seeds=1, out=tmp_path / "race")
+    monkeypatch.setattr(Throw, "curvature", 3.0)
+    with pytest.raises(StoreMismatchError, match="losses are others now"):
+        gs.race(Throw, ["random"], budget=4, seeds=2, out=tmp_path / "race")
+    assert not gs.open_run(tmp_path / "race/random-1").data.sizes["evaluation"]
+
+
+def test_a_league_names_the_scene_that_was_edited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    gs.league([Throw], ["random"], budget=4, seeds=1, out=tmp_path / "league")
+    monkeypatch.setattr(Throw, "curvature", 3.0)
+    with pytest.raises(ValueError, match=r"throw@draft: StoreMismatchError: .* whose losses are others now"):
+        gs.league([Throw], ["random"], budget=4, seeds=1, out=tmp_path / "league")
+
+
+def test_a_card_goes_on_with_the_same_engines_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    how: dict[str, Any] = {"resolution": 3, "device": "cpu", "out": tmp_path / "card"}
+    gs.card(["control"], **how)
+    gs.card(["control"], **how)
+    evaluate = Branin._evaluate
+
+    def halved(env: Branin, x: Tensor, *, grad: bool) -> Evaluation:
+        found = evaluate(env, x, grad=grad)
+        return Evaluation(found.loss / 2, found.grad, found.status)
+
+    monkeypatch.setattr(Branin, "_evaluate", halved)
+    with pytest.raises(StoreMismatchError, match="a study of branin whose losses are others now"):
+        gs.card(["control"], **how)
+
+
+# --- files that are edited between two commands ---
+
+MINE = """
+from pathlib import Path
+import torch
+from gradscape import Environment, Evaluation, ParameterSpace
+import helper
+from helper import soft as force
+
+
+class Throw(Environment):
+    name = "mine"
+    space = ParameterSpace({"x": (-1, 1), "y": (-1, 1)})
+
+    def _evaluate(self, x, *, grad):
+        x = x.requires_grad_(grad)
+        mass = float(Path(__file__).with_name("mass.txt").read_text())
+        scale = float(Path(__file__).with_name("body.xml").read_text().split('"')[1])
+        loss = mass * scale * force(x) + work(x) + memory(x)
+        slope = torch.autograd.grad(loss.sum(), x)[0] if grad else None
+        return Evaluation.from_results(loss.detach(), slope)
+
+
+def work(x):
+    return x[:, 0]
+
+
+def memory(x):
+    return 0.5 * x[:, 1]
+"""
+FILES = {
+    "my.py": MINE,
+    "helper.py": "def soft(x):\n    return (x**2).sum(dim=1)\n\n\ndef hard(x):\n    return (x**4).sum(dim=1)\n",
+    "mass.txt": "1.0",
+    "body.xml": '<geom size="1.0"/>',
+}
+EDITS = {
+    "an imported module": ("helper.py", "x**2", "x**3"),
+    "an import line": ("my.py", "import soft as", "import hard as"),
+    "a data file": ("mass.txt", "1.0", "2.0"),
+    "a model's file": ("body.xml", "1.0", "3.0"),
+    "a function called work": ("my.py", "return x[:, 0]", "return 2 * x[:, 0]"),
+    "a function called memory": ("my.py", "return 0.5 *", "return 0.6 *"),
+}
+COMMANDS = (
+    "slice my.py:Throw --dims 0 1 --resolution 6 --out cut",
+    "optimize my.py:Throw --method random --budget 4 --out run",
+)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A slice and a run of a class in a file."""
+    folder = tmp_path_factory.mktemp("made")
+    for name, content in FILES.items():
+        (folder / name).write_text(content)
+    for command in COMMANDS:
+        done = alone(partial(landscape, *command.split()), folder)
+        assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.mark.parametrize("edit", EDITS)
+def test_an_edit_of_anything_that_a_class_uses_is_noticed(made: Path, tmp_path: Path, edit: str) -> None:
+    shutil.copytree(made, tmp_path / "here")
+    name, before, after = EDITS[edit]
+    file = tmp_path / "here" / name
+    assert before in file.read_text()
+    file.write_text(file.read_text().replace(before, after))
+    for command in COMMANDS:
+        done = alone(partial(landscape, *command.split()), tmp_path / "here")
+        assert done.returncode == 2, done.stderr
+        assert "of mine whose losses are others now:" in done.stderr
+        assert done.stderr.strip().count("\n") == 0, done.stderr
+
+
+def test_commands_go_on_after_an_edit_that_changes_no_number(made: Path, tmp_path: Path) -> None:
+    shutil.copytree(made, tmp_path / "here")
+    helper = tmp_path / "here/helper.py"
+    helper.write_text(helper.read_text().replace("x", "points"))
+    for command in COMMANDS:
+        done = alone(partial(landscape, *command.split()), tmp_path / "here")
+        assert done.returncode == 0, done.stderr
+        assert "are there already" in done.stderr
