@@ -22,7 +22,7 @@ import pytest
 from gradscape.envs.registry import EXTRAS
 
 ROOT = Path(__file__).parent.parent
-NOT_SENT = {".git", ".venv", "build", "dist", "out", "__pycache__", "node_modules", "generated"}
+NOT_SENT = {".git", ".venv*", "build", "dist", "out", "__pycache__", "node_modules", "generated"}
 LARGEST = 10_000_000  # bytes of a wheel or an sdist
 LOST = ("*.egg-info", ".*_cache", ".hypothesis")
 TRIED = """

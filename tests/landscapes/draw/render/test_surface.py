@@ -1,6 +1,7 @@
 """Surfaces: high where the loss is, holes where it failed, labels and runs in their places."""
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import xarray as xr
 from matplotlib.colors import to_rgb
 
 from gradscape.landscapes.draw import style
-from gradscape.landscapes.draw.render import relief, surface
+from gradscape.landscapes.draw.render import relief, solids, surface
 from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
@@ -182,3 +183,21 @@ def test_files_are_a_picture_and_a_model_that_needs_nothing_else(tmp_path: Path)
 def test_a_line_has_no_surface() -> None:
     with pytest.raises(ValueError, match="a slice of rank 1"):
         surface.surface_figure(cut(("a",)))
+
+
+def test_triton_is_imported_before_anything_is_rendered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Mesa brings an LLVM of its own; triton, which CUDA builds of torch bring, crashes where it comes second."""
+    (tmp_path / "triton.py").touch()
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(sys.modules, "triton", None)
+    monkeypatch.delitem(sys.modules, "triton")
+    seen = list[bool]()
+
+    def plotter(**_: object) -> None:
+        seen.append("triton" in sys.modules)
+        raise RuntimeError("enough")
+
+    monkeypatch.setattr(solids.pv, "Plotter", plotter)
+    with pytest.raises(RuntimeError, match="enough"), solids.off_screen((8, 8)):
+        pass
+    assert seen == [True]
