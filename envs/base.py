@@ -26,6 +26,7 @@ from ..landscapes.space import ParameterSpace, as_tensor
 from .batching import Pool, cores, map_parts
 from .engines import find_engine
 from .engines.engine import Engine
+from .installed import EXTRAS
 from .records import Fidelity as Fidelity
 from .records import MaterialRange as MaterialRange
 from .records import ModelPart as ModelPart
