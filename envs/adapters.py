@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..landscapes.objective import ContractError, Evaluation, first_line
+from ..landscapes.objective import Evaluation, SimulatorError, first_line
 from ..landscapes.space import ParameterSpace, as_tensor, as_whole
 from .base import Environment
 from .function import Compute, Function, FunctionEnvironment, FunctionKeywords, check_shape
@@ -208,12 +208,12 @@ class _Torch:
             parts = [_called(call, point, settings) for point in x]
             found = torch.stack(parts) if all(isinstance(one, Tensor) for one in parts) else parts[0]
         if isinstance(found, tuple):
-            raise ContractError(
+            raise SimulatorError(
                 f"{call.name} must return losses alone, and torch differentiates them; got {len(found)} values "
                 "(from_numpy takes losses with gradients)"
             )
         if not isinstance(found, Tensor):
-            raise ContractError(f"{call.name} must return a tensor; got {type(found).__name__}")
+            raise SimulatorError(f"{call.name} must return a tensor; got {type(found).__name__}")
         check_shape(tuple(found.shape), (len(x),), "losses", call.name)
         return found
 
@@ -225,7 +225,7 @@ def _called(call: Function, x: Tensor, settings: Mapping[str, Any]) -> Any:
     except RuntimeError as error:
         if "dtype" in str(error) and {"Float", "Double"} <= set(re.findall(r"\w+", str(error))):
             other = "float32" if x.dtype == torch.float64 else "float64"
-            raise ContractError(
+            raise SimulatorError(
                 f"{call.name} mixes its points with numbers of another type ({first_line(error)}); pass "
                 f"precision={other!r} to from_torch, or convert its own with .to(x)"
             ) from error
@@ -235,7 +235,7 @@ def _called(call: Function, x: Tensor, settings: Mapping[str, Any]) -> Any:
 def _autograd(loss: Float[Tensor, " batch"], x: Float[Tensor, "batch dim"], name: str) -> Tensor:
     (gradient,) = torch.autograd.grad(loss.sum(), x, allow_unused=True) if loss.requires_grad else (None,)
     if gradient is None:
-        raise ContractError(
+        raise SimulatorError(
             f"{name} returned losses that carry no gradient; compute them from x with torch operations, "
             "or sample with gradients=0 (--no-gradients)"
         )
@@ -280,7 +280,7 @@ class _NumPy:
         else:
             result = _columns([_copied(call.fn(point, **settings)) for point in points])
         if isinstance(result, tuple) and len(result) != 2:
-            raise ContractError(
+            raise SimulatorError(
                 f"{call.name} must return losses, or (losses, gradients); got {len(result)} values, so drop the others"
             )
         loss, gradient = result if isinstance(result, tuple) else (result, None)
@@ -298,7 +298,7 @@ class _NumPy:
     ) -> Float[Tensor, "batch dim"]:
         """Return central differences, one-sided at the bounds; steps are fractions of the scaled box."""
         if self.differences is None:
-            raise ContractError(
+            raise SimulatorError(
                 f"{call.name} returned losses without gradients; return (losses, gradients), pass differences=1e-4 "
                 "to from_numpy, or sample with gradients=0 (--no-gradients)"
             )
@@ -316,11 +316,11 @@ class _NumPy:
 
 
 def _numbers(values: object, what: str) -> Tensor:
-    """Return a copy of a function's numbers as a tensor. Raises ContractError for what is none."""
+    """Return a copy of a function's numbers as a tensor. Raises SimulatorError for what is none."""
     try:
         return as_tensor(values, what).clone()
     except ValueError as error:
-        raise ContractError(str(error)) from None
+        raise SimulatorError(str(error)) from None
 
 
 def _copied(result: Any) -> Any:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ..landscapes.episode import Episode as Episode
 from ..landscapes.identity import MODEL_VERSION
-from ..landscapes.objective import ContractError, Evaluation, Objective, check_points, first_line
+from ..landscapes.objective import Evaluation, Objective, SimulatorError, check_points, first_line
 from ..landscapes.options import NoOptions, read_options
 from ..landscapes.sampling.memory import free_memory, is_out_of_memory
 from ..landscapes.space import ParameterSpace, as_tensor
@@ -350,7 +350,7 @@ class Environment(Objective):
         try:
             found = self._simulate(x, grad=grad)
         except Exception as error:
-            if isinstance(error, ContractError) or is_out_of_memory(error):
+            if isinstance(error, SimulatorError) or is_out_of_memory(error):
                 raise
             if len(x) > 1:
                 parts = [self._evaluate_rows(part, grad=grad) for part in torch.tensor_split(x, 2)]
@@ -369,7 +369,7 @@ class Environment(Objective):
                 self._simulate(point[None], grad=False)
                 self._answered = True
                 return
-        raise ContractError(
+        raise SimulatorError(
             f"{self.name} raised {type(error).__name__} at every one of {PROBES + 2} points that were tried: "
             f"{first_line(error)}; the first was x = {x[0].tolist()}"
         ) from error
@@ -380,12 +380,12 @@ class Environment(Objective):
         with torch.inference_mode(False), torch.set_grad_enabled(grad):
             found = self._evaluate(values, grad=grad)
         if not isinstance(found, Evaluation):
-            raise ContractError(
+            raise SimulatorError(
                 f"{self.name}._evaluate must return an Evaluation; got {type(found).__name__}. "
                 "Evaluation.from_results(losses, gradients) makes one"
             )
         if grad and found.grad is None:
-            raise ContractError(f"{self.name}._evaluate was asked for gradients (grad=True) and returned none")
+            raise SimulatorError(f"{self.name}._evaluate was asked for gradients (grad=True) and returned none")
         if found.grad is None or self.space.is_linear:
             return found
         return replace(found, grad=self.space.chain(values, found.grad.detach().to(values)))

@@ -12,14 +12,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..landscapes.objective import ContractError, Evaluation
+from ..landscapes.objective import Evaluation, SimulatorError
 from ..landscapes.space import ParameterSpace, as_whole
 from .base import Environment, Fidelity
 
 DEFAULT = "default"  # the fidelity of a function that names none
 NAMELESS = "function"  # what a lambda is called
 SAME_TIME = 0.01  # relative difference of what counts as the same time
-ROWS = 256  # points in one call, at most, unless said otherwise
 SEED_ARGUMENTS = ("key", "seed")  # of a function that draws random numbers
 FIDELITY_FIELDS = ("dt", "resolution", "sampling", "particles")  # that a function and a `Fidelity` call the same
 KINDS = (bool, int, float, str)  # of options
@@ -52,6 +51,11 @@ class FunctionKeywords(TypedDict, total=False):
     precision: str
     rows: int
 
+
+DEFAULTS: FunctionKeywords = {
+    "name": None, "loss_unit": "", "maximize": False, "options": None, "fidelities": None, "horizon": None,
+    "seeds": 1, "precision": "float64", "rows": 256,
+}  # fmt: skip
 
 Compute = Callable[[Float[Tensor, "batch dim"], bool], tuple[Tensor, Tensor | None, str]]
 """Returns losses, gradients if asked for, and the type of numbers that the losses came in, at points."""
@@ -91,7 +95,7 @@ class Function:
     horizon: str = ""
     seed_argument: str = ""
     seeds: int = 1
-    rows: int = ROWS
+    rows: int = DEFAULTS["rows"]
 
     @classmethod
     def of(cls, fn: Callable[..., Any], space: ParameterSpace, backend: Backend, said: FunctionKeywords) -> Function:
@@ -102,15 +106,16 @@ class Function:
             raise ValueError(f"a ParameterSpace is wanted, as gs.ParameterSpace({{'x': (-1, 1)}}); got {space!r}")
         if unknown := said.keys() - FunctionKeywords.__annotations__.keys():
             raise TypeError(f"from_{backend.engine} takes no keyword {', '.join(sorted(unknown))}")
-        name, known = said.get("name") or function_name(fn), _arguments(fn)
-        given = {key: dict(value) for key, value in (said.get("fidelities") or {}).items()}
+        who, said = f"from_{backend.engine}", {**DEFAULTS, **said}
+        name, known = said["name"] or function_name(fn), _arguments(fn)
+        given = {key: dict(value) for key, value in (said["fidelities"] or {}).items()}
         own = {argument: None for settings in given.values() for argument in settings if argument != "precision"}
-        options = said.get("options")
+        options = said["options"]
         found = _default_options(known, own) if options is None else dict(options)
-        _check_arguments(name, known, found, own, said.get("horizon"))
-        precision = _check_precision(said.get("precision", "float64"), f"from_{backend.engine}")
-        seeds = as_whole(said.get("seeds", 1), f"from_{backend.engine}'s seeds", least=1)
-        rows = as_whole(said.get("rows", ROWS), f"from_{backend.engine}'s rows", least=1)
+        _check_arguments(name, known, found, own, said["horizon"])
+        precision = _check_precision(said["precision"], who)
+        seeds = as_whole(said["seeds"], f"{who}'s seeds", least=1)
+        rows = as_whole(said["rows"], f"{who}'s rows", least=1)
         seed_argument = next((one for one in SEED_ARGUMENTS if one in known and one not in own | found), "")
         if seeds > 1 and not seed_argument:
             raise ValueError(
@@ -119,8 +124,8 @@ class Function:
         if seed_argument:
             found["seed"] = 0
         return cls(
-            fn, space, backend, name, said.get("loss_unit", ""), said.get("maximize", False), found,
-            _read_fidelities(name, given, precision), tuple(own), said.get("horizon") or "", seed_argument, seeds, rows,
+            fn, space, backend, name, said["loss_unit"], said["maximize"], found,
+            _read_fidelities(name, given, precision), tuple(own), said["horizon"] or "", seed_argument, seeds, rows,
         )  # fmt: skip
 
     @cached_property
@@ -285,13 +290,13 @@ def function_name(fn: Callable[..., object]) -> str:
 
 
 def check_shape(got: tuple[int, ...], wanted: tuple[int, ...], what: str, name: str) -> None:
-    """Raise ContractError where what a function returned has another shape than it must have."""
+    """Raise SimulatorError where what a function returned has another shape than it must have."""
     if got == wanted:
         return
     advice = "a function of one point: vectorized=False"
     if got == (*wanted, 1):
         advice = "squeeze the last axis: `.squeeze(-1)`"
-    raise ContractError(f"{name} must return {what} of shape {wanted}; got shape {got} ({advice})")
+    raise SimulatorError(f"{name} must return {what} of shape {wanted}; got shape {got} ({advice})")
 
 
 def _arguments(fn: Callable[..., Any]) -> dict[str, Any]:

@@ -333,7 +333,7 @@ class BoxedObjective(ObjectiveWrapper):
         return evaluate_inside(self.objective, check_points(x, self.space, self.name), grad=grad)
 
 
-class ContractError(ValueError):
+class SimulatorError(ValueError):
     """What a simulator returned is not what it has to return; no status of a single point can say that."""
 
 
@@ -377,7 +377,7 @@ def _ask(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> 
     """Return what an objective says of points, held against the protocol."""
     found, who = objective.evaluate(x, grad=grad), objective.name
     if not isinstance(found, Evaluation):
-        raise ContractError(f"{who} must return an Evaluation; got {type(found).__name__}")
+        raise SimulatorError(f"{who} must return an Evaluation; got {type(found).__name__}")
     count = len(x)
     wanted: dict[str, tuple[Tensor, tuple[int, ...]]] = {
         "loss": (found.loss, (count,)),
@@ -387,12 +387,12 @@ def _ask(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> 
         wanted["grad"] = (_require_gradient(found.grad, who), tuple(x.shape))
     for field, (tensor, shape) in wanted.items():
         if tuple(tensor.shape) != shape:
-            raise ContractError(
+            raise SimulatorError(
                 f"{who} must return {field} of shape {shape} for x of shape {tuple(x.shape)}; got {tuple(tensor.shape)}"
             )
     for status in NOT_EVALUATED:
         if bool((found.status == status).any()):
-            raise ContractError(f"{who} must say how every point ended; got status {status.name}")
+            raise SimulatorError(f"{who} must say how every point ended; got status {status.name}")
     return found
 
 
@@ -441,7 +441,7 @@ def _check_codes(status: object) -> Tensor:
 
 def _require_gradient(grad: Tensor | None, who: str) -> Tensor:
     if grad is None:
-        raise ContractError(
+        raise SimulatorError(
             f"{who} was asked for gradients and returned none; sample with gradients=0 (--no-gradients), "
             "or search with a method that needs none"
         )

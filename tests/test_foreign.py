@@ -85,7 +85,7 @@ def test_a_class_in_a_file_is_sliced_measured_searched_and_shown(run: Callable[.
     registry.entries().pop("two-link-arm")
     unknown = run("report", "cut", "--out", "elsewhere", cwd=folder)
     assert unknown.returncode == 2
-    assert "of a class in a file, say where it is: --env FILE.py:Class" in unknown.stderr
+    assert "say where it is, --env FILE.py:NAME, or env= in Python" in unknown.stderr
 
 
 def test_a_class_in_a_file_says_what_there_is_to_say(run: Callable[..., Said], folder: Path) -> None:
@@ -162,7 +162,7 @@ def test_a_program_registers_a_class_and_the_command_finds_it(run: Callable[...,
     gs.register(Spring)  # again, as a cell of a notebook does
     with pytest.raises(ValueError, match="an environment called 'fluid' exists already"):
         gs.register(type("Fluid", (Spring,), {"name": "fluid"}))
-    with pytest.raises(ValueError, match="takes a class derived from Environment"):
+    with pytest.raises(ValueError, match="takes an environment, or a class derived from Environment"):
         gs.register("spring")  # type: ignore[type-var]
 
 

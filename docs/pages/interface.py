@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import Any, get_overloads
 
 import gradscape
+from gradscape.envs.function import DEFAULTS
 from gradscape.jobs.scene import SceneSpec
 
 from .text import CODE, cell, code, contents, page, table
@@ -111,12 +112,12 @@ def _rst(*lines: str) -> str:
 
 
 def _keywords(one: Callable[..., Any]) -> str:
-    """Return a table of what `**keywords` may be, where a function takes those of a scene."""
+    """Return a table of what `**keywords` may be, where a function takes those of a scene or of a function."""
     told = [KEYWORDS.fullmatch(str(parameter.annotation)) for parameter in inspect.signature(one).parameters.values()]
     kinds = [names_of(import_module(one.__module__))[match[1]] for match in told if match]
-    scene = SceneSpec("")  # whose defaults they have
+    defaults = {**vars(SceneSpec("")), **DEFAULTS}
     rows = [
-        (f"`{name}`", f"`{_type(kind)}`", f"`{getattr(scene, name)!r}`")
+        (f"`{name}`", f"`{_type(kind)}`", f"`{defaults[name]!r}`")
         for keywords in kinds
         for name, kind in keywords.__annotations__.items()
     ]

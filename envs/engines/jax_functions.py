@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ...landscapes.objective import ContractError
+from ...landscapes.objective import SimulatorError
 
 if TYPE_CHECKING:
     from ..function import Compute, Function
@@ -125,19 +125,19 @@ class JaxFunction:
         """Return the loss of one point, held against what it must be."""
         loss = self.fn(x)
         if isinstance(loss, tuple):
-            raise ContractError(
+            raise SimulatorError(
                 f"{self.name} must return its loss alone, which JAX differentiates; got {len(loss)} values, so return "
                 "the first of them"
             )
         if not isinstance(loss, jax.Array):
-            raise ContractError(f"{self.name} must return a JAX array; got {type(loss).__name__}")
+            raise SimulatorError(f"{self.name} must return a JAX array; got {type(loss).__name__}")
         if loss.shape != ():
-            raise ContractError(
+            raise SimulatorError(
                 f"{self.name} must return one loss for one point, of shape (); got shape {loss.shape}. It takes one "
                 "point, of shape (dim,), and not a batch: from_jax vectorizes it"
             )
         if not jnp.issubdtype(loss.dtype, jnp.floating):
-            raise ContractError(f"{self.name} must return a floating-point loss; got {loss.dtype}")
+            raise SimulatorError(f"{self.name} must return a floating-point loss; got {loss.dtype}")
         self._type = str(loss.dtype)
         return loss
 
@@ -147,22 +147,22 @@ class JaxFunction:
         try:
             yield
         except NotImplementedError as error:
-            raise ContractError(
+            raise SimulatorError(
                 f"{self.name} cannot be vectorized: {_line(error)}; pass batch='map' to from_jax"
             ) from error
         except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
-            raise ContractError(
+            raise SimulatorError(
                 f"{self.name} cannot be traced by JAX: {_line(error)}; compute with jax.numpy and jax.lax, "
                 "or pass another function to from_numpy"
             ) from error
         except (IndexError, TypeError, ValueError) as error:  # while it is traced, which does not depend on the point
-            if isinstance(error, ContractError):
+            if isinstance(error, SimulatorError):
                 raise
             if "Reverse-mode differentiation" in str(error):
-                raise ContractError(
+                raise SimulatorError(
                     f"{self.name} cannot be differentiated in reverse: {_line(error)}; pass mode='forward' to from_jax"
                 ) from error
-            raise ContractError(
+            raise SimulatorError(
                 f"{self.name} cannot be traced: {_line(error)}. It takes one point, of shape ({self.dim},), and "
                 "returns its loss; from_jax vectorizes it"
             ) from error

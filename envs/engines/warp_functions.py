@@ -14,7 +14,7 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from ...landscapes.objective import ContractError
+from ...landscapes.objective import SimulatorError
 from ..function import check_shape
 from .runtime import cuda_available, precision
 
@@ -86,16 +86,16 @@ class WarpFunction:
             losses = self.fn(points)
         except Exception as error:  # Warp's own types of errors differ from release to release
             if wanted := _wanted_type(error, self.real):
-                raise ContractError(
+                raise SimulatorError(
                     f"{self.name} launches kernels that want {wanted} where its points are {self.precision}: pass "
                     f"precision={wanted!r} to from_warp, or write kernels for {self.precision} ({_line(error)})"
                 ) from error
             raise
         if not isinstance(losses, wp.array):
-            raise ContractError(f"{self.name} must return a Warp array; got {type(losses).__name__}")
+            raise SimulatorError(f"{self.name} must return a Warp array; got {type(losses).__name__}")
         check_shape(tuple(losses.shape), (len(points),), "losses", self.name)
         if losses.dtype != self.real:
-            raise ContractError(
+            raise SimulatorError(
                 f"{self.name} must return losses of {self.real.__name__}, as its points are; got "
                 f"{losses.dtype.__name__} (from_warp's precision says which)"
             )
@@ -103,21 +103,23 @@ class WarpFunction:
 
     def _gradient(self, tape: Any, losses: Any, points: Any) -> Float[Tensor, "batch dim"]:
         if not tape.launches:
-            raise ContractError(
+            raise SimulatorError(
                 f"{self.name} launched no kernel, so its tape is empty; launch kernels that read its points and write "
                 "its losses, or sample with gradients=0 (--no-gradients)"
             )
         if not losses.requires_grad:
-            raise ContractError(
+            raise SimulatorError(
                 f"{self.name} returned losses that carry no gradient; make them with requires_grad=True"
             )
         tape.backward(grads={losses: wp.ones_like(losses, requires_grad=False)})
         if points not in tape.gradients:
-            raise ContractError(f"{self.name} launched no kernel that reads its points, so its losses have no gradient")
+            raise SimulatorError(
+                f"{self.name} launched no kernel that reads its points, so its losses have no gradient"
+            )
         return _tensor(tape.gradients[points])
 
     def _refuse_overwrites(self, x: Float[Tensor, "batch dim"]) -> None:
-        """Raise ContractError where a kernel writes to what an earlier one has read."""
+        """Raise SimulatorError where a kernel writes to what an earlier one has read."""
         points: Any = wp.array(x.numpy(), dtype=self.real, requires_grad=True)
         with wp.Tape() as tape:  # which kernels there are: they are built anew to be looked at
             self._losses(points)
@@ -132,7 +134,7 @@ class WarpFunction:
         launched = [f"in kernel {kernel.adj.fun_name} at" for kernel in kernels]  # a module may hold others
         found = [one for one in said if any(name in one for name in launched)]
         if found:
-            raise ContractError(
+            raise SimulatorError(
                 f"{self.name} writes to what it has read, so its gradients would be wrong: {found[0]} "
                 "Write to an array of its own for each step, or pass check_overwrites=False to from_warp"
             )

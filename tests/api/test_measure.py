@@ -106,6 +106,7 @@ def test_pairs_are_ranked_and_need_two_parameters(tmp_path: Path) -> None:
         gs.pairs("rastrigin", options={"dim": 1})
 
 
-def test_keywords_beside_an_environment_are_refused() -> None:
-    with pytest.raises(ValueError, match="is made already; got device too"):
-        gs.check(Bowl(), device="cpu")
+def test_keywords_beside_an_environment_are_its_settings() -> None:
+    assert gs.check(Bowl(), device="cpu").device == "cpu"
+    with pytest.raises(ValueError, match="runs on cpu; got device 'cuda'"):
+        gs.check(Bowl(), device="cuda")

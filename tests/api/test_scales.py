@@ -164,7 +164,7 @@ def test_points_in_files_and_tables_are_values(here: Path) -> None:
     Path("point.json").write_text("[1e3, 2]")
     Path("points.csv").write_text("k,c,loss\n1e2,1,5\n1000,2,0\n")
     env = Spring()
-    for text in ("point.json", "points.csv", "points.csv:2"):
+    for text in ("point.json", "points.csv", "points.csv:3"):
         assert named_point(env, text).tolist() == [3, 2]
     Path("zero.json").write_text("[0, 2]")
     with pytest.raises(ValueError, match="k is on a logarithmic scale and takes positive values; got 0"):

@@ -66,13 +66,13 @@ def test_a_run_is_drawn_for_a_notebook(tmp_path: Path) -> None:
     assert gs.slice("branin", (0, 1), resolution=4, out=tmp_path / "cut").plot(runs=[found])
 
 
-def test_anyone_s_objective_is_searched_in_memory(tmp_path: Path) -> None:
+def test_a_function_is_searched_in_memory_unless_it_is_given_a_folder(tmp_path: Path) -> None:
     bowl = gs.from_torch(lambda x: (x**2).sum(dim=1), gs.ParameterSpace.box(["a", "b"], -1.0, 1.0))
     found = gs.optimize(bowl, "cma-es", budget=60)
     assert found.best.loss < 1e-2
     assert found.folder is None
-    with pytest.raises(ValueError, match="runs of environments are kept on disk"):
-        gs.optimize(bowl, "random", budget=2, out=tmp_path / "run")
+    kept = gs.optimize(bowl, "random", budget=2, out=tmp_path / "run")
+    assert gs.open_run(tmp_path / "run").best.loss == kept.best.loss
 
 
 def test_where_nothing_succeeded_there_is_no_best_and_it_is_said() -> None:

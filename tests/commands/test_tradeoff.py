@@ -164,11 +164,12 @@ def test_a_rung_is_gone_when_the_next_one_is_measured(
 
 
 def test_a_dt_that_does_not_divide_the_episode_is_refused() -> None:
-    base = variants.Variant.of(Converging(fidelity="draft"))
+    env = Converging(fidelity="draft")
+    base = variants.Variant.of(env)
     thirds = base.change("thirds", "dt", fidelity=Fidelity("thirds", dt=0.3))
     with pytest.raises(ValueError, match=r"with dt 0.3 s it would be 0.9 times as long"):
-        thirds.make("converging")
-    assert base.change("halves", "dt", fidelity=Fidelity("halves", dt=0.05)).make("converging").fidelity.dt == 0.05
+        thirds.make(env)
+    assert base.change("halves", "dt", fidelity=Fidelity("halves", dt=0.05)).make(env).fidelity.dt == 0.05
 
 
 def cells(scene: str, fidelity: str, factor: float) -> str:
