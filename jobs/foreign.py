@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import xarray as xr
 
 from ..landscapes.foreign import SUFFIXES, Note, Trials, experiment_trials, points_table, read_points, study_trials
+from ..landscapes.identity import stored_space
 from ..landscapes.plain import plain_name
 from .folder import run_tables
 from .scene import environment_of
@@ -43,7 +44,7 @@ def tables_over(slice: Slice, given: Sequence[Any], watch: Watch | None = None) 
             )
     found = [*(run_tables(paths) if paths else []), *(run.data for run in runs if run.data.sizes["evaluation"])]
     if tables:
-        space = (slice.remake() if slice.remake else environment_of(slice.data, "cpu")).space
+        space = stored_space(slice.data) or environment_of(slice.data, "cpu").space
         for one in tables:
             frame, name = _frame(one, note := (watch or Watch()).note)
             found.append(points_table(frame, slice.data, space, name, note=note))

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 EVERY = "gradients_every"  # of a slice's identity; not there where its gradients are at every sample
 ERROR = "error"  # the attribute of a slice or a run with what the first point that raised said
+BOUNDS = "bounds"  # of the parameters, lower and upper, by their own values: of a slice's provenance
 SCALES = "scales"  # of the parameters in an identity; not there where all are linear
 ABSENT = "none"  # in the place of a setting's value
 LISTED_SETTINGS = 6  # settings that differ, in the refusal of a store
@@ -119,6 +120,18 @@ def stored_provenance(dataset: xr.Dataset) -> dict[str, Any]:
     Raises ValueError where the dataset is neither.
     """
     return current_provenance(_decode(dataset, "provenance"), _decode(dataset, "identity"))
+
+
+def stored_space(dataset: xr.Dataset) -> ParameterSpace | None:
+    """Return the parameters of a slice with their bounds; None where an earlier version has not kept these."""
+    from .space import ParameterSpace
+
+    bounds = stored_provenance(dataset).get(BOUNDS)
+    if bounds is None:
+        return None
+    names, units = (list(map(str, dataset[name].to_numpy())) for name in ("dim", "unit"))
+    lower, upper = bounds
+    return ParameterSpace(names, lower, upper, units, stored_scales(dataset))
 
 
 def errors_of(dataset: xr.Dataset) -> str:

@@ -14,7 +14,7 @@ import zarr
 from numpy.typing import NDArray
 
 from ..capacity import BLOCK, Need, require
-from ..identity import PACKAGE, VERSIONS, with_package
+from ..identity import BOUNDS, PACKAGE, VERSIONS, with_package
 from ..objective import Status
 from ..plane import Plane
 from ..space import LOG10, ParameterSpace
@@ -80,7 +80,8 @@ def lay_out(
     names = AXES[: plane.rank][::-1]
     shape = tuple(len(axes[name]) for name in names)
     side = tuple(tile_side(points) for points in shape)
-    group.attrs.update({**_about(identity, with_package(provenance)), **COORDINATES})
+    bounds = [space.to_values(bound).tolist() for bound in (space.lower, space.upper)]
+    group.attrs.update({**_about(identity, {**with_package(provenance), BOUNDS: bounds}), **COORDINATES})
     unit = str(provenance.get("loss_unit", ""))
     create_array(group, "loss", shape, side, names, "float64", long_name="loss", **({"units": unit} if unit else {}))
     if grad:

@@ -49,6 +49,8 @@ def test_what_needs_no_new_evaluation_works(planted: Path) -> None:
     s = gs.open_slice("slice")
     assert s.plot() is not None
     assert len(gs.overlay("slice", "run").runs) == 1
+    Path("points.csv").write_text("x,y,loss\n0.5,-0.5,0.5\n")
+    assert len(gs.overlay("slice", "points.csv").runs) == 1
     assert torch.tensor(s.data.loss.to_numpy()).isfinite().all()
 
 

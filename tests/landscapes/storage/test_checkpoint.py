@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from gradscape.landscapes.adapters import from_torch
 
 import gradscape as gs
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.identity import DamagedError, StoreError, StoreMismatchError
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.checkpoint import Checkpoint
