@@ -161,6 +161,57 @@ def test_every_verb_takes_it_or_says_what_it_lacks(name: str, here: Path, run: C
             assert said.returncode == 0, (words, said)
 
 
+PENDULUM = """
+import jax
+import jax.numpy as jnp
+
+import gradscape as gs
+
+
+def swing(p, damping=0.1, dt=0.1, steps=10):
+    def step(state, _):
+        angle, rate = state
+        rate = rate + dt * (-9.81 * jnp.sin(angle) - damping * rate + p[1])
+        return (angle + dt * rate, rate), None
+
+    (angle, _), _ = jax.lax.scan(step, (p[0], 0.0), None, length=steps)
+    return angle**2
+
+
+pendulum = gs.from_jax(
+    swing,
+    gs.ParameterSpace({"angle": (-2, 2, "rad"), "torque": (-1, 1, "N m")}),
+    loss_unit="rad^2",
+    fidelities={"draft": {"dt": 0.05, "steps": 20}, "reference": {"dt": 0.01, "steps": 100}},
+    horizon="steps",
+)
+"""
+
+
+def test_a_pendulum_with_fidelities_and_a_horizon_is_studied_like_a_scene(
+    here: Path, run: Callable[..., Said], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gradscape.landscapes.measures.fidelity.REPETITION", 0.0)
+    Path("pendulum.py").write_text(PENDULUM)
+    f = "pendulum.py:pendulum"
+    for words in (
+        f"check {f} --points 2",
+        f"slice {f} --resolution 6 --fidelity reference --set damping=0.2 --out p/slice",
+        f"tradeoff {f} --points 4 --variants dt --out p/tradeoff",
+        f"tradeoff {f} --ladder convergence --points 4 --variants dt --out p/convergence",
+        f"sweep {f} --dims 0 1 --over horizon --frames 2 --resolution 4 --out p/sweep",
+        f"census {f} --slices 2 --resolution 6 --out p/census",
+        f"race {f} --methods random,l-bfgs-b --budget 12 --seeds 2 --out p/race",
+        f"extremes {f} --points 4 --knobs damping --pairs none --precisions float64 --out p/extremes",
+    ):
+        said = run(*words.split(), cwd=here)
+        assert said.returncode == 0, (words, said)
+    errors = gs.tradeoff(vars(_module(here, "pendulum.py"))["pendulum"], points=4, variants=("dt",), out="p/tradeoff")
+    median = errors.table()["median"]
+    assert median["draft-dt-x0.5"] < median["draft"] < median["draft-dt-x2"]  # of the same time, by whole steps
+    assert median["reference"] == 0
+
+
 def test_the_walk_leaves_out_no_function_and_no_verb() -> None:
     public = {one for one in gs.__all__ if callable(getattr(gs, one)) and not isinstance(getattr(gs, one), type)}
     makers = {one for one in public if one.startswith("from_")}
@@ -188,7 +239,7 @@ def test_what_is_no_simulator_is_refused_in_words(what: str, said: str, here: Pa
         as_environment(what)
 
 
-def _module(folder: Path) -> Any:
+def _module(folder: Path, name: str = "doors.py") -> Any:
     from gradscape.envs.importing import import_named
 
-    return import_named(str(folder / "doors.py"))
+    return import_named(str(folder / name))
