@@ -186,7 +186,7 @@ SCENE: dict[str, tuple[Any, Any]] = {
     "deterministic": (Deterministic, False),
     "set_": (Set, None),
 }  # the options that make a SceneSpec, with their defaults
-OWN = set(SceneSpec.__dataclass_fields__)  # names that no option of a scene may have
+OWN = {*SceneSpec.__dataclass_fields__, "self", "what"}  # names that no option of a scene may have
 
 
 def takes_scene(*without: str, **fixed: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:

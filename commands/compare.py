@@ -52,9 +52,9 @@ def compare(
     from ..landscapes.storage.paths import refuse_missing
     from .terminal import Bars, Console, command_line, print_json
 
-    refuse_missing(slice_, "slice")
     if not Path(other).exists():
         refuse_words(replace(scene, name=other))
+    refuse_missing(slice_, "slice")
     from ..api.slice import open_slice
     from ..jobs.compare import PICTURE, RECORD, CompareJob
 

@@ -196,8 +196,9 @@ class _Torch:
         def compute(x: Float[Tensor, "batch dim"], grad: bool) -> tuple[Tensor, Tensor | None, str]:
             points = x.to(device, getattr(torch, precision), copy=True).requires_grad_(grad)
             loss = self._losses(call, points, settings)
+            losses = _numbers(loss, f"the loss of {call.name}")
             slope = _autograd(loss, points, call.name) if grad else None
-            return as_tensor(loss, f"the loss of {call.name}"), slope, str(loss.dtype).removeprefix("torch.")
+            return losses, slope, str(loss.dtype).removeprefix("torch.")
 
         return compute
 
@@ -325,7 +326,7 @@ def _numbers(values: object, what: str) -> Tensor:
 
 def _copied(result: Any) -> Any:
     """Return a copy of what a function returned: one that returns its own buffer fills it anew at the next point."""
-    return tuple(np.array(one) for one in result) if isinstance(result, tuple) else np.array(result)
+    return tuple(map(_copied, result)) if isinstance(result, tuple) else np.array(result, subok=True)  # masks stay
 
 
 def _columns(found: Sequence[Any]) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, make_dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Protocol, TypedDict
 
 import torch
@@ -111,7 +111,8 @@ class Function:
         given = {key: dict(value) for key, value in (said["fidelities"] or {}).items()}
         own = {argument: None for settings in given.values() for argument in settings if argument != "precision"}
         options = said["options"]
-        found = _default_options(known, own) if options is None else dict(options)
+        bound = fn.keywords if isinstance(fn, partial) else {}  # by the user: no setting any more
+        found = _default_options(known, {**own, **bound}) if options is None else dict(options)
         _check_arguments(name, known, found, own, said["horizon"])
         precision = _check_precision(said["precision"], who)
         seeds = as_whole(said["seeds"], f"{who}'s seeds", least=1)
@@ -127,6 +128,10 @@ class Function:
             fn, space, backend, name, said["loss_unit"], said["maximize"], found,
             _read_fidelities(name, given, precision), tuple(own), said["horizon"] or "", seed_argument, seeds, rows,
         )  # fmt: skip
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what is made anew in another process."""
+        return {name: value for name, value in vars(self).items() if name != "options_class"}
 
     @cached_property
     def options_class(self) -> type[Any]:
@@ -243,8 +248,15 @@ class FunctionEnvironment(Environment):
         self._computes: dict[int, Compute] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what was compiled: another process compiles it again."""
-        return {**super().__getstate__(), "_computes": {}}
+        """Leave out what was compiled and the class of the options: another process makes both again."""
+        left = {"_computes": {}, "Options": None, "options": asdict(self.options)}
+        return {**super().__getstate__(), **left}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take over what was sent."""
+        super().__setstate__(state)
+        kind = self.function.options_class
+        vars(self).update(Options=kind, options=kind(**state["options"]))
 
     @property
     def _seeds(self) -> range:

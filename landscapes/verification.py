@@ -278,8 +278,8 @@ def _evaluate_again(
 
 
 def _evaluate(objective: Objective, x: Float[Tensor, "point dim"], *, grad: bool) -> Evaluation:
-    """Evaluate points in batches that an objective prefers."""
-    batch = objective.preferred_batch
+    """Evaluate points in batches that an objective prefers, all at once where it prefers none."""
+    batch = objective.preferred_batch if objective.preferred_batch > 1 else max(1, len(x))
     parts = [evaluate(objective, part, grad=grad) for part in torch.split(x, batch)]
     return Evaluation.join(parts, dim=objective.space.dim, grad=grad)
 

@@ -13,6 +13,7 @@ import torch
 import gradscape as gs
 from gradscape.jobs.slice_summary import SliceSummary
 from gradscape.landscapes.identity import StoreMismatchError, stored_identity
+from gradscape.landscapes.objective import Objective
 
 from ..command import Said
 
@@ -56,7 +57,7 @@ def test_slope_and_minima_are_those_of_a_closed_form() -> None:
     assert cut.plane.resolution == (5, 9)
 
 
-class Raises:
+class Raises(Objective):
     """A bowl that raises in a corner, and has no gradient at its minimum."""
 
     name, space = "raises", BOX

@@ -126,7 +126,7 @@ def test_anyone_s_environment_is_checked_and_each_check_has_a_line(
     for shown in (
         "pass      shapes                    loss (3,), grad (3, 2), status (3,)",
         "pass      dt 8x                     2 finite",
-        "skip      horizon 1x to 8x          n/a (it has no option `horizon`)",
+        "skip      horizon 1x to 8x          n/a (no setting says how long an episode is)",
         "relative error, median",
         "passes: ",
     ):

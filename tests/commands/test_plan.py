@@ -231,7 +231,7 @@ def test_a_device_that_is_not_here_has_the_rate_that_tradeoff_kept(
     errors = LossError(none, none, none, none)
     measured = Comparison(errors, none, GradientError(none, none), None, 4, Seconds(1.0, 2.5), 8)
     options, identity = asdict(env.options), {**env.identity(), "device": "cuda"}
-    draft = MeasuredVariant("draft", "named", asdict(env.fidelity), "warp", "cuda", options, 10, measured)
+    draft = MeasuredVariant("draft", "named", env.fidelity.record(), "warp", "cuda", options, 10, measured)
     path = keep(Tradeoff("flip", "draft", 4, 0, env.loss_unit, None, 0, (draft,), (), (), identity, {}, ""))
     done = run(*command, "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -203,5 +203,5 @@ def test_without_the_extra_they_are_listed_and_naming_one_says_what_installs_it(
 def test_results_say_which_version_of_an_engine_they_are_of_and_others_do_not(tmp_path):
     from gradscape.jobs.scene import PACKAGES, provenance
 
-    assert list(provenance(scene("newton-flight"), "")["versions"]) == [*PACKAGES, "newton"]
-    assert list(provenance(gs.make("branin"), "")["versions"]) == list(PACKAGES)
+    assert list(provenance(scene("newton-flight"), "")["versions"]) == ["gradscape", *PACKAGES, "newton"]
+    assert list(provenance(gs.make("branin"), "")["versions"]) == ["gradscape", *PACKAGES]

@@ -283,7 +283,7 @@ def test_neighbours_are_one_notch_off_and_can_be_made(scene: str) -> None:
     found = neighbours(standard, standard, env)
     assert len({one.key() for one in found}) == len(found) >= 2
     for one in found:
-        made = one.make(scene)
+        made = one.make(env)
         assert abs(made.nearest_dt(made.fidelity.dt) - made.fidelity.dt) < 1e-12
         back = neighbours(one, standard, env)
         assert standard.key() in {other.key() for other in back}  # a notch up and one down is where it began

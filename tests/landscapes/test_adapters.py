@@ -81,13 +81,14 @@ def test_single_precision_losses_come_out_in_double():
     assert result.loss.dtype == result.grad.dtype == torch.float64
 
 
-def test_what_the_function_raises_gets_through():
+def test_what_the_function_raises_is_said_and_is_the_cause():
     def broken(x):
         raise RuntimeError("my simulator")
 
     for adapt in (from_torch, from_numpy):
-        with pytest.raises(RuntimeError, match="my simulator"):
+        with pytest.raises(ValueError, match=r"broken raised RuntimeError at every one of 10 .*my simulator") as said:
             adapt(broken, SPACE).evaluate(X)
+        assert isinstance(said.value.__cause__, RuntimeError)
 
 
 @pytest.mark.parametrize(
@@ -108,7 +109,7 @@ def test_a_wrong_answer_says_who_what_and_what_to_do(objective, said):
 
 @pytest.mark.parametrize("objective", ADAPTED)
 def test_a_wrong_dimension_says_who_wanted_what(objective):
-    with pytest.raises(ValueError, match=r"takes 2 parameters; got x of shape \(3, 12\)"):
+    with pytest.raises(ValueError, match=r"takes 2 parameters, x of shape \(batch, 2\); got x of shape \(3, 12\)"):
         objective.evaluate(torch.zeros(3, 12))
 
 
@@ -133,9 +134,9 @@ def test_a_function_of_one_point_says_at_which_it_failed():
     def fails(x):
         raise ZeroDivisionError("the arm is singular")
 
-    with pytest.raises(ZeroDivisionError) as raised:
+    with pytest.raises(ValueError, match="the arm is singular; the first was x = ") as raised:
         from_numpy(fails, SPACE, vectorized=False).evaluate(X[:1], grad=False)
-    assert raised.value.__notes__ == [f"at x = {X[0].tolist()}"]
+    assert str(raised.value).endswith(f"x = {X[0].tolist()}")
 
 
 def test_a_function_of_one_point_taken_for_one_of_a_batch_is_told_how_to_say_so():

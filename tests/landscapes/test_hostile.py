@@ -9,8 +9,20 @@ import numpy as np
 import pytest
 import torch
 
-from gradscape import Environment, Evaluation, Fidelity, ParameterSpace, Plane, Status, from_numpy, from_torch, sample
+from gradscape import (
+    Environment,
+    Evaluation,
+    Fidelity,
+    ParameterSpace,
+    Plane,
+    Status,
+    as_environment,
+    from_numpy,
+    from_torch,
+    sample,
+)
 from gradscape.landscapes.objective import BoxedObjective, Objective
+from gradscape.landscapes.sampling.fill import sample as fill
 from gradscape.optim.search import search
 
 INF, NAN = math.inf, math.nan
@@ -86,13 +98,16 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "status 7": (answered(7), "a status is one of .*; got 7"),
     "no status yet": (answered(0), "own must say how every point ended"),
     "failures coded 257": (lambda: Evaluation.from_results(X[:, 0], None, torch.full((4,), 257)), "got 257"),
-    "a tuple": (sampled(lambda x: (x[:, 0], x, 1)), "own must return an Evaluation; got tuple"),
-    "nothing": (sampled(lambda x: None), "own must return an Evaluation; got NoneType"),
+    "a tuple": (sampled(lambda x: (x[:, 0], x, 1)), r"own._evaluate must return an Evaluation; got tuple"),
+    "nothing": (sampled(lambda x: None), r"own._evaluate must return an Evaluation; got NoneType"),
     "losses that use no x": (
         lambda: from_torch(lambda x: torch.ones(len(x), requires_grad=True) * 2, SPACE, name="f").evaluate(X),
         "f returned losses that carry no gradient; compute them from x",
     ),
-    **{f"batch {n}": (lambda n=n: sample(BOWL, PLANE, batch=n), "sample's batch is") for n in (-5, 0, 1.5, NAN, "3")},
+    **{
+        f"batch {n}": (lambda n=n: fill(as_environment(BOWL), PLANE, batch=n), "sample's batch is")
+        for n in (-5, 0, 1.5, NAN, "3")
+    },
     **{
         f"resolution {n}": (lambda n=n: Plane.through(SPACE, [0, 0], [0, 1], resolution=n), "a slice's resolution is")
         for n in (-5, 1, 2.5, NAN, None, "3", True, 10**30, [3, 0])

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gradscape.landscapes.identity import StoreMismatchError
-from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.verification import StoredPoints, verify
 
@@ -16,7 +16,7 @@ SPACE = ParameterSpace({"x": (-1, 1), "y": (-1, 1)})
 POINTS = torch.linspace(-1, 1, 9, dtype=torch.float64)[:, None].repeat(1, 2)
 
 
-class Slope:
+class Slope(Objective):
     """A loss that grows by so much along x, and keeps what it is asked."""
 
     name = "slope"

@@ -111,7 +111,7 @@ def test_descents_go_on_bit_for_bit_from_its_state():
         other = restored(other, BOWL)
 
 
-class HalfBlind:
+class HalfBlind(Objective):
     """A bowl that has no gradient in half of the box, nor at its minimum."""
 
     name = "half blind"

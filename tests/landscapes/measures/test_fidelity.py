@@ -131,7 +131,7 @@ def test_gradients_are_per_width_of_the_box_and_points_are_evaluated_once_in_ord
     space = ParameterSpace(("a", "b"), torch.tensor([0.0, 0.0]), torch.tensor([1.0, 10.0]), ("", ""))
     x = space.sobol(8, seed=3)
     heard: list[int] = []
-    found = tradeoff.measure(from_torch(lambda x: 2 * x[:, 0] + x[:, 1], space), x, follow=heard.append)
+    found = tradeoff.measure(from_torch(lambda x: 2 * x[:, 0] + x[:, 1], space, rows=1), x, follow=heard.append)
     np.testing.assert_allclose(found.grad, np.tile([2.0, 10.0], (8, 1)))
     np.testing.assert_allclose(found.loss, 2 * x[:, 0] + x[:, 1])
     assert heard == list(range(1, 9))

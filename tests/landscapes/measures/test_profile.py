@@ -13,7 +13,7 @@ from gradscape.landscapes.draw.figures.quality import quality_figure
 from gradscape.landscapes.measures import gradient_quality as gradients
 from gradscape.landscapes.measures.classify import WORDS
 from gradscape.landscapes.measures.profile import Profile, effort, measure_profile, named_measures
-from gradscape.landscapes.objective import Evaluation, Status
+from gradscape.landscapes.objective import Evaluation, Objective, Status
 
 Function = Callable[[torch.Tensor], torch.Tensor]
 
@@ -65,7 +65,7 @@ def test_words_fit_functions_that_are_known(fn: Function, box: tuple[float, floa
     assert set(found.verdict.reasons) == words
 
 
-class Partly:
+class Partly(Objective):
     """A bowl of which some points have no loss, and others none but a loss."""
 
     name, space = "partly", ParameterSpace.box(("x", "y"), -1.0, 1.0)

@@ -22,7 +22,7 @@ from gradscape.landscapes.measures.unresolved import (
     say_unresolved,
     stored_unresolved,
 )
-from gradscape.landscapes.objective import Objective
+from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
@@ -196,8 +196,13 @@ def test_what_raises_between_the_samples_is_warned_of() -> None:
     with pytest.warns(RuntimeWarning, match="raising raised between the samples.*no more"):
         assert look_between(from_numpy(raising, SPACE), dataset) == {}
     with warnings.catch_warnings(), pytest.raises(OSError, match="gone"):
-        look_between(from_numpy(_gone, SPACE), dataset)
+        look_between(Gone(), dataset)
 
 
-def _gone(x: object) -> object:
-    raise OSError("gone")
+class Gone(Objective):
+    """An objective whose workers are lost."""
+
+    space = SPACE
+
+    def evaluate(self, x: Tensor, *, grad: bool = True) -> Evaluation:
+        raise OSError("gone")

@@ -69,7 +69,7 @@ def test_processes_write_the_bits_of_one_and_progress_counts_every_tile(tmp_path
     assert (seen[-1].done, seen[-1].levels) == (288, 5)
 
 
-class Raising:
+class Raising(Objective):
     """A sum that raises in half of the box, and has no gradient in a part of the other half."""
 
     space, name = SPACE, "raising"
@@ -141,17 +141,22 @@ def test_a_function_of_a_notebook_travels(tmp_path, alone, processes):
 def test_an_error_in_a_worker_comes_back_and_what_was_done_is_kept(tmp_path, alone, processes):
     store = store_at(tmp_path / "s.zarr")
     with pytest.raises(RuntimeError, match="broken cable"):
-        sample(from_torch(broken_in_a_corner, SPACE), PLANE, store, batch=1, executor=processes)
+        sample(Broken(), PLANE, store, batch=1, executor=processes)
     kept = len(store.tiles()) - len(store.pending())
     assert kept < len(store.tiles())
     sample(from_torch(wave, SPACE), PLANE, store, executor=processes)
     assert same(store, alone)
 
 
-def broken_in_a_corner(x: torch.Tensor) -> torch.Tensor:
-    if bool((x > 1.9).any()):
-        raise RuntimeError("broken cable")
-    return wave(x)
+class Broken(Objective):
+    """A wave whose evaluation ends in a corner, and not as a status of a point."""
+
+    space = SPACE
+
+    def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
+        if bool((x > 1.9).any()):
+            raise RuntimeError("broken cable")
+        return from_torch(wave, SPACE).evaluate(x, grad=grad)
 
 
 class Slow(Executor):
@@ -243,7 +248,7 @@ def test_a_batch_that_was_half_done_by_a_worker_that_died_is_not_done_again(tmp_
     store = store_at(tmp_path / "s.zarr")
     first = store.tiles()[0]
     list(Site(MemoryBound(from_torch(wave, SPACE)), store).fill([first], 16))
-    make, arguments = Site(MemoryBound(from_torch(broken_in_a_corner, SPACE)), store).__reduce__()
+    make, arguments = Site(MemoryBound(Broken()), store).__reduce__()
     remote = make(*arguments)
     assert [filled.tile for filled in remote.fill([first], 16)] == [first]  # found: evaluated it would break
     with pytest.raises(RuntimeError, match="broken cable"):

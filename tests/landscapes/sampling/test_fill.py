@@ -182,7 +182,7 @@ def test_another_plane_than_the_stores_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda e: Evaluation(e.loss[:-1], e.grad, e.status), r"Bent must return loss of shape \(16,\).*got \(15,\)"),
+        (lambda e: Evaluation(e.loss[:-1], e.grad, e.status), r"bent must return loss of shape \(16,\).*got \(15,\)"),
         (lambda e: Evaluation(e.loss, e.grad[:, :2], e.status), r"grad of shape \(16, 3\).*got \(16, 2\)"),
         (lambda e: Evaluation(e.loss, None, e.status), "asked for gradients and returned none"),
         (lambda e: Evaluation(e.loss, e.grad, 0 * e.status), "got status MISSING"),

@@ -13,7 +13,7 @@ from matplotlib.quiver import Quiver
 from torch import Tensor
 
 import gradscape as gs
-from gradscape import ParameterSpace, Plane, from_torch, sample
+from gradscape import ParameterSpace, Plane, from_torch
 from gradscape.jobs.slice import SliceJob
 from gradscape.landscapes.draw.figures.contour import arrows_along, landscape_figure
 from gradscape.landscapes.measures.gradient_quality import compare_samples
@@ -22,7 +22,7 @@ from gradscape.landscapes.measures.twice import Twice, at_twice
 from gradscape.landscapes.measures.unresolved import find_unresolved
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.sampling.distribution import equal_groups
-from gradscape.landscapes.sampling.fill import Progress
+from gradscape.landscapes.sampling.fill import Progress, sample
 from gradscape.landscapes.storage.store import SliceStore, open_slice
 from gradscape.landscapes.verification import POINTS
 
