@@ -17,7 +17,8 @@ from benchmarks import commands, full_disks, results
 from benchmarks.damage import BAD, Trial, damage, files
 from benchmarks.forked import Limits, last_words
 
-from gradscape import ParameterSpace, Plane, from_torch, open_run, sample
+from gradscape import ParameterSpace, Plane, from_torch, open_run
+from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.storage.store import SliceStore, open_slice
 from gradscape.optim.methods.random import RandomSearch
 from gradscape.optim.runs.store import RunStore
