@@ -130,7 +130,7 @@ class Function:
         )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what is made anew in another process."""
+        """Leave out what another process makes again."""
         return {name: value for name, value in vars(self).items() if name != "options_class"}
 
     @cached_property
@@ -192,7 +192,7 @@ class FunctionEnvironment(Environment):
 
     @property
     def precision(self) -> str:
-        """float32 or float64: what losses are computed in, as far as their type of numbers tells."""
+        """float32 or float64: the precision of the losses, by their type of numbers."""
         return "float32" if self.loss_type in ("float32", "float16", "bfloat16") else self.fidelity.precision
 
     @property

@@ -30,7 +30,7 @@ ENOUGH, SHORTEST = 1e6, 0.05  # work of an episode that is timed, if it can be s
 
 
 def keep(found: Tradeoff) -> Path | None:
-    """Keep a trade-off where `choose_fidelity` finds it, in the user's data folder, in the place of an earlier one.
+    """Keep a trade-off where `choose_fidelity` finds it, in the user's data folder, which replaces an earlier one.
 
     That of a function is not kept: nothing would say when the function has changed.
     """

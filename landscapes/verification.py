@@ -1,4 +1,4 @@
-"""Verification: a few points of a stored result are evaluated anew before it is gone on with.
+"""Verification: a few points of a stored result are evaluated anew before it is continued.
 
 Where their bits are the stored ones, nothing else is asked. Where they are not, it is measured how far losses and
 gradients move when nothing changes: evaluated once more, in other batches, and at points moved within rounding. What
@@ -65,7 +65,7 @@ class StoredPoints:
         return cls(path, "slice", x, _evaluation(arrays, plane.dim), "grad" in dataset)
 
     def choose(self, objective: Objective, count: int) -> list[int]:
-        """Return the rows to evaluate anew: the middle one by its loss, the least and the largest, as far as counted.
+        """Return the rows to evaluate anew: the middle one by its loss, the least and the largest.
 
         Those that have a gradient come first, then those that have a loss. Points that the objective is not asked at
         are none of them.
@@ -82,7 +82,7 @@ class StoredPoints:
         return list(dict.fromkeys(int(order[pick]) for pick in picks))
 
     def asked(self) -> Bool[Tensor, " point"]:
-        """Say which points were asked for their gradients, as far as is known."""
+        """Say which points are known to have been asked for their gradients."""
         failed = self.found.status != Status.OK
         return self._has_gradient() | (failed & self.sloped)
 

@@ -1,7 +1,7 @@
 """The checkpoint of a study: its arrays by name in a folder, each written whole, so that it can be stopped.
 
 Every part says which study it is of, so that one from elsewhere counts as damaged. What a study's simulator said at a
-few points when it began is a part of its own, by which it is verified before it is gone on with.
+few points when it began is a part of its own, by which it is verified before it is continued.
 """
 
 from __future__ import annotations
