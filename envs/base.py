@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ..landscapes.episode import Episode as Episode
 from ..landscapes.identity import MODEL_VERSION
-from ..landscapes.objective import Evaluation, Objective, SimulatorError, check_points, first_line
+from ..landscapes.objective import Evaluation, Objective, SimulatorError, Status, check_points
 from ..landscapes.options import NoOptions, read_options
 from ..landscapes.sampling.memory import free_memory, is_out_of_memory
 from ..landscapes.space import ParameterSpace, as_tensor
@@ -35,7 +35,7 @@ from .records import unknown_fidelity
 
 T = TypeVar("T")
 FLOAT32 = torch.finfo(torch.float32).max
-PROBES = 8  # points that are tried, beside the centre, where a simulation has only raised so far
+PROBES = 8  # points that are tried, beside the centre, where a whole batch raised
 
 
 class Environment(Objective):
@@ -92,7 +92,8 @@ class Environment(Objective):
             raise ValueError(f"{self.name} is deterministic on engine {able or 'none'} only; got engine {engine}")
         self.options = read_options(self.name, self.Options, options)
         self._stop = threading.Event()
-        self._answered = False  # whether any point was evaluated without an error
+        self._raised: Exception | None = None  # what the simulation has raised now,
+        self._answering: Tensor | None = None  # and a point at which it did not
         self._setup()
         if not isinstance(getattr(self, "space", None), ParameterSpace):
             raise ValueError(
@@ -157,7 +158,11 @@ class Environment(Objective):
         parts = self._map_parts(partial(self._evaluate_rows, grad=grad), x)
         whole = Evaluation.join(parts, dim=self.space.dim, grad=grad)
         slope = None if whole.grad is None else whole.grad.to(x)
-        return Evaluation.from_results(whole.loss.to(x), slope, whole.status.cpu(), whole.error)
+        found = Evaluation.from_results(whole.loss.to(x), slope, whole.status.cpu(), whole.error)
+        if found.error:
+            self._refuse_broken(x, found)
+            self._raised = None  # which holds all that was there
+        return found
 
     @final
     def __call__(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"]:
@@ -348,31 +353,37 @@ class Environment(Objective):
     def _evaluate_rows(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         """Evaluate rows together; where that raises, in halves, so that what raises is found."""
         try:
-            found = self._simulate(x, grad=grad)
+            return self._simulate(x, grad=grad)
         except Exception as error:
             if isinstance(error, SimulatorError) or is_out_of_memory(error):
                 raise
-            if len(x) > 1:
-                parts = [self._evaluate_rows(part, grad=grad) for part in torch.tensor_split(x, 2)]
-                return Evaluation.join(parts, dim=x.shape[1], grad=grad)
-            self._refuse_if_always(error, x)
-            return Evaluation.raised(error, dim=x.shape[1], grad=grad)
-        self._answered = True
-        return found
+            self._raised = error
+            if len(x) == 1:
+                return Evaluation.raised(error, dim=x.shape[1], grad=grad)
+        parts = [self._evaluate_rows(part, grad=grad) for part in torch.tensor_split(x, 2)]
+        return Evaluation.join(parts, dim=x.shape[1], grad=grad)
 
-    def _refuse_if_always(self, error: Exception, x: Float[Tensor, "one dim"]) -> None:
-        """Raise ValueError where the simulation raises at other points of the box as well, and has never answered."""
-        if self._answered:
+    def _refuse_broken(self, x: Float[Tensor, "batch dim"], found: Evaluation) -> None:
+        """Raise SimulatorError where a whole batch raised, and so does a point that has answered before, or any other.
+
+        So an engine that is broken, or a function that cannot work, is no landscape of errors.
+        """
+        answered = found.status != Status.ERROR
+        if bool(answered.any()):
+            self._answering = x[answered][:1]
             return
-        for point in torch.cat([self.space.center[None], self.space.sobol(PROBES, seed=0)]):
+        tried = self._answering
+        if tried is None:
+            tried = torch.cat([self.space.center[None], self.space.sobol(PROBES, seed=0)])
+        for point in tried:
             with suppress(Exception):
                 self._simulate(point[None], grad=False)
-                self._answered = True
+                self._answering = point[None]
                 return
         raise SimulatorError(
-            f"{self.name} raised {type(error).__name__} at every one of {PROBES + 2} points that were tried: "
-            f"{first_line(error)}; the first was x = {x[0].tolist()}"
-        ) from error
+            f"{self.name} raised wherever it was tried, at {len(x) + len(tried)} points: {found.error}; the first was "
+            f"x = {self.space.to_values(x[0]).tolist()}"
+        ) from self._raised
 
     def _simulate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         values = self.space.to_values(x)

@@ -157,7 +157,7 @@ def _raising(error: type[BaseException]) -> Callable[[Any], Any]:
 
 @pytest.mark.parametrize("error", [StopIteration, OSError, ValueError, TypeError])
 def test_what_always_raises_is_refused_with_what_it_said(error: type[Exception]) -> None:
-    with pytest.raises(ValueError, match=f"fn raised {error.__name__} at every one of 10 points"):
+    with pytest.raises(ValueError, match=f"fn raised wherever it was tried, at 12 points: {error.__name__}"):
         gs.from_numpy(_raising(error), SPACE).evaluate(X, grad=False)
 
 
@@ -244,3 +244,19 @@ def test_an_object_without_what_it_takes_is_told_so() -> None:
         gs.check(object())
     with pytest.raises(ValueError, match="launch is a function, and nothing says what its parameters are"):
         gs.check(launch)
+
+
+def test_an_engine_that_breaks_on_the_way_is_no_landscape_of_errors() -> None:
+    calls = []
+
+    def fragile(x: Any) -> Any:
+        calls.append(len(x))
+        if len(calls) > 2:
+            raise RuntimeError("the device is lost")
+        return (x**2).sum(1)
+
+    env = gs.from_numpy(fragile, SPACE)
+    env.evaluate(X, grad=False)
+    env.evaluate(X, grad=False)
+    with pytest.raises(ValueError, match=r"fragile raised wherever it was tried.*the device is lost"):
+        env.evaluate(X, grad=False)

@@ -87,7 +87,7 @@ def test_missing_parts_stand_apart_and_refused_ones_say_why(found: ModelStudy) -
     assert "gust" not in [part.name for part in found.present]
     why = {refused.name: refused.why for refused in found.refused}
     motor = why.pop("motor")
-    assert motor.startswith("parted raised RuntimeError at every one of 10 points that were tried: the engine gives up")
+    assert "points: RuntimeError: the engine gives up" in motor
     assert why == {
         "tank": "parted needs its tank",
         "as it is": "the full model's options are those of 'wind' already",

@@ -86,7 +86,9 @@ def test_what_the_function_raises_is_said_and_is_the_cause():
         raise RuntimeError("my simulator")
 
     for adapt in (from_torch, from_numpy):
-        with pytest.raises(ValueError, match=r"broken raised RuntimeError at every one of 10 .*my simulator") as said:
+        with pytest.raises(
+            ValueError, match=r"broken raised wherever it was tried.*RuntimeError: my simulator"
+        ) as said:
             adapt(broken, SPACE).evaluate(X)
         assert isinstance(said.value.__cause__, RuntimeError)
 

@@ -119,7 +119,7 @@ def test_what_the_function_raises_is_said():
     def broken(x):
         raise RuntimeError("my simulator")
 
-    with pytest.raises(ValueError, match=r"broken raised RuntimeError at every one of 10 points.*my simulator"):
+    with pytest.raises(ValueError, match=r"broken raised wherever it was tried.*RuntimeError: my simulator"):
         gs.from_jax(broken, SPACE).evaluate(X)
 
 

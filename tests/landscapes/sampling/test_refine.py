@@ -310,5 +310,5 @@ def test_a_function_that_raises_says_so() -> None:
     def raising(x: object) -> object:
         raise RuntimeError("no more")
 
-    with pytest.raises(ValueError, match=r"raising raised RuntimeError at every one of 10 points.*no more"):
+    with pytest.raises(ValueError, match=r"raising raised wherever it was tried.*RuntimeError: no more"):
         refine(from_numpy(raising, SPACE), plane(33), SliceStore.in_memory(plane(33), SPACE), Refinement(0.1))
