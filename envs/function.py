@@ -12,11 +12,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..landscapes.identity import UNNAMED
 from ..landscapes.objective import Evaluation, SimulatorError
 from ..landscapes.space import ParameterSpace, as_whole
 from .base import Environment, Fidelity
 
-DEFAULT = "default"  # the fidelity of a function that names none
 NAMELESS = "function"  # what a lambda is called
 SAME_TIME = 0.01  # relative difference of what counts as the same time
 SEED_ARGUMENTS = ("key", "seed")  # of a function that draws random numbers
@@ -349,7 +349,7 @@ def _read_fidelities(name: str, given: Mapping[str, Mapping[str, Any]], precisio
     """Return fidelities by name, of the settings that a user gave for each."""
     found = {}
     names = {argument for settings in given.values() for argument in settings}
-    for fidelity, settings in (given or {DEFAULT: {}}).items():
+    for fidelity, settings in (given or {UNNAMED: {}}).items():
         if lacking := names - settings.keys() - {"precision"}:
             raise ValueError(f"{name}'s fidelity {fidelity} lacks {', '.join(sorted(lacking))}, which others have")
         own = {key: value for key, value in settings.items() if key in FIDELITY_FIELDS}

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 EVERY = "gradients_every"  # of a slice's identity; not there where its gradients are at every sample
 ERROR = "error"  # the attribute of a slice or a run with what the first point that raised said
+UNNAMED = "default"  # the fidelity of a simulator that names none
 BOUNDS = "bounds"  # of the parameters, lower and upper, by their own values: of a slice's provenance
 SCALES = "scales"  # of the parameters in an identity; not there where all are linear
 ABSENT = "none"  # in the place of a setting's value
@@ -120,6 +121,12 @@ def stored_provenance(dataset: xr.Dataset) -> dict[str, Any]:
     Raises ValueError where the dataset is neither.
     """
     return current_provenance(_decode(dataset, "provenance"), _decode(dataset, "identity"))
+
+
+def simulator_parts(identity: Mapping[str, Any]) -> list[str]:
+    """Return the simulator's name and its fidelity, but for that of a function which names none."""
+    said = [str(identity[key]) for key in ("objective", "fidelity") if identity.get(key)]
+    return said[:1] if said[1:] == [UNNAMED] else said
 
 
 def stored_space(dataset: xr.Dataset) -> ParameterSpace | None:

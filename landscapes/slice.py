@@ -13,7 +13,7 @@ import torch
 import xarray as xr
 from numpy.typing import NDArray
 
-from .identity import errors_of, plane_of, stored_identity, stored_provenance
+from .identity import errors_of, plane_of, simulator_parts, stored_identity, stored_provenance
 from .objective import Objective, Status
 from .plane import Plane
 
@@ -146,7 +146,7 @@ class Slice:
 
     def __repr__(self) -> str:
         """Return in a line what was sampled and what came out."""
-        about = [str(self.identity[name]) for name in ("objective", "fidelity") if name in self.identity]
+        about = simulator_parts(self.identity)
         points = " x ".join(map(str, self.plane.resolution))
         loss = self.data["loss"]
         low, high = float(loss.min()), float(loss.max())

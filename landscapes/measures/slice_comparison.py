@@ -12,7 +12,7 @@ import torch
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..identity import differing_settings, plane_of, stored_identity, stored_provenance, stored_scales
+from ..identity import differing_settings, plane_of, simulator_parts, stored_identity, stored_provenance, stored_scales
 from ..large import refuse_large
 from ..lattice import sampled_lattice
 from ..objective import Status
@@ -150,7 +150,7 @@ def _settings(dataset: xr.Dataset) -> dict[str, Any]:
 def _names(a: xr.Dataset, b: xr.Dataset, differing: dict[str, tuple[str, str]]) -> list[str]:
     """Name objective and fidelity of both, and of the same ones the first setting that differs."""
     known = [stored_identity(one) for one in (a, b)]
-    names = [" · ".join(str(one[key]) for key in ("objective", "fidelity") if one.get(key)) for one in known]
+    names = [" · ".join(simulator_parts(one)) for one in known]
     if names[0] == names[1] and differing:
         setting, values = next(iter(differing.items()))
         short = setting.rpartition(".")[2]

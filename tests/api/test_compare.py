@@ -46,7 +46,7 @@ def test_an_environment_or_anyones_objective_is_sampled_where_a_slice_is(tmp_pat
     assert "gradscape.compare(" in made.command
     memory = gs.slice(gs.from_torch(bowl, SPACE), (0, 1), resolution=5)
     twice = gs.compare(memory, gs.from_torch(doubled, SPACE), out=tmp_path / "mine")
-    assert (twice.a, twice.b) == ("bowl · default", "doubled · default")
+    assert (twice.a, twice.b) == ("bowl", "doubled")
     assert twice.slopes is not None
     assert twice.slopes.ratio.value == pytest.approx(2.0)
 

@@ -19,7 +19,7 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Patch
 from matplotlib.text import Text
 
-from ...identity import PACKAGE, VERSIONS, stored_identity, stored_provenance
+from ...identity import PACKAGE, VERSIONS, simulator_parts, stored_identity, stored_provenance
 from ...lattice import with_gradients
 from ...measures.unresolved import say_unresolved, stored_unresolved
 from ...objective import Status
@@ -107,7 +107,7 @@ def title(dataset: xr.Dataset) -> str:
     """Return objective, fidelity and resolution, and how much of it is sampled if not all."""
     identity = stored_identity(dataset)
     points = " \N{MULTIPLICATION SIGN} ".join(str(dataset.sizes[name]) for name in dataset["loss"].dims[::-1])
-    said = [str(identity[key]) for key in ("objective", "fidelity") if identity.get(key)]
+    said = simulator_parts(identity)
     whole = int(np.prod(identity["plane"]["resolution"]))
     done = int((dataset["status"] != Status.MISSING).sum())
     sampled = evaluated(dataset)
