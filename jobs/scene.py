@@ -85,7 +85,7 @@ def provenance(objective: Objective, command: str) -> dict[str, Any]:
     return {
         "command": command,
         "created": datetime.now(UTC).strftime("%Y-%m-%d"),
-        VERSIONS: {PACKAGE: __version__, **{package: _version(package) for package in _packages(objective)}},
+        VERSIONS: {PACKAGE: __version__, **{one: _version(one) for one in (*PACKAGES, *objective.packages)}},
         "loss_unit": objective.loss_unit,
     }
 
@@ -93,11 +93,6 @@ def provenance(objective: Objective, command: str) -> dict[str, Any]:
 @cache  # reading the metadata of fifteen packages takes longer than a small job
 def _version(package: str) -> str:
     return installed_version(package) or ABSENT
-
-
-def _packages(objective: Objective) -> tuple[str, ...]:
-    """Return the packages whose versions are worth keeping: beside those of all results, what its engine needs."""
-    return (*PACKAGES, *objective.packages)
 
 
 def with_policy(env: Environment, policy: str | None) -> Objective:
