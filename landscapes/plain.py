@@ -7,6 +7,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 # What a terminal obeys and does not show, but for tabs and line ends; and what turns the direction of writing.
@@ -32,10 +33,14 @@ def plain(value: Any) -> Any:
     """Return a value as JSON has it, at any depth.
 
     NaN and infinity become None; arrays, tensors and tuples become lists, numbers of numpy those of Python; whatever
-    has a `record` is what that returns. Raises TypeError for anything else that JSON does not know.
+    has a `record` is what that returns, any other dataclass its fields, and the properties that it names in `derived`.
+    Raises TypeError for anything else that JSON does not know.
     """
     if hasattr(value, "record"):
         return plain(value.record())
+    if is_dataclass(value):
+        names = [*(field.name for field in fields(value)), *getattr(value, "derived", ())]
+        return {name: plain(getattr(value, name)) for name in names}
     if isinstance(value, Mapping):
         return {name: plain(inner) for name, inner in value.items()}
     if isinstance(value, list | tuple):

@@ -1,0 +1,68 @@
+"""Records as JSON and back: a record's fields stand once, in its dataclass, and a library converts them."""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+from functools import cache
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from .plain import plain
+
+if TYPE_CHECKING:
+    from cattrs import Converter
+
+Record = TypeVar("Record")
+
+
+def to_json(record: Any) -> Any:
+    """Return a record as JSON has it, at any depth; see `from_json`.
+
+    Dataclasses become dicts of their fields, followed by the properties that their class names in `derived`, which
+    are for readers alone. NaN and infinity become None; arrays, tensors and tuples become lists. Raises TypeError for
+    what has no form in JSON.
+    """
+    return plain(record)
+
+
+def from_json(kind: type[Record], data: Any) -> Record:
+    """Return a record of a class from what `to_json` made of it.
+
+    The field types of the class are the only schema, so they are imported where the class is defined, not under
+    TYPE_CHECKING. None becomes NaN where a number is wanted; what the class does not know is ignored. Raises an error
+    of any kind for what is not such a record; `storage.records.reading` says which file is damaged.
+    """
+    return _converter().structure(data, kind)
+
+
+@cache
+def _converter() -> Converter:
+    """Return a converter that takes no value for another one: no text is a number, no number a text."""
+    from cattrs import Converter
+
+    converter = Converter(detailed_validation=False)
+    for kind, read in ((float, _number), (int, _integer), (str, _exactly), (bool, _exactly)):
+        converter.register_structure_hook(kind, read)
+    return converter
+
+
+def _number(value: Any, _: object) -> float:
+    if value is None:
+        return math.nan
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise TypeError(f"{value!r} is no number")
+    return float(value)
+
+
+def _integer(value: Any, _: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value):
+        raise TypeError(f"{value!r} is no whole number")
+    return int(value)
+
+
+def _exactly(value: Any, kind: type[Any]) -> Any:
+    if issubclass(kind, Enum):
+        return kind(value)
+    if not isinstance(value, kind):
+        raise TypeError(f"{value!r} is no {'text' if kind is str else 'yes or no'}")
+    return value
